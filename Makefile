@@ -1,0 +1,41 @@
+# `make help` lists the targets. PYTHON may name another interpreter (3.11 or newer).
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: help demo test check bench app clean
+
+help:  ## list the targets
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
+
+$(STAMP): pyproject.toml packaging/constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --upgrade pip
+	$(BIN)/pip install --quiet --constraint packaging/constraints.txt torch
+	$(BIN)/pip install --quiet --constraint packaging/constraints.txt --editable '.[dev]'
+	touch $@
+
+.PHONY: system
+system: $(STAMP)
+	@$(PYTHON) packaging/system_libraries.py
+
+demo: system  ## install everything and open the bundled scene (without a display: pictures in demo_out/)
+	$(BIN)/python packaging/demo.py
+
+test: system  ## install everything, then lint, type-check and run every test
+	$(MAKE) --no-print-directory check
+	$(BIN)/python -m pytest
+
+check: $(STAMP)  ## ruff and mypy only
+	$(BIN)/ruff check langsplat_core app tests packaging
+	$(BIN)/mypy
+
+bench: system  ## speed against error, on this machine
+	$(BIN)/langsplat bench raster --out bench_out
+
+app: system  ## open the viewer
+	$(BIN)/langsplat-viewer
+
+clean:  ## remove what these targets made
+	rm -rf $(VENV) demo_out bench_out .pytest_cache .mypy_cache .ruff_cache

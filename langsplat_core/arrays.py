@@ -1,0 +1,66 @@
+"""Small numerical helpers shared by every layer. NumPy only."""
+
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray[Any, np.dtype[Any]]
+
+
+def check_array(
+    name: str,
+    array: Array,
+    shape: tuple[int | str, ...],
+    dims: dict[str, int] | None = None,
+    dtype: type | None = None,
+) -> dict[str, int]:
+    """Require `array` to have `shape`; letters in the shape must agree with `dims`, or are bound now.
+
+    Returns the letters bound so far, so that calls can be chained over the fields of one object.
+    Raises TypeError for a wrong dtype and ValueError for a wrong shape, both naming the array:
+    ``scales: expected shape (N, 3) with {'N': 6}, got (5, 3)``.
+    """
+    dims = dict(dims or {})
+    if not isinstance(array, np.ndarray):
+        raise TypeError(f"{name}: expected a NumPy array, got {type(array).__name__}")
+    if dtype is not None and array.dtype != dtype:
+        raise TypeError(f"{name}: expected {np.dtype(dtype).name}, got {array.dtype.name}")
+    expected = ", ".join(str(size) for size in shape)
+    problem = f"{name}: expected shape ({expected}) with {dims}, got {array.shape}"
+    if array.ndim != len(shape):
+        raise ValueError(problem)
+    for size, actual in zip(shape, array.shape, strict=True):
+        if dims.setdefault(size, actual) != actual if isinstance(size, str) else size != actual:
+            raise ValueError(problem)
+    return dims
+
+
+def sigmoid(x: Array) -> Array:
+    """Logistic function, exact at +-infinity and free of overflow; dtype is kept."""
+    x = np.asarray(x)
+    e = np.exp(-np.abs(x))
+    return np.where(x >= 0, 1.0, e).astype(x.dtype) / (1 + e)
+
+
+def logit(p: Array) -> Array:
+    """Inverse of `sigmoid`; 0 and 1 give -infinity and +infinity."""
+    p = np.asarray(p)
+    with np.errstate(divide="ignore"):
+        return np.log(p) - np.log1p(-p)
+
+
+def unit(vectors: Array, epsilon: float = 1e-6) -> Array:
+    """Scale the last axis to length 1. A vector shorter than `epsilon` stays short, never NaN."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.maximum(length, epsilon)
+
+
+def rotation_matrices(quats_wxyz: Array) -> Array:
+    """(N, 4) quaternions in order w, x, y, z, any non-zero length -> (N, 3, 3) rotations."""
+    w, x, y, z = np.moveaxis(unit(quats_wxyz, 1e-30), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)

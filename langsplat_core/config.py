@@ -1,0 +1,123 @@
+"""Every setting a user can change, as frozen dataclasses; the command line is derived from them."""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """Constants of image formation; see `INRIA` and `GSPLAT` for the two named profiles.
+
+    Sources: graphdeco-inria/diff-gaussian-rasterization and gsplat, as compared in the README.
+    """
+
+    near: float = 0.2  # Gaussians with camera z <= near are not drawn, world units
+    fov_clamp: float = 1.3  # Jacobian taken at most at this multiple of the half field of view
+    dilation: float = 0.3  # added to both diagonal entries of the 2D covariance, px^2
+    alpha_max: float = 0.99  # cap of one Gaussian's alpha
+    alpha_min: float = 1 / 255  # smaller alphas are skipped
+    transmittance_min: float = 1e-4  # stop when the next transmittance would be <= this, without adding
+    antialiased: bool = False  # Mip-Splatting: opacity times sqrt(det before / det after dilation)
+
+
+INRIA = RasterSettings()
+GSPLAT = replace(INRIA, near=0.01)
+RASTER_PROFILES = {"inria": INRIA, "gsplat": GSPLAT}
+
+
+@dataclass(frozen=True)
+class DatasetConfig:
+    """How photographs are read."""
+
+    max_side: int = 800  # photographs are shrunk until their longer side has at most this many pixels
+    test_every: int = 8  # every n-th view, in name order, is held out from training; 0 holds out none
+
+
+@dataclass(frozen=True)
+class RadianceConfig:
+    """3D Gaussian Splatting training (Kerbl et al. 2023); defaults are those of the INRIA code.
+
+    Step counts below are for `reference_steps`; a smaller `steps` scales every schedule with it.
+    """
+
+    steps: int = 30_000
+    reference_steps: int = 30_000
+    backend: Literal["auto", "cpu", "cuda"] = "auto"
+    sh_degree: int = 3
+    sh_degree_every: int = 1_000
+    max_gaussians: int = 1_000_000
+    lambda_dssim: float = 0.2
+    position_lr_init: float = 1.6e-4  # times the cameras' extent
+    position_lr_final: float = 1.6e-6
+    feature_lr: float = 2.5e-3  # higher SH coefficients: a twentieth
+    opacity_lr: float = 0.05
+    scale_lr: float = 5e-3
+    rotation_lr: float = 1e-3
+    densify_from: int = 500
+    densify_until: int = 15_000
+    densify_every: int = 100
+    densify_grad: float = 2e-4  # mean norm of the gradient by the 2D mean, in NDC
+    percent_dense: float = 0.01  # of the extent: larger Gaussians split, smaller ones are cloned
+    opacity_reset_every: int = 3_000
+    prune_opacity: float = 5e-3
+    checkpoint_every: int = 2_000  # steps of this run
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class MaskConfig:
+    """Where masks come from and which are kept (paper section 3.1 and the method's public code)."""
+
+    source: Literal["auto", "sam", "graph"] = "auto"  # auto: sam when `sam` names weights, else graph
+    sam: str = ""  # hub id or folder of SAM weights, e.g. facebook/sam-vit-huge
+    points_per_side: int = 32
+    points_per_batch: int = 64
+    predicted_iou: float = 0.7
+    stability: float = 0.85
+    stability_offset: float = 1.0
+    box_nms: float = 0.7
+    min_region: int = 100  # px
+    nms_iou: float = 0.8
+    nms_score: float = 0.7
+    nms_inner: float = 0.5
+
+
+@dataclass(frozen=True)
+class ClipConfig:
+    """The vision-language encoder."""
+
+    model: str = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"  # hub id, folder, or "demo" for the bundled one
+    batch: int = 32
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+@dataclass(frozen=True)
+class CodecConfig:
+    """Compression of CLIP vectors to latents (paper section 3.2)."""
+
+    kind: Literal["autoencoder", "linear"] = "autoencoder"
+    latent_dim: int = 3
+    steps: int = 4_000
+    batch: int = 256
+    lr: float = 7e-4
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class LiftConfig:
+    """How mask vectors reach the Gaussians."""
+
+    mode: Literal["membership", "one-pass"] = "membership"  # one-pass: the paper's latents, W^T H / W^T 1
+    chunk: int = 32  # mask channels per gather pass
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """The whole path from photographs to a scene with a language field."""
+
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    radiance: RadianceConfig = field(default_factory=RadianceConfig)
+    masks: MaskConfig = field(default_factory=MaskConfig)
+    clip: ClipConfig = field(default_factory=ClipConfig)
+    codec: CodecConfig = field(default_factory=CodecConfig)
+    lift: LiftConfig = field(default_factory=LiftConfig)

@@ -1,0 +1,55 @@
+"""What every rasterizer is: a linear operator per view, and nothing more.
+
+With geometry frozen, a rendered image is ``F = W x``: `x` holds one vector per Gaussian and `W` the
+blending weights alpha_i T_i of the view. A backend projects a view once and then offers `splat`
+(``W x``) and, where it can lift, `gather` (``W^T y``, the exact adjoint).
+"""
+
+from typing import Literal, Protocol
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import INRIA, RasterSettings
+from langsplat_core.scene import Camera, Gaussians
+
+DepthKind = Literal["expected", "median"]
+
+
+class View(Protocol):
+    """N Gaussians as one camera of H x W pixels sees them."""
+
+    @property
+    def dropped(self) -> int:
+        """How many rows were invalid (see `Gaussians.valid`) and therefore not drawn."""
+
+    def splat(self, values: Array) -> tuple[Array, Array]:
+        """(N, C) values -> (H, W, C) image ``W x`` without background, and (H, W) alpha = row sums of W."""
+
+    def depth(self, kind: DepthKind = "expected") -> Array:
+        """(H, W) depth along camera z, world units; 0 where nothing is drawn.
+
+        `expected` is the alpha-weighted mean; `median` is the depth of the Gaussian at which the
+        transmittance falls to 0.5 or below (0 where it never does).
+        """
+
+
+class LiftingView(View, Protocol):
+    """A view whose backend also has the adjoint."""
+
+    def gather(self, image: Array) -> Array:
+        """(H, W, C) image -> (N, C) values ``W^T y``."""
+
+
+class Rasterizer(Protocol):
+    """A backend; stateless apart from device resources."""
+
+    name: str
+
+    def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> View:
+        """Project `gaussians` into `camera` once, for any number of `splat` calls."""
+
+
+class LiftingRasterizer(Rasterizer, Protocol):
+    """A backend whose views can gather."""
+
+    def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> LiftingView:
+        """As in `Rasterizer`."""

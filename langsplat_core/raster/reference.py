@@ -1,0 +1,164 @@
+"""The truth: a float64 rasterizer written to be read. Every other backend is tested against it.
+
+Image formation, from top to bottom (constants in `config.RasterSettings`):
+
+1. Camera space: p = R x + t; Gaussians with p.z <= near are not drawn.
+2. Footprint: the perspective map is linearised at p, with p.x/p.z and p.y/p.z clamped to 1.3 times the
+   half field of view on each side of the principal point. With A = J R rotation diag(scales) (2x3) the
+   2D covariance is A A^T + 0.3 I, positive definite by construction.
+3. alpha(u) = min(0.99, opacity * exp(-1/2 (u-m)^T cov^-1 (u-m))) at pixel centres u; alphas below 1/255
+   are skipped, so a Gaussian's extent is the ellipse where alpha equals 1/255.
+4. Front to back by camera z, ties by index: weight = alpha * T, T <- T (1 - alpha); a pixel stops before
+   the Gaussian that would bring T to 1e-4 or below.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from langsplat_core.arrays import Array, check_array, rotation_matrices, sigmoid
+from langsplat_core.config import INRIA, RasterSettings
+from langsplat_core.raster.protocol import DepthKind
+from langsplat_core.scene import Camera, Gaussians
+
+
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """Projected Gaussians, N rows; rows that are not drawn have opacity 0."""
+
+    means_px: Array  # (N, 2) pixels
+    depths: Array  # (N,) camera z
+    conics: Array  # (N, 3) entries xx, xy, yy of the inverse 2D covariance, 1/px^2
+    extents_px: Array  # (N, 2) half width and half height of the alpha = alpha_min contour
+    opacities: Array  # (N,) in [0, 1]
+
+
+def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> Footprints:
+    """Steps 1 and 2 of the module's list, for all Gaussians at once."""
+    valid = gaussians.valid()
+    means = np.where(valid[:, None], gaussians.means, 0).astype(np.float64)
+    points = means @ camera.rotation.T + camera.world_to_camera[:3, 3]
+    drawn = valid & (points[:, 2] > settings.near)
+    x, y, z = np.where(drawn[:, None], points, (0.0, 0.0, 1.0)).T
+
+    # Clamp where the Jacobian is taken, not where the mean goes (EWA splatting's linearisation
+    # explodes far outside the field of view).
+    margin_x = (settings.fov_clamp - 1) * 0.5 * camera.width / camera.fx
+    margin_y = (settings.fov_clamp - 1) * 0.5 * camera.height / camera.fy
+    left, right = camera.cx / camera.fx + margin_x, (camera.width - camera.cx) / camera.fx + margin_x
+    top, bottom = camera.cy / camera.fy + margin_y, (camera.height - camera.cy) / camera.fy + margin_y
+    tx = np.clip(x / z, -left, right) * z
+    ty = np.clip(y / z, -top, bottom) * z
+    zero = np.zeros_like(z)
+    jacobian = np.stack(
+        [
+            np.stack([camera.fx / z, zero, -camera.fx * tx / z**2], -1),
+            np.stack([zero, camera.fy / z, -camera.fy * ty / z**2], -1),
+        ],
+        -2,
+    )
+    scales = np.exp(np.where(drawn[:, None], gaussians.log_scales, 0).astype(np.float64))
+    quats = np.where(drawn[:, None], gaussians.quats_wxyz, (1.0, 0.0, 0.0, 0.0)).astype(np.float64)
+    a = jacobian @ camera.rotation @ (rotation_matrices(quats) * scales[:, None, :])
+
+    # det(A A^T) = |row0 x row1|^2 (Cauchy-Binet): no cancellation, however thin the needle.
+    xx = (a[:, 0] ** 2).sum(1)
+    yy = (a[:, 1] ** 2).sum(1)
+    xy = (a[:, 0] * a[:, 1]).sum(1)
+    det_sharp = (np.cross(a[:, 0], a[:, 1]) ** 2).sum(1)
+    det = det_sharp + settings.dilation * (xx + yy) + settings.dilation**2
+    xx, yy = xx + settings.dilation, yy + settings.dilation
+
+    opacities = sigmoid(np.where(drawn, gaussians.opacity_logits, -np.inf).astype(np.float64))
+    if settings.antialiased:
+        opacities = opacities * np.sqrt(np.maximum(det_sharp / det, 0.005**2))
+    opacities = np.where(drawn & (opacities >= settings.alpha_min), opacities, 0)
+    reach = np.sqrt(2 * np.log(np.maximum(opacities / settings.alpha_min, 1)))  # in standard deviations
+    return Footprints(
+        means_px=np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1),
+        depths=z,
+        conics=np.stack([yy / det, -xy / det, xx / det], -1),
+        extents_px=np.stack([reach * np.sqrt(xx), reach * np.sqrt(yy)], -1),
+        opacities=opacities,
+    )
+
+
+class ReferenceView:
+    """Blending weights of one view, recomputed Gaussian by Gaussian in every call."""
+
+    def __init__(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> None:
+        self.camera, self.settings = camera, settings
+        self.footprints = project(gaussians, camera, settings)
+        self.dropped = int(len(gaussians) - gaussians.valid().sum())
+        self.order = np.argsort(self.footprints.depths, kind="stable")
+
+    def _weights(self):  # type: ignore[no-untyped-def]
+        """Yield (index, window, weights, transmittance after) front to back: steps 3 and 4."""
+        f, s = self.footprints, self.settings
+        height, width = self.camera.height, self.camera.width
+        transmittance = np.ones((height, width))
+        running = np.ones((height, width), bool)
+        for i in self.order:
+            if f.opacities[i] == 0:
+                continue
+            # The window only saves time: outside the extent alpha is below alpha_min anyway.
+            # 1e-9 relative slack keeps rounding from cutting a pixel that lies on the contour.
+            low = np.ceil(f.means_px[i] - f.extents_px[i] * (1 + 1e-9) - 0.5 - 1e-9)
+            high = np.floor(f.means_px[i] + f.extents_px[i] * (1 + 1e-9) - 0.5 + 1e-9) + 1
+            x0, y0 = (int(v) for v in np.clip(low, 0, (width, height)))
+            x1, y1 = (int(v) for v in np.clip(high, 0, (width, height)))
+            if x0 >= x1 or y0 >= y1:
+                continue
+            window = np.s_[y0:y1, x0:x1]
+            dx = np.arange(x0, x1) + 0.5 - f.means_px[i, 0]
+            dy = (np.arange(y0, y1) + 0.5 - f.means_px[i, 1])[:, None]
+            xx, xy, yy = f.conics[i]
+            alpha = f.opacities[i] * np.exp(-0.5 * (xx * dx**2 + 2 * xy * dx * dy + yy * dy**2))
+            alpha = np.minimum(s.alpha_max, alpha)
+            hit = running[window] & (alpha >= s.alpha_min)
+            next_transmittance = transmittance[window] * (1 - alpha)
+            stops = hit & (next_transmittance <= s.transmittance_min)
+            running[window] &= ~stops
+            hit &= ~stops
+            weights = np.where(hit, alpha * transmittance[window], 0)
+            transmittance[window] = np.where(hit, next_transmittance, transmittance[window])
+            yield i, window, weights, transmittance[window]
+
+    def splat(self, values: Array) -> tuple[Array, Array]:
+        """See `View.splat`; float64."""
+        check_array("values", np.asarray(values), (len(self.order), "C"))
+        image = np.zeros((self.camera.height, self.camera.width, values.shape[1]))
+        alpha = np.zeros((self.camera.height, self.camera.width))
+        for i, window, weights, _ in self._weights():
+            image[window] += weights[..., None] * values[i]
+            alpha[window] += weights
+        return image, alpha
+
+    def gather(self, image: Array) -> Array:
+        """See `LiftingView.gather`; float64."""
+        check_array("image", np.asarray(image), (self.camera.height, self.camera.width, "C"))
+        values = np.zeros((len(self.order), image.shape[2]))
+        for i, window, weights, _ in self._weights():
+            values[i] = np.tensordot(weights, image[window], 2)
+        return values
+
+    def depth(self, kind: DepthKind = "expected") -> Array:
+        """See `View.depth`; float64."""
+        if kind == "expected":
+            total, alpha = self.splat(self.footprints.depths[:, None])
+            return np.where(alpha > 0, total[..., 0] / np.where(alpha > 0, alpha, 1), 0)
+        median = np.zeros((self.camera.height, self.camera.width))
+        for i, window, weights, after in self._weights():
+            first = (median[window] == 0) & (weights > 0) & (after <= 0.5)
+            median[window][first] = self.footprints.depths[i]
+        return median
+
+
+class ReferenceRasterizer:
+    """Float64, one Gaussian at a time: slow and plain."""
+
+    name = "reference"
+
+    def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> ReferenceView:
+        """See `Rasterizer.view`."""
+        return ReferenceView(gaussians, camera, settings)

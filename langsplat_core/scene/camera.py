@@ -1,0 +1,95 @@
+"""The pinhole camera, in OpenCV's frame: x right, y down, z forward."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from langsplat_core.arrays import Array, check_array
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera without distortion.
+
+    Pixel (0, 0) is the top left one and its centre lies at (0.5, 0.5).
+    """
+
+    width: int  # pixels, >= 1
+    height: int  # pixels, >= 1
+    fx: float  # pixels, > 0
+    fy: float  # pixels, > 0
+    cx: float  # pixels, principal point measured from the left edge
+    cy: float  # pixels, principal point measured from the top edge
+    world_to_camera: Array  # (4, 4) float64, rigid
+    name: str = ""  # file stem of the photograph it belongs to, if any
+
+    def __post_init__(self) -> None:
+        matrix = np.ascontiguousarray(self.world_to_camera, dtype=np.float64)
+        check_array("world_to_camera", matrix, (4, 4))
+        if not np.isfinite(matrix).all():
+            raise ValueError("world_to_camera: every entry must be finite")
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"camera size must be at least 1x1, got {self.width}x{self.height}")
+        if not (self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()):
+            raise ValueError("camera: fx and fy must be positive and all intrinsics finite")
+        object.__setattr__(self, "world_to_camera", matrix)
+
+    @property
+    def position(self) -> Array:
+        """(3,) centre of projection in world units."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+    @property
+    def rotation(self) -> Array:
+        """(3, 3) world-to-camera rotation; its rows are the camera's right, down and forward axes."""
+        return self.world_to_camera[:3, :3]
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same view on another pixel grid."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+        )
+
+    def project(self, points_world: Array) -> tuple[Array, Array]:
+        """(N, 3) world points -> (N, 2) pixel positions and (N,) depths along z (may be <= 0)."""
+        in_camera = points_world @ self.rotation.T + self.world_to_camera[:3, 3]
+        depth = in_camera[:, 2]
+        safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
+        pixels = in_camera[:, :2] / safe[:, None] * (self.fx, self.fy) + (self.cx, self.cy)
+        return pixels, depth
+
+    def unproject(self, pixel_xy: tuple[float, float], depth: float) -> Array:
+        """World point (3,) at a pixel position and a depth along the camera's z axis."""
+        x, y = pixel_xy
+        in_camera = np.array([(x - self.cx) / self.fx * depth, (y - self.cy) / self.fy * depth, depth])
+        return self.rotation.T @ (in_camera - self.world_to_camera[:3, 3])
+
+
+def look_at(
+    eye: Array, target: Array, up: Array, size: tuple[int, int], fov_y_degrees: float = 50.0
+) -> Camera:
+    """A camera at `eye` that sees `target` in its centre; `up` (world) points up in the image.
+
+    `size` is (width, height) in pixels. An `up` parallel to the view is replaced by a world axis.
+    """
+    eye = np.asarray(eye, dtype=np.float64)
+    forward = np.asarray(target, dtype=np.float64) - eye
+    forward = forward / max(float(np.linalg.norm(forward)), 1e-12)
+    right = np.cross(forward, np.asarray(up, dtype=np.float64))
+    if np.linalg.norm(right) < 1e-9:
+        right = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
+    right = right / np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = -rotation @ eye
+    width, height = size
+    focal = 0.5 * height / np.tan(np.radians(fov_y_degrees) / 2)
+    return Camera(width, height, focal, focal, width / 2, height / 2, matrix)

@@ -1,0 +1,35 @@
+"""The language field: what every Gaussian means, at three levels."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from langsplat_core.arrays import Array, check_array
+from langsplat_core.scene.codec import Codec
+
+LEVELS = ("subpart", "part", "whole")  # index 0, 1, 2 wherever a level axis appears
+CANONICAL_PHRASES = ("object", "things", "stuff", "texture")  # LERF's negatives, used by LangSplat
+
+
+@dataclass(frozen=True, eq=False)
+class LanguageField:
+    """Latents of N Gaussians at the three levels, with everything a query needs beside them."""
+
+    latents: Array  # (3, N, d) float32; zero where a Gaussian was never observed
+    confidence: Array  # (3, N) float32 >= 0: total blending weight with which it was observed
+    codec: Codec
+    canonical: Array  # (4, D) float32 unit text vectors of CANONICAL_PHRASES
+    encoder_id: str  # hub id or folder of the text encoder, e.g. "demo"
+    phrasebook: Mapping[str, Array] = field(default_factory=dict)  # phrase -> (D,) unit text vector
+
+    def __post_init__(self) -> None:
+        d, big = self.codec.latent_dim, self.codec.vector_dim
+        dims = check_array("latents", self.latents, (len(LEVELS), "N", d), dtype=np.float32)
+        check_array("confidence", self.confidence, (len(LEVELS), "N"), dims, dtype=np.float32)
+        check_array("canonical", self.canonical, (len(CANONICAL_PHRASES), big), dtype=np.float32)
+        for phrase, vector in self.phrasebook.items():
+            check_array(f"phrasebook[{phrase!r}]", vector, (big,), dtype=np.float32)
+
+    def __len__(self) -> int:
+        return int(self.latents.shape[1])

@@ -1,0 +1,44 @@
+"""A scene: Gaussians, perhaps a language field, perhaps the cameras it was trained from."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.scene.camera import Camera
+from langsplat_core.scene.gaussians import Gaussians
+from langsplat_core.scene.language import LanguageField
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What `load_scene` returns and every renderer and query takes."""
+
+    gaussians: Gaussians
+    language: LanguageField | None = None
+    cameras: tuple[Camera, ...] = ()  # training cameras, in the dataset's order
+    path: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.language is not None and len(self.language) != len(self.gaussians):
+            raise ValueError(
+                f"language field of {len(self.language)} Gaussians on a scene of {len(self.gaussians)}"
+            )
+
+    def up(self) -> Array:
+        """(3,) the world's up direction: the mean of the cameras' up axes, else -y as COLMAP has it."""
+        if self.cameras:
+            mean = -np.mean([camera.rotation[1] for camera in self.cameras], axis=0)
+            if np.linalg.norm(mean) > 0.2:  # cameras that roll in every direction tell nothing
+                return mean / np.linalg.norm(mean)
+        return np.array([0.0, -1.0, 0.0])
+
+    def bounds(self) -> tuple[Array, float]:
+        """Robust centre (3,) and radius in world units: medians, so that floaters do not count."""
+        means = self.gaussians.means[self.gaussians.valid()].astype(np.float64)
+        if len(means) == 0:
+            return np.zeros(3), 1.0
+        centre = np.median(means, axis=0)
+        radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.7))
+        return centre, max(radius, 1e-3)

@@ -1,0 +1,58 @@
+"""Check for the shared libraries the wheels expect from the system; install them when root on Debian.
+
+Run by `make demo` and `make test` with any Python; uses the standard library only.
+"""
+
+import ctypes.util
+import os
+import shutil
+import subprocess
+import sys
+
+# library name as the loader knows it -> Debian package that carries it
+NEEDED = {
+    "EGL": "libegl1",
+    "GL": "libgl1",
+    "usb-1.0": "libusb-1.0-0",
+    "gomp": "libgomp1",
+    "X11": "libx11-6",
+}
+# Mesa's software driver has no library that find_library sees: look for the driver folder's file.
+DRI_PACKAGE = "libgl1-mesa-dri"
+XVFB_PACKAGE = "xvfb"
+
+
+def missing_packages() -> list[str]:
+    """Debian packages of the libraries that the loader cannot find."""
+    missing = [package for name, package in NEEDED.items() if ctypes.util.find_library(name) is None]
+    has_vendor = any(
+        os.path.isdir(folder) and os.listdir(folder)
+        for folder in ("/usr/share/glvnd/egl_vendor.d", "/etc/glvnd/egl_vendor.d")
+    )
+    if not has_vendor:
+        missing.append("libegl-mesa0")
+        missing.append(DRI_PACKAGE)
+    if shutil.which("Xvfb") is None and not os.environ.get("DISPLAY"):
+        missing.append(XVFB_PACKAGE)  # window tests; the headless path does not need it
+    return missing
+
+
+def main() -> int:
+    """Install what is missing, or print the line that does; 0 unless an install failed."""
+    if not sys.platform.startswith("linux"):
+        return 0
+    missing = missing_packages()
+    if not missing:
+        return 0
+    command = ["apt-get", "install", "-y", "--no-install-recommends", *missing]
+    if os.geteuid() != 0 or shutil.which("apt-get") is None:
+        print("System libraries are missing. Please run:\n  sudo " + " ".join(command))
+        return 0
+    print("Installing system libraries: " + " ".join(missing))
+    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    subprocess.run(["apt-get", "update", "-q"], env=environment, stdout=subprocess.DEVNULL, check=False)
+    return subprocess.run(command, env=environment, stdout=subprocess.DEVNULL, check=False).returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main())
