@@ -121,3 +121,19 @@ class TrainConfig:
     clip: ClipConfig = field(default_factory=ClipConfig)
     codec: CodecConfig = field(default_factory=CodecConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
+
+
+Display = Literal["rgb", "latent", "relevancy", "segmentation", "depth", "alpha"]
+LevelChoice = Literal["auto", "subpart", "part", "whole"]
+
+
+@dataclass(frozen=True)
+class PictureConfig:
+    """How channels become a picture; the window's shader and the NumPy twin follow the same list."""
+
+    display: Display = "rgb"
+    heat_opacity: float = 0.85  # of the heat map over the colours where relevancy is high
+    dim: float = 0.45  # colours are multiplied by this where a query finds nothing
+    threshold: float = 0.6  # relevancy above which a pixel belongs to a segmentation, in [0, 1]
+    alpha_gate: float = 0.3  # pixels with less alpha carry no relevancy
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # display values in [0, 1]

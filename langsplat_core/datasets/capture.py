@@ -1,0 +1,43 @@
+"""A capture: photographs with known cameras, as every loader returns them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from langsplat_core.arrays import Array, check_array
+from langsplat_core.scene import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Undistorted photographs, in name order, with pinhole cameras of the same size."""
+
+    cameras: tuple[Camera, ...]  # camera.name is the photograph's file stem
+    images: tuple[Array, ...]  # (H, W, 3) uint8 each, display (sRGB) values
+    points: Array  # (M, 3) float64 structure-from-motion points; M may be 0
+    colours: Array  # (M, 3) uint8
+
+    def __post_init__(self) -> None:
+        if len(self.cameras) != len(self.images):
+            raise ValueError(f"{len(self.cameras)} cameras for {len(self.images)} photographs")
+        for camera, image in zip(self.cameras, self.images, strict=True):
+            check_array(f"photograph {camera.name}", image, (camera.height, camera.width, 3), dtype=np.uint8)
+        dims = check_array("points", self.points, ("M", 3))
+        check_array("colours", self.colours, ("M", 3), dims)
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def split(self, test_every: int) -> tuple[list[int], list[int]]:
+        """Indices of (training, held-out) views; every `test_every`-th is held out, 0 holds out none.
+
+        Never leaves fewer than one training view.
+        """
+        test = [i for i in range(len(self)) if test_every > 1 and i % test_every == 0 and len(self) > 1]
+        return [i for i in range(len(self)) if i not in test], test
+
+    def extent(self) -> float:
+        """1.1 times the largest distance of a camera from the cameras' mean: the scene scale that the
+        INRIA code multiplies position learning rates with. World units, > 0."""
+        centres = np.array([camera.position for camera in self.cameras])
+        return max(1.1 * float(np.linalg.norm(centres - centres.mean(0), axis=1).max()), 1e-6)

@@ -1,0 +1,50 @@
+"""How long work reports where it is. Core functions take a `Progress`; the command line and the window
+supply one each. A `Progress` may raise to interrupt the work (Ctrl-C, the window's cancel button)."""
+
+import sys
+from collections.abc import Callable
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as RichBar
+
+Progress = Callable[[str, float], None]  # (what is being done, fraction done in [0, 1])
+
+
+def silent(label: str, fraction: float) -> None:
+    """Reports nothing."""
+
+
+class Cancelled(Exception):
+    """Raised by a `Progress` to stop the work; what was stored so far stays valid."""
+
+
+class TerminalProgress:
+    """A `Progress` that draws one bar per label on stderr; use as a context manager."""
+
+    def __init__(self) -> None:
+        self._bar = RichBar(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f}%"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=Console(file=sys.stderr),
+        )
+        self._tasks: dict[str, int] = {}
+
+    def __enter__(self) -> "TerminalProgress":
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def __call__(self, label: str, fraction: float) -> None:
+        stage = label.partition(":")[0]  # text behind a colon may change while a stage runs
+        if stage not in self._tasks:
+            self._tasks[stage] = self._bar.add_task(label, total=1.0)
+        self._bar.update(self._tasks[stage], completed=fraction, description=label)  # type: ignore[arg-type]
