@@ -1,0 +1,77 @@
+"""A phrase as a small table: relevancy over the sphere of latents.
+
+With d = 3 and unit latents, the relevancy of one phrase is a function on the sphere. The decoder is run
+once per scene at the nodes of an octahedral grid; after that a phrase costs one matrix-vector product,
+and every Gaussian looks its value up by bilinear interpolation at a place computed once.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from langsplat_core.arrays import Array, sigmoid
+from langsplat_core.query.relevancy import TEMPERATURE
+from langsplat_core.scene import AutoencoderCodec
+
+RESOLUTION = 192  # nodes per side; error against exact decoding falls with its square
+
+
+def octahedral_to_sphere(uv: Array) -> Array:
+    """(..., 2) in [0, 1]^2 -> (..., 3) unit vectors; the square's border is the lower hemisphere's pole."""
+    xy = 2 * np.asarray(uv, np.float64) - 1
+    z = 1 - np.abs(xy).sum(-1)
+    folded = (1 - np.abs(xy[..., ::-1])) * np.where(xy >= 0, 1, -1)
+    xy = np.where((z < 0)[..., None], folded, xy)
+    vectors = np.concatenate([xy, z[..., None]], -1)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def sphere_to_octahedral(vectors: Array) -> Array:
+    """(..., 3) non-zero vectors -> (..., 2) in [0, 1]^2; inverse of `octahedral_to_sphere`."""
+    scaled = vectors / np.abs(vectors).sum(-1, keepdims=True)
+    xy, z = scaled[..., :2], scaled[..., 2]
+    folded = (1 - np.abs(xy[..., ::-1])) * np.where(xy >= 0, 1, -1)
+    return (np.where((z < 0)[..., None], folded, xy) + 1) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class SphereTable:
+    """Decoded vectors at the nodes, and where each of M latents lies between them."""
+
+    vectors: Array  # (R * R, D) float32 decoded unit vectors
+    nearest_canonical: Array  # (R * R,) largest cosine with a canonical phrase
+    corner: Array  # (M,) int64 index of the lower left node; -1 for a latent without meaning
+    fraction: Array  # (M, 2) float32 position inside the cell, in [0, 1]
+    resolution: int
+
+    def relevancy(self, phrase: Array) -> Array:
+        """(D,) unit phrase vector -> (M,) float32 relevancy; 0 where the latent has no meaning."""
+        nodes = sigmoid(TEMPERATURE * (self.vectors @ phrase - self.nearest_canonical))
+        corner = np.maximum(self.corner, 0)
+        u, v = self.fraction.T
+        low = nodes[corner] * (1 - u) + nodes[corner + 1] * u
+        high = nodes[corner + self.resolution] * (1 - u) + nodes[corner + self.resolution + 1] * u
+        return np.where(self.corner >= 0, low * (1 - v) + high * v, 0).astype(np.float32)
+
+
+def build_table(
+    codec: AutoencoderCodec, latents: Array, canonical: Array, resolution: int = RESOLUTION
+) -> SphereTable:
+    """Tabulate `codec` for (M, 3) latents; those shorter than 1e-6 have no meaning."""
+    if codec.latent_dim != 3:
+        raise ValueError(f"a sphere table needs latents of 3 numbers, the codec has {codec.latent_dim}")
+    axis = np.linspace(0, 1, resolution)
+    grid = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)  # row-major: first coordinate fastest
+    vectors = codec.decode(octahedral_to_sphere(grid).astype(np.float32))
+
+    known = np.linalg.norm(latents, axis=1) > 1e-6
+    safe = np.where(known[:, None], latents, (0.0, 0.0, 1.0)).astype(np.float64)
+    position = sphere_to_octahedral(safe) * (resolution - 1)
+    cell = np.clip(np.floor(position), 0, resolution - 2).astype(np.int64)
+    return SphereTable(
+        vectors=vectors,
+        nearest_canonical=(vectors @ canonical.T).max(1),
+        corner=np.where(known, cell[:, 1] * resolution + cell[:, 0], -1),
+        fraction=(position - cell).astype(np.float32),
+        resolution=resolution,
+    )
