@@ -107,7 +107,9 @@ class CodecConfig:
 class LiftConfig:
     """How mask vectors reach the Gaussians."""
 
-    mode: Literal["membership", "one-pass"] = "membership"  # one-pass: the paper's latents, W^T H / W^T 1
+    # median, mean: of the CLIP vectors of the masks a Gaussian belongs to, then encoded;
+    # one-pass: the paper's latents, averaged as W^T H / W^T 1
+    mode: Literal["median", "mean", "one-pass"] = "median"
     chunk: int = 32  # mask channels per gather pass
 
 

@@ -55,7 +55,7 @@ def turbo(t: Array) -> Array:
 
 
 def gated_mean(total: Array, alpha: Array, gate: float) -> Array:
-    """Weighted sums (H, W, Q) / alpha where alpha exceeds `gate`, else 0: an uncovered pixel means nothing."""
+    """Weighted sums (H, W, Q) / alpha where alpha exceeds `gate`, else 0: nothing there means nothing."""
     open_ = alpha > gate
     return np.where(open_[..., None], total / np.where(open_, alpha, 1)[..., None], 0)
 

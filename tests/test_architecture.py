@@ -1,0 +1,101 @@
+"""The layers are a rule: imports run strictly downward, and opening a scene loads nothing heavy."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+# From top to bottom; packages of one row never import each other.
+LAYERS = [
+    ["langsplat_viewer"],
+    ["langsplat_core.cli"],
+    ["langsplat_core.pipeline"],
+    ["langsplat_core.evaluation"],
+    ["langsplat_core.training", "langsplat_core.query"],
+    ["langsplat_core.raster", "langsplat_core.semantics", "langsplat_core.datasets", "langsplat_core.formats"],
+    ["langsplat_core.scene"],
+    ["langsplat_core.config", "langsplat_core.progress", "langsplat_core.files"],
+    ["langsplat_core.arrays"],
+    ["langsplat_core.errors"],
+]
+FACADE = "langsplat_core.__init__"  # the public names; it may reach anything below the command line
+HEAVY = ("torch", "open3d", "transformers", "pycolmap", "moderngl", "glfw", "imgui_bundle", "skimage")
+
+
+def module_name(path: Path) -> str:
+    parts = list(path.relative_to(ROOT).with_suffix("").parts)
+    return ".".join(parts[1:] if parts[0] == "app" else parts)
+
+
+def package_of(module: str) -> str | None:
+    for row in LAYERS:
+        for package in row:
+            if module == package or module.startswith(package + "."):
+                return package
+    return None
+
+
+def rank(package: str) -> int:
+    return next(i for i, row in enumerate(LAYERS) if package in row)
+
+
+def imported_modules(path: Path) -> list[str]:
+    names = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            names.append(node.module or "")
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
+    return names
+
+
+def violations(module: str, imports: list[str]) -> list[str]:
+    own = package_of(module)
+    found = []
+    for name in imports:
+        other = package_of(name)
+        if own is None or other is None or other == own:
+            continue
+        if rank(other) <= rank(own):
+            found.append(f"{module} imports {name}")
+    return found
+
+
+SOURCES = [*ROOT.glob("langsplat_core/**/*.py"), *ROOT.glob("app/**/*.py")]
+
+
+def test_imports_run_strictly_downward():
+    assert len(SOURCES) > 20
+    found = []
+    for path in SOURCES:
+        if module_name(path) != FACADE:
+            found += violations(module_name(path), imported_modules(path))
+    assert not found, "\n".join(found)
+
+
+def test_every_module_has_a_layer():
+    homeless = [
+        module_name(path)
+        for path in SOURCES
+        if package_of(module_name(path)) is None and module_name(path) not in (FACADE, "langsplat_viewer.__init__")
+    ]
+    assert not homeless
+
+
+def test_the_rule_itself_can_fail():
+    assert violations("langsplat_core.scene.camera", ["langsplat_core.query.engine"])
+    assert violations("langsplat_core.training.lift", ["langsplat_core.query"])
+    assert not violations("langsplat_core.training.lift", ["langsplat_core.raster.protocol"])
+
+
+def test_opening_a_scene_imports_nothing_heavy():
+    code = (
+        "import sys, langsplat_core, langsplat_core.formats, langsplat_core.scene, langsplat_core.query.engine,"
+        " langsplat_core.query.picture, langsplat_core.raster;"
+        f"print([m for m in {HEAVY!r} if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
