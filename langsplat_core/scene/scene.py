@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.scene.camera import Camera
+from langsplat_core.scene.camera import Camera, look_at
 from langsplat_core.scene.gaussians import Gaussians
 from langsplat_core.scene.language import LanguageField
 
@@ -42,3 +42,12 @@ class Scene:
         centre = np.median(means, axis=0)
         radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.7))
         return centre, max(radius, 1e-3)
+
+    def framing_camera(self, size: tuple[int, int]) -> Camera:
+        """A camera of `size` (width, height) that frames the bounds, a little from above."""
+        centre, radius = self.bounds()
+        up = self.up()
+        side = np.eye(3)[int(np.argmin(np.abs(up)))]
+        side = np.cross(up, side)
+        direction = side / np.linalg.norm(side) + 0.35 * up
+        return look_at(centre + 2.6 * radius * direction / np.linalg.norm(direction), centre, up, size)

@@ -1,0 +1,47 @@
+"""LangSplat: 3D Gaussian scenes that can be searched with words.
+
+The public names below load on first use, so that importing the package costs nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from langsplat_core.formats import load_scene, save_scene
+    from langsplat_core.query.engine import QueryEngine, QueryResult
+    from langsplat_core.raster import load_rasterizer
+    from langsplat_core.scene import Camera, Gaussians, LanguageField, Scene, look_at
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "load_scene": "langsplat_core.formats",
+    "save_scene": "langsplat_core.formats",
+    "load_rasterizer": "langsplat_core.raster",
+    "QueryEngine": "langsplat_core.query.engine",
+    "QueryResult": "langsplat_core.query.engine",
+    "Camera": "langsplat_core.scene",
+    "Gaussians": "langsplat_core.scene",
+    "LanguageField": "langsplat_core.scene",
+    "Scene": "langsplat_core.scene",
+    "look_at": "langsplat_core.scene",
+}
+
+__all__ = [
+    "Camera",
+    "Gaussians",
+    "LanguageField",
+    "QueryEngine",
+    "QueryResult",
+    "Scene",
+    "load_rasterizer",
+    "load_scene",
+    "look_at",
+    "save_scene",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'langsplat_core' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)

@@ -1,0 +1,35 @@
+"""`langsplat convert`: one scene file to another, carrying the language field along."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import tyro
+
+from langsplat_core.errors import InputError
+from langsplat_core.formats import load_gaussians, load_scene, rematch_language, save_scene
+from langsplat_core.scene import Scene
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Write any readable scene as an INRIA PLY, with language field and cameras beside it if it has them."""
+
+    source: tyro.conf.Positional[Path]
+    """Scene to read: .ply, compressed .ply, SOG folder, meta.json or .sog."""
+    out: tyro.conf.Positional[Path]
+    """PLY to write."""
+    rematch: Path | None = None
+    """A language sidecar (*.langsplat.safetensors) made before the Gaussians were edited: its field is
+    carried over to the Gaussians of SOURCE by nearest position."""
+
+    def run(self) -> None:
+        if self.out.suffix.lower() != ".ply":
+            raise InputError(f"{self.out}: only .ply can be written")
+        if self.rematch is None:
+            scene = load_scene(self.source)
+        else:
+            gaussians = load_gaussians(self.source)
+            scene = Scene(gaussians, rematch_language(self.rematch, gaussians.means))
+        save_scene(self.out, replace(scene, path=self.out))
+        field = "with a language field" if scene.language else "without a language field"
+        print(f"{self.out}: {len(scene.gaussians)} Gaussians, {field}")

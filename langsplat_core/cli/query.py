@@ -1,0 +1,105 @@
+"""`langsplat query`: where in a scene a phrase is true."""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+from langsplat_core.config import LevelChoice, PictureConfig
+from langsplat_core.errors import InputError
+from langsplat_core.formats import load_scene
+from langsplat_core.query.engine import NO_FIELD, QueryEngine, QueryResult
+from langsplat_core.query.localize import peak_pixel
+from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
+from langsplat_core.raster import load_rasterizer
+from langsplat_core.scene import LEVELS, Camera, Scene
+from langsplat_core.semantics.clip import load_text_encoder
+
+PAPER_FILTER = 20  # px, mean filter before the peak is taken (paper, implementation details)
+
+
+@dataclass(frozen=True)
+class QueryScene:
+    """Ask a scene for phrases: score, level, pixel, place in world units, box."""
+
+    scene: tyro.conf.Positional[Path]
+    """A trained scene, *.ply with its language field beside it."""
+    texts: tyro.conf.Positional[tuple[str, ...]]
+    """Phrases, each in quotes if it has several words."""
+    level: LevelChoice = "auto"
+    """Semantic level; auto takes the one with the highest score."""
+    mode: Literal["splat", "paper"] = "splat"
+    """splat: relevancy per Gaussian, then blended. paper: latents blended, every pixel decoded."""
+    camera: Annotated[int, tyro.conf.arg(metavar="INDEX")] = 0
+    """Training view in which the pixel is reported."""
+    encoder: str = ""
+    """Text encoder folder or hub id, in place of the one the scene names."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self) -> None:
+        scene = load_scene(self.scene)
+        if scene.language is None:
+            raise InputError(f"{self.scene}: {NO_FIELD}")
+        if not self.texts:
+            raise InputError("no phrase given; for example: langsplat query scene.ply 'red cup'")
+        camera = _camera(scene, self.camera)
+        engine = QueryEngine(scene)
+        if any(text.lower() not in scene.language.phrasebook for text in self.texts):
+            engine.encoder = load_text_encoder(self.encoder or scene.language.encoder_id)
+        answers = []
+        for text in self.texts:
+            result = engine.run(text, self.level)
+            answers.append(_answer(result, scene, engine, camera, self.mode))
+        if self.json:
+            json.dump(answers, sys.stdout, indent=1)
+            print()
+            return
+        for answer in answers:
+            verdict = "found" if answer["found"] else "not here"
+            place = "-" if answer["place"] is None else " ".join(f"{v:.3f}" for v in answer["place"])
+            print(
+                f"{answer['phrase']}: {verdict}, score {answer['score']:.3f} at level {answer['level']}, "
+                f"place {place}, pixel {answer['pixel']}"
+            )
+
+
+def _camera(scene: Scene, index: int) -> Camera | None:
+    if not scene.cameras:
+        return None
+    if not 0 <= index < len(scene.cameras):
+        raise InputError(f"--camera {index}: the scene has cameras 0 to {len(scene.cameras) - 1}")
+    return scene.cameras[index]
+
+
+def _answer(
+    result: QueryResult, scene: Scene, engine: QueryEngine, camera: Camera | None, mode: str
+) -> dict[str, Any]:
+    """One phrase's answer, ready for JSON. Pixel fields are None without cameras."""
+    answer: dict[str, Any] = {
+        "phrase": result.phrase,
+        "found": result.found,
+        "score": result.peak,
+        "level": LEVELS[result.level],
+        "scores": dict(zip(LEVELS, result.scores, strict=True)),
+        "place": None if result.place is None else result.place.tolist(),
+        "box": None if result.box is None else result.box.tolist(),
+        "pixel": None,
+        "pixel_score": None,
+        "view": None if camera is None else camera.name,
+    }
+    if camera is not None:
+        view = load_rasterizer("cpu").view(scene.gaussians, camera)
+        gate = PictureConfig().alpha_gate
+        if mode == "paper":
+            phrase = engine.text_vector(result.phrase)[None]
+            relevancy = decoded_relevancy(view, engine.field, result.level, phrase, gate)
+        else:
+            relevancy = splatted_relevancy(view, result.relevancy[result.level][:, None], gate)
+        column, row, score = peak_pixel(np.asarray(relevancy[..., 0]), PAPER_FILTER)
+        answer |= {"pixel": [column, row], "pixel_score": score}
+    return answer
