@@ -18,16 +18,20 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.files import atomic_path
+from langsplat_core.formats.compressed_ply import is_compressed, read_compressed
+from langsplat_core.formats.inria_layout import (
+    BASE_COLOUR,
+    POSITION,
+    ROTATION,
+    SCALE,
+    check_gaussian_properties,
+    sh_from_channel_major,
+    sh_to_channel_major,
+)
 from langsplat_core.formats.opening import open_for_reading
 from langsplat_core.formats.ply_body import CHUNK_ROWS, iterate_rows
 from langsplat_core.formats.ply_header import PlyElement, PlyHeader, read_ply_header
-from langsplat_core.scene import SH_COUNTS, Gaussians
-
-POSITION = ("x", "y", "z")
-BASE_COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
-SCALE = ("scale_0", "scale_1", "scale_2")
-ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
-REST_COUNTS = {3 * (count - 1): degree for degree, count in SH_COUNTS.items()}  # f_rest_* -> SH degree
+from langsplat_core.scene import Gaussians
 
 
 def read_ply(path: Path | str) -> Gaussians:
@@ -41,6 +45,8 @@ def read_ply(path: Path | str) -> Gaussians:
     with file:
         header = read_ply_header(file, path)
         vertex = header.element("vertex")
+        if is_compressed(header):
+            return read_compressed(file, size, header, path)
         if vertex is None:
             raise FormatError(f"{path}: has no element 'vertex', so it is not a 3D Gaussian scene")
         return _read_vertices(file, size, header, vertex, path)
@@ -69,39 +75,6 @@ def _read_vertices(file: BinaryIO, size: int, header: PlyHeader, vertex: PlyElem
         opacity_logits=out["opacity"][:, 0],
         sh=sh_from_channel_major(out["sh"][:, :3], out["sh"][:, 3:]),
     )
-
-
-def sh_from_channel_major(base: Array, rest: Array) -> Array:
-    """(N, 3) base colours and (N, 3 (K - 1)) channel-major coefficients -> (N, K, 3)."""
-    by_channel = rest.reshape(len(rest), 3, rest.shape[1] // 3)
-    return np.concatenate([base[:, None], by_channel.transpose(0, 2, 1)], axis=1)
-
-
-def check_gaussian_properties(vertex: PlyElement, path: Path) -> tuple[str, ...]:
-    """Require the scalar properties of a Gaussian; returns the names of its `f_rest_*` in order."""
-    names = {prop.name for prop in vertex.properties}
-    needed = (*POSITION, *BASE_COLOUR, "opacity", *SCALE, *ROTATION)
-    missing = [name for name in needed if name not in names]
-    if not names & set(needed[3:]):
-        raise FormatError(
-            f"{path}: a mesh or point cloud, not a 3D Gaussian scene: its vertices have no f_dc, opacity, "
-            "scale and rot; train one with 'langsplat train'"
-        )
-    if missing:
-        raise FormatError(f"{path}: property {missing[0]!r} is missing; every Gaussian needs it")
-    rest_count = sum(name.startswith("f_rest_") for name in names)
-    if rest_count not in REST_COUNTS:
-        raise FormatError(
-            f"{path}: {rest_count} properties f_rest_*; expected 0, 9, 24 or 45 (SH degree 0-3)"
-        )
-    rest = tuple(f"f_rest_{index}" for index in range(rest_count))
-    absent = [name for name in rest if name not in names]
-    if absent:
-        raise FormatError(f"{path}: property {absent[0]!r} is missing among {rest_count} f_rest_*")
-    lists = [prop.name for prop in vertex.properties if prop.count_code]
-    if lists:
-        raise FormatError(f"{path}: property {lists[0]!r} of vertex is a list; expected one number")
-    return rest
 
 
 def write_ply(path: Path | str, gaussians: Gaussians, comments: tuple[str, ...] = ()) -> None:
@@ -134,7 +107,7 @@ def _rows(part: Gaussians) -> Array:
         part.means,
         np.zeros((count, 3), np.float32),
         part.sh[:, 0],
-        part.sh[:, 1:].transpose(0, 2, 1).reshape(count, -1),
+        sh_to_channel_major(part.sh),
         part.opacity_logits[:, None],
         part.log_scales,
         part.quats_wxyz,
