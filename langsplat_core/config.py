@@ -60,6 +60,7 @@ class RadianceConfig:
     percent_dense: float = 0.01  # of the extent: larger Gaussians split, smaller ones are cloned
     opacity_reset_every: int = 3_000
     prune_opacity: float = 5e-3
+    coarse_fraction: float = 1 / 3  # of the steps, at the start, on pictures of half the size; INRIA: 0
     checkpoint_every: int = 2_000  # steps of this run
     seed: int = 0
 
