@@ -1,17 +1,118 @@
-"""Files: scenes as PLY, compressed PLY and SOG, the language sidecar, cameras, LangSplat's features."""
+"""Files: scenes (PLY, compressed PLY, SOG), the language sidecar, cameras, LangSplat's features.
 
+A scene is `scene.ply` with, beside it, `scene.langsplat.safetensors` and `scene.cameras.json`, either of
+which may be absent. The same companions are looked for beside a compressed PLY, a SOG folder or a .sog.
+"""
+
+from contextlib import ExitStack
 from pathlib import Path
 
-from langsplat_core.errors import FormatError
+from langsplat_core.errors import InputError
+from langsplat_core.files import atomic_path
+from langsplat_core.formats import cameras_json, language
+from langsplat_core.formats.cameras_json import read_cameras, write_cameras
+from langsplat_core.formats.langsplat_features import read_features, write_features
+from langsplat_core.formats.language import read_language, rematch_language, write_language
 from langsplat_core.formats.ply import read_ply, write_ply
-from langsplat_core.scene import Scene
+from langsplat_core.formats.sog import META_NAME, read_sog
+from langsplat_core.scene import Gaussians, Scene
 
-__all__ = ["load_scene", "read_ply", "write_ply"]
+__all__ = [
+    "SUPPORTED",
+    "companion_path",
+    "load_gaussians",
+    "load_scene",
+    "read_cameras",
+    "read_features",
+    "read_language",
+    "read_ply",
+    "read_sog",
+    "rematch_language",
+    "save_scene",
+    "write_cameras",
+    "write_features",
+    "write_language",
+    "write_ply",
+]
+
+SUPPORTED = ".ply, .compressed.ply, .sog, or a SOG folder or its meta.json"
+
+
+def load_gaussians(path: Path | str) -> Gaussians:
+    """The Gaussians of a scene in any supported format, without its companions.
+
+    Raises InputError for what cannot be opened or is of no supported kind, FormatError for what breaks
+    the rules of its format.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".ply" and not path.is_dir():
+        return read_ply(path)
+    if path.suffix.lower() == ".sog" or path.name == META_NAME or (path / META_NAME).exists():
+        return read_sog(path)
+    if path.is_dir():
+        inside = sorted(path.glob("**/*.ply"))
+        hint = f"; perhaps {inside[-1]}" if inside else ""
+        raise InputError(f"{path}: a folder without {META_NAME} is not a scene{hint}")
+    if not path.exists():
+        raise InputError(f"{path}: no such file; check the spelling and the folder")
+    raise InputError(f"{path}: not a scene of a known kind; supported: {SUPPORTED}")
 
 
 def load_scene(path: Path | str) -> Scene:
-    """Open a scene."""
+    """A scene with its language field and cameras, where they lie beside it.
+
+    Cameras are `<scene>.cameras.json`, or for a PLY in the folder structure of the INRIA code
+    (`model/point_cloud/iteration_N/point_cloud.ply`) `model/cameras.json`. Raises InputError and
+    FormatError as `load_gaussians` does, also when a companion is unusable or made for other Gaussians.
+    """
+    path = Path(path)
+    gaussians = load_gaussians(path)
+    sidecar = companion_path(path, language.SUFFIX)
+    cameras = _cameras_path(path)
+    return Scene(
+        gaussians,
+        read_language(sidecar, gaussians.means) if sidecar.exists() else None,
+        read_cameras(cameras) if cameras.exists() else (),
+        path,
+    )
+
+
+def save_scene(path: Path | str, scene: Scene) -> None:
+    """Write `scene` as a .ply with its companions; those it lacks are removed.
+
+    All files are first written whole under temporary names. Then the old companions are removed, the PLY
+    renamed into place, and last the new companions. Interrupted anywhere, there is the old scene or the
+    new one, perhaps without companions, but never a PLY beside companions of another.
+    """
     path = Path(path)
     if path.suffix.lower() != ".ply":
-        raise FormatError(f"{path}: unknown kind of scene; supported: .ply")
-    return Scene(read_ply(path), path=path)
+        raise InputError(f"{path}: scenes are written as .ply; choose such a name")
+    sidecar, cameras = companion_path(path, language.SUFFIX), companion_path(path, cameras_json.SUFFIX)
+    with ExitStack() as renames:  # which it makes in the reverse order of the following lines
+        if scene.cameras:
+            write_cameras(renames.enter_context(atomic_path(cameras)), scene.cameras)
+        if scene.language is not None:
+            temporary = renames.enter_context(atomic_path(sidecar))
+            write_language(temporary, scene.language, scene.gaussians.means)
+        write_ply(renames.enter_context(atomic_path(path)), scene.gaussians)
+        for companion in (sidecar, cameras):
+            companion.unlink(missing_ok=True)
+
+
+def companion_path(scene: Path | str, suffix: str) -> Path:
+    """Where the file of a scene that ends in `suffix` lies: `a/b.ply` -> `a/b<suffix>`; a SOG folder `a/b`
+    (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder."""
+    scene = Path(scene)
+    if scene.name == META_NAME:
+        scene = scene.parent
+    if scene.suffix.lower() in (".ply", ".sog") and not scene.is_dir():
+        return scene.with_name(scene.stem + suffix)
+    whole = scene.resolve()  # "." has no name of its own
+    return whole.with_name(whole.name + suffix)
+
+
+def _cameras_path(scene: Path) -> Path:
+    beside = companion_path(scene, cameras_json.SUFFIX)
+    if not beside.exists() and scene.name == "point_cloud.ply":
+        return scene.parent.parent.parent / "cameras.json"
+    return beside

@@ -1,10 +1,11 @@
 """Opening a file for reading, with every way it can fail as one line for the user."""
 
+import json
 import stat
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
-from langsplat_core.errors import InputError
+from langsplat_core.errors import FormatError, InputError
 
 
 def open_for_reading(path: Path) -> tuple[BinaryIO, int]:
@@ -28,10 +29,20 @@ def open_for_reading(path: Path) -> tuple[BinaryIO, int]:
         raise InputError(f"{path}: cannot be opened ({error})") from None
 
 
-def read_small_file(path: Path, limit: int) -> bytes:
-    """The whole of a file that must not exceed `limit` bytes (text and JSON never come near it)."""
+def read_json_file(path: Path, limit: int) -> Any:
+    """The value in a JSON file of at most `limit` bytes. Raises InputError and FormatError."""
     file, size = open_for_reading(path)
     with file:
         if size > limit:
-            raise InputError(f"{path}: {size} bytes; a file of this kind never exceeds {limit}")
-        return file.read(limit)
+            raise FormatError(f"{path}: {size} bytes; a file of this kind never exceeds {limit}")
+        return parse_json(file.read(limit), path)
+
+
+def parse_json(text: bytes, path: Path) -> Any:
+    """`json.loads` with its failures as FormatError: bad syntax, bad UTF-8, endless nesting or digits."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise FormatError(f"{path}: not readable as JSON (nested too deeply)") from None
+    except ValueError as error:
+        raise FormatError(f"{path}: not readable as JSON ({str(error)[:80]})") from None
