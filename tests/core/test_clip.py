@@ -1,0 +1,153 @@
+"""CLIP through the real loading path, with a tiny model made here."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from transformers import CLIPConfig, CLIPModel, CLIPTokenizer
+
+from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.semantics.clip import CLIP_MEAN, CLIP_STD, load_clip, load_text_encoder
+
+WORDS = ["red", "green", "mug", "apple", "handle", "object", "things"]
+SIDE = 32
+
+
+def tiny_clip(folder: Path, half: bool = False) -> CLIPModel:
+    """A CLIP of two narrow layers with a word-level vocabulary, saved in Hugging Face layout."""
+    letters = sorted({letter for word in WORDS for letter in word})
+    tokens = ["<|startoftext|>", "<|endoftext|>", *letters, *(f"{letter}</w>" for letter in letters)]
+    tokenizer = CLIPTokenizer(vocab={token: i for i, token in enumerate(tokens)}, merges=[])
+    tokenizer.save_pretrained(folder)
+    tower = {"hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2}
+    text = tower | {"vocab_size": len(tokens), "max_position_embeddings": 12}
+    text |= {"bos_token_id": 0, "eos_token_id": 1, "pad_token_id": 1}
+    torch.manual_seed(0)
+    model = CLIPModel(
+        CLIPConfig(
+            text_config=text,
+            vision_config=tower | {"image_size": SIDE, "patch_size": 8},
+            projection_dim=24,
+        )
+    ).eval()
+    (model.half() if half else model).save_pretrained(folder)
+    return model.float()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("clip")
+    tiny_clip(folder)
+    return folder
+
+
+def crops(count: int) -> np.ndarray:
+    return np.random.default_rng(1).integers(0, 256, (count, SIDE, SIDE, 3), dtype=np.uint8)
+
+
+def test_images_agree_with_the_whole_model(folder: Path) -> None:
+    pictures = crops(5)
+    encoder = load_clip(str(folder), "cpu")
+    got = encoder.encode_images(pictures, batch=2)
+    assert (encoder.dim, encoder.image_size, encoder.id) == (24, SIDE, str(folder))
+    model = CLIPModel.from_pretrained(folder).eval()
+    pixels = (pictures / 255 - np.array(CLIP_MEAN)) / np.array(CLIP_STD)
+    inputs = torch.from_numpy(pixels.transpose(0, 3, 1, 2).astype(np.float32))
+    with torch.no_grad():
+        want = model.visual_projection(model.vision_model(inputs).pooler_output).numpy()
+    want /= np.linalg.norm(want, axis=1, keepdims=True)
+    assert got.dtype == np.float32
+    np.testing.assert_allclose(got, want, atol=2e-6)  # float32, batches of another size
+
+
+def test_texts_agree_with_the_whole_model_one_at_a_time(folder: Path) -> None:
+    phrases = ["red mug", "handle", "green apple things"]
+    got = load_text_encoder(str(folder)).encode_texts(phrases)
+    np.testing.assert_array_equal(got, load_clip(str(folder), "cpu").encode_texts(phrases))
+    model = CLIPModel.from_pretrained(folder).eval()
+    tokenizer = CLIPTokenizer.from_pretrained(folder)
+    for phrase, vector in zip(phrases, got, strict=True):  # alone, so without any padding
+        tokens = tokenizer([phrase], truncation=True, max_length=12, return_tensors="pt").input_ids
+        with torch.no_grad():
+            want = model.text_projection(model.text_model(input_ids=tokens).pooler_output).numpy()[0]
+        np.testing.assert_allclose(vector, want / np.linalg.norm(want), atol=2e-6)
+
+
+def test_nothing_to_encode_gives_no_rows(folder: Path) -> None:
+    encoder = load_clip(str(folder), "cpu")
+    assert encoder.encode_images(crops(0)).shape == (0, 24)
+    assert encoder.encode_texts([]).shape == (0, 24)
+
+
+def test_half_precision_weights_are_used_in_float32(tmp_path: Path) -> None:
+    tiny_clip(tmp_path, half=True)
+    vectors = load_clip(str(tmp_path), "cpu").encode_images(crops(1))
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-6)
+
+
+def test_the_folder_may_state_its_own_normalisation(tmp_path: Path) -> None:
+    tiny_clip(tmp_path)
+    before = load_clip(str(tmp_path), "cpu").encode_images(crops(1))
+    settings = '{"image_mean": [0.5, 0.5, 0.5], "image_std": [0.5, 0.5, 0.5]}'
+    (tmp_path / "preprocessor_config.json").write_text(settings, encoding="utf-8")
+    assert abs(load_clip(str(tmp_path), "cpu").encode_images(crops(1)) - before).max() > 1e-4
+
+
+def test_pictures_of_the_wrong_size_are_refused(folder: Path) -> None:
+    with pytest.raises(ValueError, match="32 x 32"):
+        load_clip(str(folder), "cpu").encode_images(np.zeros((1, 16, 16, 3), np.uint8))
+
+
+@pytest.mark.parametrize("phrase", ["", "   ", "?!"])
+def test_an_empty_phrase_is_an_input_error(folder: Path, phrase: str) -> None:
+    with pytest.raises(InputError, match="type a word"):
+        load_text_encoder(str(folder)).encode_texts([phrase])
+
+
+def test_a_vocabulary_makes_words_unknown(tmp_path: Path) -> None:
+    tiny_clip(tmp_path)
+    assert load_text_encoder(str(tmp_path)).unknown_words("ardent mule") == ()
+    (tmp_path / "vocabulary.txt").write_text("\n".join(WORDS), encoding="utf-8")
+    encoder = load_text_encoder(str(tmp_path))
+    assert encoder.unknown_words("Red, APPLE handl") == ("handl",)
+    assert encoder.encode_texts(["Red  mug"]).shape == (1, 24)
+    with pytest.raises(
+        EncoderError, match=r"'handl': not taught .* such as handle; .*--clip\.model laion/"
+    ) as error:
+        encoder.encode_texts(["handl"])
+    assert "\n" not in str(error.value)
+
+
+def test_absent_weights_say_what_to_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    with pytest.raises(EncoderError, match=r"no such folder; pass `--clip\.model FOLDER`"):
+        load_clip("./nowhere")
+    with pytest.raises(EncoderError, match=r"no config\.json with model\.safetensors"):
+        load_clip(str(tmp_path))
+    with pytest.raises(
+        EncoderError, match=r"HF_HUB_OFFLINE is set.*`hf download nobody/nothing-here`"
+    ) as error:
+        load_clip("nobody/nothing-here")
+    assert "\n" not in str(error.value)
+
+
+def test_a_truncated_file_is_one_line(tmp_path: Path) -> None:
+    tiny_clip(tmp_path)
+    weights = tmp_path / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:2000])
+    with pytest.raises(EncoderError, match=r"not CLIP\w* weights") as error:
+        load_clip(str(tmp_path), "cpu")
+    assert "\n" not in str(error.value)
+
+
+def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
+    tiny_clip(tmp_path)
+    config = tmp_path / "config.json"
+    text = config.read_text(encoding="utf-8")
+    config.write_text(text.replace('"intermediate_size": 48', '"intermediate_size": 40'), encoding="utf-8")
+    with pytest.raises(EncoderError, match="6 do not fit, such as"):
+        load_clip(str(tmp_path), "cpu")
+    config.write_text(text.replace('"num_hidden_layers": 2', '"num_hidden_layers": 3'), encoding="utf-8")
+    with pytest.raises(EncoderError, match="16 do not fit, such as"):  # else they would be random
+        load_clip(str(tmp_path), "cpu")
