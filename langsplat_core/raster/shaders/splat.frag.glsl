@@ -1,0 +1,25 @@
+// Steps 3 and 4 of raster/reference.py, back to front: premultiplied, blended with (1, 1 - alpha).
+// Row 0 of the image is row 0 of the target, so gl_FragCoord is the pixel centre.
+
+uniform float alpha_min;
+uniform float alpha_max;
+
+flat in vec2 mean;
+flat in vec4 footprint;
+flat in float opacity;
+flat in vec3 value[TARGETS];
+
+layout(location = 0) out vec4 target[TARGETS];
+
+void main() {
+    // Distances in standard deviations along the footprint's axes: a quadratic form of the inverse
+    // covariance would cancel for long needles.
+    vec2 d = gl_FragCoord.xy - mean;
+    vec2 v = vec2(dot(footprint.xy, d), footprint.x * d.y - footprint.y * d.x) * footprint.zw;
+    float alpha = min(alpha_max, opacity * exp(-0.5 * dot(v, v)));
+    if (alpha < alpha_min)
+        discard;
+    for (int i = 0; i < TARGETS; ++i)
+        target[i] = i == DEPTH_TARGET ? vec4(value[i].x * alpha, alpha, 0.0, alpha)
+                                      : vec4(value[i] * alpha, alpha);
+}
