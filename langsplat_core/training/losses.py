@@ -79,7 +79,7 @@ def ssim(picture: Tensor, target: Tensor) -> Tensor:
 
     Differentiable by `picture` only.
     """
-    result: Tensor = _MeanSsim.apply(picture, target)  # type: ignore[no-untyped-call]
+    result: Tensor = _MeanSsim.apply(picture, target)
     return result
 
 
