@@ -61,7 +61,9 @@ def train_scene(
     work = work or out.with_name(out.stem + ".work")
     clock = _Clock()
 
-    encoder = load_clip(config.clip.model, config.clip.device)  # first: absent weights should not cost an hour
+    encoder = load_clip(
+        config.clip.model, config.clip.device
+    )  # first: absent weights should not cost an hour
     mask_source = load_mask_source(config.masks, config.clip.device)
     log.info("masks: %s, encoder: %s", mask_source.name, encoder.id)
 
@@ -77,7 +79,9 @@ def train_scene(
         [capture.cameras[i].name for i in train],
         mask_source,
         encoder,
-        FeatureStore(work / stage_key("features", 1, config.masks, config.clip.model, config.dataset.max_side)),
+        FeatureStore(
+            work / stage_key("features", 1, config.masks, config.clip.model, config.dataset.max_side)
+        ),
         progress,
     )
     views = [(capture.cameras[i], item) for i, item in zip(train, features, strict=True)]
@@ -131,7 +135,9 @@ def _language(
     rasterizer = load_rasterizer("cpu")
     mask_vectors = np.concatenate([features.vectors for _, features in views])
     if len(mask_vectors) == 0:
-        raise InputError("no masks were found in any photograph; try --masks.source graph, or larger photographs")
+        raise InputError(
+            "no masks were found in any photograph; try --masks.source graph, or larger photographs"
+        )
     if config.lift.mode == "one-pass":
         codec = fit_codec(mask_vectors, config.codec, progress)
         latents, confidence = lift_latents(rasterizer, gaussians, views, codec, progress=progress)
