@@ -1,0 +1,225 @@
+"""Blending on the CPU: ``W x``, ``W^T y`` and the depth of half transmittance, tile by tile.
+
+Each tile walks its Gaussians front to back; each Gaussian walks the rows it touches; a row is sixteen
+lanes, without branches. A tile's state is one flat float32 array, sixteen numbers per row and plane.
+
+A pixel's transmittance is stored negative once the pixel has stopped: its size stays readable, and
+`T - alpha T > transmittance_min` is then false for every later Gaussian.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+from langsplat_core.config import RasterSettings
+from langsplat_core.raster import cpu_project as cp
+from langsplat_core.raster.cpu_tiles import TILE, spread
+from langsplat_core.raster.lanes import (
+    exp2,
+    lanes,
+    largest,
+    load,
+    ramp,
+    smaller,
+    store,
+    total,
+    where_at_least,
+    where_greater,
+)
+
+PIXELS = TILE * TILE
+_CHECK_EVERY = 16  # Gaussians between two looks at whether a tile still has running pixels
+
+
+class Cutoffs(NamedTuple):
+    """The constants of step 3 and 4 of `reference.py`."""
+
+    alpha_min: float
+    alpha_max: float
+    transmittance_min: float
+
+
+def make_cutoffs(settings: RasterSettings) -> Cutoffs:
+    return Cutoffs(float(settings.alpha_min), float(settings.alpha_max), float(settings.transmittance_min))
+
+
+@njit(cache=True, forceinline=True)
+def start_tile(transmittance, x0, y0, width, height):
+    """Transmittance 1 inside the image; pixels of the tile beyond its border have stopped already."""
+    for row in range(TILE):
+        for column in range(TILE):
+            inside = (x0 + column < width) & (y0 + row < height)
+            transmittance[row * TILE + column] = 1.0 if inside else -1.0
+
+
+@njit(cache=True, forceinline=True)
+def running_rows(transmittance, low, high):
+    """Shrink rows [low, high) to those that begin and end with a row that has a running pixel."""
+    while low < high and largest(load(transmittance, low * TILE)) <= 0:
+        low += 1
+    while low < high and largest(load(transmittance, (high - 1) * TILE)) <= 0:
+        high -= 1
+    return low, high
+
+
+@njit(cache=True, forceinline=True)
+def row_offsets(g, x, y):
+    """w of the row's first pixel, v of the row (see `cpu_project`) for the pixel centre (x, y), float64."""
+    dy = y - g[cp.MEAN_Y]
+    return g[cp.FACTOR_A] * (x - g[cp.MEAN_X] - g[cp.FACTOR_K] * dy), g[cp.FACTOR_C] * dy
+
+
+@njit(cache=True, forceinline=True)
+def blend_row(transmittance, at, w, log2_height, cutoffs):
+    """Step 3 and 4 for one row: returns alpha (0 where the Gaussian is not added) and T before it."""
+    before = load(transmittance, at)
+    alpha = smaller(exp2(log2_height - w * w), cutoffs.alpha_max)
+    after = before - alpha * before
+    going = where_greater(after, cutoffs.transmittance_min, after, smaller(before, 0.0 - before))
+    added = where_greater(after, cutoffs.transmittance_min, alpha, 0.0)
+    store(transmittance, at, where_at_least(alpha, cutoffs.alpha_min, going, before))
+    return where_at_least(alpha, cutoffs.alpha_min, added, 0.0), before
+
+
+@njit(cache=True)
+def _splat_tile(tile, tiles, geometry, values, cutoffs, image, alpha):
+    height, width, channels = image.shape
+    x0, y0 = tile % tiles.columns * TILE, tile // tiles.columns * TILE
+    transmittance = np.empty(PIXELS, np.float32)
+    start_tile(transmittance, x0, y0, width, height)
+    sums = np.zeros(PIXELS * channels, np.float32)
+    first, last = tiles.starts[tile], tiles.starts[tile + 1]
+    top, bottom = 0, TILE
+    for s in range(first, last):
+        if (s - first) % _CHECK_EVERY == _CHECK_EVERY - 1:
+            top, bottom = running_rows(transmittance, top, bottom)
+            if top >= bottom:
+                break
+        rank, rows = tiles.ranks[s], np.int64(tiles.rows[s])
+        g = geometry[rank]
+        step = ramp() * g[cp.FACTOR_A]
+        for row in range(max(rows & 255, top), min(rows >> 8, bottom)):
+            w, v = row_offsets(g, x0 + 0.5, y0 + row + 0.5)
+            added, before = blend_row(
+                transmittance, row * TILE, step + w, g[cp.LOG2_OPACITY] - v * v, cutoffs
+            )
+            weight = added * before
+            for channel in range(channels):
+                at = (row * channels + channel) * TILE
+                store(sums, at, load(sums, at) + weight * values[rank, channel])
+    for row in range(min(TILE, height - y0)):
+        for column in range(min(TILE, width - x0)):
+            alpha[y0 + row, x0 + column] = np.float32(1) - abs(transmittance[row * TILE + column])
+            for channel in range(channels):
+                image[y0 + row, x0 + column, channel] = sums[(row * channels + channel) * TILE + column]
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def splat(tiles, geometry, values, cutoffs, image, alpha):
+    """(M, C) values in depth order -> fills (H, W, C) image and (H, W) alpha, all float32."""
+    count = tiles.starts.shape[0] - 1
+    for i in prange(count):
+        _splat_tile(spread(i, count), tiles, geometry, values, cutoffs, image, alpha)
+
+
+@njit(cache=True, forceinline=True)
+def load_tile(planes, image, x0, y0):
+    """planes[(row, channel, column)] <- the tile of (H, W, C) image at (x0, y0); 0 beyond its border."""
+    height, width, channels = image.shape
+    planes[:] = 0
+    for row in range(min(TILE, height - y0)):
+        for column in range(min(TILE, width - x0)):
+            for channel in range(channels):
+                planes[(row * channels + channel) * TILE + column] = image[y0 + row, x0 + column, channel]
+
+
+@njit(cache=True, forceinline=True)
+def correlate(planes, channels, weights, low, high, out):
+    """out[channel] <- sum over rows [low, high) of weights (stored from row `low`) times planes."""
+    for channel in range(channels):
+        acc = lanes(np.float32(0))
+        for row in range(low, high):
+            acc = acc + load(weights, (row - low) * TILE) * load(planes, (row * channels + channel) * TILE)
+        out[channel] = total(acc)
+
+
+@njit(cache=True)
+def _gather_tile(tile, tiles, geometry, image, cutoffs, partial):
+    height, width, channels = image.shape
+    x0, y0 = tile % tiles.columns * TILE, tile // tiles.columns * TILE
+    transmittance = np.empty(PIXELS, np.float32)
+    start_tile(transmittance, x0, y0, width, height)
+    planes = np.empty(PIXELS * channels, np.float32)
+    load_tile(planes, image, x0, y0)
+    weights = np.empty(PIXELS, np.float32)
+    first, last = tiles.starts[tile], tiles.starts[tile + 1]
+    top, bottom = 0, TILE
+    for s in range(first, last):
+        if (s - first) % _CHECK_EVERY == _CHECK_EVERY - 1:
+            top, bottom = running_rows(transmittance, top, bottom)
+            if top >= bottom:
+                partial[s:last] = 0
+                break
+        rows = np.int64(tiles.rows[s])
+        low, high = max(rows & 255, top), min(rows >> 8, bottom)
+        g = geometry[tiles.ranks[s]]
+        step = ramp() * g[cp.FACTOR_A]
+        for row in range(low, high):
+            w, v = row_offsets(g, x0 + 0.5, y0 + row + 0.5)
+            added, before = blend_row(
+                transmittance, row * TILE, step + w, g[cp.LOG2_OPACITY] - v * v, cutoffs
+            )
+            store(weights, (row - low) * TILE, added * before)
+        correlate(planes, channels, weights, low, high, partial[s])
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def gather(tiles, geometry, image, cutoffs, partial):
+    """(H, W, C) float32 image -> fills (I, C) partial sums of ``W^T y``, one row per intersection."""
+    count = tiles.starts.shape[0] - 1
+    for i in prange(count):
+        _gather_tile(spread(i, count), tiles, geometry, image, cutoffs, partial)
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def sum_partials(tiles, order, partial, out):
+    """out[order[rank]] <- sum of the rank's partial sums, in the order of its tiles (so: reproducible)."""
+    for rank in prange(order.shape[0]):
+        for channel in range(out.shape[1]):
+            acc = 0.0
+            for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):
+                acc += partial[tiles.slots[n], channel]
+            out[order[rank], channel] = acc
+
+
+@njit(cache=True)
+def _median_tile(tile, tiles, geometry, depths, cutoffs, out):
+    height, width = out.shape
+    x0, y0 = tile % tiles.columns * TILE, tile // tiles.columns * TILE
+    transmittance = np.empty(PIXELS, np.float32)
+    start_tile(transmittance, x0, y0, width, height)
+    found = np.zeros(PIXELS, np.float32)
+    half = np.float32(0.5)
+    for s in range(tiles.starts[tile], tiles.starts[tile + 1]):
+        rank, rows = tiles.ranks[s], np.int64(tiles.rows[s])
+        g = geometry[rank]
+        step = ramp() * g[cp.FACTOR_A]
+        for row in range(rows & 255, rows >> 8):
+            w, v = row_offsets(g, x0 + 0.5, y0 + row + 0.5)
+            at = row * TILE
+            added, before = blend_row(transmittance, at, step + w, g[cp.LOG2_OPACITY] - v * v, cutoffs)
+            passed = where_greater(before, half, lanes(np.float32(depths[rank])), load(found, at))
+            after = before - added * before
+            store(found, at, where_at_least(half, after, passed, load(found, at)))
+    for row in range(min(TILE, height - y0)):
+        for column in range(min(TILE, width - x0)):
+            out[y0 + row, x0 + column] = found[row * TILE + column]
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def median_depth(tiles, geometry, depths, cutoffs, out):
+    """(M,) depths in depth order -> (H, W) depth of the Gaussian that takes T to 0.5 or below, else 0."""
+    count = tiles.starts.shape[0] - 1
+    for i in prange(count):
+        _median_tile(spread(i, count), tiles, geometry, depths, cutoffs, out)
