@@ -32,6 +32,7 @@ would save 6 d of them and tilt a unit latent by up to 0.02 degrees.)
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -126,10 +127,11 @@ def rematch_language(
     )
 
 
-def _median_spacing(tree: "cKDTree") -> float:  # type: ignore[name-defined]  # noqa: F821
-    """Median distance of (a sample of) the tree's points to their nearest neighbours."""
+def _median_spacing(tree: Any) -> float:
+    """Median distance of (a sample of) the tree's points to their nearest neighbours; 0 for a single one."""
     sample = tree.data[:: max(1, len(tree.data) // 10_000)]
-    return float(np.median(tree.query(sample, k=2)[0][:, 1]))
+    distances = tree.query(sample, k=2)[0][:, 1]  # infinite where there is no second point
+    return float(np.median(np.where(np.isfinite(distances), distances, 0)))
 
 
 def _read(path: Path) -> tuple[LanguageField, Array, str]:

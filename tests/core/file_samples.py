@@ -1,0 +1,263 @@
+"""Encoders of the formats that the project only reads, and small files of every kind, for tests.
+
+They are written from the published layouts, apart from the readers, so that both would have to be wrong
+in the same way for a test to miss it.
+"""
+
+import io
+import json
+import os
+import zipfile
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from langsplat_core.arrays import Array, sigmoid, unit
+from langsplat_core.scene import (
+    CANONICAL_PHRASES,
+    AutoencoderCodec,
+    Codec,
+    Gaussians,
+    LanguageField,
+    LinearCodec,
+)
+
+SHARED_DATA = Path(os.environ.get("LANGSPLAT_TEST_DATA", Path(__file__).parents[3] / "shared" / "data"))
+C0 = 0.28209479177387814
+
+
+def inria_names(sh_degree: int, normals: bool = True) -> list[str]:
+    """Property names in the order of the INRIA code."""
+    rest = 3 * ((sh_degree + 1) ** 2 - 1)
+    return [
+        *"xyz",
+        *(["nx", "ny", "nz"] if normals else []),
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(rest)),
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]
+
+
+def columns(g: Gaussians) -> dict[str, Array]:
+    """INRIA property name -> (N,) values, written out one by one."""
+    out = {name: g.means[:, i] for i, name in enumerate("xyz")}
+    out |= {name: np.zeros(len(g), np.float32) for name in ("nx", "ny", "nz")}
+    out |= {f"f_dc_{i}": g.sh[:, 0, i] for i in range(3)}
+    higher = g.sh.shape[1] - 1
+    for channel in range(3):
+        for k in range(higher):
+            out[f"f_rest_{channel * higher + k}"] = g.sh[:, 1 + k, channel]
+    out["opacity"] = g.opacity_logits
+    out |= {f"scale_{i}": g.log_scales[:, i] for i in range(3)}
+    out |= {f"rot_{i}": g.quats_wxyz[:, i] for i in range(4)}
+    return out
+
+
+def ply_bytes(header: list[str], body: bytes, newline: str = "\n") -> bytes:
+    return (newline.join(["ply", *header, "end_header"]) + newline).encode() + body
+
+
+def vertex_table(g: Gaussians, names: list[str], code: str = "<f4") -> Array:
+    values = columns(g)
+    table = np.zeros(len(g), np.dtype([(name, code) for name in names]))
+    for name in names:
+        table[name] = values.get(name, 7.0)  # 7: a property that is none of ours
+    return table
+
+
+def plain_ply(
+    g: Gaussians, names: list[str] | None = None, *, front: bytes = b"", newline: str = "\n"
+) -> bytes:
+    """Binary little endian; `front` is the body of a list element `face` of 2 rows before the vertices."""
+    names = names or inria_names(g.sh_degree)
+    header = ["format binary_little_endian 1.0"]
+    if front:
+        header += ["element face 2", "property list uchar int vertex_indices"]
+    header += [f"element vertex {len(g)}", *(f"property float {name}" for name in names)]
+    return ply_bytes(header, front + vertex_table(g, names).tobytes(), newline)
+
+
+def ascii_ply(g: Gaussians) -> bytes:
+    """With an element of two lines, one of them a list, in front, and a blank line."""
+    names = inria_names(g.sh_degree, normals=False)
+    header = ["format ascii 1.0", "element face 2", "property list uchar int vertex_indices"]
+    header += [f"element vertex {len(g)}", *(f"property float {name}" for name in names)]
+    rows = vertex_table(g, names).tolist()
+    lines = ["3 0 1 2", "4 0 1 2 3", "", *(" ".join(repr(value) for value in row) for row in rows)]
+    return ply_bytes(header, "\n".join(lines).encode())
+
+
+def _fields(values: Array, bits: tuple[int, ...]) -> Array:
+    """(N, len(bits)) fractions in [0, 1] -> (N,) uint32, the first field on top."""
+    packed = np.zeros(len(values), np.uint32)
+    for column, width in enumerate(bits):
+        code = np.floor(values[:, column] * (2**width - 1) + 0.5).astype(np.uint32)
+        packed = (packed << np.uint32(width)) | code
+    return packed
+
+
+def compressed_ply(g: Gaussians, *, colours: bool = True) -> bytes:
+    """SuperSplat's compressed PLY; without `colours` the chunks have the 12 older columns."""
+    starts = range(0, len(g), 256)
+    blocks = {"position": g.means, "scale": g.log_scales, "colour": 0.5 + C0 * g.sh[:, 0]}
+    bounds, fractions = [], {key: np.zeros_like(block, np.float64) for key, block in blocks.items()}
+    for start in starts:
+        rows, row = slice(start, start + 256), []
+        for key, block in blocks.items():
+            if key == "colour" and not colours:
+                fractions[key][rows] = np.clip(block[rows], 0, 1)
+                continue
+            low, high = block[rows].min(0), block[rows].max(0)
+            fractions[key][rows] = (block[rows].astype(np.float64) - low) / np.maximum(high - low, 1e-12)
+            row += [low, high]
+        bounds.append(np.concatenate(row))
+    quats = unit(g.quats_wxyz.astype(np.float64))
+    largest = np.abs(quats).argmax(1)
+    quats *= np.sign(np.take_along_axis(quats, largest[:, None], 1))
+    three = np.array([np.delete(q, i) for q, i in zip(quats, largest, strict=True)])
+    rotation = _fields(three / np.sqrt(2) + 0.5, (10, 10, 10)) | (largest.astype(np.uint32) << 30)
+    opacity = sigmoid(g.opacity_logits.astype(np.float64))[:, None]
+    packed = [
+        _fields(fractions["position"], (11, 10, 11)),
+        rotation,
+        _fields(fractions["scale"], (11, 10, 11)),
+        _fields(np.concatenate([fractions["colour"], opacity], 1), (8, 8, 8, 8)),
+    ]
+    axes = [f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"]
+    scales = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"]
+    rgb = [f"{end}_{axis}" for end in ("min", "max") for axis in "rgb"] if colours else []
+    header = ["format binary_little_endian 1.0", "comment made by a test", f"element chunk {len(bounds)}"]
+    header += [f"property float {name}" for name in axes + scales + rgb]
+    header += [f"element vertex {len(g)}"]
+    header += [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
+    body = np.array(bounds, "<f4").tobytes() + np.stack(packed, 1).astype("<u4").tobytes()
+    if g.sh_degree:
+        rest = np.stack([v for name, v in columns(g).items() if name.startswith("f_rest_")], 1)
+        header += [f"element sh {len(g)}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
+        body += np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8).tobytes()
+    return ply_bytes(header, body)
+
+
+def _webp(pixels: Array) -> bytes:
+    buffer = io.BytesIO()
+    # exact: else the encoder may change colours under alpha 0
+    Image.fromarray(pixels.astype(np.uint8), "RGBA" if pixels.shape[2] == 4 else "RGB").save(
+        buffer, "WEBP", lossless=True, exact=True
+    )
+    return buffer.getvalue()
+
+
+def _plane(codes: Array, width: int) -> Array:
+    """(N, C) codes -> (H, W, C) with zero pixels at the end."""
+    height = -(-len(codes) // width)
+    out = np.zeros((height * width, codes.shape[1]), np.uint8)
+    out[: len(codes)] = codes
+    return out.reshape(height, width, -1)
+
+
+def _nearest(values: Array, codebook: Array) -> Array:
+    return np.abs(values[..., None] - codebook).argmin(-1).astype(np.uint8)
+
+
+def sog_files(g: Gaussians, palette_entries: int = 70) -> dict[str, bytes]:
+    """SOG version 2 with linear codebooks; Gaussian i has palette entry i modulo `palette_entries`."""
+    width = 12
+    logs = np.sign(g.means) * np.log1p(np.abs(g.means.astype(np.float64)))
+    mins, maxs = logs.min(0), logs.max(0)
+    code = np.round((logs - mins) / (maxs - mins) * 65535).astype(np.uint32)
+    quats = unit(g.quats_wxyz.astype(np.float64))
+    largest = np.abs(quats).argmax(1)
+    quats *= np.sign(np.take_along_axis(quats, largest[:, None], 1))
+    three = np.array([np.delete(q, i) for q, i in zip(quats, largest, strict=True)])
+    packed = np.concatenate([np.round((three / np.sqrt(2) + 0.5) * 255), 252 + largest[:, None]], 1)
+    packed = _plane(packed, width)
+    packed[..., 3] = np.maximum(packed[..., 3], 252)  # the padding too
+    books = {
+        "scales": np.linspace(g.log_scales.min(), g.log_scales.max(), 256),
+        "sh0": np.linspace(g.sh[:, 0].min(), g.sh[:, 0].max(), 256),
+        "shN": np.linspace(-1, 1, 256),
+    }
+    alpha = np.round(sigmoid(g.opacity_logits.astype(np.float64)) * 255)[:, None]
+    sh0 = np.concatenate([_nearest(g.sh[:, 0], books["sh0"]), alpha], 1)
+    meta = {
+        "version": 2,
+        "count": len(g),
+        "means": {"mins": mins.tolist(), "maxs": maxs.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"codebook": books["scales"].tolist(), "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": books["sh0"].tolist(), "files": ["sh0.webp"]},
+    }
+    files = {
+        "means_l.webp": _webp(_plane(code & 255, width)),
+        "means_u.webp": _webp(_plane(code >> 8, width)),
+        "scales.webp": _webp(_plane(_nearest(g.log_scales, books["scales"]), width)),
+        "quats.webp": _webp(packed),
+        "sh0.webp": _webp(_plane(sh0, width)),
+    }
+    if g.sh_degree:
+        higher = g.sh.shape[1] - 1
+        entries = min(palette_entries, len(g))
+        palette = np.zeros((-(-entries // 64) * 64, higher, 3), np.uint8)
+        palette[:entries] = _nearest(g.sh[:entries, 1:], books["shN"])
+        label = np.arange(len(g)) % entries
+        meta["shN"] = {
+            "count": entries,
+            "bands": g.sh_degree,
+            "codebook": books["shN"].tolist(),
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+        }
+        files["shN_centroids.webp"] = _webp(palette.reshape(-1, 64 * higher, 3))
+        labels = np.stack([label & 255, label >> 8, label * 0], 1)
+        files["shN_labels.webp"] = _webp(_plane(labels, width))
+    return {"meta.json": json.dumps(meta).encode(), **files}
+
+
+def zipped(files: dict[str, bytes]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return buffer.getvalue()
+
+
+def write_folder(folder: Path, files: dict[str, bytes]) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    return folder
+
+
+def random_codec(kind: str, d: int = 3, big: int = 16, seed: int = 0) -> Codec:
+    rng = np.random.default_rng(seed)
+    if kind == "linear":
+        return LinearCodec(np.linalg.qr(rng.normal(size=(big, d)))[0].T.astype(np.float32).copy())
+
+    def layers(*widths: int) -> tuple[tuple[Array, Array], ...]:
+        return tuple(
+            (rng.normal(size=(out, into)).astype(np.float32), rng.normal(size=out).astype(np.float32))
+            for into, out in pairwise(widths)
+        )
+
+    return AutoencoderCodec(layers(big, 8, d), layers(d, 5, 8, big))
+
+
+def random_field(
+    n: int, kind: str = "autoencoder", phrases: tuple[str, ...] = ("red mug", "Tür"), seed: int = 0
+) -> LanguageField:
+    rng = np.random.default_rng(seed)
+    codec = random_codec(kind, seed=seed)
+    latents = unit(rng.normal(size=(3, n, codec.latent_dim))).astype(np.float32)
+    latents[:, ::7] = 0  # never observed
+    big = codec.vector_dim
+    return LanguageField(
+        latents=latents,
+        confidence=rng.uniform(0, 9, size=(3, n)).astype(np.float32),
+        codec=codec,
+        canonical=unit(rng.normal(size=(len(CANONICAL_PHRASES), big))).astype(np.float32),
+        encoder_id="demo",
+        phrasebook={phrase: unit(rng.normal(size=big)).astype(np.float32) for phrase in phrases},
+    )
