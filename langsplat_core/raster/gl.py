@@ -21,7 +21,7 @@ from langsplat_core.raster.protocol import DepthKind
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 
 MAX_TARGETS = 4  # colour attachments of one pass, three values each
-Source = moderngl.Texture | Literal["colour", "depth"]  # what a target shows
+Source = moderngl.Texture | Literal["colour"]  # what a target shows
 
 
 class GlRasterizer:
@@ -45,7 +45,7 @@ class GlRasterizer:
             vertex_shader=shader("fullscreen.vert"), fragment_shader=shader("project.frag")
         )
         self._project_vao = ctx.vertex_array(self._project, [])
-        self._splats: dict[tuple[int, int], moderngl.Program] = {}
+        self._splats: dict[tuple[int, bool], moderngl.Program] = {}
         self._scene: SceneTextures | None = None
         self._current: GlView | None = None  # whose projection and order the scene's textures hold
         self._targets: Targets | None = None
@@ -83,36 +83,35 @@ class GlRasterizer:
             self._scene = SceneTextures(self.ctx, gaussians, self.precision == "half")
         return self._scene
 
-    def draw(self, view: "GlView", sources: Sequence[Source]) -> tuple[moderngl.Texture, ...]:
-        """Splat one image per source, at most four, in one pass.
+    def draw(
+        self, view: "GlView", sources: Sequence[Source], with_depth: bool = False
+    ) -> tuple[moderngl.Texture, ...]:
+        """Splat one image per source, at most four with depth, in one pass.
 
         A texture comes from `SceneTextures.upload`; "colour" is the view-dependent colour. Images are
-        RGBA, premultiplied, row 0 on top; that of "depth" is (sum of weight * camera z, alpha) in
-        single precision. They belong to the rasterizer and hold until its next `draw`.
+        RGBA, premultiplied, row 0 on top. Depth comes last, as (sum of weight * camera z, alpha) in
+        single precision. The images belong to the rasterizer and hold until its next `draw`.
         """
         scene = self.scene(view.gaussians)
         if self._current is not view:
             self._make_current(scene, view)
-        depth_target = sources.index("depth") if "depth" in sources else -1
-        program = self._splat_program(len(sources), depth_target)
-        targets = self._targets_for(view.camera, len(sources), depth_target)
-        units = range(2, 2 + len(sources))
+        program = self._splat_program(len(sources), with_depth)
+        targets = self._targets_for(view.camera, len(sources), with_depth)
         set_uniforms(
             program,
             {
                 "placement": 0,
                 "shape": 1,
-                "values": np.array(units, "i4").tobytes(),
+                "values": np.arange(2, 2 + len(sources), dtype="i4").tobytes(),
                 "columns": scene.columns,
                 "image_size": (view.camera.width, view.camera.height),
                 "alpha_min": view.settings.alpha_min,
                 "alpha_max": view.settings.alpha_max,
             },
         )
-        scene.placement.use(0)
-        scene.shape.use(1)
-        for unit, source in zip(units, sources, strict=True):
-            (scene.colours if isinstance(source, str) else source).use(unit)
+        textures = [scene.colours if isinstance(source, str) else source for source in sources]
+        for unit, texture in enumerate((scene.placement, scene.shape, *textures)):
+            texture.use(unit)
         vao = self.ctx.vertex_array(program, [(scene.order, "1i/i", "gaussian")])
         with drawing(self.ctx, targets.framebuffer, moderngl.BLEND):
             targets.framebuffer.clear()
@@ -159,17 +158,17 @@ class GlRasterizer:
             scene.order.write(view.order)
         self._current = view
 
-    def _splat_program(self, targets: int, depth_target: int) -> moderngl.Program:
-        key = (targets, depth_target)
+    def _splat_program(self, values: int, depth: bool) -> moderngl.Program:
+        key = (values, depth)
         if key not in self._splats:
-            head = f"#version 410 core\n#define TARGETS {targets}\n#define DEPTH_TARGET {depth_target}\n"
+            head = f"#version 410 core\n#define VALUES {values}\n#define DEPTH {int(depth)}\n"
             self._splats[key] = self.ctx.program(
                 vertex_shader=head + shader("splat.vert"), fragment_shader=head + shader("splat.frag")
             )
         return self._splats[key]
 
-    def _targets_for(self, camera: Camera, count: int, depth_target: int) -> Targets:
-        key = (camera.width, camera.height, count, depth_target)
+    def _targets_for(self, camera: Camera, values: int, depth: bool) -> Targets:
+        key = (camera.width, camera.height, values, depth)
         if self._targets is None or self._targets.key != key:
             if self._targets is not None:
                 self._targets.release()
@@ -246,11 +245,11 @@ class GlView:
         """See `View.depth`; float32. BackendError for "median": a blender cannot find it."""
         if kind != "expected":
             raise BackendError("rasterizer 'opengl' has no median depth image; use --backend cpu")
-        total, alpha = np.moveaxis(self._read(self.rasterizer.draw(self, ["depth"])[0]), -1, 0)
+        total, alpha = np.moveaxis(self._read(self.rasterizer.draw(self, [], with_depth=True)[0]), -1, 0)
         return np.where(alpha > 0, total / np.where(alpha > 0, alpha, 1), 0)
 
-    def depth_at(self, x_px: float, y_px: float) -> tuple[float, float]:
-        """Surface depth and alpha at one image position, from the projection read back.
+    def depth_at(self, column: int, row: int) -> tuple[float, float]:
+        """Surface depth and alpha of one pixel, from the projection read back.
 
         The depth is the median (see `View.depth`) or, where the transmittance stays above 0.5, the
         alpha-weighted mean; camera z in world units, 0 where nothing is drawn.
@@ -261,7 +260,7 @@ class GlView:
         order = self.order[::-1]
         x, y, z, opacity = np.frombuffer(scene.placement.read(), "f4").reshape(-1, 4)[order].T
         along_x, along_y, *inverse = np.frombuffer(scene.shape.read(), "f4").reshape(-1, 4)[order].T
-        dx, dy = x_px - x, y_px - y
+        dx, dy = column + 0.5 - x, row + 0.5 - y
         with np.errstate(over="ignore", invalid="ignore"):
             u = (along_x * dx + along_y * dy) * inverse[0]
             v = (along_x * dy - along_y * dx) * inverse[1]

@@ -44,21 +44,18 @@ def drawing(ctx: moderngl.Context, framebuffer: moderngl.Framebuffer, flags: int
 
 
 class Targets:
-    """The images that one pass draws: RGBA, the depth image RG (sum of weight * camera z, alpha)."""
+    """The images that one pass draws: RGBA, then depth as RG (sum of weight * camera z, alpha)."""
 
-    def __init__(self, ctx: moderngl.Context, key: tuple[int, int, int, int], dtype: str) -> None:
+    def __init__(self, ctx: moderngl.Context, key: tuple[int, int, int, bool], dtype: str) -> None:
         self.key = key
-        width, height, count, depth_target = key
-        # Depth is always single: half floats would give it 11 bits, and none beyond 65504 units.
-        self.images = tuple(
-            ctx.texture(
-                (width, height), 2 if i == depth_target else 4, dtype="f4" if i == depth_target else dtype
-            )
-            for i in range(count)
-        )
-        for image in self.images:
+        width, height, values, depth = key
+        images = [ctx.texture((width, height), 4, dtype=dtype) for _ in range(values)]
+        if depth:  # always single: half floats would give it 11 bits, and none beyond 65504 units
+            images.append(ctx.texture((width, height), 2, dtype="f4"))
+        for image in images:
             image.repeat_x = image.repeat_y = False
-        self.framebuffer = ctx.framebuffer(self.images)
+        self.images = tuple(images)
+        self.framebuffer = ctx.framebuffer(images)
 
     def release(self) -> None:
         """Give the device memory back."""

@@ -3,9 +3,8 @@
 // compares the two. Channels are premultiplied by alpha, row 0 is the top row.
 
 uniform sampler2D colours;      // rgb, alpha
-uniform sampler2D latents;      // latent colours, alpha
-uniform sampler2D relevancies;  // one query per channel, alpha
-uniform sampler2D depths;       // sum of weight * camera z, alpha
+uniform sampler2D extra;        // latent colours, alpha; one query per channel, alpha; or
+                                // sum of weight * camera z, alpha
 uniform sampler2D turbo_table;  // 256 x 1
 uniform vec3 query_colours[3];
 
@@ -40,9 +39,9 @@ void main() {
     vec3 base = clamp(c.rgb + uncovered, 0.0, 1.0);
     vec3 shown = base;
     if (display == 1) {
-        shown = texture(latents, place).rgb + uncovered;
+        shown = texture(extra, place).rgb + uncovered;
     } else if (display == 2 || display == 3) {
-        vec4 sums = texture(relevancies, place);
+        vec4 sums = texture(extra, place);
         vec3 relevancy = sums.a > alpha_gate ? sums.rgb / sums.a : vec3(0.0);
         float highest = relevancy[0];
         int winner = 0;
@@ -60,7 +59,7 @@ void main() {
         else
             shown = highest > threshold ? mix(base, query_colours[winner], segment_opacity) : base * dim;
     } else if (display == 4) {
-        vec2 sums = texture(depths, place).rg;
+        vec2 sums = texture(extra, place).rg;
         float t = (sums.r / max(sums.g, 1e-9) - depth_range.x) / max(depth_range.y - depth_range.x, 1e-9);
         shown = sums.g > alpha_gate ? turbo(1.0 - clamp(t, 0.0, 1.0)) : background;
     } else if (display == 5) {

@@ -7,9 +7,14 @@ uniform float alpha_max;
 flat in vec2 mean;
 flat in vec4 footprint;
 flat in float opacity;
-flat in vec3 value[TARGETS];
-
-layout(location = 0) out vec4 target[TARGETS];
+#if VALUES > 0
+flat in vec3 value[VALUES];
+layout(location = 0) out vec4 image[VALUES];
+#endif
+#if DEPTH
+flat in float depth;
+layout(location = VALUES) out vec4 depth_image;  // the target keeps two channels; blending needs the last
+#endif
 
 void main() {
     // Distances in standard deviations along the footprint's axes: a quadratic form of the inverse
@@ -19,7 +24,11 @@ void main() {
     float alpha = min(alpha_max, opacity * exp(-0.5 * dot(v, v)));
     if (alpha < alpha_min)
         discard;
-    for (int i = 0; i < TARGETS; ++i)
-        target[i] = i == DEPTH_TARGET ? vec4(value[i].x * alpha, alpha, 0.0, alpha)
-                                      : vec4(value[i] * alpha, alpha);
+#if VALUES > 0
+    for (int i = 0; i < VALUES; ++i)
+        image[i] = vec4(value[i] * alpha, alpha);
+#endif
+#if DEPTH
+    depth_image = vec4(depth * alpha, alpha, 0.0, alpha);
+#endif
 }

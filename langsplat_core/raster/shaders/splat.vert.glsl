@@ -1,10 +1,9 @@
 // One quad per Gaussian, oriented along its footprint and just large enough for the alpha = alpha_min
 // contour, cut to what the image can see (a needle may be a million pixels long).
-// The host puts "#version", TARGETS and DEPTH_TARGET (-1: none) in front.
+// The host puts "#version", VALUES (number of images) and DEPTH (0 or 1) in front.
 
 uniform sampler2D placement;  // as written by project.frag.glsl
 uniform sampler2D shape;
-uniform sampler2D values[TARGETS];
 uniform int columns;          // Gaussians per texture row
 uniform vec2 image_size;      // px
 uniform float alpha_min;
@@ -14,7 +13,13 @@ in int gaussian;              // per instance, back to front
 flat out vec2 mean;
 flat out vec4 footprint;
 flat out float opacity;
-flat out vec3 value[TARGETS];
+#if VALUES > 0
+uniform sampler2D values[VALUES];
+flat out vec3 value[VALUES];
+#endif
+#if DEPTH
+flat out float depth;
+#endif
 
 void main() {
     ivec2 texel = ivec2(gaussian % columns, gaussian / columns);
@@ -22,8 +27,13 @@ void main() {
     footprint = texelFetch(shape, texel, 0);
     mean = place.xy;
     opacity = place.w;
-    for (int i = 0; i < TARGETS; ++i)
-        value[i] = i == DEPTH_TARGET ? vec3(place.z) : texelFetch(values[i], texel, 0).rgb;
+#if VALUES > 0
+    for (int i = 0; i < VALUES; ++i)
+        value[i] = texelFetch(values[i], texel, 0).rgb;
+#endif
+#if DEPTH
+    depth = place.z;
+#endif
 
     vec2 along = footprint.xy;
     vec2 across = vec2(-along.y, along.x);

@@ -1,0 +1,171 @@
+"""From a scene, a camera and picture settings to pixels. Needs a GL context, never a window.
+
+A rasterizer fills channel textures (colours, and the one further channel that the display needs); a
+composite shader turns them into the picture. The channels are kept while camera, scene and layers stay,
+so that moving a slider or repainting the user interface costs only the composite pass.
+"""
+
+from typing import Literal
+
+import moderngl
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import PictureConfig
+from langsplat_core.query import picture as rules
+from langsplat_core.raster.gl_draw import drawing, set_uniforms, shader
+from langsplat_core.scene import Camera, Scene
+from langsplat_viewer.channel_textures import ChannelSource, CpuSource, GlSource, Textures
+from langsplat_viewer.channels import Extra, Layers, camera_key, depth_range
+
+Backend = Literal["auto", "opengl", "cpu"]
+SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swr ", "software", "swiftshader", "basic render")
+PICK_ALPHA = 0.1  # a pixel with less alpha shows nothing that could be picked
+_DISPLAYS = ("rgb", "latent", "relevancy", "segmentation", "depth", "alpha")  # as composite.frag.glsl counts
+
+
+def is_software(ctx: moderngl.Context) -> bool:
+    """Whether this context draws on the CPU; the compiled CPU rasterizer is then several times faster."""
+    renderer = ctx.info["GL_RENDERER"].lower()
+    return any(name in renderer for name in SOFTWARE_RENDERERS)
+
+
+class FrameRenderer:
+    """Draws a scene into framebuffers of one context.
+
+    `backend` "auto" takes the CPU rasterizer where the GL driver is software, else OpenGL; the attribute
+    of that name says which it became. `precision` is that of the OpenGL rasterizer's images.
+    """
+
+    def __init__(
+        self, ctx: moderngl.Context, backend: Backend = "auto", precision: Literal["half", "single"] = "half"
+    ) -> None:
+        if backend == "auto":
+            backend = "cpu" if is_software(ctx) else "opengl"
+        self.backend: str = backend
+        self._ctx = ctx
+        self._source: ChannelSource = CpuSource(ctx) if backend == "cpu" else GlSource(ctx, precision)
+        self._program = ctx.program(
+            vertex_shader=shader("fullscreen.vert"), fragment_shader=shader("composite.frag")
+        )
+        self._vao = ctx.vertex_array(self._program, [])
+        self._turbo = ctx.texture((len(rules.TURBO), 1), 3, rules.TURBO.tobytes())
+        self._scene: Scene | None = None
+        self._layers = Layers()
+        self._camera: Camera | None = None  # of the last draw
+        self._drawn: tuple[object, ...] = ()  # what `_textures` show
+        self._textures: Textures = ()
+        self._own: moderngl.Framebuffer | None = None
+
+    def set_scene(self, scene: Scene) -> None:
+        """Show another scene, without layers."""
+        self._source.set_scene(scene)
+        self._scene, self._layers, self._camera, self._drawn = scene, Layers(), None, ()
+
+    def set_layers(self, latent_rgb: Array | None, relevancies: Array | None) -> None:
+        """What the displays "latent" and "relevancy" show: (N, 3) colours in [0, 1] of the level shown;
+        (N, Q) relevancies in [0, 1] of 1 to 3 queries. ValueError for other shapes."""
+        layers = Layers(latent_rgb, relevancies)
+        layers.check(0 if self._scene is None else len(self._scene.gaussians))
+        self._source.set_layers(layers)
+        self._layers, self._drawn = layers, ()
+
+    def draw(
+        self,
+        target: moderngl.Framebuffer,
+        camera: Camera,
+        picture: PictureConfig,
+        heat_peaks: tuple[float, ...] = (),
+    ) -> None:
+        """Fill `target`'s viewport with the picture and leave `target` bound.
+
+        The image is rasterized at the camera's size and stretched to the viewport if that is another.
+        `heat_peaks` as in `query.picture.compose`.
+        """
+        if self._scene is None:
+            target.clear(*picture.background, 1.0, viewport=target.viewport)
+            target.use()
+            return
+        extra = self._layers.extra(picture)
+        wanted = (*camera_key(camera), extra)
+        if self._drawn != wanted:
+            self._drawn = ()
+            self._textures = self._source.render(camera, extra)
+            self._drawn = wanted
+        self._camera = camera
+        set_uniforms(self._program, self._uniforms(camera, picture, heat_peaks, extra))
+        for unit, texture in enumerate((*self._textures, self._turbo)):
+            texture.use(unit)
+        with drawing(self._ctx, target, moderngl.NOTHING):
+            self._vao.render(moderngl.TRIANGLES, vertices=3)
+        target.use()
+
+    def _uniforms(
+        self, camera: Camera, picture: PictureConfig, heat_peaks: tuple[float, ...], extra: Extra
+    ) -> dict[str, object]:
+        assert self._scene is not None
+        # Without its layer a display shows the plain colours.
+        display = picture.display if extra != "none" or picture.display == "alpha" else "rgb"
+        relevancies = self._layers.relevancies
+        spans = [max(peak - rules.RELEVANCY_FLOOR, rules.MIN_HEAT_SPAN) for peak in heat_peaks[:3]]
+        spans += [1 - rules.RELEVANCY_FLOOR] * (3 - len(spans))
+        return {
+            "colours": 0,
+            "extra": len(self._textures) - 1,
+            "turbo_table": len(self._textures),
+            "display": _DISPLAYS.index(display),
+            "queries": 1 if relevancies is None else relevancies.shape[1],
+            "query_colours": rules.QUERY_COLOURS.astype("f4").tobytes(),
+            "heat_spans": tuple(spans),
+            "relevancy_floor": rules.RELEVANCY_FLOOR,
+            "heat_fade": rules.HEAT_FADE,
+            "heat_opacity": picture.heat_opacity,
+            "dim": picture.dim,
+            "threshold": picture.threshold,
+            "segment_opacity": rules.SEGMENT_OPACITY,
+            "alpha_gate": picture.alpha_gate,
+            "background": picture.background,
+            "depth_range": depth_range(self._scene.gaussians, camera) if extra == "depth" else (0.0, 1.0),
+        }
+
+    def read(self, camera: Camera, picture: PictureConfig, heat_peaks: tuple[float, ...] = ()) -> Array:
+        """(H, W, 3) uint8 picture at the camera's size, row 0 on top; leaves bound what was bound."""
+        size = (camera.width, camera.height)
+        if self._own is None or self._own.size != size:
+            self._release_own()
+            self._own = self._ctx.framebuffer([self._ctx.texture(size, 4)])
+        before = self._ctx.fbo or self._ctx.detect_framebuffer(0)
+        try:
+            self.draw(self._own, camera, picture, heat_peaks)
+            pixels = self._own.read(components=3, alignment=1)
+        finally:
+            before.use()
+        return np.frombuffer(pixels, np.uint8).reshape(camera.height, camera.width, 3)[::-1].copy()
+
+    def depth_at(self, x_px: float, y_px: float) -> float | None:
+        """Camera z of the surface in the pixel at a position in the last drawn image (in pixels of its
+        camera), world units; None outside the image, where alpha is small, and before anything was drawn.
+
+        The surface is where half the light is stopped, so that neither a floater in front nor a wall
+        behind is picked; where the scene is more transparent than that, the mean depth.
+        """
+        camera = self._camera
+        if camera is None or not (0 <= x_px < camera.width and 0 <= y_px < camera.height):
+            return None
+        depth, alpha = self._source.depth_at(camera, int(x_px), int(y_px))
+        return depth if alpha > PICK_ALPHA and depth > 0 else None
+
+    def _release_own(self) -> None:
+        if self._own is not None:
+            texture = self._own.color_attachments[0]
+            self._own.release()
+            texture.release()
+            self._own = None
+
+    def release(self) -> None:
+        """Give all device memory back; the renderer cannot be used afterwards."""
+        self._release_own()
+        self._source.release()
+        self._vao.release()
+        self._program.release()
+        self._turbo.release()
