@@ -35,7 +35,7 @@ def read_json_file(path: Path, limit: int) -> Any:
     with file:
         if size > limit:
             raise FormatError(f"{path}: {size} bytes; a file of this kind never exceeds {limit}")
-        return parse_json(file.read(limit), path)
+        return parse_json(file.read(size), path)
 
 
 def parse_json(text: bytes, path: Path) -> Any:

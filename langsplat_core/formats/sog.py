@@ -69,7 +69,7 @@ def _folder_reader(folder: Path) -> Fetch:
         with file:
             if size > limit:
                 raise FormatError(f"{folder / name}: {size} bytes; expected at most {limit}")
-            return file.read(limit)
+            return file.read(size)
 
     return fetch
 
