@@ -1,0 +1,102 @@
+"""`langsplat-viewer`: arguments -> window, or one picture without a window."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from langsplat_core.cli.run import main
+from langsplat_core.config import LevelChoice
+from langsplat_core.errors import InputError
+from langsplat_viewer.options import (
+    Backend,
+    DisplayChoice,
+    camera_file,
+    chosen_display,
+    parse_size,
+    scene_path,
+    services,
+)
+
+
+@dataclass(frozen=True)
+class ViewerCommand:
+    """Open a 3D Gaussian scene, look around in it and search it with words."""
+
+    scene: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[SCENE]")] = None
+    """Scene file, *.ply (default: the bundled demo)."""
+    query: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="TEXT")] = ()
+    """Phrase to search for; repeat it for several. The last three are shown."""
+    level: LevelChoice = "auto"
+    """Semantic level of the search; auto takes the one that answers best."""
+    display: DisplayChoice = "auto"
+    """What is shown; auto is relevancy with a query, else rgb."""
+    size: Annotated[str, tyro.conf.arg(metavar="WxH")] = ""
+    """Size of the window or picture in pixels."""
+    camera: Annotated[str, tyro.conf.arg(metavar="FILE|INDEX")] = ""
+    """First view: a camera file (JSON, as "Save view" writes it), or a training camera by number from 0."""
+    backend: Backend = "auto"
+    """What draws."""
+    encoder: Annotated[str, tyro.conf.arg(metavar="ID|FOLDER")] = ""
+    """Text encoder in place of the one that the scene names."""
+    headless: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Draw one picture without a window and print the answers."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE.png")] = None
+    """Where --headless writes."""
+
+    def run(self) -> None:
+        size = parse_size(self.size)
+        path = scene_path(self.scene)
+        camera_file(self.camera)  # a file that cannot be read is said before anything slow is done
+        if self.headless:
+            self._still(path, size)
+        else:
+            self._window(path, size)
+
+    def _still(self, path: Path, size: tuple[int, int] | None) -> None:
+        from langsplat_viewer.still import StillRequest, check_out, draw_still
+
+        request = StillRequest(
+            path=path,
+            out=check_out(self.out),
+            queries=self.query,
+            level=self.level,
+            display=chosen_display(self.display, self.query),
+            size=size,
+            camera=self.camera,
+            backend=self.backend,
+        )
+        print("\n".join(draw_still(request, services(self.encoder))))
+
+    def _window(self, path: Path, size: tuple[int, int] | None) -> None:
+        if self.out is not None:
+            raise InputError("--out is for pictures without a window; add --headless")
+        from langsplat_viewer.window import WindowRequest, open_window
+
+        open_window(
+            WindowRequest(
+                path=path,
+                queries=self.query,
+                level=self.level,
+                display=chosen_display(self.display, self.query),
+                size=size,
+                camera=self.camera,
+                backend=self.backend,
+            ),
+            services(self.encoder),
+        )
+
+
+def _parse() -> ViewerCommand:
+    return tyro.cli(ViewerCommand, prog="langsplat-viewer")
+
+
+def entry() -> None:
+    """The `langsplat-viewer` console script."""
+    sys.exit(main("langsplat-viewer", _parse))
+
+
+if __name__ == "__main__":
+    entry()

@@ -1,0 +1,147 @@
+"""The picture of the scene as a texture, drawn again only when something it depends on has changed.
+
+Needs a GL context but no window. While the camera moves on a slow machine the picture is drawn at a
+fraction of the window's resolution; as soon as it rests, once more at full resolution.
+"""
+
+import time
+from typing import Protocol
+
+import moderngl
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import PictureConfig
+from langsplat_core.scene import Camera, Scene
+from langsplat_viewer.controls import OrbitCamera
+from langsplat_viewer.state import FrameStats, ViewerState
+
+SCALES = (1.0, 0.5, 0.25)
+MOVING_BUDGET = 40.0  # milliseconds per picture that still feel like motion
+REST_SECONDS = 0.15  # without a move, after which the fine picture is drawn
+
+
+class Renderer(Protocol):
+    """What `frame.FrameRenderer` offers."""
+
+    backend: str
+
+    def set_scene(self, scene: Scene) -> None:
+        """Draw this scene from now on."""
+
+    def set_layers(self, latent_rgb: Array | None, relevancies: Array | None) -> None:
+        """(N, 3) latent colours and (N, Q) relevancies, Q <= 3, of the scene's Gaussians."""
+
+    def draw(
+        self,
+        target: moderngl.Framebuffer,
+        camera: Camera,
+        picture: PictureConfig,
+        heat_peaks: tuple[float, ...] = (),
+    ) -> None:
+        """Draw into `target`, which has the camera's size."""
+
+    def read(self, camera: Camera, picture: PictureConfig, heat_peaks: tuple[float, ...] = ()) -> Array:
+        """(H, W, 3) uint8 picture."""
+
+    def depth_at(self, x_px: float, y_px: float) -> float | None:
+        """Camera z of the surface at a pixel of the last picture, world units."""
+
+
+class Canvas:
+    """Keeps a texture up to date with a `ViewerState`."""
+
+    def __init__(self, ctx: moderngl.Context, renderer: Renderer) -> None:
+        self._ctx = ctx
+        self._renderer = renderer
+        self._targets: dict[tuple[int, int], moderngl.Framebuffer] = {}  # by size, the latest used last
+        self._textures: dict[tuple[int, int], moderngl.Texture] = {}
+        self._scene: Scene | None = None
+        self._layers: tuple[object, ...] | None = None
+        self._drawn: tuple[object, ...] | None = None  # what the texture shows
+        self._view: OrbitCamera | None = None
+        self._moved = -1e9  # when the view last changed, seconds
+        self._fine_ms = 0.0
+        self._camera: Camera | None = None
+        self.texture: moderngl.Texture | None = None  # RGBA8, first row at the bottom, as GL has it
+
+    def update(self, state: ViewerState, now: float) -> bool:
+        """Draw if anything changed since the last call; returns whether a finer picture is still due.
+
+        `now` in seconds. Raises what the renderer raises (BackendError, moderngl.Error); the same
+        picture is then not tried again.
+        """
+        if state.scene is None or state.view is None:
+            return False
+        if state.view is not self._view:
+            if self._view is not None:
+                self._moved = now
+            self._view = state.view
+        moving = now - self._moved < REST_SECONDS
+        scale = self._scale() if moving and state.coarse_while_moving else 1.0
+        size = (max(1, round(state.size[0] * scale)), max(1, round(state.size[1] * scale)))
+        key = (state.layers_key(), state.picture, state.view, state.size, scale, state.heat_peaks())
+        if key != self._drawn:
+            self._drawn = key
+            self._draw(state, size, scale)
+        return moving
+
+    def _scale(self) -> float:
+        """The largest scale at which a picture is expected within the budget."""
+        within = [s for s in SCALES if self._fine_ms * s * s <= MOVING_BUDGET]
+        return within[0] if within else SCALES[-1]
+
+    def _sync(self, state: ViewerState) -> None:
+        """Hand the scene and the layers to the renderer if they are not the ones it has."""
+        assert state.scene is not None
+        if state.scene is not self._scene:
+            self._scene = state.scene
+            self._renderer.set_scene(state.scene)
+            self._layers = None
+        if state.layers_key() != self._layers:
+            self._layers = state.layers_key()
+            self._renderer.set_layers(state.latent_rgb(), state.relevancies())
+
+    def _draw(self, state: ViewerState, size: tuple[int, int], scale: float) -> None:
+        assert state.view is not None
+        self._sync(state)
+        target = self._target(size)
+        camera = state.view.camera(*size)
+        began = time.perf_counter()
+        self._renderer.draw(target, camera, state.picture, state.heat_peaks())
+        self._ctx.finish()
+        milliseconds = 1e3 * (time.perf_counter() - began)
+        if scale == 1:
+            self._fine_ms = milliseconds
+        self._camera = camera
+        self.texture = self._textures[size]
+        state.stats = FrameStats(milliseconds, *size, scale)
+
+    def _target(self, size: tuple[int, int]) -> moderngl.Framebuffer:
+        """A framebuffer of this size; the last few sizes are kept, because moving alternates between two."""
+        if size not in self._targets:
+            if len(self._targets) >= len(SCALES):
+                oldest = next(iter(self._targets))
+                self._targets.pop(oldest).release()
+                self._textures.pop(oldest).release()
+            texture = self._ctx.texture(size, 4)
+            texture.repeat_x = texture.repeat_y = False
+            self._textures[size] = texture
+            self._targets[size] = self._ctx.framebuffer([texture])
+        self._targets[size] = self._targets.pop(size)
+        return self._targets[size]
+
+    def point_at(self, u: float, v: float) -> Array | None:
+        """See `actions.Surface`."""
+        if self._camera is None:
+            return None
+        pixel = (u * self._camera.width, v * self._camera.height)
+        depth = self._renderer.depth_at(*pixel)
+        return None if depth is None or depth <= 0 else self._camera.unproject(pixel, depth)
+
+    def capture(self, state: ViewerState) -> Array:
+        """See `actions.Surface`."""
+        assert state.view is not None
+        self._sync(state)
+        self._camera = state.view.camera(*state.size)
+        return np.asarray(self._renderer.read(self._camera, state.picture, state.heat_peaks()))

@@ -1,0 +1,208 @@
+"""Camera control as plain maths: what the mouse and the keys do, without a window.
+
+An `OrbitCamera` turns around a target point. Every control is a function from one camera to the next,
+so that a test can do and undo it.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from langsplat_core.arrays import Array
+from langsplat_core.scene import Camera, Scene, look_at
+
+MAX_ELEVATION = math.radians(88)  # nearer to the pole a small drag would spin the picture
+DEFAULT_FOV = 50.0  # degrees, of the picture's shorter side
+FOV_RANGE = (10.0, 120.0)  # degrees
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics on a picture of reference size; any window shows that whole picture, uncropped."""
+
+    width: float  # pixels of the reference picture
+    height: float
+    fx: float  # pixels
+    fy: float
+    cx: float  # pixels from the left edge
+    cy: float  # pixels from the top edge
+
+    def fitted(self, width: int, height: int) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy in a window of `width` x `height` pixels that holds the reference picture
+        centred, as large as it goes, with square pixels kept square."""
+        s = min(width / self.width, height / self.height)
+        return (
+            self.fx * s,
+            self.fy * s,
+            (self.cx - self.width / 2) * s + width / 2,
+            (self.cy - self.height / 2) * s + height / 2,
+        )
+
+    @property
+    def fov_degrees(self) -> float:
+        """Angle of view across the shorter side."""
+        return math.degrees(2 * math.atan(0.5 * min(self.width, self.height) / min(self.fx, self.fy)))
+
+
+def symmetric_lens(fov_degrees: float = DEFAULT_FOV) -> Lens:
+    """A centred lens that sees `fov_degrees` across the window's shorter side."""
+    focal = 0.5 / math.tan(math.radians(fov_degrees) / 2)
+    return Lens(1.0, 1.0, focal, focal, 0.5, 0.5)
+
+
+def lens_of(camera: Camera) -> Lens:
+    """The lens of a photograph."""
+    return Lens(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+@dataclass(frozen=True, eq=False)
+class OrbitCamera:
+    """Where the viewer stands and what it turns around."""
+
+    rotation: Array  # (3, 3) world-to-camera, rows are right, down and forward
+    target: Array  # (3,) world units, on the optical axis
+    distance: float  # world units from the eye to the target, > 0
+    up: Array  # (3,) unit, the world's up: the axis that a sideways drag turns about
+    lens: Lens
+
+    @property
+    def eye(self) -> Array:
+        """(3,) centre of projection, world units."""
+        return self.target - self.distance * self.rotation[2]
+
+    def camera(self, width: int, height: int) -> Camera:
+        """The pinhole camera for a picture of `width` x `height` pixels."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.rotation
+        matrix[:3, 3] = -self.rotation @ self.eye
+        return Camera(width, height, *self.lens.fitted(width, height), matrix)
+
+    @property
+    def elevation(self) -> float:
+        """Angle of the line of sight above the horizon, radians."""
+        return math.asin(float(np.clip(self.rotation[2] @ self.up, -1, 1)))
+
+
+def _about(axis: Array, angle: float) -> Array:
+    """(3, 3) right-handed rotation by `angle` radians about a unit axis."""
+    return Rotation.from_rotvec(np.asarray(axis) * angle).as_matrix()
+
+
+def orbit(view: OrbitCamera, yaw: float, pitch: float) -> OrbitCamera:
+    """Turn the world under the hand: near things follow a drag right by `yaw` and down by `pitch` (radians).
+
+    Yaw turns about the world's up and multiplies from the right, pitch about the camera's right axis
+    and multiplies from the left; they commute, so a drag there and back returns exactly.
+    """
+    limit = max(MAX_ELEVATION, abs(view.elevation))
+    pitch = float(np.clip(pitch, view.elevation - limit, view.elevation + limit))
+    rotation = _about(np.array([1.0, 0, 0]), pitch) @ view.rotation @ _about(view.up, yaw)
+    return replace(view, rotation=_orthonormal(rotation))
+
+
+def _orthonormal(rotation: Array) -> Array:
+    """The nearest rotation: thousands of small drags must not let the axes drift apart."""
+    u, _, vt = np.linalg.svd(rotation)
+    return u @ vt
+
+
+def look(view: OrbitCamera, yaw: float, pitch: float) -> OrbitCamera:
+    """Turn the head: right by `yaw`, down by `pitch` (radians), without moving the eye."""
+    turned = orbit(view, -yaw, -pitch)
+    return replace(turned, target=view.eye + view.distance * turned.rotation[2])
+
+
+def roll(view: OrbitCamera, angle: float) -> OrbitCamera:
+    """Turn the picture clockwise by `angle` radians about the line of sight."""
+    return replace(view, rotation=_about(np.array([0, 0, 1.0]), angle) @ view.rotation)
+
+
+def pan(view: OrbitCamera, dx: float, dy: float, size: tuple[int, int]) -> OrbitCamera:
+    """Move sideways so that the target follows a drag of (dx, dy) pixels in a window of `size` pixels."""
+    fx, fy, _, _ = view.lens.fitted(*size)
+    right, down, _ = view.rotation
+    return replace(view, target=view.target - view.distance * (dx / fx * right + dy / fy * down))
+
+
+def zoom(view: OrbitCamera, factor: float, min_distance: float) -> OrbitCamera:
+    """Multiply the distance by `factor`; at `min_distance` the target is pushed on, so it never sticks."""
+    wanted = view.distance * factor
+    distance = max(wanted, min_distance)
+    push = distance - wanted if factor < 1 else 0.0
+    return replace(view, distance=distance, target=view.target + push * view.rotation[2])
+
+
+def fly(view: OrbitCamera, right: float, up: float, forward: float) -> OrbitCamera:
+    """Move eye and target together: along the camera's right and forward axes and the world's up."""
+    step = right * view.rotation[0] + up * view.up + forward * view.rotation[2]
+    return replace(view, target=view.target + step)
+
+
+def focus(view: OrbitCamera, point: Array, distance: float | None = None) -> OrbitCamera:
+    """Bring `point` (3,) to the centre and turn around it from now on; the direction of view is kept."""
+    return replace(
+        view,
+        target=np.asarray(point, np.float64),
+        distance=view.distance if distance is None else max(distance, 1e-9),
+    )
+
+
+def level(view: OrbitCamera) -> OrbitCamera:
+    """The same view with a level horizon."""
+    upright = look_at(view.eye, view.target, view.up, (1, 1))
+    return replace(view, rotation=upright.rotation)
+
+
+def adopt_up(view: OrbitCamera) -> OrbitCamera:
+    """Take the picture's up as the world's up, for scenes whose file says nothing about it."""
+    return replace(view, up=-view.rotation[1])
+
+
+def with_fov(view: OrbitCamera, fov_degrees: float) -> OrbitCamera:
+    """The same view through a symmetric lens of `fov_degrees` across the shorter side."""
+    return replace(view, lens=symmetric_lens(float(np.clip(fov_degrees, *FOV_RANGE))))
+
+
+def between(start: OrbitCamera, end: OrbitCamera, t: float) -> OrbitCamera:
+    """A view on the way from `start` (t = 0) to `end` (t = 1); the lens is the end's."""
+    if t >= 1:
+        return end
+    ease = t * t * (3 - 2 * t)
+    turn = Rotation.from_matrix(end.rotation @ start.rotation.T).as_rotvec() * ease
+    return replace(
+        end,
+        rotation=Rotation.from_rotvec(turn).as_matrix() @ start.rotation,
+        target=start.target + ease * (end.target - start.target),
+        distance=start.distance * (end.distance / start.distance) ** ease,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Extent:
+    """What the camera needs to know about a scene; computed once, because it looks at every Gaussian."""
+
+    centre: Array  # (3,) robust middle, world units
+    radius: float  # robust, world units, > 0
+    up: Array  # (3,) unit
+    home: Camera  # frames the whole scene
+
+
+def extent_of(scene: Scene) -> Extent:
+    """Measure a scene."""
+    centre, radius = scene.bounds()
+    return Extent(centre, radius, scene.up(), scene.framing_camera((1000, 1000)))
+
+
+def from_camera(camera: Camera, extent: Extent) -> OrbitCamera:
+    """The exact view of `camera`, turning around the depth at which it sees the scene's middle."""
+    forward = camera.rotation[2]
+    distance = max(float((extent.centre - camera.position) @ forward), 0.3 * extent.radius)
+    target = camera.position + distance * forward
+    return OrbitCamera(camera.rotation, target, distance, extent.up, lens_of(camera))
+
+
+def default_view(scene: Scene, extent: Extent) -> OrbitCamera:
+    """The first training camera where there is one, else a view of the whole scene."""
+    return from_camera(scene.cameras[0] if scene.cameras else extent.home, extent)

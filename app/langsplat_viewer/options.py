@@ -1,0 +1,104 @@
+"""The program's arguments, and what they mean: sizes, cameras, displays. Imports no windowing library."""
+
+import re
+from importlib.resources import files
+from pathlib import Path
+from typing import Literal
+
+from langsplat_core.config import Display
+from langsplat_core.errors import InputError
+from langsplat_core.formats import load_scene
+from langsplat_core.formats.cameras_json import read_cameras
+from langsplat_core.formats.sog import META_NAME
+from langsplat_core.query.engine import NO_FIELD, TextEncoder
+from langsplat_core.scene import Camera, Scene
+from langsplat_viewer.actions import NEEDS_FIELD, Services
+
+DisplayChoice = Literal["auto", "rgb", "latent", "relevancy", "segmentation", "depth", "alpha"]
+Backend = Literal["auto", "opengl", "cpu", "cuda"]
+MAX_SIDE = 16_384  # pixels; beyond it drivers refuse textures
+
+
+def parse_size(text: str) -> tuple[int, int] | None:
+    """ "1280x720" -> (1280, 720); "" -> None. Raises InputError."""
+    if not text:
+        return None
+    match = re.fullmatch(r"(\d{1,6})[xX×](\d{1,6})", text.strip())
+    size = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not all(1 <= side <= MAX_SIDE for side in size):
+        raise InputError(f"--size {text}: give width x height in pixels, 1 to {MAX_SIDE}, such as 1280x720")
+    return size
+
+
+def scene_path(scene: Path | None) -> Path:
+    """The file to open; without one the bundled demo. InputError where it is absent or not a file."""
+    if scene is None:
+        demo = Path(str(files("langsplat_assets") / "demo" / "scene.ply"))
+        if not demo.is_file():
+            raise InputError(f"the bundled demo scene is missing ({demo}); name a scene, or reinstall")
+        return demo
+    if not scene.exists():
+        raise InputError(f"{scene}: no such file; check the spelling and the folder")
+    if scene.is_dir() and not (scene / META_NAME).exists():
+        raise InputError(f"{scene}: is a folder, not a scene; name the .ply file in it")
+    return scene
+
+
+def camera_file(choice: str) -> Camera | None:
+    """The camera of a `--camera FILE`; None where `choice` is empty or an index. Raises InputError."""
+    if not choice or re.fullmatch(r"-?\d+", choice):
+        return None
+    cameras = read_cameras(Path(choice))
+    if not cameras:
+        raise InputError(f"--camera {choice}: the file holds no camera")
+    return cameras[0]
+
+
+def chosen_camera(scene: Scene, choice: str) -> Camera | None:
+    """The camera that `--camera` names: of a file, or a training camera by index from 0; None without a
+    choice. Raises InputError."""
+    if not choice:
+        return None
+    of_file = camera_file(choice)
+    if of_file is not None:
+        return of_file
+    if not scene.cameras:
+        raise InputError(f"--camera {choice}: the scene has no training cameras; name a camera file instead")
+    if not 0 <= int(choice) < len(scene.cameras):
+        raise InputError(f"--camera {choice}: the scene has cameras 0 to {len(scene.cameras) - 1}")
+    return scene.cameras[int(choice)]
+
+
+def chosen_display(choice: DisplayChoice, queries: tuple[str, ...]) -> Display:
+    """Relevancy when something is searched, colours otherwise, unless a display is named."""
+    if choice == "auto":
+        return "relevancy" if queries else "rgb"
+    return choice
+
+
+def check_display(scene: Scene, display: Display, queries: tuple[str, ...]) -> None:
+    """InputError for a display or query that this scene cannot answer."""
+    if scene.language is None and (queries or display in NEEDS_FIELD):
+        raise InputError(f"{scene.path}: {NO_FIELD}")
+    if display in ("relevancy", "segmentation") and not queries:
+        raise InputError(f"--display {display} shows a search; add --query TEXT")
+
+
+def load_text_encoder(encoder_id: str) -> TextEncoder:
+    """The text half of CLIP; imports torch."""
+    from langsplat_core.semantics import clip
+
+    return clip.load_text_encoder(encoder_id)
+
+
+def warm_up(scene: Scene, backend: str) -> None:
+    """Have the CPU rasterizer compiled before the window first draws with it (once per installation)."""
+    if backend == "cpu":
+        from langsplat_viewer.channels import CpuChannels, Layers
+
+        CpuChannels().render(scene, Layers(), scene.framing_camera((16, 16)), "none")
+
+
+def services(encoder_id: str) -> Services:
+    """The real layers below."""
+    return Services(load_scene, load_text_encoder, encoder_id, warm_up)

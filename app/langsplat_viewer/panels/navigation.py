@@ -1,0 +1,91 @@
+"""Mouse and keys over the scene -> camera moves and actions."""
+
+import math
+from pathlib import Path
+
+from imgui_bundle import imgui
+
+from langsplat_viewer import actions, controls
+from langsplat_viewer.actions import Viewer
+from langsplat_viewer.panels.layout import Area
+from langsplat_viewer.panels.view import DISPLAYS
+
+NEAREST = 0.02  # of the scene's radius: the closest the camera comes to its centre of turning
+ROLL_SPEED = 1.0  # radians per second
+LONGEST_FRAME = 0.1  # seconds; a stalled frame must not throw a flying camera across the scene
+
+
+def handle(viewer: Viewer, area: Area) -> None:
+    """Once per frame, after the panels: they take what is theirs first."""
+    io = imgui.get_io()
+    if viewer.state.view is not None and not io.want_capture_mouse:
+        _mouse(viewer, area)
+    if not io.want_text_input:
+        _keys(viewer)
+        if viewer.state.view is not None and not io.key_ctrl:
+            _fly(viewer)
+
+
+def _mouse(viewer: Viewer, area: Area) -> None:
+    io, extent = imgui.get_io(), viewer.state.extent
+    assert extent is not None
+    if imgui.is_mouse_double_clicked(0):
+        actions.focus_pixel(viewer, *area.fraction(io.mouse_pos.x, io.mouse_pos.y))
+        return
+    dx, dy = io.mouse_delta.x, io.mouse_delta.y
+    if dx or dy:
+        turn = math.pi / area.height  # a drag over the whole height is half a turn
+        if imgui.is_mouse_down(1) or imgui.is_mouse_down(2) or (imgui.is_mouse_down(0) and io.key_shift):
+            size = (max(round(area.width), 1), max(round(area.height), 1))
+            actions.move(viewer, lambda view: controls.pan(view, dx, dy, size))
+        elif imgui.is_mouse_down(0) and io.key_ctrl:
+            actions.move(viewer, lambda view: controls.look(view, dx * turn, dy * turn))
+        elif imgui.is_mouse_down(0):
+            actions.move(viewer, lambda view: controls.orbit(view, dx * turn, dy * turn))
+    if io.mouse_wheel:
+        factor = 0.88**io.mouse_wheel
+        actions.move(viewer, lambda view: controls.zoom(view, factor, NEAREST * extent.radius))
+
+
+def _keys(viewer: Viewer) -> None:
+    state, key = viewer.state, imgui.Key
+    if imgui.is_key_pressed(key.r, False):
+        actions.reset_view(viewer)
+    if imgui.is_key_pressed(key.f, False):
+        actions.focus_result(viewer)
+    if imgui.is_key_pressed(key.comma):
+        actions.step_camera(viewer, -1)
+    if imgui.is_key_pressed(key.period):
+        actions.step_camera(viewer, 1)
+    if imgui.is_key_pressed(key.p, False):
+        actions.save_picture(viewer, Path.cwd())
+    if imgui.is_key_pressed(key.slash, False):
+        state.show_panel, state.focus_input = True, True
+    if imgui.is_key_pressed(key.tab, False):
+        state.show_panel = not state.show_panel
+    if imgui.is_key_pressed(key.f1, False):
+        state.show_help = not state.show_help
+    if imgui.is_key_pressed(key.escape, False):
+        state.show_help = False
+    for index, (_, display, latent_level) in enumerate(DISPLAYS):
+        if imgui.is_key_pressed(imgui.Key(key._1 + index), False):
+            actions.set_display(viewer, display, latent_level)
+
+
+def _fly(viewer: Viewer) -> None:
+    """Keys that act as long as they are held."""
+    io, extent, key = imgui.get_io(), viewer.state.extent, imgui.Key
+    assert extent is not None
+
+    def held(plus: imgui.Key, minus: imgui.Key) -> int:
+        return int(imgui.is_key_down(plus)) - int(imgui.is_key_down(minus))
+
+    seconds = min(io.delta_time, LONGEST_FRAME)
+    right, up, ahead = held(key.d, key.a), held(key.e, key.q), held(key.w, key.s)
+    if right or up or ahead:
+        pace = 4.0 if io.key_shift else 0.25 if io.key_alt else 1.0
+        step = pace * viewer.state.fly_speed * extent.radius * seconds
+        actions.move(viewer, lambda view: controls.fly(view, right * step, up * step, ahead * step))
+    turn = held(key.right_bracket, key.left_bracket)
+    if turn:
+        actions.move(viewer, lambda view: controls.roll(view, turn * ROLL_SPEED * seconds))

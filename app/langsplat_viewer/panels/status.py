@@ -1,0 +1,47 @@
+"""Progress, messages and figures: the foot of the panel, always in sight."""
+
+from imgui_bundle import ImVec2, hello_imgui, imgui
+
+from langsplat_viewer import actions
+from langsplat_viewer.actions import Viewer
+from langsplat_viewer.panels.style import BAD, MUTED, small_wrapped
+
+FOOT_EM = 9.5  # height of the foot
+
+
+def draw(viewer: Viewer) -> None:
+    """What is being done, what was said (the latest first), and how fast pictures are made."""
+    imgui.separator_text("Messages")
+    if viewer.worker.current is not None:
+        _progress(viewer, *viewer.worker.current)
+    line = imgui.get_text_line_height_with_spacing()
+    if imgui.begin_child("messages", ImVec2(0, -line)):
+        for message in reversed(viewer.state.messages):
+            small_wrapped(message.text, BAD if message.is_error else MUTED)
+    imgui.end_child()
+    imgui.text_colored(MUTED, figures(viewer, imgui.get_io().framerate))
+
+
+def figures(viewer: Viewer, frames_per_second: float) -> str:
+    """One line: frames per second, backend, time and size of the last picture."""
+    stats = viewer.state.stats
+    parts = [f"{frames_per_second:.0f} fps", viewer.state.backend]
+    if stats.width:
+        parts += [f"{stats.milliseconds:.0f} ms", f"{stats.width} x {stats.height}"]
+    return "   ".join(part for part in parts if part)
+
+
+def _progress(viewer: Viewer, label: str, fraction: float) -> None:
+    cancel = imgui.calc_text_size("Cancel").x + 2 * imgui.get_style().frame_padding.x
+    width = -cancel - imgui.get_style().item_spacing.x
+    imgui.push_style_color(imgui.Col_.plot_histogram, imgui.get_style_color_vec4(imgui.Col_.button_active))
+    imgui.progress_bar(fraction, ImVec2(width, 0), label)
+    imgui.pop_style_color()
+    imgui.same_line()
+    if imgui.button("Cancel"):
+        actions.cancel(viewer)
+
+
+def foot_height() -> float:
+    """Window units that the foot takes."""
+    return hello_imgui.em_size(FOOT_EM)

@@ -1,0 +1,108 @@
+"""One picture without a window: `langsplat-viewer --headless --out picture.png`."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import Display, LevelChoice, PictureConfig
+from langsplat_core.errors import InputError
+from langsplat_core.query.engine import QueryResult
+from langsplat_core.query.picture import latent_colours
+from langsplat_core.scene import LEVELS, Camera, Scene
+from langsplat_viewer.actions import Services, save_png
+from langsplat_viewer.answers import Answers
+from langsplat_viewer.controls import lens_of
+from langsplat_viewer.headless import render_picture
+from langsplat_viewer.options import Backend, check_display, chosen_camera
+from langsplat_viewer.state import SLOTS
+
+DEFAULT_SIZE = (1280, 720)
+
+
+@dataclass(frozen=True)
+class StillRequest:
+    """What picture is wanted."""
+
+    path: Path  # scene
+    out: Path  # *.png
+    queries: tuple[str, ...] = ()
+    level: LevelChoice = "auto"
+    display: Display = "rgb"
+    size: tuple[int, int] | None = None  # pixels; None: the training camera's, else DEFAULT_SIZE
+    camera: str = ""
+    backend: Backend = "auto"
+
+
+def check_out(out: Path | None) -> Path:
+    """Where the picture goes; InputError where that cannot work, before anything slow is done."""
+    if out is None:
+        raise InputError("--headless needs somewhere to draw to; add --out picture.png")
+    if out.suffix.lower() != ".png":
+        raise InputError(f"--out {out}: only PNG is written; end the name in .png")
+    if out.is_dir():
+        raise InputError(f"--out {out}: is a folder; name a file in it")
+    folder = next(parent for parent in out.absolute().parents if parent.exists())
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise InputError(f"--out {out}: {folder} cannot be written to; choose another folder")
+    return out
+
+
+def still_camera(scene: Scene, choice: str, size: tuple[int, int] | None) -> Camera:
+    """The camera of a picture: as chosen, else the first training camera, else one that frames the scene."""
+    camera = chosen_camera(scene, choice) or (scene.cameras[0] if scene.cameras else None)
+    if camera is None:
+        return scene.framing_camera(size or DEFAULT_SIZE)
+    if size is None or size == (camera.width, camera.height):
+        return camera
+    return Camera(*size, *lens_of(camera).fitted(*size), camera.world_to_camera, camera.name)
+
+
+def describe(result: QueryResult) -> str:
+    """One line for people and for scripts."""
+    place = "none" if result.place is None else "({})".format(", ".join(f"{v:.3f}" for v in result.place))
+    verdict = "found" if result.found else "not here"
+    level = LEVELS[result.level]
+    return f"'{result.phrase}': {verdict}, score {result.peak:.3f}, level {level}, place {place}"
+
+
+def draw_still(request: StillRequest, services: Services) -> list[str]:
+    """Draw and save the picture; returns the lines to print: the picture's, then one for each query."""
+    scene = services.load_scene(request.path)
+    check_display(scene, request.display, request.queries)
+    camera = still_camera(scene, request.camera, request.size)
+    answers = Answers(scene, services.load_encoder, services.encoder_id)
+    results = [answers.ask(phrase, request.level) for phrase in request.queries]
+    shown = results[-SLOTS:]  # as in the window, where a fourth query takes the oldest one's colour
+
+    image = render_picture(
+        scene,
+        camera,
+        PictureConfig(display=request.display),
+        backend=request.backend,
+        latent_rgb=_latent(scene, request),
+        relevancies=_columns(shown),
+        heat_peaks=tuple(result.peak for result in shown),
+    )
+    try:
+        save_png(request.out, image)
+    except OSError as error:
+        raise InputError(f"--out {request.out}: cannot be written ({error.strerror or error})") from None
+    size = f"{camera.width}x{camera.height}"
+    return [f"{request.out}: {size}, {request.display}", *(describe(result) for result in results)]
+
+
+def _latent(scene: Scene, request: StillRequest) -> Array | None:
+    if request.display != "latent" or scene.language is None:
+        return None
+    level = LEVELS.index("whole" if request.level == "auto" else request.level)
+    colours: Array = latent_colours(scene.language)[level]
+    return colours
+
+
+def _columns(results: list[QueryResult]) -> Array | None:
+    if not results:
+        return None
+    return np.stack([result.relevancy[result.level] for result in results], axis=1)

@@ -1,0 +1,216 @@
+"""The window: the only user of hello_imgui and glfw. Everything it does is in actions, panels and canvas."""
+
+import os
+import sys
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+# imgui_bundle brings its own GLFW library and must be imported first, else the process holds two.
+from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui, immapp  # isort: skip
+from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
+import glfw  # isort: skip
+import moderngl
+
+from langsplat_core.config import Display, LevelChoice
+from langsplat_core.errors import BackendError, InputError, LangSplatError
+from langsplat_viewer import actions
+from langsplat_viewer.actions import Services, Viewer
+from langsplat_viewer.canvas import Canvas, Renderer
+from langsplat_viewer.controls import from_camera
+from langsplat_viewer.jobs import one_line
+from langsplat_viewer.options import Backend, chosen_camera
+from langsplat_viewer.panels import layout, navigation
+from langsplat_viewer.panels.scene import OpenDialog
+
+DEFAULT_SIZE = (1280, 800)
+GL_VERSIONS = ((4, 1), (3, 3))  # 4.1 draws splats on every system; 3.3 still shows the CPU's pictures
+IDLE_FPS = 8.0  # frames per second while nothing happens
+
+MakeRenderer = Callable[[moderngl.Context], Renderer]
+
+
+@dataclass(frozen=True)
+class WindowRequest:
+    """What the window opens with."""
+
+    path: Path
+    queries: tuple[str, ...] = ()
+    level: LevelChoice = "auto"
+    display: Display = "rgb"
+    size: tuple[int, int] | None = None  # of the window, pixels
+    camera: str = ""
+    backend: Backend = "auto"
+
+
+def open_window(request: WindowRequest, services: Services) -> None:
+    """Run until the window is closed. Raises BackendError where there is no display or no OpenGL."""
+    window = Window(request, services, lambda ctx: _frame_renderer(ctx, request.backend))
+    immapp.run(window.params())
+    if window.failure is not None:
+        raise window.failure
+
+
+def _frame_renderer(ctx: moderngl.Context, backend: Backend) -> Renderer:
+    from langsplat_viewer.frame import FrameRenderer
+
+    if backend == "cuda":
+        raise BackendError("--backend cuda draws pictures without a window; add --headless, or use opengl")
+    return FrameRenderer(ctx, backend)
+
+
+def probe_gl() -> tuple[int, int]:
+    """The newest of `GL_VERSIONS` that a window can have here. Raises BackendError without a display."""
+    hint = "to draw a picture without a window add --headless --out picture.png"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", glfw.GLFWError)
+        is_linux = sys.platform.startswith("linux")
+        if is_linux and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            raise BackendError(f"no display to open a window on (DISPLAY is not set); {hint}")
+        if not glfw.init():
+            raise BackendError(f"the display cannot be reached; {hint}")
+        for major, minor in GL_VERSIONS:
+            glfw.window_hint(glfw.VISIBLE, False)
+            _gl_hints(major, minor)
+            window = glfw.create_window(16, 16, "probe", None, None)
+            glfw.default_window_hints()
+            if window:
+                glfw.destroy_window(window)
+                return major, minor
+    raise BackendError(f"the display offers no OpenGL 3.3; update the graphics driver, or {hint}")
+
+
+def _gl_hints(major: int, minor: int) -> None:
+    glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, major)
+    glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, minor)
+    glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
+    glfw.window_hint(glfw.OPENGL_FORWARD_COMPAT, True)
+
+
+class Window:
+    """Callbacks of one window."""
+
+    def __init__(self, request: WindowRequest, services: Services, make_renderer: MakeRenderer) -> None:
+        self.viewer = Viewer(services)
+        self.failure: LangSplatError | None = None  # why the window could not work
+        self._request = request
+        self._make_renderer = make_renderer
+        self._dialog = OpenDialog()
+        self._canvas: Canvas | None = None
+        self._screen: moderngl.Framebuffer | None = None
+        self._unfinished = False  # a finer picture is due
+
+    def params(self) -> hello_imgui.RunnerParams:
+        """Everything hello_imgui wants to know. Raises BackendError where no window can be opened."""
+        major, minor = probe_gl()
+        params = hello_imgui.RunnerParams()
+        window = params.app_window_params
+        window.window_title = "LangSplat viewer"
+        window.window_geometry.size = self._request.size or DEFAULT_SIZE
+        if self._request.size is not None:
+            window.window_geometry.window_size_measure_mode = hello_imgui.WindowSizeMeasureMode.screen_coords
+        window.restore_previous_geometry = False
+        params.imgui_window_params.default_imgui_window_type = (
+            hello_imgui.DefaultImGuiWindowType.no_default_window
+        )
+        params.imgui_window_params.background_color = ImVec4(0, 0, 0, 1)
+        gl = params.renderer_backend_options.open_gl_options
+        gl.major_version, gl.minor_version = major, minor
+        gl.glsl_version = "410" if (major, minor) >= (4, 1) else "330"
+        gl.use_core_profile = gl.use_forward_compat = True
+        gl.anti_aliasing_samples = 0  # splats gain nothing from it
+        params.ini_disable = True  # the layout is fixed: nothing to remember, no file in the user's folder
+        params.fps_idling.fps_idle = IDLE_FPS
+        params.callbacks.setup_imgui_style = _style
+        params.callbacks.post_init = self._start
+        params.callbacks.show_gui = self._gui
+        params.callbacks.before_imgui_render = self._picture
+        params.callbacks.before_exit = self._stop
+        return params
+
+    def _start(self) -> None:
+        """The GL context is there."""
+        try:
+            ctx = moderngl.get_context()
+            renderer = self._make_renderer(ctx)
+            self._canvas = Canvas(ctx, renderer)
+            self.viewer.state.backend = renderer.backend
+        except (LangSplatError, moderngl.Error) as error:
+            self.failure = BackendError(one_line(error))
+            hello_imgui.get_runner_params().app_shall_exit = True
+            return
+        self._screen = ctx.detect_framebuffer()
+        self.viewer.surface = self._canvas
+        glfw.set_drop_callback(glfw_window_hello_imgui(), self._dropped)  # type: ignore[arg-type]
+        actions.open_scene(self.viewer, self._request.path, self._first_view)
+
+    def _first_view(self, viewer: Viewer) -> None:
+        """The scene of the command line is open: do what else the command line asks for."""
+        state, request = viewer.state, self._request
+        assert state.scene is not None
+        assert state.extent is not None
+        try:
+            camera = chosen_camera(state.scene, request.camera)
+            if camera is not None:
+                state.view = from_camera(camera, state.extent)
+        except InputError as error:
+            state.say(str(error), is_error=True)
+        state.level = request.level
+        for phrase in request.queries:
+            actions.ask(viewer, phrase)
+        level = {"subpart": 0, "part": 1}.get(request.level, 2)
+        actions.set_display(viewer, request.display, level)
+
+    def _dropped(self, window: object, paths: list[str]) -> None:
+        if paths:
+            actions.open_scene(self.viewer, Path(paths[0]))
+
+    def _gui(self) -> None:
+        viewer = self.viewer
+        actions.tick(viewer, imgui.get_time())
+        area = layout.scene_area(viewer)
+        scale = imgui.get_io().display_framebuffer_scale
+        viewer.state.size = (
+            max(1, round(area.width * scale.x)),
+            max(1, round(area.height * scale.y)),
+        )
+        layout.draw(viewer, self._dialog)
+        navigation.handle(viewer, layout.scene_area(viewer))
+        busy = self._unfinished or viewer.state.glide is not None
+        hello_imgui.get_runner_params().fps_idling.enable_idling = not busy
+
+    def _picture(self) -> None:
+        """Bring the picture up to date and put it behind the panels."""
+        canvas, state = self._canvas, self.viewer.state
+        if canvas is None or self._screen is None:
+            return
+        try:
+            self._unfinished = canvas.update(state, imgui.get_time())
+        except (LangSplatError, moderngl.Error, MemoryError) as error:
+            self._unfinished = False
+            state.say(one_line(error), is_error=True)
+        self._screen.use()
+        self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
+        if canvas.texture is not None:
+            area = layout.scene_area(self.viewer)
+            imgui.get_background_draw_list().add_image(
+                imgui.ImTextureRef(canvas.texture.glo),
+                ImVec2(area.left, area.top),
+                ImVec2(area.left + area.width, area.top + area.height),
+                ImVec2(0, 1),  # GL's first row is the lowest
+                ImVec2(1, 0),
+            )
+
+    def _stop(self) -> None:
+        self.viewer.worker.close()
+
+
+def _style() -> None:
+    """Calm and dark: one accent, little contrast between the widgets."""
+    hello_imgui.apply_theme(hello_imgui.ImGuiTheme_.darcula_darker)
+    style = imgui.get_style()
+    style.window_padding = ImVec2(12, 10)
+    style.item_spacing = ImVec2(8, 6)
+    style.frame_rounding = 4
+    style.window_border_size = 0

@@ -1,0 +1,79 @@
+"""A scene of three blobs with known meanings, and a text encoder that knows their names."""
+
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.arrays import Array, logit, unit
+from langsplat_core.scene import Camera, Gaussians, LanguageField, LinearCodec, Scene, look_at
+
+WORDS = ("mug", "book", "plant")  # each an axis of the vector space; the fourth is the canonical phrases'
+CENTRES = np.array([[-1.2, 0.0, 0.0], [0.0, 0.0, 0.0], [1.2, 0.0, 0.0]])
+COLOURS = np.array([[0.8, 0.2, 0.2], [0.2, 0.7, 0.2], [0.2, 0.3, 0.8]])
+PER_BLOB = 120
+DIM = 8
+
+
+def axis(index: int) -> Array:
+    return np.eye(DIM, dtype=np.float32)[index]
+
+
+def blobs(seed: int = 0) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    means = np.repeat(CENTRES, PER_BLOB, 0) + rng.normal(scale=0.18, size=(3 * PER_BLOB, 3))
+    n = len(means)
+    return Gaussians(
+        means=means,
+        log_scales=np.full((n, 3), np.log(0.08)),
+        quats_wxyz=np.tile([1.0, 0, 0, 0], (n, 1)),
+        opacity_logits=np.full(n, logit(np.array(0.85))),
+        sh=((np.repeat(COLOURS, PER_BLOB, 0) - 0.5) / 0.2820948)[:, None],
+    )
+
+
+def language(phrasebook: bool = False) -> LanguageField:
+    """Each blob means its word at level "whole"; at "part" all blobs mean "plant"; "subpart" is unobserved."""
+    latents = np.zeros((3, 3 * PER_BLOB, 4), np.float32)
+    latents[2] = np.repeat(np.eye(4, dtype=np.float32)[:3], PER_BLOB, 0)
+    latents[1] = unit(0.6 * np.eye(4)[2] + 0.8 * np.eye(4)[3])
+    confidence = np.ones((3, 3 * PER_BLOB), np.float32)
+    confidence[0] = 0
+    return LanguageField(
+        latents=latents,
+        confidence=confidence,
+        codec=LinearCodec(np.eye(4, DIM, dtype=np.float32)),
+        canonical=np.tile(axis(3), (4, 1)),
+        encoder_id="fake",
+        phrasebook={"book": axis(1)} if phrasebook else {},
+    )
+
+
+def cameras(count: int = 3) -> tuple[Camera, ...]:
+    """Views from in front (-z) along an arc; y points down."""
+    up = np.array([0.0, -1.0, 0.0])
+    found = []
+    for index in range(count):
+        angle = 0.5 * (index - (count - 1) / 2)
+        eye = 5 * np.array([np.sin(angle), -0.15, -np.cos(angle)])
+        view = look_at(eye, np.zeros(3), up, (160, 120))
+        found.append(Camera(160, 120, view.fx, view.fy, 80, 60, view.world_to_camera, f"photo_{index}"))
+    return tuple(found)
+
+
+def blob_scene(*, field: bool = True, with_cameras: bool = True, phrasebook: bool = False) -> Scene:
+    return Scene(
+        blobs(),
+        language(phrasebook) if field else None,
+        cameras() if with_cameras else (),
+        Path("blobs.ply"),
+    )
+
+
+class FakeEncoder:
+    """Knows `WORDS`."""
+
+    def encode_texts(self, texts: list[str]) -> Array:
+        return np.stack([axis(WORDS.index(text)) for text in texts])
+
+    def unknown_words(self, text: str) -> tuple[str, ...]:
+        return tuple(word for word in text.split() if word not in WORDS)
