@@ -13,6 +13,7 @@ from langsplat_core.formats import cameras_json, language
 from langsplat_core.formats.cameras_json import read_cameras, write_cameras
 from langsplat_core.formats.langsplat_features import read_features, write_features
 from langsplat_core.formats.language import read_language, rematch_language, write_language
+from langsplat_core.formats.opening import exists
 from langsplat_core.formats.ply import read_ply, write_ply
 from langsplat_core.formats.sog import META_NAME, read_sog
 from langsplat_core.scene import Gaussians, Scene
@@ -45,16 +46,16 @@ def load_gaussians(path: Path | str) -> Gaussians:
     the rules of its format.
     """
     path = Path(path)
+    if not exists(path):
+        raise InputError(f"{path}: no such file; check the spelling and the folder")
     if path.suffix.lower() == ".ply" and not path.is_dir():
         return read_ply(path)
-    if path.suffix.lower() == ".sog" or path.name == META_NAME or (path / META_NAME).exists():
+    if path.suffix.lower() == ".sog" or path.name == META_NAME or exists(path / META_NAME):
         return read_sog(path)
     if path.is_dir():
         inside = sorted(path.glob("**/*.ply"))
         hint = f"; perhaps {inside[-1]}" if inside else ""
         raise InputError(f"{path}: a folder without {META_NAME} is not a scene{hint}")
-    if not path.exists():
-        raise InputError(f"{path}: no such file; check the spelling and the folder")
     raise InputError(f"{path}: not a scene of a known kind; supported: {SUPPORTED}")
 
 
@@ -71,8 +72,8 @@ def load_scene(path: Path | str) -> Scene:
     cameras = _cameras_path(path)
     return Scene(
         gaussians,
-        read_language(sidecar, gaussians.means) if sidecar.exists() else None,
-        read_cameras(cameras) if cameras.exists() else (),
+        read_language(sidecar, gaussians.means) if exists(sidecar) else None,
+        read_cameras(cameras) if exists(cameras) else (),
         path,
     )
 
@@ -113,6 +114,6 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
 
 def _cameras_path(scene: Path) -> Path:
     beside = companion_path(scene, cameras_json.SUFFIX)
-    if not beside.exists() and scene.name == "point_cloud.ply":
+    if not exists(beside) and scene.name == "point_cloud.ply":
         return scene.parent.parent.parent / "cameras.json"
     return beside

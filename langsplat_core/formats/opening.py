@@ -29,6 +29,14 @@ def open_for_reading(path: Path) -> tuple[BinaryIO, int]:
         raise InputError(f"{path}: cannot be opened ({error})") from None
 
 
+def exists(path: Path) -> bool:
+    """`Path.exists`, where a name too long or a folder that may not be searched means no."""
+    try:
+        return path.exists()
+    except OSError:
+        return False
+
+
 def read_json_file(path: Path, limit: int) -> Any:
     """The value in a JSON file of at most `limit` bytes. Raises InputError and FormatError."""
     file, size = open_for_reading(path)

@@ -92,10 +92,9 @@ def _parse(lines: list[str], size: int, path: Path) -> PlyHeader:
     comments: list[str] = []
     elements: list[PlyElement] = []
     for line in lines:
-        keyword, _, rest = line.partition(" ")
-        words = rest.split()
+        keyword, *words = line.split() or [""]
         if keyword in ("comment", "obj_info"):
-            comments.append(rest)
+            comments.append(line.removeprefix(keyword).strip())
         elif keyword == "format" and words and words[0] in BYTE_ORDERS:
             byte_order = BYTE_ORDERS[words[0]]
         elif keyword == "element" and len(words) == 2:

@@ -381,8 +381,11 @@ def test_what_is_not_a_scene(tmp_path):
     (tmp_path / "a.splat").write_bytes(b"x")
     with pytest.raises(InputError, match=r"a\.splat: not a scene of a known kind; supported: \.ply, .*\.sog"):
         load_scene(tmp_path / "a.splat")
-    with pytest.raises(InputError, match="no such file"):
-        load_scene(tmp_path / "nowhere")
+    for nowhere in ("nowhere", "nowhere.ply", "nowhere.sog", "n" * 5000 + ".ply", "nul\0.ply"):
+        with pytest.raises(InputError, match="no such file"):
+            load_scene(tmp_path / nowhere)
+    write_ply(tmp_path / ("n" * 240 + ".ply"), random_gaussians(1))  # its companions' names would be too long
+    assert load_scene(tmp_path / ("n" * 240 + ".ply")).language is None
     write_ply(tmp_path / "model" / "iteration_7" / "point_cloud.ply", random_gaussians(1))
     with pytest.raises(InputError, match=r"perhaps .*model/iteration_7/point_cloud\.ply"):
         load_scene(tmp_path / "model")

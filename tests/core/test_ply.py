@@ -48,10 +48,17 @@ def test_what_is_written_is_read_back_bit_for_bit(tmp_path, degree, count):
     assert_same(read_ply(tmp_path / "a.ply"), want)
 
 
-def test_more_rows_than_one_chunk(tmp_path):
+@pytest.mark.parametrize("encode", [plain_ply, ascii_ply])
+def test_more_rows_than_one_chunk(tmp_path, encode):
     want = random_gaussians(2 * 8192 + 3)
-    write_ply(tmp_path / "a.ply", want)
+    (tmp_path / "a.ply").write_bytes(encode(want))
     assert_same(read_ply(tmp_path / "a.ply"), want)
+
+
+def test_tabs_and_blank_lines_in_the_header(put):
+    want = random_gaussians(3)
+    content = plain_ply(want).replace(b"property float x\n", b"\nproperty\tfloat \t x\t\ncomment\n")
+    assert_same(read_ply(put(content)), want)
 
 
 def test_rows_that_cannot_be_drawn_are_kept_as_they_are(tmp_path):
