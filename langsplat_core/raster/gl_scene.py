@@ -50,7 +50,7 @@ class SceneTextures:
                 "use --backend cpu"
             )
         self.geometry = self._layers(self._geometry(kept), np.dtype(np.float32))
-        sh = kept.sh.reshape(len(kept), -1)
+        sh = kept.sh.reshape(len(kept), 3 * kept.sh.shape[1])
         self.sh = self._layers(np.clip(sh, -HALF_MAX, HALF_MAX) if half else sh, "f2" if half else "f4")
         self.placement, self.shape, self.colours = (ctx.texture(self.size, 4, dtype="f4") for _ in range(3))
         self.projected = ctx.framebuffer([self.placement, self.shape, self.colours])

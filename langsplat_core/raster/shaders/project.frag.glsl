@@ -84,10 +84,9 @@ void main() {
     // Rows of A = J W R diag(s); row vector times matrix.
     vec3 a0 = focal.x / z * ((vec3(1.0, 0.0, -clamped.x) * world_to_camera) * axes) * scales;
     vec3 a1 = focal.y / z * ((vec3(0.0, 1.0, -clamped.y) * world_to_camera) * axes) * scales;
-    vec3 largest = max(abs(a0), abs(a1));
-    float excess = max(max(largest.x, max(largest.y, largest.z)) / LARGEST_PX, 1.0);
-    a0 /= excess;
-    a1 /= excess;
+    vec3 keep = LARGEST_PX / max(max(abs(a0), abs(a1)), LARGEST_PX);  // per axis of the Gaussian
+    a0 *= keep;
+    a1 *= keep;
 
     float xx = dot(a0, a0), yy = dot(a1, a1), xy = dot(a0, a1);
     vec3 normal = cross(a0, a1);
