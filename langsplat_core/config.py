@@ -126,6 +126,20 @@ class TrainConfig:
     lift: LiftConfig = field(default_factory=LiftConfig)
 
 
+@dataclass(frozen=True)
+class DemoEncoderConfig:
+    """Training of the small CLIP that comes with the program (`langsplat demo encoder`)."""
+
+    rooms: int = 300  # random rooms that crops are rendered from
+    views: int = 3  # photographs of each room
+    plain_crops: int = 8_000  # crops of nothing but a colour or a texture
+    steps: int = 3_500
+    batch: int = 192  # crops per step
+    phrases: int = 192  # phrases per step
+    lr: float = 1e-3
+    seed: int = 0
+
+
 Display = Literal["rgb", "latent", "relevancy", "segmentation", "depth", "alpha"]
 LevelChoice = Literal["auto", "subpart", "part", "whole"]
 

@@ -1,0 +1,278 @@
+"""Training of the small CLIP that comes with the program, from pictures of procedural rooms alone.
+
+Each step shows the model a batch of crops and a sample of phrases, of which ground truth says which are
+right, wrong or neither for every crop. Three losses on their cosines: a sigmoid loss about a fixed cosine
+`PIVOT`, contrast over phrases and over crops with several right answers, and, for crops that show
+something nameable, canonical phrases held at `PIVOT`: above it a phrase is likelier than "object", below
+less likely, which is what relevancy asks.
+"""
+
+import json
+import math
+from collections import Counter
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import DemoEncoderConfig
+from langsplat_core.files import atomic_path
+from langsplat_core.progress import Progress
+from langsplat_core.scene import CANONICAL_PHRASES
+from langsplat_core.training.demo_crops import CROP, CropSet, read_crops, write_crops
+from langsplat_core.training.demo_phrases import (
+    CONTEXT,
+    PREFIXES,
+    PhraseBook,
+    phrase_book,
+    vocabulary,
+    write_tokenizer,
+)
+
+MEAN, STD = (0.32, 0.28, 0.25), (0.30, 0.28, 0.27)  # of the training crops, black surroundings included
+PIVOT = 0.3  # cosine between right and wrong, and of every nameable crop with the canonical phrases
+_SIGMOID_SCALE, _CONTRAST_SCALE = 14.0, 20.0
+_KEPT_PATCHES = 0.55  # share of the patches shown to the model during training (FLIP, Li et al. 2023)
+_AVERAGING = 0.998  # decay of the running mean of the weights, which is what is saved
+_SAVE_EVERY = 250  # steps
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """One training step's worth of data."""
+
+    pixels: Tensor  # (B, 3, 64, 64) float32, normalised
+    tokens: Tensor  # (P, L) int64, padded with the end token
+    fits: Tensor  # (B, P) int8: 1 right, 0 wrong, -1 neither
+    nameable: Tensor  # (B,) bool: False for clutter
+
+
+def build_model(tokens: int, start: int, end: int) -> Any:
+    """A `transformers.CLIPModel` of 2.4 million weights for a vocabulary of `tokens`."""
+    from transformers import CLIPConfig, CLIPModel
+
+    text = dict(
+        vocab_size=tokens, hidden_size=128, intermediate_size=512, num_hidden_layers=3, num_attention_heads=4,
+        max_position_embeddings=CONTEXT, projection_dim=512, bos_token_id=start, eos_token_id=end, pad_token_id=end,
+    )  # fmt: skip
+    vision = dict(
+        hidden_size=160, intermediate_size=640, num_hidden_layers=5, num_attention_heads=5,
+        image_size=CROP, patch_size=8, projection_dim=512,
+    )  # fmt: skip
+    model = CLIPModel(CLIPConfig(text_config=text, vision_config=vision, projection_dim=512))
+    model.set_attn_implementation("eager")  # on a CPU the fused one is four times slower to differentiate
+    return model
+
+
+def normalised(crops: Array) -> Tensor:
+    """(B, 64, 64, 3) uint8 -> (B, 3, 64, 64) float32 as the encoder takes them."""
+    pixels = torch.from_numpy(np.ascontiguousarray(crops)).permute(0, 3, 1, 2).float() / 255
+    return (pixels - torch.tensor(MEAN).view(3, 1, 1)) / torch.tensor(STD).view(3, 1, 1)
+
+
+class Sampler:
+    """Draws batches: crops of rare words more often, one right phrase per crop, and random others."""
+
+    def __init__(self, crops: CropSet, book: PhraseBook, token_of: dict[str, int], ends: tuple[int, int]) -> None:
+        self._crops = crops
+        self._book = book
+        row_of = {label: row for row, label in enumerate(book.labels)}
+        self._rows = np.array([row_of[label] for label in crops.labels])
+        keys = [(label.word, label.thing, label.level) for label in crops.labels]
+        count = Counter(keys)
+        weight = np.array([count[key] ** -0.6 for key in keys])
+        self._weight = weight / weight.sum()
+        self._start, self._end = ends
+        self._tokens = [[token_of[word] for word in phrase.split()] for phrase in book.phrases]
+        self._prefixes = [[token_of[word] for word in prefix.split()] for prefix in PREFIXES]
+        kinds = np.array(book.kinds)
+        self._kind_rows = [np.flatnonzero(kinds == kind) for kind in dict.fromkeys(book.kinds)]
+        self._right = [self._right_by_kind(row) for row in range(len(book.labels))]
+
+    def _right_by_kind(self, row: int) -> list[Array]:
+        fits = self._book.fits[row]
+        groups = [rows[fits[rows] == 1] for rows in self._kind_rows]
+        return [group for group in groups if len(group)]
+
+    def batch(self, config: DemoEncoderConfig, rng: np.random.Generator) -> Batch:
+        """The next batch of `config.batch` crops and `config.phrases` phrases."""
+        chosen = rng.choice(len(self._rows), config.batch, p=self._weight)
+        canonical = len(CANONICAL_PHRASES)
+        phrases = list(range(canonical))
+        for row in self._rows[chosen]:
+            groups = self._right[row]
+            phrases.append(int(rng.choice(groups[rng.integers(len(groups))])))
+        spare = rng.choice(len(self._book.phrases), config.phrases, replace=False)
+        unique = list(dict.fromkeys([*phrases, *map(int, spare)]))[: canonical + config.phrases]
+        rows = np.asarray(self._rows[chosen])
+        fits = torch.from_numpy(self._book.fits[rows][:, unique])
+        clutter = self._book.fits[rows][:, 0] == 1
+        pixels = _jitter(normalised(_flipped(self._crops.images[chosen], rng)), rng)
+        tokens = self._padded([self._dressed(k, rng) for k in unique])
+        return Batch(pixels, tokens, fits, torch.from_numpy(~clutter))
+
+    def _dressed(self, phrase: int, rng: np.random.Generator) -> list[int]:
+        """Tokens of a phrase with an article before it now and then; canonical phrases stay bare."""
+        prefix = self._prefixes[rng.integers(len(self._prefixes))] if phrase >= len(CANONICAL_PHRASES) else []
+        return [self._start, *prefix, *self._tokens[phrase], self._end]
+
+    def _padded(self, rows: list[list[int]]) -> Tensor:
+        longest = max(map(len, rows))
+        return torch.tensor([row + [self._end] * (longest - len(row)) for row in rows])
+
+
+def _flipped(images: Array, rng: np.random.Generator) -> Array:
+    mirror = rng.random(len(images)) < 0.5
+    return np.where(mirror[:, None, None, None], images[:, :, ::-1], images)
+
+
+def _jitter(pixels: Tensor, rng: np.random.Generator) -> Tensor:
+    """Small shifts of the picture and of its exposure."""
+    dy, dx = (int(v) for v in rng.integers(-3, 4, 2))
+    gain = torch.from_numpy(rng.normal(1, 0.06, (len(pixels), 1, 1, 1)).astype(np.float32))
+    black = -torch.tensor(MEAN).view(3, 1, 1) / torch.tensor(STD).view(3, 1, 1)
+    return torch.roll((pixels - black) * gain, (dy, dx), (2, 3)) + black
+
+
+def image_vectors(model: Any, pixels: Tensor, keep: float = 1.0) -> Tensor:
+    """(B, 512) unit vectors; `keep` < 1 shows the model a random share of the patches only."""
+    vision = model.vision_model
+    hidden = vision.embeddings(pixels)
+    if keep < 1:
+        count = hidden.shape[1] - 1
+        order = torch.rand(len(hidden), count).argsort(1)[:, : round(keep * count)] + 1
+        order = torch.cat([torch.zeros(len(hidden), 1, dtype=torch.long), order], 1)
+        hidden = hidden.gather(1, order[..., None].expand(-1, -1, hidden.shape[2]))
+    hidden = vision.encoder(inputs_embeds=vision.pre_layrnorm(hidden)).last_hidden_state[:, 0]
+    return F.normalize(model.visual_projection(vision.post_layernorm(hidden)).float(), dim=-1)
+
+
+def text_vectors(model: Any, tokens: Tensor) -> Tensor:
+    """(P, 512) unit vectors of (P, L) tokens."""
+    pooled = model.text_model(input_ids=tokens).pooler_output
+    return F.normalize(model.text_projection(pooled).float(), dim=-1)
+
+
+def loss_of(cosines: Tensor, fits: Tensor, nameable: Tensor) -> Tensor:
+    """Scalar loss of (B, P) cosines; the first four phrases are the canonical ones. See the module text."""
+    canonical = len(CANONICAL_PHRASES)
+    right, wrong = (fits == 1).float(), (fits == 0).float()
+    held = torch.zeros_like(wrong)
+    held[:, :canonical] = nameable[:, None].float()
+    wrong = wrong * (1 - held)
+    margin = _SIGMOID_SCALE * (cosines - PIVOT)
+    positive = (F.softplus(-margin) * right).sum() / right.sum().clamp(min=1)
+    negative = (F.softplus(margin) * wrong).sum() / len(cosines)
+    pinned = (((cosines - PIVOT) ** 2) * held).sum() / held.sum().clamp(min=1)
+    logits = _CONTRAST_SCALE * cosines
+    return positive + 0.5 * negative + 20 * pinned + _contrast(logits, right, wrong) + _contrast(logits.T, right.T, wrong.T)
+
+
+def _contrast(logits: Tensor, right: Tensor, wrong: Tensor) -> Tensor:
+    """Mean over right pairs of -log p(right among itself and every wrong one of its row)."""
+    others = torch.logsumexp(logits.masked_fill(wrong == 0, -1e4), 1, keepdim=True)
+    each = F.softplus(others - logits) * right
+    per_row = each.sum(1) / right.sum(1).clamp(min=1)
+    return per_row.sum() / (right.sum(1) > 0).sum().clamp(min=1)
+
+
+def train_demo_encoder(out: Path, config: DemoEncoderConfig, progress: Progress) -> None:
+    """Train the demo encoder into folder `out`, in the layout that `transformers` loads.
+
+    Crops and the state of the training are kept in `out`/work and reused by the next call with the same
+    settings; `out` itself always holds the best model so far. Deterministic for one number of threads.
+    """
+    work = out / "work"
+    write_crops(work / "crops", config, progress)
+    crops, _ = read_crops(work / "crops")
+    book = phrase_book(list(crops.labels))
+    words = vocabulary(book)
+    write_tokenizer(words, out)
+    from transformers import CLIPTokenizerFast
+
+    tokenizer = CLIPTokenizerFast.from_pretrained(out)
+    token_of = {word: tokenizer.convert_tokens_to_ids(f"{word}</w>") for word in words}
+    ends = (tokenizer.bos_token_id, tokenizer.eos_token_id)
+    sampler = Sampler(crops, book, token_of, ends)
+    torch.manual_seed(config.seed)
+    run = _Run(build_model(len(tokenizer), *ends), config)
+    run.resume(work / "state.pt")
+    while run.step < config.steps:
+        run.advance(sampler.batch(config, np.random.default_rng((config.seed, 17, run.step))))
+        progress(f"training: step {run.step}, loss {run.loss:.3f}", run.step / config.steps)
+        if run.step % _SAVE_EVERY == 0 or run.step == config.steps:
+            run.save(work / "state.pt")
+            export(run.mean, out)
+
+
+class _Run:
+    """Model, running mean of its weights, and optimiser."""
+
+    def __init__(self, model: Any, config: DemoEncoderConfig) -> None:
+        self.model, self.config, self.step, self.loss = model.train(), config, 0, math.nan
+        self.mean = type(model)(model.config)
+        self.mean.load_state_dict(model.state_dict())
+        matrices = [p for p in model.parameters() if p.ndim > 1]
+        others = [p for p in model.parameters() if p.ndim <= 1]
+        groups = [dict(params=matrices, weight_decay=0.05), dict(params=others, weight_decay=0.0)]
+        self.optimiser = torch.optim.AdamW(groups, lr=config.lr, betas=(0.9, 0.98))
+
+    def advance(self, batch: Batch) -> None:
+        """One step of AdamW on a warmed-up cosine schedule, in bfloat16 where that is fast."""
+        warm, done = min(1.0, (self.step + 1) / 300), self.step / self.config.steps
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.config.lr * warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * done)))
+        with torch.autocast("cpu", torch.bfloat16):
+            keep = _KEPT_PATCHES if done < 0.85 else 1.0
+            images = image_vectors(self.model, batch.pixels, keep)
+            texts = text_vectors(self.model, batch.tokens)
+        loss = loss_of(images @ texts.T, batch.fits, batch.nameable)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
+        self.optimiser.step()
+        self.step, self.loss = self.step + 1, float(loss.detach())
+        decay = min(_AVERAGING, self.step / (self.step + 20))
+        with torch.no_grad():
+            for mean, now in zip(self.mean.parameters(), self.model.parameters(), strict=True):
+                mean.lerp_(now, 1 - decay)
+
+    def save(self, path: Path) -> None:
+        """Write everything needed to go on."""
+        state = dict(
+            config=json.dumps(asdict(self.config)), step=self.step, model=self.model.state_dict(),
+            mean=self.mean.state_dict(), optimiser=self.optimiser.state_dict(),
+        )  # fmt: skip
+        with atomic_path(path) as temporary:
+            torch.save(state, temporary)
+
+    def resume(self, path: Path) -> None:
+        """Go on from `path` if it is there and was made with the same settings."""
+        if not path.exists():
+            return
+        state = torch.load(path, weights_only=True)
+        if state["config"] != json.dumps(asdict(self.config)):
+            return
+        self.step = state["step"]
+        self.model.load_state_dict(state["model"])
+        self.mean.load_state_dict(state["mean"])
+        self.optimiser.load_state_dict(state["optimiser"])
+
+
+def export(model: Any, out: Path) -> None:
+    """Write `model` in half precision, its configuration and how pictures are normalised."""
+    half = type(model)(model.config)
+    half.load_state_dict(model.state_dict())
+    half.half().save_pretrained(out)
+    settings = {
+        "image_processor_type": "CLIPImageProcessor", "image_mean": MEAN, "image_std": STD,
+        "do_center_crop": True, "do_convert_rgb": True, "do_normalize": True, "do_rescale": True, "do_resize": True,
+        "crop_size": {"height": CROP, "width": CROP}, "size": {"shortest_edge": CROP}, "resample": 2,
+        "rescale_factor": 1 / 255,
+    }  # fmt: skip
+    (out / "preprocessor_config.json").write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
