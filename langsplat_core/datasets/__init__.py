@@ -1,1 +1,51 @@
-""""""
+"""Photographs with cameras, whatever they came with."""
+
+from pathlib import Path
+
+from langsplat_core.config import DatasetConfig
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.colmap import find_model, load_colmap
+from langsplat_core.datasets.known_poses import add_points
+from langsplat_core.datasets.nerfstudio import load_nerfstudio
+from langsplat_core.datasets.photos import load_photos, photo_folder
+from langsplat_core.errors import InputError
+from langsplat_core.progress import Progress, silent
+
+__all__ = ["Capture", "load_capture"]
+
+ACCEPTED = (
+    "a folder with transforms.json (nerfstudio) or that file, a folder with sparse/0 and images (COLMAP), "
+    "or a folder of at least three photographs (jpg, png, webp, tif)"
+)
+
+
+def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progress = silent) -> Capture:
+    """Undistorted photographs of at most ``config.max_side`` pixels, their cameras and points.
+
+    Recognises, in this order, a nerfstudio ``transforms.json``, a COLMAP model, and plain photographs,
+    whose cameras are then found by structure from motion. A dataset with cameras but without points gets
+    triangulated ones. Whatever had to be computed is kept in ``work/sfm`` and not computed again for the
+    same photographs. The world is the dataset's own. What had to be left out is reported once, by a
+    warning of the logger "langsplat". Raises InputError where nothing usable remains.
+    """
+    path = Path(path)
+    if config.max_side < 16:
+        raise InputError(f"max_side is {config.max_side}; photographs need at least 16 pixels")
+    if not path.exists():
+        raise InputError(f"{path} does not exist; expected {ACCEPTED}")
+    capture = _load(path, config.max_side, work, progress)
+    return capture if len(capture.points) else add_points(capture, work, progress)
+
+
+def _load(path: Path, max_side: int, work: Path, progress: Progress) -> Capture:
+    if path.is_file() and path.suffix.lower() == ".json":
+        return load_nerfstudio(path, max_side, progress)
+    if (path / "transforms.json").is_file():
+        return load_nerfstudio(path / "transforms.json", max_side, progress)
+    model = find_model(path)
+    if model is not None:
+        return load_colmap(path, model, max_side, progress)
+    photos = photo_folder(path)
+    if photos is None:
+        raise InputError(f"{path} is no dataset; expected {ACCEPTED}")
+    return load_photos(photos, max_side, work, progress)

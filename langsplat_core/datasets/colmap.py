@@ -1,0 +1,98 @@
+"""Datasets with a COLMAP model: ``sparse/0`` or ``sparse`` beside ``images``."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.colmap_model import ModelCamera, SparseModel, has_model, read_model
+from langsplat_core.datasets.images import Photo, develop, shortened
+from langsplat_core.datasets.lens import (
+    BrownDistortion,
+    ColmapDistortion,
+    Distortion,
+    FisheyeDistortion,
+    Lens,
+)
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.progress import Progress
+
+log = logging.getLogger("langsplat")
+
+# COLMAP's mapper drops points above 4 px itself, so only models that were made otherwise lose any here.
+MAX_POINT_ERROR = 4.0  # pixels
+_BROWN = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+_FISHEYE = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
+_INTRINSICS = ("fx", "fy", "cx", "cy")
+
+
+def find_model(folder: Path) -> Path | None:
+    """The folder of the COLMAP model of a dataset, if it has one."""
+    return next((f for f in (folder / "sparse" / "0", folder / "sparse") if has_model(f)), None)
+
+
+def lens_of(camera: ModelCamera) -> Lens:
+    """The lens of a COLMAP camera; ValueError if its focal length is impossible."""
+    named = camera.named()
+    fx, fy, cx, cy = (named[key] for key in _INTRINSICS)
+    rest = {key: value for key, value in named.items() if key not in _INTRINSICS}
+    distortion: Distortion
+    if camera.model in _BROWN:
+        distortion = BrownDistortion(**rest)
+    elif camera.model in _FISHEYE:
+        distortion = FisheyeDistortion(**rest)
+    else:
+        distortion = ColmapDistortion(camera.model, camera.params, fx, fy, cx, cy)
+    return Lens(camera.width, camera.height, fx, fy, cx, cy, distortion)
+
+
+def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progress) -> Capture:
+    """The photographs of `folder` with the cameras and points of the model; see `load_capture`."""
+    model = read_model(model_folder)
+    photos = located_photos(model, _photo_folder(folder, model), model_folder)
+    missing = [photo.label for photo in photos if not photo.path.is_file()]
+    if missing and len(missing) == len(photos):
+        raise InputError(
+            f"none of the {len(photos)} photographs named by {model_folder} exists "
+            f"(first: {photos[0].path}); put them into {folder / 'images'}"
+        )
+    if missing:
+        log.warning(
+            "%d of %d photographs of the model do not exist and are left out: %s",
+            len(missing),
+            len(photos),
+            shortened(missing),
+        )
+    there = [photo for photo in photos if photo.path.is_file()]
+    cameras, images = develop(there, max_side, progress)
+    return Capture(cameras, images, *good_points(model))
+
+
+def _photo_folder(folder: Path, model: SparseModel) -> Path:
+    """``images`` if it is there, else the dataset's own folder."""
+    return folder / "images" if (folder / "images").is_dir() or not model.images else folder
+
+
+def located_photos(model: SparseModel, photo_folder: Path, source: Path) -> list[Photo]:
+    """The model's images as photographs in `photo_folder`; FormatError names `source` for a bad camera."""
+    lenses = {}
+    for camera_id, camera in model.cameras.items():
+        try:
+            lenses[camera_id] = lens_of(camera)
+        except ValueError as error:
+            raise FormatError(f"{source}: camera {camera_id}: {error}; export the model again") from None
+    return [
+        Photo(photo_folder / image.name, image.name, lenses[image.camera_id], image.world_to_camera)
+        for image in model.images
+    ]
+
+
+def good_points(model: SparseModel) -> tuple[Array, Array]:
+    """(M, 3) points and (M, 3) colours without those that are plainly wrong: not finite, seen by a single
+    image, or reprojected more than `MAX_POINT_ERROR` off. Unknown errors and tracks count as good."""
+    good = np.isfinite(model.points).all(1)
+    good &= ~(model.errors > MAX_POINT_ERROR)
+    good &= model.track_lengths != 1
+    return model.points[good], model.colours[good]

@@ -1,0 +1,160 @@
+"""Photographs: finding them, reading them whatever their kind, and making pinhole pictures of them."""
+
+import logging
+import struct
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from PIL import Image, ImageOps
+
+from langsplat_core.arrays import Array
+from langsplat_core.datasets.lens import Lens
+from langsplat_core.datasets.undistort import pinhole_for, resample, source_positions
+from langsplat_core.errors import InputError
+from langsplat_core.progress import Progress
+from langsplat_core.scene import Camera
+
+log = logging.getLogger("langsplat")
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
+ASPECT_TOLERANCE = 0.02  # shrunk copies round their sizes
+WORKERS = 2  # decoding and resampling release the interpreter; more would only hold more pixels
+# What Pillow raises for files that are not, or no longer, pictures.
+UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A photograph on disk and the camera it was taken with."""
+
+    path: Path
+    label: str  # path inside the dataset, "/" between its parts
+    lens: Lens
+    world_to_camera: Array  # (4, 4) float64, rigid
+    upright: bool = False  # the lens describes the photograph turned as its EXIF data ask
+
+
+def find_photos(folder: Path) -> list[Path]:
+    """Photographs directly in `folder`, by name; hidden files do not count."""
+    if not folder.is_dir():
+        return []
+    found = (p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and p.name[0] != ".")
+    return sorted(p for p in found if p.is_file())
+
+
+def shortened(names: Iterable[str], limit: int = 5) -> str:
+    """``a, b, c and 4 more``."""
+    listed = sorted(names)
+    rest = len(listed) - limit
+    return ", ".join(listed[:limit]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def unique_names(labels: Sequence[str]) -> list[str]:
+    """File stems where those differ from each other, else paths with "_" for "/" and for the suffix's dot."""
+    stems = [PurePosixPath(label).stem for label in labels]
+    if len(set(stems)) == len(stems):
+        return stems
+    paths = [str(PurePosixPath(label).with_suffix("")).replace("/", "_") for label in labels]
+    if len(set(paths)) == len(paths):
+        return paths
+    return [label.replace("/", "_").replace(".", "_") for label in labels]
+
+
+def read_photo(path: Path, upright: bool) -> Image.Image:
+    """An RGB picture; transparent pixels are laid over black, 16 bits become 8.
+
+    With `upright` it is turned as its EXIF data ask. Raises one of `UNREADABLE`.
+    """
+    with Image.open(path) as opened:
+        picture = upright_copy(opened) if upright else opened
+        if picture.mode.startswith("I") or picture.mode == "F":  # Pillow's own conversion would clip
+            values = np.asarray(picture, np.float64)
+            if picture.mode == "F" or values.max(initial=0) > 65535:
+                raise ValueError("more than 16 bits per channel")
+            return Image.fromarray((values / 257 + 0.5).astype(np.uint8)).convert("RGB")
+        if picture.has_transparency_data:
+            black = Image.new("RGBA", picture.size, (0, 0, 0, 255))
+            return Image.alpha_composite(black, picture.convert("RGBA")).convert("RGB")
+        return picture.convert("RGB")
+
+
+def upright_copy(picture: Image.Image) -> Image.Image:
+    """Turned as the EXIF data ask; unreadable EXIF data count as none."""
+    try:
+        return ImageOps.exif_transpose(picture)
+    except (SyntaxError, ValueError, KeyError, TypeError, struct.error):
+        return picture.copy()
+
+
+def _read_for(photo: Photo) -> tuple[Image.Image, Lens]:
+    """The picture, and the photo's lens on its pixel grid.
+
+    COLMAP reads pixels as stored, other tools turn them first; when the stored shape does not fit the
+    lens but the turned one does, the latter is meant.
+    """
+    picture = read_photo(photo.path, photo.upright)
+    if not photo.upright and not _fits(picture.size, photo.lens):
+        picture = read_photo(photo.path, upright=True)
+    if not _fits(picture.size, photo.lens):
+        lens = photo.lens
+        raise InputError(
+            f"{photo.path} is {picture.width}x{picture.height} pixels but its camera is "
+            f"{lens.width}x{lens.height}; use the photographs that the cameras were computed from"
+        )
+    return picture, photo.lens.resized(*picture.size)
+
+
+def _fits(size: tuple[int, int], lens: Lens) -> bool:
+    ratio = (size[0] * lens.height) / (size[1] * lens.width)
+    return (
+        abs(ratio - 1) < ASPECT_TOLERANCE or max(abs(size[0] - lens.width), abs(size[1] - lens.height)) <= 1
+    )
+
+
+def develop(
+    photos: Sequence[Photo], max_side: int, progress: Progress
+) -> tuple[tuple[Camera, ...], tuple[Array, ...]]:
+    """Pinhole cameras and (H, W, 3) uint8 pictures of `photos`, sorted by name.
+
+    Files that cannot be read are reported once and left out; InputError when none is left.
+    """
+    if not photos:
+        raise InputError("the dataset lists no photographs")
+    names = unique_names([photo.label for photo in photos])
+    order = sorted(range(len(photos)), key=names.__getitem__)
+
+    # Photographs of one lens share its pinhole and its map; a few maps are kept, not one per photograph.
+    @lru_cache(maxsize=4)
+    def plan(lens: Lens) -> tuple[Camera, Array | None]:
+        camera = pinhole_for(lens, max_side)
+        return camera, None if lens.distortion is None else source_positions(lens, camera)
+
+    def one(index: int) -> tuple[Camera, Array] | str:
+        photo = photos[index]
+        try:
+            picture, lens = _read_for(photo)
+        except UNREADABLE as error:
+            return f"{photo.label} ({error})"
+        camera, positions = plan(lens)
+        pose = replace(camera, world_to_camera=photo.world_to_camera, name=names[index])
+        return pose, resample(picture, lens, camera, positions)
+
+    done: list[tuple[Camera, Array]] = []
+    broken: list[str] = []
+    with ThreadPoolExecutor(WORKERS) as pool:
+        for count, result in enumerate(pool.map(one, order), 1):
+            if isinstance(result, str):
+                broken.append(result)
+            else:
+                done.append(result)
+            progress("reading photographs", count / len(order))
+    if not done:
+        raise InputError(f"no photograph can be read: {shortened(broken)}")
+    if broken:
+        log.warning("%d photographs cannot be read and are left out: %s", len(broken), shortened(broken))
+    cameras, images = zip(*done, strict=True)
+    return cameras, images

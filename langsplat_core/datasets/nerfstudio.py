@@ -1,0 +1,189 @@
+"""Datasets with a ``transforms.json``, as nerfstudio and instant-ngp write it.
+
+Poses are camera-to-world in OpenGL's frame (y up, looking along -z). An ``applied_transform`` has already
+been applied to both poses and points, so the world is taken as it stands.
+Layout: https://docs.nerf.studio/quickstart/data_conventions.html
+"""
+
+import json
+import logging
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
+
+from langsplat_core.arrays import Array
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.images import PHOTO_SUFFIXES, UNREADABLE, Photo, develop, shortened
+from langsplat_core.datasets.lens import BrownDistortion, Distortion, FisheyeDistortion, Lens
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.progress import Progress
+
+log = logging.getLogger("langsplat")
+
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+Json = dict[str, Any]
+
+
+def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
+    """The photographs and cameras that `file` lists; points only if it names a PLY."""
+    top = _read_json(file)
+    frames = top.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise FormatError(f'{file} has no list of "frames"; it is not a nerfstudio dataset')
+    photos: dict[str, Photo] = {}
+    missing = []
+    for number, frame in enumerate(frames):
+        where = f"{file}: frame {number}"
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise FormatError(f'{where} has no "file_path"; it is not a nerfstudio dataset')
+        label = frame["file_path"].replace("\\", "/")
+        path = _photo_file(file.parent, label)
+        size = None if path is None else _stored_size(path)
+        if path is None or size is None:
+            missing.append(label)
+            continue
+        try:
+            photos[label] = Photo(path, label, _lens({**top, **frame}, size), _pose(frame))
+        except ValueError as error:
+            raise FormatError(f"{where} ({label}): {error}") from None
+    _report_missing(file, missing, len(frames))
+    cameras, images = develop(list(photos.values()), max_side, progress)
+    return Capture(cameras, images, *_points(file, top.get("ply_file_path")))
+
+
+def _report_missing(file: Path, missing: list[str], total: int) -> None:
+    if len(missing) == total:
+        raise InputError(
+            f"none of the {total} photographs listed in {file} can be opened (first: {missing[0]}); "
+            "paths in it are relative to its folder"
+        )
+    if missing:
+        log.warning(
+            "%d of %d photographs in %s do not exist or cannot be opened and are left out: %s",
+            len(missing),
+            total,
+            file.name,
+            shortened(missing),
+        )
+
+
+def _read_json(file: Path) -> Json:
+    try:
+        top = json.loads(file.read_text(encoding="utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{file} is not valid JSON ({error})") from None
+    if not isinstance(top, dict):
+        raise FormatError(f"{file} is not a nerfstudio dataset: expected an object at the top")
+    return top
+
+
+def _photo_file(folder: Path, label: str) -> Path | None:
+    """The photograph called `label`; some datasets leave its suffix away."""
+    path = folder / label
+    candidates = [path, *(path.with_name(path.name + suffix) for suffix in PHOTO_SUFFIXES)]
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def _number(values: Json, key: str, default: float | None = None) -> float:
+    """A finite number; ValueError names the key."""
+    value = values.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f'"{key}" must be a finite number, got {value!r}')
+    return float(value)
+
+
+def _stored_size(path: Path) -> tuple[int, int] | None:
+    """Width and height in the file's header; None if it is no picture."""
+    try:
+        with Image.open(path) as picture:
+            return picture.size
+    except UNREADABLE:
+        return None
+
+
+def _lens(values: Json, size: tuple[int, int]) -> Lens:
+    """The lens of merged top-level and per-frame values; `size` counts where they give none."""
+    width, height = (round(_number(values, key, default)) for key, default in zip("wh", size, strict=True))
+    fx = _focal(values, "x", width, None)
+    return Lens(
+        width,
+        height,
+        fx,
+        _focal(values, "y", height, fx),
+        _number(values, "cx", width / 2),
+        _number(values, "cy", height / 2),
+        _distortion(values),
+    )
+
+
+def _focal(values: Json, axis: str, side: int, default: float | None) -> float:
+    """Pixels, from ``fl_*`` or the field of view ``camera_angle_*`` in radians."""
+    if f"fl_{axis}" in values:
+        return _number(values, f"fl_{axis}")
+    if f"camera_angle_{axis}" in values:
+        angle = _number(values, f"camera_angle_{axis}")
+        if not 0 < angle < math.pi:
+            raise ValueError(f'"camera_angle_{axis}" must lie between 0 and pi, got {angle}')
+        return 0.5 * side / math.tan(0.5 * angle)
+    if default is None:
+        raise ValueError(f'neither "fl_{axis}" nor "camera_angle_{axis}" is given')
+    return default
+
+
+def _distortion(values: Json) -> Distortion:
+    model = values.get("camera_model", "OPENCV")
+    k1, k2, k3, k4, p1, p2 = (_number(values, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if model == "OPENCV_FISHEYE" or values.get("is_fisheye") is True:
+        return FisheyeDistortion(k1, k2, k3, k4)
+    if model not in PERSPECTIVE:
+        raise ValueError(f'"camera_model" {model!r} is not one of {", ".join(PERSPECTIVE)}, OPENCV_FISHEYE')
+    if k4 != 0:
+        raise ValueError('"k4" has no agreed meaning for a perspective lens; undistort the photographs first')
+    return BrownDistortion(k1, k2, p1, p2, k3)
+
+
+def _pose(frame: Json) -> Array:
+    """(4, 4) world-to-camera in OpenCV's frame."""
+    try:
+        matrix = np.array(frame.get("transform_matrix"), np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
+        raise ValueError('"transform_matrix" must be 4x4 finite numbers')
+    camera_to_world = np.eye(4)
+    camera_to_world[:3] = matrix[:3]
+    # Rotations lose their last digits in text; anything further off is no rotation.
+    left, stretch, right = np.linalg.svd(camera_to_world[:3, :3])
+    if np.abs(stretch - 1).max() > 1e-2 or np.linalg.det(left @ right) < 0:
+        raise ValueError('"transform_matrix" is not a rotation with a translation')
+    camera_to_world[:3, :3] = left @ right
+    return np.linalg.inv(camera_to_world @ OPENGL_TO_OPENCV)
+
+
+def _points(file: Path, name: object) -> tuple[Array, Array]:
+    """(M, 3) float64 and (M, 3) uint8 of the PLY; none if the dataset names none or it is not there."""
+    none = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    if not isinstance(name, str) or not name:
+        return none
+    path = file.parent / name
+    if not path.is_file():
+        log.warning("%s names the points %s, which do not exist", file.name, name)
+        return none
+    try:
+        vertex = PlyData.read(path)["vertex"]
+        points = np.stack([vertex[axis] for axis in "xyz"], -1).astype(np.float64)
+    except (PlyHeaderParseError, PlyElementParseError, KeyError, ValueError, OSError, MemoryError) as error:
+        raise FormatError(f"{path} is no readable point cloud ({error}); remove ply_file_path") from None
+    try:
+        colours = np.stack([vertex[channel] for channel in ("red", "green", "blue")], -1)
+    except ValueError:
+        colours = np.full(points.shape, 128, np.uint8)
+    if colours.dtype.kind == "f":
+        colours = np.clip(np.rint(colours * 255), 0, 255)
+    finite = np.isfinite(points).all(1)
+    return points[finite], colours.astype(np.uint8)[finite]

@@ -1,0 +1,142 @@
+"""A plain folder of photographs: cameras by structure from motion."""
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from langsplat_core.datasets import sfm
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.colmap import good_points, located_photos
+from langsplat_core.datasets.colmap_model import SparseModel, has_model, read_model
+from langsplat_core.datasets.images import UNREADABLE, Photo, develop, find_photos, read_photo, shortened
+from langsplat_core.errors import InputError
+from langsplat_core.files import atomic_path
+from langsplat_core.progress import Progress
+
+log = logging.getLogger("langsplat")
+
+SFM_SIDE = 1600  # px, longer side of the copies that features are sought in
+MIN_PHOTOS = 3
+# EXIF tags from which COLMAP guesses the focal length: maker, model; focal length, same for 35 mm film.
+_MAIN_TAGS, _EXIF_IFD, _EXIF_TAGS = (0x010F, 0x0110), 0x8769, (0x920A, 0xA405)
+_ADVICE = "take more photographs, each sharing at least two thirds of its view with the next"
+
+
+@dataclass(frozen=True)
+class _Copy:
+    """A small upright copy of a photograph in the workspace."""
+
+    name: str
+    size: tuple[int, int]
+    optics: str  # maker, camera and focal length: photographs with the same share a camera
+
+
+def photo_folder(folder: Path) -> Path | None:
+    """Where the photographs of a dataset without cameras lie: in `folder` itself or one level down."""
+    candidates = (folder, folder / "images", folder / "photos")
+    return next((candidate for candidate in candidates if find_photos(candidate)), None)
+
+
+def load_photos(folder: Path, max_side: int, work: Path, progress: Progress) -> Capture:
+    """Locate the photographs in `folder` (kept in ``work/sfm``) and load them; see `load_capture`."""
+    paths = find_photos(folder)
+    if len(paths) < MIN_PHOTOS:
+        raise InputError(
+            f"{folder} has {len(paths)} photographs; at least {MIN_PHOTOS} are needed: {_ADVICE}"
+        )
+    stamps = [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in paths]
+    workspace = sfm.open_workspace(work, ["photographs", 1, str(folder.resolve()), SFM_SIDE, stamps])
+    numbered = {f"{index:05d}.jpg": path for index, path in enumerate(paths)}
+    if not has_model(workspace / "sparse"):
+        _reconstruct(workspace, numbered, progress)
+    model = read_model(workspace / "sparse")
+    _report_left_out(model, numbered)
+    located = located_photos(model, workspace / "images", workspace / "sparse")
+    photos = [
+        Photo(numbered[p.label], numbered[p.label].name, p.lens, p.world_to_camera, upright=True)
+        for p in located
+    ]
+    cameras, images = develop(photos, max_side, progress)
+    return Capture(cameras, images, *good_points(model))
+
+
+def _reconstruct(workspace: Path, numbered: dict[str, Path], progress: Progress) -> None:
+    copies = _small_copies(workspace / "images", numbered, progress)
+    try:
+        sfm.extract_features(workspace, _groups(copies), progress)
+        sfm.match_features(workspace, sfm.pairs_by_name([copy.name for copy in copies]), progress)
+        found = sfm.map_cameras(workspace, len(copies), progress)
+    except sfm.FAILURES as error:
+        raise InputError(
+            f"structure from motion failed ({str(error).splitlines()[0]}); remove {workspace} and try again"
+        ) from None
+    if found < MIN_PHOTOS:
+        raise InputError(f"only {found} of {len(copies)} photographs could be located together: {_ADVICE}")
+
+
+def _report_left_out(model: SparseModel, numbered: dict[str, Path]) -> None:
+    located = {image.name for image in model.images}
+    lost = [path.name for name, path in numbered.items() if name not in located]
+    if lost:
+        log.warning(
+            "%d of %d photographs could not be located and are left out: %s",
+            len(lost),
+            len(numbered),
+            shortened(lost),
+        )
+
+
+def _small_copies(folder: Path, numbered: dict[str, Path], progress: Progress) -> list[_Copy]:
+    """Copies that COLMAP can read and finds the same way up as we do; unreadable files are left out."""
+    copies, broken = [], []
+    for index, (name, path) in enumerate(numbered.items()):
+        progress("preparing photographs", index / len(numbered))
+        try:
+            if not (folder / name).is_file():
+                _write_copy(path, folder / name)
+            with Image.open(folder / name) as copy:
+                copies.append(_Copy(name, copy.size, str(_tags(copy.getexif()))))
+        except UNREADABLE as error:
+            broken.append(f"{path.name} ({error})")
+    progress("preparing photographs", 1.0)
+    if broken:
+        log.warning("%d photographs cannot be read: %s", len(broken), shortened(broken))
+    if len(copies) < MIN_PHOTOS:
+        raise InputError(f"only {len(copies)} photographs can be read; at least {MIN_PHOTOS} are needed")
+    return copies
+
+
+def _write_copy(path: Path, copy: Path) -> None:
+    picture = read_photo(path, upright=True)
+    picture.thumbnail((SFM_SIDE, SFM_SIDE), Image.Resampling.LANCZOS)
+    with atomic_path(copy) as temporary:
+        picture.save(temporary, quality=95, exif=_optics(path))
+
+
+def _optics(path: Path) -> Image.Exif:
+    """Only what tells the focal length: other tags, orientation first of all, would be wrong for a copy."""
+    kept = Image.Exif()
+    try:
+        with Image.open(path) as picture:
+            source = picture.getexif()
+            kept.update({tag: source[tag] for tag in _MAIN_TAGS if tag in source})
+            inner = source.get_ifd(_EXIF_IFD)
+            kept.get_ifd(_EXIF_IFD).update({tag: inner[tag] for tag in _EXIF_TAGS if tag in inner})
+        kept.tobytes()
+    except UNREADABLE:
+        return Image.Exif()
+    return kept
+
+
+def _tags(exif: Image.Exif) -> dict[int, object]:
+    return dict(exif) | dict(exif.get_ifd(_EXIF_IFD))
+
+
+def _groups(copies: list[_Copy]) -> list[sfm.Group]:
+    """One camera for all photographs of one size and one set of optics."""
+    members: dict[tuple[tuple[int, int], str], list[str]] = {}
+    for copy in copies:
+        members.setdefault((copy.size, copy.optics), []).append(copy.name)
+    return [sfm.Group(tuple(names), "SIMPLE_RADIAL", side=max(size)) for (size, _), names in members.items()]
