@@ -21,7 +21,7 @@ CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 VOCABULARY = "vocabulary.txt"  # beside the weights: the only words the encoder was taught, one per line
 WORD = re.compile(r"[^\W_]+(?:'[^\W_]+)?")
 EXAMPLES = 12  # known words to name where a phrase has an unknown one
-BATCH = 64  # phrases or pictures per forward pass
+TEXT_BATCH = 64  # phrases per forward pass
 
 
 class ClipTextEncoder:
@@ -54,7 +54,7 @@ class ClipTextEncoder:
         """
         for text in texts:
             self._check(text)
-        parts = [self._encode(list(texts[i : i + BATCH])) for i in range(0, len(texts), BATCH)]
+        parts = [self._encode(list(texts[i : i + TEXT_BATCH])) for i in range(0, len(texts), TEXT_BATCH)]
         return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
 
     def _check(self, text: str) -> None:
@@ -87,9 +87,10 @@ class ClipTextEncoder:
 class ClipEncoder:
     """Both halves of a CLIP model."""
 
-    def __init__(self, text: ClipTextEncoder, folder: Path, device: str) -> None:
+    def __init__(self, text: ClipTextEncoder, folder: Path, device: str, batch: int) -> None:
         from transformers import CLIPVisionModelWithProjection
 
+        self._batch = batch
         self._text = text
         self._device = device
         self._model: Any = _load(CLIPVisionModelWithProjection, "vision", text.id, folder, device)
@@ -118,13 +119,14 @@ class ClipEncoder:
         """As `ClipTextEncoder.encode_texts`."""
         return self._text.encode_texts(texts)
 
-    def encode_images(self, crops: Array | Sequence[Array], batch: int = BATCH) -> Array:
+    def encode_images(self, crops: Array | Sequence[Array]) -> Array:
         """(M, D) float32 unit vectors of M pictures (image_size, image_size, 3) uint8, display values."""
         size = self.image_size
         for crop in crops:
             if crop.shape != (size, size, 3):
                 raise ValueError(f"crops: expected {size} x {size} x 3 pictures, got shape {crop.shape}")
-        parts = [self._encode(np.stack(list(crops[i : i + batch]))) for i in range(0, len(crops), batch)]
+        starts = range(0, len(crops), self._batch)
+        parts = [self._encode(np.stack(list(crops[i : i + self._batch]))) for i in starts]
         return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
 
     def _encode(self, crops: Array) -> Array:
@@ -146,13 +148,14 @@ def load_text_encoder(model: str, device: str = "cpu") -> ClipTextEncoder:
     return ClipTextEncoder(model, clip_folder(model), torch_device(device))
 
 
-def load_clip(model: str, device: str = "auto") -> ClipEncoder:
+def load_clip(model: str, device: str = "auto", batch: int = 32) -> ClipEncoder:
     """Load both halves of `model`: a folder, a hub id, or "demo" for the bundled encoder.
 
+    batch: pictures per forward pass.
     Raises EncoderError where the weights are absent or are not those of a CLIP model.
     """
     folder, device = clip_folder(model), torch_device(device)
-    return ClipEncoder(ClipTextEncoder(model, folder, device), folder, device)
+    return ClipEncoder(ClipTextEncoder(model, folder, device), folder, device, batch)
 
 
 def clip_folder(model: str) -> Path:

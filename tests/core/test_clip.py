@@ -48,8 +48,8 @@ def crops(count: int) -> np.ndarray:
 
 def test_images_agree_with_the_whole_model(folder: Path) -> None:
     pictures = crops(5)
-    encoder = load_clip(str(folder), "cpu")
-    got = encoder.encode_images(pictures, batch=2)
+    encoder = load_clip(str(folder), "cpu", batch=2)
+    got = encoder.encode_images(pictures)
     assert (encoder.dim, encoder.image_size, encoder.id) == (24, SIDE, str(folder))
     model = CLIPModel.from_pretrained(folder).eval()
     pixels = (pictures / 255 - np.array(CLIP_MEAN)) / np.array(CLIP_STD)
