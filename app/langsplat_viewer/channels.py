@@ -8,7 +8,7 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, PictureConfig
 from langsplat_core.query.picture import Channels
-from langsplat_core.raster.numba_cpu import CpuRasterizer, CpuView
+from langsplat_core.raster import View, load_rasterizer
 from langsplat_core.raster.spherical_harmonics import colours
 from langsplat_core.scene import Camera, Gaussians, Scene
 
@@ -71,15 +71,20 @@ class CpuChannels:
     """Channels of one scene by the CPU rasterizer; the projection is kept while the camera rests."""
 
     def __init__(self) -> None:
-        self._rasterizer = CpuRasterizer()
-        self._view: CpuView | None = None
-        self._key: tuple[object, ...] = ()
+        self._rasterizer = load_rasterizer("cpu")
+        self._view: View | None = None
+        self._shown: tuple[Gaussians, tuple[object, ...]] | None = None  # what `_view` is a view of
 
-    def view(self, gaussians: Gaussians, camera: Camera) -> CpuView:
+    def view(self, gaussians: Gaussians, camera: Camera) -> View:
         """`gaussians` projected into `camera`."""
         key = camera_key(camera)
-        if self._view is None or self._view.gaussians is not gaussians or self._key != key:
-            self._view, self._key = self._rasterizer.view(gaussians, camera), key
+        if (
+            self._view is None
+            or self._shown is None
+            or self._shown[0] is not gaussians
+            or self._shown[1] != key
+        ):
+            self._view, self._shown = self._rasterizer.view(gaussians, camera), (gaussians, key)
         return self._view
 
     def render(self, scene: Scene, layers: Layers, camera: Camera, extra: Extra) -> Channels:

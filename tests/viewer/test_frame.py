@@ -1,0 +1,305 @@
+"""The frame renderer: composition, backends, caching, picking, headless pictures."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import Display, PictureConfig
+from langsplat_core.errors import BackendError
+from langsplat_core.query.picture import Channels, compose
+from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.scene import Camera, Gaussians, Scene, look_at
+from langsplat_viewer.channels import CpuChannels, Layers, depth_range
+from langsplat_viewer.frame import FrameRenderer, is_software
+from langsplat_viewer.headless import create_egl_context, render_picture
+from tests.scenes import random_camera, random_gaussians, random_values
+
+DISPLAYS: tuple[Display, ...] = ("rgb", "latent", "relevancy", "segmentation", "depth", "alpha")
+COUNT = 150
+SCENE = Scene(random_gaussians(COUNT, sh_degree=3))
+CAMERA = random_camera(1, distance=2.0)
+LATENT = random_values(COUNT, 3, 1)
+RELEVANCIES = random_values(COUNT, 2, 2)
+PEAKS = (0.9, 0.55)
+PICTURE = PictureConfig(background=(0.2, 0.5, 0.9))
+
+
+@pytest.fixture(params=["opengl", "cpu"])
+def frame(gl, request):
+    renderer = FrameRenderer(gl, request.param, "single")
+    renderer.set_scene(SCENE)
+    renderer.set_layers(LATENT, RELEVANCIES)
+    yield renderer
+    renderer.release()
+
+
+def largest_difference(a: Array, b: Array) -> int:
+    return int(np.abs(a.astype(int) - b.astype(int)).max())
+
+
+def random_channels(seed: int, queries: int) -> Channels:
+    """Alpha from 0 to 1 with many pixels about the gate, colours beyond 1, depths beyond the range."""
+    rng = np.random.default_rng(seed)
+    shape = (40, 50)
+    alpha = np.clip(rng.normal(0.4, 0.35, size=shape), 0, 1).astype(np.float32)
+    premultiplied = rng.uniform(size=(*shape, 3 + 3 + queries)).astype(np.float32) * alpha[..., None]
+    return Channels(
+        rgb=premultiplied[..., :3] * 1.3,
+        alpha=alpha,
+        latent=premultiplied[..., 3:6],
+        relevancies=premultiplied[..., 6:],
+        depth_sum=rng.uniform(0.5, 4.0, size=shape).astype(np.float32) * alpha,
+        depth_range=(1.0, 3.0),
+    )
+
+
+@pytest.mark.parametrize("queries", [1, 2, 3])
+@pytest.mark.parametrize("display", DISPLAYS)
+def test_the_shader_composes_as_numpy_does(gl, monkeypatch, display, queries):
+    channels = random_channels(queries, queries)
+    extra = Layers(LATENT, RELEVANCIES).extra(PictureConfig(display=display))
+    fields = {"latent": ("latent",), "relevancies": ("relevancies",), "depth": ("depth_sum",)}.get(extra, ())
+    others = {"latent", "relevancies", "depth_sum"} - set(fields)
+    shown = replace(channels, **dict.fromkeys(others))
+    monkeypatch.setattr(CpuChannels, "render", lambda *_: shown)
+    monkeypatch.setattr("langsplat_viewer.frame.depth_range", lambda *_: channels.depth_range)
+    renderer = FrameRenderer(gl, "cpu")
+    renderer.set_scene(SCENE)
+    renderer.set_layers(LATENT, random_values(COUNT, queries))
+    picture = replace(PICTURE, display=display, heat_opacity=0.8, dim=0.4, threshold=0.55, alpha_gate=0.25)
+    for peaks in ((), (0.9,), (0.9, 0.52, 0.7)[:queries]):
+        got = renderer.read(CAMERA.resized(50, 40), picture, peaks)
+        assert largest_difference(got, compose(shown, picture, peaks)) <= 1
+    renderer.release()
+
+
+@pytest.mark.parametrize("display", DISPLAYS)
+def test_the_picture_is_that_of_the_reference(frame, display):
+    """Either backend against float64 channels composed in NumPy. Pixels at a threshold or at a cut-off
+    of image formation may flip; all others agree to 2/255."""
+    picture = replace(PICTURE, display=display)
+    got = frame.read(CAMERA, picture, PEAKS)
+    assert got.shape == (CAMERA.height, CAMERA.width, 3)
+    difference = np.abs(got.astype(int) - reference_picture(picture)).max(-1)
+    assert (difference > 2).mean() <= 2e-3
+
+
+def reference_picture(picture: PictureConfig) -> Array:
+    from langsplat_core.raster.spherical_harmonics import colours
+
+    gaussians = SCENE.gaussians
+    view = ReferenceRasterizer().view(gaussians, CAMERA)
+    rgb = colours(gaussians.sh, gaussians.means, CAMERA.position)
+    image, alpha = view.splat(np.concatenate([rgb, LATENT, RELEVANCIES, view.footprints.depths[:, None]], 1))
+    depths = depth_range(gaussians, CAMERA)
+    channels = Channels(image[..., :3], alpha, image[..., 3:6], image[..., 6:8], image[..., 8], depths)
+    return compose(channels, picture, PEAKS)
+
+
+def test_the_backends_agree_on_a_screen(gl):
+    """Half floats, the viewer's default, against the CPU rasterizer."""
+    pictures = []
+    for backend in ("opengl", "cpu"):
+        renderer = FrameRenderer(gl, backend)
+        renderer.set_scene(SCENE)
+        pictures.append(renderer.read(CAMERA, PICTURE))
+        renderer.release()
+    assert largest_difference(*pictures) <= 3
+
+
+def test_a_missing_layer_shows_the_plain_colours(frame):
+    frame.set_layers(None, None)
+    plain = frame.read(CAMERA, PICTURE)
+    for display in ("latent", "relevancy", "segmentation"):
+        assert largest_difference(frame.read(CAMERA, replace(PICTURE, display=display)), plain) == 0
+
+
+def test_layers_of_another_shape_are_refused(frame):
+    with pytest.raises(ValueError, match="latent_rgb"):
+        frame.set_layers(LATENT[:-1], None)
+    with pytest.raises(ValueError, match="relevancies"):
+        frame.set_layers(None, random_values(COUNT, 4))
+
+
+def test_channels_are_kept_while_only_the_picture_settings_change(frame, monkeypatch):
+    calls = []
+    render = frame._source.render
+    monkeypatch.setattr(frame._source, "render", lambda *args: calls.append(args) or render(*args))
+    heat = replace(PICTURE, display="relevancy")
+    first = frame.read(CAMERA, heat, PEAKS)
+    assert largest_difference(first, frame.read(CAMERA, replace(heat, heat_opacity=0.1), PEAKS)) > 20
+    frame.read(CAMERA, replace(heat, display="segmentation"), PEAKS)
+    assert len(calls) == 1
+    frame.read(replace(CAMERA, name="same view"), heat, PEAKS)
+    assert len(calls) == 1
+    frame.read(random_camera(4), heat, PEAKS)
+    assert len(calls) == 2
+    frame.set_layers(LATENT, 1 - RELEVANCIES)
+    assert largest_difference(frame.read(CAMERA, heat, PEAKS), first) > 20
+    frame.set_scene(Scene(random_gaussians(20, 3)))
+    frame.read(CAMERA, heat)
+    assert len(calls) == 4
+
+
+def wall(colour: tuple[float, float, float], centre: tuple[float, float, float], width: float) -> Gaussians:
+    """One opaque disc that faces the z axis."""
+    return Gaussians(
+        means=np.array([centre]),
+        log_scales=np.log([[width, width, 1e-3]]),
+        quats_wxyz=np.array([[1.0, 0, 0, 0]]),
+        opacity_logits=np.array([np.inf]),
+        sh=((np.array([[colour]]) - 0.5) / 0.28209479),
+    )
+
+
+FRONT = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
+
+
+def test_row_0_is_the_top(gl):
+    """y points down: a red disc above the axis belongs into the upper half."""
+    for backend in ("opengl", "cpu"):
+        renderer = FrameRenderer(gl, backend)
+        renderer.set_scene(Scene(wall((1, 0, 0), (0, -1.0, 4.0), 0.2)))
+        red = renderer.read(FRONT, PictureConfig())[..., 0].astype(float)
+        assert red[:24].sum() > 100 * max(red[24:].sum(), 1)
+        renderer.release()
+
+
+def test_the_viewport_alone_is_drawn_and_stretched(gl, frame):
+    target = gl.framebuffer([gl.texture((200, 150), 4)])
+    target.clear(1.0, 0.0, 1.0)
+    target.viewport = (30, 20, 2 * CAMERA.width, 2 * CAMERA.height)
+    frame.draw(target, CAMERA, PICTURE)
+    assert gl.fbo is target
+    target.viewport = (0, 0, 200, 150)
+    pixels = np.frombuffer(target.read(components=3), np.uint8).reshape(150, 200, 3)[::-1]
+    inside = pixels[150 - 20 - 2 * CAMERA.height : 150 - 20, 30 : 30 + 2 * CAMERA.width]
+    small = inside.reshape(CAMERA.height, 2, CAMERA.width, 2, 3).mean((1, 3))
+    assert np.abs(small - frame.read(CAMERA, PICTURE)).mean() < 2
+    outside = np.ones((150, 200), bool)
+    outside[150 - 20 - 2 * CAMERA.height : 150 - 20, 30 : 30 + 2 * CAMERA.width] = False
+    assert (pixels[outside] == (255, 0, 255)).all()
+    gl.detect_framebuffer(0).use()
+    target.release()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks libGL.so.1")
+def test_a_user_interface_finds_a_plain_state(gl, frame):
+    from tests.core.test_gl_raster import gl_state
+
+    target = gl.framebuffer([gl.texture((64, 64), 4)])
+    target.use()
+    gl.enable_only(0)
+    before = gl_state()
+    frame.draw(target, CAMERA, replace(PICTURE, display="relevancy"), PEAKS)
+    np.testing.assert_array_equal(gl_state(), before)
+    gl.detect_framebuffer(0).use()
+    target.release()
+
+
+def test_picking_finds_the_surface(gl):
+    """An opaque disc at z = 4 behind a faint one at z = 2: the surface is the opaque one."""
+    solid, veil = wall((1, 1, 1), (0, 0, 4.0), 0.5), wall((0, 0, 1), (0, 0, 2.0), 0.5)
+    faint = replace(veil, opacity_logits=np.array([-1.0]))
+    fields = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh")
+    both = Gaussians(*(np.concatenate([getattr(solid, f), getattr(faint, f)]) for f in fields))
+    for backend in ("opengl", "cpu"):
+        renderer = FrameRenderer(gl, backend)
+        assert renderer.depth_at(32, 24) is None
+        renderer.set_scene(Scene(both))
+        assert renderer.depth_at(32, 24) is None  # nothing drawn yet
+        renderer.read(FRONT, PictureConfig())
+        assert renderer.depth_at(32.0, 24.0) == pytest.approx(4.0, rel=1e-5)
+        assert renderer.depth_at(0.5, 0.5) is None
+        assert renderer.depth_at(-1.0, 3.0) is None
+        assert renderer.depth_at(64.0, 3.0) is None
+        renderer.set_scene(Scene(faint))
+        renderer.read(FRONT, PictureConfig())
+        assert renderer.depth_at(32.0, 24.0) == pytest.approx(
+            2.0, rel=1e-5
+        )  # the mean: half is never reached
+        renderer.release()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 1), (33, 21), (70, 45)])
+def test_every_size(frame, size):
+    assert frame.read(CAMERA.resized(*size), PICTURE).shape == (size[1], size[0], 3)
+
+
+def test_without_a_scene_and_with_an_empty_one_the_background_shows(gl):
+    for backend in ("opengl", "cpu"):
+        renderer = FrameRenderer(gl, backend)
+        want = np.round(255 * np.array(PICTURE.background))
+        assert np.abs(renderer.read(CAMERA, PICTURE) - want).max() <= 1
+        renderer.set_scene(Scene(SCENE.gaussians.take(np.zeros(COUNT, bool))))
+        for display in ("rgb", "depth"):
+            picture = renderer.read(CAMERA, replace(PICTURE, display=display))
+            assert np.abs(picture - want).max() <= 1
+        assert renderer.depth_at(3, 3) is None
+        renderer.release()
+
+
+def test_auto_takes_the_cpu_where_the_driver_is_software(gl):
+    renderer = FrameRenderer(gl)
+    assert renderer.backend == ("cpu" if is_software(gl) else "opengl")
+    renderer.release()
+
+
+def test_depth_range_covers_what_is_in_view():
+    camera = look_at(np.array([0.0, 0, -5]), np.zeros(3), np.array([0.0, -1, 0]), (64, 48))
+    near, far = depth_range(random_gaussians(500), camera)
+    assert 4 < near < 4.6
+    assert 5.4 < far < 6
+    assert depth_range(random_gaussians(0), camera) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize("display", DISPLAYS)
+def test_headless_pictures_agree(gl, display):
+    picture = replace(PICTURE, display=display)
+    layers = {"latent_rgb": LATENT, "relevancies": RELEVANCIES, "heat_peaks": PEAKS}
+    with_gl = render_picture(SCENE, CAMERA, picture, backend="opengl", **layers)
+    without = render_picture(SCENE, CAMERA, picture, backend="cpu", **layers)
+    difference = np.abs(with_gl.astype(int) - without).max(-1)
+    assert np.quantile(difference, 0.95) <= 4  # half floats, and heat colours that magnify them
+
+
+NO_DRIVER = """
+import sys
+from langsplat_core.errors import BackendError
+from langsplat_viewer.headless import create_egl_context, render_picture
+from langsplat_core.config import PictureConfig
+from langsplat_core.scene import Scene
+from tests.scenes import random_camera, random_gaussians
+scene = Scene(random_gaussians(20))
+for backend in ("auto", "cpu"):
+    assert render_picture(scene, random_camera(), PictureConfig(), backend=backend).any()
+try:
+    render_picture(scene, random_camera(), PictureConfig(), backend="opengl")
+except BackendError as error:
+    assert "libegl1" in str(error) and "--backend cpu" in str(error) and "\\n" not in str(error)
+    print("refused")
+print([name for name in ("glfw", "imgui_bundle") if name in sys.modules])
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="hides EGL's drivers from its loader")
+def test_without_any_driver_the_cpu_still_makes_pictures():
+    hidden = {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent.json"}
+    run = subprocess.run(
+        [sys.executable, "-c", NO_DRIVER], env=os.environ | hidden, capture_output=True, text=True
+    )
+    assert run.stdout.split("\n")[:2] == ["refused", "[]"], run.stderr
+
+
+def test_an_absent_driver_is_one_line(monkeypatch):
+    def fail(**_):
+        raise Exception("libEGL.so not loaded")
+
+    monkeypatch.setattr("moderngl.create_context", fail)
+    with pytest.raises(BackendError, match="libgl1-mesa-dri"):
+        create_egl_context()
