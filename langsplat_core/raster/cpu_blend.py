@@ -10,12 +10,13 @@ A pixel's transmittance is stored negative once the pixel has stopped: its size 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 
+from langsplat_core.arrays import Array
 from langsplat_core.config import RasterSettings
 from langsplat_core.raster import cpu_project as cp
-from langsplat_core.raster.cpu_tiles import TILE, spread
+from langsplat_core.raster.cpu_tiles import TILE, Tiles, spread
 from langsplat_core.raster.lanes import (
+    Lanes,
     exp2,
     lanes,
     largest,
@@ -27,9 +28,10 @@ from langsplat_core.raster.lanes import (
     where_at_least,
     where_greater,
 )
+from langsplat_core.raster.workers import helper, kernel
 
 PIXELS = TILE * TILE
-_CHECK_EVERY = 16  # Gaussians between two looks at whether a tile still has running pixels
+CHECK_EVERY = 16  # Gaussians between two looks at whether a tile still has running pixels
 
 
 class Cutoffs(NamedTuple):
@@ -44,8 +46,8 @@ def make_cutoffs(settings: RasterSettings) -> Cutoffs:
     return Cutoffs(float(settings.alpha_min), float(settings.alpha_max), float(settings.transmittance_min))
 
 
-@njit(cache=True, forceinline=True)
-def start_tile(transmittance, x0, y0, width, height):
+@helper
+def start_tile(transmittance: Array, x0: int, y0: int, width: int, height: int) -> None:
     """Transmittance 1 inside the image; pixels of the tile beyond its border have stopped already."""
     for row in range(TILE):
         for column in range(TILE):
@@ -53,8 +55,8 @@ def start_tile(transmittance, x0, y0, width, height):
             transmittance[row * TILE + column] = 1.0 if inside else -1.0
 
 
-@njit(cache=True, forceinline=True)
-def running_rows(transmittance, low, high):
+@helper
+def running_rows(transmittance: Array, low: int, high: int) -> tuple[int, int]:
     """Shrink rows [low, high) to those that begin and end with a row that has a running pixel."""
     while low < high and largest(load(transmittance, low * TILE)) <= 0:
         low += 1
@@ -63,15 +65,23 @@ def running_rows(transmittance, low, high):
     return low, high
 
 
-@njit(cache=True, forceinline=True)
-def row_offsets(g, x, y):
+@helper
+def rows_to_blend(packed: int, top: int, bottom: int) -> tuple[int, int]:
+    """`Tiles.rows` of an intersection, within the running rows [top, bottom)."""
+    return max(packed & 255, top), min(packed >> 8, bottom)
+
+
+@helper
+def row_offsets(g: Array, x: float, y: float) -> tuple[float, float]:
     """w of the row's first pixel, v of the row (see `cpu_project`) for the pixel centre (x, y), float64."""
     dy = y - g[cp.MEAN_Y]
     return g[cp.FACTOR_A] * (x - g[cp.MEAN_X] - g[cp.FACTOR_K] * dy), g[cp.FACTOR_C] * dy
 
 
-@njit(cache=True, forceinline=True)
-def blend_row(transmittance, at, w, log2_height, cutoffs):
+@helper
+def blend_row(
+    transmittance: Array, at: int, w: Lanes, log2_height: float, cutoffs: Cutoffs
+) -> tuple[Lanes, Lanes]:
     """Step 3 and 4 for one row: returns alpha (0 where the Gaussian is not added) and T before it."""
     before = load(transmittance, at)
     alpha = smaller(exp2(log2_height - w * w), cutoffs.alpha_max)
@@ -82,8 +92,10 @@ def blend_row(transmittance, at, w, log2_height, cutoffs):
     return where_at_least(alpha, cutoffs.alpha_min, added, 0.0), before
 
 
-@njit(cache=True)
-def _splat_tile(tile, tiles, geometry, values, cutoffs, image, alpha):
+@helper
+def _splat_tile(
+    tile: int, tiles: Tiles, geometry: Array, values: Array, cutoffs: Cutoffs, image: Array, alpha: Array
+) -> None:
     height, width, channels = image.shape
     x0, y0 = tile % tiles.columns * TILE, tile // tiles.columns * TILE
     transmittance = np.empty(PIXELS, np.float32)
@@ -92,14 +104,15 @@ def _splat_tile(tile, tiles, geometry, values, cutoffs, image, alpha):
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
     top, bottom = 0, TILE
     for s in range(first, last):
-        if (s - first) % _CHECK_EVERY == _CHECK_EVERY - 1:
+        if (s - first) % CHECK_EVERY == CHECK_EVERY - 1:
             top, bottom = running_rows(transmittance, top, bottom)
             if top >= bottom:
                 break
-        rank, rows = tiles.ranks[s], np.int64(tiles.rows[s])
+        rank = tiles.ranks[s]
+        low, high = rows_to_blend(tiles.rows[s], top, bottom)
         g = geometry[rank]
         step = ramp() * g[cp.FACTOR_A]
-        for row in range(max(rows & 255, top), min(rows >> 8, bottom)):
+        for row in range(low, high):
             w, v = row_offsets(g, x0 + 0.5, y0 + row + 0.5)
             added, before = blend_row(
                 transmittance, row * TILE, step + w, g[cp.LOG2_OPACITY] - v * v, cutoffs
@@ -115,16 +128,25 @@ def _splat_tile(tile, tiles, geometry, values, cutoffs, image, alpha):
                 image[y0 + row, x0 + column, channel] = sums[(row * channels + channel) * TILE + column]
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def splat(tiles, geometry, values, cutoffs, image, alpha):
+@kernel
+def splat(
+    first: int,
+    last: int,
+    tiles: Tiles,
+    geometry: Array,
+    values: Array,
+    cutoffs: Cutoffs,
+    image: Array,
+    alpha: Array,
+) -> None:
     """(M, C) values in depth order -> fills (H, W, C) image and (H, W) alpha, all float32."""
     count = tiles.starts.shape[0] - 1
-    for i in prange(count):
+    for i in range(first, last):
         _splat_tile(spread(i, count), tiles, geometry, values, cutoffs, image, alpha)
 
 
-@njit(cache=True, forceinline=True)
-def load_tile(planes, image, x0, y0):
+@helper
+def load_tile(planes: Array, image: Array, x0: int, y0: int) -> None:
     """planes[(row, channel, column)] <- the tile of (H, W, C) image at (x0, y0); 0 beyond its border."""
     height, width, channels = image.shape
     planes[:] = 0
@@ -134,8 +156,8 @@ def load_tile(planes, image, x0, y0):
                 planes[(row * channels + channel) * TILE + column] = image[y0 + row, x0 + column, channel]
 
 
-@njit(cache=True, forceinline=True)
-def correlate(planes, channels, weights, low, high, out):
+@helper
+def correlate(planes: Array, channels: int, weights: Array, low: int, high: int, out: Array) -> None:
     """out[channel] <- sum over rows [low, high) of weights (stored from row `low`) times planes."""
     for channel in range(channels):
         acc = lanes(np.float32(0))
@@ -144,8 +166,10 @@ def correlate(planes, channels, weights, low, high, out):
         out[channel] = total(acc)
 
 
-@njit(cache=True)
-def _gather_tile(tile, tiles, geometry, image, cutoffs, partial):
+@helper
+def _gather_tile(
+    tile: int, tiles: Tiles, geometry: Array, image: Array, cutoffs: Cutoffs, partial: Array
+) -> None:
     height, width, channels = image.shape
     x0, y0 = tile % tiles.columns * TILE, tile // tiles.columns * TILE
     transmittance = np.empty(PIXELS, np.float32)
@@ -156,13 +180,12 @@ def _gather_tile(tile, tiles, geometry, image, cutoffs, partial):
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
     top, bottom = 0, TILE
     for s in range(first, last):
-        if (s - first) % _CHECK_EVERY == _CHECK_EVERY - 1:
+        if (s - first) % CHECK_EVERY == CHECK_EVERY - 1:
             top, bottom = running_rows(transmittance, top, bottom)
             if top >= bottom:
                 partial[s:last] = 0
                 break
-        rows = np.int64(tiles.rows[s])
-        low, high = max(rows & 255, top), min(rows >> 8, bottom)
+        low, high = rows_to_blend(tiles.rows[s], top, bottom)
         g = geometry[tiles.ranks[s]]
         step = ramp() * g[cp.FACTOR_A]
         for row in range(low, high):
@@ -174,18 +197,20 @@ def _gather_tile(tile, tiles, geometry, image, cutoffs, partial):
         correlate(planes, channels, weights, low, high, partial[s])
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def gather(tiles, geometry, image, cutoffs, partial):
+@kernel
+def gather(
+    first: int, last: int, tiles: Tiles, geometry: Array, image: Array, cutoffs: Cutoffs, partial: Array
+) -> None:
     """(H, W, C) float32 image -> fills (I, C) partial sums of ``W^T y``, one row per intersection."""
     count = tiles.starts.shape[0] - 1
-    for i in prange(count):
+    for i in range(first, last):
         _gather_tile(spread(i, count), tiles, geometry, image, cutoffs, partial)
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def sum_partials(tiles, order, partial, out):
+@kernel
+def sum_partials(first: int, last: int, tiles: Tiles, order: Array, partial: Array, out: Array) -> None:
     """out[order[rank]] <- sum of the rank's partial sums, in the order of its tiles (so: reproducible)."""
-    for rank in prange(order.shape[0]):
+    for rank in range(first, last):
         for channel in range(out.shape[1]):
             acc = 0.0
             for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):
@@ -193,8 +218,10 @@ def sum_partials(tiles, order, partial, out):
             out[order[rank], channel] = acc
 
 
-@njit(cache=True)
-def _median_tile(tile, tiles, geometry, depths, cutoffs, out):
+@helper
+def _median_tile(
+    tile: int, tiles: Tiles, geometry: Array, depths: Array, cutoffs: Cutoffs, out: Array
+) -> None:
     height, width = out.shape
     x0, y0 = tile % tiles.columns * TILE, tile // tiles.columns * TILE
     transmittance = np.empty(PIXELS, np.float32)
@@ -202,10 +229,11 @@ def _median_tile(tile, tiles, geometry, depths, cutoffs, out):
     found = np.zeros(PIXELS, np.float32)
     half = np.float32(0.5)
     for s in range(tiles.starts[tile], tiles.starts[tile + 1]):
-        rank, rows = tiles.ranks[s], np.int64(tiles.rows[s])
+        rank = tiles.ranks[s]
+        low, high = rows_to_blend(tiles.rows[s], 0, TILE)
         g = geometry[rank]
         step = ramp() * g[cp.FACTOR_A]
-        for row in range(rows & 255, rows >> 8):
+        for row in range(low, high):
             w, v = row_offsets(g, x0 + 0.5, y0 + row + 0.5)
             at = row * TILE
             added, before = blend_row(transmittance, at, step + w, g[cp.LOG2_OPACITY] - v * v, cutoffs)
@@ -217,9 +245,11 @@ def _median_tile(tile, tiles, geometry, depths, cutoffs, out):
             out[y0 + row, x0 + column] = found[row * TILE + column]
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def median_depth(tiles, geometry, depths, cutoffs, out):
+@kernel
+def median_depth(
+    first: int, last: int, tiles: Tiles, geometry: Array, depths: Array, cutoffs: Cutoffs, out: Array
+) -> None:
     """(M,) depths in depth order -> (H, W) depth of the Gaussian that takes T to 0.5 or below, else 0."""
     count = tiles.starts.shape[0] - 1
-    for i in prange(count):
+    for i in range(first, last):
         _median_tile(spread(i, count), tiles, geometry, depths, cutoffs, out)

@@ -15,18 +15,39 @@ is not, so float32 pixels suffice.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import RasterSettings
+from langsplat_core.raster.workers import helper, kernel
 from langsplat_core.scene import Camera
 
 INVALID, UNDRAWN, DRAWN = 0, 1, 2  # what `project` says of a row
 MEAN_X, MEAN_Y, FACTOR_A, FACTOR_K, FACTOR_C, LOG2_OPACITY, HALF_WIDTH, HALF_HEIGHT = range(8)  # columns
 HALF_LOG2_E = 0.5 / np.log(2.0)
 LN2 = np.log(2.0)
-_COMPENSATION_MIN = 0.005**2  # floor of det before / det after dilation, as gsplat has it
+COMPENSATION_MIN = 0.005**2  # floor of det before / det after dilation, as gsplat has it
 _MAX_LOG_SCALE, _MIN_QUAT_SQUARED, _INFINITY_BITS = 80.0, 1e-24, 0x7F800000  # see Gaussians.valid
+
+
+Point = tuple[float, float, float]
+
+
+class Rows(NamedTuple):
+    """N Gaussians as `Gaussians` stores them."""
+
+    means: Array  # (N, 3) float32
+    log_scales: Array  # (N, 3) float32
+    quats_wxyz: Array  # (N, 4) float32
+    opacity_logits: Array  # (N,) float32
+    sh_bits: Array  # (N, 3 K) uint32: the SH coefficients' bits, only to see whether they are finite
+
+
+class Footprints(NamedTuple):
+    """What `project` fills in."""
+
+    geometry: Array  # (N, 8) float64, columns MEAN_X to HALF_HEIGHT; only where DRAWN
+    depths: Array  # (N,) float64 camera z; only where DRAWN
+    status: Array  # (N,) uint8
 
 
 class Lens(NamedTuple):
@@ -74,8 +95,8 @@ def make_lens(camera: Camera, settings: RasterSettings) -> Lens:
     )
 
 
-@njit(cache=True, forceinline=True)
-def _camera_point(mean, lens):
+@helper
+def camera_point(mean: Array, lens: Lens) -> Point:
     r, t = lens.rotation, lens.translation
     m0, m1, m2 = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
     return (
@@ -85,19 +106,19 @@ def _camera_point(mean, lens):
     )
 
 
-@njit(cache=True, forceinline=True)
-def _jacobian(x, y, z, lens):
+@helper
+def _jacobian(x: float, y: float, z: float, lens: Lens) -> tuple[float, float, float, float]:
     """Non-zero entries (0,0), (0,2), (1,1), (1,2) of d(pixel)/d(camera point), taken at the clamped point."""
     tx = min(max(x / z, -lens.left), lens.right)
     ty = min(max(y / z, -lens.top), lens.bottom)
     return lens.fx / z, -lens.fx * tx / z, lens.fy / z, -lens.fy * ty / z
 
 
-@njit(cache=True, forceinline=True)
-def _fill_axes(camera_point, log_scales, quat, lens, work):
-    """work[0] <- rotation of the quaternion, work[1] <- B = J R (two rows), work[2] <- A = B rotation diag(s);
-    returns the scales and the inverse length of the quaternion."""
-    x, y, z = camera_point
+@helper
+def fill_axes(point: Point, log_scales: Array, quat: Array, lens: Lens, work: Array) -> tuple[Point, float]:
+    """work[0] <- rotation of the quaternion, work[1] <- B = J R (two rows), work[2] <- A = B rotation
+    diag(s); returns the scales s and the inverse length of the quaternion."""
+    x, y, z = point
     j00, j02, j11, j12 = _jacobian(x, y, z, lens)
     q0, q1, q2, q3 = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
     inverse = 1 / np.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
@@ -133,8 +154,8 @@ def _fill_axes(camera_point, log_scales, quat, lens, work):
     return scales, inverse
 
 
-@njit(cache=True, forceinline=True)
-def _covariance(a, dilation):
+@helper
+def covariance(a: Array, dilation: float) -> tuple[float, float, float, float, float]:
     """2D covariance xx, xy, yy with dilation, its determinant, and the determinant before dilation.
 
     det(A A^T) = |row0 x row1|^2 (Cauchy-Binet): no cancellation, however thin the needle.
@@ -149,16 +170,17 @@ def _covariance(a, dilation):
     return xx + dilation, xy, yy + dilation, sharp + dilation * (xx + yy) + dilation * dilation, sharp
 
 
-@njit(cache=True, forceinline=True)
-def _opacity(logit):
+@helper
+def opacity_of(logit: float) -> float:
     e = np.exp(-abs(np.float64(logit)))
     return (1.0 if logit >= 0 else e) / (1 + e)
 
 
-@njit(cache=True, forceinline=True)
-def _is_valid(mean, log_scales, quat, logit, sh_bits):
+@helper
+def _is_valid(rows: Rows, i: int) -> bool:
     """The compiled twin of `Gaussians.valid`."""
-    ok = not np.isnan(logit)
+    mean, log_scales, quat, sh_bits = rows.means[i], rows.log_scales[i], rows.quats_wxyz[i], rows.sh_bits[i]
+    ok = not np.isnan(rows.opacity_logits[i])
     squared = 0.0
     for n in range(3):
         ok &= np.isfinite(mean[n]) & (log_scales[n] <= _MAX_LOG_SCALE)
@@ -170,26 +192,26 @@ def _is_valid(mean, log_scales, quat, logit, sh_bits):
     return ok & np.isfinite(squared) & (squared > _MIN_QUAT_SQUARED) & (highest < np.uint32(_INFINITY_BITS))
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def project(means, log_scales, quats, logits, sh_bits, lens, geometry, depths, status):
-    """Fill `geometry` (N, 8), `depths` (N,) and `status` (N,) for N Gaussians.
+@kernel
+def project(first: int, last: int, rows: Rows, lens: Lens, out: Footprints) -> None:
+    """Fill `out` for rows [first, last).
 
     A Gaussian whose alpha = alpha_min contour meets no pixel centre is UNDRAWN.
     """
-    for i in prange(means.shape[0]):
-        if not _is_valid(means[i], log_scales[i], quats[i], logits[i], sh_bits[i]):
-            status[i] = INVALID
+    work = np.empty((3, 3, 3))
+    for i in range(first, last):
+        if not _is_valid(rows, i):
+            out.status[i] = INVALID
             continue
-        status[i] = UNDRAWN
-        x, y, z = _camera_point(means[i], lens)
-        opacity = _opacity(logits[i])
+        out.status[i] = UNDRAWN
+        x, y, z = camera_point(rows.means[i], lens)
+        opacity = opacity_of(rows.opacity_logits[i])
         if not (z > lens.near and opacity >= lens.alpha_min):
             continue
-        work = np.empty((3, 3, 3))
-        _fill_axes((x, y, z), log_scales[i], quats[i], lens, work)
-        xx, xy, yy, det, sharp = _covariance(work[2], lens.dilation)
+        fill_axes((x, y, z), rows.log_scales[i], rows.quats_wxyz[i], lens, work)
+        xx, xy, yy, det, sharp = covariance(work[2], lens.dilation)
         if lens.antialiased:
-            opacity *= np.sqrt(max(sharp / det, _COMPENSATION_MIN))
+            opacity *= np.sqrt(max(sharp / det, COMPENSATION_MIN))
             if opacity < lens.alpha_min:
                 continue
         reach = np.sqrt(2 * np.log(max(opacity / lens.alpha_min, 1.0)))
@@ -197,12 +219,12 @@ def project(means, log_scales, quats, logits, sh_bits, lens, geometry, depths, s
         wide, high = reach * np.sqrt(xx), reach * np.sqrt(yy)
         if u + wide < 0.5 or u - wide > lens.width - 0.5 or v + high < 0.5 or v - high > lens.height - 0.5:
             continue
-        status[i] = DRAWN
-        depths[i] = z
-        row = geometry[i]
-        row[MEAN_X], row[MEAN_Y] = u, v
-        row[FACTOR_A] = np.sqrt(HALF_LOG2_E * yy / det)
-        row[FACTOR_K] = xy / yy
-        row[FACTOR_C] = np.sqrt(HALF_LOG2_E / yy)
-        row[LOG2_OPACITY] = np.log2(opacity)
-        row[HALF_WIDTH], row[HALF_HEIGHT] = wide, high
+        out.status[i] = DRAWN
+        out.depths[i] = z
+        g = out.geometry[i]
+        g[MEAN_X], g[MEAN_Y] = u, v
+        g[FACTOR_A] = np.sqrt(HALF_LOG2_E * yy / det)
+        g[FACTOR_K] = xy / yy
+        g[FACTOR_C] = np.sqrt(HALF_LOG2_E / yy)
+        g[LOG2_OPACITY] = np.log2(opacity)
+        g[HALF_WIDTH], g[HALF_HEIGHT] = wide, high

@@ -3,17 +3,25 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import cpu_project as cp
+from langsplat_core.raster.workers import Workers, helper, kernel
 
 TILE = 16
 _BLOCKS = 16  # pieces of the depth order that are binned side by side; the result does not depend on it
 _SLACK = 1e-3  # px by which footprints are widened here; the blending kernels test alpha itself
 _MOST = 2**31 - 1  # intersections of Gaussians and tiles in one view
 _DIGIT = 11  # bits per pass of the radix sort
+
+
+class Grid(NamedTuple):
+    """An image cut into tiles."""
+
+    width: float  # px; a float, as it is compared with floats
+    height: float
+    columns: int  # tiles per row of tiles
 
 
 class Tiles(NamedTuple):
@@ -27,8 +35,8 @@ class Tiles(NamedTuple):
     columns: int  # tiles per row of tiles
 
 
-@njit(cache=True, nogil=True)
-def depth_order(status, depth_bits):
+@kernel
+def depth_order(status: Array, depth_bits: Array) -> Array:
     """(N,) status and depths reinterpreted as uint64 -> (M,) int32 drawn rows, by depth, ties by index.
 
     Positive floats order as their bits do. Least significant digit first, each pass stable.
@@ -67,20 +75,20 @@ def depth_order(status, depth_bits):
     return order
 
 
-@njit(cache=True, forceinline=True)
-def _span(centre, low, high, size):
+@helper
+def _span(centre: float, low: float, high: float, size: float) -> tuple[int, int]:
     """Pixels [first, last) of `size` whose centres lie in [centre + low, centre + high]."""
     first = min(max(np.ceil(centre + low - 0.5 - _SLACK), 0.0), size)
     last = min(max(np.floor(centre + high - 0.5 + _SLACK) + 1, 0.0), size)
     return int(first), int(last)
 
 
-@njit(cache=True, forceinline=True)
-def _rows_in_column(g, column, height):
+@helper
+def _rows_in_column(g: Array, column: int, height: float) -> tuple[int, int]:
     """Pixel rows [first, last) in which the footprint `g` meets a column of tiles.
 
-    At abscissa dx the ellipse spans dy = slope dx +- bulge sqrt(half_width^2 - dx^2); its highest point over a
-    strip of columns is the ellipse's own, or else on the border nearest to that.
+    At abscissa dx the ellipse spans dy = slope dx +- bulge sqrt(half_width^2 - dx^2); its lowest point over
+    a strip of columns is the ellipse's own, or else on the strip's border nearest to that.
     """
     a2, c2, k = g[cp.FACTOR_A] * g[cp.FACTOR_A], g[cp.FACTOR_C] * g[cp.FACTOR_C], g[cp.FACTOR_K]
     across = a2 * k * k + c2
@@ -94,26 +102,32 @@ def _rows_in_column(g, column, height):
     return _span(g[cp.MEAN_Y], low, high, height)
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def _count(geometry, width, height, columns, counts, firsts):
-    """counts[block, tile] and firsts[rank + 1] <- how many intersections there are."""
+@helper
+def _columns_touched(g: Array, grid: Grid) -> tuple[int, int]:
+    first, last = _span(g[cp.MEAN_X], -g[cp.HALF_WIDTH], g[cp.HALF_WIDTH], grid.width)
+    return first // TILE, (last + TILE - 1) // TILE if last > first else first // TILE
+
+
+@kernel
+def _count(first: int, last: int, geometry: Array, grid: Grid, counts: Array, firsts: Array) -> None:
+    """For blocks [first, last): counts[block, tile] and firsts[rank + 1] <- how many intersections."""
     share = (geometry.shape[0] + _BLOCKS - 1) // _BLOCKS
-    for block in prange(_BLOCKS):
+    for block in range(first, last):
         for rank in range(block * share, min(geometry.shape[0], (block + 1) * share)):
             g = geometry[rank]
-            first, last = _span(g[cp.MEAN_X], -g[cp.HALF_WIDTH], g[cp.HALF_WIDTH], width)
+            left, right = _columns_touched(g, grid)
             touched = 0
-            for column in range(first // TILE, (last + TILE - 1) // TILE if last > first else 0):
-                low, high = _rows_in_column(g, column, height)
+            for column in range(left, right):
+                low, high = _rows_in_column(g, column, grid.height)
                 if low < high:
-                    touched += (high - 1) // TILE - low // TILE + 1
                     for row in range(low // TILE, (high - 1) // TILE + 1):
-                        counts[block, row * columns + column] += 1
+                        counts[block, row * grid.columns + column] += 1
+                        touched += 1
             firsts[rank + 1] = touched
 
 
-@njit(cache=True, nogil=True)
-def _accumulate(counts, starts, firsts):
+@kernel
+def _accumulate(counts: Array, starts: Array, firsts: Array) -> None:
     """Running sums: starts, firsts, and counts[block, tile] <- where the block writes in the tile."""
     total = 0
     for tile in range(counts.shape[1]):
@@ -125,60 +139,62 @@ def _accumulate(counts, starts, firsts):
         firsts[rank] += firsts[rank - 1]
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def _place(geometry, width, height, columns, places, firsts, ranks, rows, slots):
-    """The loop of `_count` again, now writing; within a tile ranks ascend, whatever the thread count."""
+@kernel
+def _place(first: int, last: int, geometry: Array, grid: Grid, places: Array, tiles: Tiles) -> None:
+    """The loop of `_count` again, now writing; within a tile ranks ascend, whoever runs which block."""
     share = (geometry.shape[0] + _BLOCKS - 1) // _BLOCKS
-    for block in prange(_BLOCKS):
+    for block in range(first, last):
         for rank in range(block * share, min(geometry.shape[0], (block + 1) * share)):
             g = geometry[rank]
-            mine = firsts[rank]
-            first, last = _span(g[cp.MEAN_X], -g[cp.HALF_WIDTH], g[cp.HALF_WIDTH], width)
-            for column in range(first // TILE, (last + TILE - 1) // TILE if last > first else 0):
-                low, high = _rows_in_column(g, column, height)
+            mine = tiles.firsts[rank]
+            left, right = _columns_touched(g, grid)
+            for column in range(left, right):
+                low, high = _rows_in_column(g, column, grid.height)
                 if low >= high:
                     continue
                 for row in range(low // TILE, (high - 1) // TILE + 1):
-                    place = places[block, row * columns + column]
-                    places[block, row * columns + column] = place + 1
-                    ranks[place] = rank
-                    rows[place] = max(low - row * TILE, 0) + 256 * min(high - row * TILE, TILE)
-                    slots[mine] = place
+                    tile = row * grid.columns + column
+                    place = places[block, tile]
+                    places[block, tile] = place + 1
+                    tiles.ranks[place] = rank
+                    tiles.rows[place] = max(low - row * TILE, 0) + 256 * min(high - row * TILE, TILE)
+                    tiles.slots[mine] = place
                     mine += 1
 
 
-def bin_tiles(geometry: Array, width: int, height: int) -> Tiles:
+def bin_tiles(geometry: Array, width: int, height: int, workers: Workers) -> Tiles:
     """(M, 8) geometry in depth order -> the intersections with the tiles of a width x height image."""
     columns, lines = -(-width // TILE), -(-height // TILE)
+    grid = Grid(float(width), float(height), columns)
     counts = np.zeros((_BLOCKS, columns * lines), np.int64)
-    starts = np.zeros(columns * lines + 1, np.int64)
+    starts = np.empty(columns * lines + 1, np.int64)
     firsts = np.zeros(len(geometry) + 1, np.int64)
-    _count(geometry, float(width), float(height), columns, counts, firsts)
+    workers.run(_count, _BLOCKS, geometry, grid, counts, firsts)
     _accumulate(counts, starts, firsts)
     total = int(starts[-1])
     if total > _MOST:
         raise BackendError(
-            f"{total} overlaps of Gaussians and tiles are too many for the CPU rasterizer; render a smaller image"
+            f"{total} overlaps of Gaussians and tiles are too many for the CPU rasterizer: "
+            "render a smaller image"
         )
     ranks, rows, slots = np.empty(total, np.int32), np.empty(total, np.uint16), np.empty(total, np.int32)
-    _place(geometry, float(width), float(height), columns, counts, firsts, ranks, rows, slots)
-    return Tiles(starts, ranks, rows, firsts, slots, columns)
+    tiles = Tiles(starts, ranks, rows, firsts, slots, columns)
+    workers.run(_place, _BLOCKS, geometry, grid, counts, tiles)
+    return tiles
 
 
-@njit(cache=True, forceinline=True)
-def spread(index, count):
+@helper
+def spread(index: int, count: int) -> int:
     """A permutation of range(count) whose every stretch samples the whole image evenly.
 
-    Threads take contiguous shares of a loop; busy tiles are contiguous too.
+    Threads take contiguous pieces of a loop over tiles, and busy tiles lie together. The stride is near the
+    golden section of `count` and prime to it.
     """
     stride = max(int(count * 0.6180339887), 1)
-    while _gcd(stride, count) != 1:
+    while True:
+        a, b = stride, count
+        while b != 0:
+            a, b = b, a % b
+        if a == 1:
+            return (index * stride) % count
         stride += 1
-    return (index * stride) % count
-
-
-@njit(cache=True)
-def _gcd(a, b):
-    while b:
-        a, b = b, a % b
-    return a

@@ -4,22 +4,20 @@ Results do not depend on the number of threads: tiles are independent, and sums 
 per Gaussian in a fixed order.
 """
 
-import threading
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster import cpu_backward, cpu_blend, cpu_project, cpu_tiles
+from langsplat_core.raster import cpu_backward, cpu_blend, cpu_project, cpu_tiles, cpu_unproject
 from langsplat_core.raster.protocol import DepthKind
+from langsplat_core.raster.workers import Workers
 from langsplat_core.scene import Camera, Gaussians
 
 _CHANNELS_AT_ONCE = 32  # a tile's state stays in the first level cache
-
-# One of numba's threading layers aborts the process when two Python threads start kernels at once; every
-# kernel uses all cores anyway, so the window's and the worker's calls take turns.
-_KERNELS = threading.RLock()
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,40 +35,39 @@ class GaussianGradients:
 class CpuView:
     """M drawn of N Gaussians, in depth order, with their tiles."""
 
-    def __init__(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> None:
+    def __init__(
+        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, workers: Workers
+    ) -> None:
         n = len(gaussians)
-        self.gaussians, self.camera = gaussians, camera
+        self.camera = camera
+        self._count, self._workers = n, workers
         self._lens = cpu_project.make_lens(camera, settings)
         self._cutoffs = cpu_blend.make_cutoffs(settings)
-        geometry, depths, status = np.empty((n, 8)), np.zeros(n), np.empty(n, np.uint8)
-        with _KERNELS:
-            cpu_project.project(
-                gaussians.means,
-                gaussians.log_scales,
-                gaussians.quats_wxyz,
-                gaussians.opacity_logits,
-                gaussians.sh.reshape(n, gaussians.sh.shape[1] * 3).view(np.uint32),
-                self._lens,
-                geometry,
-                depths,
-                status,
-            )
-            self._order = cpu_tiles.depth_order(status, depths.view(np.uint64))
-            self._geometry = geometry[self._order]
-            self._tiles = cpu_tiles.bin_tiles(self._geometry, camera.width, camera.height)
-        self._depths = depths[self._order]
-        self.dropped = int(np.count_nonzero(status == cpu_project.INVALID))
+        self._rows = cpu_project.Rows(
+            gaussians.means,
+            gaussians.log_scales,
+            gaussians.quats_wxyz,
+            gaussians.opacity_logits,
+            gaussians.sh.reshape(n, gaussians.sh.shape[1] * 3).view(np.uint32),
+        )
+        found = cpu_project.Footprints(np.empty((n, 8)), np.empty(n), np.empty(n, np.uint8))
+        workers.run(cpu_project.project, n, self._rows, self._lens, found)
+        self._order = cpu_tiles.depth_order(found.status, found.depths.view(np.uint64))
+        self._geometry, self._depths = found.geometry[self._order], found.depths[self._order]
+        self._tiles = cpu_tiles.bin_tiles(self._geometry, camera.width, camera.height, workers)
+        self.dropped = int(np.count_nonzero(found.status == cpu_project.INVALID))
 
     @property
     def radii(self) -> Array:
         """(N,) float32 px: the greater half extent of each footprint; 0 where nothing is drawn."""
-        radii = np.zeros(len(self.gaussians), np.float32)
-        radii[self._order] = self._geometry[:, cpu_project.HALF_WIDTH :].max(1)
+        radii = np.zeros(self._count, np.float32)
+        touches = np.diff(self._tiles.firsts) > 0
+        radii[self._order] = np.where(touches, self._geometry[:, cpu_project.HALF_WIDTH :].max(1), 0)
         return radii
 
     def splat(self, values: Array) -> tuple[Array, Array]:
         """See `View.splat`; float32. Values must be finite."""
-        check_array("values", values, (len(self.gaussians), "C"))
+        check_array("values", values, (self._count, "C"))
         ordered = np.asarray(values, np.float32)[self._order]
         height, width, channels = self.camera.height, self.camera.width, ordered.shape[1]
         alpha = np.empty((height, width), np.float32)
@@ -78,8 +75,7 @@ class CpuView:
         for start in range(0, max(channels, 1), _CHANNELS_AT_ONCE):
             part = np.ascontiguousarray(ordered[:, start : start + _CHANNELS_AT_ONCE])
             image = np.empty((height, width, part.shape[1]), np.float32)
-            with _KERNELS:
-                cpu_blend.splat(self._tiles, self._geometry, part, self._cutoffs, image, alpha)
+            self._over_tiles(cpu_blend.splat, part, self._cutoffs, image, alpha)
             parts.append(image)
         return parts[0] if len(parts) == 1 else np.concatenate(parts, -1), alpha
 
@@ -87,14 +83,15 @@ class CpuView:
         """See `LiftingView.gather`; float32, summed in float64 over tiles."""
         check_array("image", image, (self.camera.height, self.camera.width, "C"))
         channels = image.shape[2]
-        values = np.zeros((len(self.gaussians), channels), np.float32)
+        values = np.zeros((self._count, channels), np.float32)
         for start in range(0, channels, _CHANNELS_AT_ONCE):
             part = np.ascontiguousarray(image[..., start : start + _CHANNELS_AT_ONCE], np.float32)
             partial = np.empty((len(self._tiles.ranks), part.shape[2]), np.float32)
-            out = np.zeros((len(self.gaussians), part.shape[2]), np.float32)
-            with _KERNELS:
-                cpu_blend.gather(self._tiles, self._geometry, part, self._cutoffs, partial)
-                cpu_blend.sum_partials(self._tiles, self._order, partial, out)
+            out = np.zeros((self._count, part.shape[2]), np.float32)
+            self._over_tiles(cpu_blend.gather, part, self._cutoffs, partial)
+            self._workers.run(
+                cpu_blend.sum_partials, len(self._order), self._tiles, self._order, partial, out
+            )
             values[:, start : start + _CHANNELS_AT_ONCE] = out
         return values
 
@@ -105,51 +102,57 @@ class CpuView:
 
         They are those of image formation as it is: 0 through a capped alpha and across the cut-offs.
         """
-        n, height, width = len(self.gaussians), self.camera.height, self.camera.width
+        n, height, width = self._count, self.camera.height, self.camera.width
         channels = check_array("values", values, (n, "C"))["C"]
         check_array("image_grad", image_grad, (height, width, channels))
         if alpha_grad is None:
             alpha_grad = np.zeros((height, width), np.float32)
         check_array("alpha_grad", alpha_grad, (height, width))
         ordered = np.ascontiguousarray(np.asarray(values, np.float32)[self._order])
-        image_grad = np.ascontiguousarray(image_grad, np.float32)
-        alpha_grad = np.ascontiguousarray(alpha_grad, np.float32)[..., None]
-        g = self.gaussians
-        parameters = (g.means, g.log_scales, g.quats_wxyz, g.opacity_logits)
-        gradients = (*(np.zeros_like(parameter) for parameter in parameters), np.zeros((n, 2), np.float32))
-        by_values = np.zeros((n, channels), np.float32)
+        grads = (
+            np.ascontiguousarray(image_grad, np.float32),
+            np.ascontiguousarray(alpha_grad, np.float32)[..., None],
+        )
         moments = cpu_backward.MOMENTS
         partial = np.empty((len(self._tiles.ranks), moments + channels), np.float32)
-        with _KERNELS:
-            cpu_backward.backward(
-                self._tiles, self._geometry, ordered, image_grad, alpha_grad, self._cutoffs, partial
-            )
-            cpu_backward.to_parameters(
-                self._tiles, self._order, self._geometry, partial, parameters, self._lens, gradients
-            )
-            cpu_blend.sum_partials(self._tiles, self._order, partial[:, moments:], by_values)
-        return GaussianGradients(*gradients[:4], by_values, gradients[4])
+        self._over_tiles(cpu_backward.backward, ordered, grads, self._cutoffs, partial)
+        out = cpu_unproject.ParameterGradients(
+            *(np.zeros((n, *shape), np.float32) for shape in ((3,), (3,), (4,), (), (2,)))
+        )
+        by_values = np.zeros((n, channels), np.float32)
+        drawn = (len(self._order), self._tiles, self._order)
+        self._workers.run(
+            cpu_unproject.to_parameters, *drawn, self._geometry, partial, self._rows, self._lens, out
+        )
+        self._workers.run(cpu_blend.sum_partials, *drawn, partial[:, moments:], by_values)
+        return GaussianGradients(*out[:4], by_values, out.means_px)
+
+    def _over_tiles(self, kernel: Callable[..., None], *arguments: Any) -> None:
+        self._workers.run(kernel, len(self._tiles.starts) - 1, self._tiles, self._geometry, *arguments)
 
     def depth(self, kind: DepthKind = "expected") -> Array:
         """See `View.depth`; float32."""
         if kind == "median":
             median = np.empty((self.camera.height, self.camera.width), np.float32)
-            with _KERNELS:
-                cpu_blend.median_depth(self._tiles, self._geometry, self._depths, self._cutoffs, median)
+            self._over_tiles(cpu_blend.median_depth, self._depths, self._cutoffs, median)
             return median
         # Ones are blended along: alpha itself is 1 - T, which has no digits left where it is small.
-        both = np.zeros((len(self.gaussians), 2), np.float32)
+        both = np.zeros((self._count, 2), np.float32)
         both[self._order] = np.stack([self._depths, np.ones_like(self._depths)], -1)
         sums, weights = np.moveaxis(self.splat(both)[0], -1, 0)
         return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), 0)
 
 
 class CpuRasterizer:
-    """Numba kernels; compiled at first use (some seconds) and cached beside the package or in the user's
-    cache folder."""
+    """Kernels are compiled at first use (some seconds) and cached beside the package, or in the user's cache
+    folder where that cannot be written."""
 
     name = "cpu"
 
+    def __init__(self, threads: int | None = None) -> None:
+        """`threads` defaults to all cores this process may use; results do not depend on it."""
+        self._workers = Workers(threads)
+
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> CpuView:
         """See `Rasterizer.view`."""
-        return CpuView(gaussians, camera, settings)
+        return CpuView(gaussians, camera, settings, self._workers)
