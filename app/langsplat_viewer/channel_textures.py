@@ -6,9 +6,10 @@ import moderngl
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.raster import Rasterizer
 from langsplat_core.raster.gl import GlRasterizer, GlView, Source
 from langsplat_core.scene import Camera, Scene
-from langsplat_viewer.channels import CpuChannels, Extra, Layers
+from langsplat_viewer.channels import ArrayChannels, Extra, Layers
 
 Textures = tuple[moderngl.Texture, ...]  # colours with alpha and, if asked for, one further channel
 
@@ -72,12 +73,12 @@ class GlSource:
         self._rasterizer.release()
 
 
-class CpuSource:
-    """Channels by the CPU rasterizer, uploaded."""
+class ArraySource:
+    """Channels by a rasterizer that returns arrays, uploaded."""
 
-    def __init__(self, ctx: moderngl.Context) -> None:
+    def __init__(self, ctx: moderngl.Context, rasterizer: Rasterizer) -> None:
         self._ctx = ctx
-        self._channels = CpuChannels()
+        self._channels = ArrayChannels(rasterizer)
         self._layers = Layers()
         self._textures: dict[str, moderngl.Texture] = {}
 

@@ -1,4 +1,4 @@
-"""Which channels a picture needs, and those channels from the CPU rasterizer. No graphics device here."""
+"""Which channels a picture needs, and those channels as arrays. No graphics device here."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,7 +8,7 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, PictureConfig
 from langsplat_core.query.picture import Channels
-from langsplat_core.raster import View, load_rasterizer
+from langsplat_core.raster import Rasterizer, View
 from langsplat_core.raster.spherical_harmonics import colours
 from langsplat_core.scene import Camera, Gaussians, Scene
 
@@ -67,11 +67,11 @@ def camera_key(camera: Camera) -> tuple[object, ...]:
     return (*intrinsics, camera.world_to_camera.tobytes())
 
 
-class CpuChannels:
-    """Channels of one scene by the CPU rasterizer; the projection is kept while the camera rests."""
+class ArrayChannels:
+    """Channels by a rasterizer that returns arrays; the projection is kept while the camera rests."""
 
-    def __init__(self) -> None:
-        self._rasterizer = load_rasterizer("cpu")
+    def __init__(self, rasterizer: Rasterizer) -> None:
+        self._rasterizer = rasterizer
         self._view: View | None = None
         self._shown: tuple[Gaussians, tuple[object, ...]] | None = None  # what `_view` is a view of
 

@@ -13,40 +13,47 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
 from langsplat_core.query import picture as rules
+from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.gl_draw import drawing, set_uniforms, shader
 from langsplat_core.scene import Camera, Scene
-from langsplat_viewer.channel_textures import ChannelSource, CpuSource, GlSource, Textures
+from langsplat_viewer.channel_textures import ArraySource, ChannelSource, GlSource, Textures
 from langsplat_viewer.channels import Extra, Layers, camera_key, depth_range
 
-Backend = Literal["auto", "opengl", "cpu"]
+Backend = Literal["auto", "opengl", "cpu", "cuda"]
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swr ", "software", "swiftshader", "basic render")
 PICK_ALPHA = 0.1  # a pixel with less alpha shows nothing that could be picked
 _DISPLAYS = ("rgb", "latent", "relevancy", "segmentation", "depth", "alpha")  # as composite.frag.glsl counts
 
 
-def is_software(ctx: moderngl.Context) -> bool:
-    """Whether this context draws on the CPU; the compiled CPU rasterizer is then several times faster."""
+def suits_opengl(ctx: moderngl.Context) -> bool:
+    """Whether backend "auto" becomes "opengl": not on a driver before 4.1, and not on one that draws on
+    the CPU, where the compiled CPU rasterizer is several times faster."""
     renderer = ctx.info["GL_RENDERER"].lower()
-    return any(name in renderer for name in SOFTWARE_RENDERERS)
+    return ctx.version_code >= 410 and not any(name in renderer for name in SOFTWARE_RENDERERS)
 
 
 class FrameRenderer:
-    """Draws a scene into framebuffers of one context.
+    """Draws a scene into framebuffers of one context, OpenGL 3.3 or newer.
 
-    `backend` "auto" takes the CPU rasterizer where the GL driver is software, else OpenGL; the attribute
-    of that name says which it became. `precision` is that of the OpenGL rasterizer's images.
+    `backend` "auto" is "opengl" or "cpu", see `suits_opengl`; the attribute of that name says which it
+    became. `precision` is that of the OpenGL rasterizer's images. Raises BackendError where a rasterizer
+    cannot load.
     """
 
     def __init__(
         self, ctx: moderngl.Context, backend: Backend = "auto", precision: Literal["half", "single"] = "half"
     ) -> None:
         if backend == "auto":
-            backend = "cpu" if is_software(ctx) else "opengl"
+            backend = "opengl" if suits_opengl(ctx) else "cpu"
         self.backend: str = backend
         self._ctx = ctx
-        self._source: ChannelSource = CpuSource(ctx) if backend == "cpu" else GlSource(ctx, precision)
+        self._source: ChannelSource
+        if backend == "opengl":
+            self._source = GlSource(ctx, precision)
+        else:
+            self._source = ArraySource(ctx, load_rasterizer(backend))
         self._program = ctx.program(
-            vertex_shader=shader("fullscreen.vert"), fragment_shader=shader("composite.frag")
+            vertex_shader=shader("fullscreen.vert", 330), fragment_shader=shader("composite.frag", 330)
         )
         self._vao = ctx.vertex_array(self._program, [])
         self._turbo = ctx.texture((len(rules.TURBO), 1), 3, rules.TURBO.tobytes())

@@ -94,9 +94,10 @@ def load_text_encoder(encoder_id: str) -> TextEncoder:
 def warm_up(scene: Scene, backend: str) -> None:
     """Have the CPU rasterizer compiled before the window first draws with it (once per installation)."""
     if backend == "cpu":
-        from langsplat_viewer.channels import CpuChannels, Layers
+        from langsplat_core.raster import load_rasterizer
+        from langsplat_viewer.channels import ArrayChannels, Layers
 
-        CpuChannels().render(scene, Layers(), scene.framing_camera((16, 16)), "none")
+        ArrayChannels(load_rasterizer("cpu")).render(scene, Layers(), scene.framing_camera((16, 16)), "none")
 
 
 def services(encoder_id: str) -> Services:

@@ -161,10 +161,10 @@ class GlRasterizer:
     def _splat_program(self, values: int, depth: bool) -> moderngl.Program:
         key = (values, depth)
         if key not in self._splats:
-            head = f"#version 410 core\n#define VALUES {values}\n#define DEPTH {int(depth)}\n"
-            self._splats[key] = self.ctx.program(
-                vertex_shader=head + shader("splat.vert"), fragment_shader=head + shader("splat.frag")
+            vertex, fragment = (
+                shader(name, VALUES=values, DEPTH=int(depth)) for name in ("splat.vert", "splat.frag")
             )
+            self._splats[key] = self.ctx.program(vertex_shader=vertex, fragment_shader=fragment)
         return self._splats[key]
 
     def _targets_for(self, camera: Camera, values: int, depth: bool) -> Targets:

@@ -7,9 +7,11 @@ from importlib.resources import files
 import moderngl
 
 
-def shader(name: str) -> str:
-    """Source text of shaders/`name`.glsl."""
-    return files("langsplat_core.raster.shaders").joinpath(f"{name}.glsl").read_text(encoding="utf-8")
+def shader(name: str, version: int = 410, **defines: int) -> str:
+    """Source of shaders/`name`.glsl with its GLSL version and `defines` in front."""
+    head = [f"#version {version} core", *(f"#define {key} {value}" for key, value in defines.items())]
+    folder = files("langsplat_core.raster.shaders")
+    return "\n".join([*head, folder.joinpath(f"{name}.glsl").read_text(encoding="utf-8")])
 
 
 def set_uniforms(program: moderngl.Program, values: dict[str, object]) -> None:

@@ -14,8 +14,8 @@ from langsplat_core.errors import BackendError
 from langsplat_core.query.picture import Channels, compose
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Gaussians, Scene, look_at
-from langsplat_viewer.channels import CpuChannels, Layers, depth_range
-from langsplat_viewer.frame import FrameRenderer, is_software
+from langsplat_viewer.channels import ArrayChannels, Layers, depth_range
+from langsplat_viewer.frame import FrameRenderer, suits_opengl
 from langsplat_viewer.headless import create_egl_context, render_picture
 from tests.scenes import random_camera, random_gaussians, random_values
 
@@ -66,7 +66,7 @@ def test_the_shader_composes_as_numpy_does(gl, monkeypatch, display, queries):
     fields = {"latent": ("latent",), "relevancies": ("relevancies",), "depth": ("depth_sum",)}.get(extra, ())
     others = {"latent", "relevancies", "depth_sum"} - set(fields)
     shown = replace(channels, **dict.fromkeys(others))
-    monkeypatch.setattr(CpuChannels, "render", lambda *_: shown)
+    monkeypatch.setattr(ArrayChannels, "render", lambda *_: shown)
     monkeypatch.setattr("langsplat_viewer.frame.depth_range", lambda *_: channels.depth_range)
     renderer = FrameRenderer(gl, "cpu")
     renderer.set_scene(SCENE)
@@ -246,7 +246,7 @@ def test_without_a_scene_and_with_an_empty_one_the_background_shows(gl):
 
 def test_auto_takes_the_cpu_where_the_driver_is_software(gl):
     renderer = FrameRenderer(gl)
-    assert renderer.backend == ("cpu" if is_software(gl) else "opengl")
+    assert renderer.backend == ("opengl" if suits_opengl(gl) else "cpu")
     renderer.release()
 
 

@@ -1,4 +1,3 @@
-#version 410 core
 // From channels to a picture; langsplat_core/query/picture.py is the plain twin of this file and a test
 // compares the two. Channels are premultiplied by alpha, row 0 is the top row.
 

@@ -1,4 +1,3 @@
-#version 410 core
 // One triangle that covers the viewport; needs no vertex buffer.
 
 out vec2 uv;  // (0, 0) bottom left to (1, 1) top right of the viewport

@@ -1,4 +1,3 @@
-#version 410 core
 // Steps 1 and 2 of raster/reference.py: one fragment projects one Gaussian, once per view.
 //
 // A fragment pass instead of the splats' vertex shader, because that would repeat the work for each of

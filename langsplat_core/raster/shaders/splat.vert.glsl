@@ -1,6 +1,6 @@
 // One quad per Gaussian, oriented along its footprint and just large enough for the alpha = alpha_min
 // contour, cut to what the image can see (a needle may be a million pixels long).
-// The host puts "#version", VALUES (number of images) and DEPTH (0 or 1) in front.
+// The host defines VALUES (number of images) and DEPTH (0 or 1).
 
 uniform sampler2D placement;  // as written by project.frag.glsl
 uniform sampler2D shape;
