@@ -110,7 +110,7 @@ def _orthonormal(rotation: Array) -> Array:
 
 def look(view: OrbitCamera, yaw: float, pitch: float) -> OrbitCamera:
     """Turn the head: right by `yaw`, down by `pitch` (radians), without moving the eye."""
-    turned = orbit(view, -yaw, -pitch)
+    turned = orbit(view, yaw, pitch)
     return replace(turned, target=view.eye + view.distance * turned.rotation[2])
 
 

@@ -28,6 +28,20 @@ DEFAULT_SIZE = (1280, 800)
 GL_VERSIONS = ((4, 1), (3, 3))  # 4.1 draws splats on every system; 3.3 still shows the CPU's pictures
 IDLE_FPS = 8.0  # frames per second while nothing happens
 
+# What may go wrong while a picture is drawn, from drivers to arrays that do not fit. It is shown as a line in
+# the window: an exception that left a frame half way would take the whole window down.
+DRAW_ERRORS = (
+    LangSplatError,
+    moderngl.Error,
+    ArithmeticError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+
 MakeRenderer = Callable[[moderngl.Context], Renderer]
 
 
@@ -136,9 +150,8 @@ class Window:
             renderer = self._make_renderer(ctx)
             self._canvas = Canvas(ctx, renderer)
             self.viewer.state.backend = renderer.backend
-        except (LangSplatError, moderngl.Error) as error:
+        except DRAW_ERRORS as error:
             self.failure = BackendError(one_line(error))
-            hello_imgui.get_runner_params().app_shall_exit = True
             return
         self._screen = ctx.detect_framebuffer()
         self.viewer.surface = self._canvas
@@ -168,6 +181,9 @@ class Window:
 
     def _gui(self) -> None:
         viewer = self.viewer
+        if self.failure is not None:  # leaving before a first frame would trip an assertion of hello_imgui
+            hello_imgui.get_runner_params().app_shall_exit = True
+            return
         actions.tick(viewer, imgui.get_time())
         area = layout.scene_area(viewer)
         scale = imgui.get_io().display_framebuffer_scale
@@ -187,7 +203,7 @@ class Window:
             return
         try:
             self._unfinished = canvas.update(state, imgui.get_time())
-        except (LangSplatError, moderngl.Error, MemoryError) as error:
+        except DRAW_ERRORS as error:
             self._unfinished = False
             state.say(one_line(error), is_error=True)
         self._screen.use()
@@ -214,3 +230,5 @@ def _style() -> None:
     style.item_spacing = ImVec2(8, 6)
     style.frame_rounding = 4
     style.window_border_size = 0
+    popup = style.color_(imgui.Col_.popup_bg)
+    style.set_color_(imgui.Col_.popup_bg, ImVec4(popup.x, popup.y, popup.z, 1))

@@ -68,7 +68,7 @@ def draw_camera(viewer: Viewer) -> None:
     if imgui.button("Focus (F)"):
         actions.focus_result(viewer)
     imgui.same_line()
-    if imgui.button("Level"):
+    if imgui.button("Horizon"):
         actions.move(viewer, level)
     _tip("Turn the picture until the horizon is level")
     imgui.same_line()
