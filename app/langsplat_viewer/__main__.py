@@ -1,6 +1,7 @@
 """`langsplat-viewer`: arguments -> window, or one picture without a window."""
 
 import sys
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -10,8 +11,9 @@ import tyro
 from langsplat_core.cli.run import main
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import InputError
+from langsplat_core.progress import Progress, TerminalProgress, silent
+from langsplat_viewer.frame import Backend
 from langsplat_viewer.options import (
-    Backend,
     DisplayChoice,
     camera_file,
     chosen_display,
@@ -68,7 +70,12 @@ class ViewerCommand:
             camera=self.camera,
             backend=self.backend,
         )
-        print("\n".join(draw_still(request, services(self.encoder))))
+        bars: AbstractContextManager[Progress] = nullcontext(silent)
+        if sys.stderr.isatty():
+            bars = TerminalProgress()
+        with bars as progress:
+            lines = draw_still(request, services(self.encoder), progress)
+        print("\n".join(lines))
 
     def _window(self, path: Path, size: tuple[int, int] | None) -> None:
         if self.out is not None:

@@ -15,7 +15,6 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.actions import NEEDS_FIELD, Services
 
 DisplayChoice = Literal["auto", "rgb", "latent", "relevancy", "segmentation", "depth", "alpha"]
-Backend = Literal["auto", "opengl", "cpu", "cuda"]
 MAX_SIDE = 16_384  # pixels; beyond it drivers refuse textures
 
 

@@ -9,14 +9,16 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import Display, LevelChoice, PictureConfig
 from langsplat_core.errors import InputError
+from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryResult
 from langsplat_core.query.picture import latent_colours
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_viewer.actions import Services, save_png
 from langsplat_viewer.answers import Answers
 from langsplat_viewer.controls import lens_of
+from langsplat_viewer.frame import Backend
 from langsplat_viewer.headless import render_picture
-from langsplat_viewer.options import Backend, check_display, chosen_camera
+from langsplat_viewer.options import check_display, chosen_camera
 from langsplat_viewer.state import SLOTS
 
 DEFAULT_SIZE = (1280, 720)
@@ -68,15 +70,17 @@ def describe(result: QueryResult) -> str:
     return f"'{result.phrase}': {verdict}, score {result.peak:.3f}, level {level}, place {place}"
 
 
-def draw_still(request: StillRequest, services: Services) -> list[str]:
+def draw_still(request: StillRequest, services: Services, progress: Progress = silent) -> list[str]:
     """Draw and save the picture; returns the lines to print: the picture's, then one for each query."""
+    progress("opening the scene", 0.1)
     scene = services.load_scene(request.path)
     check_display(scene, request.display, request.queries)
     camera = still_camera(scene, request.camera, request.size)
     answers = Answers(scene, services.load_encoder, services.encoder_id)
-    results = [answers.ask(phrase, request.level) for phrase in request.queries]
+    results = [answers.ask(phrase, request.level, progress) for phrase in request.queries]
     shown = results[-SLOTS:]  # as in the window, where a fourth query takes the oldest one's colour
 
+    progress("drawing", 0.8)
     image = render_picture(
         scene,
         camera,

@@ -19,8 +19,9 @@ from langsplat_viewer import actions
 from langsplat_viewer.actions import Services, Viewer
 from langsplat_viewer.canvas import Canvas, Renderer
 from langsplat_viewer.controls import from_camera
+from langsplat_viewer.frame import Backend, FrameRenderer
 from langsplat_viewer.jobs import one_line
-from langsplat_viewer.options import Backend, chosen_camera
+from langsplat_viewer.options import chosen_camera
 from langsplat_viewer.panels import layout, navigation
 from langsplat_viewer.panels.scene import OpenDialog
 
@@ -60,18 +61,10 @@ class WindowRequest:
 
 def open_window(request: WindowRequest, services: Services) -> None:
     """Run until the window is closed. Raises BackendError where there is no display or no OpenGL."""
-    window = Window(request, services, lambda ctx: _frame_renderer(ctx, request.backend))
+    window = Window(request, services, lambda ctx: FrameRenderer(ctx, request.backend))
     immapp.run(window.params())
     if window.failure is not None:
         raise window.failure
-
-
-def _frame_renderer(ctx: moderngl.Context, backend: Backend) -> Renderer:
-    from langsplat_viewer.frame import FrameRenderer
-
-    if backend == "cuda":
-        raise BackendError("--backend cuda draws pictures without a window; add --headless, or use opengl")
-    return FrameRenderer(ctx, backend)
 
 
 def probe_gl() -> tuple[int, int]:
