@@ -12,7 +12,14 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from langsplat_core.arrays import Array
 from langsplat_core.config import DemoEncoderConfig
 from langsplat_core.datasets.synthetic.captions import Label
-from langsplat_core.datasets.synthetic.colours import COLOURS, from_lch, random_colour, to_display, to_lch, to_linear
+from langsplat_core.datasets.synthetic.colours import (
+    COLOURS,
+    from_lch,
+    random_colour,
+    to_display,
+    to_lch,
+    to_linear,
+)
 from langsplat_core.datasets.synthetic.render import Light, Picture, Renderer
 from langsplat_core.datasets.synthetic.textures import noise
 from langsplat_core.datasets.synthetic.world import World, build_world
@@ -100,7 +107,9 @@ def _random_camera(rng: np.random.Generator) -> Camera:
     target = np.array([rng.uniform(-0.45, 0.45), rng.uniform(-0.35, 0.35), 0.05])
     if rng.random() < 0.15:
         target = np.array([rng.uniform(-1.5, 1.5), rng.uniform(-1.5, 1.5), rng.uniform(-0.6, 0.6)])
-    out = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+    out = np.array(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+    )
     eye = np.clip(target * (1, 1, 0) + distance * out + (0, 0, 0.05), -2.1, 2.1)
     return look_at(eye, target, np.array([0.0, 0, 1]), _VIEW, rng.uniform(35, 58))
 
@@ -109,7 +118,9 @@ def _photograph(image: Array, rng: np.random.Generator) -> Array:
     """Exposure, white balance, blur, noise and compression as a real camera would add them."""
     gain = np.exp(rng.normal(0, 0.14)) * np.exp(rng.normal(0, 0.035, 3))
     pixels = to_display(to_linear(np.arange(256) / 255)[:, None] * gain)  # (256, 3) look-up per channel
-    result = Image.fromarray((np.stack([pixels[image[..., c], c] for c in range(3)], -1) * 255 + 0.5).astype(np.uint8))
+    result = Image.fromarray(
+        (np.stack([pixels[image[..., c], c] for c in range(3)], -1) * 255 + 0.5).astype(np.uint8)
+    )
     if rng.random() < 0.5:
         result = result.filter(ImageFilter.GaussianBlur(float(rng.uniform(0.2, 1.3))))
     if rng.random() < 0.4:
@@ -209,7 +220,9 @@ def _blob(rng: np.random.Generator) -> Array:
     y, x = np.mgrid[:CROP, :CROP] / CROP - 0.5
     angle = rng.uniform(0, np.pi)
     u, v = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
-    shape = np.hypot(u, v * rng.uniform(1, 3)) + 0.09 * noise(_lattice(rng), rng.uniform(0.8, 3)).reshape(x.shape)
+    shape = np.hypot(u, v * rng.uniform(1, 3)) + 0.09 * noise(_lattice(rng), rng.uniform(0.8, 3)).reshape(
+        x.shape
+    )
     mask = shape < rng.uniform(0.2, 0.55)
     return mask if mask.sum() > 60 else np.ones_like(mask)
 
@@ -247,7 +260,9 @@ def _meaningless(rng: np.random.Generator) -> Array:
         colour = rng.uniform(0, 1, (6, 3))[patch] + 0.05 * planes
     else:
         lch = to_lch(rng.uniform(0.1, 0.9, 3))
-        spread = np.stack([lch[0] + 14 * planes[:, 0], lch[1] + 10 * planes[:, 1], lch[2] + 90 * planes[:, 2]], 1)
+        spread = np.stack(
+            [lch[0] + 14 * planes[:, 0], lch[1] + 10 * planes[:, 1], lch[2] + 90 * planes[:, 2]], 1
+        )
         colour = from_lch(np.clip(spread, 0, None))
     return (np.clip(colour, 0, 1) * 255).astype(np.uint8).reshape(CROP, CROP, 3)
 

@@ -56,14 +56,15 @@ def build_model(tokens: int, start: int, end: int) -> Any:
     """A `transformers.CLIPModel` of 2.4 million weights for a vocabulary of `tokens`."""
     from transformers import CLIPConfig, CLIPModel
 
-    text = dict(
-        vocab_size=tokens, hidden_size=128, intermediate_size=512, num_hidden_layers=3, num_attention_heads=4,
-        max_position_embeddings=CONTEXT, projection_dim=512, bos_token_id=start, eos_token_id=end, pad_token_id=end,
-    )  # fmt: skip
-    vision = dict(
-        hidden_size=160, intermediate_size=640, num_hidden_layers=5, num_attention_heads=5,
-        image_size=CROP, patch_size=8, projection_dim=512,
-    )  # fmt: skip
+    text = {
+        "vocab_size": tokens, "hidden_size": 128, "intermediate_size": 512, "num_hidden_layers": 3,
+        "num_attention_heads": 4, "max_position_embeddings": CONTEXT, "projection_dim": 512,
+        "bos_token_id": start, "eos_token_id": end, "pad_token_id": end,
+    }  # fmt: skip
+    vision = {
+        "hidden_size": 160, "intermediate_size": 640, "num_hidden_layers": 5, "num_attention_heads": 5,
+        "image_size": CROP, "patch_size": 8, "projection_dim": 512,
+    }  # fmt: skip
     model = CLIPModel(CLIPConfig(text_config=text, vision_config=vision, projection_dim=512))
     model.set_attn_implementation("eager")  # on a CPU the fused one is four times slower to differentiate
     return model
@@ -78,7 +79,9 @@ def normalised(crops: Array) -> Tensor:
 class Sampler:
     """Draws batches: crops of rare words more often, one right phrase per crop, and random others."""
 
-    def __init__(self, crops: CropSet, book: PhraseBook, token_of: dict[str, int], ends: tuple[int, int]) -> None:
+    def __init__(
+        self, crops: CropSet, book: PhraseBook, token_of: dict[str, int], ends: tuple[int, int]
+    ) -> None:
         self._crops = crops
         self._book = book
         row_of = {label: row for row, label in enumerate(book.labels)}
@@ -170,7 +173,13 @@ def loss_of(cosines: Tensor, fits: Tensor, nameable: Tensor) -> Tensor:
     negative = (F.softplus(margin) * wrong).sum() / len(cosines)
     pinned = (((cosines - PIVOT) ** 2) * held).sum() / held.sum().clamp(min=1)
     logits = _CONTRAST_SCALE * cosines
-    return positive + 0.5 * negative + 20 * pinned + _contrast(logits, right, wrong) + _contrast(logits.T, right.T, wrong.T)
+    return (
+        positive
+        + 0.5 * negative
+        + 20 * pinned
+        + _contrast(logits, right, wrong)
+        + _contrast(logits.T, right.T, wrong.T)
+    )
 
 
 def _contrast(logits: Tensor, right: Tensor, wrong: Tensor) -> Tensor:
@@ -219,7 +228,7 @@ class _Run:
         self.mean.load_state_dict(model.state_dict())
         matrices = [p for p in model.parameters() if p.ndim > 1]
         others = [p for p in model.parameters() if p.ndim <= 1]
-        groups = [dict(params=matrices, weight_decay=0.05), dict(params=others, weight_decay=0.0)]
+        groups = [{"params": matrices, "weight_decay": 0.05}, {"params": others, "weight_decay": 0.0}]
         self.optimiser = torch.optim.AdamW(groups, lr=config.lr, betas=(0.9, 0.98))
 
     def advance(self, batch: Batch) -> None:
@@ -244,10 +253,10 @@ class _Run:
 
     def save(self, path: Path) -> None:
         """Write everything needed to go on."""
-        state = dict(
-            config=json.dumps(asdict(self.config)), step=self.step, model=self.model.state_dict(),
-            mean=self.mean.state_dict(), optimiser=self.optimiser.state_dict(),
-        )  # fmt: skip
+        state = {
+            "config": json.dumps(asdict(self.config)), "step": self.step, "model": self.model.state_dict(),
+            "mean": self.mean.state_dict(), "optimiser": self.optimiser.state_dict(),
+        }  # fmt: skip
         with atomic_path(path) as temporary:
             torch.save(state, temporary)
 
@@ -270,9 +279,10 @@ def export(model: Any, out: Path) -> None:
     half.load_state_dict(model.state_dict())
     half.half().save_pretrained(out)
     settings = {
-        "image_processor_type": "CLIPImageProcessor", "image_mean": MEAN, "image_std": STD,
-        "do_center_crop": True, "do_convert_rgb": True, "do_normalize": True, "do_rescale": True, "do_resize": True,
-        "crop_size": {"height": CROP, "width": CROP}, "size": {"shortest_edge": CROP}, "resample": 2,
-        "rescale_factor": 1 / 255,
+        "image_processor_type": "CLIPImageProcessor",
+        "image_mean": MEAN, "image_std": STD, "rescale_factor": 1 / 255,
+        "do_center_crop": True, "do_convert_rgb": True, "do_normalize": True, "do_rescale": True,
+        "do_resize": True, "resample": 2,
+        "crop_size": {"height": CROP, "width": CROP}, "size": {"shortest_edge": CROP},
     }  # fmt: skip
     (out / "preprocessor_config.json").write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")

@@ -37,7 +37,9 @@ KINDS: dict[str, str] = {
     **dict.fromkeys(("table", "chair", "stool"), "furniture"),
 }  # object -> the kind of thing it is
 # Parts that are nearly the whole of their object, so that the object's word is not wrong for them.
-BULK = frozenset({"body", "cover", "peel", "skin", "surface", "box", "side", "floor", "wall", "rug", "top", "centre"})
+BULK = frozenset(
+    {"body", "cover", "peel", "skin", "surface", "box", "side", "floor", "wall", "rug", "top", "centre"}
+)
 
 
 def object_words(word: str) -> tuple[str, ...]:

@@ -82,6 +82,6 @@ def random_colour(word: str, rng: np.random.Generator) -> Array:
     l0, l1, c0, c1, h0, h1 = _BOXES[word]
     for _ in range(1000):
         colour = from_lch(rng.uniform((l0, c0, h0), (l1, min(c1, 95), h1)))
-        if 0 <= colour.min() and colour.max() <= 1:
+        if colour.min() >= 0 and colour.max() <= 1:
             return colour
     raise ValueError(f"no displayable colour found for {word!r}")

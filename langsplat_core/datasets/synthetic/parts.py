@@ -1,7 +1,7 @@
 """What objects are made of: materials, labelled pieces, and the kit that builders work with."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -13,6 +13,8 @@ Texture = Literal[
     "plain", "speckled", "wood", "planks", "cloth", "metal", "pages", "tiles", "plaster", "leaf", "striped",
     "dotted", "rug", "painting", "peel",
 ]  # fmt: skip
+
+Word = TypeVar("Word", bound=str)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +68,9 @@ class Kit:
         """A length between two bounds."""
         return float(self.rng.uniform(low, high))
 
-    def pick(self, *words: str) -> str:
+    def pick(self, *words: Word) -> Word:
         """One of several words."""
-        return str(self.rng.choice(words))
+        return words[int(self.rng.integers(len(words)))]
 
     def other(self, word: str, *words: str) -> str:
         """One of `words` that is not `word`."""
@@ -81,9 +83,7 @@ class Kit:
 
     def pattern(self, word: str, second: str, texture: Texture, gloss: float = 0.2) -> Material:
         """Two named colours; `word` covers most of the surface."""
-        return Material(
-            word, random_colour(word, self.rng), random_colour(second, self.rng), texture, gloss
-        )
+        return Material(word, random_colour(word, self.rng), random_colour(second, self.rng), texture, gloss)
 
     def wood(self, word: str = "brown") -> Material:
         """Wooden surface of a colour."""

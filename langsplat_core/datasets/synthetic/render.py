@@ -4,6 +4,7 @@ Light is gathered once per vertex with a fixed sample set, so every view sees th
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -41,30 +42,34 @@ class Renderer:
 
     def __init__(self, world: World, light: Light, samples: int = 32) -> None:
         """`samples`: rays per vertex for the sky and again for the lamp."""
-        import open3d as o3d
+        import open3d
 
-        self._o3d = o3d
+        o3d: Any = open3d  # its type stubs do not know that a tensor can be made of an array alone
+        self._tensor = o3d.core.Tensor
         self._world = world
         self._light = light
         self._tracer = o3d.t.geometry.RaycastingScene(1)
         self._tracer.add_triangles(
-            o3d.core.Tensor(np.ascontiguousarray(world.vertices)),
-            o3d.core.Tensor(np.ascontiguousarray(world.triangles.astype(np.uint32))),
+            self._tensor(np.ascontiguousarray(world.vertices)),
+            self._tensor(np.ascontiguousarray(world.triangles.astype(np.uint32))),
         )
+        # Off the surface and a little towards the lamp, so that vertices in a corner are not inside a wall.
+        inwards = _unit(light.position - world.vertices)
+        self._origins = (world.vertices + 2e-3 * world.normals + 4e-3 * inwards).astype(np.float32)
         self._key = self._lamp_light(samples)
         self._sky = self._sky_light(samples)
 
     def _blocked(self, origins: Array, directions: Array, reach: float) -> Array:
         """(N,) distance to the first surface over `reach`, in [0, 1]; 1 where nothing is within reach."""
         rays = np.concatenate([origins, directions], 1).astype(np.float32)
-        hit = self._tracer.cast_rays(self._o3d.core.Tensor(rays), nthreads=1)["t_hit"].numpy()
+        hit = self._tracer.cast_rays(self._tensor(rays), nthreads=1)["t_hit"].numpy()
         return np.minimum(hit / reach, 1.0)
 
     def _lamp_light(self, samples: int) -> Array:
         """(V,) share of the lamp that each vertex sees, times the cosine of incidence."""
         world, rng = self._world, np.random.default_rng(5)
         total = np.zeros(len(world.vertices), np.float32)
-        origins = world.vertices + 2e-3 * world.normals
+        origins = self._origins
         grid = (np.arange(samples) + rng.random(samples)) / samples
         for u, v in zip(grid, rng.permutation(grid), strict=True):
             spot = self._light.position + self._light.size * np.array([u - 0.5, v - 0.5, 0])
@@ -75,7 +80,7 @@ class Renderer:
             lit = np.flatnonzero(cosine > 0)
             rays = np.concatenate([origins[lit], towards[lit]], 1).astype(np.float32)
             blocked = self._tracer.test_occlusions(
-                self._o3d.core.Tensor(rays), tfar=float(distance.max()) * 0.98, nthreads=1
+                self._tensor(rays), tfar=float(distance.max()) * 0.98, nthreads=1
             )
             total[lit] += cosine[lit] * ~blocked.numpy()
         return total / samples
@@ -84,7 +89,7 @@ class Renderer:
         """(V,) cosine-weighted openness of each vertex, in [0, 1]."""
         world, rng = self._world, np.random.default_rng(6)
         total = np.zeros(len(world.vertices), np.float32)
-        origins = world.vertices + 2e-3 * world.normals
+        origins = self._origins
         for z, angle in zip((np.arange(samples) + 0.5) / samples, rng.permutation(samples), strict=True):
             turn = 2 * np.pi * (angle + 0.5) / samples
             r = np.sqrt(1 - z * z)
@@ -102,7 +107,7 @@ class Renderer:
         origin, directions = _rays(fine)
         rays = np.empty((len(directions), 6), np.float32)
         rays[:, :3], rays[:, 3:] = origin, directions
-        hit = self._tracer.cast_rays(self._o3d.core.Tensor(rays), nthreads=1)
+        hit = self._tracer.cast_rays(self._tensor(rays), nthreads=1)
         triangle = hit["primitive_ids"].numpy().astype(np.int64)
         distance = hit["t_hit"].numpy()
         seen = np.isfinite(distance)

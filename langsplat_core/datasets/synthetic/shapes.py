@@ -3,6 +3,7 @@
 Every builder returns a `Mesh` whose triangles face outwards (counter-clockwise seen from outside).
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,7 +102,7 @@ def lathe(profile: list[tuple[float, float]], around: int = 32, cell: float = 0.
     inside). Points closer than `cell` are left as they are, longer stretches are subdivided.
     """
     fine: list[tuple[float, float]] = [profile[0]]
-    for (r0, z0), (r1, z1) in zip(profile[:-1], profile[1:], strict=True):
+    for (r0, z0), (r1, z1) in itertools.pairwise(profile):
         count = max(int(np.ceil(np.hypot(r1 - r0, z1 - z0) / cell)), 1)
         fine += [(r0 + (r1 - r0) * i / count, z0 + (z1 - z0) * i / count) for i in range(1, count + 1)]
     line = np.array(fine)
@@ -158,7 +159,7 @@ def arc(centre: tuple[float, float], radius: float, start: float, stop: float, c
     )
 
 
-def slab(outline: list[tuple[float, float]], thickness: float) -> Mesh:
+def slab(outline: list[tuple[float, float]], thickness: float, cell: float = 0.02) -> Mesh:
     """A convex polygon (counter-clockwise, x and z) extruded along y by `thickness`, centred in y."""
     points = np.array(outline)
     n = len(points)
@@ -174,4 +175,23 @@ def slab(outline: list[tuple[float, float]], thickness: float) -> Mesh:
         vertices = np.stack([front[i], front[j], back[j], back[i]])
         triangles = np.array([[0, 2, 1], [0, 3, 2]])
         faces.append(Mesh(vertices, triangles, _vertex_normals(vertices, triangles)))
-    return join(faces)
+    return _refined(join(faces), cell)
+
+
+def _refined(mesh: Mesh, cell: float) -> Mesh:
+    """The same flat faces cut into triangles with edges of at most `cell`: light is kept per vertex."""
+    corners, normals = mesh.vertices[mesh.triangles], mesh.normals[mesh.triangles]
+    while True:
+        edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+        longest = edges.argmax(1)
+        split = edges.max(1) > cell
+        if not split.any():
+            break
+        turn = (longest[split, None] + np.arange(3)) % 3  # the longest edge first
+        a, b, c = np.moveaxis(np.take_along_axis(corners[split], turn[..., None], 1), 1, 0)
+        middle = (a + b) / 2
+        halves = [np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)]
+        corners = np.concatenate([corners[~split], *halves])
+        normals = np.concatenate([normals[~split], normals[split], normals[split]])
+    count = len(corners)
+    return Mesh(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), normals.reshape(-1, 3))

@@ -35,10 +35,9 @@ def teapot(kit: Kit, colour: str) -> Thing:
     profile = [(r * s, r * z) for s, z in ((0, 0), (0.62, 0), (0.9, 0.25), (1, 0.62), (0.9, 1.0), (0.5, 1.3))]
     band = [(r * 1.006, r * 0.55), (r * 1.008, r * 0.7)]
     lid = lathe([(0.52 * r, 1.29 * r), (0.4 * r, 1.42 * r), (0.12 * r, 1.5 * r), (0, 1.5 * r)])
-    spout = tube(
-        [(-0.8 * r, 0, 0.5 * r), (-1.25 * r, 0, 0.68 * r), (-1.5 * r, 0, 1.0 * r), (-1.72 * r, 0, 1.28 * r)],
-        [0.3 * r, 0.2 * r, 0.14 * r, 0.12 * r],
-    )  # type: ignore[arg-type]
+    line = np.array([(-0.8, 0, 0.5), (-1.25, 0, 0.68), (-1.5, 0, 1.0), (-1.72, 0, 1.28)])
+    spout = tube(line * r, np.array([0.3, 0.2, 0.14, 0.12]) * r)
+    knob = ball(0.16 * r, 16).moved((0, 0, 1.58 * r))
     handle = tube(arc((0.86 * r, 0.72 * r), 0.48 * r, -78, 78), 0.0105)
     return Thing("teapot", colour, (
         Piece("body", "", lathe(profile, 40), coat),
@@ -46,7 +45,7 @@ def teapot(kit: Kit, colour: str) -> Thing:
         Piece("spout", "", spout, coat),
         Piece("handle", "", handle, coat),
         Piece("lid", "", lid, coat),
-        Piece("lid", "knob", ball(0.16 * r, 16).moved((0, 0, 1.58 * r)), kit.paint(kit.pick(colour, "black"))),
+        Piece("lid", "knob", knob, kit.paint(kit.pick(colour, "black"))),
     ))  # fmt: skip
 
 
@@ -60,7 +59,7 @@ def bottle(kit: Kit, colour: str) -> Thing:
     label = lathe([(r * 1.012, s * 0.3), (r * 1.012, s * 0.75)], 32)
     return Thing("bottle", colour, (
         Piece("body", "", body, glass),
-        Piece("body", "label", label, kit.paint(kit.other(colour, "white", "beige", "yellow"), "pages", 0.05)),
+        Piece("body", "label", label, kit.paint(kit.other(colour, "white", "beige", "yellow"), "pages", 0.0)),
         Piece("neck", "", neck, glass),
         Piece("cap", "", cap, kit.paint(kit.other(colour, "red", "white", "black", "blue", "yellow"))),
     ))  # fmt: skip
@@ -124,7 +123,7 @@ def plant(kit: Kit, colour: str) -> Thing:
 
 
 def lamp(kit: Kit, colour: str) -> Thing:
-    h, r = kit.size(0.3, 0.38), kit.size(0.1, 0.125)
+    h, r = kit.size(0.26, 0.34), kit.size(0.09, 0.115)
     foot = kit.paint(kit.other(colour, "black", "gray", "brown", "white"), gloss=0.5)
     shade = [(r, h - 0.13), (0.62 * r, h + 0.02)]
     inside = [(0.6 * r, h + 0.02), (r * 0.98, h - 0.13)]
@@ -148,7 +147,7 @@ def book(kit: Kit, colour: str) -> Thing:
     return Thing("book", colour, (
         Piece("cover", "", boards, cover),
         Piece("cover", "spine", spine, cover),
-        Piece("cover", "title", title, kit.paint(kit.other(colour, "yellow", "white", "black"), "pages", 0.05)),
+        Piece("cover", "title", title, kit.paint(kit.other(colour, "yellow", "white"), "pages", 0.0)),
         Piece("pages", "", box(w - 0.012, d - 0.012, t - 0.008).moved((0.002, 0, 0.004)),
               kit.paint(kit.pick("white", "beige"), "pages", 0.0)),
     ))  # fmt: skip
@@ -160,9 +159,13 @@ def clock(kit: Kit, colour: str) -> Thing:
     dial = lathe([(r * 0.86, 0), (0, 0)], 44).turned(upright).moved((0, -0.022, r + 0.012))
     ring = lathe([(r, -0.02), (r, 0.02), (r * 0.93, 0.032), (r * 0.86, 0.024), (r * 0.86, 0.0)], 44)
     back = lathe([(0, -0.02), (r, -0.02)], 44)
-    bars = [box(0.01, 0.004, r * 0.5), box(0.008, 0.004, r * 0.72).turned(rotation_about("y", kit.size(60, 150)))]
+    bars = [
+        box(0.01, 0.004, r * 0.5),
+        box(0.008, 0.004, r * 0.72).turned(rotation_about("y", kit.size(60, 150))),
+    ]
     marks = [
-        box(0.008, 0.003, 0.014).moved((0, 0, r * 0.66)).turned(rotation_about("y", 30 * k)) for k in range(12)
+        box(0.008, 0.003, 0.014).moved((0, 0, r * 0.66)).turned(rotation_about("y", 30 * k))
+        for k in range(12)
     ]
     feet = [ball(0.016, 12).moved((x * r, 0, 0.014)) for x in (-0.55, 0.55)]
     case, ink = kit.paint(colour, gloss=0.5), kit.paint(kit.pick("black", "red"))

@@ -42,7 +42,9 @@ def _wood(p: Array) -> Array:
 def _planks(p: Array) -> Array:
     row = np.floor(p[:, 1] / 0.17)
     along = p[:, 0] + 0.43 * row
-    joint = (np.abs(p[:, 1] / 0.17 - row - 0.5) > 0.48) | (np.abs(along / 1.1 - np.floor(along / 1.1) - 0.5) > 0.496)
+    joint = (np.abs(p[:, 1] / 0.17 - row - 0.5) > 0.48) | (
+        np.abs(along / 1.1 - np.floor(along / 1.1) - 0.5) > 0.496
+    )
     shade = np.sin(12.9898 * row + 78.233 * np.floor(along / 1.1)) * 0.45
     grain = noise(np.stack([p[:, 0], p[:, 1] + 3.1 * row, p[:, 2]], 1), (1.2, 0.12, 0.4))
     return np.where(joint, 2.6, 0.45 + shade + 0.35 * grain)
@@ -64,8 +66,12 @@ def _cloth(p: Array) -> Array:
 def _rug(p: Array) -> Array:
     inside = np.maximum(np.abs(p[:, 0]) / 1.15, np.abs(p[:, 1]) / 0.95)
     border = (inside > 0.82) & (inside < 0.9)
-    lattice = np.abs(p[:, 0] / 0.3 - np.round(p[:, 0] / 0.3)) + np.abs(p[:, 1] / 0.3 - np.round(p[:, 1] / 0.3))
-    return np.where(border | ((inside < 0.78) & (lattice > 0.38) & (lattice < 0.48)), 1.0, 0.12 * noise(p, 0.05))
+    lattice = np.abs(p[:, 0] / 0.3 - np.round(p[:, 0] / 0.3)) + np.abs(
+        p[:, 1] / 0.3 - np.round(p[:, 1] / 0.3)
+    )
+    return np.where(
+        border | ((inside < 0.78) & (lattice > 0.38) & (lattice < 0.48)), 1.0, 0.12 * noise(p, 0.05)
+    )
 
 
 def _painting(p: Array) -> Array:

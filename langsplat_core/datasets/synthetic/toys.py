@@ -65,7 +65,9 @@ def car(kit: Kit, colour: str) -> Thing:
         slab([(-0.076, 0.091), (-0.018, 0.091), (-0.018, 0.13), (-0.064, 0.13)], w * 0.87),
         slab([(-0.008, 0.091), (0.036, 0.091), (0.014, 0.13), (-0.008, 0.13)], w * 0.87),
     ]
-    shield = slab([(0.024, 0.089), (0.049, 0.089), (0.021, 0.134), (0.014, 0.134)], w * 0.74).moved((0.002, 0, 0))
+    shield = slab([(0.024, 0.089), (0.049, 0.089), (0.021, 0.134), (0.014, 0.134)], w * 0.74).moved(
+        (0.002, 0, 0)
+    )
     paint, tyre, glass = kit.paint(colour, gloss=0.8), kit.paint("black"), kit.paint("turquoise", gloss=0.9)
     hub_paint, side = kit.paint(kit.pick("gray", "white", "yellow")), rotation_about("x", 90)
     pieces = []
@@ -73,7 +75,10 @@ def car(kit: Kit, colour: str) -> Thing:
         wheel = cylinder(r, 0.03, 24).moved((0, 0, -0.015)).turned(side)
         hub = cylinder(r * 0.5, 0.032, 16).moved((0, 0, -0.016)).turned(side)
         at = (x * n, y * w / 2, r)
-        pieces += [Piece("wheel", "tyre", wheel.moved(at), tyre, k), Piece("wheel", "hub", hub.moved(at), hub_paint, k)]
+        pieces += [
+            Piece("wheel", "tyre", wheel.moved(at), tyre, k),
+            Piece("wheel", "hub", hub.moved(at), hub_paint, k),
+        ]
     lights = join([ball(0.012, 12).moved((n / 2, y * w * 0.33, 0.058)) for y in (-1, 1)])
     return Thing("car", colour, (
         Piece("body", "", hull, paint),
@@ -116,7 +121,9 @@ def gift(kit: Kit, colour: str) -> Thing:
     w, d, h = kit.size(0.13, 0.17), kit.size(0.12, 0.16), kit.size(0.09, 0.13)
     second = kit.other(colour, "red", "yellow", "white", "purple", "pink", "green")
     ribbon = kit.paint(second, gloss=0.6)
-    wrap = kit.paint(colour, "plain", 0.3) if kit.rng.random() < 0.5 else kit.pattern(colour, "white", "dotted")
+    wrap = (
+        kit.paint(colour, "plain", 0.3) if kit.rng.random() < 0.5 else kit.pattern(colour, "white", "dotted")
+    )
     bands = join([box(0.025, d + 0.003, h + 0.002), box(w + 0.003, 0.025, h + 0.002)])
     loops = [
         tube(arc((0.028, 0), 0.026, -165, 165, 14), 0.009, 8).stretched((1, 1.7, 0.8)).turned(
@@ -136,7 +143,9 @@ def duck(kit: Kit, colour: str) -> Thing:
     coat = kit.paint(colour, gloss=0.45)
     trunk = ball(r).stretched((1.3, 1, 0.82)).moved((0, 0, 0.76 * r))
     tail = slab([(0, 0), (0.5 * r, 0.12 * r), (0.62 * r, 0.5 * r)], 0.5 * r).moved((0.9 * r, 0, 0.9 * r))
-    wings = [ball(r * 0.55, 18).stretched((1.2, 0.3, 0.7)).moved((0.2 * r, y * 0.95 * r, 0.9 * r)) for y in (-1, 1)]
+    wings = [
+        ball(r * 0.55, 18).stretched((1.2, 0.3, 0.7)).moved((0.2 * r, y * 0.95 * r, 0.9 * r)) for y in (-1, 1)
+    ]
     head = ball(0.62 * r).moved((-0.75 * r, 0, 1.85 * r))
     eyes = [ball(0.1 * r, 12).moved((-1.22 * r, y * 0.33 * r, 2.02 * r)) for y in (-1, 1)]
     beak = ball(0.3 * r, 16).stretched((1.25, 0.9, 0.42)).moved((-1.42 * r, 0, 1.72 * r))
@@ -155,13 +164,17 @@ def house(kit: Kit, colour: str) -> Thing:
     gable = slab([(-w / 2, 0), (w / 2, 0), (w / 2, h), (0, peak), (-w / 2, h)], d)
     slope = float(np.degrees(np.arctan2(peak - h, w / 2)))
     span = float(np.hypot(w / 2, peak - h)) + 0.02
+    plank = box(span, d + 0.03, 0.012)
     tiles = [
-        box(span, d + 0.03, 0.012).moved((x * (span / 2), 0, 0)).turned(rotation_about("y", x * slope)).moved((0, 0, peak))
+        plank.moved((x * span / 2, 0, 0)).turned(rotation_about("y", x * slope)).moved((0, 0, peak))
         for x in (-1, 1)
-    ]  # fmt: skip
+    ]
     stack = box(0.026, 0.026, 0.06).moved((w * 0.25, 0, h + 0.03))
     roof = kit.paint(kit.other(colour, "red", "brown", "blue", "gray"), "striped", 0.1)
-    glass, door = kit.paint(kit.other(colour, "turquoise", "white", "yellow")), kit.paint(kit.other(colour, "brown", "green", "red"))
+    glass, door = (
+        kit.paint(kit.other(colour, "turquoise", "white", "yellow")),
+        kit.paint(kit.other(colour, "brown", "green", "red")),
+    )
     panes = [box(0.03, 0.004, 0.032).moved((x * w * 0.28, -d / 2, h * 0.52)) for x in (-1, 1)]
     panes += [box(0.004, 0.03, 0.032).moved((x * w / 2, 0, h * 0.52)) for x in (-1, 1)]
     return Thing("house", colour, (
@@ -186,7 +199,9 @@ def robot(kit: Kit, colour: str) -> Thing:
             Piece("arm", "", arm.moved((x * w * 0.66, 0, 0.085)), limb, k),
         ]
     head = box(w * 0.7, w * 0.6, w * 0.58).moved((0, 0, 0.185))
-    rod = join([cylinder(0.003, 0.04, 8), ball(0.009, 12).moved((0, 0, 0.043))]).moved((0, 0, 0.185 + w * 0.58))
+    rod = join([cylinder(0.003, 0.04, 8), ball(0.009, 12).moved((0, 0, 0.043))]).moved(
+        (0, 0, 0.185 + w * 0.58)
+    )
     eyes = [ball(0.011, 14).moved((x * w * 0.17, -w * 0.3, 0.185 + w * 0.34)) for x in (-1, 1)]
     panel = box(w * 0.56, 0.004, 0.05).moved((0, -w * 0.31, 0.1))
     return Thing("robot", colour, (

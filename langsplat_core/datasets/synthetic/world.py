@@ -113,7 +113,9 @@ def _fill_bowls(placed: list[_Placed], rng: np.random.Generator) -> list[_Placed
             at = rotation_about("z", start + 120 * k) @ (reach * ENLARGED, 0, 0.0)
             lift = 0.032 if host.thing.word == "bowl" else 0.013
             tilt = rotation_about("z", rng.uniform(0, 360)) @ rotation_about("x", rng.uniform(-12, 12))
-            fruit.append(_Placed(builder(kit, colour), tilt, host.offset + at + (0, 0, lift * ENLARGED), ENLARGED))
+            fruit.append(
+                _Placed(builder(kit, colour), tilt, host.offset + at + (0, 0, lift * ENLARGED), ENLARGED)
+            )
     return fruit
 
 
@@ -149,7 +151,8 @@ def _assemble(placed: list[_Placed]) -> World:
     columns: dict[str, list[Array]] = {key: [] for key in ("v", "n", "l", "t", "p")}
     labels: list[Label] = []
     known: dict[tuple[object, ...], int] = {}
-    ids, materials = [], []
+    ids: list[list[int]] = []
+    materials: list[Material] = []
     offset = 0
 
     def number(key: tuple[object, ...], level: int, thing: Thing, piece: Piece) -> int:
