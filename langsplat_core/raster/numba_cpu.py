@@ -13,9 +13,12 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.raster import cpu_backward, cpu_blend, cpu_project, cpu_tiles, cpu_unproject
+from langsplat_core.raster.cpu_colour import colours, colours_backward
 from langsplat_core.raster.protocol import DepthKind
-from langsplat_core.raster.workers import Workers
+from langsplat_core.raster.workers import Workers, shared_workers
 from langsplat_core.scene import Camera, Gaussians
+
+__all__ = ["CpuRasterizer", "CpuView", "GaussianGradients", "colours", "colours_backward"]
 
 _CHANNELS_AT_ONCE = 32  # a tile's state stays in the first level cache
 
@@ -151,7 +154,7 @@ class CpuRasterizer:
 
     def __init__(self, threads: int | None = None) -> None:
         """`threads` defaults to all cores this process may use; results do not depend on it."""
-        self._workers = Workers(threads)
+        self._workers = shared_workers(threads)
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> CpuView:
         """See `Rasterizer.view`."""

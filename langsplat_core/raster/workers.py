@@ -12,6 +12,7 @@ in another file, delete the `*.nbi` files in `__pycache__`.
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any
 
 from numba import njit
@@ -40,6 +41,12 @@ class Workers:
         jobs = [self._pool.submit(compiled, edges[i], edges[i + 1], *arguments) for i in range(pieces)]
         for job in jobs:
             job.result()
+
+
+@cache
+def shared_workers(threads: int | None = None) -> Workers:
+    """One pool per number of threads for the whole process, however many rasterizers there are."""
+    return Workers(threads)
 
 
 def _cores() -> int:
