@@ -37,7 +37,8 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INR
     """Steps 1 and 2 of the module's list, for all Gaussians at once."""
     valid = gaussians.valid()
     means = np.where(valid[:, None], gaussians.means, 0).astype(np.float64)
-    points = means @ camera.rotation.T + camera.world_to_camera[:3, 3]
+    # Not a matrix product: BLAS may round equal rows differently, and equal depths tie by index.
+    points = (means[:, None, :] * camera.rotation).sum(2) + camera.world_to_camera[:3, 3]
     drawn = valid & (points[:, 2] > settings.near)
     x, y, z = np.where(drawn[:, None], points, (0.0, 0.0, 1.0)).T
 
