@@ -1,4 +1,7 @@
-"""`langsplat demo`: make the bundled scene, its photographs and its encoder again."""
+"""`langsplat demo`: make the bundled scene, its photographs and its encoder again.
+
+The work is imported when it is done: torch and open3d take seconds that --help need not pay.
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -6,10 +9,8 @@ from typing import Annotated
 
 import tyro
 
-from langsplat_core.datasets.synthetic import write_dataset
-from langsplat_core.pipeline.demo import build_demo
+from langsplat_core.config import DemoEncoderConfig
 from langsplat_core.progress import TerminalProgress
-from langsplat_core.training.demo_encoder import DemoEncoderConfig, train_demo_encoder
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,8 @@ class DemoDataset:
     """Width and height, pixels."""
 
     def run(self) -> None:
+        from langsplat_core.datasets.synthetic.dataset import write_dataset
+
         with TerminalProgress() as progress:
             write_dataset(self.out, self.seed, self.views, self.size, progress)
         print(f"{self.out}: {self.views} photographs with ground truth")
@@ -40,6 +43,8 @@ class DemoEncoder:
     config: Annotated[DemoEncoderConfig, tyro.conf.arg(name="")] = field(default_factory=DemoEncoderConfig)
 
     def run(self) -> None:
+        from langsplat_core.training.demo_encoder import train_demo_encoder
+
         with TerminalProgress() as progress:
             train_demo_encoder(self.out, self.config, progress)
         print(f"{self.out}: demo encoder")
@@ -57,6 +62,8 @@ class DemoBuild:
     """Steps of radiance training."""
 
     def run(self) -> None:
+        from langsplat_core.pipeline.demo import build_demo
+
         with TerminalProgress() as progress:
             report = build_demo(self.out, self.seed, self.steps, progress)
         print(f"{self.out}: {report.gaussians} Gaussians, held-out PSNR {report.psnr:.2f} dB")

@@ -6,15 +6,12 @@ from pathlib import Path
 import tyro
 
 from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets import load_capture
-from langsplat_core.datasets.synthetic.world import SMALL
 from langsplat_core.errors import InputError
 from langsplat_core.evaluation.synthetic import evaluate, read_truth, rejection_rate
 from langsplat_core.formats import load_scene
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import NO_FIELD, QueryEngine
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.semantics.clip import load_text_encoder
 
 
 @dataclass(frozen=True)
@@ -29,6 +26,10 @@ class EvalSynthetic:
     """Blend latents and decode every pixel, as the paper does, instead of blending relevancies."""
 
     def run(self) -> None:
+        from langsplat_core.datasets import load_capture
+        from langsplat_core.datasets.synthetic.world import SMALL
+        from langsplat_core.semantics.clip import load_text_encoder
+
         scene = load_scene(self.scene)
         if scene.language is None:
             raise InputError(f"{self.scene}: {NO_FIELD}")

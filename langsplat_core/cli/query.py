@@ -17,7 +17,6 @@ from langsplat_core.query.localize import peak_pixel
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import LEVELS, Camera, Scene
-from langsplat_core.semantics.clip import load_text_encoder
 
 PAPER_FILTER = 20  # px, mean filter before the peak is taken (paper, implementation details)
 
@@ -50,6 +49,8 @@ class QueryScene:
         camera = _camera(scene, self.camera)
         engine = QueryEngine(scene)
         if any(text.lower() not in scene.language.phrasebook for text in self.texts):
+            from langsplat_core.semantics.clip import load_text_encoder
+
             engine.encoder = load_text_encoder(self.encoder or scene.language.encoder_id)
         answers = []
         for text in self.texts:

@@ -7,7 +7,6 @@ from typing import Annotated
 import tyro
 
 from langsplat_core.config import TrainConfig
-from langsplat_core.pipeline.train import train_scene
 from langsplat_core.progress import TerminalProgress
 
 
@@ -25,6 +24,10 @@ class Train:
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
     def run(self) -> None:
+        from langsplat_core.pipeline.train import (
+            train_scene,  # imports torch: seconds that --help need not pay
+        )
+
         with TerminalProgress() as progress:
             report = train_scene(self.dataset, self.out, self.config, self.work, progress)
         psnr = "no held-out views" if report.psnr is None else f"held-out PSNR {report.psnr:.2f} dB"

@@ -122,7 +122,7 @@ def _splat(view: View, values: Array, gate: float) -> Array:
 
 
 def _mask(labels: Array, phrase: Phrase) -> Array:
-    return np.isin(labels, phrase.ids).any(0)
+    return np.asarray(np.isin(labels, phrase.ids).any(axis=0))
 
 
 def _judge(relevancy: Array, peak: float, truth: Array) -> tuple[float, bool]:

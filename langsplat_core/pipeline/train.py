@@ -21,7 +21,7 @@ from langsplat_core.files import atomic_path
 from langsplat_core.formats import read_ply, save_scene, write_ply
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.numba_cpu import CpuRasterizer
 from langsplat_core.scene import CANONICAL_PHRASES, Camera, Codec, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.clip import ClipEncoder, load_clip
 from langsplat_core.semantics.masks import load_mask_source
@@ -132,7 +132,7 @@ def _radiance(
 def _language(
     gaussians: Gaussians, views: Views, encoder: ClipEncoder, config: TrainConfig, progress: Progress
 ) -> tuple[LanguageField, float]:
-    rasterizer = load_rasterizer("cpu")
+    rasterizer = CpuRasterizer()
     mask_vectors = np.concatenate([features.vectors for _, features in views])
     if len(mask_vectors) == 0:
         raise InputError(
@@ -161,7 +161,7 @@ def _lifted_vectors(
 ) -> list[tuple[Array, Array]]:
     """Per level: (N, D) float16 unit vectors and (N,) confidence. Half precision because three levels
     of 512 numbers for a million Gaussians are 3 GB even so; its error, 5e-4, is far below a mask's."""
-    memberships = find_memberships(load_rasterizer("cpu"), gaussians, views, config.chunk, progress=progress)
+    memberships = find_memberships(CpuRasterizer(), gaussians, views, config.chunk, progress=progress)
     levels = []
     for vectors, confidence in lift_vectors(memberships, robust=config.mode == "median"):
         levels.append((vectors.astype(np.float16), confidence))

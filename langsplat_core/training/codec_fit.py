@@ -49,7 +49,7 @@ def fit_autoencoder(vectors: Array, config: CodecConfig, progress: Progress = si
         cosine = (output * batch).sum(1).mean()
         loss = nn.functional.l1_loss(output, batch) + (1 - cosine)
         optimiser.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         optimiser.step()
         schedule.step()
         if step % 50 == 0 or step + 1 == config.steps:
@@ -85,7 +85,7 @@ def _settle_statistics(encoder: nn.Sequential, data: torch.Tensor) -> None:
     for module in encoder:
         if isinstance(module, nn.BatchNorm1d):
             module.reset_running_stats()
-            module.momentum = None  # type: ignore[assignment]  # None: cumulative average
+            module.momentum = None  # cumulative average
     encoder.train()
     with torch.no_grad():
         for chunk in data.split(max(2, 8192)):

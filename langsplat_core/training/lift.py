@@ -100,7 +100,7 @@ def lift_vectors(memberships: Memberships, robust: bool) -> Iterator[tuple[Array
         yield np.where(confidence[:, None] > 0, centre, 0).astype(np.float32), confidence
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@numba.njit(parallel=True, cache=True, nogil=True)
 def _weiszfeld(indptr: Array, indices: Array, data: Array, vectors: Array, centre: Array) -> None:
     """Improve `centre` (N, D) in place towards the weighted geometric median on the unit sphere.
 
@@ -159,8 +159,8 @@ def lift_latents(
         total += view.gather(np.ascontiguousarray(stacked)).reshape(count, len(LEVELS), d + 1)
         progress("lifting latents onto the Gaussians", (done + 1) / len(views))
     confidence = total[..., d]
-    latents = total[..., :d] / np.maximum(confidence, 1e-9)[..., None]
+    means = unit(total[..., :d] / np.maximum(confidence, 1e-9)[..., None])
     return (
-        np.moveaxis(unit(latents), 1, 0).astype(np.float32).copy(),
+        np.moveaxis(means, 1, 0).astype(np.float32).copy(),
         confidence.T.astype(np.float32).copy(),
     )
