@@ -113,7 +113,6 @@ class FrameRenderer:
         assert self._scene is not None
         # Without its layer a display shows the plain colours.
         display = picture.display if extra != "none" or picture.display == "alpha" else "rgb"
-        relevancies = self._layers.relevancies
         spans = [max(peak - rules.RELEVANCY_FLOOR, rules.MIN_HEAT_SPAN) for peak in heat_peaks[:3]]
         spans += [1 - rules.RELEVANCY_FLOOR] * (3 - len(spans))
         return {
@@ -121,7 +120,6 @@ class FrameRenderer:
             "extra": len(self._textures) - 1,
             "turbo_table": len(self._textures),
             "display": _DISPLAYS.index(display),
-            "queries": 1 if relevancies is None else relevancies.shape[1],
             "query_colours": rules.QUERY_COLOURS.astype("f4").tobytes(),
             "heat_spans": tuple(spans),
             "relevancy_floor": rules.RELEVANCY_FLOOR,

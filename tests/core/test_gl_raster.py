@@ -301,6 +301,7 @@ def test_the_state_of_gl_is_left_as_found(gl, raster):
     target.viewport = (3, 4, 10, 11)
     target.use()
     gl.enable_only(0)
+    gl.blend_func = 0x0302, 0x0303  # source alpha, 1 - source alpha
     before = gl_state()
     view = raster.view(random_gaussians(20), random_camera())
     view.splat(random_values(20, 7))

@@ -195,6 +195,7 @@ def test_a_user_interface_finds_a_plain_state(gl, frame):
     target = gl.framebuffer([gl.texture((64, 64), 4)])
     target.use()
     gl.enable_only(0)
+    gl.blend_func = 0x0302, 0x0303  # source alpha, 1 - source alpha
     before = gl_state()
     frame.draw(target, CAMERA, replace(PICTURE, display="relevancy"), PEAKS)
     np.testing.assert_array_equal(gl_state(), before)
@@ -248,6 +249,38 @@ def test_auto_takes_the_cpu_where_the_driver_is_software(gl):
     renderer = FrameRenderer(gl)
     assert renderer.backend == ("opengl" if suits_opengl(gl) else "cpu")
     renderer.release()
+
+
+OLD_DRIVER = """
+import moderngl
+from langsplat_core.config import PictureConfig
+from langsplat_core.errors import BackendError
+from langsplat_core.scene import Scene
+from langsplat_viewer.frame import FrameRenderer
+from tests.scenes import random_camera, random_gaussians
+ctx = moderngl.create_context(standalone=True, backend="egl", require=330)
+assert ctx.version_code == 330, ctx.version_code
+renderer = FrameRenderer(ctx)
+renderer.set_scene(Scene(random_gaussians(20)))
+print(renderer.backend, renderer.read(random_camera(), PictureConfig()).any(), ctx.error)
+try:
+    FrameRenderer(ctx, "opengl")
+except BackendError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Mesa's override")
+def test_opengl_3_3_is_enough_with_the_cpu_rasterizer(gl):
+    if "llvmpipe" not in gl.info["GL_RENDERER"]:
+        pytest.skip("only Mesa can pretend to be an older OpenGL")
+    older = {"MESA_GL_VERSION_OVERRIDE": "3.3FC", "MESA_GLSL_VERSION_OVERRIDE": "330"}
+    run = subprocess.run(
+        [sys.executable, "-c", OLD_DRIVER], env=os.environ | older, capture_output=True, text=True
+    )
+    first, second = run.stdout.splitlines()[:2] or [run.stderr, ""]
+    assert first.split() == ["cpu", "True", "GL_NO_ERROR"]
+    assert "needs OpenGL 4.1, this driver offers 3.3" in second
 
 
 def test_depth_range_covers_what_is_in_view():

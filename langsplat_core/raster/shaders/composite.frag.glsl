@@ -2,13 +2,12 @@
 // compares the two. Channels are premultiplied by alpha, row 0 is the top row.
 
 uniform sampler2D colours;      // rgb, alpha
-uniform sampler2D extra;        // latent colours, alpha; one query per channel, alpha; or
+uniform sampler2D extra;        // latent colours, alpha; one query per channel (0: none), alpha; or
                                 // sum of weight * camera z, alpha
 uniform sampler2D turbo_table;  // 256 x 1
 uniform vec3 query_colours[3];
 
 uniform int display;            // 0 rgb, 1 latent, 2 relevancy, 3 segmentation, 4 depth, 5 alpha
-uniform int queries;            // relevancy channels in use, 1 to 3
 uniform vec3 heat_spans;        // relevancy above the floor at which the heat saturates, per query
 uniform float relevancy_floor;
 uniform float heat_fade;
@@ -45,7 +44,7 @@ void main() {
         float highest = relevancy[0];
         int winner = 0;
         float heat = (relevancy[0] - relevancy_floor) / heat_spans[0];
-        for (int j = 1; j < queries; ++j) {
+        for (int j = 1; j < 3; ++j) {
             if (relevancy[j] > highest) {
                 highest = relevancy[j];
                 winner = j;
