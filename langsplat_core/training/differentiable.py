@@ -4,6 +4,7 @@
 * CUDA: gsplat (`training.differentiable_cuda`), imported only when asked for or found.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
-from langsplat_core.raster.numba_cpu import CpuRasterizer, colours, colours_backward
+from langsplat_core.raster.numba_cpu import CpuRasterizer, CpuView, colours, colours_backward
 from langsplat_core.scene import Camera, Gaussians
 
 Backend = Literal["auto", "cpu", "cuda"]
@@ -62,7 +63,7 @@ class _CpuPicture(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        setup: tuple[Camera, RasterSettings, list[Tensor]],
+        setup: tuple[Callable[[Gaussians], CpuView], Camera, list[Tensor]],
         means: Tensor,
         log_scales: Tensor,
         quats_wxyz: Tensor,
@@ -70,11 +71,11 @@ class _CpuPicture(torch.autograd.Function):
         sh: Tensor,
         probe: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        camera, settings, visible = setup
+        project, camera, visible = setup
         gaussians = Gaussians(
             *(t.detach().numpy() for t in (means, log_scales, quats_wxyz, opacity_logits, sh))
         )
-        view = CpuRasterizer().view(gaussians, camera, settings)
+        view = project(gaussians)
         values = colours(gaussians.sh, gaussians.means, camera.position)
         image, alpha = view.splat(values)
         visible.append(torch.from_numpy(view.radii > 0))
@@ -103,6 +104,7 @@ class CpuRenderer:
     def __init__(self, settings: RasterSettings = INRIA) -> None:
         self.device = torch.device("cpu")
         self._settings = settings
+        self._rasterizer = CpuRasterizer()
 
     def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> Rendered:
         """See `DifferentiableRenderer.render`."""
@@ -110,7 +112,7 @@ class CpuRenderer:
         probe = torch.zeros(len(p["means"]), 2, requires_grad=p["means"].requires_grad)
         visible: list[Tensor] = []
         image, alpha = _CpuPicture.apply(
-            (camera, self._settings, visible),
+            (lambda gaussians: self._rasterizer.view(gaussians, camera, self._settings), camera, visible),
             p["means"],
             p["log_scales"],
             p["quats_wxyz"],

@@ -39,11 +39,17 @@ def blur(pictures: Tensor) -> Tensor:
     return pictures
 
 
+def _raw_moments(picture: Tensor, target: Tensor) -> Tensor:
+    """(4, H, W, C): x, y, x^2 + y^2, x y. SSIM needs the two squares only as their sum."""
+    squares = torch.addcmul(picture * picture, target, target)
+    return torch.stack([picture, target, squares, picture * target])
+
+
 def _ssim_terms(moments: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(5, H, W, C) blurred x, y, x^2, y^2, xy -> the four factors of SSIM = a1 a2 / (b1 b2)."""
-    mx, my, xx, yy, xy = moments
-    product, squares = mx * my, mx * mx + my * my
-    return 2 * product + C1, 2 * (xy - product) + C2, squares + C1, (xx + yy) - squares + C2
+    """(4, H, W, C) blurred x, y, x^2 + y^2, xy -> the four factors of SSIM = a1 a2 / (b1 b2)."""
+    mx, my, xx_yy, xy = moments
+    product, squares = mx * my, torch.addcmul(mx * mx, my, my)
+    return 2 * product + C1, 2 * (xy - product) + C2, squares + C1, xx_yy - squares + C2
 
 
 class _MeanSsim(torch.autograd.Function):
@@ -57,7 +63,7 @@ class _MeanSsim(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, picture: Tensor, target: Tensor) -> Tensor:
-        moments = blur(torch.stack([picture, target, picture * picture, target * target, picture * target]))
+        moments = blur(_raw_moments(picture, target))
         a1, a2, b1, b2 = _ssim_terms(moments)
         similarity = (a1 * a2) / (b1 * b2)
         if ctx.needs_input_grad[0]:
