@@ -6,13 +6,12 @@ import moderngl
 import pytest
 
 from langsplat_core.errors import BackendError
+from langsplat_core.raster.gl_context import create_egl_context
 
 
 @pytest.fixture(scope="session")
 def gl_session() -> Iterator[moderngl.Context]:
     """One offscreen context for the whole run; for what is dear to make. Tests take `gl`."""
-    from langsplat_viewer.headless import create_egl_context  # not at collection: it loads numba
-
     try:
         ctx = create_egl_context()
     except BackendError as error:

@@ -7,9 +7,9 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, PictureConfig
+from langsplat_core.errors import BackendError
 from langsplat_core.query.picture import Channels
 from langsplat_core.raster import Rasterizer, View
-from langsplat_core.raster.spherical_harmonics import colours
 from langsplat_core.scene import Camera, Gaussians, Scene
 
 Extra = Literal["none", "latent", "relevancies", "depth"]  # what is rasterized beside colours and alpha
@@ -89,6 +89,8 @@ class ArrayChannels:
 
     def render(self, scene: Scene, layers: Layers, camera: Camera, extra: Extra) -> Channels:
         """Colours, alpha and `extra`, in one pass."""
+        from langsplat_core.raster.cpu_colour import colours  # numba: a second that OpenGL need not wait for
+
         gaussians = scene.gaussians
         values = [colours(gaussians.sh, gaussians.means, camera.position)]
         if extra == "depth":
@@ -115,5 +117,8 @@ class ArrayChannels:
         world units, 0 where there is nothing, and alpha."""
         view = self.view(gaussians, camera)
         _, alpha = view.splat(np.empty((len(gaussians), 0), np.float32))
-        depth = view.depth("median")[row, column] or view.depth("expected")[row, column]
-        return float(depth), float(alpha[row, column])
+        try:
+            depth = view.depth("median")[row, column]
+        except BackendError:  # CUDA has no median
+            depth = 0
+        return float(depth or view.depth("expected")[row, column]), float(alpha[row, column])

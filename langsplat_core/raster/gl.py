@@ -60,16 +60,15 @@ class GlRasterizer:
             )
         scene = self.scene(gaussians)
         last = self._current
-        axis = camera.world_to_camera[2]
         if (
             last is not None
             and last.gaussians is gaussians
             and last.settings.near == settings.near
-            and np.array_equal(last.camera.world_to_camera[2], axis)
+            and np.array_equal(last.camera.world_to_camera[2], camera.world_to_camera[2])
         ):
             order = last.order
         else:
-            depths = scene.means @ axis[:3] + axis[3]
+            depths = scene.depths(camera)
             ahead = np.flatnonzero(depths > settings.near)
             order = ahead[front_to_back(depths[ahead])][::-1].astype(np.int32)
         return GlView(self, gaussians, camera, settings, order)

@@ -11,7 +11,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.errors import BackendError
-from langsplat_core.scene import Gaussians
+from langsplat_core.scene import Camera, Gaussians
 
 COLUMNS = 4096  # texels per row; 16384 rows, which every 4.1 device allows, then hold 67 million
 HALF_MAX = 65504.0
@@ -40,7 +40,7 @@ class SceneTextures:
         self.gaussians = gaussians
         self.rows = np.flatnonzero(gaussians.valid())  # (n,) kept rows
         kept = gaussians.take(self.rows)
-        self.means = kept.means.astype(np.float64)  # (n, 3) for sorting
+        self._means = np.ascontiguousarray(kept.means.T, np.float64)  # (3, n)
         self._ctx = ctx
         self.columns = max(min(COLUMNS, len(kept)), 1)
         self.size = (self.columns, max(math.ceil(len(kept) / self.columns), 1))
@@ -55,6 +55,14 @@ class SceneTextures:
         self.placement, self.shape, self.colours = (ctx.texture(self.size, 4, dtype="f4") for _ in range(3))
         self.projected = ctx.framebuffer([self.placement, self.shape, self.colours])
         self.order = ctx.buffer(reserve=4 * max(len(kept), 1), dynamic=True)
+
+    def depths(self, camera: Camera) -> Array:
+        """(n,) float64 camera z. Term by term, as in the reference: a matrix product may round equal rows
+        differently, and equal depths must tie."""
+        x, y, z = self._means
+        a, b, c, d = camera.world_to_camera[2]
+        depths: Array = x * a + y * b + z * c + d
+        return depths
 
     @staticmethod
     def _geometry(kept: Gaussians) -> Array:

@@ -12,6 +12,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import GSPLAT, INRIA, RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.raster.gl import GlRasterizer
+from langsplat_core.raster.gl_context import create_egl_context
 from langsplat_core.raster.gl_scene import front_to_back
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.spherical_harmonics import colours
@@ -137,6 +138,12 @@ class TestAgainstTheReference:
         gaussians = replace(random_gaussians(count), means=flat)
         camera = Camera(50, 40, 60.0, 60.0, 25.0, 20.0, np.eye(4))
         agree(raster, gaussians, camera)
+
+    def test_copies_of_a_gaussian_are_drawn_by_index(self, raster):
+        """From any direction: equal rows must get equal depths, wherever in the file they are."""
+        twice = random_gaussians(41).take(np.concatenate([np.arange(41), np.arange(41)[::-1]]))
+        for seed in range(3):
+            agree(raster, twice, random_camera(seed))
 
 
 def test_half_precision_stays_within_its_error(gl):
@@ -316,7 +323,7 @@ MAC = """
 import numpy as np, moderngl
 from langsplat_core.raster.gl import GlRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_viewer.headless import create_egl_context
+from langsplat_core.raster.gl_context import create_egl_context
 from tests.scenes import random_camera, random_gaussians, random_values
 ctx = create_egl_context()
 assert ctx.version_code == 410, ctx.version_code
@@ -334,3 +341,12 @@ def test_opengl_4_1_is_enough(gl):
     older = {"MESA_GL_VERSION_OVERRIDE": "4.1FC", "MESA_GLSL_VERSION_OVERRIDE": "410"}
     run = subprocess.run([sys.executable, "-c", MAC], env=os.environ | older, capture_output=True, text=True)
     assert run.stdout.split() == ["True", "GL_NO_ERROR"], run.stderr
+
+
+def test_an_absent_driver_is_one_line(monkeypatch):
+    def fail(**_):
+        raise Exception("libEGL.so not loaded")
+
+    monkeypatch.setattr("moderngl.create_context", fail)
+    with pytest.raises(BackendError, match="libgl1-mesa-dri"):
+        create_egl_context()
