@@ -19,9 +19,9 @@ WORK_SIDE = 400  # px, longer side at which regions are found; contrasts below a
 SUPERPIXELS = 700
 COMPACTNESS = 0.1  # of SLIC, whose colours are scaled to [0, 1]
 SMOOTHING = 0.12  # total variation weight on L/100: removes carpet, keeps edges
-LIGHTNESS = 0.25  # weight of L where the mean colours of regions are compared
 TYPICAL = 66.0  # L + 16 at L = 50, so that chromaticities below are of the size of a and b
-MERGE_COSTS = (8.0, 15.0, 26.0)  # colour difference plus contrast; chosen on photographs and renderings
+CHROMA_FALL = 0.045
+MERGE_COSTS = (6.0, 11.0, 19.0)  # colour difference plus contrast; chosen on photographs and renderings
 MIN_FRACTIONS = (0.0008, 0.002, 0.004)  # of the picture's area
 
 
@@ -56,7 +56,7 @@ def nested_partitions(image: Array) -> Array:
     size = max(1, round(width * scale)), max(1, round(height * scale))
     small = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))
     lab = 100 * denoise_tv_chambolle(rgb2lab(small) / 100, SMOOTHING, max_num_iter=60, channel_axis=-1)
-    graph = RegionGraph(_superpixels(lab), lab, _paint(lab))
+    graph = RegionGraph(_superpixels(lab), _paint(lab))
     levels = []
     for cost, min_fraction in zip(MERGE_COSTS, MIN_FRACTIONS, strict=True):
         graph.merge_until(cost, min_fraction)
@@ -67,13 +67,18 @@ def nested_partitions(image: Array) -> Array:
 
 
 def _paint(lab: Array) -> Array:
-    """(H, W, 3) colours in which shading changes only the first, lightly weighted channel.
+    """(H, W, 3) CIELAB -> (H, W, 3) colours of which shading changes only the first channel, lightness.
 
     In CIELAB both a, b and L + 16 are differences of cube roots, so all three scale alike with the light
-    that falls on a surface: a / (L + 16) and b / (L + 16) do not depend on it.
+    that falls on a surface: a / (L + 16) and b / (L + 16) hardly depend on it. Large chromas are compressed,
+    since the eye tells those apart less well (the factor 0.045 is that of CIE 94), and since in deep shade
+    the cube roots of CIELAB turn into straight lines.
     """
     lightness = np.maximum(lab[..., :1], 0)
-    return np.concatenate([LIGHTNESS * lightness, lab[..., 1:] * TYPICAL / (lightness + 16)], axis=-1)
+    chromaticity = lab[..., 1:] * TYPICAL / (lightness + 16)
+    chroma = np.linalg.norm(chromaticity, axis=-1, keepdims=True)
+    compressed = np.log1p(CHROMA_FALL * chroma) / np.maximum(CHROMA_FALL * chroma, 1e-9)
+    return np.concatenate([lightness, chromaticity * np.where(chroma > 0, compressed, 1)], axis=-1)
 
 
 def _superpixels(lab: Array) -> Array:

@@ -6,7 +6,8 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 
-COLOUR_CONTRAST = np.array([0.4, 1.0, 1.0])  # weight of L, a, b at a boundary: shadows count less than paint
+MEAN_LIGHTNESS = 0.25  # weight of lightness where mean colours are compared: shade is no other thing
+EDGE_LIGHTNESS = 0.4  # and where a boundary's contrast is measured
 CONTRAST_REACH = 2  # px on either side of a boundary, because blurred edges are wider than one step
 SIZE_POWER = 0.25  # how much cheaper small regions merge than large ones
 SIZE_UNIT = 1 / 200  # of the picture: a region of this size merges at its plain cost
@@ -21,16 +22,16 @@ class RegionGraph:
     boundary, less for small regions and for those that the other one encloses.
     """
 
-    def __init__(self, labels: Array, lab: Array, colours: Array) -> None:
-        """labels: (H, W) int, 0..N-1, each present; lab: (H, W, 3) CIELAB for boundary contrasts;
-        colours: (H, W, 3) whose means per region are compared."""
+    def __init__(self, labels: Array, colours: Array) -> None:
+        """labels: (H, W) int, 0..N-1, each present; colours: (H, W, 3) lightness and two chromaticities."""
         self._labels = labels
         count = int(labels.max()) + 1
         flat = labels.ravel()
         self._size = np.bincount(flat, minlength=count).astype(float)  # px
-        sums = [np.bincount(flat, colours[..., c].ravel(), count) for c in range(3)]
+        shades = colours * (MEAN_LIGHTNESS, 1.0, 1.0)
+        sums = [np.bincount(flat, shades[..., c].ravel(), count) for c in range(3)]
         self._mean = np.stack(sums, axis=1) / self._size[:, None]
-        self._neighbours = _adjacency(labels, lab, count)
+        self._neighbours = _adjacency(labels, colours, count)
         self._perimeter = [sum(length for length, _ in edges.values()) for edges in self._neighbours]
         self._parent = np.arange(count)
         self._version = [0] * count  # rises with every change: entries of the heap with another are stale
@@ -94,9 +95,9 @@ class RegionGraph:
             self._push(kept, other)
 
 
-def _adjacency(labels: Array, lab: Array, count: int) -> list[dict[int, tuple[float, float]]]:
+def _adjacency(labels: Array, colours: Array, count: int) -> list[dict[int, tuple[float, float]]]:
     """Per region: neighbour -> (length of the common boundary, px; sum of the contrast along it)."""
-    weighted = lab * COLOUR_CONTRAST
+    weighted = colours * (EDGE_LIGHTNESS, 1.0, 1.0)
     pairs, contrasts = [], []
     for axis in (0, 1):
         steps = np.arange(labels.shape[axis] - 1)

@@ -1,0 +1,184 @@
+"""Vectors of regions, and the store that lets a run continue."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from langsplat_core.arrays import unit
+from langsplat_core.errors import FormatError
+from langsplat_core.progress import Cancelled, Progress, silent
+from langsplat_core.semantics.embed import embed_regions
+from langsplat_core.semantics.masks import LevelMasks
+from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture, feature_key
+
+
+class ColourEncoder:
+    """Stands in for CLIP: the vector of a crop is its mean colour where it is not black."""
+
+    id = "colours"
+    image_size = 16
+    calls = 0
+
+    def encode_images(self, crops: np.ndarray) -> np.ndarray:
+        self.calls += 1
+        seen = crops.reshape(len(crops), 16 * 16, 3).astype(np.float32)
+        return unit(seen.max(axis=1) + 1e-3).astype(np.float32).reshape(len(crops), 3)
+
+
+class Halves:
+    """A mask source: left and right at subpart level, everything at whole level, no parts."""
+
+    name = "halves"
+
+    def __init__(self, key: str = "1") -> None:
+        self.key = key
+        self.calls = 0
+
+    def __call__(self, image: np.ndarray, progress: Progress) -> LevelMasks:
+        self.calls += 1
+        progress("finding", 0.5)
+        height, width = image.shape[:2]
+        halves = np.zeros((2, height, width), bool)
+        halves[0, :, : width // 2] = halves[1, :, width // 2 :] = True
+        none, everything = np.zeros((0, height, width), bool), np.ones((1, height, width), bool)
+        scores = [np.ones(n, np.float32) for n in (2, 0, 1)]
+        return LevelMasks((halves, none, everything), (scores[0], scores[1], scores[2]))
+
+
+def red_and_blue(height: int = 10, width: int = 20) -> np.ndarray:
+    image = np.zeros((height, width, 3), np.uint8)
+    image[:, : width // 2, 0] = 200
+    image[:, width // 2 :, 2] = 200
+    return image
+
+
+def test_each_row_describes_its_own_region() -> None:
+    labels = np.full((3, 10, 20), -1, np.int32)
+    labels[0, :, :10], labels[0, :, 10:], labels[2, 2:8, 4:9] = 1, 0, 2  # not in order of position
+    vectors = embed_regions(red_and_blue(), labels, ColourEncoder())
+    np.testing.assert_allclose(vectors, [[0, 0, 1], [1, 0, 0], [1, 0, 0]], atol=1e-4)
+
+
+def test_no_region_gives_no_row() -> None:
+    labels = np.full((3, 10, 20), -1, np.int32)
+    assert embed_regions(red_and_blue(), labels, ColourEncoder()).shape == (0, 3)
+
+
+def random_features(seed: int = 0, count: int = 7) -> ImageFeatures:
+    rng = np.random.default_rng(seed)
+    vectors = unit(rng.normal(size=(count, 512)).astype(np.float32))
+    return ImageFeatures(rng.integers(-1, count, (3, 9, 8)).astype(np.int32), vectors)
+
+
+def test_what_is_saved_comes_back(tmp_path: Path) -> None:
+    store, features = FeatureStore(tmp_path), random_features()
+    store.save("frame.001", features, "a")
+    back = store.load("frame.001")
+    np.testing.assert_array_equal(back.labels, features.labels)
+    assert back.labels.dtype == np.int32
+    cosine = (back.vectors * features.vectors).sum(axis=1)
+    assert (1 - cosine).max() < 1e-6  # half floats
+    np.testing.assert_allclose(np.linalg.norm(back.vectors, axis=1), 1, atol=1e-6)
+
+
+def test_more_regions_than_half_integers_hold(tmp_path: Path) -> None:
+    labels = np.full((3, 200, 200), -1, np.int32)
+    labels[0] = np.arange(40_000).reshape(200, 200)
+    features = ImageFeatures(labels, np.full((40_000, 1), 1, np.float32))
+    FeatureStore(tmp_path).save("many", features)
+    np.testing.assert_array_equal(FeatureStore(tmp_path).load("many").labels, labels)
+
+
+def test_rows_beyond_the_vectors_are_refused() -> None:
+    with pytest.raises(ValueError, match="labels: rows"):
+        ImageFeatures(np.full((3, 2, 2), 1, np.int32), np.zeros((1, 4), np.float32))
+
+
+def test_another_key_is_not_what_is_wanted(tmp_path: Path) -> None:
+    store = FeatureStore(tmp_path)
+    assert not store.has("a")
+    store.save("a", random_features(), "one")
+    assert store.has("a")
+    assert store.has("a", "one")
+    assert not store.has("a", "two")
+
+
+@pytest.mark.parametrize("name", ["left/001", "..", "ä b", "a.b.c"])
+def test_any_name_is_one_file_in_the_folder(tmp_path: Path, name: str) -> None:
+    store = FeatureStore(tmp_path / "store")
+    store.save(name, random_features())
+    assert store.has(name)
+    assert [path.parent for path in tmp_path.rglob("*.npz")] == [tmp_path / "store"]
+
+
+@pytest.mark.parametrize("keep", [0, 100, -40])
+def test_a_damaged_file_is_named(tmp_path: Path, keep: int) -> None:
+    store = FeatureStore(tmp_path)
+    store.save("a", random_features(), "k")
+    path = store.path("a")
+    path.write_bytes(path.read_bytes()[:keep])
+    assert not store.has("a", "k")
+    with pytest.raises(FormatError, match="delete it and run again"):
+        store.load("a")
+
+
+def test_an_absent_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"a\.features\.npz"):
+        FeatureStore(tmp_path).load("a")
+
+
+def test_the_key_follows_all_that_matters() -> None:
+    encoder, image = ColourEncoder(), red_and_blue()
+    keys = {feature_key(image, Halves(), encoder), feature_key(image, Halves("2"), encoder)}
+    keys.add(feature_key(image[::-1], Halves(), encoder))
+    keys.add(feature_key(red_and_blue(20, 10), Halves(), encoder))
+    other = ColourEncoder()
+    other.id = "others"
+    keys.add(feature_key(image, Halves(), other))
+    # Upside down this picture is the same one.
+    assert len(keys) == 4
+    assert feature_key(image, Halves(), encoder) in keys
+
+
+def test_an_interrupted_run_continues_where_it_stopped(tmp_path: Path) -> None:
+    images = [np.roll(red_and_blue(), shift, axis=1) for shift in range(4)]
+    names = ["a", "b", "c", "d"]
+    source, encoder, store = Halves(), ColourEncoder(), FeatureStore(tmp_path)
+
+    def stop_at_c(label: str, fraction: float) -> None:
+        if label.endswith("c") and fraction > 0.5:  # while its masks are being found
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        describe_capture(images, names, source, encoder, store, stop_at_c)
+    assert [store.has(name) for name in names] == [True, True, False, False]
+    assert len(list(tmp_path.iterdir())) == 2  # and nothing half written
+    seen: list[float] = []
+    found = describe_capture(images, names, source, encoder, store, lambda _, fraction: seen.append(fraction))
+    assert source.calls == 3 + 2
+    assert encoder.calls == 4
+    assert seen == sorted(seen)
+    assert seen[-1] == 1.0
+    again = describe_capture(images, names, Halves(), encoder, store, silent)
+    assert encoder.calls == 4
+    for one, other in zip(found, again, strict=True):
+        np.testing.assert_array_equal(one.labels, other.labels)
+        np.testing.assert_array_equal(one.vectors, other.vectors)
+    assert np.unique(found[0].labels).tolist() == [-1, 0, 1, 2]
+    np.testing.assert_allclose(found[0].vectors[:2], [[1, 0, 0], [0, 0, 1]], atol=1e-4)
+
+
+def test_changed_settings_redo_what_is_stored(tmp_path: Path) -> None:
+    store, encoder = FeatureStore(tmp_path), ColourEncoder()
+    describe_capture([red_and_blue()], ["a"], Halves(), encoder, store)
+    changed = Halves("other thresholds")
+    describe_capture([red_and_blue()], ["a"], changed, encoder, store)
+    assert changed.calls == 1
+
+
+def test_a_photograph_one_pixel_wide(tmp_path: Path) -> None:
+    image = np.full((30, 1, 3), 200, np.uint8)
+    (found,) = describe_capture([image], ["thin"], Halves(), ColourEncoder(), FeatureStore(tmp_path))
+    assert found.labels.shape == (3, 30, 1)
+    assert len(found.vectors) == 2  # the left half has no pixel, so no row
