@@ -1,0 +1,325 @@
+"""The CPU rasterizer against the float64 reference, and laws that need none."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+from langsplat_core.config import GSPLAT, INRIA
+from langsplat_core.errors import BackendError, InputError
+from langsplat_core.raster import BACKENDS, load_rasterizer, spherical_harmonics
+from langsplat_core.raster.cpu_tiles import depth_order
+from langsplat_core.raster.numba_cpu import CpuRasterizer, colours, colours_backward
+from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.scene import Camera, Gaussians
+from tests.close import assert_adjoint, assert_close_off_cuts, cut_off_band
+from tests.golden import load_golden
+from tests.scenes import random_camera, random_gaussians, random_values, shifted
+
+CPU, REFERENCE = CpuRasterizer(), ReferenceRasterizer()
+PLAIN = Camera(40, 30, 40.0, 40.0, 20.0, 15.0, np.eye(4))  # at the origin, looking along z
+
+
+def assert_same_picture(gaussians, camera, settings=INRIA, channels=3, atol=2e-5):
+    """Splat, alpha, gather, depths of the CPU equal the reference's; returns the CPU's image."""
+    x = random_values(len(gaussians), channels)
+    fast, slow = CPU.view(gaussians, camera, settings), REFERENCE.view(gaussians, camera, settings)
+    band = cut_off_band(slow)
+    (image, alpha), (want, want_alpha) = fast.splat(x), slow.splat(x)
+    assert image.dtype == alpha.dtype == np.float32
+    assert_close_off_cuts(image, want, band, atol)
+    assert_close_off_cuts(alpha, want_alpha, band, atol)
+    y = np.random.default_rng(1).normal(size=image.shape).astype(np.float32)
+    y[band] = 0  # flipped weights of the band would enter every sum
+    np.testing.assert_allclose(fast.gather(y), slow.gather(y), atol=1e-5 * max(image.size, 100) ** 0.5)
+    assert_adjoint(lambda v: fast.splat(v)[0], fast.gather, x, y)
+    depth = slow.depth()
+    assert_close_off_cuts(fast.depth(), depth, band, atol * max(depth.max(), 1))
+    halves = np.abs(fast.depth("median") - slow.depth("median")) > 1e-5 * max(depth.max(), 1)
+    assert halves.sum() <= 1 + band.sum()  # T of exactly 0.5 is one more step
+    assert fast.dropped == slow.dropped
+    return image
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_scenes(seed):
+    image = assert_same_picture(random_gaussians(150, seed), random_camera(seed))
+    assert image.max() > 0.1
+
+
+@pytest.mark.parametrize("distance", [0.6, 1.0])
+def test_inside_the_scene(distance):
+    """Gaussians behind, beside and around the camera: near plane and clamped Jacobians."""
+    assert_same_picture(random_gaussians(150, 8), random_camera(8, distance=distance))
+    assert_same_picture(random_gaussians(150, 8), random_camera(8, distance=distance), GSPLAT)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 37), (37, 1), (16, 16), (17, 33), (48, 32)])
+def test_sizes(size):
+    assert_same_picture(random_gaussians(60, 9), random_camera(9, *size))
+
+
+def test_antialiased():
+    gaussians = random_gaussians(150, 10, scale_range=(0.001, 0.1))
+    assert_same_picture(gaussians, random_camera(10), replace(INRIA, antialiased=True))
+
+
+@pytest.mark.parametrize("channels", [1, 2, 5, 32, 40])
+def test_any_number_of_channels(channels):
+    assert_same_picture(random_gaussians(60, 11), random_camera(11), channels=channels)
+
+
+@pytest.mark.parametrize(
+    "gaussians",
+    [
+        random_gaussians(0),
+        random_gaussians(20).take(np.zeros(20, bool)),
+        replace(random_gaussians(20), means=np.tile([0, 0, -5.0], (20, 1))),
+    ],
+    ids=["none", "none taken", "all behind"],
+)
+def test_nothing_to_draw(gaussians):
+    view = CPU.view(gaussians, PLAIN)
+    image, alpha = view.splat(random_values(len(gaussians), 3))
+    assert image.shape == (30, 40, 3)
+    assert not image.any()
+    assert not alpha.any()
+    assert view.gather(np.ones((30, 40, 2))).shape == (len(gaussians), 2)
+    gradients = view.backward(random_values(len(gaussians), 3), np.ones((30, 40, 3)), np.ones((30, 40)))
+    assert gradients.means.shape == (len(gaussians), 3)
+    assert not gradients.means.any()
+    assert not view.depth("median").any()
+    assert not view.radii.any()
+
+
+def test_needles_flat_axes_and_giants():
+    gaussians = random_gaussians(90, 12)
+    log_scales = gaussians.log_scales.copy()
+    log_scales[:30] = np.log([1.0, 1e-6, 1e-6])  # needles of 1 : 1e6
+    log_scales[30:50, 2] = -np.inf  # discs
+    log_scales[50:60, 1:] = -np.inf  # lines
+    log_scales[60:65] = -np.inf  # points
+    log_scales[65:68] = [7.0, -5.0, -6.0]  # a thousand world units long
+    log_scales[68:70] = 79.0
+    assert_same_picture(replace(gaussians, log_scales=log_scales), random_camera(12))
+
+
+def test_invalid_rows_are_dropped_and_counted():
+    clean = random_gaussians(60, 13, sh_degree=1)
+    x, camera = random_values(60, 3), random_camera(13)
+    fields = {name: getattr(clean, name).copy() for name in vars(clean)}
+    fields["means"][0, 1] = np.nan
+    fields["means"][1, 2] = np.inf
+    fields["log_scales"][2, 0] = np.nan
+    fields["log_scales"][3, 0] = 120
+    fields["quats_wxyz"][4] = 0
+    fields["quats_wxyz"][5, 3] = np.nan
+    fields["opacity_logits"][6] = np.nan
+    fields["sh"][7, 3, 2] = -np.inf
+    dirty = Gaussians(**fields)
+    view = CPU.view(dirty, camera)
+    assert view.dropped == 8 == (~dirty.valid()).sum()
+    image = view.splat(x)[0]
+    assert np.array_equal(image, CPU.view(clean.take(np.arange(8, 60)), camera).splat(x[8:])[0])
+    gradients = view.backward(x, image, None)
+    for name, gradient in vars(gradients).items():
+        assert np.isfinite(gradient).all(), name
+        assert not gradient[:8].any(), name
+    assert not view.gather(image)[:8].any()
+    assert not view.radii[:8].any()
+
+
+def test_infinite_opacity_logits():
+    gaussians = random_gaussians(40, 14)
+    logits = gaussians.opacity_logits.copy()
+    logits[:10], logits[10:20], logits[20], logits[21] = np.inf, -np.inf, 100, -100
+    gaussians = replace(gaussians, opacity_logits=logits)
+    image = assert_same_picture(gaussians, random_camera(14))
+    assert not CPU.view(gaussians, random_camera(14)).gather(image)[10:20].any()
+
+
+def test_equal_depths_are_drawn_by_index():
+    gaussians = random_gaussians(60, 15)
+    means = gaussians.means.copy()
+    means[:, 2] = np.repeat([3.0, 2.0], 30)  # world z is camera z here
+    means[40:] = means[40]
+    assert_same_picture(replace(gaussians, means=means), PLAIN)
+    assert_same_picture(replace(gaussians, means=means), random_camera(15, distance=6.0))
+
+
+def test_a_world_far_from_the_origin():
+    gaussians = random_gaussians(80, 16)
+    gaussians = replace(gaussians, means=np.round(gaussians.means * 16) / 16)  # float32 holds these at 1e6
+    camera = random_camera(16)
+    far, far_camera = shifted(gaussians, camera, np.array([1e6, -5e5, 2e5]))
+    x = random_values(80, 3)
+    here, there = CPU.view(gaussians, camera).splat(x)[0], CPU.view(far, far_camera).splat(x)[0]
+    band = cut_off_band(REFERENCE.view(gaussians, camera))
+    # Equal depths of rounded means may swap when the last bits of their sums differ.
+    assert_close_off_cuts(there, here, band)
+    assert_same_picture(far, far_camera)
+
+
+def test_opaque_stack_stops_and_later_ones_weigh_nothing():
+    n = 40
+    stack = Gaussians(
+        np.stack([np.zeros(n), np.zeros(n), np.arange(2.0, n + 2)], -1),
+        np.full((n, 3), 6.0),
+        np.tile([1.0, 0, 0, 0], (n, 1)),
+        np.full(n, 3.0),
+        np.zeros((n, 1, 3)),
+    )
+    view = CPU.view(stack, PLAIN)
+    weights = view.gather(np.ones((30, 40, 1)))[:, 0]
+    assert weights[0] > 0
+    assert not weights[10:].any()
+    gradients = view.backward(np.ones((n, 1), np.float32), np.ones((30, 40, 1)))
+    assert not gradients.opacity_logits[10:].any()
+    assert_same_picture(stack, PLAIN)
+
+
+def test_weights_are_the_alpha():
+    view = CPU.view(random_gaussians(200, 17), random_camera(17))
+    ones, alpha = view.splat(np.ones((200, 1), np.float32))
+    np.testing.assert_allclose(ones[..., 0], alpha, atol=1e-6)
+    assert alpha.max() <= 1 - 1e-4 + 1e-6
+
+
+def test_radii_are_positive_exactly_where_something_is_drawn():
+    gaussians, camera = random_gaussians(300, 18, radius=2.0), random_camera(18)
+    view = CPU.view(gaussians, camera)
+    extents = REFERENCE.view(gaussians, camera).footprints.extents_px.max(1)
+    drawn = view.gather(np.ones((camera.height, camera.width, 1)))[:, 0] > 0
+    assert 0 < drawn.sum() < 300
+    assert (view.radii[drawn] > 0).all()
+    assert ((view.radii > 0) & ~drawn).mean() < 0.05  # hidden ones only
+    np.testing.assert_allclose(view.radii[view.radii > 0], extents[view.radii > 0], rtol=1e-5)
+
+
+def test_results_do_not_depend_on_the_number_of_threads():
+    gaussians, camera = random_gaussians(400, 19), random_camera(19, 150, 110)
+    x, target = random_values(400, 3), random_values(150 * 110, 3).reshape(110, 150, 3)
+    results = []
+    for threads in (1, 2, 5):
+        view = CpuRasterizer(threads).view(gaussians, camera)
+        gradients = vars(view.backward(x, target, target[..., 0])).values()
+        results.append([*view.splat(x), view.gather(target), view.depth("median"), *gradients])
+    for other in results[1:]:
+        assert all(np.array_equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_tiles_hold_little_more_than_what_touches_them():
+    """Culling by the ellipse, not by its box: needles across the image are the case that counts."""
+    gaussians, camera = random_gaussians(60, 20, scale_range=(0.001, 0.6)), random_camera(20, 128, 96)
+    f = REFERENCE.view(gaussians, camera).footprints
+    ys, xs = np.mgrid[:96, :128] + 0.5
+    touched = 0
+    for mean, (xx, xy, yy), opacity in zip(f.means_px, f.conics, f.opacities, strict=True):
+        dx, dy = xs - mean[0], ys - mean[1]
+        alpha = opacity * np.exp(-0.5 * (xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy))
+        touched += (alpha.reshape(6, 16, 8, 16).max((1, 3)) >= 1 / 255).sum()
+    kept = len(CPU.view(gaussians, camera)._tiles.ranks)
+    assert touched <= kept <= 1.15 * touched
+
+
+def test_depth_order_is_a_stable_sort():
+    rng = np.random.default_rng(21)
+    for depths in (
+        rng.integers(1, 5, 500).astype(float),
+        rng.lognormal(0, 9, 500),
+        np.full(3, 2.0),
+        np.ones(0),
+    ):
+        status = rng.integers(0, 3, len(depths)).astype(np.uint8)
+        drawn = np.flatnonzero(status == 2)
+        want = drawn[np.argsort(depths[drawn], kind="stable")]
+        assert np.array_equal(depth_order(status, depths.view(np.uint64)), want)
+
+
+@pytest.mark.parametrize("case", ["tiny_case", "basic_case"])
+def test_golden_images_of_gsplat(real_data, case):
+    gaussians, camera, want = load_golden(real_data / "golden" / f"{case}.safetensors")
+    image, alpha = CPU.view(gaussians, camera, GSPLAT).splat(
+        colours(gaussians.sh, gaussians.means, camera.position)
+    )
+    got = np.concatenate([image, alpha[..., None]], -1)
+    np.testing.assert_allclose(got, want, atol=1e-5, rtol=0.01)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_colours_and_their_gradient(degree):
+    gaussians, eye = random_gaussians(200, 22, degree), np.array([0.3, -2.0, 0.5])
+    gaussians = replace(gaussians, sh=2 * gaussians.sh)
+    sh, means = gaussians.sh.astype(np.float64), gaussians.means.astype(np.float64)
+    want = spherical_harmonics.colours(sh, means, eye)
+    np.testing.assert_allclose(colours(gaussians.sh, gaussians.means, eye), want, atol=1e-6)
+    assert (want == 0).any()  # some are clamped
+    grad = np.random.default_rng(0).normal(size=want.shape).astype(np.float32)
+    sh_grad, means_grad = colours_backward(gaussians.sh, gaussians.means, eye, grad)
+
+    def loss(sh, means):
+        return (spherical_harmonics.colours(sh, means, eye) * grad).sum(1)
+
+    step = 1e-6
+    for axis in np.eye(3) * step:
+        want = (loss(sh, means + axis) - loss(sh, means - axis)) / (2 * step)
+        np.testing.assert_allclose(means_grad @ axis / step, want, atol=1e-6)
+    for k in range(sh.shape[1]):
+        for channel in range(3):
+            nudge = np.zeros_like(sh)
+            nudge[:, k, channel] = step
+            want = (loss(sh + nudge, means) - loss(sh - nudge, means)) / (2 * step)
+            np.testing.assert_allclose(sh_grad[:, k, channel], want, atol=1e-6)
+
+
+def test_colours_of_invalid_and_coincident_rows():
+    gaussians = random_gaussians(3, 23, 1)
+    sh, means = gaussians.sh.copy(), gaussians.means.copy()
+    sh[0, 1, 1], means[1] = np.nan, 0
+    got = colours(sh, means, np.zeros(3))
+    np.testing.assert_allclose(got, spherical_harmonics.colours(sh, means, np.zeros(3)), atol=1e-6)
+    sh_grad, means_grad = colours_backward(sh, means, np.zeros(3), np.ones((3, 3)))
+    assert np.isfinite(sh_grad).all()
+    assert np.isfinite(means_grad).all()
+    assert not sh_grad[0, :, 1].any()
+
+
+def test_backends_are_loaded_by_name_and_lazily():
+    assert set(BACKENDS) == {"reference", "cpu", "opengl", "cuda"}
+    assert load_rasterizer("cpu", threads=1).name == "cpu"
+    with pytest.raises(InputError, match="choose one of reference, cpu, opengl, cuda"):
+        load_rasterizer("vulkan")
+    code = (
+        "import sys, langsplat_core.raster; "
+        "print([m for m in ('numba', 'torch', 'moderngl') if m in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
+
+
+@pytest.mark.skipif(find_spec("gsplat") is not None, reason="gsplat is installed")
+def test_a_missing_backend_says_what_to_try():
+    with pytest.raises(BackendError, match=r"^rasterizer 'cuda' cannot load \(.*\); try --backend cpu$"):
+        load_rasterizer("cuda")
+
+
+def test_no_channels_still_have_an_alpha():
+    view = CPU.view(random_gaussians(30, 24), random_camera(24))
+    image, alpha = view.splat(np.zeros((30, 0), np.float32))
+    assert image.shape == (45, 70, 0)
+    assert np.array_equal(alpha, view.splat(np.ones((30, 1), np.float32))[1])
+    assert view.gather(image).shape == (30, 0)
+
+
+def test_wrong_shapes_are_named():
+    view = CPU.view(random_gaussians(5), PLAIN)
+    with pytest.raises(ValueError, match="values: expected shape"):
+        view.splat(np.zeros((4, 3), np.float32))
+    with pytest.raises(ValueError, match="image: expected shape"):
+        view.gather(np.zeros((40, 30, 3), np.float32))
+    with pytest.raises(ValueError, match="image_grad: expected shape"):
+        view.backward(np.zeros((5, 3), np.float32), np.zeros((30, 40, 2), np.float32))
+    with pytest.raises(ValueError, match="alpha_grad: expected shape"):
+        view.backward(np.zeros((5, 3), np.float32), np.zeros((30, 40, 3)), np.zeros((40, 30)))
