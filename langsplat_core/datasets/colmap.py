@@ -1,6 +1,7 @@
 """Datasets with a COLMAP model: ``sparse/0`` or ``sparse`` beside ``images``."""
 
 import logging
+import os
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +53,8 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
     """The photographs of `folder` with the cameras and points of the model; see `load_capture`."""
     model = read_model(model_folder)
     photos = located_photos(model, _photo_folder(folder, model), model_folder)
-    missing = [photo.label for photo in photos if not photo.path.is_file()]
+    # os.path.isfile, unlike Path.is_file, also says no to names that no file system could hold.
+    missing = {photo.label for photo in photos if not os.path.isfile(photo.path)}
     if missing and len(missing) == len(photos):
         raise InputError(
             f"none of the {len(photos)} photographs named by {model_folder} exists "
@@ -65,7 +67,7 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
             len(photos),
             shortened(missing),
         )
-    there = [photo for photo in photos if photo.path.is_file()]
+    there = [photo for photo in photos if photo.label not in missing]
     cameras, images = develop(there, max_side, progress)
     return Capture(cameras, images, *good_points(model))
 
@@ -83,9 +85,10 @@ def located_photos(model: SparseModel, photo_folder: Path, source: Path) -> list
             lenses[camera_id] = lens_of(camera)
         except ValueError as error:
             raise FormatError(f"{source}: camera {camera_id}: {error}; export the model again") from None
+    by_name = {image.name: image for image in model.images}
     return [
-        Photo(photo_folder / image.name, image.name, lenses[image.camera_id], image.world_to_camera)
-        for image in model.images
+        Photo(photo_folder / name, name, lenses[image.camera_id], image.world_to_camera)
+        for name, image in by_name.items()
     ]
 
 

@@ -113,13 +113,13 @@ def read_model(folder: Path) -> SparseModel:
 def _guarded(read: Callable[[bytes], Result], path: Path) -> Result:
     try:
         return read(path.read_bytes())
-    except (struct.error, ValueError, IndexError) as error:
+    except (struct.error, ValueError, IndexError, OverflowError) as error:
         raise FormatError(f"{path} is no readable COLMAP file ({error}); export the model again") from None
 
 
 def _image(name: str, camera_id: int, quaternion_wxyz: Array, translation: Array) -> ModelImage:
-    length = np.linalg.norm(quaternion_wxyz)
-    if not (np.isfinite(translation).all() and np.isfinite(length) and length > 1e-9):
+    largest = np.abs(quaternion_wxyz).max()
+    if not (np.isfinite(translation).all() and 1e-9 < largest < 1e9):
         raise ValueError(f"image {name} has an impossible pose")
     matrix = np.eye(4)
     matrix[:3, :3] = rotation_matrices(quaternion_wxyz[None])[0]

@@ -8,6 +8,8 @@ Layout: https://docs.nerf.studio/quickstart/data_conventions.html
 import json
 import logging
 import math
+import os
+import reprlib
 from pathlib import Path
 from typing import Any
 
@@ -84,16 +86,16 @@ def _read_json(file: Path) -> Json:
 
 def _photo_file(folder: Path, label: str) -> Path | None:
     """The photograph called `label`; some datasets leave its suffix away."""
-    path = folder / label
-    candidates = [path, *(path.with_name(path.name + suffix) for suffix in PHOTO_SUFFIXES)]
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    candidates = (f"{folder / label}{suffix}" for suffix in ("", *PHOTO_SUFFIXES))
+    # os.path.isfile, unlike Path.is_file, also says no to names that no file system could hold.
+    return next((Path(candidate) for candidate in candidates if os.path.isfile(candidate)), None)
 
 
 def _number(values: Json, key: str, default: float | None = None) -> float:
     """A finite number; ValueError names the key."""
     value = values.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError(f'"{key}" must be a finite number, got {value!r}')
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e15:
+        raise ValueError(f'"{key}" must be a finite number, got {reprlib.repr(value)}')
     return float(value)
 
 
@@ -171,7 +173,7 @@ def _points(file: Path, name: object) -> tuple[Array, Array]:
     if not isinstance(name, str) or not name:
         return none
     path = file.parent / name
-    if not path.is_file():
+    if not os.path.isfile(path):
         log.warning("%s names the points %s, which do not exist", file.name, name)
         return none
     try:

@@ -23,11 +23,13 @@ def _radial_profile(distortion: Distortion) -> tuple[Array, Array]:
     radii = np.tan(np.linspace(0, MAX_HALF_ANGLE, 400))
     angles = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     points = radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], -1)
-    determinant = np.linalg.det(_jacobian(distortion, points.reshape(-1, 2))).reshape(len(radii), -1)
-    folded = ~(determinant > 0).all(1)  # NaN counts as folded
-    end = int(np.argmax(folded)) if folded.any() else len(radii)
-    distorted = distortion(points[:end].reshape(-1, 2)).reshape(end, -1, 2)
-    return radii[:end], np.linalg.norm(distorted, axis=-1).mean(1)
+    with np.errstate(all="ignore"):  # absurd coefficients overflow; what is not a number counts as folded
+        determinant = np.linalg.det(_jacobian(distortion, points.reshape(-1, 2)))
+        folded = ~(determinant > 0).reshape(len(radii), -1).all(1)
+        end = int(np.argmax(folded)) if folded.any() else len(radii)
+        distorted = distortion(points[:end].reshape(-1, 2)).reshape(end, -1, 2)
+        profile = np.linalg.norm(distorted, axis=-1).mean(1)
+    return radii[:end], profile
 
 
 def _jacobian(distortion: Distortion, xy: Array, step: float = 1e-6) -> Array:
@@ -99,8 +101,12 @@ def _inner_rectangle(lens: Lens) -> tuple[float, float, float, float]:
     except (ValueError, np.linalg.LinAlgError) as error:
         raise InputError(f"{lens}: {error}; calibrate it again") from None
     left, top, right, bottom = xy
-    edges = left[:, 0].max(), top[:, 1].max(), right[:, 0].min(), bottom[:, 1].min()
-    return tuple(float(edge) for edge in edges)
+    return (
+        float(left[:, 0].max()),
+        float(top[:, 1].max()),
+        float(right[:, 0].min()),
+        float(bottom[:, 1].min()),
+    )
 
 
 def source_positions(lens: Lens, camera: Camera) -> Array:
