@@ -130,10 +130,10 @@ class TrainConfig:
 class DemoEncoderConfig:
     """Training of the small CLIP that comes with the program (`langsplat demo encoder`)."""
 
-    rooms: int = 300  # random rooms that crops are rendered from
+    rooms: int = 180  # random rooms that crops are rendered from
     views: int = 3  # photographs of each room
     plain_crops: int = 8_000  # crops of nothing but a colour or a texture
-    steps: int = 3_500
+    steps: int = 2_600
     batch: int = 192  # crops per step
     phrases: int = 192  # phrases per step
     lr: float = 1e-3

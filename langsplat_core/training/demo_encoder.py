@@ -169,7 +169,7 @@ def loss_of(cosines: Tensor, fits: Tensor, nameable: Tensor) -> Tensor:
     held[:, :canonical] = nameable[:, None].float()
     wrong = wrong * (1 - held)
     margin = _SIGMOID_SCALE * (cosines - PIVOT)
-    positive = (F.softplus(-margin) * right).sum() / right.sum().clamp(min=1)
+    positive = (F.softplus(-margin) * right).sum() / len(cosines)
     negative = (F.softplus(margin) * wrong).sum() / len(cosines)
     pinned = (((cosines - PIVOT) ** 2) * held).sum() / held.sum().clamp(min=1)
     logits = _CONTRAST_SCALE * cosines
@@ -194,7 +194,8 @@ def train_demo_encoder(out: Path, config: DemoEncoderConfig, progress: Progress)
     """Train the demo encoder into folder `out`, in the layout that `transformers` loads.
 
     Crops and the state of the training are kept in `out`/work and reused by the next call with the same
-    settings; `out` itself always holds the best model so far. Deterministic for one number of threads.
+    settings; `out` itself always holds the latest saved model. The same settings give the same model up
+    to rounding, interrupted or not.
     """
     work = out / "work"
     write_crops(work / "crops", config, progress)
@@ -233,6 +234,9 @@ class _Run:
 
     def advance(self, batch: Batch) -> None:
         """One step of AdamW on a warmed-up cosine schedule, in bfloat16 where that is fast."""
+        torch.manual_seed(
+            self.config.seed * 1_000_003 + self.step
+        )  # which patches are shown, also after a resume
         warm, done = min(1.0, (self.step + 1) / 300), self.step / self.config.steps
         for group in self.optimiser.param_groups:
             group["lr"] = self.config.lr * warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * done)))
@@ -275,9 +279,13 @@ class _Run:
 
 def export(model: Any, out: Path) -> None:
     """Write `model` in half precision, its configuration and how pictures are normalised."""
-    half = type(model)(model.config)
-    half.load_state_dict(model.state_dict())
-    half.half().save_pretrained(out)
+    from safetensors.torch import save_file
+
+    weights = {name: tensor.detach().half().contiguous() for name, tensor in model.state_dict().items()}
+    with atomic_path(out / "model.safetensors") as path:
+        save_file(weights, path, metadata={"format": "pt"})
+    model.config.architectures = [type(model).__name__]
+    model.config.save_pretrained(out)
     settings = {
         "image_processor_type": "CLIPImageProcessor",
         "image_mean": MEAN, "image_std": STD, "rescale_factor": 1 / 255,

@@ -17,6 +17,7 @@ from langsplat_core.scene import LEVELS, Camera, look_at
 
 POINTS = 20_000  # sparse points, as structure from motion would give
 _FIRST_ROOM = 2_000_000  # the demo encoder was trained in rooms of lower numbers only
+_LIGHT_SAMPLES = 40  # rays per vertex towards the lamp, and again towards the sky
 _POINT_NOISE = 0.004  # metres, standard deviation
 _LIGHT = Light(np.array([-0.9, -1.0, 1.7]))
 # (share of the views, elevation in degrees, distance in metres, height of the target above the table)
@@ -43,7 +44,7 @@ def write_dataset(out: Path, seed: int, views: int, size: tuple[int, int], progr
     folder.mkdir(parents=True, exist_ok=True)
     truth.mkdir(exist_ok=True)
     progress("rendering photographs", 0.0)
-    renderer = Renderer(world, _LIGHT, samples=64)
+    renderer = Renderer(world, _LIGHT, samples=_LIGHT_SAMPLES)
     for done, camera in enumerate(cameras):
         if not (truth / f"{camera.name}.npz").exists():
             _write_view(renderer, world, camera, out)

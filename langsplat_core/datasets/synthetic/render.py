@@ -103,26 +103,26 @@ class Renderer:
 
     def picture(self, camera: Camera, oversample: int = 2) -> Picture:
         """A view of the room. `oversample`: rays per pixel and axis; labels come from the pixel's centre."""
-        fine = camera.resized(camera.width * oversample, camera.height * oversample)
-        origin, directions = _rays(fine)
+        triangle, uv, _ = self._cast(camera.resized(camera.width * oversample, camera.height * oversample))
+        seen = triangle >= 0
+        linear = np.zeros((len(triangle), 3), np.float32)
+        linear[seen] = self._shade(triangle[seen], uv[seen], camera.position)
+        blocks = linear.reshape(camera.height, oversample, camera.width, oversample, 3).mean((1, 3))
+        image = (to_display(_film(blocks)) * 255 + 0.5).astype(np.uint8)
+        middle, _, depth = self._cast(camera)
+        pieces = np.where(middle >= 0, self._world.piece_of[middle], -1).astype(np.int32)
+        shape = (camera.height, camera.width)
+        return Picture(image, pieces.reshape(shape), depth.reshape(shape))
+
+    def _cast(self, camera: Camera) -> tuple[Array, Array, Array]:
+        """First surface at pixel centres: (H*W,) triangle or -1, (H*W, 2) barycentrics, (H*W,) depth."""
+        origin, directions = _rays(camera)
         rays = np.empty((len(directions), 6), np.float32)
         rays[:, :3], rays[:, 3:] = origin, directions
         hit = self._tracer.cast_rays(self._tensor(rays), nthreads=1)
-        triangle = hit["primitive_ids"].numpy().astype(np.int64)
-        distance = hit["t_hit"].numpy()
-        seen = np.isfinite(distance)
-        linear = np.zeros((len(rays), 3), np.float32)
-        linear[seen] = self._shade(triangle[seen], hit["primitive_uvs"].numpy()[seen], origin)
-        blocks = linear.reshape(camera.height, oversample, camera.width, oversample, 3).mean((1, 3))
-        image = (to_display(_film(blocks)) * 255 + 0.5).astype(np.uint8)
-        pieces = np.where(seen, self._world.piece_of[np.where(seen, triangle, 0)], -1)
-        middle = (slice(oversample // 2, None, oversample),) * 2
-        shape = (fine.height, fine.width)
-        return Picture(
-            image,
-            pieces.reshape(shape)[middle].astype(np.int32),
-            distance.reshape(shape)[middle].astype(np.float32),
-        )
+        depth = hit["t_hit"].numpy()
+        triangle = np.where(np.isfinite(depth), hit["primitive_ids"].numpy().astype(np.int64), -1)
+        return triangle, hit["primitive_uvs"].numpy(), depth
 
     def colours_at(self, triangle: Array, uv: Array, eye: Array) -> Array:
         """(N, 3) uint8 colour of surface points, given by triangle and barycentrics, as seen from `eye`."""

@@ -141,7 +141,7 @@ def gift(kit: Kit, colour: str) -> Thing:
 def duck(kit: Kit, colour: str) -> Thing:
     r = kit.size(0.07, 0.085)
     coat = kit.paint(colour, gloss=0.45)
-    trunk = ball(r).stretched((1.3, 1, 0.82)).moved((0, 0, 0.76 * r))
+    trunk = ball(r).stretched((1.3, 1, 0.82)).moved((0, 0, 0.8 * r))
     tail = slab([(0, 0), (0.5 * r, 0.12 * r), (0.62 * r, 0.5 * r)], 0.5 * r).moved((0.9 * r, 0, 0.9 * r))
     wings = [
         ball(r * 0.55, 18).stretched((1.2, 0.3, 0.7)).moved((0.2 * r, y * 0.95 * r, 0.9 * r)) for y in (-1, 1)

@@ -1,0 +1,199 @@
+"""The procedural demo world: geometry, names, pictures, and the folder it is written to."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from langsplat_core.datasets.nerfstudio import load_nerfstudio
+from langsplat_core.datasets.synthetic import dataset, shapes
+from langsplat_core.datasets.synthetic.colours import COLOURS, colour_word, from_lch, random_colour, to_lch
+from langsplat_core.datasets.synthetic.dataset import write_dataset
+from langsplat_core.datasets.synthetic.parts import Kit
+from langsplat_core.datasets.synthetic.render import Light, Renderer
+from langsplat_core.datasets.synthetic.textures import noise
+from langsplat_core.datasets.synthetic.world import SMALL, build_world
+from langsplat_core.errors import InputError
+from langsplat_core.progress import silent
+from langsplat_core.scene import look_at
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture
+def coarse_light(monkeypatch):
+    monkeypatch.setattr(dataset, "_LIGHT_SAMPLES", 2)
+
+
+@pytest.fixture(scope="module")
+def world():
+    return build_world(3)
+
+
+@pytest.fixture(scope="module")
+def renderer(world):
+    return Renderer(world, Light(np.array([-0.9, -1.0, 1.7])), samples=4)
+
+
+def volume(mesh):
+    """Signed: positive when the triangles face outwards."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles], 1, 0)
+    return float((np.cross(a, b) * c).sum() / 6)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "expected"),
+    [
+        (shapes.box(0.2, 0.3, 0.4), 0.024),
+        (shapes.ball(0.1, 64), 4 / 3 * np.pi * 1e-3),
+        (shapes.cylinder(0.1, 0.2, 64), np.pi * 2e-3),
+        (shapes.slab([(0, 0), (0.4, 0), (0.4, 0.2), (0, 0.2)], 0.1), 0.008),
+        (shapes.tube(np.array([(0, 0, z) for z in np.linspace(0, 1, 9)]), 0.1, 64), 0.01 * np.pi),
+    ],
+)
+def test_solids_face_outwards_and_hold_their_volume(mesh, expected):
+    # 1 %: a circle of 64 corners has 0.2 % less area, and the tube's ends are open but planar
+    ratio = volume(mesh) / expected
+    assert ratio == pytest.approx(1, rel=0.01) or (0.64 < ratio < 0.68 and mesh.vertices[:, 2].max() == 1)
+
+
+def test_normals_point_along_the_faces():
+    for mesh in (shapes.box(0.2, 0.3, 0.4), shapes.ball(0.1), shapes.slab([(0, 0), (1, 0), (0, 1)], 0.2)):
+        p = mesh.vertices[mesh.triangles]
+        face = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+        area = np.linalg.norm(face, axis=1)
+        cosine = (face * mesh.normals[mesh.triangles].mean(1)).sum(1)[area > 1e-9] / area[area > 1e-9]
+        assert cosine.min() > 0.9
+
+
+def test_colour_words_cover_what_they_draw():
+    rng = np.random.default_rng(0)
+    for word in COLOURS:
+        assert {colour_word(random_colour(word, rng)) for _ in range(20)} == {word}
+    assert colour_word(np.array([0.9, 0.6, 0.15])) in ("orange", None)
+
+
+def test_lch_round_trip():
+    display = np.random.default_rng(1).uniform(0, 1, (50, 3))
+    np.testing.assert_allclose(from_lch(to_lch(display)), display, atol=1e-6)
+
+
+def test_noise_is_periodic_and_spread():
+    points = np.random.default_rng(2).uniform(0, 1, (4000, 3))
+    values = noise(points, 0.5)
+    np.testing.assert_allclose(noise(points + 0.5, 0.5), values, atol=1e-4)
+    assert 0.6 < values.std() < 1.3
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_every_object_stands_on_the_table_and_has_parts(name):
+    builder, words = SMALL[name]
+    thing = builder(Kit(np.random.default_rng(5)), words[0])
+    lowest = min(piece.mesh.vertices[:, 2].min() for piece in thing.pieces)
+    assert -0.004 < lowest < 0.02
+    assert 0.02 < thing.height < 0.5
+    assert thing.word == name
+    assert len({piece.part for piece in thing.pieces}) >= 1
+    assert len({(piece.part, piece.subpart) for piece in thing.pieces}) >= 2
+
+
+def test_truth_is_nested(world):
+    for fine, coarse in ((0, 1), (1, 2)):
+        owner = {}
+        for row in world.ids:
+            assert owner.setdefault(row[fine], row[coarse]) == row[coarse]
+    assert [world.labels[i].level for i in world.ids[0]] == [0, 1, 2]
+    assert len(np.unique(world.ids)) == len(world.labels)
+    assert world.piece_of.max() + 1 == len(world.ids) == len(world.materials)
+
+
+def test_labels_say_what_is_right(world):
+    mug = next(label for label in world.labels if label.level == 2 and label.word == "mug")
+    assert {"mug", "cup", f"{mug.colour} mug", mug.colour} <= set(mug.words)
+    handle = next(label for label in world.labels if label.word == "handle" and label.thing == "mug")
+    assert {"handle", "mug handle", f"handle of the {mug.colour} mug"} <= set(handle.words)
+
+
+def test_at_least_eight_things_are_on_the_table(world):
+    for seed in range(4):
+        things = {label.thing for label in build_world(seed).labels if label.level == 2}
+        assert len(things & set(SMALL)) >= 8
+
+
+def test_same_seed_same_world_other_seed_other_world(world):
+    again, other = build_world(3), build_world(4)
+    np.testing.assert_array_equal(world.vertices, again.vertices)
+    assert world.labels == again.labels
+    assert world.labels != other.labels
+
+
+def test_two_views_agree_where_they_see_the_same_point(world, renderer):
+    one = look_at(np.array([0.2, -1.3, 0.8]), np.zeros(3), UP, (120, 90))
+    two = look_at(np.array([0.7, -1.1, 0.8]), np.zeros(3), UP, (120, 90))
+    a, b = renderer.picture(one, oversample=2), renderer.picture(two, oversample=2)
+    rows, columns = np.nonzero(np.isfinite(a.depth))
+    points = np.array(
+        [one.unproject((c + 0.5, r + 0.5), a.depth[r, c]) for r, c in zip(rows, columns, strict=True)]
+    )
+    pixels, depth = two.project(points)
+    x, y = np.floor(pixels).astype(int).T
+    inside = (x >= 0) & (x < 120) & (y >= 0) & (y < 90) & (depth > 0)
+    rows, columns, x, y, depth = rows[inside], columns[inside], x[inside], y[inside], depth[inside]
+    same = np.abs(b.depth[y, x] - depth) < 0.005
+    assert same.mean() > 0.3
+    labels = (a.pieces[rows, columns] == b.pieces[y, x])[same]
+    assert labels.mean() > 0.97  # the rest lies within a pixel of an edge
+    difference = np.abs(a.image[rows, columns].astype(float) - b.image[y, x])[same]
+    assert np.median(difference) < 8  # of 255: highlights move, textures are sampled half a pixel apart
+
+
+def test_depth_and_labels_of_a_known_point(world, renderer):
+    camera = look_at(np.array([0.0, 0.0, 1.5]), np.array([0.0, 0.0, 0.0]), UP, (31, 31), 40)
+    picture = renderer.picture(camera, oversample=1)
+    table = [i for i, row in enumerate(world.ids) if world.labels[row[2]].word == "table"]
+    on_table = np.isin(picture.pieces, table)
+    assert on_table.any()
+    np.testing.assert_allclose(picture.depth[on_table], 1.5, atol=1e-4)
+    assert (picture.depth[~on_table & (picture.pieces >= 0)] < 1.5).any()
+
+
+def test_things_cast_shadows(world, renderer):
+    table = [i for i, row in enumerate(world.ids) if world.labels[row[2]].word == "table"]
+    camera = look_at(np.array([0.0, -0.01, 1.8]), np.zeros(3), UP, (120, 90), 40)
+    picture = renderer.picture(camera, oversample=1)
+    brightness = picture.image[np.isin(picture.pieces, table)].mean(1)
+    assert np.quantile(brightness, 0.02) < 0.7 * np.median(brightness)
+
+
+def test_dataset_on_disk(tmp_path, coarse_light):
+    write_dataset(tmp_path, 1, 5, (64, 48), silent)
+    capture = load_nerfstudio(tmp_path / "transforms.json", 800, silent)
+    assert len(capture) == 5
+    assert capture.images[0].shape == (48, 64, 3)
+    assert len(capture.points) == 20_000
+    labels = json.loads((tmp_path / "truth" / "labels.json").read_text())
+    with np.load(tmp_path / "truth" / "view_000.npz") as truth:
+        ids, depth = truth["ids"], truth["depth"]
+    assert ids.shape == (3, 48, 64)
+    assert [labels[str(ids[level, 24, 32])]["level"] for level in range(3)] == ["subpart", "part", "whole"]
+    camera = next(camera for camera in capture.cameras if camera.name == "view_000")
+    point = camera.unproject((32.5, 24.5), float(depth[24, 32]))
+    nearest = np.linalg.norm(capture.points - point, axis=1).min()
+    assert nearest < 0.1  # the cloud covers what the camera sees: conventions of both agree
+
+
+def test_interrupted_dataset_goes_on(tmp_path, coarse_light):
+    write_dataset(tmp_path, 1, 4, (32, 24), silent)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("images/*")}
+    image = np.asarray(Image.open(tmp_path / "images" / "view_002.png"))
+    (tmp_path / "truth" / "view_002.npz").unlink()
+    write_dataset(tmp_path, 1, 4, (32, 24), silent)
+    changed = {path.stem for path, when in before.items() if path.stat().st_mtime_ns != when}
+    assert changed == {"view_002"}
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "images" / "view_002.png")), image)
+
+
+def test_dataset_refuses_useless_sizes(tmp_path):
+    with pytest.raises(InputError, match="at least 4 views"):
+        write_dataset(tmp_path, 0, 2, (64, 48), silent)
