@@ -43,20 +43,40 @@ def box_nms(boxes: Array, scores: Array, iou: float) -> Array:
 def clean_regions(mask: Array, min_region: int) -> tuple[Array, bool]:
     """Fill holes below `min_region` px, then drop islands below it; the largest island always stays.
 
-    mask: (H, W) bool. Returns the mask and whether anything changed. As SAM's `remove_small_regions`.
+    mask: (H, W) bool, not empty. Returns the mask and whether anything changed. As SAM's
+    `remove_small_regions`; only the surroundings of the mask are looked at, which changes nothing else.
     """
+    (left, top, right, bottom), (height, width) = mask_boxes(mask[None])[0], mask.shape
+    gaps = np.array([top * width, (height - bottom) * width, left * height, (width - right) * height])
+    if ((gaps > 0) & (gaps < min_region)).any():  # what lies beyond the box may itself be a small hole
+        window = np.s_[0:height, 0:width]
+        gaps[:] = 0
+    else:
+        window = np.s_[max(top - 1, 0) : bottom + 1, max(left - 1, 0) : right + 1]
+    cleaned = np.zeros_like(mask)
+    cleaned[window] = _drop_islands(_fill_holes(mask[window], min_region, gaps > 0), min_region)
+    return cleaned, not np.array_equal(cleaned, mask)
+
+
+def _fill_holes(mask: Array, min_region: int, open_sides: Array) -> Array:
+    """open_sides: (4,) bool top, bottom, left, right: whether the background goes on for long there."""
     holes, count = ndimage.label(~mask, EIGHT)
     small = np.bincount(holes.ravel(), minlength=count + 1) < min_region
+    for side, is_open in zip((holes[0], holes[-1], holes[:, 0], holes[:, -1]), open_sides, strict=True):
+        if is_open:
+            small[side] = False
     small[0] = False  # the mask itself
-    filled = mask | small[holes]
-    islands, count = ndimage.label(filled, EIGHT)
+    return mask | small[holes]
+
+
+def _drop_islands(mask: Array, min_region: int) -> Array:
+    islands, count = ndimage.label(mask, EIGHT)
     sizes = np.bincount(islands.ravel(), minlength=count + 1)
     keep = sizes >= min_region
-    if count and not keep[1:].any():
+    if not keep[1:].any():
         keep[1 + np.argmax(sizes[1:])] = True
     keep[0] = False
-    cleaned = keep[islands]
-    return cleaned, not np.array_equal(cleaned, mask)
+    return keep[islands]
 
 
 def common_pixels(masks: Array) -> Array:

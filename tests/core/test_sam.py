@@ -174,6 +174,37 @@ def test_crumbs_are_removed_and_small_holes_filled() -> None:
     assert not clean_regions(want, 100)[1]
 
 
+def plain_clean(mask: np.ndarray, min_region: int) -> np.ndarray:
+    """Holes, then islands, on the whole picture, one component at a time."""
+    mask = mask.copy()
+    for value in (False, True):
+        parts, count = ndimage.label(mask == value, np.ones((3, 3)))
+        sizes = [(parts == i).sum() for i in range(1, count + 1)]
+        small = [i for i, size in enumerate(sizes, 1) if size < min_region]
+        if value and len(small) == count:
+            small.remove(1 + int(np.argmax(sizes)))
+        for i in small:
+            mask[parts == i] = not value
+    return mask
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_cleaning_agrees_with_the_whole_picture(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    shape = rng.integers(6, 40, 2)
+    noise = ndimage.gaussian_filter(rng.normal(size=shape), rng.choice([0.7, 1.5, 3]))
+    mask = noise > np.quantile(noise, rng.choice([0.1, 0.5, 0.9]))
+    if seed % 3 == 0:
+        mask[: rng.integers(1, 4)] = mask[:, : rng.integers(1, 4)] = False
+    if not mask.any():
+        mask[-1, -1] = True
+    for min_region in (2, 12, 60):
+        want = plain_clean(mask, min_region)
+        got, changed = clean_regions(mask, min_region)
+        np.testing.assert_array_equal(got, want)
+        assert changed == (want != mask).any()
+
+
 def test_the_largest_island_always_stays() -> None:
     mask = np.zeros((30, 30), bool)
     mask[1:3, 1:3] = mask[10:14, 10:14] = True
