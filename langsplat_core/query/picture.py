@@ -91,8 +91,9 @@ def _depth_picture(channels: Channels, picture: PictureConfig) -> Array:
 def _heat_picture(
     colours: Array, relevancy: Array, picture: PictureConfig, peaks: tuple[float, ...]
 ) -> Array:
-    spans = [max(peak - RELEVANCY_FLOOR, MIN_HEAT_SPAN) for peak in peaks]
-    spans += [1 - RELEVANCY_FLOOR] * (relevancy.shape[-1] - len(spans))
+    shown = relevancy.shape[-1]
+    spans = [max(peak - RELEVANCY_FLOOR, MIN_HEAT_SPAN) for peak in peaks[:shown]]
+    spans += [1 - RELEVANCY_FLOOR] * (shown - len(spans))
     heat = np.clip((relevancy - RELEVANCY_FLOOR) / spans, 0, 1).max(-1)
     fade = np.clip(heat / HEAT_FADE, 0, 1)
     mix = (picture.heat_opacity * fade * fade * (3 - 2 * fade))[..., None]  # smoothstep

@@ -35,6 +35,16 @@ def fit_linear(vectors: Array, rank: int) -> LinearCodec:
 
 def fit_autoencoder(vectors: Array, config: CodecConfig, progress: Progress = silent) -> AutoencoderCodec:
     """Adam with a cosine schedule on random batches; progress shows the batch's mean cosine."""
+    # Layers this small are slower on several threads than on one, and many times slower on a busy machine.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return _train(vectors, config, progress)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _train(vectors: Array, config: CodecConfig, progress: Progress) -> AutoencoderCodec:
     torch.manual_seed(config.seed)
     data = torch.from_numpy(np.ascontiguousarray(vectors, np.float32))
     encoder, decoder = _networks(data.shape[1], config.latent_dim)
