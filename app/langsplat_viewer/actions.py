@@ -284,13 +284,13 @@ def step_camera(viewer: Viewer, by: int) -> None:
 
 def focus_result(viewer: Viewer, query: Query | None = None) -> None:
     """Bring a query's place to the centre, at a distance that shows its surroundings; without `query` the
-    best one shown; without any the middle of the scene."""
+    latest one shown that was found; without any the middle of the scene."""
     state, extent = viewer.state, viewer.state.extent
     if extent is None or state.view is None:
         return
     if query is None:
-        placed = [q for q in state.queries if q.slot is not None and q.result and q.result.place is not None]
-        query = max(placed, key=lambda q: q.result.peak if q.result else 0.0, default=None)
+        found = [q for q in state.queries if q.slot is not None and q.result and q.result.found]
+        query = found[-1] if found else None
     if query is None or query.result is None or query.result.place is None:
         glide_to(viewer, focus(state.view, extent.centre, 2.6 * extent.radius))
         return

@@ -32,7 +32,7 @@ def blobs(seed: int = 0) -> Gaussians:
 
 
 def language(phrasebook: bool = False) -> LanguageField:
-    """Each blob means its word at level "whole"; at "part" all blobs mean "plant"; "subpart" is unobserved."""
+    """Each blob means its word at level "whole"; at "part" all are a little "plant"; "subpart" is empty."""
     latents = np.zeros((3, 3 * PER_BLOB, 4), np.float32)
     latents[2] = np.repeat(np.eye(4, dtype=np.float32)[:3], PER_BLOB, 0)
     latents[1] = unit(0.6 * np.eye(4)[2] + 0.8 * np.eye(4)[3])

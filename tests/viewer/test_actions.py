@@ -308,15 +308,25 @@ def test_layers_change_only_when_the_picture_needs_others(opened):
 # --- Camera
 
 
-def test_focus_brings_the_best_result_to_the_centre(opened):
-    actions.ask(opened, "plant")
+def test_focus_brings_the_latest_result_found_to_the_centre(opened):
+    for word in ("mug", "plant", "sofa"):
+        actions.ask(opened, word)
     settle(opened)
     actions.focus_result(opened)
     arrive(opened)
-    place = opened.state.queries[0].result.place
+    place = opened.state.queries[1].result.place
     pixels, depth = opened.state.view.camera(160, 120).project(place[None])
     assert_allclose(pixels[0], (80, 60), atol=1e-6)
     assert 0 < depth[0] < 5
+
+
+def test_focus_on_one_of_several_results(opened):
+    for word in ("mug", "plant"):
+        actions.ask(opened, word)
+    settle(opened)
+    actions.focus_result(opened, opened.state.queries[0])
+    arrive(opened)
+    assert_allclose(opened.state.view.target, opened.state.queries[0].result.place)
 
 
 def test_focus_without_a_result_is_the_scenes_middle(opened):

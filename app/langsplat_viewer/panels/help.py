@@ -14,7 +14,7 @@ KEYS = (
     ("Shift, Alt", "fly faster, slower"),
     ("[ ]", "roll"),
     ("R", "whole scene"),
-    ("F", "focus on the best result"),
+    ("F", "focus on the latest result found"),
     (", .", "previous, next training camera"),
     ("1 ... 8", "display, in the panel's order"),
     ("/", "type a search"),

@@ -19,13 +19,16 @@ def draw(viewer: Viewer) -> None:
         for message in reversed(viewer.state.messages):
             small_wrapped(message.text, BAD if message.is_error else MUTED)
     imgui.end_child()
-    imgui.text_colored(MUTED, figures(viewer, imgui.get_io().framerate))
+    idling = hello_imgui.get_runner_params().fps_idling.is_idling
+    imgui.text_colored(MUTED, figures(viewer, None if idling else imgui.get_io().framerate))
 
 
-def figures(viewer: Viewer, frames_per_second: float) -> str:
-    """One line: frames per second, backend, time and size of the last picture."""
+def figures(viewer: Viewer, frames_per_second: float | None) -> str:
+    """One line: frames per second (None: the window sleeps until something happens), backend, time and
+    size of the last picture."""
     stats = viewer.state.stats
-    parts = [f"{frames_per_second:.0f} fps", viewer.state.backend]
+    speed = "idle" if frames_per_second is None else f"{frames_per_second:.0f} fps"
+    parts = [speed, viewer.state.backend]
     if stats.width:
         parts += [f"{stats.milliseconds:.0f} ms", f"{stats.width} x {stats.height}"]
     return "   ".join(part for part in parts if part)

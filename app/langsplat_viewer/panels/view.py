@@ -8,6 +8,7 @@ from langsplat_core.config import Display
 from langsplat_viewer import actions
 from langsplat_viewer.actions import Viewer
 from langsplat_viewer.controls import FOV_RANGE, adopt_up, level, with_fov
+from langsplat_viewer.panels.style import MUTED, small_wrapped
 
 # (label, display, latent level), in the order of the keys 1 to 8; labels of radio buttons
 DISPLAYS: tuple[tuple[str, Display, int | None], ...] = (
@@ -36,6 +37,8 @@ def draw_display(viewer: Viewer) -> None:
                 imgui.same_line()
             _display_button(viewer, *DISPLAYS[index])
     picture = viewer.state.picture
+    if picture.display in ("relevancy", "segmentation") and not viewer.state.shown():
+        small_wrapped("search for something to see where it is", MUTED)
     if picture.display == "relevancy":
         picture = replace(picture, heat_opacity=_slider("Heat opacity", picture.heat_opacity, 0.0, 1.0))
     if picture.display == "segmentation":

@@ -1,0 +1,172 @@
+"""The window itself, on a virtual display, driven like a person would; and the canvas behind it."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from langsplat_core.formats import save_scene
+from langsplat_viewer.canvas import REST_SECONDS, Canvas
+from langsplat_viewer.controls import default_view, extent_of, orbit
+from langsplat_viewer.state import ViewerState
+from tests.viewer.fakes import blob_scene
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def display() -> Iterator[str]:
+    """The name of a display: a virtual one of our own where Xvfb is installed, else the session's."""
+    if shutil.which("Xvfb") is None:
+        if not os.environ.get("DISPLAY"):
+            pytest.skip("neither Xvfb nor a display")
+        yield os.environ["DISPLAY"]
+        return
+    reading, writing = os.pipe()
+    command = ["Xvfb", "-displayfd", str(writing), "-screen", "0", "1280x900x24", "-nolisten", "tcp"]
+    server = subprocess.Popen(command, pass_fds=[writing], stderr=subprocess.DEVNULL)
+    os.close(writing)
+    with os.fdopen(reading) as pipe:
+        number = pipe.readline().strip()
+    assert number, "Xvfb did not start"
+    yield f":{number}"
+    server.terminate()
+    server.wait(10)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Scenes with and without a language field, and one cut short."""
+    for name, field in (("blobs", True), ("plain", False)):
+        save_scene(tmp_path / f"{name}.ply", replace(blob_scene(field=field), path=None))
+    whole = (tmp_path / "plain.ply").read_bytes()
+    (tmp_path / "truncated.ply").write_bytes(whole[: len(whole) // 2])
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "scenario", ["look_and_search", "without_field", "from_the_command_line", "broken_renderer"]
+)
+def test_window(scenario: str, display: str, folder: Path):
+    environment = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}
+    environment |= {"DISPLAY": display, "PYTHONPATH": str(ROOT)}
+    run = subprocess.run(
+        [sys.executable, "-m", "tests.viewer.window_driver", scenario, str(folder)],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert run.returncode == 0, (run.stdout + run.stderr)[-4000:]
+    assert run.stdout.rstrip().endswith("PASSED"), (run.stdout + run.stderr)[-4000:]
+
+
+class FakeRenderer:
+    """Notes what is asked of it, and takes as long as a slow machine if told to."""
+
+    backend = "fake"
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, object]] = []
+
+    def set_scene(self, scene) -> None:
+        self.calls.append(("scene", scene))
+
+    def set_layers(self, latent_rgb, relevancies) -> None:
+        self.calls.append(("layers", latent_rgb is not None))
+
+    def draw(self, target, camera, picture, heat_peaks=()) -> None:
+        self.calls.append(("draw", (camera.width, camera.height)))
+        target.clear(1.0, 0.0, 0.0, 1.0)
+
+    def read(self, camera, picture, heat_peaks=()):
+        return np.zeros((camera.height, camera.width, 3), np.uint8)
+
+    def depth_at(self, x_px, y_px):
+        return 2.0 if x_px > 100 else None
+
+
+@pytest.fixture
+def state() -> ViewerState:
+    scene = blob_scene()
+    extent = extent_of(scene)
+    return ViewerState(scene=scene, extent=extent, view=default_view(scene, extent), size=(200, 120))
+
+
+def drawn(renderer: FakeRenderer) -> list[object]:
+    found = [what for kind, what in renderer.calls if kind == "draw"]
+    renderer.calls.clear()
+    return found
+
+
+def test_canvas_draws_only_changes(gl, state):
+    renderer = FakeRenderer()
+    canvas = Canvas(gl, renderer)
+    assert not canvas.update(state, 0.0)
+    assert [kind for kind, _ in renderer.calls] == ["scene", "layers", "draw"]
+    renderer.calls.clear()
+    for second in range(1, 5):
+        canvas.update(state, float(second))
+    assert renderer.calls == []
+    state.picture = replace(state.picture, display="depth")
+    canvas.update(state, 6.0)
+    assert renderer.calls == [("draw", (200, 120))]
+    renderer.calls.clear()
+    state.latent, state.picture = np.zeros((3, 360, 3), np.float32), replace(state.picture, display="latent")
+    canvas.update(state, 7.0)
+    assert renderer.calls == [("layers", True), ("draw", (200, 120))]
+    assert np.frombuffer(canvas.texture.read(), np.uint8)[:4].tolist() == [255, 0, 0, 255]
+
+
+@pytest.mark.parametrize(("fine_ms", "coarse"), [(10, (200, 120)), (150, (100, 60)), (5000, (50, 30))])
+def test_canvas_is_coarse_only_while_a_slow_camera_moves(gl, state, fine_ms, coarse):
+    renderer = FakeRenderer()
+    canvas = Canvas(gl, renderer)
+    canvas.update(state, 0.0)
+    canvas._fine_ms = fine_ms
+    drawn(renderer)
+    state.view = orbit(state.view, 0.1, 0)
+    assert canvas.update(state, 10.0)  # a finer picture is due
+    assert drawn(renderer) == [coarse]
+    canvas.update(state, 10.0 + 0.5 * REST_SECONDS)
+    assert drawn(renderer) == []
+    assert not canvas.update(state, 10.0 + 2 * REST_SECONDS)
+    assert drawn(renderer) == ([] if coarse == (200, 120) else [(200, 120)])
+
+
+def test_canvas_stays_fine_if_told_so(gl, state):
+    renderer = FakeRenderer()
+    canvas = Canvas(gl, renderer)
+    state.coarse_while_moving = False
+    canvas.update(state, 0.0)
+    canvas._fine_ms = 5000
+    state.view = orbit(state.view, 0.1, 0)
+    canvas.update(state, 10.0)
+    assert drawn(renderer) == [(200, 120), (200, 120)]
+
+
+def test_canvas_keeps_few_textures(gl, state):
+    canvas = Canvas(gl, FakeRenderer())
+    for width in range(20, 40):
+        state.size = (width, 20)
+        canvas.update(state, 0.0)
+        assert canvas.texture.size == (width, 20)
+    assert len(canvas._targets) == len(canvas._textures) <= 3
+
+
+def test_canvas_finds_the_point_under_the_cursor(gl, state):
+    canvas = Canvas(gl, FakeRenderer())
+    assert canvas.point_at(0.8, 0.5) is None  # nothing was drawn yet
+    canvas.update(state, 0.0)
+    camera = state.view.camera(200, 120)
+    pixels, depth = camera.project(canvas.point_at(0.8, 0.25)[None])
+    np.testing.assert_allclose(pixels[0], (160, 30))
+    np.testing.assert_allclose(depth, 2.0)
+    assert canvas.point_at(0.2, 0.25) is None

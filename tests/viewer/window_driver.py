@@ -1,0 +1,248 @@
+"""Drives the real window through imgui's test engine; run by test_window.py in a process of its own.
+
+    python -m tests.viewer.window_driver SCENARIO FOLDER
+
+A scenario asserts as it goes and ends with "PASSED". FOLDER holds the scenes and is the working folder.
+"""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from imgui_bundle import imgui  # isort: skip
+from imgui_bundle.immapp import testing  # isort: skip
+from langsplat_core.errors import BackendError
+from langsplat_core.formats import load_scene
+from langsplat_viewer.actions import Services
+from langsplat_viewer.frame import FrameRenderer
+from langsplat_viewer.window import Window, WindowRequest
+from tests.viewer.fakes import CENTRES, FakeEncoder
+
+MUG, BOOK, PLANT = CENTRES
+
+
+class CountingRenderer(FrameRenderer):
+    """Counts the pictures it draws."""
+
+    def __init__(self, ctx) -> None:
+        super().__init__(ctx, "opengl")
+        self.count = 0
+
+    def draw(self, *args, **kwargs) -> None:
+        self.count += 1
+        super().draw(*args, **kwargs)
+
+
+class Session:
+    """A window under test."""
+
+    def __init__(self, folder: Path, scene: str, **request) -> None:
+        self.folder = folder
+        self.renderer: CountingRenderer | None = None
+        services = Services(load_scene, lambda encoder_id: FakeEncoder())
+        self.window = Window(
+            WindowRequest(folder / scene, size=(860, 620), **request), services, self._make_renderer
+        )
+        self.state = self.window.viewer.state
+
+    def _make_renderer(self, ctx) -> CountingRenderer:
+        self.renderer = CountingRenderer(ctx)
+        return self.renderer
+
+    def run(self, test: Callable[["Session"], None]) -> None:
+        def body(ctx) -> None:
+            self.ctx = ctx
+            test(self)
+
+        testing.run(test_function=body, runner_params=self.window.params())
+
+    def wait(self, condition: Callable[[], bool]) -> None:
+        for _ in range(3000):
+            self.ctx.yield_()
+            if condition():
+                return
+        raise AssertionError("waited in vain")
+
+    def settle(self) -> None:
+        """Until nothing moves and nothing is under way."""
+        self.ctx.yield_(2)
+        self.wait(lambda: self.window.viewer.worker.current is None and self.state.glide is None)
+        self.wait(lambda: not self.window._unfinished)
+        self.ctx.yield_(2)
+
+    def shot(self, name: str) -> np.ndarray:
+        """(H, W, 3) the whole window."""
+        self.settle()
+        path = self.folder / f"{name}.png"
+        testing.capture(self.ctx, str(path))
+        return np.asarray(Image.open(path).convert("RGB")).astype(int)
+
+    def at(self, shot: np.ndarray, point: np.ndarray) -> np.ndarray:
+        """(3,) mean colour of the 5 x 5 pixels around a world point."""
+        width, height = self.state.size
+        (x, y), _ = (part[0] for part in self.state.view.camera(width, height).project(point[None]))
+        column, row = int(x) + shot.shape[1] - width, int(y)
+        return shot[row - 2 : row + 3, column - 2 : column + 3].reshape(-1, 3).mean(0)
+
+    def search(self, phrase: str) -> None:
+        self.ctx.item_click("//**/##phrase")
+        self.ctx.key_chars_append_enter(phrase)
+        self.settle()
+
+
+def look_and_search(s: Session) -> None:
+    s.wait(lambda: s.state.scene is not None)
+    rgb = s.shot("rgb")
+    assert s.at(rgb, MUG).argmax() == 0
+    assert s.at(rgb, BOOK).argmax() == 1
+    assert s.at(rgb, PLANT).argmax() == 2
+    panel = rgb[600, 5]
+
+    # A picture is drawn again only when something changed.
+    drawn = s.renderer.count
+    s.ctx.yield_(20)
+    assert s.renderer.count == drawn
+
+    # Typing owns the keyboard: the p of "plant" saves no picture, its a and t move nothing.
+    before = s.state.view
+    s.search("plant")
+    assert s.state.view is before
+    assert list(s.folder.glob("blobs-*.png")) == []
+    assert s.state.queries[0].result.found
+    heat = s.shot("heat")
+    hot = s.at(heat, PLANT)
+    assert hot[0] > hot[2] + 60  # blue turned hot
+    np.testing.assert_allclose(s.at(heat, BOOK), 0.45 * s.at(rgb, BOOK), atol=6)  # the rest is dimmed
+
+    # The heat stays on the thing while the camera moves round it.
+    x, y = 600, 300
+    s.ctx.mouse_teleport_to_pos((x, y))
+    s.ctx.mouse_down(0)
+    for step in range(8):
+        s.ctx.mouse_teleport_to_pos((x + 8 * step, y - 3 * step))
+        s.ctx.yield_()
+    s.ctx.mouse_up(0)
+    moved = s.shot("moved")
+    assert s.state.view is not before
+    # Blended relevancy depends a little on the view; the heat map's red end is steep, its blue end far away.
+    np.testing.assert_allclose(s.at(moved, PLANT), hot, atol=40)
+    assert s.at(moved, PLANT)[2] < 60 < s.at(rgb, PLANT)[2]
+
+    s.search("sofa")
+    assert "sofa" in s.state.queries[1].problem
+    s.search("mug")
+    both = s.shot("both")
+    np.testing.assert_allclose(s.at(both, MUG), s.at(both, PLANT), atol=40)
+
+    seen = [both]
+    for label in ("Colours", "Depth", "Alpha", "Segmentation", "subpart##latent", "whole##latent"):
+        s.ctx.item_click(f"//**/{label}")
+        shot = s.shot(label.replace("#", ""))
+        assert all(np.abs(shot[:, 400:] - other[:, 400:]).max() > 30 for other in seen), label
+        assert (shot[600, 5] == panel).all(), f"{label} coloured the panel"
+        seen.append(shot)
+    alpha = seen[3][100:500, 400:]
+    assert (alpha.max(-1) == alpha.min(-1)).all()
+    assert alpha.max() > 200
+
+    # Keys, away from the box.
+    s.ctx.mouse_teleport_to_pos((600, 550))
+    s.ctx.mouse_click(0)
+    s.ctx.key_press(imgui.Key._1)
+    s.ctx.key_press(imgui.Key.r)
+    s.settle()
+    assert s.state.picture.display == "rgb"
+    width = s.state.size[0]
+    s.ctx.key_press(imgui.Key.tab)
+    s.settle()
+    assert s.state.size == (860, 620)
+    assert width < 600
+    s.ctx.key_press(imgui.Key.tab)
+    s.settle()
+    s.ctx.key_press(imgui.Key.f)
+    s.settle()
+    place = s.state.queries[-1].result.place
+    np.testing.assert_allclose(s.state.view.target, place)
+
+    s.ctx.key_press(imgui.Key.p)
+    s.ctx.yield_(2)
+    saved = np.asarray(Image.open(s.folder / "blobs-001.png")).astype(int)
+    assert saved.shape == (s.state.size[1], s.state.size[0], 3)
+    shown = s.shot("saved")
+    np.testing.assert_allclose(saved[:500], shown[:500, -s.state.size[0] :], atol=3)  # below: the cursor
+    assert not list(s.folder.glob("*.ini"))
+
+
+def without_field(s: Session) -> None:
+    s.wait(lambda: s.state.scene is not None)
+    s.settle()
+    assert any("langsplat train" in message.text for message in s.state.messages)
+    assert not s.ctx.item_exists("//**/##phrase")
+    s.ctx.key_press(imgui.Key._4)  # relevancy: refused with a line, not a crash
+    assert s.state.picture.display == "rgb"
+
+    s.window._dropped(None, [str(s.folder / "truncated.ply")])
+    s.settle()
+    assert s.state.messages[-1].is_error
+    assert "truncated.ply" in s.state.messages[-1].text
+    assert s.state.path.name == "plain.ply"
+
+    s.window._dropped(None, [str(s.folder / "blobs.ply")])
+    s.wait(lambda: s.state.path.name == "blobs.ply")
+    s.settle()
+    assert s.ctx.item_exists("//**/##phrase")
+    s.ctx.item_click("//**/Keys")
+    s.ctx.item_click("//**/##next")
+    s.settle()
+    assert s.state.camera_index == 1
+    s.shot("keys")
+
+
+def from_the_command_line(s: Session) -> None:
+    s.wait(lambda: s.state.scene is not None)
+    s.settle()
+    assert [query.phrase for query in s.state.queries] == ["mug", "sofa", "plant"]
+    assert [query.result is not None for query in s.state.queries] == [True, False, True]
+    assert s.state.picture.display == "segmentation"
+    assert s.state.level == "whole"
+    expected = s.state.scene.cameras[2].world_to_camera
+    np.testing.assert_allclose(s.state.view.camera(160, 120).world_to_camera, expected, atol=1e-9)
+
+
+def broken_renderer(s: Session) -> None:
+    """A driver that fails while drawing: the window lives on and says so once."""
+
+    def fail(*args, **kwargs) -> None:
+        raise BackendError("the driver gave up; use --backend cpu")
+
+    s.wait(lambda: s.state.scene is not None)
+    s.settle()
+    s.renderer.draw = fail
+    s.ctx.key_press(imgui.Key.r)
+    s.settle()
+    s.ctx.yield_(20)
+    assert s.state.messages[-1].text == "the driver gave up; use --backend cpu"
+    del s.renderer.draw
+    s.ctx.key_press(imgui.Key._2)
+    assert s.shot("mended")[:, 400:].max() > 100
+
+
+SCENARIOS = {
+    "look_and_search": (look_and_search, "blobs.ply", {}),
+    "without_field": (without_field, "plain.ply", {}),
+    "from_the_command_line": (
+        from_the_command_line,
+        "blobs.ply",
+        {"queries": ("mug", "sofa", "plant"), "display": "segmentation", "level": "whole", "camera": "2"},
+    ),
+    "broken_renderer": (broken_renderer, "blobs.ply", {}),
+}
+
+
+if __name__ == "__main__":
+    scenario, scene_name, settings = SCENARIOS[sys.argv[1]]
+    Session(Path(sys.argv[2]), scene_name, **settings).run(scenario)
+    print("PASSED")
