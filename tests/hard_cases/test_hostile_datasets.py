@@ -1,4 +1,4 @@
-"""Datasets that are broken, odd or meant to harm: each loads what is sound or says in one line what is not."""
+"""Datasets that are broken, odd or meant to harm: what is sound loads, the rest is refused in one line."""
 
 import json
 import struct
