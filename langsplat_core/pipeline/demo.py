@@ -5,7 +5,14 @@ Nothing is planted: the pipeline sees the photographs, their cameras and noisy p
 
 from pathlib import Path
 
-from langsplat_core.config import ClipConfig, CodecConfig, DatasetConfig, MaskConfig, RadianceConfig, TrainConfig
+from langsplat_core.config import (
+    ClipConfig,
+    CodecConfig,
+    DatasetConfig,
+    MaskConfig,
+    RadianceConfig,
+    TrainConfig,
+)
 from langsplat_core.datasets.synthetic.dataset import write_dataset
 from langsplat_core.pipeline.train import TrainReport, train_scene
 from langsplat_core.progress import Progress, silent
