@@ -79,9 +79,7 @@ def train_scene(
         [capture.cameras[i].name for i in train],
         mask_source,
         encoder,
-        FeatureStore(
-            work / stage_key("features", 1, config.masks, config.clip.model, config.dataset.max_side)
-        ),
+        FeatureStore(work / "features"),  # keyed by mask settings, encoder and image
         progress,
     )
     views = [(capture.cameras[i], item) for i, item in zip(train, features, strict=True)]
