@@ -113,10 +113,10 @@ def train_scene(
 def _radiance(
     capture: Capture, train: list[int], config: TrainConfig, work: Path, progress: Progress
 ) -> Gaussians:
-    names = [capture.cameras[i].name for i in train]
+    photographs = capture_digest(capture, train)
     # The backend changes who computes, not what: a run may move between machines.
     settings = replace(config.radiance, backend="auto")
-    done = work / f"{stage_key('radiance', 1, settings, config.dataset, names)}.ply"
+    done = work / f"{stage_key('radiance', 1, settings, photographs)}.ply"
     if done.exists():
         return read_ply(done)
     gaussians = train_radiance(
