@@ -19,7 +19,7 @@ from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
 from langsplat_core.formats import read_ply, save_scene, write_ply
-from langsplat_core.pipeline.stages import stage_key
+from langsplat_core.pipeline.stages import capture_digest, stage_key
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.numba_cpu import CpuRasterizer
 from langsplat_core.scene import CANONICAL_PHRASES, Camera, Codec, Gaussians, LanguageField, Scene
