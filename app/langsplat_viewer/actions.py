@@ -71,8 +71,12 @@ class Viewer:
 
 @dataclass(frozen=True, eq=False)
 class _Opened:
+    """A scene with all that the window's thread should not have to compute."""
+
     scene: Scene
+    unusable: int  # Gaussians with NaN or a zero quaternion; they are not drawn
     extent: Extent
+    view: OrbitCamera
     latent: Array | None
 
 
@@ -105,7 +109,9 @@ def open_scene(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = lamb
         viewer.services.warm_up(scene, backend)
         progress(f"preparing {path.name}", 0.9)
         latent = None if scene.language is None else latent_colours(scene.language)
-        return _Opened(scene, extent_of(scene), latent)
+        unusable = len(scene.gaussians) - int(scene.gaussians.valid().sum())
+        extent = extent_of(scene)
+        return _Opened(scene, unusable, extent, default_view(scene, extent), latent)
 
     def done(opened: _Opened) -> None:
         _show_scene(viewer, path, opened)
@@ -123,11 +129,12 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state.opening, state.path = None, path
     state.scene, state.extent, state.latent = scene, opened.extent, opened.latent
     state.queries, state.camera_index, state.glide = [], 0 if scene.cameras else None, None
-    state.view = default_view(scene, opened.extent)
+    state.view = opened.view
     if scene.language is None and state.picture.display in NEEDS_FIELD:
         state.picture = replace(state.picture, display="rgb")
     viewer.answers = Answers(scene, viewer.services.load_encoder, viewer.services.encoder_id)
-    state.say(f"{path.name}: {len(scene.gaussians):,} Gaussians")
+    not_drawn = f", {opened.unusable:,} of them unusable and not drawn" if opened.unusable else ""
+    state.say(f"{path.name}: {len(scene.gaussians):,} Gaussians{not_drawn}")
     if scene.language is None:
         state.say(NO_FIELD)
         return

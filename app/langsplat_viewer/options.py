@@ -36,10 +36,13 @@ def scene_path(scene: Path | None) -> Path:
         if not demo.is_file():
             raise InputError(f"the bundled demo scene is missing ({demo}); name a scene, or reinstall")
         return demo
-    if not scene.exists():
-        raise InputError(f"{scene}: no such file; check the spelling and the folder")
-    if scene.is_dir() and not (scene / META_NAME).exists():
-        raise InputError(f"{scene}: is a folder, not a scene; name the .ply file in it")
+    try:
+        if not scene.exists():
+            raise InputError(f"{scene}: no such file; check the spelling and the folder")
+        if scene.is_dir() and not (scene / META_NAME).exists():
+            raise InputError(f"{scene}: is a folder, not a scene; name the .ply file in it")
+    except OSError as error:  # a name too long, a folder that may not be looked into
+        raise InputError(f"{str(scene)[:80]}: cannot be opened ({error.strerror})") from None
     return scene
 
 

@@ -4,11 +4,12 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+import moderngl
 import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import Display, LevelChoice, PictureConfig
-from langsplat_core.errors import InputError
+from langsplat_core.errors import BackendError, InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryResult
 from langsplat_core.query.picture import latent_colours
@@ -44,9 +45,12 @@ def check_out(out: Path | None) -> Path:
         raise InputError("--headless needs somewhere to draw to; add --out picture.png")
     if out.suffix.lower() != ".png":
         raise InputError(f"--out {out}: only PNG is written; end the name in .png")
-    if out.is_dir():
-        raise InputError(f"--out {out}: is a folder; name a file in it")
-    folder = next(parent for parent in out.absolute().parents if parent.exists())
+    try:
+        if out.is_dir():
+            raise InputError(f"--out {out}: is a folder; name a file in it")
+        folder = next(parent for parent in out.absolute().parents if parent.exists())
+    except OSError as error:
+        raise InputError(f"--out {str(out)[:80]}: cannot be written ({error.strerror})") from None
     if not folder.is_dir() or not os.access(folder, os.W_OK):
         raise InputError(f"--out {out}: {folder} cannot be written to; choose another folder")
     return out
@@ -81,20 +85,24 @@ def draw_still(request: StillRequest, services: Services, progress: Progress = s
     shown = results[-SLOTS:]  # as in the window, where a fourth query takes the oldest one's colour
 
     progress("drawing", 0.8)
-    image = render_picture(
-        scene,
-        camera,
-        PictureConfig(display=request.display),
-        backend=request.backend,
-        latent_rgb=_latent(scene, request),
-        relevancies=_columns(shown),
-        heat_peaks=tuple(result.peak for result in shown),
-    )
+    size = f"{camera.width}x{camera.height}"
     try:
+        image = render_picture(
+            scene,
+            camera,
+            PictureConfig(display=request.display),
+            backend=request.backend,
+            latent_rgb=_latent(scene, request),
+            relevancies=_columns(shown),
+            heat_peaks=tuple(result.peak for result in shown),
+        )
         save_png(request.out, image)
+    except MemoryError:
+        raise InputError(f"not enough memory for a picture of {size}; choose a smaller --size") from None
+    except moderngl.Error as error:
+        raise BackendError(f"OpenGL cannot draw {size} here ({error}); try --backend cpu") from None
     except OSError as error:
         raise InputError(f"--out {request.out}: cannot be written ({error.strerror or error})") from None
-    size = f"{camera.width}x{camera.height}"
     return [f"{request.out}: {size}, {request.display}", *(describe(result) for result in results)]
 
 

@@ -25,6 +25,7 @@ from langsplat_viewer.options import chosen_camera
 from langsplat_viewer.panels import layout, navigation
 from langsplat_viewer.panels.scene import OpenDialog
 
+TITLE = "LangSplat viewer"
 DEFAULT_SIZE = (1280, 800)
 GL_VERSIONS = ((4, 1), (3, 3))  # 4.1 draws splats on every system; 3.3 still shows the CPU's pictures
 IDLE_FPS = 8.0  # frames per second while nothing happens
@@ -107,13 +108,14 @@ class Window:
         self._canvas: Canvas | None = None
         self._screen: moderngl.Framebuffer | None = None
         self._unfinished = False  # a finer picture is due
+        self._titled: Path | None = None  # the scene that the window's title names
 
     def params(self) -> hello_imgui.RunnerParams:
         """Everything hello_imgui wants to know. Raises BackendError where no window can be opened."""
         major, minor = probe_gl()
         params = hello_imgui.RunnerParams()
         window = params.app_window_params
-        window.window_title = "LangSplat viewer"
+        window.window_title = TITLE
         window.window_geometry.size = self._request.size or DEFAULT_SIZE
         if self._request.size is not None:
             window.window_geometry.window_size_measure_mode = hello_imgui.WindowSizeMeasureMode.screen_coords
@@ -184,10 +186,17 @@ class Window:
             max(1, round(area.width * scale.x)),
             max(1, round(area.height * scale.y)),
         )
+        self._title()
         layout.draw(viewer, self._dialog)
         navigation.handle(viewer, layout.scene_area(viewer))
         busy = self._unfinished or viewer.state.glide is not None
         hello_imgui.get_runner_params().fps_idling.enable_idling = not busy
+
+    def _title(self) -> None:
+        path = self.viewer.state.path
+        if path is not None and path != self._titled:
+            glfw.set_window_title(glfw_window_hello_imgui(), f"{path.name} - {TITLE}")
+            self._titled = path
 
     def _picture(self) -> None:
         """Bring the picture up to date and put it behind the panels."""

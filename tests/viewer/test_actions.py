@@ -89,6 +89,16 @@ def test_open_shows_the_scene_from_its_first_camera(opened):
     )
 
 
+def test_unusable_gaussians_are_counted(viewer):
+    scene = blob_scene(field=False)
+    scene.gaussians.means[[3, 7]] = np.nan
+    viewer.services = replace(viewer.services, load_scene=lambda path: scene)
+    actions.open_scene(viewer, Path("holes.ply"))
+    settle(viewer)
+    assert viewer.state.messages[0].text == "holes.ply: 360 Gaussians, 2 of them unusable and not drawn"
+    assert np.isfinite(viewer.state.view.camera(160, 120).world_to_camera).all()
+
+
 def test_a_broken_file_leaves_the_open_scene_alone(opened):
     before = opened.state.view
     actions.open_scene(opened, Path("broken.ply"))

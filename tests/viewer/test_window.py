@@ -51,7 +51,14 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    "scenario", ["look_and_search", "without_field", "from_the_command_line", "broken_renderer"]
+    "scenario",
+    [
+        "look_and_search",
+        "without_field",
+        "from_the_command_line",
+        "broken_renderer",
+        "close_while_opening",
+    ],
 )
 def test_window(scenario: str, display: str, folder: Path):
     environment = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}

@@ -6,6 +6,7 @@ A scenario asserts as it goes and ends with "PASSED". FOLDER holds the scenes an
 """
 
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from imgui_bundle import imgui  # isort: skip
 from imgui_bundle.immapp import testing  # isort: skip
 from langsplat_core.errors import BackendError
 from langsplat_core.formats import load_scene
+from langsplat_core.scene import Scene
 from langsplat_viewer.actions import Services
 from langsplat_viewer.frame import FrameRenderer
 from langsplat_viewer.window import Window, WindowRequest
@@ -39,10 +41,10 @@ class CountingRenderer(FrameRenderer):
 class Session:
     """A window under test."""
 
-    def __init__(self, folder: Path, scene: str, **request) -> None:
+    def __init__(self, folder: Path, scene: str, load=load_scene, **request) -> None:
         self.folder = folder
         self.renderer: CountingRenderer | None = None
-        services = Services(load_scene, lambda encoder_id: FakeEncoder())
+        services = Services(load, lambda encoder_id: FakeEncoder())
         self.window = Window(
             WindowRequest(folder / scene, size=(860, 620), **request), services, self._make_renderer
         )
@@ -230,6 +232,19 @@ def broken_renderer(s: Session) -> None:
     assert s.shot("mended")[:, 400:].max() > 100
 
 
+def close_while_opening(s: Session) -> None:
+    """The window may be closed at any time; the process ends when the reading does."""
+    assert s.state.scene is None
+    assert s.window.viewer.worker.current is not None
+    s.ctx.item_click("//**/Cancel")
+    assert s.window.viewer.worker.current is None
+
+
+def slow_load(path: Path) -> Scene:
+    time.sleep(1.0)
+    return load_scene(path)
+
+
 SCENARIOS = {
     "look_and_search": (look_and_search, "blobs.ply", {}),
     "without_field": (without_field, "plain.ply", {}),
@@ -239,6 +254,7 @@ SCENARIOS = {
         {"queries": ("mug", "sofa", "plant"), "display": "segmentation", "level": "whole", "camera": "2"},
     ),
     "broken_renderer": (broken_renderer, "blobs.ply", {}),
+    "close_while_opening": (close_while_opening, "blobs.ply", {"load": slow_load}),
 }
 
 

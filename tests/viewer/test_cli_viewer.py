@@ -1,0 +1,253 @@
+"""The program from its arguments: pictures without a window, and refusals as one line with exit code 2."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from langsplat_core.formats import companion_path, language, save_scene, write_cameras
+from langsplat_core.scene import Camera, Scene
+from langsplat_viewer import __main__ as program
+from langsplat_viewer import options
+from langsplat_viewer.options import parse_size
+from tests.viewer.fakes import CENTRES, FakeEncoder, blob_scene
+
+MUG, BOOK, PLANT = CENTRES
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder, with scenes in it."""
+    save_scene(tmp_path / "blobs.ply", blob_scene(phrasebook=True))
+    save_scene(tmp_path / "plain.ply", blob_scene(field=False, with_cameras=False))
+    whole = (tmp_path / "plain.ply").read_bytes()
+    (tmp_path / "truncated.ply").write_bytes(whole[: len(whole) // 2])
+    moved = blob_scene()
+    gaussians = replace(moved.gaussians, means=moved.gaussians.means + 1)
+    save_scene(tmp_path / "edited.ply", Scene(gaussians))
+    sidecar = companion_path(tmp_path / "blobs.ply", language.SUFFIX)
+    companion_path(tmp_path / "edited.ply", language.SUFFIX).write_bytes(sidecar.read_bytes())
+    (tmp_path / "broken.json").write_text('[{"width": 12')
+    (tmp_path / "empty.json").write_text("[]")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def viewer(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """Runs the console script's function; returns exit code, stdout lines, stderr lines."""
+    monkeypatch.setattr(options, "load_text_encoder", lambda encoder_id: FakeEncoder())
+
+    def run(*arguments: str) -> tuple[int, list[str], list[str]]:
+        monkeypatch.setattr(sys, "argv", ["langsplat-viewer", *arguments])
+        with pytest.raises(SystemExit) as stop:
+            program.entry()
+        captured = capsys.readouterr()
+        return int(stop.value.code or 0), captured.out.splitlines(), captured.err.splitlines()
+
+    return run
+
+
+def picture(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path)).astype(int)
+
+
+def colour_at(image: np.ndarray, camera: Camera, point: np.ndarray) -> np.ndarray:
+    pixels, _ = camera.project(point[None])
+    column, row = pixels[0].astype(int)
+    return image[row - 2 : row + 3, column - 2 : column + 3].reshape(-1, 3).mean(0)
+
+
+def test_a_picture_from_the_first_training_camera(viewer, folder):
+    code, out, err = viewer("blobs.ply", "--headless", "--out", "a.png")
+    assert (code, out, err) == (0, ["a.png: 160x120, rgb"], [])
+    image, camera = picture(folder / "a.png"), blob_scene().cameras[0]
+    assert image.shape == (120, 160, 3)
+    assert [colour_at(image, camera, p).argmax() for p in (MUG, BOOK, PLANT)] == [0, 1, 2]
+
+
+def test_a_query_answers_in_words_and_as_heat(viewer, folder):
+    viewer("blobs.ply", "--headless", "--out", "rgb.png", "--camera", "1")
+    arguments = ["--query", "plant", "--query", "Book", "--camera", "1"]
+    code, out, err = viewer("blobs.ply", "--headless", "--out", "a.png", *arguments)
+    assert (code, err) == (0, [])
+    assert out[0] == "a.png: 160x120, relevancy"
+    assert out[1].startswith("'plant': found, score ")
+    assert "level whole" in out[1]
+    place = np.array([float(v) for v in out[1].partition("place (")[2].rstrip(")").split(",")])
+    np.testing.assert_allclose(place, PLANT, atol=0.2)
+    assert out[2].startswith("'Book': found")
+    camera = blob_scene().cameras[1]
+    before, heat = picture(folder / "rgb.png"), picture(folder / "a.png")
+    assert colour_at(heat, camera, PLANT)[2] < 60 < colour_at(before, camera, PLANT)[2]
+    np.testing.assert_allclose(
+        colour_at(heat, camera, MUG), 0.45 * colour_at(before, camera, MUG), atol=4
+    )  # what is not asked for is dimmed
+
+
+def test_a_fixed_level_is_used_and_named(viewer, folder):
+    _, out, _ = viewer("blobs.ply", "--headless", "--out", "a.png", "--query", "mug", "--level", "part")
+    assert "not here" in out[1]
+    assert "level part" in out[1]
+
+
+def test_every_display_is_another_picture(viewer, folder):
+    seen = []
+    for display in ("rgb", "latent", "relevancy", "segmentation", "depth", "alpha"):
+        code, out, _ = viewer(
+            "blobs.ply", "--headless", "--out", f"{display}.png", "--query", "mug", "--display", display
+        )
+        assert (code, out[0]) == (0, f"{display}.png: 160x120, {display}")
+        image = picture(folder / f"{display}.png")
+        assert all(np.abs(image - other).max() > 30 for other in seen), display
+        seen.append(image)
+
+
+def test_a_size_holds_the_whole_photograph(viewer, folder):
+    viewer("blobs.ply", "--headless", "--out", "a.png")
+    viewer("blobs.ply", "--headless", "--out", "b.png", "--size", "400x120")
+    wide = picture(folder / "b.png")
+    assert wide.shape == (120, 400, 3)
+    np.testing.assert_allclose(wide[:, 120:280], picture(folder / "a.png"), atol=1)
+
+
+def test_a_camera_file_gives_that_view(viewer, folder):
+    write_cameras(folder / "view.json", (blob_scene().cameras[2],))
+    viewer("blobs.ply", "--headless", "--out", "a.png", "--camera", "2")
+    viewer("blobs.ply", "--headless", "--out", "b.png", "--camera", "view.json")
+    np.testing.assert_array_equal(picture(folder / "a.png"), picture(folder / "b.png"))
+
+
+def test_a_scene_without_cameras_is_framed(viewer, folder):
+    code, out, _ = viewer("plain.ply", "--headless", "--out", "new/folder/a.png", "--size", "96x64")
+    assert (code, out) == (0, ["new/folder/a.png: 96x64, rgb"])
+    covered = (picture(folder / "new/folder/a.png").max(-1) > 40).mean()
+    assert 0.02 < covered < 0.9
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["nope.ply"], "nope.ply: no such file"),
+        (["."], "is a folder"),
+        (["x" * 5000 + ".ply"], "cannot be opened"),
+        (["truncated.ply"], "truncated.ply: truncated"),
+        (["edited.ply"], "edited.langsplat.safetensors"),
+        (["blobs.ply", "--query", "sofa"], "'sofa'"),
+        (["blobs.ply", "--query", " "], "empty"),
+        (["blobs.ply", "--camera", "3"], "cameras 0 to 2"),
+        (["blobs.ply", "--camera=-1"], "cameras 0 to 2"),
+        (["blobs.ply", "--camera", "nope.json"], "nope.json: no such file"),
+        (["blobs.ply", "--camera", "broken.json"], "broken.json"),
+        (["blobs.ply", "--camera", "empty.json"], "holds no camera"),
+        (["plain.ply", "--camera", "0"], "no training cameras"),
+        (["plain.ply", "--query", "mug"], "langsplat train"),
+        (["plain.ply", "--display", "latent"], "langsplat train"),
+        (["plain.ply", "--display", "relevancy"], "langsplat train"),
+        (["blobs.ply", "--display", "segmentation"], "add --query"),
+        (["blobs.ply", "--display", "pretty"], "pretty"),
+        (["blobs.ply", "--size", "big"], "1280x720"),
+        (["blobs.ply", "--size", "0x10"], "1280x720"),
+        (["blobs.ply", "--size", "99999x10"], "1280x720"),
+        (["blobs.ply", "--backend", "magic"], "magic"),
+        (["blobs.ply", "--headles"], "--headles"),
+        (["blobs.ply", "plain.ply"], "plain.ply"),
+    ],
+)
+def test_what_cannot_work_is_one_line(viewer, folder, arguments, reason):
+    code, out, err = viewer(*arguments, "--headless", "--out", "a.png")
+    assert code == 2
+    assert out == []
+    assert len(err) == 1
+    assert reason in err[0]
+    assert err[0].startswith("langsplat-viewer: ")
+    assert not (folder / "a.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--headless"], "add --out"),
+        (["--headless", "--out", "a.jpg"], "end the name in .png"),
+        (["--headless", "--out", "folder.png"], "is a folder"),
+        (["--headless", "--out", "blobs.ply/a.png"], "cannot be written"),
+        (["--headless", "--out", "x" * 5000 + ".png"], "cannot be written"),
+        (["--out", "a.png"], "add --headless"),
+    ],
+)
+def test_an_impossible_out_is_one_line(viewer, folder, arguments, reason):
+    (folder / "folder.png").mkdir()
+    code, out, err = viewer("blobs.ply", *arguments)
+    assert (code, out, len(err)) == (2, [], 1)
+    assert reason in err[0]
+
+
+def test_an_encoder_that_is_absent_is_one_line(monkeypatch, folder, capsys):
+    monkeypatch.setattr(
+        sys, "argv", ["langsplat-viewer", "blobs.ply", "--headless", "--out", "a.png", "--query", "mug"]
+    )
+    with pytest.raises(SystemExit) as stop:
+        program.entry()
+    assert stop.value.code == 2
+    error = capsys.readouterr().err.splitlines()
+    assert len(error) == 1
+    assert "fake" in error[0]
+    assert not (folder / "a.png").exists()
+
+
+def test_a_failed_picture_leaves_the_old_one(viewer, folder):
+    (folder / "a.png").write_bytes(b"old")
+    viewer("truncated.ply", "--headless", "--out", "a.png")
+    assert (folder / "a.png").read_bytes() == b"old"
+    viewer("plain.ply", "--headless", "--out", "a.png", "--size", "32x32")
+    assert picture(folder / "a.png").shape == (32, 32, 3)
+    assert not [path for path in folder.iterdir() if path.name.startswith(".a")]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the message is about X11")
+@pytest.mark.parametrize("display", [None, ":987"])
+def test_no_display_suggests_a_picture_without_a_window(folder, display):
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    if display is not None:
+        environment["DISPLAY"] = display
+    run = subprocess.run(
+        [sys.executable, "-m", "langsplat_viewer", "blobs.ply"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert run.returncode == 2
+    assert len(run.stderr.splitlines()) == 1, run.stderr
+    assert "--headless" in run.stderr
+
+
+def test_without_a_window_no_windowing_library_is_loaded(folder):
+    code = (
+        "import sys\n"
+        "from langsplat_viewer.__main__ import entry\n"
+        "sys.argv = 'langsplat-viewer blobs.ply --query book --headless --out a.png'.split()\n"
+        "try:\n"
+        "    entry()\n"
+        "except SystemExit as stop:\n"
+        "    assert not stop.code, stop.code\n"
+        "heavy = ('glfw', 'imgui_bundle', 'torch', 'transformers', 'open3d')\n"
+        "print([name for name in heavy if name in sys.modules])\n"
+    )
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.splitlines()[-1] == "[]"
+    assert (folder / "a.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "size"), [("", None), ("1280x720", (1280, 720)), ("1X16384", (1, 16384)), (" 3×4 ", (3, 4))]
+)
+def test_sizes(text, size):
+    assert parse_size(text) == size
