@@ -16,11 +16,13 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.raster import cpu_project as cp
 from langsplat_core.raster.cpu_blend import (
+    AHEAD,
     CHECK_EVERY,
     PIXELS,
     Cutoffs,
     blend_row,
     correlate,
+    enter,
     load_tile,
     row_offsets,
     rows_to_blend,
@@ -69,13 +71,12 @@ def _record(
         tape = _grown(tape, used)
         low, high = rows_to_blend(tiles.rows[s], top, bottom)
         spans[s - first, 0], spans[s - first, 1] = low, high
-        g = geometry[tiles.ranks[s]]
-        step = ramp() * g[cp.FACTOR_A]
+        g = enter(geometry, tiles, s, min(s + AHEAD, last - 1))
+        step, peak = ramp() * g[cp.FACTOR_A], g[cp.LOG2_OPACITY]
+        w, v, w_step, v_step = row_offsets(g, x0 + 0.5, y0 + low + 0.5)
         for row in range(low, high):
-            w, v = row_offsets(g, x0 + 0.5, y0 + row + 0.5)
-            added, before = blend_row(
-                transmittance, row * TILE, step + w, g[cp.LOG2_OPACITY] - v * v, cutoffs
-            )
+            added, before = blend_row(transmittance, row * TILE, step + w, peak - v * v, cutoffs)
+            w, v = w + w_step, v + v_step
             store(tape, used, added)
             store(tape, used + TILE, before)
             used += _ENTRY
@@ -110,12 +111,12 @@ def _backward_tile(
     for s in range(end - 1, first - 1, -1):
         low, high = max(spans[s - first, 0], 0), spans[s - first, 1]
         used -= max(high - low, 0) * _ENTRY
-        g = geometry[tiles.ranks[s]]
+        g = enter(geometry, tiles, s, max(s - AHEAD, first))
         x = values[tiles.ranks[s]]
         step = ramp() * g[cp.FACTOR_A]
+        offset, v, w_step, v_step = row_offsets(g, x0 + 0.5, y0 + low + 0.5)
         q0 = qw = qv = qww = qwv = qvv = lanes(np.float32(0))
         for row in range(low, high):
-            offset, v = row_offsets(g, x0 + 0.5, y0 + row + 0.5)
             w = step + offset
             at = used + (row - low) * _ENTRY
             alpha, before = load(tape, at), load(tape, at + TILE)
@@ -131,6 +132,7 @@ def _backward_tile(
             moved, lifted = q * w, q * v
             q0, qw, qv = q0 + q, qw + moved, qv + lifted
             qww, qwv, qvv = qww + moved * w, qwv + moved * v, qvv + lifted * v
+            offset, v = offset + w_step, v + v_step
         sums = partial[s]
         sums[Q], sums[QW], sums[QV] = total(q0), total(qw), total(qv)
         sums[QWW], sums[QWV], sums[QVV] = total(qww), total(qwv), total(qvv)

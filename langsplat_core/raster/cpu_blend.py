@@ -21,6 +21,7 @@ from langsplat_core.raster.lanes import (
     lanes,
     largest,
     load,
+    prefetch,
     ramp,
     smaller,
     store,
@@ -31,6 +32,7 @@ from langsplat_core.raster.lanes import (
 from langsplat_core.raster.workers import helper, kernel
 
 PIXELS = TILE * TILE
+AHEAD = 8  # intersections between asking for a footprint and using it
 CHECK_EVERY = 16  # Gaussians between two looks at whether a tile still has running pixels
 
 
@@ -72,24 +74,38 @@ def rows_to_blend(packed: int, top: int, bottom: int) -> tuple[int, int]:
 
 
 @helper
-def row_offsets(g: Array, x: float, y: float) -> tuple[float, float]:
-    """w of the row's first pixel, v of the row (see `cpu_project`) for the pixel centre (x, y), float64."""
+def enter(geometry: Array, tiles: Tiles, s: int, later: int) -> Array:
+    """The footprint of intersection `s`; that of `later` is asked for, as memory is far away."""
+    prefetch(geometry, np.int64(tiles.ranks[later]) * cp.COLUMNS)
+    return geometry[tiles.ranks[s]]
+
+
+@helper
+def row_offsets(g: Array, x: float, y: float) -> tuple[float, float, float, float]:
+    """w and v (see `cpu_project`) at the pixel centre (x, y), and what a step of one row adds to them.
+
+    float64: across a long thin footprint w is the small difference of large numbers.
+    """
     dy = y - g[cp.MEAN_Y]
-    return g[cp.FACTOR_A] * (x - g[cp.MEAN_X] - g[cp.FACTOR_K] * dy), g[cp.FACTOR_C] * dy
+    skew = g[cp.FACTOR_A] * g[cp.FACTOR_K]
+    return g[cp.FACTOR_A] * (x - g[cp.MEAN_X]) - skew * dy, g[cp.FACTOR_C] * dy, -skew, g[cp.FACTOR_C]
 
 
 @helper
 def blend_row(
     transmittance: Array, at: int, w: Lanes, log2_height: float, cutoffs: Cutoffs
 ) -> tuple[Lanes, Lanes]:
-    """Step 3 and 4 for one row: returns alpha (0 where the Gaussian is not added) and T before it."""
+    """Step 3 and 4 for one row: returns alpha (0 where the Gaussian is not added) and T before it.
+
+    All sixteen lanes are stored: a masked store would stall the next Gaussian's load of the same row.
+    """
     before = load(transmittance, at)
     alpha = smaller(exp2(log2_height - w * w), cutoffs.alpha_max)
+    alpha = where_at_least(alpha, cutoffs.alpha_min, alpha, 0.0)
     after = before - alpha * before
-    going = where_greater(after, cutoffs.transmittance_min, after, smaller(before, 0.0 - before))
-    added = where_greater(after, cutoffs.transmittance_min, alpha, 0.0)
-    store(transmittance, at, where_at_least(alpha, cutoffs.alpha_min, going, before))
-    return where_at_least(alpha, cutoffs.alpha_min, added, 0.0), before
+    stopped = smaller(before, 0.0 - before)
+    store(transmittance, at, where_greater(after, cutoffs.transmittance_min, after, stopped))
+    return where_greater(after, cutoffs.transmittance_min, alpha, 0.0), before
 
 
 @helper
@@ -110,13 +126,12 @@ def _splat_tile(
                 break
         rank = tiles.ranks[s]
         low, high = rows_to_blend(tiles.rows[s], top, bottom)
-        g = geometry[rank]
-        step = ramp() * g[cp.FACTOR_A]
+        g = enter(geometry, tiles, s, min(s + AHEAD, last - 1))
+        step, peak = ramp() * g[cp.FACTOR_A], g[cp.LOG2_OPACITY]
+        w, v, w_step, v_step = row_offsets(g, x0 + 0.5, y0 + low + 0.5)
         for row in range(low, high):
-            w, v = row_offsets(g, x0 + 0.5, y0 + row + 0.5)
-            added, before = blend_row(
-                transmittance, row * TILE, step + w, g[cp.LOG2_OPACITY] - v * v, cutoffs
-            )
+            added, before = blend_row(transmittance, row * TILE, step + w, peak - v * v, cutoffs)
+            w, v = w + w_step, v + v_step
             weight = added * before
             for channel in range(channels):
                 at = (row * channels + channel) * TILE
@@ -186,13 +201,12 @@ def _gather_tile(
                 partial[s:last] = 0
                 break
         low, high = rows_to_blend(tiles.rows[s], top, bottom)
-        g = geometry[tiles.ranks[s]]
-        step = ramp() * g[cp.FACTOR_A]
+        g = enter(geometry, tiles, s, min(s + AHEAD, last - 1))
+        step, peak = ramp() * g[cp.FACTOR_A], g[cp.LOG2_OPACITY]
+        w, v, w_step, v_step = row_offsets(g, x0 + 0.5, y0 + low + 0.5)
         for row in range(low, high):
-            w, v = row_offsets(g, x0 + 0.5, y0 + row + 0.5)
-            added, before = blend_row(
-                transmittance, row * TILE, step + w, g[cp.LOG2_OPACITY] - v * v, cutoffs
-            )
+            added, before = blend_row(transmittance, row * TILE, step + w, peak - v * v, cutoffs)
+            w, v = w + w_step, v + v_step
             store(weights, (row - low) * TILE, added * before)
         correlate(planes, channels, weights, low, high, partial[s])
 
@@ -210,12 +224,14 @@ def gather(
 @kernel
 def sum_partials(first: int, last: int, tiles: Tiles, order: Array, partial: Array, out: Array) -> None:
     """out[order[rank]] <- sum of the rank's partial sums, in the order of its tiles (so: reproducible)."""
+    sums = np.empty(out.shape[1])
     for rank in range(first, last):
+        sums[:] = 0
+        for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):
+            for channel in range(out.shape[1]):
+                sums[channel] += partial[tiles.slots[n], channel]
         for channel in range(out.shape[1]):
-            acc = 0.0
-            for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):
-                acc += partial[tiles.slots[n], channel]
-            out[order[rank], channel] = acc
+            out[order[rank], channel] = sums[channel]
 
 
 @helper
@@ -228,15 +244,17 @@ def _median_tile(
     start_tile(transmittance, x0, y0, width, height)
     found = np.zeros(PIXELS, np.float32)
     half = np.float32(0.5)
-    for s in range(tiles.starts[tile], tiles.starts[tile + 1]):
+    first, last = tiles.starts[tile], tiles.starts[tile + 1]
+    for s in range(first, last):
         rank = tiles.ranks[s]
         low, high = rows_to_blend(tiles.rows[s], 0, TILE)
-        g = geometry[rank]
-        step = ramp() * g[cp.FACTOR_A]
+        g = enter(geometry, tiles, s, min(s + AHEAD, last - 1))
+        step, peak = ramp() * g[cp.FACTOR_A], g[cp.LOG2_OPACITY]
+        w, v, w_step, v_step = row_offsets(g, x0 + 0.5, y0 + low + 0.5)
         for row in range(low, high):
-            w, v = row_offsets(g, x0 + 0.5, y0 + row + 0.5)
             at = row * TILE
-            added, before = blend_row(transmittance, at, step + w, g[cp.LOG2_OPACITY] - v * v, cutoffs)
+            added, before = blend_row(transmittance, at, step + w, peak - v * v, cutoffs)
+            w, v = w + w_step, v + v_step
             passed = where_greater(before, half, lanes(np.float32(depths[rank])), load(found, at))
             after = before - added * before
             store(found, at, where_at_least(half, after, passed, load(found, at)))

@@ -21,6 +21,7 @@ from langsplat_core.config import RasterSettings
 from langsplat_core.raster.workers import helper, kernel
 from langsplat_core.scene import Camera
 
+COLUMNS = 8  # of the geometry: one cache line a row
 INVALID, UNDRAWN, DRAWN = 0, 1, 2  # what `project` says of a row
 MEAN_X, MEAN_Y, FACTOR_A, FACTOR_K, FACTOR_C, LOG2_OPACITY, HALF_WIDTH, HALF_HEIGHT = range(8)  # columns
 HALF_LOG2_E = 0.5 / np.log(2.0)

@@ -97,6 +97,22 @@ def load(typing: Any, array: Any, index: Any) -> Any:
 
 
 @intrinsic
+def prefetch(typing: Any, array: Any, index: Any) -> Any:
+    """Ask for the cache line of element `index` (counted flat) of a contiguous array."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
+        byte = ir.IntType(8).as_pointer()
+        signature = ir.FunctionType(ir.VoidType(), [byte, _INT, _INT, _INT])
+        fetch = builder.module.declare_intrinsic("llvm.prefetch", [byte], signature)
+        read, keep, is_data = _INT(0), _INT(3), _INT(1)
+        builder.call(fetch, [builder.bitcast(builder.gep(data, [arguments[1]]), byte), read, keep, is_data])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), lower
+
+
+@intrinsic
 def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
     """array[index : index + 16] = value of a flat float32 array, unchecked."""
 

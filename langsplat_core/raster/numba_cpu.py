@@ -53,10 +53,12 @@ class CpuView:
             gaussians.opacity_logits,
             gaussians.sh.reshape(n, gaussians.sh.shape[1] * 3).view(np.uint32),
         )
-        found = cpu_project.Footprints(np.empty((n, 8)), np.empty(n), np.empty(n, np.uint8))
+        found = cpu_project.Footprints(np.empty((n, cpu_project.COLUMNS)), np.empty(n), np.empty(n, np.uint8))
         workers.run(cpu_project.project, n, self._rows, self._lens, found)
         self._order = cpu_tiles.depth_order(found.status, found.depths.view(np.uint64))
-        self._geometry, self._depths = found.geometry[self._order], found.depths[self._order]
+        self._geometry = _aligned((len(self._order), cpu_project.COLUMNS))
+        np.take(found.geometry, self._order, axis=0, out=self._geometry, mode="clip")
+        self._depths = found.depths[self._order]
         self._tiles = cpu_tiles.bin_tiles(self._geometry, camera.width, camera.height, workers)
         self.dropped = int(np.count_nonzero(found.status == cpu_project.INVALID))
 
@@ -144,6 +146,13 @@ class CpuView:
         both[self._order] = np.stack([self._depths, np.ones_like(self._depths)], -1)
         sums, weights = np.moveaxis(self.splat(both)[0], -1, 0)
         return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), 0)
+
+
+def _aligned(shape: tuple[int, int]) -> Array:
+    """An empty float64 array whose rows of eight begin at cache lines of 64 bytes."""
+    memory = np.empty(shape[0] * shape[1] + 7)
+    start = (-memory.ctypes.data // 8) % 8
+    return memory[start : start + shape[0] * shape[1]].reshape(shape)
 
 
 class CpuRasterizer:
