@@ -53,9 +53,11 @@ class Renderer:
             self._tensor(np.ascontiguousarray(world.vertices)),
             self._tensor(np.ascontiguousarray(world.triangles.astype(np.uint32))),
         )
-        # Off the surface and a little towards the lamp, so that vertices in a corner are not inside a wall.
+        # Off the surface, and where it faces the lamp a little towards it, so that vertices in a corner are
+        # not inside a wall. A surface that faces away would be pushed into its own object: it would be black.
         inwards = _unit(light.position - world.vertices)
-        self._origins = (world.vertices + 2e-3 * world.normals + 4e-3 * inwards).astype(np.float32)
+        facing = np.clip((inwards * world.normals).sum(1, keepdims=True), 0, 1)
+        self._origins = (world.vertices + 2e-3 * world.normals + 4e-3 * facing * inwards).astype(np.float32)
         self._key = self._lamp_light(samples)
         self._sky = self._sky_light(samples)
 
