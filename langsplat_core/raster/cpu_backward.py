@@ -37,6 +37,7 @@ from langsplat_core.raster.workers import helper, kernel
 Q, QW, QV, QWW, QWV, QVV = range(6)
 MOMENTS = 6
 _ENTRY = 2 * TILE  # numbers of tape per row: alpha and T
+_TAPE = 128 * TILE * _ENTRY  # its first length: 128 Gaussians that fill the tile
 
 
 @helper
@@ -52,20 +53,20 @@ def _grown(tape: Array, used: int) -> Array:
 
 @helper
 def _record(
-    tile: int, tiles: Tiles, geometry: Array, cutoffs: Cutoffs, transmittance: Array, spans: Array
+    tile: int, tiles: Tiles, geometry: Array, cutoffs: Cutoffs, state: Array, spans: Array, tape: Array
 ) -> tuple[Array, int, int]:
-    """Walk front to back; returns the tape, its length and the end of the intersections visited.
+    """Walk front to back; returns the tape (a longer one where it was full), its length and the end of the
+    intersections visited.
 
     spans[s - first] <- rows [low, high) of each intersection that were blended.
     """
     x0, y0 = tile % tiles.columns * TILE, tile // tiles.columns * TILE
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
-    tape = np.empty(64 * TILE * _ENTRY, np.float32)
     used = 0
     top, bottom = 0, TILE
     for s in range(first, last):
         if (s - first) % CHECK_EVERY == CHECK_EVERY - 1:
-            top, bottom = running_rows(transmittance, top, bottom)
+            top, bottom = running_rows(state, top, bottom)
             if top >= bottom:
                 return tape, used, s
         tape = _grown(tape, used)
@@ -75,7 +76,7 @@ def _record(
         step, peak = ramp() * g[cp.FACTOR_A], g[cp.LOG2_OPACITY]
         w, v, w_step, v_step = row_offsets(g, x0 + 0.5, y0 + low + 0.5)
         for row in range(low, high):
-            added, before = blend_row(transmittance, row * TILE, step + w, peak - v * v, cutoffs)
+            added, before = blend_row(state, row * TILE, step + w, peak - v * v, cutoffs)
             w, v = w + w_step, v + v_step
             store(tape, used, added)
             store(tape, used + TILE, before)
@@ -92,7 +93,9 @@ def _backward_tile(
     grads: tuple[Array, Array],
     cutoffs: Cutoffs,
     partial: Array,
-) -> None:
+    tape: Array,
+) -> Array:
+    """One tile; returns the tape, for the next tile to write over."""
     image_grad, alpha_grad = grads
     height, width, channels = image_grad.shape
     x0, y0 = tile % tiles.columns * TILE, tile // tiles.columns * TILE
@@ -100,7 +103,7 @@ def _backward_tile(
     state = np.empty(PIXELS, np.float32)
     start_tile(state, x0, y0, width, height)
     spans = np.zeros((last - first, 2), np.int64)
-    tape, used, end = _record(tile, tiles, geometry, cutoffs, state, spans)
+    tape, used, end = _record(tile, tiles, geometry, cutoffs, state, spans, tape)
     partial[end:last] = 0
     planes, plane = np.empty(PIXELS * channels, np.float32), np.empty(PIXELS, np.float32)
     load_tile(planes, image_grad, x0, y0)
@@ -137,6 +140,7 @@ def _backward_tile(
         sums[Q], sums[QW], sums[QV] = total(q0), total(qw), total(qv)
         sums[QWW], sums[QWV], sums[QVV] = total(qww), total(qwv), total(qvv)
         correlate(planes, channels, weights, low, high, sums[MOMENTS:])
+    return tape
 
 
 @kernel
@@ -153,5 +157,6 @@ def backward(
     """(M, C) values in depth order; gradients (H, W, C) and (H, W, 1) by image and alpha; fills (I, 6 + C)
     partial sums. All float32, for tiles [first, last)."""
     count = tiles.starts.shape[0] - 1
+    tape = np.empty(_TAPE, np.float32)
     for i in range(first, last):
-        _backward_tile(spread(i, count), tiles, geometry, values, grads, cutoffs, partial)
+        tape = _backward_tile(spread(i, count), tiles, geometry, values, grads, cutoffs, partial, tape)

@@ -18,15 +18,16 @@ class ParameterGradients(NamedTuple):
     log_scales: Array  # (N, 3)
     quats_wxyz: Array  # (N, 4)
     opacity_logits: Array  # (N,)
+    values: Array  # (N, C)
     means_px: Array  # (N, 2)
 
 
 @helper
-def _sum_moments(rank: int, tiles: Tiles, partial: Array, moments: Array) -> None:
-    moments[:] = 0
+def _sum_over_tiles(rank: int, tiles: Tiles, partial: Array, sums: Array) -> None:
+    sums[:] = 0
     for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):
-        for m in range(MOMENTS):
-            moments[m] += partial[tiles.slots[n], m]
+        for m in range(sums.shape[0]):
+            sums[m] += partial[tiles.slots[n], m]
 
 
 @helper
@@ -153,13 +154,17 @@ def to_parameters(
     lens: cp.Lens,
     out: ParameterGradients,
 ) -> None:
-    """For drawn Gaussians [first, last) in depth order: sum their partial moments over tiles, in the order
-    of the tiles, and pull them back through the projection."""
-    moments, work, by_b, by_turn = np.empty(MOMENTS), np.empty((3, 3, 3)), np.empty((2, 3)), np.empty((3, 3))
+    """For drawn Gaussians [first, last) in depth order: sum what `backward` left, in the order of the tiles,
+    and pull the moments back through the projection."""
+    sums = np.empty(partial.shape[1])
+    moments = sums[:MOMENTS]
+    work, by_b, by_turn = np.empty((3, 3, 3)), np.empty((2, 3)), np.empty((3, 3))
     r = lens.rotation
     for rank in range(first, last):
         i = order[rank]
-        _sum_moments(rank, tiles, partial, moments)
+        _sum_over_tiles(rank, tiles, partial, sums)
+        for channel in range(sums.shape[0] - MOMENTS):
+            out.values[i, channel] = sums[MOMENTS + channel]
         du, dv, by_covariance = _footprint_gradient(geometry[rank], moments)
         out.means_px[i, 0], out.means_px[i, 1] = du, dv
         out.opacity_logits[i] = moments[Q] * (1 - cp.opacity_of(rows.opacity_logits[i]))

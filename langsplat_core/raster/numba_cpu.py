@@ -122,15 +122,20 @@ class CpuView:
         partial = np.empty((len(self._tiles.ranks), moments + channels), np.float32)
         self._over_tiles(cpu_backward.backward, ordered, grads, self._cutoffs, partial)
         out = cpu_unproject.ParameterGradients(
-            *(np.zeros((n, *shape), np.float32) for shape in ((3,), (3,), (4,), (), (2,)))
+            *(np.zeros((n, *shape), np.float32) for shape in ((3,), (3,), (4,), (), (channels,), (2,)))
         )
-        by_values = np.zeros((n, channels), np.float32)
-        drawn = (len(self._order), self._tiles, self._order)
         self._workers.run(
-            cpu_unproject.to_parameters, *drawn, self._geometry, partial, self._rows, self._lens, out
+            cpu_unproject.to_parameters,
+            len(self._order),
+            self._tiles,
+            self._order,
+            self._geometry,
+            partial,
+            self._rows,
+            self._lens,
+            out,
         )
-        self._workers.run(cpu_blend.sum_partials, *drawn, partial[:, moments:], by_values)
-        return GaussianGradients(*out[:4], by_values, out.means_px)
+        return GaussianGradients(*out)
 
     def _over_tiles(self, kernel: Callable[..., None], *arguments: Any) -> None:
         self._workers.run(kernel, len(self._tiles.starts) - 1, self._tiles, self._geometry, *arguments)
