@@ -99,7 +99,9 @@ def warm_up(scene: Scene, backend: str) -> None:
         from langsplat_core.raster import load_rasterizer
         from langsplat_viewer.channels import ArrayChannels, Layers
 
-        ArrayChannels(load_rasterizer("cpu")).render(scene, Layers(), scene.framing_camera((16, 16)), "none")
+        channels, camera = ArrayChannels(load_rasterizer("cpu")), scene.framing_camera((16, 16))
+        channels.render(scene, Layers(), camera, "none")
+        channels.depth_at(scene.gaussians, camera, 8, 8)
 
 
 def services(encoder_id: str) -> Services:

@@ -35,16 +35,22 @@ def _mouse(viewer: Viewer, area: Area) -> None:
     dx, dy = io.mouse_delta.x, io.mouse_delta.y
     if dx or dy:
         turn = math.pi / area.height  # a drag over the whole height is half a turn
-        if imgui.is_mouse_down(1) or imgui.is_mouse_down(2) or (imgui.is_mouse_down(0) and io.key_shift):
+        if _held(1) or _held(2) or (_held(0) and io.key_shift):
             size = (max(round(area.width), 1), max(round(area.height), 1))
             actions.move(viewer, lambda view: controls.pan(view, dx, dy, size))
-        elif imgui.is_mouse_down(0) and io.key_ctrl:
+        elif _held(0) and io.key_ctrl:
             actions.move(viewer, lambda view: controls.look(view, dx * turn, dy * turn))
-        elif imgui.is_mouse_down(0):
+        elif _held(0):
             actions.move(viewer, lambda view: controls.orbit(view, dx * turn, dy * turn))
     if io.mouse_wheel:
         factor = 0.88**io.mouse_wheel
         actions.move(viewer, lambda view: controls.zoom(view, factor, NEAREST * extent.radius))
+
+
+def _held(button: int) -> bool:
+    """Whether a button drags. Where frames are slow, the way to the place of the click and the click itself
+    fall into one frame; that way was no drag."""
+    return imgui.is_mouse_down(button) and not imgui.is_mouse_clicked(button)
 
 
 def _keys(viewer: Viewer) -> None:
