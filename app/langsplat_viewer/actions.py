@@ -10,13 +10,9 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from PIL import Image
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import Display, LevelChoice
-from langsplat_core.errors import LangSplatError
-from langsplat_core.files import atomic_path
-from langsplat_core.formats.cameras_json import write_cameras
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import NO_FIELD, QueryResult
 from langsplat_core.query.picture import latent_colours
@@ -31,7 +27,7 @@ from langsplat_viewer.controls import (
     focus,
     from_camera,
 )
-from langsplat_viewer.jobs import Worker, one_line
+from langsplat_viewer.jobs import Worker
 from langsplat_viewer.state import GLIDE_SECONDS, SLOTS, Glide, Query, ViewerState
 
 NEEDS_FIELD: tuple[Display, ...] = ("latent", "relevancy", "segmentation")
@@ -317,52 +313,3 @@ def focus_pixel(viewer: Viewer, u: float, v: float) -> None:
         return
     depth = float((point - viewer.state.view.eye) @ viewer.state.view.rotation[2])
     glide_to(viewer, focus(viewer.state.view, point, depth))
-
-
-# --- Files -----------------------------------------------------------------------------------------
-
-
-def free_name(folder: Path, stem: str, suffix: str) -> Path:
-    """The first of stem-001, stem-002, ... that does not exist in `folder`."""
-    number = 1
-    while (path := folder / f"{stem}-{number:03d}{suffix}").exists():
-        number += 1
-    return path
-
-
-def save_png(path: Path, image: Array) -> None:
-    """Write an (H, W, 3) uint8 picture, whole or not at all."""
-    with atomic_path(path) as temporary:
-        Image.fromarray(image).save(temporary, format="PNG")
-
-
-def save_picture(viewer: Viewer, folder: Path) -> Path | None:
-    """Save the scene as shown to a new PNG in `folder`; returns its path, None if that failed."""
-    state = viewer.state
-    if viewer.surface is None or state.scene is None:
-        state.say("open a scene first, then save a picture of it", is_error=True)
-        return None
-    path = free_name(folder, state.path.stem if state.path else "picture", ".png")
-    try:
-        save_png(path, viewer.surface.capture(state))
-    except (OSError, LangSplatError) as error:
-        state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
-        return None
-    state.say(f"saved {path}")
-    return path
-
-
-def save_view(viewer: Viewer, folder: Path) -> Path | None:
-    """Save the current camera to a new file that `--camera` reads; returns its path, None if that failed."""
-    state = viewer.state
-    if state.view is None:
-        state.say("open a scene first, then save a view of it", is_error=True)
-        return None
-    path = free_name(folder, f"{state.path.stem if state.path else 'view'}-view", ".json")
-    try:
-        write_cameras(path, (state.view.camera(*state.size),))
-    except OSError as error:
-        state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
-        return None
-    state.say(f"saved {path}; show it again with --camera {path.name}")
-    return path

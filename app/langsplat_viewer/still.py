@@ -14,12 +14,13 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryResult
 from langsplat_core.query.picture import latent_colours
 from langsplat_core.scene import LEVELS, Camera, Scene
-from langsplat_viewer.actions import Services, save_png
+from langsplat_viewer.actions import Services
 from langsplat_viewer.answers import Answers
 from langsplat_viewer.controls import lens_of
 from langsplat_viewer.frame import Backend
 from langsplat_viewer.headless import render_picture
 from langsplat_viewer.options import check_display, chosen_camera
+from langsplat_viewer.saving import save_png
 from langsplat_viewer.state import SLOTS
 
 DEFAULT_SIZE = (1280, 720)

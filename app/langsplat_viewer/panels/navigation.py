@@ -5,7 +5,7 @@ from pathlib import Path
 
 from imgui_bundle import imgui
 
-from langsplat_viewer import actions, controls
+from langsplat_viewer import actions, controls, saving
 from langsplat_viewer.actions import Viewer
 from langsplat_viewer.panels.layout import Area
 from langsplat_viewer.panels.view import DISPLAYS
@@ -64,7 +64,7 @@ def _keys(viewer: Viewer) -> None:
     if imgui.is_key_pressed(key.period):
         actions.step_camera(viewer, 1)
     if imgui.is_key_pressed(key.p, False):
-        actions.save_picture(viewer, Path.cwd())
+        saving.save_picture(viewer, Path.cwd())
     if imgui.is_key_pressed(key.slash, False):
         state.show_panel, state.focus_input = True, True
     if imgui.is_key_pressed(key.tab, False):

@@ -7,7 +7,7 @@ from typing import Any
 
 from imgui_bundle import imgui, portable_file_dialogs
 
-from langsplat_viewer import actions
+from langsplat_viewer import actions, saving
 from langsplat_viewer.actions import Viewer
 from langsplat_viewer.panels.style import MUTED, small_wrapped
 
@@ -47,10 +47,10 @@ def draw(viewer: Viewer, dialog: OpenDialog) -> None:
         imgui.open_popup("open a scene")
     imgui.same_line()
     if imgui.button("Save picture"):
-        actions.save_picture(viewer, Path.cwd())
+        saving.save_picture(viewer, Path.cwd())
     imgui.same_line()
     if imgui.button("Save view"):
-        actions.save_view(viewer, Path.cwd())
+        saving.save_view(viewer, Path.cwd())
     imgui.same_line()
     if imgui.button("Keys"):
         state.show_help = not state.show_help
