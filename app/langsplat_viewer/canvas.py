@@ -17,7 +17,7 @@ from langsplat_viewer.controls import OrbitCamera
 from langsplat_viewer.state import FrameStats, ViewerState
 
 SCALES = (1.0, 0.5, 0.25)
-MOVING_BUDGET = 60.0  # milliseconds per picture that still feel like motion
+MOVING_BUDGET = 80.0  # milliseconds per picture that still feel like motion
 REST_SECONDS = 0.15  # without a move, after which the fine picture is drawn
 
 
