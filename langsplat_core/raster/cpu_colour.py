@@ -4,7 +4,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.raster.spherical_harmonics import C0, C1, C2, C3
-from langsplat_core.raster.workers import helper, kernel, shared_workers
+from langsplat_core.raster.workers import helper, kernel, plain, shared_workers
 
 _C20, _C21, _C22 = C2
 _C30, _C31, _C32, _C33, _C34 = C3
@@ -115,8 +115,8 @@ def colours(sh: Array, means: Array, camera_position: Array) -> Array:
     n = check_array("sh", sh, ("N", "K", 3), dtype=np.float32)
     check_array("means", means, ("N", 3), n, dtype=np.float32)
     out = np.empty(means.shape, np.float32)
-    position = np.ascontiguousarray(camera_position, np.float64)
-    shared_workers().run(_forward, len(sh), sh, means, position, out)
+    position = np.array(camera_position, np.float64)
+    shared_workers().run(_forward, len(sh), plain(sh), plain(means), position, out)
     return out
 
 
@@ -131,7 +131,7 @@ def colours_backward(
     check_array("means", means, ("N", 3), n, dtype=np.float32)
     check_array("colour_grad", colour_grad, ("N", 3), n)
     sh_grad, means_grad = np.empty(sh.shape, np.float32), np.zeros(means.shape, np.float32)
-    position = np.ascontiguousarray(camera_position, np.float64)
-    grad = np.ascontiguousarray(colour_grad, np.float32)
-    shared_workers().run(_backward, len(sh), sh, means, position, grad, sh_grad, means_grad)
+    position = np.array(camera_position, np.float64)
+    inputs = (plain(sh), plain(means), position, plain(colour_grad))
+    shared_workers().run(_backward, len(sh), *inputs, sh_grad, means_grad)
     return sh_grad, means_grad

@@ -15,7 +15,7 @@ from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.raster import cpu_backward, cpu_blend, cpu_project, cpu_tiles, cpu_unproject
 from langsplat_core.raster.cpu_colour import colours, colours_backward
 from langsplat_core.raster.protocol import DepthKind
-from langsplat_core.raster.workers import Workers, shared_workers
+from langsplat_core.raster.workers import Workers, plain, shared_workers
 from langsplat_core.scene import Camera, Gaussians
 
 __all__ = ["CpuRasterizer", "CpuView", "GaussianGradients", "colours", "colours_backward"]
@@ -47,11 +47,11 @@ class CpuView:
         self._lens = cpu_project.make_lens(camera, settings)
         self._cutoffs = cpu_blend.make_cutoffs(settings)
         self._rows = cpu_project.Rows(
-            gaussians.means,
-            gaussians.log_scales,
-            gaussians.quats_wxyz,
-            gaussians.opacity_logits,
-            gaussians.sh.reshape(n, gaussians.sh.shape[1] * 3).view(np.uint32),
+            plain(gaussians.means),
+            plain(gaussians.log_scales),
+            plain(gaussians.quats_wxyz),
+            plain(gaussians.opacity_logits),
+            plain(gaussians.sh).reshape(n, gaussians.sh.shape[1] * 3).view(np.uint32),
         )
         found = cpu_project.Footprints(np.empty((n, cpu_project.COLUMNS)), np.empty(n), np.empty(n, np.uint8))
         workers.run(cpu_project.project, n, self._rows, self._lens, found)
@@ -73,12 +73,12 @@ class CpuView:
     def splat(self, values: Array) -> tuple[Array, Array]:
         """See `View.splat`; float32. Values must be finite."""
         check_array("values", values, (self._count, "C"))
-        ordered = np.asarray(values, np.float32)[self._order]
+        ordered = values[self._order]
         height, width, channels = self.camera.height, self.camera.width, ordered.shape[1]
         alpha = np.empty((height, width), np.float32)
         parts = []
         for start in range(0, max(channels, 1), _CHANNELS_AT_ONCE):
-            part = np.ascontiguousarray(ordered[:, start : start + _CHANNELS_AT_ONCE])
+            part = plain(ordered[:, start : start + _CHANNELS_AT_ONCE])
             image = np.empty((height, width, part.shape[1]), np.float32)
             self._over_tiles(cpu_blend.splat, part, self._cutoffs, image, alpha)
             parts.append(image)
@@ -90,7 +90,7 @@ class CpuView:
         channels = image.shape[2]
         values = np.zeros((self._count, channels), np.float32)
         for start in range(0, channels, _CHANNELS_AT_ONCE):
-            part = np.ascontiguousarray(image[..., start : start + _CHANNELS_AT_ONCE], np.float32)
+            part = plain(image[..., start : start + _CHANNELS_AT_ONCE])
             partial = np.empty((len(self._tiles.ranks), part.shape[2]), np.float32)
             out = np.zeros((self._count, part.shape[2]), np.float32)
             self._over_tiles(cpu_blend.gather, part, self._cutoffs, partial)
@@ -113,11 +113,8 @@ class CpuView:
         if alpha_grad is None:
             alpha_grad = np.zeros((height, width), np.float32)
         check_array("alpha_grad", alpha_grad, (height, width))
-        ordered = np.ascontiguousarray(np.asarray(values, np.float32)[self._order])
-        grads = (
-            np.ascontiguousarray(image_grad, np.float32),
-            np.ascontiguousarray(alpha_grad, np.float32)[..., None],
-        )
+        ordered = plain(values[self._order])
+        grads = (plain(image_grad), plain(alpha_grad)[..., None])
         moments = cpu_backward.MOMENTS
         partial = np.empty((len(self._tiles.ranks), moments + channels), np.float32)
         self._over_tiles(cpu_backward.backward, ordered, grads, self._cutoffs, partial)

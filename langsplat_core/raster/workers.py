@@ -15,12 +15,23 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any
 
+import numpy as np
 from numba import njit
+
+from langsplat_core.arrays import Array
 
 kernel = njit(cache=True, nogil=True, error_model="numpy")
 helper = njit(forceinline=True, error_model="numpy")  # compiled into the kernels that call it
 
 _PIECES_PER_THREAD = 4
+
+
+def plain(array: Array) -> Array:
+    """The array as float32, contiguous and writeable: one type for numba, which compiles once per type.
+
+    Only a read-only array is copied for that reason; kernels never write to their inputs.
+    """
+    return np.require(array, np.float32, ["C", "W"])
 
 
 class Workers:

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from importlib.util import find_spec
 
@@ -10,11 +11,12 @@ import pytest
 
 from langsplat_core.config import GSPLAT, INRIA
 from langsplat_core.errors import BackendError, InputError
+from langsplat_core.formats.ply import read_ply
 from langsplat_core.raster import BACKENDS, load_rasterizer, spherical_harmonics
 from langsplat_core.raster.cpu_tiles import depth_order
 from langsplat_core.raster.numba_cpu import CpuRasterizer, colours, colours_backward
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.scene import Camera, Gaussians
+from langsplat_core.scene import Camera, Gaussians, Scene, look_at
 from tests.close import assert_adjoint, assert_close_off_cuts, cut_off_band
 from tests.golden import load_golden
 from tests.scenes import random_camera, random_gaussians, random_values, shifted
@@ -209,6 +211,47 @@ def test_results_do_not_depend_on_the_number_of_threads():
         results.append([*view.splat(x), view.gather(target), view.depth("median"), *gradients])
     for other in results[1:]:
         assert all(np.array_equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_two_threads_may_render_at_once():
+    gaussians, camera = random_gaussians(300, 25), random_camera(25, 120, 90)
+    x = random_values(300, 3)
+    want = CPU.view(gaussians, camera).splat(x)[0]
+
+    def render(_: int) -> bool:
+        return all(np.array_equal(CPU.view(gaussians, camera).splat(x)[0], want) for _ in range(5))
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(render, range(4)))
+
+
+def test_arrays_of_any_make():
+    """Doubles, strided and read-only arrays (as memory-mapped files give) mean the same."""
+    gaussians, camera = random_gaussians(50, 26), random_camera(26)
+    x = random_values(50, 3)
+    view = CPU.view(gaussians, camera)
+    want, y = view.splat(x)[0], np.ones((45, 70, 2), np.float32)
+    assert np.array_equal(view.splat(np.asfortranarray(x.astype(np.float64)))[0], want)
+    flipped = np.asfortranarray(y.astype(np.float64))
+    assert np.array_equal(view.gather(flipped), view.gather(y))
+    for name in vars(gaussians):
+        getattr(gaussians, name).flags.writeable = False
+    x.flags.writeable = y.flags.writeable = False
+    view = CPU.view(gaussians, camera)
+    assert np.array_equal(view.splat(x)[0], want)
+    assert view.gather(y).any()
+    assert view.backward(x[:, :2], y).means.any()
+    assert colours(gaussians.sh, gaussians.means, camera.position).any()
+
+
+def test_real_gaussians(real_data):
+    """Trained ones: anisotropy up to 2.5e7, opacities of exactly 1, needles, equal depths."""
+    guitar = read_ply(real_data / "gaussians" / "guitar.compressed.ply")
+    guitar = guitar.take(np.arange(0, len(guitar), 12))
+    centre, radius = Scene(guitar).bounds()
+    camera = look_at(centre + radius * np.array([0.5, -0.4, -2.0]), centre, np.array([0, -1.0, 0]), (90, 70))
+    image = assert_same_picture(guitar, camera)
+    assert image.mean() > 0.01
 
 
 def test_tiles_hold_little_more_than_what_touches_them():
