@@ -150,8 +150,14 @@ def _language(
         codec=codec,
         canonical=encoder.encode_texts(list(CANONICAL_PHRASES)),
         encoder_id=encoder.id,
+        phrasebook=_phrasebook(encoder, config.phrases),
     )
     return field, reconstruction_cosine(codec, mask_vectors)
+
+
+def _phrasebook(encoder: ClipEncoder, phrases: tuple[str, ...]) -> dict[str, Array]:
+    names = [" ".join(phrase.lower().split()) for phrase in phrases]
+    return dict(zip(names, encoder.encode_texts(names), strict=True))
 
 
 def _lifted_vectors(

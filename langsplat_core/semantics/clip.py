@@ -145,7 +145,7 @@ def load_text_encoder(model: str, device: str = "cpu") -> ClipTextEncoder:
     The device is the CPU unless told otherwise, because a phrase takes it a few milliseconds.
     Raises EncoderError where the weights are absent or are not those of a CLIP model.
     """
-    return ClipTextEncoder(model, clip_folder(model), torch_device(device))
+    return ClipTextEncoder(model, clip_folder(model, "--encoder"), torch_device(device))
 
 
 def load_clip(model: str, device: str = "auto", batch: int = 32) -> ClipEncoder:
@@ -154,17 +154,17 @@ def load_clip(model: str, device: str = "auto", batch: int = 32) -> ClipEncoder:
     batch: pictures per forward pass.
     Raises EncoderError where the weights are absent or are not those of a CLIP model.
     """
-    folder, device = clip_folder(model), torch_device(device)
+    folder, device = clip_folder(model, "--clip.model"), torch_device(device)
     return ClipEncoder(ClipTextEncoder(model, folder, device), folder, device, batch)
 
 
-def clip_folder(model: str) -> Path:
-    """Where the files of `model` lie; see `weights.weights_folder`."""
+def clip_folder(model: str, option: str) -> Path:
+    """Where the files of `model` lie; `option` is what messages name, see `weights.weights_folder`."""
     if model != DEMO:
-        return weights_folder(model, "--clip.model")
+        return weights_folder(model, option)
     folder = Path(str(files("langsplat_assets") / "demo_encoder"))
     if not folder.is_dir():
-        raise EncoderError(f"the bundled demo encoder is missing ({folder}); reinstall, or pass --clip.model")
+        raise EncoderError(f"the bundled demo encoder is missing ({folder}); reinstall, or pass {option}")
     return folder
 
 

@@ -187,7 +187,7 @@ def test_training_twice_gives_the_same_model(monkeypatch, tmp_path):
 @pytest.fixture(scope="module")
 def bundled():
     try:
-        clip_folder("demo")
+        clip_folder("demo", "--encoder")
     except EncoderError:
         pytest.skip("the bundled demo encoder is not there")
     return load_clip("demo", "cpu")

@@ -1,0 +1,44 @@
+"""`langsplat ...`: thin commands, each a dataclass of arguments and one call into the layers below."""
+
+import sys
+
+from tyro.extras import SubcommandApp
+
+from langsplat_core.cli.bench import BenchRaster
+from langsplat_core.cli.convert import Convert
+from langsplat_core.cli.demo import DemoBuild, DemoDataset, DemoEncoder
+from langsplat_core.cli.evaluate import EvalSynthetic
+from langsplat_core.cli.inspect import Doctor, Inspect
+from langsplat_core.cli.query import QueryScene
+from langsplat_core.cli.run import Command, main
+from langsplat_core.cli.train import Train
+
+
+def _parse(args: list[str]) -> Command:
+    demo, evaluate, bench = SubcommandApp(), SubcommandApp(), SubcommandApp()
+    demo.command(name="build")(DemoBuild)
+    demo.command(name="dataset")(DemoDataset)
+    demo.command(name="encoder")(DemoEncoder)
+    evaluate.command(name="synthetic")(EvalSynthetic)
+    bench.command(name="raster")(BenchRaster)
+    app = SubcommandApp()
+    app.command(name="train")(Train)
+    app.command(name="query")(QueryScene)
+    app.command(name="convert")(Convert)
+    app.command(name="inspect")(Inspect)
+    app.command(name="doctor")(Doctor)
+    app.command(demo, name="demo", help="Make the bundled scene, its photographs and its encoder.")
+    app.command(evaluate, name="eval", help="Measure a scene against ground truth.")
+    app.command(bench, name="bench", help="Speed against error, measured in one run.")
+    command: Command = app.cli(
+        prog="langsplat",
+        description="Train, query, convert and measure 3D Gaussian scenes with a language field.",
+        args=args,
+    )
+    return command
+
+
+def entry() -> None:
+    """The `langsplat` console script."""
+    args = sys.argv[1:] or ["--help"]
+    sys.exit(main("langsplat", lambda: _parse(args)))
