@@ -124,6 +124,7 @@ class TrainConfig:
     clip: ClipConfig = field(default_factory=ClipConfig)
     codec: CodecConfig = field(default_factory=CodecConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
+    phrases: tuple[str, ...] = ()  # stored encoded in the scene: they can be asked without any encoder
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ class DemoEncoderConfig:
     rooms: int = 180  # random rooms that crops are rendered from
     views: int = 3  # photographs of each room
     plain_crops: int = 8_000  # crops of nothing but a colour or a texture
-    steps: int = 2_600
+    steps: int = 3_000
     batch: int = 192  # crops per step
     phrases: int = 192  # phrases per step
     lr: float = 1e-3

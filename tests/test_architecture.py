@@ -13,7 +13,12 @@ LAYERS = [
     ["langsplat_core.pipeline"],
     ["langsplat_core.evaluation"],
     ["langsplat_core.training", "langsplat_core.query"],
-    ["langsplat_core.raster", "langsplat_core.semantics", "langsplat_core.datasets", "langsplat_core.formats"],
+    [
+        "langsplat_core.raster",
+        "langsplat_core.semantics",
+        "langsplat_core.datasets",
+        "langsplat_core.formats",
+    ],
     ["langsplat_core.scene"],
     ["langsplat_core.config", "langsplat_core.progress", "langsplat_core.files"],
     ["langsplat_core.arrays"],
@@ -80,7 +85,8 @@ def test_every_module_has_a_layer():
     homeless = [
         module_name(path)
         for path in SOURCES
-        if package_of(module_name(path)) is None and module_name(path) not in (FACADE, "langsplat_viewer.__init__")
+        if package_of(module_name(path)) is None
+        and module_name(path) not in (FACADE, "langsplat_viewer.__init__")
     ]
     assert not homeless
 
