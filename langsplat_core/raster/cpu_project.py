@@ -1,4 +1,4 @@
-"""Projection of Gaussians for the CPU backend: steps 1 and 2 of `reference.py`, compiled, and their adjoint.
+"""Projection of Gaussians for the CPU backend: steps 1 and 2 of `reference.py`, compiled.
 
 Everything here is float64, in the reference's order of operations: depths agree with it bit for bit, and
 coordinates of a million world units lose nothing. It costs about 0.1 microseconds a Gaussian.
