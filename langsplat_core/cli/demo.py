@@ -56,9 +56,9 @@ class DemoBuild:
 
     out: Path
     """The scene to write, *.ply."""
-    seed: int = 0
+    seed: int = 7
     """Another seed is another room."""
-    steps: int = 6_000
+    steps: int = 5_000
     """Steps of radiance training."""
 
     def run(self) -> None:

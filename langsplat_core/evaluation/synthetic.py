@@ -47,7 +47,7 @@ class Truth:
     def labels(self, name: str) -> Array:
         """(3, H, W) ids of the photograph with this stem, -1 where nothing is."""
         with np.load(self.folder / f"{name}.npz", allow_pickle=False) as stored:
-            return np.asarray(stored[stored.files[0]]).astype(np.int64)
+            return np.asarray(stored["ids"]).astype(np.int64)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from langsplat_core.datasets.synthetic.dataset import write_dataset
 from langsplat_core.pipeline.train import TrainReport, train_scene
 from langsplat_core.progress import Progress, silent
 
+SEED = 7
 VIEWS = 72
 SIZE = (640, 480)
 
@@ -32,7 +33,7 @@ def demo_config(steps: int) -> TrainConfig:
     )
 
 
-def build_demo(out: Path, seed: int = 0, steps: int = 6_000, progress: Progress = silent) -> TrainReport:
+def build_demo(out: Path, seed: int = SEED, steps: int = 5_000, progress: Progress = silent) -> TrainReport:
     """Render and train; photographs and truth stay in `<out>.work/photographs`."""
     work = out.with_name(out.stem + ".work")
     photographs = work / "photographs"

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.synthetic.render import Light, Renderer
+from langsplat_core.datasets.synthetic.render import Light, Picture, Renderer
 from langsplat_core.datasets.synthetic.world import BRIGHT, World, build_world
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
@@ -19,7 +19,7 @@ POINTS = 20_000  # sparse points, as structure from motion would give
 _FIRST_ROOM = 2_000_000  # the demo encoder was trained in rooms of lower numbers only
 _LIGHT_SAMPLES = 40  # rays per vertex towards the lamp, and again towards the sky
 _POINT_NOISE = 0.004  # metres, standard deviation
-_LIGHT = Light(np.array([-0.9, -1.0, 1.7]))
+LIGHT = Light(np.array([-0.9, -1.0, 1.7]))
 # (share of the views, elevation in degrees, distance in metres, height of the target above the table)
 _RINGS = ((0.4, 24.0, 1.5, 0.0), (0.35, 42.0, 1.25, 0.02), (0.25, 33.0, 0.92, 0.06))
 
@@ -38,13 +38,13 @@ def write_dataset(out: Path, seed: int, views: int, size: tuple[int, int], progr
         raise InputError(
             f"demo dataset: {views} views of {size[0]}x{size[1]}: it needs at least 4 views of 16x16"
         )
-    world = build_world(_FIRST_ROOM + seed, palette=BRIGHT)
+    world = build_room(seed)
     cameras = orbit_cameras(views, size, seed)
     folder, truth = out / "images", out / "truth"
     folder.mkdir(parents=True, exist_ok=True)
     truth.mkdir(exist_ok=True)
     progress("rendering photographs", 0.0)
-    renderer = Renderer(world, _LIGHT, samples=_LIGHT_SAMPLES)
+    renderer = Renderer(world, LIGHT, samples=_LIGHT_SAMPLES)
     for done, camera in enumerate(cameras):
         if not (truth / f"{camera.name}.npz").exists():
             _write_view(renderer, world, camera, out)
@@ -52,6 +52,17 @@ def write_dataset(out: Path, seed: int, views: int, size: tuple[int, int], progr
     _write_labels(world, truth / "labels.json")
     _write_points(world, renderer, seed, out / "points.ply")
     _write_transforms(cameras, out / "transforms.json")
+
+
+def build_room(seed: int) -> World:
+    """The room that `write_dataset` photographs; the demo encoder has never seen one of them."""
+    return build_world(_FIRST_ROOM + seed, palette=BRIGHT)
+
+
+def truth_ids(world: World, picture: Picture) -> Array:
+    """(3, H, W) int32 label ids of a picture at subpart, part and whole level, -1 where nothing is."""
+    ids = np.where(picture.pieces[..., None] >= 0, world.ids[picture.pieces], -1)
+    return np.moveaxis(ids, -1, 0).astype(np.int32)
 
 
 def orbit_cameras(views: int, size: tuple[int, int], seed: int) -> list[Camera]:
@@ -79,9 +90,8 @@ def _write_view(renderer: Renderer, world: World, camera: Camera, out: Path) -> 
     picture = renderer.picture(camera)
     with atomic_path(out / "images" / f"{camera.name}.png") as path:
         Image.fromarray(picture.image).save(path)
-    ids = np.where(picture.pieces[..., None] >= 0, world.ids[picture.pieces], -1)
     with atomic_path(out / "truth" / f"{camera.name}.npz") as path:
-        np.savez_compressed(path, ids=np.moveaxis(ids, -1, 0).astype(np.int32), depth=picture.depth)
+        np.savez_compressed(path, ids=truth_ids(world, picture), depth=picture.depth)
 
 
 def _write_labels(world: World, path: Path) -> None:
