@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help demo test check bench app clean
+.PHONY: help demo test check bench pictures app clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -33,6 +33,10 @@ check: $(STAMP)  ## ruff and mypy only
 
 bench: system  ## speed against error, on this machine
 	$(BIN)/langsplat bench raster --out bench_out
+
+pictures: system  ## make the README's pictures again (on a display, or on Xvfb)
+	if [ -n "$$DISPLAY" ]; then $(BIN)/python packaging/pictures.py; \
+	else xvfb-run -a -s "-screen 0 1280x800x24" $(BIN)/python packaging/pictures.py; fi
 
 app: system  ## open the viewer
 	$(BIN)/langsplat-viewer
