@@ -11,9 +11,12 @@ PICTURES = {
     "colours.png": [],
     "latent_whole.png": ["--display", "latent", "--level", "whole"],
     "latent_part.png": ["--display", "latent", "--level", "part"],
-    "red_mug.png": ["--query", "red mug"],
-    "lamp.png": ["--query", "lamp"],
-    "three_queries.png": ["--query", "red", "--query", "green", "--query", "yellow", "--display", "segmentation"],
+    "orange_mug.png": ["--query", "orange mug"],
+    "handle.png": ["--query", "handle of the mug"],
+    "segmentation.png": [
+        *("--query", "banana", "--query", "purple car", "--query", "plant"),
+        *("--display", "segmentation"),
+    ],
 }
 
 
