@@ -135,8 +135,8 @@ class DemoEncoderConfig:
     views: int = 3  # photographs of each room
     plain_crops: int = 8_000  # crops of nothing but a colour or a texture
     steps: int = 3_000
-    batch: int = 192  # crops per step
-    phrases: int = 192  # phrases per step
+    batch: int = 128  # crops per step
+    phrases: int = 128  # phrases per step
     lr: float = 1e-3
     seed: int = 0
 

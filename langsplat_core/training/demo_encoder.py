@@ -3,8 +3,8 @@
 Each step shows the model a batch of crops and a sample of phrases, of which ground truth says which are
 right, wrong or neither for every crop. Three losses on their cosines: a sigmoid loss about a fixed cosine
 `PIVOT`, contrast over phrases and over crops with several right answers, and, for crops that show
-something nameable, canonical phrases held at `PIVOT`: above it a phrase is likelier than "object", below
-less likely, which is what relevancy asks.
+something nameable, canonical phrases held at `CANONICAL_COSINE`: above it a phrase is likelier than "object",
+below less likely, which is what relevancy asks.
 """
 
 import json
@@ -16,11 +16,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DemoEncoderConfig
+from langsplat_core.datasets.synthetic.world import SMALL
 from langsplat_core.files import atomic_path
 from langsplat_core.progress import Progress
 from langsplat_core.scene import CANONICAL_PHRASES
@@ -35,10 +36,12 @@ from langsplat_core.training.demo_phrases import (
 )
 
 MEAN, STD = (0.32, 0.28, 0.25), (0.30, 0.28, 0.27)  # of the training crops, black surroundings included
-PIVOT = 0.3  # cosine between right and wrong, and of every nameable crop with the canonical phrases
+PIVOT = 0.3  # cosine at which a phrase is as likely right as wrong
+CANONICAL_COSINE = 0.24  # of a nameable crop with the canonical phrases: doubtful answers pass as found
 _SIGMOID_SCALE, _CONTRAST_SCALE = 14.0, 20.0
 _KEPT_PATCHES = 0.55  # share of the patches shown to the model during training (FLIP, Li et al. 2023)
 _AVERAGING = 0.998  # decay of the running mean of the weights, which is what is saved
+_WHOLE_WEIGHT = 8.0  # crops of small objects are drawn this much more often than others of their count
 _SAVE_EVERY = 250  # steps
 
 
@@ -50,6 +53,7 @@ class Batch:
     tokens: Tensor  # (P, L) int64, padded with the end token
     fits: Tensor  # (B, P) int8: 1 right, 0 wrong, -1 neither
     nameable: Tensor  # (B,) bool: False for clutter
+    classes: Tensor  # (B, 3) int64 rows of the object's, the region's and the colour's word, -100 for none
 
 
 def build_model(tokens: int, start: int, end: int) -> Any:
@@ -88,7 +92,9 @@ class Sampler:
         self._rows = np.array([row_of[label] for label in crops.labels])
         keys = [(label.word, label.thing, label.level) for label in crops.labels]
         count = Counter(keys)
-        weight = np.array([count[key] ** -0.6 for key in keys])
+        # Rare words more often; whole things on the table most, for they are what people ask for.
+        whole = [_WHOLE_WEIGHT if level == 2 and word in SMALL else 1.0 for word, _, level in keys]
+        weight = np.array([count[key] ** -0.6 for key in keys]) * whole
         self._weight = weight / weight.sum()
         self._start, self._end = ends
         self._tokens = [[token_of[word] for word in phrase.split()] for phrase in book.phrases]
@@ -96,6 +102,7 @@ class Sampler:
         kinds = np.array(book.kinds)
         self._kind_rows = [np.flatnonzero(kinds == kind) for kind in dict.fromkeys(book.kinds)]
         self._right = [self._right_by_kind(row) for row in range(len(book.labels))]
+        self._classes, self.class_counts = _word_classes(book)
 
     def _right_by_kind(self, row: int) -> list[Array]:
         fits = self._book.fits[row]
@@ -117,7 +124,8 @@ class Sampler:
         clutter = self._book.fits[rows][:, 0] == 1
         pixels = _jitter(normalised(_flipped(self._crops.images[chosen], rng)), rng)
         tokens = self._padded([self._dressed(k, rng) for k in unique])
-        return Batch(pixels, tokens, fits, torch.from_numpy(~clutter))
+        classes = torch.from_numpy(self._classes[rows])
+        return Batch(pixels, tokens, fits, torch.from_numpy(~clutter), classes)
 
     def _dressed(self, phrase: int, rng: np.random.Generator) -> list[int]:
         """Tokens of a phrase with an article before it now and then; canonical phrases stay bare."""
@@ -129,30 +137,60 @@ class Sampler:
         return torch.tensor([row + [self._end] * (longest - len(row)) for row in rows])
 
 
+def _word_classes(book: PhraseBook) -> tuple[Array, list[int]]:
+    """(U, 3) rows of every label's object, region and colour word, -100 for none; how many of each."""
+    columns, counts = [], []
+    for field in ("thing", "word", "colour"):
+        words = [getattr(label, field) for label in book.labels]
+        row_of = {word: row for row, word in enumerate(sorted(set(words) - {""}))}
+        columns.append([row_of.get(word, -100) for word in words])
+        counts.append(max(len(row_of), 1))
+    return np.array(columns).T.copy(), counts
+
+
 def _flipped(images: Array, rng: np.random.Generator) -> Array:
     mirror = rng.random(len(images)) < 0.5
     return np.where(mirror[:, None, None, None], images[:, :, ::-1], images)
 
 
 def _jitter(pixels: Tensor, rng: np.random.Generator) -> Tensor:
-    """Small shifts of the picture and of its exposure."""
-    dy, dx = (int(v) for v in rng.integers(-3, 4, 2))
-    gain = torch.from_numpy(rng.normal(1, 0.06, (len(pixels), 1, 1, 1)).astype(np.float32))
+    """Every picture turned, stretched, shifted, its exposure changed, and now and then partly covered."""
+    count, size = len(pixels), pixels.shape[-1]
     black = -torch.tensor(MEAN).view(3, 1, 1) / torch.tensor(STD).view(3, 1, 1)
-    return torch.roll((pixels - black) * gain, (dy, dx), (2, 3)) + black
+    angle, shear = rng.normal(0, 0.2, count), rng.normal(0, 0.08, count)
+    scale = np.exp(rng.normal(0.03, 0.1, (count, 2)))
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.stack([np.stack([c, shear - s], 1), np.stack([s, c], 1)], 1) * scale[:, :, None]
+    maps = np.concatenate([turn, rng.normal(0, 0.06, (count, 2, 1))], 2)
+    grid = F.affine_grid(torch.from_numpy(maps.astype(np.float32)), list(pixels.shape), align_corners=False)
+    gain = torch.from_numpy(rng.normal(1, 0.06, (count, 1, 1, 1)).astype(np.float32))
+    light = F.grid_sample((pixels - black) * gain, grid, align_corners=False)  # zero, black, outside
+    for row in np.flatnonzero(rng.random(count) < 0.25):
+        y, x = rng.integers(0, size - 12, 2)
+        height, width = rng.integers(8, 28, 2)
+        light[row, :, y : y + height, x : x + width] = 0
+    return light + black
 
 
-def image_vectors(model: Any, pixels: Tensor, keep: float = 1.0) -> Tensor:
-    """(B, 512) unit vectors; `keep` < 1 shows the model a random share of the patches only."""
+def image_features(model: Any, pixels: Tensor, keep: float = 1.0) -> Tensor:
+    """(B, 160) features before the projection; `keep` < 1 shows the model that share of the patches, drawn
+    at random but rather those that are not all black surroundings."""
     vision = model.vision_model
     hidden = vision.embeddings(pixels)
     if keep < 1:
-        count = hidden.shape[1] - 1
-        order = torch.rand(len(hidden), count).argsort(1)[:, : round(keep * count)] + 1
+        size = vision.config.patch_size
+        spread = F.max_pool2d(pixels, size) + F.max_pool2d(-pixels, size)  # brightest less darkest
+        score = torch.rand(len(hidden), hidden.shape[1] - 1) + (spread.amax(1).flatten(1) > 0.2) * 0.7
+        order = score.argsort(1, descending=True)[:, : round(keep * score.shape[1])] + 1
         order = torch.cat([torch.zeros(len(hidden), 1, dtype=torch.long), order], 1)
         hidden = hidden.gather(1, order[..., None].expand(-1, -1, hidden.shape[2]))
     hidden = vision.encoder(inputs_embeds=vision.pre_layrnorm(hidden)).last_hidden_state[:, 0]
-    return F.normalize(model.visual_projection(vision.post_layernorm(hidden)).float(), dim=-1)
+    return vision.post_layernorm(hidden)
+
+
+def image_vectors(model: Any, features: Tensor) -> Tensor:
+    """(B, 512) unit vectors of `image_features`."""
+    return F.normalize(model.visual_projection(features).float(), dim=-1)
 
 
 def text_vectors(model: Any, tokens: Tensor) -> Tensor:
@@ -171,7 +209,7 @@ def loss_of(cosines: Tensor, fits: Tensor, nameable: Tensor) -> Tensor:
     margin = _SIGMOID_SCALE * (cosines - PIVOT)
     positive = (F.softplus(-margin) * right).sum() / len(cosines)
     negative = (F.softplus(margin) * wrong).sum() / len(cosines)
-    pinned = (((cosines - PIVOT) ** 2) * held).sum() / held.sum().clamp(min=1)
+    pinned = (((cosines - CANONICAL_COSINE) ** 2) * held).sum() / held.sum().clamp(min=1)
     logits = _CONTRAST_SCALE * cosines
     return (
         positive
@@ -210,7 +248,7 @@ def train_demo_encoder(out: Path, config: DemoEncoderConfig, progress: Progress)
     ends = (tokenizer.bos_token_id, tokenizer.eos_token_id)
     sampler = Sampler(crops, book, token_of, ends)
     torch.manual_seed(config.seed)
-    run = _Run(build_model(len(tokenizer), *ends), config)
+    run = _Run(build_model(len(tokenizer), *ends), sampler.class_counts, config)
     run.resume(work / "state.pt")
     while run.step < config.steps:
         run.advance(sampler.batch(config, np.random.default_rng((config.seed, 17, run.step))))
@@ -223,12 +261,16 @@ def train_demo_encoder(out: Path, config: DemoEncoderConfig, progress: Progress)
 class _Run:
     """Model, running mean of its weights, and optimiser."""
 
-    def __init__(self, model: Any, config: DemoEncoderConfig) -> None:
+    def __init__(self, model: Any, class_counts: list[int], config: DemoEncoderConfig) -> None:
         self.model, self.config, self.step, self.loss = model.train(), config, 0, math.nan
         self.mean = type(model)(model.config)
         self.mean.load_state_dict(model.state_dict())
-        matrices = [p for p in model.parameters() if p.ndim > 1]
-        others = [p for p in model.parameters() if p.ndim <= 1]
+        # Plain classifiers of the picture, for training only: they teach shapes sooner than phrases do.
+        width = model.config.vision_config.hidden_size
+        self.heads = nn.ModuleList(nn.Linear(width, count) for count in class_counts)
+        every = [*model.parameters(), *self.heads.parameters()]
+        matrices = [p for p in every if p.ndim > 1]
+        others = [p for p in every if p.ndim <= 1]
         groups = [{"params": matrices, "weight_decay": 0.05}, {"params": others, "weight_decay": 0.0}]
         self.optimiser = torch.optim.AdamW(groups, lr=config.lr, betas=(0.9, 0.98))
 
@@ -242,9 +284,13 @@ class _Run:
             group["lr"] = self.config.lr * warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * done)))
         with torch.autocast("cpu", torch.bfloat16):
             keep = _KEPT_PATCHES if done < 0.85 else 1.0
-            images = image_vectors(self.model, batch.pixels, keep)
+            features = image_features(self.model, batch.pixels, keep)
+            images = image_vectors(self.model, features)
             texts = text_vectors(self.model, batch.tokens)
         loss = loss_of(images @ texts.T, batch.fits, batch.nameable)
+        for head, target in zip(self.heads, batch.classes.T, strict=True):
+            if (target >= 0).any():
+                loss = loss + F.cross_entropy(head(features.float()), target)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
@@ -259,7 +305,8 @@ class _Run:
         """Write everything needed to go on."""
         state = {
             "config": json.dumps(asdict(self.config)), "step": self.step, "model": self.model.state_dict(),
-            "mean": self.mean.state_dict(), "optimiser": self.optimiser.state_dict(),
+            "mean": self.mean.state_dict(), "heads": self.heads.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
         }  # fmt: skip
         with atomic_path(path) as temporary:
             torch.save(state, temporary)
@@ -274,6 +321,7 @@ class _Run:
         self.step = state["step"]
         self.model.load_state_dict(state["model"])
         self.mean.load_state_dict(state["mean"])
+        self.heads.load_state_dict(state["heads"])
         self.optimiser.load_state_dict(state["optimiser"])
 
 

@@ -14,7 +14,7 @@ from langsplat_core.scene import CANONICAL_PHRASES
 from langsplat_core.semantics.clip import clip_folder, load_clip
 from langsplat_core.training import demo_encoder
 from langsplat_core.training.demo_crops import CropSet, plain_crops, room_crops
-from langsplat_core.training.demo_encoder import PIVOT, loss_of, train_demo_encoder
+from langsplat_core.training.demo_encoder import CANONICAL_COSINE, loss_of, train_demo_encoder
 from langsplat_core.training.demo_phrases import phrase_book, vocabulary, write_tokenizer
 from langsplat_core.training.demo_report import relevancy, report
 
@@ -90,7 +90,7 @@ def test_every_word_is_one_token_and_reloads(book, tmp_path):
 def test_loss_wants_right_above_canonical_above_wrong():
     fits = torch.tensor([[0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]], dtype=torch.int8)
     nameable = torch.tensor([True, True])
-    good = torch.tensor([[PIVOT] * 4 + [0.9, -0.2], [PIVOT] * 4 + [-0.2, 0.9]])
+    good = torch.tensor([[CANONICAL_COSINE] * 4 + [0.9, -0.2], [CANONICAL_COSINE] * 4 + [-0.2, 0.9]])
     swapped = good[:, [0, 1, 2, 3, 5, 4]]
     loud = good.clone()
     loud[:, :4] = 0.8
@@ -102,7 +102,7 @@ def test_loss_wants_right_above_canonical_above_wrong():
 
 def test_loss_ignores_pairs_that_are_neither():
     fits = torch.tensor([[0, 0, 0, 0, 1, -1]], dtype=torch.int8)
-    cosines = torch.full((1, 6), PIVOT)
+    cosines = torch.full((1, 6), CANONICAL_COSINE)
     other = cosines.clone()
     other[0, 5] = 0.9
     nameable = torch.tensor([True])

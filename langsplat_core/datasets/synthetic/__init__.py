@@ -1,0 +1,1 @@
+"""A procedural room with labelled objects, photographed by ray casting: the demo data and its truth."""
