@@ -174,7 +174,7 @@ def test_training_twice_gives_the_same_model(monkeypatch, tmp_path):
     weights = []
     for name, seed in (("one", 0), ("two", 0), ("other", 1)):
         # The learning rate starts at a 300th of this: steps large enough to be seen in half precision.
-        config = DemoEncoderConfig(steps=2, batch=8, phrases=8, lr=1.0, seed=seed)
+        config = DemoEncoderConfig(steps=2, batch=8, phrases=8, lr=0.1, seed=seed)
         train_demo_encoder(tmp_path / name, config, silent)
         tensors = load_file(tmp_path / name / "model.safetensors")
         weights.append(np.concatenate([tensor.float().numpy().ravel() for tensor in tensors.values()]))
