@@ -25,6 +25,7 @@ from langsplat_core.semantics.store import ImageFeatures
 
 MIN_WEIGHT = 1e-3  # a Gaussian's weight in a mask, in pixels, below which the pair is not stored
 MEDIAN_STEPS = 8
+FAINT = 2e-3  # share of a Gaussian's weight below which a mask has no say in its median
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +97,21 @@ def lift_vectors(memberships: Memberships, robust: bool) -> Iterator[tuple[Array
         confidence = np.asarray(weights.sum(1), np.float32).ravel()
         centre = unit(weights @ vectors).astype(np.float32)
         if robust and len(columns):
-            _weiszfeld(weights.indptr, weights.indices, weights.data, vectors, centre)
+            strong = _without_faint(weights, confidence)
+            _weiszfeld(strong.indptr, strong.indices, strong.data, vectors, centre)
         yield np.where(confidence[:, None] > 0, centre, 0).astype(np.float32), confidence
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+def _without_faint(weights: sparse.csr_matrix, confidence: Array) -> sparse.csr_matrix:
+    """Without the pairs below `FAINT` of their Gaussian's total: half of all pairs, little of the weight."""
+    rows = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
+    keep = weights.data >= FAINT * confidence[rows]
+    indptr = np.concatenate([[0], np.cumsum(np.bincount(rows[keep], minlength=weights.shape[0]))])
+    return sparse.csr_matrix((weights.data[keep], weights.indices[keep], indptr), shape=weights.shape)
+
+
+# Sums may be reordered: without that the compiler cannot use vector instructions, which are 10 times faster.
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
 def _weiszfeld(indptr: Array, indices: Array, data: Array, vectors: Array, centre: Array) -> None:
     """Improve `centre` (N, D) in place towards the weighted geometric median on the unit sphere.
 
