@@ -36,8 +36,8 @@ def accumulate(state: TrainingState, means_px_grad: Tensor, visible: Tensor, siz
     the rendered (width, height).
     """
     to_ndc = means_px_grad.new_tensor([0.5 * size[0], 0.5 * size[1]])
-    norms = (torch.nan_to_num(means_px_grad, 0.0, 0.0, 0.0) * to_ndc).norm(dim=1)
-    state.grad_sum += norms * visible
+    x, y = (torch.nan_to_num(means_px_grad, 0.0, 0.0, 0.0) * to_ndc).unbind(1)
+    state.grad_sum += torch.hypot(x, y) * visible
     state.seen += visible
 
 

@@ -31,7 +31,6 @@ from langsplat_core.training.losses import psnr, radiance_loss, ssim
 from langsplat_core.training.schedule import Schedule, schedule_for
 from langsplat_core.training.state import TrainingState, adam_step, clean_gradients, start
 
-FEATURE_REST_DIVISOR = 20  # higher harmonics learn this much more slowly than the base colour
 COARSE_MIN_SIDE = 64  # px: smaller pictures are never halved
 SMALLEST_EXTENT = 0.05  # of the distance to the scene: one camera, or cameras in one place, have no extent
 
@@ -105,7 +104,7 @@ def train_radiance(
     seed = initial_gaussians(capture, train_indices, config.sh_degree, config.max_gaussians, config.seed)
     extent = _extent(capture, seed)
     pictures = _Pictures(capture, train_indices, renderer.device)
-    run = _Run(config, schedule_for(config, len(pictures), extent), pictures, renderer, extent)
+    run = _Run(config, schedule_for(config, extent), pictures, renderer, extent)
     made_from = fingerprint(capture, config, train_indices) if checkpoint else ""
     if checkpoint and checkpoint.exists():
         state = load_checkpoint(checkpoint, made_from, renderer.device)
@@ -167,24 +166,13 @@ def _step(run: _Run, state: TrainingState) -> float:
     clean_gradients(state)
     if step < schedule.densify_until:
         accumulate(state, rendered.means_px_grad(), rendered.visible, (camera.width, camera.height))
-    adam_step(state, _learning_rates(run, step))
+    adam_step(state, schedule.learning_rates(step))
     if schedule.densifies(step):
-        densify(state, run.config, run.extent, prune_large=step > schedule.prune_large_from)
+        densify(state, run.config, run.extent, prune_large=schedule.prunes_large(step))
     if schedule.resets_opacity(step):
         reset_opacities(state)
     state.step = step
     return float(loss.detach())
-
-
-def _learning_rates(run: _Run, step: int) -> dict[str, float]:
-    return {
-        "means": run.schedule.position_lr(step),
-        "log_scales": run.config.scale_lr,
-        "quats_wxyz": run.config.rotation_lr,
-        "opacity_logits": run.config.opacity_lr,
-        "sh_dc": run.config.feature_lr,
-        "sh_rest": run.config.feature_lr / FEATURE_REST_DIVISOR,
-    }
 
 
 def _visible(gaussians: Gaussians) -> Gaussians:

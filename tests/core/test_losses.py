@@ -54,6 +54,25 @@ def test_the_written_out_gradient_is_the_derivative() -> None:
     assert torch.autograd.gradcheck(lambda x: radiance_loss(x, b, 0.2), a.clone().requires_grad_(), atol=1e-8)
 
 
+@pytest.mark.parametrize("shape", [(31, 40, 3), (1, 1, 3), (3, 2, 1), (64, 7, 3), (5, 90, 2)])
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_the_compiled_loss_is_the_formula(shape: tuple[int, int, int], weight: float) -> None:
+    a, b = pictures(5, shape)
+    a[0, 0] = b[0, 0]  # equal pixels have no L1 gradient
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        # float64 copies of the float32 pictures, so that both see the same signs of a - b
+        picture = a.float().to(dtype).requires_grad_()
+        loss = radiance_loss(picture, b.float().to(dtype), weight)
+        loss.backward()
+        assert picture.grad is not None
+        results.append((float(loss.detach()), picture.grad.double().numpy()))
+    (ours, gradient), (want, want_gradient) = results
+    assert ours == pytest.approx(want, abs=1e-6)
+    # 1e-7: of equal pictures the gradient is a difference of equal numbers, not exactly 0 in float32
+    np.testing.assert_allclose(gradient, want_gradient, atol=2e-6 * np.abs(want_gradient).max() + 1e-7)
+
+
 def test_the_loss_mixes_l1_and_dissimilarity() -> None:
     a, b = pictures(4)
     l1, dissimilarity = float((a - b).abs().mean()), 1 - float(ssim(a, b))
