@@ -99,7 +99,8 @@ def test_the_rule_itself_can_fail():
 
 def test_opening_a_scene_imports_nothing_heavy():
     code = (
-        "import sys, langsplat_core, langsplat_core.formats, langsplat_core.scene, langsplat_core.query.engine,"
+        "import sys, langsplat_core, langsplat_core.formats, langsplat_core.scene,"
+        " langsplat_core.query.engine,"
         " langsplat_core.query.picture, langsplat_core.raster;"
         f"print([m for m in {HEAVY!r} if m in sys.modules])"
     )

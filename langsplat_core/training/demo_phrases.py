@@ -1,6 +1,8 @@
 """The language of the demo encoder: its phrases, which of them fit a crop, and its tokenizer."""
 
+from collections import Counter
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +22,7 @@ from langsplat_core.scene import CANONICAL_PHRASES
 FUNCTION_WORDS = ("a", "an", "the", "of", "and", "with", "photo", "my", "on", "in", "some", "one")
 PREFIXES = ("", "", "", "", "a", "the", "the", "a photo of a", "a photo of the", "my", "one", "some")
 CONTEXT = 16  # tokens of the longest phrase, with start and end
-START, END = "<|startoftext|>", "<|endoftext|>"
+START, END, WORD_END = "<|startoftext|>", "<|endoftext|>", "</w>"
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,27 +88,43 @@ def vocabulary(book: PhraseBook) -> list[str]:
 def write_tokenizer(words: list[str], folder: Path) -> None:
     """A CLIP tokenizer (byte-pair encoding) whose merges make one token of every word, and the word list.
 
-    Letters are tokens too, so any other word is spelled out rather than refused.
+    Letters are tokens too, so any other word is spelled out rather than refused. The same words always
+    give the same token numbers, so a resumed training finds its embeddings where they were.
     """
-    from tokenizers import Tokenizer, models, pre_tokenizers, trainers
     from transformers import CLIPTokenizerFast
 
-    model = Tokenizer(models.BPE(end_of_word_suffix="</w>"))
-    model.pre_tokenizer = pre_tokenizers.Whitespace()
-    alphabet = [chr(c) for c in range(ord("a"), ord("z") + 1)]
-    trainer = trainers.BpeTrainer(
-        vocab_size=30 * len(words),
-        min_frequency=1,
-        special_tokens=[START, END],
-        initial_alphabet=alphabet,
-        end_of_word_suffix="</w>",
-        show_progress=False,
-    )
-    model.train_from_iterator([*words, " ".join(alphabet)], trainer)
-    import json
-
-    learned = json.loads(model.to_str())["model"]
-    merges = [tuple(pair) for pair in learned["merges"]]
-    tokenizer = CLIPTokenizerFast(vocab=learned["vocab"], merges=merges, model_max_length=CONTEXT)
+    letters = [chr(c) for c in range(ord("a"), ord("z") + 1)]
+    merges = word_merges(words)
+    tokens = [START, END, *letters, *(letter + WORD_END for letter in letters)]
+    tokens += [left + right for left, right in merges]
+    vocab = {token: number for number, token in enumerate(dict.fromkeys(tokens))}
+    tokenizer = CLIPTokenizerFast(vocab=vocab, merges=merges, model_max_length=CONTEXT)
+    folder.mkdir(parents=True, exist_ok=True)
     tokenizer.save_pretrained(folder)
     (folder / "vocabulary.txt").write_text("\n".join(words) + "\n", encoding="utf-8")
+
+
+def word_merges(words: list[str]) -> list[tuple[str, str]]:
+    """Byte-pair merges, in order, after which every word is one symbol (Sennrich et al. 2016).
+
+    The commonest pair is merged first, the alphabet decides between equals. Words are of letters a-z.
+    """
+    spelled = [[*word[:-1], word[-1] + WORD_END] for word in words]
+    merges: list[tuple[str, str]] = []
+    while any(len(symbols) > 1 for symbols in spelled):
+        pairs = Counter(pair for symbols in spelled for pair in pairwise(symbols))
+        best = min(pairs, key=lambda pair: (-pairs[pair], pair))
+        merges.append(best)
+        spelled = [_merged(symbols, best) for symbols in spelled]
+    return merges
+
+
+def _merged(symbols: list[str], pair: tuple[str, str]) -> list[str]:
+    """`symbols` with every occurrence of `pair`, from the left, made one symbol."""
+    result: list[str] = []
+    for symbol in symbols:
+        if result and (result[-1], symbol) == pair:
+            result[-1] += symbol
+        else:
+            result.append(symbol)
+    return result

@@ -15,7 +15,7 @@ from langsplat_core.semantics.clip import clip_folder, load_clip
 from langsplat_core.training import demo_encoder
 from langsplat_core.training.demo_crops import CropSet, plain_crops, room_crops
 from langsplat_core.training.demo_encoder import CANONICAL_COSINE, loss_of, train_demo_encoder
-from langsplat_core.training.demo_phrases import phrase_book, vocabulary, write_tokenizer
+from langsplat_core.training.demo_phrases import phrase_book, vocabulary, word_merges, write_tokenizer
 from langsplat_core.training.demo_report import relevancy, report
 
 MUG = Label(2, "mug", "mug", "red", "red", ("red", "white"))
@@ -85,6 +85,16 @@ def test_every_word_is_one_token_and_reloads(book, tmp_path):
         assert tokens[-1] == [tokenizer.bos_token_id, *tokens[-1][1:-1], tokenizer.eos_token_id]
         assert len(tokens[-1]) > 3  # an unknown word is spelled out
     assert (tmp_path / "vocabulary.txt").read_text().split() == words
+
+
+def test_token_numbers_depend_on_the_words_alone(book, tmp_path):
+    """A resumed training must find its embeddings where they were."""
+    for name in ("one", "two"):
+        write_tokenizer(vocabulary(book), tmp_path / name)
+    assert (tmp_path / "one" / "tokenizer.json").read_bytes() == (
+        tmp_path / "two" / "tokenizer.json"
+    ).read_bytes()
+    assert word_merges(["aba", "ab"]) == [("a", "b"), ("a", "b</w>"), ("ab", "a</w>")]
 
 
 def test_loss_wants_right_above_canonical_above_wrong():

@@ -1,5 +1,7 @@
 """Relevancy, the sphere table, levels, places and pixels."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -32,7 +34,7 @@ def random_codec(rng: np.random.Generator, d: int = 3) -> AutoencoderCodec:
                 (rng.normal(size=(b, a)) * (1.6 / a**0.5)).astype(np.float32),
                 (0.3 * rng.normal(size=b)).astype(np.float32),
             )
-            for a, b in zip(widths, widths[1:], strict=False)
+            for a, b in pairwise(widths)
         )
 
     return AutoencoderCodec(layers((D, 24, d)), layers((d, 24, 32, D)))
