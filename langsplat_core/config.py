@@ -131,10 +131,10 @@ class TrainConfig:
 class DemoEncoderConfig:
     """Training of the small CLIP that comes with the program (`langsplat demo encoder`)."""
 
-    rooms: int = 180  # random rooms that crops are rendered from
+    rooms: int = 300  # random rooms that crops are rendered from
     views: int = 3  # photographs of each room
     plain_crops: int = 8_000  # crops of nothing but a colour or a texture
-    steps: int = 3_000
+    steps: int = 8_000
     batch: int = 128  # crops per step
     phrases: int = 128  # phrases per step
     lr: float = 1e-3
