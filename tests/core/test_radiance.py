@@ -14,12 +14,12 @@ from safetensors.torch import load_file
 from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA, RadianceConfig, RasterSettings
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.errors import InputError
+from langsplat_core.errors import BackendError, InputError
 from langsplat_core.progress import Cancelled
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.spherical_harmonics import C0, colours
 from langsplat_core.scene import Camera, Gaussians, look_at
-from langsplat_core.training.differentiable import CpuRenderer
+from langsplat_core.training.differentiable import CpuRenderer, renderer_for
 from langsplat_core.training.initialise import initial_gaussians
 from langsplat_core.training.radiance import evaluate_views, train_radiance
 from langsplat_core.training.state import PARAMETERS, TrainingState, start
@@ -171,6 +171,22 @@ def test_one_view_and_no_view() -> None:
     assert len(trained) > 0
     with pytest.raises(InputError, match="no photographs to train on"):
         train_radiance(capture(), SHORT, [])
+
+
+def test_a_view_that_sees_nothing_changes_nothing_else() -> None:
+    away = look_at(np.array([0, 0, -4.0]), np.array([0, 0, -9.0]), np.array([0.0, -1.0, 0.0]), SIZE)
+    blind = replace(capture(), cameras=(away, *capture().cameras[1:]))
+    trained = train_radiance(blind, replace(SHORT, steps=12), [0, 1])
+    assert len(trained) > 100
+    assert trained.valid().all()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_asking_for_cuda_where_there_is_none_is_one_line() -> None:
+    with pytest.raises(BackendError, match="no CUDA device; use --backend cpu") as caught:
+        train_radiance(capture(), replace(SHORT, backend="cuda"), [0])
+    assert "\n" not in str(caught.value)
+    assert isinstance(renderer_for("auto"), CpuRenderer)
 
 
 def test_initial_gaussians_sit_on_the_points() -> None:
