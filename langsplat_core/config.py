@@ -37,7 +37,8 @@ class DatasetConfig:
 class RadianceConfig:
     """3D Gaussian Splatting training (Kerbl et al. 2023); defaults are those of the INRIA code.
 
-    Step counts below are for `reference_steps`; a smaller `steps` scales every schedule with it.
+    Step counts below are for `reference_steps`; a smaller `steps` scales every schedule with it and lets
+    geometry learn faster (see `training.schedule`).
     """
 
     steps: int = 30_000
