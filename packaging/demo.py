@@ -11,10 +11,10 @@ PICTURES = {
     "colours.png": [],
     "latent_whole.png": ["--display", "latent", "--level", "whole"],
     "latent_part.png": ["--display", "latent", "--level", "part"],
-    "orange_mug.png": ["--query", "orange mug"],
+    "purple_car.png": ["--query", "purple car"],
     "handle.png": ["--query", "handle of the mug"],
     "segmentation.png": [
-        *("--query", "banana", "--query", "purple car", "--query", "plant"),
+        *("--query", "banana", "--query", "purple car", "--query", "green apple"),
         *("--display", "segmentation"),
     ],
 }

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 from imgui_bundle.immapp import testing  # isort: skip  (before glfw)
 from PIL import Image
@@ -18,7 +19,7 @@ STILLS = {
     "latent_whole.png": ["--display", "latent", "--level", "whole"],
     "latent_part.png": ["--display", "latent", "--level", "part"],
     "segmentation.png": [
-        *("--query", "banana", "--query", "purple car", "--query", "plant"),
+        *("--query", "banana", "--query", "purple car", "--query", "green apple"),
         *("--display", "segmentation"),
     ],
 }
@@ -31,7 +32,7 @@ def window_picture(path: Path, queries: tuple[str, ...]) -> None:
     )
     window = Window(request, services(""), FrameRenderer)
 
-    def wait_and_capture(ctx: testing.TestContext) -> None:
+    def wait_and_capture(ctx: Any) -> None:  # imgui's test context has no public type
         state = window.viewer.state
         for _ in range(20_000):
             ctx.yield_()
@@ -51,7 +52,7 @@ def main() -> None:
     for name, options in STILLS.items():
         command = [sys.executable, "-m", "langsplat_viewer", "--headless", "--camera", CAMERA]
         subprocess.run([*command, "--out", str(OUT / name), *options], check=True)
-    window_picture(OUT / "window.png", ("orange mug",))
+    window_picture(OUT / "window.png", ("purple car",))
 
 
 if __name__ == "__main__":
