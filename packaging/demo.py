@@ -12,7 +12,7 @@ PICTURES = {
     "latent_whole.png": ["--display", "latent", "--level", "whole"],
     "latent_part.png": ["--display", "latent", "--level", "part"],
     "purple_car.png": ["--query", "purple car"],
-    "handle.png": ["--query", "handle of the mug"],
+    "window.png": ["--query", "window"],
     "segmentation.png": [
         *("--query", "banana", "--query", "purple car", "--query", "green apple"),
         *("--display", "segmentation"),
