@@ -74,7 +74,7 @@ def measure(
     for index, backend in enumerate(backends):
 
         def row(
-            operation: str, call: Callable[[], Array], truth: Array | None, name: str = backend.name
+            operation: str, call: Callable[[], Array], truth: Array | None, name: str = _label(backend)
         ) -> Measurement:
             seconds, result = _timed(call, repeats)
             error = None if truth is None else np.abs(result - truth)
@@ -100,6 +100,11 @@ def measure(
             rows.append(row("gather", lambda view=view: _gather(view, image), truth_values))  # type: ignore[misc]
         progress(f"bench: {backend.name}", (index + 1) / len(backends))
     return rows
+
+
+def _label(backend: Rasterizer) -> str:
+    """Its name, with the precision where it offers several."""
+    return f"{backend.name} {getattr(backend, 'precision', '')}".strip()
 
 
 def _gather(view: View, image: Array) -> Array:
