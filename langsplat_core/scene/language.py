@@ -1,7 +1,7 @@
 """The language field: what every Gaussian means, at three levels."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,3 +33,7 @@ class LanguageField:
 
     def __len__(self) -> int:
         return int(self.latents.shape[1])
+
+    def take(self, rows: Array) -> "LanguageField":
+        """The field of the Gaussians at `rows` (indices or a boolean mask)."""
+        return replace(self, latents=self.latents[:, rows], confidence=self.confidence[:, rows])

@@ -1,11 +1,13 @@
 """A scene: Gaussians, perhaps a language field, perhaps the cameras it was trained from."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.scene.camera import Camera, look_at
 from langsplat_core.scene.gaussians import Gaussians
 from langsplat_core.scene.language import LanguageField
@@ -19,12 +21,31 @@ class Scene:
     language: LanguageField | None = None
     cameras: tuple[Camera, ...] = ()  # training cameras, in the dataset's order
     path: Path | None = None
+    antialiased: bool = False  # trained with Mip-Splatting's compensation, as its file says
+    extras: Mapping[str, Array] = field(default_factory=dict)  # (N,) per-Gaussian properties nobody here reads
 
     def __post_init__(self) -> None:
+        for name, values in self.extras.items():
+            if values.shape != (len(self.gaussians),):
+                raise ValueError(f"extra property {name} of shape {values.shape}, not ({len(self.gaussians)},)")
         if self.language is not None and len(self.language) != len(self.gaussians):
             raise ValueError(
                 f"language field of {len(self.language)} Gaussians on a scene of {len(self.gaussians)}"
             )
+
+    def take(self, rows: Array) -> "Scene":
+        """The scene of the Gaussians at `rows` (indices or a boolean mask), without a path."""
+        return replace(
+            self,
+            gaussians=self.gaussians.take(rows),
+            language=None if self.language is None else self.language.take(rows),
+            extras={name: values[rows] for name, values in self.extras.items()},
+            path=None,
+        )
+
+    def raster_settings(self, profile: RasterSettings = INRIA) -> RasterSettings:
+        """`profile` with the antialiasing that this scene was trained with."""
+        return replace(profile, antialiased=self.antialiased)
 
     def up(self) -> Array:
         """(3,) the world's up direction: the mean of the cameras' up axes, else -y as COLMAP has it."""
