@@ -22,12 +22,12 @@ class Scene:
     cameras: tuple[Camera, ...] = ()  # training cameras, in the dataset's order
     path: Path | None = None
     antialiased: bool = False  # trained with Mip-Splatting's compensation, as its file says
-    extras: Mapping[str, Array] = field(default_factory=dict)  # (N,) per-Gaussian properties nobody here reads
+    extras: Mapping[str, Array] = field(default_factory=dict)  # (N,) properties not read here
 
     def __post_init__(self) -> None:
         for name, values in self.extras.items():
             if values.shape != (len(self.gaussians),):
-                raise ValueError(f"extra property {name} of shape {values.shape}, not ({len(self.gaussians)},)")
+                raise ValueError(f"extras[{name!r}] of shape {values.shape}, not ({len(self.gaussians)},)")
         if self.language is not None and len(self.language) != len(self.gaussians):
             raise ValueError(
                 f"language field of {len(self.language)} Gaussians on a scene of {len(self.gaussians)}"
