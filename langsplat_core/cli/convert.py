@@ -6,8 +6,7 @@ from pathlib import Path
 import tyro
 
 from langsplat_core.errors import InputError
-from langsplat_core.formats import load_gaussians, load_scene, rematch_language, save_scene
-from langsplat_core.scene import Scene
+from langsplat_core.formats import load_scene, load_without_language, rematch_language, save_scene
 
 
 @dataclass(frozen=True)
@@ -28,8 +27,8 @@ class Convert:
         if self.rematch is None:
             scene = load_scene(self.source)
         else:
-            gaussians = load_gaussians(self.source)
-            scene = Scene(gaussians, rematch_language(self.rematch, gaussians.means))
+            scene = load_without_language(self.source)
+            scene = replace(scene, language=rematch_language(self.rematch, scene.gaussians.means))
         save_scene(self.out, replace(scene, path=self.out))
         field = "with a language field" if scene.language else "without a language field"
         print(f"{self.out}: {len(scene.gaussians)} Gaussians, {field}")

@@ -5,17 +5,18 @@ which may be absent. The same companions are looked for beside a compressed PLY,
 """
 
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
-from langsplat_core.formats import cameras_json, language
+from langsplat_core.formats import antialiasing, cameras_json, language
 from langsplat_core.formats.cameras_json import read_cameras, write_cameras
 from langsplat_core.formats.langsplat_features import read_features, write_features
 from langsplat_core.formats.language import read_language, rematch_language, write_language
 from langsplat_core.formats.opening import exists
-from langsplat_core.formats.ply import read_ply, write_ply
-from langsplat_core.formats.sog import META_NAME, read_sog
+from langsplat_core.formats.ply import read_ply, read_ply_scene, write_ply
+from langsplat_core.formats.sog import META_NAME, read_sog, read_sog_scene
 from langsplat_core.scene import Gaussians, Scene
 
 __all__ = [
@@ -23,11 +24,14 @@ __all__ = [
     "companion_path",
     "load_gaussians",
     "load_scene",
+    "load_without_language",
     "read_cameras",
     "read_features",
     "read_language",
     "read_ply",
+    "read_ply_scene",
     "read_sog",
+    "read_sog_scene",
     "rematch_language",
     "save_scene",
     "write_cameras",
@@ -45,18 +49,7 @@ def load_gaussians(path: Path | str) -> Gaussians:
     Raises InputError for what cannot be opened or is of no supported kind, FormatError for what breaks
     the rules of its format.
     """
-    path = Path(path)
-    if not exists(path):
-        raise InputError(f"{path}: no such file; check the spelling and the folder")
-    if path.suffix.lower() == ".ply" and not path.is_dir():
-        return read_ply(path)
-    if path.suffix.lower() == ".sog" or path.name == META_NAME or exists(path / META_NAME):
-        return read_sog(path)
-    if path.is_dir():
-        inside = sorted(path.glob("**/*.ply"))
-        hint = f"; perhaps {inside[-1]}" if inside else ""
-        raise InputError(f"{path}: a folder without {META_NAME} is not a scene{hint}")
-    raise InputError(f"{path}: not a scene of a known kind; supported: {SUPPORTED}")
+    return _read_scene(Path(path)).gaussians
 
 
 def load_scene(path: Path | str) -> Scene:
@@ -66,16 +59,33 @@ def load_scene(path: Path | str) -> Scene:
     (`model/point_cloud/iteration_N/point_cloud.ply`) `model/cameras.json`. Raises InputError and
     FormatError as `load_gaussians` does, also when a companion is unusable or made for other Gaussians.
     """
-    path = Path(path)
-    gaussians = load_gaussians(path)
+    scene = load_without_language(path)
     sidecar = companion_path(path, language.SUFFIX)
-    cameras = _cameras_path(path)
-    return Scene(
-        gaussians,
-        read_language(sidecar, gaussians.means) if exists(sidecar) else None,
-        read_cameras(cameras) if exists(cameras) else (),
-        path,
-    )
+    if not exists(sidecar):
+        return scene
+    return replace(scene, language=read_language(sidecar, scene.gaussians.means))
+
+
+def load_without_language(path: Path | str) -> Scene:
+    """As `load_scene`, but without the language field, which is not even looked at."""
+    path = Path(path)
+    scene, cameras = _read_scene(path), _cameras_path(path)
+    return replace(scene, cameras=read_cameras(cameras) if exists(cameras) else (), path=path)
+
+
+def _read_scene(path: Path) -> Scene:
+    """What the scene's own file holds."""
+    if not exists(path):
+        raise InputError(f"{path}: no such file; check the spelling and the folder")
+    if path.suffix.lower() == ".ply" and not path.is_dir():
+        return read_ply_scene(path)
+    if path.suffix.lower() == ".sog" or path.name == META_NAME or exists(path / META_NAME):
+        return read_sog_scene(path)
+    if path.is_dir():
+        inside = sorted(path.glob("**/*.ply"))
+        hint = f"; perhaps {inside[-1]}" if inside else ""
+        raise InputError(f"{path}: a folder without {META_NAME} is not a scene{hint}")
+    raise InputError(f"{path}: not a scene of a known kind; supported: {SUPPORTED}")
 
 
 def save_scene(path: Path | str, scene: Scene) -> None:
@@ -95,7 +105,8 @@ def save_scene(path: Path | str, scene: Scene) -> None:
         if scene.language is not None:
             temporary = renames.enter_context(atomic_path(sidecar))
             write_language(temporary, scene.language, scene.gaussians.means)
-        write_ply(renames.enter_context(atomic_path(path)), scene.gaussians)
+        comments = (antialiasing.COMMENT,) if scene.antialiased else ()
+        write_ply(renames.enter_context(atomic_path(path)), scene.gaussians, comments, scene.extras)
         for companion in (sidecar, cameras):
             companion.unlink(missing_ok=True)
 

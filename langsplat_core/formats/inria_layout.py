@@ -10,6 +10,7 @@ from langsplat_core.formats.ply_header import PlyElement
 from langsplat_core.scene import SH_COUNTS
 
 POSITION = ("x", "y", "z")
+NORMAL = ("nx", "ny", "nz")  # zeros that nobody reads
 BASE_COLOUR = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")

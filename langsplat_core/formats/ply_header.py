@@ -21,6 +21,7 @@ _LONG_NAMES = {
     "f8": ("double", "float64"),
 }
 _TYPES = {name: code for code, names in _LONG_NAMES.items() for name in names}
+TYPE_NAMES = {code: names[0] for code, names in _LONG_NAMES.items()}  # as they are written
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,9 @@ by row, belongs to Gaussian i:
     shN, optional        files[1]: 16-bit number of a palette entry; files[0]: the palette, 64 entries a
                          row, one pixel per coefficient, rgb: indices into `codebook`
 
-Opacities of 0 and 1 become logits of -infinity and +infinity. Source: PlayCanvas' public specification.
+Opacities of 0 and 1 become logits of -infinity and +infinity. `model: "antialiased"`, in older files
+`antialias: true`, says that the Gaussians were trained with Mip-Splatting's compensation. Source:
+PlayCanvas' public specification.
 """
 
 import io
@@ -29,7 +31,7 @@ from langsplat_core.arrays import Array, logit
 from langsplat_core.errors import FormatError
 from langsplat_core.formats.compressed_ply import smallest_three
 from langsplat_core.formats.opening import open_for_reading, parse_json
-from langsplat_core.scene import SH_COUNTS, Gaussians
+from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 
 META_NAME = "meta.json"
 META_LIMIT = 1024 * 1024  # bytes; a real one has three codebooks, 15 kB
@@ -44,7 +46,12 @@ Fetch = Callable[[str, int], bytes]  # (file name, most bytes) -> content
 
 
 def read_sog(path: Path | str) -> Gaussians:
-    """The Gaussians of a SOG folder, its `meta.json`, or a `.sog` file.
+    """The Gaussians of a SOG folder, its `meta.json`, or a `.sog` file. Raises as `read_sog_scene` does."""
+    return read_sog_scene(path).gaussians
+
+
+def read_sog_scene(path: Path | str) -> Scene:
+    """The Gaussians, as `read_sog` gives them, and whether they are to be drawn antialiased.
 
     Raises InputError when a file cannot be opened and FormatError when it breaks a rule of the format.
     """
@@ -91,10 +98,14 @@ def _archive_reader(archive: zipfile.ZipFile, archive_size: int, path: Path) -> 
     return fetch
 
 
-def _decode(fetch: Fetch, meta_path: Path) -> Gaussians:
+def _decode(fetch: Fetch, meta_path: Path) -> Scene:
     """`meta_path` is for messages; the name of the meta file is its last part."""
     meta = _Meta(parse_json(fetch(meta_path.name, META_LIMIT), meta_path), meta_path)
     meta.check_version()
+    return Scene(_gaussians(fetch, meta), antialiased=meta.antialiased())
+
+
+def _gaussians(fetch: Fetch, meta: "_Meta") -> Gaussians:
     count = meta.whole_number("count", least=0, most=2**32)
     planes = _Planes(fetch, meta, count)
     low, high = planes.of_gaussians("means", 0), planes.of_gaussians("means", 1)
@@ -103,7 +114,7 @@ def _decode(fetch: Fetch, meta_path: Path) -> Gaussians:
     logs = mins + (maxs - mins) * fractions
     quats = planes.of_gaussians("quats", 0)
     if count and quats[:, 3].min() < 252:
-        raise FormatError(f"{meta_path}: 'quats' holds an alpha below 252; was the image saved lossily?")
+        raise FormatError(f"{meta.path}: 'quats' holds an alpha below 252; was the image saved lossily?")
     sh0 = planes.of_gaussians("sh0", 0)
     base = meta.numbers("sh0", "codebook", 256)[sh0[:, :3]]
     with np.errstate(over="ignore"):  # overflow to infinity makes rows that are dropped later
@@ -184,6 +195,9 @@ class _Meta:
         version = self.content.get("version", 1)
         if version != 2:
             raise FormatError(f"{self.path}: SOG version {version!r}; only 2 is read, export the scene again")
+
+    def antialiased(self) -> bool:
+        return self.content.get("model") == "antialiased" or self.content.get("antialias") is True
 
     def whole_number(self, *keys: str, least: int, most: int) -> int:
         value = self._at(keys)
