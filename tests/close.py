@@ -15,26 +15,33 @@ from langsplat_core.raster.reference import Footprints, ReferenceView
 BAND = 1e-4  # relative distance to a cut-off; float32 kernels are within about 1e-6 of it
 
 
-def cut_off_band(view: ReferenceView) -> Array:
-    """(H, W) True where some Gaussian's alpha, or the transmittance behind it, lies at a cut-off."""
+def cut_off_band(view: ReferenceView, relative: float = BAND) -> Array:
+    """(H, W) True where some Gaussian's alpha, or the transmittance behind it, lies at a cut-off.
+
+    At means within `relative` of it.
+    """
     settings: RasterSettings = view.settings
     f: Footprints = view.footprints
-    ys, xs = np.mgrid[: view.camera.height, : view.camera.width] + 0.5
-    band = np.zeros(xs.shape, bool)
-    transmittance, running = np.ones(xs.shape), np.ones(xs.shape, bool)
-    for i in view.order:
-        if f.opacities[i] == 0:
-            continue
-        dx, dy = xs - f.means_px[i, 0], ys - f.means_px[i, 1]
+    height, width = view.camera.height, view.camera.width
+    band = np.zeros((height, width), bool)
+    transmittance, running = np.ones((height, width)), np.ones((height, width), bool)
+    low, high = view.windows  # one pixel is added all round: an alpha just below the cut-off lies outside
+    for i in view.order[(high > low).all(1)[view.order]]:
+        (x0, y0), (x1, y1) = np.maximum(low[i] - 1, 0), high[i] + 1
+        window = np.s_[y0:y1, x0:x1]
+        dx = np.arange(x0, min(x1, width)) + 0.5 - f.means_px[i, 0]
+        dy = (np.arange(y0, min(y1, height)) + 0.5 - f.means_px[i, 1])[:, None]
         xx, xy, yy = f.conics[i]
         power = -0.5 * (xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy)
         alpha = np.minimum(f.opacities[i] * np.exp(power), settings.alpha_max)
-        after = transmittance * (1 - alpha)
-        hit = running & (alpha >= settings.alpha_min)
-        band |= running & (np.abs(alpha / settings.alpha_min - 1) < BAND)
-        band |= hit & (np.abs(after / settings.transmittance_min - 1) < BAND)
-        running &= ~(hit & (after <= settings.transmittance_min))
-        transmittance = np.where(hit & running, after, transmittance)
+        open_here, before = running[window], transmittance[window]
+        after = before * (1 - alpha)
+        hit = open_here & (alpha >= settings.alpha_min)
+        band[window] |= open_here & (np.abs(alpha - settings.alpha_min) < relative * settings.alpha_min)
+        limit = settings.transmittance_min
+        band[window] |= hit & (np.abs(after - limit) < relative * limit)
+        running[window] &= ~(hit & (after <= limit))
+        transmittance[window] = np.where(hit & running[window], after, before)
     return band
 
 

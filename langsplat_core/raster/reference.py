@@ -92,6 +92,20 @@ class ReferenceView:
         self.footprints = project(gaussians, camera, settings)
         self.dropped = int(len(gaussians) - gaussians.valid().sum())
         self.order = np.argsort(self.footprints.depths, kind="stable")
+        self.windows = self._windows()
+
+    def _windows(self) -> tuple[Array, Array]:
+        """First and one-past-last pixel (x, y), each (N, 2) int, of what a Gaussian may touch; empty if nothing.
+
+        They only save time: outside the extent alpha is below alpha_min anyway. 1e-9 relative slack keeps
+        rounding from cutting a pixel that lies on the contour.
+        """
+        f, size = self.footprints, (self.camera.width, self.camera.height)
+        reach = f.extents_px * (1 + 1e-9) + 1e-9
+        low = np.clip(np.ceil(f.means_px - reach - 0.5), 0, size).astype(np.int64)
+        high = np.clip(np.floor(f.means_px + reach - 0.5) + 1, 0, size).astype(np.int64)
+        high[f.opacities == 0] = 0
+        return low, high
 
     def _weights(self):  # type: ignore[no-untyped-def]
         """Yield (index, window, weights, transmittance after) front to back: steps 3 and 4."""
@@ -99,15 +113,9 @@ class ReferenceView:
         height, width = self.camera.height, self.camera.width
         transmittance = np.ones((height, width))
         running = np.ones((height, width), bool)
+        low, high = self.windows
         for i in self.order:
-            if f.opacities[i] == 0:
-                continue
-            # The window only saves time: outside the extent alpha is below alpha_min anyway.
-            # 1e-9 relative slack keeps rounding from cutting a pixel that lies on the contour.
-            low = np.ceil(f.means_px[i] - f.extents_px[i] * (1 + 1e-9) - 0.5 - 1e-9)
-            high = np.floor(f.means_px[i] + f.extents_px[i] * (1 + 1e-9) - 0.5 + 1e-9) + 1
-            x0, y0 = (int(v) for v in np.clip(low, 0, (width, height)))
-            x1, y1 = (int(v) for v in np.clip(high, 0, (width, height)))
+            (x0, y0), (x1, y1) = low[i], high[i]
             if x0 >= x1 or y0 >= y1:
                 continue
             window = np.s_[y0:y1, x0:x1]

@@ -47,13 +47,34 @@ class Gaussians:
     def valid(self) -> Array:
         """(N,) True where a row can be drawn: finite mean and colour, a non-zero finite quaternion,
         scales that are not NaN or so large that they overflow, an opacity that is not NaN."""
+        usable = np.ones(len(self), bool)
+        for _, sound in self._requirements():
+            usable &= sound
+        return usable
+
+    def invalid_rows(self) -> dict[str, int]:
+        """Why rows are not valid: reason -> count, for those reasons that occur.
+
+        A row counts once, under its first reason, so that the counts add up to the rows dropped.
+        """
+        counts = {}
+        unexplained = np.ones(len(self), bool)
+        for reason, sound in self._requirements():
+            faulty = unexplained & ~sound
+            unexplained &= sound
+            if faulty.any():
+                counts[reason] = int(faulty.sum())
+        return counts
+
+    def _requirements(self) -> tuple[tuple[str, Array], ...]:
+        """What a row must fulfil to be drawn: name of the fault, (N,) True where there is none."""
         with np.errstate(over="ignore", invalid="ignore"):
             length_squared = (self.quats_wxyz.astype(np.float64) ** 2).sum(1)
-            return (
-                np.isfinite(self.means).all(1)
-                & (self.log_scales <= 80).all(1)  # exp(88.7) overflows float32; NaN compares False
-                & np.isfinite(length_squared)
-                & (length_squared > 1e-24)
-                & ~np.isnan(self.opacity_logits)
-                & np.isfinite(self.sh).all((1, 2))
-            )
+        return (
+            ("position not finite", np.isfinite(self.means).all(1)),
+            # exp(88.7) overflows float32; NaN compares False
+            ("scale not a number or above e^80", (self.log_scales <= 80).all(1)),
+            ("rotation zero or not finite", np.isfinite(length_squared) & (length_squared > 1e-24)),
+            ("opacity not a number", ~np.isnan(self.opacity_logits)),
+            ("colour not finite", np.isfinite(self.sh).all((1, 2))),
+        )
