@@ -52,7 +52,7 @@ class GlSource:
         self._layers = layers
 
     def _view(self, camera: Camera) -> GlView:
-        return self._rasterizer.view(self._scene.gaussians, camera)
+        return self._rasterizer.view(self._scene.gaussians, camera, self._scene.raster_settings())
 
     def render(self, camera: Camera, extra: Extra) -> Textures:
         sources: list[Source] = ["colour"]
@@ -117,7 +117,7 @@ class ArraySource:
         return texture
 
     def depth_at(self, camera: Camera, column: int, row: int) -> tuple[float, float]:
-        return self._channels.depth_at(self._scene.gaussians, camera, column, row)
+        return self._channels.depth_at(self._scene, camera, column, row)
 
     def release(self) -> None:
         for texture in self._textures.values():

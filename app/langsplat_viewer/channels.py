@@ -75,16 +75,17 @@ class ArrayChannels:
         self._view: View | None = None
         self._shown: tuple[Gaussians, tuple[object, ...]] | None = None  # what `_view` is a view of
 
-    def view(self, gaussians: Gaussians, camera: Camera) -> View:
-        """`gaussians` projected into `camera`."""
-        key = camera_key(camera)
+    def view(self, scene: Scene, camera: Camera) -> View:
+        """The Gaussians of `scene` projected into `camera`."""
+        gaussians, settings = scene.gaussians, scene.raster_settings()
+        key = (settings, *camera_key(camera))
         if (
             self._view is None
             or self._shown is None
             or self._shown[0] is not gaussians
             or self._shown[1] != key
         ):
-            self._view, self._shown = self._rasterizer.view(gaussians, camera), (gaussians, key)
+            self._view, self._shown = self._rasterizer.view(gaussians, camera, settings), (gaussians, key)
         return self._view
 
     def render(self, scene: Scene, layers: Layers, camera: Camera, extra: Extra) -> Channels:
@@ -101,7 +102,7 @@ class ArrayChannels:
             values.append(layers.latent_rgb)
         elif extra == "relevancies" and layers.relevancies is not None:
             values.append(layers.relevancies)
-        image, alpha = self.view(gaussians, camera).splat(np.concatenate(values, 1, dtype=np.float32))
+        image, alpha = self.view(scene, camera).splat(np.concatenate(values, 1, dtype=np.float32))
         more = image[..., 3:]
         return Channels(
             rgb=image[..., :3],
@@ -112,11 +113,11 @@ class ArrayChannels:
             depth_range=depth_range(gaussians, camera) if extra == "depth" else (0.0, 1.0),
         )
 
-    def depth_at(self, gaussians: Gaussians, camera: Camera, column: int, row: int) -> tuple[float, float]:
+    def depth_at(self, scene: Scene, camera: Camera, column: int, row: int) -> tuple[float, float]:
         """Depth of the surface in a pixel (the median, or the mean where the scene is transparent there),
         world units, 0 where there is nothing, and alpha."""
-        view = self.view(gaussians, camera)
-        _, alpha = view.splat(np.empty((len(gaussians), 0), np.float32))
+        view = self.view(scene, camera)
+        _, alpha = view.splat(np.empty((len(scene.gaussians), 0), np.float32))
         try:
             depth = view.depth("median")[row, column]
         except BackendError:  # CUDA has no median

@@ -101,7 +101,7 @@ def warm_up(scene: Scene, backend: str) -> None:
 
         channels, camera = ArrayChannels(load_rasterizer("cpu")), scene.framing_camera((16, 16))
         channels.render(scene, Layers(), camera, "none")
-        channels.depth_at(scene.gaussians, camera, 8, 8)
+        channels.depth_at(scene, camera, 8, 8)
 
 
 def services(encoder_id: str) -> Services:

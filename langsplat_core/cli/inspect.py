@@ -31,6 +31,8 @@ class Inspect:
         )
         print(f"Gaussians        {len(gaussians)} ({len(gaussians) - int(valid.sum())} invalid rows)")
         print(f"SH degree        {gaussians.sh_degree}")
+        print(f"antialiased      {'yes, as Mip-Splatting' if scene.antialiased else 'no'}")
+        print(f"extra properties {', '.join(scene.extras) or 'none'}")
         print(f"bounds (1-99 %)  {np.round(low, 3).tolist()} to {np.round(high, 3).tolist()}")
         print(f"cameras          {len(scene.cameras)}")
         if field is None:

@@ -94,7 +94,7 @@ def _answer(
         "view": None if camera is None else camera.name,
     }
     if camera is not None:
-        view = load_rasterizer("cpu").view(scene.gaussians, camera)
+        view = load_rasterizer("cpu").view(scene.gaussians, camera, scene.raster_settings())
         gate = PictureConfig().alpha_gate
         if mode == "paper":
             phrase = engine.text_vector(result.phrase)[None]

@@ -99,7 +99,7 @@ def evaluate(
     gate = PictureConfig().alpha_gate
     for done, camera in enumerate(cameras):
         labels = truth.labels(camera.name)
-        view = rasterizer.view(engine.scene.gaussians, camera)
+        view = rasterizer.view(engine.scene.gaussians, camera, engine.scene.raster_settings())
         visible = [p for p in truth.phrases if _mask(labels, p).sum() >= MIN_PIXELS]
         for phrase in visible:
             answer = answers[phrase]
