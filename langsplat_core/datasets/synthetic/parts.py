@@ -14,6 +14,10 @@ Texture = Literal[
     "dotted", "rug", "painting", "peel",
 ]  # fmt: skip
 
+Substance = Literal[
+    "plastic", "ceramic", "glass", "metal", "wood", "cloth", "paper", "plaster", "leaf", "skin", "rubber"
+]  # what it is made of: decides highlight, relief and fine mottling
+
 Word = TypeVar("Word", bound=str)
 
 
@@ -26,6 +30,7 @@ class Material:
     second: Array  # (3,) sRGB in [0, 1]: grain, stripes, joints
     texture: Texture
     gloss: float  # strength of the highlight, [0, 1]
+    substance: Substance | None = None  # None: what the texture and the gloss suggest
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +63,11 @@ class Thing:
         return max(float(p.mesh.vertices[:, 2].max()) for p in self.pieces)
 
 
+_MADE_OF: dict[str, Substance] = {
+    "wood": "wood", "planks": "wood", "cloth": "cloth", "rug": "cloth", "metal": "metal", "pages": "paper",
+}  # fmt: skip
+
+
 class Kit:
     """Random choices and material recipes for one object."""
 
@@ -76,14 +86,46 @@ class Kit:
         """One of `words` that is not `word`."""
         return self.pick(*[candidate for candidate in words if candidate != word])
 
-    def paint(self, word: str, texture: Texture = "plain", gloss: float = 0.3, shift: float = 14) -> Material:
-        """A material of a named colour; the second colour is the first one `shift` lightness darker."""
+    def paint(
+        self,
+        word: str,
+        texture: Texture = "plain",
+        gloss: float = 0.3,
+        shift: float = 14,
+        substance: Substance | None = None,
+    ) -> Material:
+        """A material of a named colour; the second colour is the first one `shift` lightness darker.
+
+        Cloth, metal and wooden textures are of those materials unless `substance` says otherwise.
+        """
         colour = random_colour(word, self.rng)
-        return Material(word, colour, darker(colour, shift), texture, gloss)
+        made_of = substance or _MADE_OF.get(texture)
+        return Material(word, colour, darker(colour, shift), texture, gloss, made_of)
+
+    def plastic(self, word: str) -> Material:
+        """Smooth and shiny, as toys are."""
+        return self.paint(word, "plain", 0.5, substance="plastic")
+
+    def ceramic(self, word: str) -> Material:
+        """Glazed, now and then speckled."""
+        return self.paint(word, self.pick("plain", "plain", "speckled"), 0.55, substance="ceramic")
+
+    def glass(self, word: str) -> Material:
+        """Coloured, with the strongest highlights; light does not pass."""
+        return self.paint(word, "plain", 0.95, 8, substance="glass")
+
+    def cloth(self, word: str) -> Material:
+        """Woven and dull."""
+        return self.paint(word, "cloth", 0.02)
+
+    def steel(self, word: str) -> Material:
+        """Metal of any colour: brushed, with strong highlights."""
+        return self.paint(word, "metal", 0.9, 10)
 
     def pattern(self, word: str, second: str, texture: Texture, gloss: float = 0.2) -> Material:
         """Two named colours; `word` covers most of the surface."""
-        return Material(word, random_colour(word, self.rng), random_colour(second, self.rng), texture, gloss)
+        colours = random_colour(word, self.rng), random_colour(second, self.rng)
+        return Material(word, *colours, texture, gloss, _MADE_OF.get(texture))
 
     def wood(self, word: str = "brown") -> Material:
         """Wooden surface of a colour."""
@@ -97,7 +139,7 @@ class Kit:
 
     def metal(self) -> Material:
         """Grey metal."""
-        return self.paint("gray", "metal", 0.9, 10)
+        return self.steel("gray")
 
 
 def darker(colour: Array, by: float) -> Array:
