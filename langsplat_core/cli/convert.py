@@ -5,25 +5,24 @@ from pathlib import Path
 
 import tyro
 
-from langsplat_core.errors import InputError
 from langsplat_core.formats import load_scene, load_without_language, rematch_language, save_scene
 
 
 @dataclass(frozen=True)
 class Convert:
-    """Write any readable scene as an INRIA PLY, with language field and cameras beside it if it has them."""
+    """Write any readable scene as .ply, .spz or .splat, with language field and cameras beside it if it has
+    them. A .ply (INRIA's) keeps everything, .spz is ten times smaller and rounded, .splat is without view
+    dependence."""
 
     source: tyro.conf.Positional[Path]
-    """Scene to read: .ply, compressed .ply, SOG folder, meta.json or .sog."""
+    """Scene to read: .ply, compressed .ply, .spz, .splat, .ksplat, SOG folder, meta.json or .sog."""
     out: tyro.conf.Positional[Path]
-    """PLY to write."""
+    """Scene to write: .ply, .spz or .splat."""
     rematch: Path | None = None
     """A language sidecar (*.langsplat.safetensors) made before the Gaussians were edited: its field is
     carried over to the Gaussians of SOURCE by nearest position."""
 
     def run(self) -> None:
-        if self.out.suffix.lower() != ".ply":
-            raise InputError(f"{self.out}: only .ply can be written")
         if self.rematch is None:
             scene = load_scene(self.source)
         else:

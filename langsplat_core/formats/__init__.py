@@ -1,9 +1,13 @@
-"""Files: scenes (PLY, compressed PLY, SOG), the language sidecar, cameras, LangSplat's features.
+"""Files: scenes (PLY, compressed PLY, SOG, SPZ, .splat, .ksplat), the language sidecar, cameras, LangSplat's
+features.
 
 A scene is `scene.ply` with, beside it, `scene.langsplat.safetensors` and `scene.cameras.json`, either of
-which may be absent. The same companions are looked for beside a compressed PLY, a SOG folder or a .sog.
+which may be absent. The same companions are looked for beside a compressed PLY, a SOG folder or a .sog. Those
+of `scene.spz`, `.splat` and `.ksplat` keep its suffix, `scene.spz.langsplat.safetensors`: the sidecar knows
+the rounded positions of that file, so that it could not serve a `scene.ply` in the same folder.
 """
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +16,14 @@ from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
 from langsplat_core.formats import antialiasing, cameras_json, language
 from langsplat_core.formats.cameras_json import read_cameras, write_cameras
+from langsplat_core.formats.ksplat import read_ksplat
 from langsplat_core.formats.langsplat_features import read_features, write_features
 from langsplat_core.formats.language import read_language, rematch_language, write_language
 from langsplat_core.formats.opening import exists
 from langsplat_core.formats.ply import read_ply, read_ply_scene, write_ply
 from langsplat_core.formats.sog import META_NAME, read_sog, read_sog_scene
+from langsplat_core.formats.splat import read_splat, write_splat
+from langsplat_core.formats.spz import read_spz_scene, write_spz
 from langsplat_core.scene import Gaussians, Scene
 
 __all__ = [
@@ -27,20 +34,25 @@ __all__ = [
     "load_without_language",
     "read_cameras",
     "read_features",
+    "read_ksplat",
     "read_language",
     "read_ply",
     "read_ply_scene",
     "read_sog",
     "read_sog_scene",
+    "read_splat",
+    "read_spz_scene",
     "rematch_language",
     "save_scene",
     "write_cameras",
     "write_features",
     "write_language",
     "write_ply",
+    "write_splat",
+    "write_spz",
 ]
 
-SUPPORTED = ".ply, .compressed.ply, .sog, or a SOG folder or its meta.json"
+SUPPORTED = ".ply, .compressed.ply, .spz, .splat, .ksplat, .sog, or a SOG folder or its meta.json"
 
 
 def load_gaussians(path: Path | str) -> Gaussians:
@@ -77,8 +89,9 @@ def _read_scene(path: Path) -> Scene:
     """What the scene's own file holds."""
     if not exists(path):
         raise InputError(f"{path}: no such file; check the spelling and the folder")
-    if path.suffix.lower() == ".ply" and not path.is_dir():
-        return read_ply_scene(path)
+    read = _READERS.get(path.suffix.lower())
+    if read is not None and not path.is_dir():
+        return read(path)
     if path.suffix.lower() == ".sog" or path.name == META_NAME or exists(path / META_NAME):
         return read_sog_scene(path)
     if path.is_dir():
@@ -89,36 +102,63 @@ def _read_scene(path: Path) -> Scene:
 
 
 def save_scene(path: Path | str, scene: Scene) -> None:
-    """Write `scene` as a .ply with its companions; those it lacks are removed.
+    """Write `scene` as .ply, .spz or .splat, by its name, with its companions; those it lacks are removed.
 
-    All files are first written whole under temporary names. Then the old companions are removed, the PLY
-    renamed into place, and last the new companions. Interrupted anywhere, there is the old scene or the
-    new one, perhaps without companions, but never a PLY beside companions of another.
+    Only the PLY keeps everything. .spz rounds it and has no extras; .splat moreover has neither view
+    dependence nor the mark of antialiasing. All keep the rows' order. All files are first written whole under
+    temporary names. Then the old companions are removed, the scene's file renamed into place, and last the
+    new companions. Interrupted anywhere, there is the old scene or the new one, perhaps without companions,
+    but never a scene beside companions of another.
     """
     path = Path(path)
-    if path.suffix.lower() != ".ply":
-        raise InputError(f"{path}: scenes are written as .ply; choose such a name")
+    write = _WRITERS.get(path.suffix.lower())
+    if write is None:
+        raise InputError(f"{path}: scenes are written as {', '.join(_WRITERS)}; choose such a name")
     sidecar, cameras = companion_path(path, language.SUFFIX), companion_path(path, cameras_json.SUFFIX)
     with ExitStack() as renames:  # which it makes in the reverse order of the following lines
         if scene.cameras:
             write_cameras(renames.enter_context(atomic_path(cameras)), scene.cameras)
-        if scene.language is not None:
-            temporary = renames.enter_context(atomic_path(sidecar))
-            write_language(temporary, scene.language, scene.gaussians.means)
-        comments = (antialiasing.COMMENT,) if scene.antialiased else ()
-        write_ply(renames.enter_context(atomic_path(path)), scene.gaussians, comments, scene.extras)
+        new_sidecar = None if scene.language is None else renames.enter_context(atomic_path(sidecar))
+        new_file = renames.enter_context(atomic_path(path))
+        write(new_file, scene)
+        if scene.language is not None and new_sidecar is not None:
+            # The sidecar belongs to the positions as a reader finds them, rounded in some formats.
+            means = scene.gaussians.means if write is _write_ply else load_gaussians(new_file).means
+            write_language(new_sidecar, scene.language, means)
         for companion in (sidecar, cameras):
             companion.unlink(missing_ok=True)
 
 
+def _write_ply(path: Path, scene: Scene) -> None:
+    comments = (antialiasing.COMMENT,) if scene.antialiased else ()
+    write_ply(path, scene.gaussians, comments, scene.extras)
+
+
+# By suffix; SOG is also a folder and read by name
+_READERS: dict[str, Callable[[Path], Scene]] = {
+    ".ply": read_ply_scene,
+    ".spz": read_spz_scene,
+    ".splat": lambda path: Scene(read_splat(path)),
+    ".ksplat": lambda path: Scene(read_ksplat(path)),
+}
+_WRITERS: dict[str, Callable[[Path, Scene], None]] = {
+    ".ply": _write_ply,
+    ".spz": lambda path, scene: write_spz(path, scene.gaussians, scene.antialiased),
+    ".splat": lambda path, scene: write_splat(path, scene.gaussians),
+}
+
+
 def companion_path(scene: Path | str, suffix: str) -> Path:
-    """Where the file of a scene that ends in `suffix` lies: `a/b.ply` -> `a/b<suffix>`; a SOG folder `a/b`
-    (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder."""
+    """Where the file of a scene that ends in `suffix` lies: `a/b.ply` or .sog -> `a/b<suffix>`; a SOG folder
+    `a/b` (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder; `a/b.spz`, .splat or .ksplat ->
+    `a/b.spz<suffix>` and so on."""
     scene = Path(scene)
     if scene.name == META_NAME:
         scene = scene.parent
     if scene.suffix.lower() in (".ply", ".sog") and not scene.is_dir():
         return scene.with_name(scene.stem + suffix)
+    if scene.suffix.lower() in _READERS and not scene.is_dir():
+        return scene.with_name(scene.name + suffix)
     whole = scene.resolve()  # "." has no name of its own
     return whole.with_name(whole.name + suffix)
 

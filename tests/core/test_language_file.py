@@ -344,8 +344,8 @@ def test_a_failure_while_writing_changes_nothing(tmp_path, monkeypatch):
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
 
 
-def test_only_ply_is_written(tmp_path):
-    with pytest.raises(InputError, match=r"scenes are written as \.ply"):
+def test_formats_that_are_not_written(tmp_path):
+    with pytest.raises(InputError, match=r"scenes are written as \.ply, \.spz, \.splat"):
         save_scene(tmp_path / "scene.sog", full_scene())
     assert not list(tmp_path.iterdir())
 
@@ -378,9 +378,9 @@ def test_cameras_of_an_inria_model(tmp_path):
 
 
 def test_what_is_not_a_scene(tmp_path):
-    (tmp_path / "a.splat").write_bytes(b"x")
-    with pytest.raises(InputError, match=r"a\.splat: not a scene of a known kind; supported: \.ply, .*\.sog"):
-        load_scene(tmp_path / "a.splat")
+    (tmp_path / "a.obj").write_bytes(b"x")
+    with pytest.raises(InputError, match=r"a\.obj: not a scene of a known kind; supported: \.ply, .*\.sog"):
+        load_scene(tmp_path / "a.obj")
     for nowhere in ("nowhere", "nowhere.ply", "nowhere.sog", "n" * 5000 + ".ply", "nul\0.ply"):
         with pytest.raises(InputError, match="no such file"):
             load_scene(tmp_path / nowhere)

@@ -24,7 +24,7 @@ class OpenDialog:
     def start(self) -> None:
         """Show the dialog unless it is shown already."""
         if self._dialog is None:
-            kinds = ["Scenes", "*.ply *.sog", "All files", "*"]
+            kinds = ["Scenes", "*.ply *.spz *.splat *.ksplat *.sog", "All files", "*"]
             self._dialog = portable_file_dialogs.open_file("Open a scene", str(Path.cwd()), kinds)
 
     def answer(self) -> Path | None:

@@ -1,0 +1,88 @@
+"""The .splat file of antimatter15's viewer: 32 bytes per Gaussian and nothing else.
+
+    position   3 float32, world units, axes as in the PLY
+    scale      3 float32, world units (not logarithms)
+    colour     4 uint8: red, green, blue and opacity, as fractions of 255
+    rotation   4 uint8: w x y z as (value - 128) / 128
+
+Little endian, no header, no spherical harmonics beyond the base colour. Writers in the wild order the rows
+by size times opacity, so that a viewer can show the first part; here the order is kept, because the
+language field goes by rows. Source of the layout: antimatter15/splat; the code here is our own.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.arrays import Array, logit, sigmoid, unit
+from langsplat_core.errors import FormatError
+from langsplat_core.files import atomic_path
+from langsplat_core.formats.inria_layout import SH_C0
+from langsplat_core.formats.opening import open_for_reading
+from langsplat_core.scene import Gaussians
+
+_RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
+
+
+def read_splat(path: Path | str) -> Gaussians:
+    """The Gaussians of a .splat file, of SH degree 0.
+
+    A file cut off between two Gaussians cannot be told from a whole one. Raises InputError when the file
+    cannot be opened and FormatError when it is no such file.
+    """
+    path = Path(path)
+    file, size = open_for_reading(path)
+    with file:
+        if size == 0 or size % _RECORD.itemsize:
+            raise FormatError(
+                f"{path}: {size} bytes are not a whole number of Gaussians of {_RECORD.itemsize}; the file "
+                "is truncated or not a .splat"
+            )
+        rows = np.frombuffer(file.read(size), _RECORD)
+    # Nothing else in the file tells it from noise, of which seven rows in eight have a negative scale.
+    with np.errstate(invalid="ignore"):
+        sound = np.isfinite(rows["position"]).all(1) & (rows["scale"] >= 0).all(1)
+    if sound.sum() < len(rows) / 2:
+        raise FormatError(
+            f"{path}: {len(rows) - sound.sum()} of {len(rows)} rows are no Gaussians; not a .splat"
+        )
+    return Gaussians(
+        means=rows["position"],
+        log_scales=log_of_scales(rows["scale"]),
+        quats_wxyz=(rows["rotation"].astype(np.float32) - 128) / 128,
+        opacity_logits=logit(rows["colour"][:, 3] / 255),
+        sh=base_of_colours(rows["colour"])[:, None],
+    )
+
+
+def write_splat(path: Path | str, gaussians: Gaussians) -> None:
+    """Write the Gaussians in their order, atomically, without their view dependence.
+
+    Colours and opacities are rounded to 1/255 (colours beyond 0..1 are cut off), rotations to 1/128 per
+    component; positions and scales stay exact.
+    """
+    rows = np.zeros(len(gaussians), _RECORD)
+    rows["position"] = gaussians.means
+    with np.errstate(over="ignore"):
+        rows["scale"] = np.exp(gaussians.log_scales)
+    rows["colour"][:, :3] = to_bytes((0.5 + SH_C0 * gaussians.sh[:, 0]) * 255)
+    rows["colour"][:, 3] = to_bytes(sigmoid(gaussians.opacity_logits) * 255)
+    rows["rotation"] = to_bytes(unit(gaussians.quats_wxyz.astype(np.float64)) * 128 + 128)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(rows.tobytes())
+
+
+def base_of_colours(rgba: Array) -> Array:
+    """(N, 4) uint8 -> (N, 3) coefficients f_dc."""
+    return (rgba[:, :3] / 255 - 0.5) / SH_C0
+
+
+def log_of_scales(scales: Array) -> Array:
+    """0 becomes -infinity, a flat axis; a negative scale NaN, a row that is dropped later."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log(scales)
+
+
+def to_bytes(values: Array) -> Array:
+    """Rounded and clipped to uint8; NaN becomes 0."""
+    return np.clip(np.rint(np.nan_to_num(values, nan=0)), 0, 255).astype(np.uint8)
