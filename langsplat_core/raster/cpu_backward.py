@@ -30,12 +30,12 @@ from langsplat_core.raster.cpu_blend import (
     start_tile,
 )
 from langsplat_core.raster.cpu_tiles import TILE, Tiles, spread
-from langsplat_core.raster.lanes import lanes, load, ramp, reciprocal, store, total, where_greater
+from langsplat_core.raster.lanes import lanes, load, ramp, reciprocal, store, store_totals, where_greater
 from langsplat_core.raster.workers import helper, kernel
 
-# Columns of the partial sums; the gradient by the values follows them.
+# Columns of the partial sums (two are unused); the gradient by the values follows them.
 Q, QW, QV, QWW, QWV, QVV = range(6)
-MOMENTS = 6
+MOMENTS = 8
 _ENTRY = 2 * TILE  # numbers of tape per row: alpha and T
 _TAPE = 128 * TILE * _ENTRY  # its first length: 128 Gaussians that fill the tile
 
@@ -97,7 +97,8 @@ def _backward_tile(
 ) -> Array:
     """One tile; returns the tape, for the next tile to write over."""
     image_grad, alpha_grad = grads
-    height, width, channels = image_grad.shape
+    height, width, _ = image_grad.shape
+    lines, columns = values.shape[1], partial.shape[1]
     x0, y0 = tile % tiles.columns * TILE, tile // tiles.columns * TILE
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
     state = np.empty(PIXELS, np.float32)
@@ -105,7 +106,7 @@ def _backward_tile(
     spans = np.zeros((last - first, 2), np.int64)
     tape, used, end = _record(tile, tiles, geometry, cutoffs, state, spans, tape)
     partial[end:last] = 0
-    planes, plane = np.empty(PIXELS * channels, np.float32), np.empty(PIXELS, np.float32)
+    planes, plane = np.empty(PIXELS * lines, np.float32), np.empty(PIXELS, np.float32)
     load_tile(planes, image_grad, x0, y0)
     load_tile(plane, alpha_grad, x0, y0)
     weights = np.empty(PIXELS, np.float32)
@@ -118,7 +119,7 @@ def _backward_tile(
         x = values[tiles.ranks[s]]
         step = ramp() * g[cp.FACTOR_A]
         offset, v, w_step, v_step = row_offsets(g, x0 + 0.5, y0 + low + 0.5)
-        q0 = qw = qv = qww = qwv = qvv = lanes(np.float32(0))
+        q0 = qw = qv = qww = qwv = qvv = none = lanes(np.float32(0))
         for row in range(low, high):
             w = step + offset
             at = used + (row - low) * _ENTRY
@@ -126,8 +127,8 @@ def _backward_tile(
             weight = alpha * before
             store(weights, (row - low) * TILE, weight)
             slope = load(plane, row * TILE)
-            for channel in range(channels):
-                slope = slope + load(planes, (row * channels + channel) * TILE) * x[channel]
+            for line in range(lines):
+                slope = slope + load(planes, (row * lines + line) * TILE) * x[line]
             hidden = load(behind, row * TILE)
             store(behind, row * TILE, hidden + weight * slope)
             q = weight * slope - hidden * alpha * reciprocal(1.0 - alpha)
@@ -136,10 +137,9 @@ def _backward_tile(
             q0, qw, qv = q0 + q, qw + moved, qv + lifted
             qww, qwv, qvv = qww + moved * w, qwv + moved * v, qvv + lifted * v
             offset, v = offset + w_step, v + v_step
-        sums = partial[s]
-        sums[Q], sums[QW], sums[QV] = total(q0), total(qw), total(qv)
-        sums[QWW], sums[QWV], sums[QVV] = total(qww), total(qwv), total(qvv)
-        correlate(planes, channels, weights, low, high, sums[MOMENTS:])
+        store_totals(partial, s * columns, q0, qw, qv, qww)
+        store_totals(partial, s * columns + QWV, qwv, qvv, none, none)
+        correlate(planes, lines, weights, low, high, partial, s, MOMENTS)
     return tape
 
 
@@ -154,8 +154,8 @@ def backward(
     cutoffs: Cutoffs,
     partial: Array,
 ) -> None:
-    """(M, C) values in depth order; gradients (H, W, C) and (H, W, 1) by image and alpha; fills (I, 6 + C)
-    partial sums. All float32, for tiles [first, last)."""
+    """(M, padded(C)) values in depth order; gradients (H, W, C) and (H, W, 1) by image and alpha; fills
+    (I, 8 + padded(C)) partial sums. All float32, for tiles [first, last)."""
     count = tiles.starts.shape[0] - 1
     tape = np.empty(_TAPE, np.float32)
     for i in range(first, last):

@@ -21,10 +21,15 @@ from langsplat_core.raster.lanes import (
     lanes,
     largest,
     load,
+    load_four,
+    load_three,
     prefetch,
     ramp,
     smaller,
     store,
+    store_four,
+    store_three,
+    store_totals,
     total,
     where_at_least,
     where_greater,
@@ -108,15 +113,69 @@ def blend_row(
     return where_greater(after, cutoffs.transmittance_min, alpha, 0.0), before
 
 
+def padded(channels: int) -> int:
+    """Channels are blended in fours; three take a fourth along, which is zero."""
+    return channels + (channels % 4 == 3)
+
+
+padded_inside = helper(padded)
+
+
+@helper
+def _add_weighted(sums: Array, at: int, channels: int, weight: Lanes, x: Array) -> None:
+    """sums[at + 16 channel : + 16] += weight x[channel]"""
+    fours = channels & ~3
+    for channel in range(0, fours, 4):
+        store(sums, at, load(sums, at) + weight * x[channel])
+        store(sums, at + TILE, load(sums, at + TILE) + weight * x[channel + 1])
+        store(sums, at + 2 * TILE, load(sums, at + 2 * TILE) + weight * x[channel + 2])
+        store(sums, at + 3 * TILE, load(sums, at + 3 * TILE) + weight * x[channel + 3])
+        at += 4 * TILE
+    for channel in range(fours, channels):
+        store(sums, at, load(sums, at) + weight * x[channel])
+        at += TILE
+
+
+@helper
+def write_tile(planes: Array, image: Array, x0: int, y0: int) -> None:
+    """The tile of (H, W, C) image at (x0, y0) <- planes[(row, channel, column)]."""
+    height, width, channels = image.shape
+    lines = padded_inside(channels)
+    fours = channels & ~3 if x0 + TILE <= width else 0
+    for row in range(min(TILE, height - y0)):
+        first, at = row * lines * TILE, ((y0 + row) * width + x0) * channels
+        if channels == 1 and x0 + TILE <= width:
+            store(image, at, load(planes, first))
+            continue
+        if channels == 3 and x0 + TILE <= width:
+            a, b, c = load(planes, first), load(planes, first + TILE), load(planes, first + 2 * TILE)
+            store_three(image, at, a, b, c)
+            continue
+        for channel in range(0, fours, 4):
+            f = first + channel * TILE
+            a, b, c, d = (
+                load(planes, f),
+                load(planes, f + TILE),
+                load(planes, f + 2 * TILE),
+                load(planes, f + 3 * TILE),
+            )
+            store_four(image, at + channel, channels, a, b, c, d)
+        for column in range(min(TILE, width - x0)):
+            for channel in range(fours, channels):
+                image[y0 + row, x0 + column, channel] = planes[first + channel * TILE + column]
+
+
 @helper
 def _splat_tile(
     tile: int, tiles: Tiles, geometry: Array, values: Array, cutoffs: Cutoffs, image: Array, alpha: Array
 ) -> None:
-    height, width, channels = image.shape
+    height, width, _ = image.shape
+    lines = values.shape[1]
     x0, y0 = tile % tiles.columns * TILE, tile // tiles.columns * TILE
     transmittance = np.empty(PIXELS, np.float32)
     start_tile(transmittance, x0, y0, width, height)
-    sums = np.zeros(PIXELS * channels, np.float32)
+    sums = np.empty(PIXELS * lines, np.float32)
+    sums[:] = 0
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
     top, bottom = 0, TILE
     for s in range(first, last):
@@ -124,23 +183,22 @@ def _splat_tile(
             top, bottom = running_rows(transmittance, top, bottom)
             if top >= bottom:
                 break
-        rank = tiles.ranks[s]
         low, high = rows_to_blend(tiles.rows[s], top, bottom)
-        g = enter(geometry, tiles, s, min(s + AHEAD, last - 1))
+        later = min(s + AHEAD, last - 1)
+        g = enter(geometry, tiles, s, later)
+        prefetch(values, np.int64(tiles.ranks[later]) * lines)
+        prefetch(values, np.int64(tiles.ranks[later]) * lines + lines - 1)
+        x = values[tiles.ranks[s]]
         step, peak = ramp() * g[cp.FACTOR_A], g[cp.LOG2_OPACITY]
         w, v, w_step, v_step = row_offsets(g, x0 + 0.5, y0 + low + 0.5)
         for row in range(low, high):
             added, before = blend_row(transmittance, row * TILE, step + w, peak - v * v, cutoffs)
             w, v = w + w_step, v + v_step
-            weight = added * before
-            for channel in range(channels):
-                at = (row * channels + channel) * TILE
-                store(sums, at, load(sums, at) + weight * values[rank, channel])
-    for row in range(min(TILE, height - y0)):
-        for column in range(min(TILE, width - x0)):
-            alpha[y0 + row, x0 + column] = np.float32(1) - abs(transmittance[row * TILE + column])
-            for channel in range(channels):
-                image[y0 + row, x0 + column, channel] = sums[(row * channels + channel) * TILE + column]
+            _add_weighted(sums, row * lines * TILE, lines, added * before, x)
+    write_tile(sums, image, x0, y0)
+    for n in range(PIXELS):
+        transmittance[n] = np.float32(1) - abs(transmittance[n])
+    write_tile(transmittance, alpha, x0, y0)
 
 
 @kernel
@@ -154,7 +212,7 @@ def splat(
     image: Array,
     alpha: Array,
 ) -> None:
-    """(M, C) values in depth order -> fills (H, W, C) image and (H, W) alpha, all float32."""
+    """(M, padded(C)) values in depth order -> fills (H, W, C) image and (H, W, 1) alpha, all float32."""
     count = tiles.starts.shape[0] - 1
     for i in range(first, last):
         _splat_tile(spread(i, count), tiles, geometry, values, cutoffs, image, alpha)
@@ -162,34 +220,66 @@ def splat(
 
 @helper
 def load_tile(planes: Array, image: Array, x0: int, y0: int) -> None:
-    """planes[(row, channel, column)] <- the tile of (H, W, C) image at (x0, y0); 0 beyond its border."""
+    """planes[(row, channel, column)] <- the tile of (H, W, C) image at (x0, y0); 0 beyond its border and in
+    the fourth channel of three."""
     height, width, channels = image.shape
+    lines = padded_inside(channels)
     planes[:] = 0
+    fours = channels & ~3 if x0 + TILE <= width else 0
     for row in range(min(TILE, height - y0)):
+        first, at = row * lines * TILE, ((y0 + row) * width + x0) * channels
+        if channels == 3 and x0 + TILE <= width:
+            p, q, r = load_three(image, at)
+            store(planes, first, p)
+            store(planes, first + TILE, q)
+            store(planes, first + 2 * TILE, r)
+            continue
+        for channel in range(0, fours, 4):
+            a, b, c, d = load_four(image, at + channel, channels)
+            f = first + channel * TILE
+            store(planes, f, a)
+            store(planes, f + TILE, b)
+            store(planes, f + 2 * TILE, c)
+            store(planes, f + 3 * TILE, d)
         for column in range(min(TILE, width - x0)):
-            for channel in range(channels):
-                planes[(row * channels + channel) * TILE + column] = image[y0 + row, x0 + column, channel]
+            for channel in range(fours, channels):
+                planes[first + channel * TILE + column] = image[y0 + row, x0 + column, channel]
 
 
 @helper
-def correlate(planes: Array, channels: int, weights: Array, low: int, high: int, out: Array) -> None:
-    """out[channel] <- sum over rows [low, high) of weights (stored from row `low`) times planes."""
-    for channel in range(channels):
-        acc = lanes(np.float32(0))
+def correlate(
+    planes: Array, lines: int, weights: Array, low: int, high: int, out: Array, s: int, column: int
+) -> None:
+    """out[s, column + line] <- sum over rows [low, high) of weights (stored from row `low`) times planes."""
+    fours = lines & ~3
+    for line in range(0, fours, 4):
+        a = b = c = d = lanes(np.float32(0))
+        f = (low * lines + line) * TILE
+        for row in range(high - low):
+            weight = load(weights, row * TILE)
+            a = a + weight * load(planes, f)
+            b = b + weight * load(planes, f + TILE)
+            c = c + weight * load(planes, f + 2 * TILE)
+            d = d + weight * load(planes, f + 3 * TILE)
+            f += lines * TILE
+        store_totals(out, s * out.shape[1] + column + line, a, b, c, d)
+    for line in range(fours, lines):
+        a = lanes(np.float32(0))
         for row in range(low, high):
-            acc = acc + load(weights, (row - low) * TILE) * load(planes, (row * channels + channel) * TILE)
-        out[channel] = total(acc)
+            a = a + load(weights, (row - low) * TILE) * load(planes, (row * lines + line) * TILE)
+        out[s, column + line] = total(a)
 
 
 @helper
 def _gather_tile(
     tile: int, tiles: Tiles, geometry: Array, image: Array, cutoffs: Cutoffs, partial: Array
 ) -> None:
-    height, width, channels = image.shape
+    height, width, _ = image.shape
+    lines = partial.shape[1]
     x0, y0 = tile % tiles.columns * TILE, tile // tiles.columns * TILE
     transmittance = np.empty(PIXELS, np.float32)
     start_tile(transmittance, x0, y0, width, height)
-    planes = np.empty(PIXELS * channels, np.float32)
+    planes = np.empty(PIXELS * lines, np.float32)
     load_tile(planes, image, x0, y0)
     weights = np.empty(PIXELS, np.float32)
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
@@ -208,14 +298,14 @@ def _gather_tile(
             added, before = blend_row(transmittance, row * TILE, step + w, peak - v * v, cutoffs)
             w, v = w + w_step, v + v_step
             store(weights, (row - low) * TILE, added * before)
-        correlate(planes, channels, weights, low, high, partial[s])
+        correlate(planes, lines, weights, low, high, partial, s, 0)
 
 
 @kernel
 def gather(
     first: int, last: int, tiles: Tiles, geometry: Array, image: Array, cutoffs: Cutoffs, partial: Array
 ) -> None:
-    """(H, W, C) float32 image -> fills (I, C) partial sums of ``W^T y``, one row per intersection."""
+    """(H, W, C) float32 image -> fills (I, padded(C)) partial sums of ``W^T y``, a row per intersection."""
     count = tiles.starts.shape[0] - 1
     for i in range(first, last):
         _gather_tile(spread(i, count), tiles, geometry, image, cutoffs, partial)
@@ -225,9 +315,11 @@ def gather(
 def sum_partials(first: int, last: int, tiles: Tiles, order: Array, partial: Array, out: Array) -> None:
     """out[order[rank]] <- sum of the rank's partial sums, in the order of its tiles (so: reproducible)."""
     sums = np.empty(out.shape[1])
+    end = tiles.slots.shape[0] - 1
     for rank in range(first, last):
         sums[:] = 0
         for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):
+            prefetch(partial, np.int64(tiles.slots[min(n + 2 * AHEAD, end)]) * partial.shape[1])
             for channel in range(out.shape[1]):
                 sums[channel] += partial[tiles.slots[n], channel]
         for channel in range(out.shape[1]):
@@ -238,11 +330,12 @@ def sum_partials(first: int, last: int, tiles: Tiles, order: Array, partial: Arr
 def _median_tile(
     tile: int, tiles: Tiles, geometry: Array, depths: Array, cutoffs: Cutoffs, out: Array
 ) -> None:
-    height, width = out.shape
+    height, width, _ = out.shape
     x0, y0 = tile % tiles.columns * TILE, tile // tiles.columns * TILE
     transmittance = np.empty(PIXELS, np.float32)
     start_tile(transmittance, x0, y0, width, height)
-    found = np.zeros(PIXELS, np.float32)
+    found = np.empty(PIXELS, np.float32)
+    found[:] = 0
     half = np.float32(0.5)
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
     for s in range(first, last):
@@ -258,16 +351,14 @@ def _median_tile(
             passed = where_greater(before, half, lanes(np.float32(depths[rank])), load(found, at))
             after = before - added * before
             store(found, at, where_at_least(half, after, passed, load(found, at)))
-    for row in range(min(TILE, height - y0)):
-        for column in range(min(TILE, width - x0)):
-            out[y0 + row, x0 + column] = found[row * TILE + column]
+    write_tile(found, out, x0, y0)
 
 
 @kernel
 def median_depth(
     first: int, last: int, tiles: Tiles, geometry: Array, depths: Array, cutoffs: Cutoffs, out: Array
 ) -> None:
-    """(M,) depths in depth order -> (H, W) depth of the Gaussian that takes T to 0.5 or below, else 0."""
+    """(M,) depths in depth order -> (H, W, 1) depth of the Gaussian that takes T to 0.5 or below, else 0."""
     count = tiles.starts.shape[0] - 1
     for i in range(first, last):
         _median_tile(spread(i, count), tiles, geometry, depths, cutoffs, out)

@@ -7,7 +7,9 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.raster import cpu_project as cp
 from langsplat_core.raster.cpu_backward import MOMENTS, QV, QVV, QW, QWV, QWW, Q
+from langsplat_core.raster.cpu_blend import AHEAD
 from langsplat_core.raster.cpu_tiles import Tiles
+from langsplat_core.raster.lanes import prefetch
 from langsplat_core.raster.workers import helper, kernel
 
 
@@ -25,7 +27,9 @@ class ParameterGradients(NamedTuple):
 @helper
 def _sum_over_tiles(rank: int, tiles: Tiles, partial: Array, sums: Array) -> None:
     sums[:] = 0
+    end = tiles.slots.shape[0] - 1
     for n in range(tiles.firsts[rank], tiles.firsts[rank + 1]):
+        prefetch(partial, np.int64(tiles.slots[min(n + 2 * AHEAD, end)]) * partial.shape[1])
         for m in range(sums.shape[0]):
             sums[m] += partial[tiles.slots[n], m]
 
@@ -163,7 +167,7 @@ def to_parameters(
     for rank in range(first, last):
         i = order[rank]
         _sum_over_tiles(rank, tiles, partial, sums)
-        for channel in range(sums.shape[0] - MOMENTS):
+        for channel in range(out.values.shape[1]):
             out.values[i, channel] = sums[MOMENTS + channel]
         du, dv, by_covariance = _footprint_gradient(geometry[rank], moments)
         out.means_px[i, 0], out.means_px[i, 1] = du, dv

@@ -75,14 +75,14 @@ class CpuView:
         check_array("values", values, (self._count, "C"))
         ordered = values[self._order]
         height, width, channels = self.camera.height, self.camera.width, ordered.shape[1]
-        alpha = np.empty((height, width), np.float32)
+        alpha = np.empty((height, width, 1), np.float32)
         parts = []
         for start in range(0, max(channels, 1), _CHANNELS_AT_ONCE):
-            part = plain(ordered[:, start : start + _CHANNELS_AT_ONCE])
+            part = ordered[:, start : start + _CHANNELS_AT_ONCE]
             image = np.empty((height, width, part.shape[1]), np.float32)
-            self._over_tiles(cpu_blend.splat, part, self._cutoffs, image, alpha)
+            self._over_tiles(cpu_blend.splat, _in_fours(part), self._cutoffs, image, alpha)
             parts.append(image)
-        return parts[0] if len(parts) == 1 else np.concatenate(parts, -1), alpha
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, -1), alpha[..., 0]
 
     def gather(self, image: Array) -> Array:
         """See `LiftingView.gather`; float32, summed in float64 over tiles."""
@@ -91,7 +91,7 @@ class CpuView:
         values = np.zeros((self._count, channels), np.float32)
         for start in range(0, channels, _CHANNELS_AT_ONCE):
             part = plain(image[..., start : start + _CHANNELS_AT_ONCE])
-            partial = np.empty((len(self._tiles.ranks), part.shape[2]), np.float32)
+            partial = np.empty((len(self._tiles.ranks), cpu_blend.padded(part.shape[2])), np.float32)
             out = np.zeros((self._count, part.shape[2]), np.float32)
             self._over_tiles(cpu_blend.gather, part, self._cutoffs, partial)
             self._workers.run(
@@ -113,10 +113,10 @@ class CpuView:
         if alpha_grad is None:
             alpha_grad = np.zeros((height, width), np.float32)
         check_array("alpha_grad", alpha_grad, (height, width))
-        ordered = plain(values[self._order])
+        ordered = _in_fours(values[self._order])
         grads = (plain(image_grad), plain(alpha_grad)[..., None])
         moments = cpu_backward.MOMENTS
-        partial = np.empty((len(self._tiles.ranks), moments + channels), np.float32)
+        partial = np.empty((len(self._tiles.ranks), moments + ordered.shape[1]), np.float32)
         self._over_tiles(cpu_backward.backward, ordered, grads, self._cutoffs, partial)
         out = cpu_unproject.ParameterGradients(
             *(np.zeros((n, *shape), np.float32) for shape in ((3,), (3,), (4,), (), (channels,), (2,)))
@@ -140,14 +140,24 @@ class CpuView:
     def depth(self, kind: DepthKind = "expected") -> Array:
         """See `View.depth`; float32."""
         if kind == "median":
-            median = np.empty((self.camera.height, self.camera.width), np.float32)
+            median = np.empty((self.camera.height, self.camera.width, 1), np.float32)
             self._over_tiles(cpu_blend.median_depth, self._depths, self._cutoffs, median)
-            return median
+            return median[..., 0]
         # Ones are blended along: alpha itself is 1 - T, which has no digits left where it is small.
         both = np.zeros((self._count, 2), np.float32)
         both[self._order] = np.stack([self._depths, np.ones_like(self._depths)], -1)
         sums, weights = np.moveaxis(self.splat(both)[0], -1, 0)
         return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), 0)
+
+
+def _in_fours(values: Array) -> Array:
+    """(M, C) values as float32 (M, padded(C)), the last column zero where it was added."""
+    count, channels = values.shape
+    if cpu_blend.padded(channels) == channels:
+        return plain(values)
+    wide = np.zeros((count, cpu_blend.padded(channels)), np.float32)
+    wide[:, :channels] = values
+    return wide
 
 
 def _aligned(shape: tuple[int, int]) -> Array:

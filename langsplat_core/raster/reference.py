@@ -95,7 +95,7 @@ class ReferenceView:
         self.windows = self._windows()
 
     def _windows(self) -> tuple[Array, Array]:
-        """First and one-past-last pixel (x, y), each (N, 2) int, of what a Gaussian may touch; empty if nothing.
+        """First and one-past-last pixel (x, y) that each Gaussian may touch: two (N, 2) ints.
 
         They only save time: outside the extent alpha is below alpha_min anyway. 1e-9 relative slack keeps
         rounding from cutting a pixel that lies on the contour.
