@@ -4,13 +4,16 @@ from pathlib import Path
 
 import pytest
 
+from tests.backends import backend, gl_rasterizers
 from tests.gl_context import gl, gl_session
+from tests.measured import measured, print_measured
 
-__all__ = ["gl", "gl_session", "real_data"]
+__all__ = ["backend", "gl", "gl_rasterizers", "gl_session", "measured", "real_data"]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--slow", action="store_true", help="run the long tier too")
+    parser.addoption("--measured", action="store_true", help="print the errors that accuracy tests measured")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -18,6 +21,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for item in items:
             if "slow" in item.keywords:
                 item.add_marker(pytest.mark.skip(reason="long tier: run with --slow"))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    if config.getoption("--slow") or config.getoption("--measured"):
+        print_measured(terminalreporter, config)
 
 
 @pytest.fixture(scope="session")

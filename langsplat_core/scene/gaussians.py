@@ -1,6 +1,7 @@
 """The Gaussians of a scene, stored as the INRIA PLY stores them: raw, not activated."""
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -66,7 +67,7 @@ class Gaussians:
                 counts[reason] = int(faulty.sum())
         return counts
 
-    def _requirements(self) -> tuple[tuple[str, Array], ...]:
+    def _requirements(self) -> tuple[tuple[str, Any], ...]:
         """What a row must fulfil to be drawn: name of the fault, (N,) True where there is none."""
         with np.errstate(over="ignore", invalid="ignore"):
             length_squared = (self.quats_wxyz.astype(np.float64) ** 2).sum(1)

@@ -76,7 +76,7 @@ void main() {
     from_camera -= camera_low;
     vec3 p = world_to_camera * from_camera;
     // Gaussians at or behind the near plane are not in the draw list; here they must only stay finite.
-    float z = max(p.z, 1e-6);
+    float z = max(p.z, 1e-12);
     vec2 tangent = p.xy / z;
     vec2 clamped = clamp(tangent, -tangents.xy, tangents.zw);
 
