@@ -1,42 +1,17 @@
 """A furnished room with small objects on a table: geometry, materials, and the names of everything."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.synthetic import furniture, tableware, toys
+from langsplat_core.datasets.synthetic import furniture
 from langsplat_core.datasets.synthetic.captions import Label, label_region
+from langsplat_core.datasets.synthetic.catalogue import BRIGHT, SMALL
 from langsplat_core.datasets.synthetic.colours import COLOURS
 from langsplat_core.datasets.synthetic.parts import Kit, Material, Piece, Thing
 from langsplat_core.datasets.synthetic.shapes import rotation_about
 
-Builder = Callable[[Kit, str], Thing]
-BRIGHT = tuple(word for word in COLOURS if word not in ("gray", "beige", "brown", "black"))
-# What may stand on the table, and the colours it comes in.
-SMALL: dict[str, tuple[Builder, tuple[str, ...]]] = {
-    "mug": (tableware.mug, COLOURS),
-    "teapot": (tableware.teapot, COLOURS),
-    "bottle": (tableware.bottle, ("green", "blue", "brown", "turquoise", "red", "purple", "white", "pink")),
-    "bowl": (tableware.bowl, COLOURS),
-    "plate": (tableware.plate, COLOURS),
-    "vase": (tableware.vase, COLOURS),
-    "plant": (tableware.plant, ("brown", "red", "white", "orange", "blue", "gray", "yellow", "purple")),
-    "lamp": (tableware.lamp, BRIGHT),
-    "book": (tableware.book, COLOURS),
-    "clock": (tableware.clock, COLOURS),
-    "orange": (toys.orange, ("orange",)),
-    "apple": (toys.apple, ("red", "green", "yellow")),
-    "banana": (toys.banana, ("yellow",)),
-    "car": (toys.car, COLOURS),
-    "block": (toys.block, COLOURS),
-    "ball": (toys.toy_ball, COLOURS),
-    "gift": (toys.gift, COLOURS),
-    "duck": (toys.duck, ("yellow", "pink", "blue", "white", "green", "orange", "red", "purple")),
-    "house": (toys.house, COLOURS),
-    "robot": (toys.robot, COLOURS),
-}
 ENLARGED = 1.3  # small objects are shown larger than life, so that their parts are worth looking at
 ALWAYS = ("mug", "lamp", "bowl")  # every room has these
 
