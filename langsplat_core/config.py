@@ -142,6 +142,18 @@ class DemoEncoderConfig:
     seed: int = 0
 
 
+@dataclass(frozen=True)
+class CompactConfig:
+    """How small a scene may be made (`langsplat compact`)."""
+
+    max_psnr_loss: float = 0.1  # dB, mean over the measuring views; nothing that loses more is written
+    views: int = 96  # at most, of the scene's cameras or photographs; a sixth of them measures the loss
+    max_side: int = 800  # pictures are drawn with at most this many pixels on their longer side
+    # dB that the scene is assumed to have where no photographs are given: higher is more cautious
+    assumed_psnr: float = 35.0
+    phrases: tuple[str, ...] = ()  # asked before and after, beside those in the scene's phrasebook
+
+
 Display = Literal["rgb", "latent", "relevancy", "segmentation", "depth", "alpha"]
 LevelChoice = Literal["auto", "subpart", "part", "whole"]
 
