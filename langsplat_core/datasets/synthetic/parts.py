@@ -1,6 +1,6 @@
 """What objects are made of: materials, labelled pieces, and the kit that builders work with."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -15,7 +15,7 @@ Texture = Literal[
 ]  # fmt: skip
 
 Substance = Literal[
-    "plastic", "ceramic", "glass", "metal", "wood", "cloth", "paper", "plaster", "leaf", "skin", "rubber"
+    "plastic", "ceramic", "glass", "metal", "wood", "cloth", "paper", "plaster", "leaf", "skin", "rubber", "wax"
 ]  # what it is made of: decides highlight, relief and fine mottling
 
 Word = TypeVar("Word", bound=str)
@@ -30,7 +30,7 @@ class Material:
     second: Array  # (3,) sRGB in [0, 1]: grain, stripes, joints
     texture: Texture
     gloss: float  # strength of the highlight, [0, 1]
-    substance: Substance | None = None  # None: what the texture and the gloss suggest
+    substance: Substance | None = None  # what it is made of; None: no common word fits
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +61,12 @@ class Thing:
     def height(self) -> float:
         """Of the highest vertex, metres."""
         return max(float(p.mesh.vertices[:, 2].max()) for p in self.pieces)
+
+    def centred(self) -> "Thing":
+        """The same thing with the middle of its footprint's bounding box at the origin."""
+        points = np.concatenate([p.mesh.vertices[:, :2] for p in self.pieces])
+        x, y = -(points.min(0) + points.max(0)) / 2
+        return replace(self, pieces=tuple(replace(p, mesh=p.mesh.moved((x, y, 0.0))) for p in self.pieces))
 
 
 _MADE_OF: dict[str, Substance] = {
