@@ -20,6 +20,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import RasterSettings
 from langsplat_core.raster.workers import helper, kernel
 from langsplat_core.scene import Camera
+from langsplat_core.scene.gaussians import LARGEST_COEFFICIENT
 
 COLUMNS = 8  # of the geometry: one cache line a row
 INVALID, UNDRAWN, DRAWN = 0, 1, 2  # what `project` says of a row
@@ -27,7 +28,8 @@ MEAN_X, MEAN_Y, FACTOR_A, FACTOR_K, FACTOR_C, LOG2_OPACITY, HALF_WIDTH, HALF_HEI
 HALF_LOG2_E = 0.5 / np.log(2.0)
 LN2 = np.log(2.0)
 COMPENSATION_MIN = 0.005**2  # floor of det before / det after dilation, as gsplat has it
-_MAX_LOG_SCALE, _MIN_QUAT_SQUARED, _INFINITY_BITS = 80.0, 1e-24, 0x7F800000  # see Gaussians.valid
+_MAX_LOG_SCALE, _MIN_QUAT_SQUARED = 80.0, 1e-24  # see Gaussians.valid
+_LARGEST_BITS = int(np.float32(LARGEST_COEFFICIENT).view(np.uint32))  # positive floats order as their bits
 
 
 Point = tuple[float, float, float]
@@ -40,7 +42,7 @@ class Rows(NamedTuple):
     log_scales: Array  # (N, 3) float32
     quats_wxyz: Array  # (N, 4) float32
     opacity_logits: Array  # (N,) float32
-    sh_bits: Array  # (N, 3 K) uint32: the SH coefficients' bits, only to see whether they are finite
+    sh_bits: Array  # (N, 3 K) uint32: the SH coefficients' bits, only to see whether they are usable
 
 
 class Footprints(NamedTuple):
@@ -190,7 +192,7 @@ def _is_valid(rows: Rows, i: int) -> bool:
     highest = np.uint32(0)
     for n in range(sh_bits.shape[0]):
         highest = max(highest, sh_bits[n] & np.uint32(0x7FFFFFFF))
-    return ok & np.isfinite(squared) & (squared > _MIN_QUAT_SQUARED) & (highest < np.uint32(_INFINITY_BITS))
+    return ok & np.isfinite(squared) & (squared > _MIN_QUAT_SQUARED) & (highest <= np.uint32(_LARGEST_BITS))
 
 
 @kernel

@@ -16,7 +16,7 @@ from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.raster.gl_draw import Targets, drawing, set_uniforms, shader
-from langsplat_core.raster.gl_scene import SceneTextures, front_to_back
+from langsplat_core.raster.gl_scene import HALF_MAX, SceneTextures, front_to_back
 from langsplat_core.raster.protocol import DepthKind
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 
@@ -147,6 +147,7 @@ class GlRasterizer:
                 "dilation": settings.dilation,
                 "alpha_min": settings.alpha_min,
                 "antialiased": settings.antialiased,
+                "colour_max": HALF_MAX if self.precision == "half" else np.finfo(np.float32).max,
                 "sh_count": SH_COUNTS[view.gaussians.sh_degree],
             },
         )

@@ -8,6 +8,7 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16}  # degree -> coefficients per colour channel
+LARGEST_COEFFICIENT = 1e20  # of the spherical harmonics: sums of sixteen and their gradients fit a float32
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +47,8 @@ class Gaussians:
         return Gaussians(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def valid(self) -> Array:
-        """(N,) True where a row can be drawn: finite mean and colour, a non-zero finite quaternion,
-        scales that are not NaN or so large that they overflow, an opacity that is not NaN."""
+        """(N,) True where a row can be drawn: finite mean, a non-zero finite quaternion, scales and colours
+        that are not NaN or so large that they overflow, an opacity that is not NaN."""
         usable = np.ones(len(self), bool)
         for _, sound in self._requirements():
             usable &= sound
@@ -71,11 +72,12 @@ class Gaussians:
         """What a row must fulfil to be drawn: name of the fault, (N,) True where there is none."""
         with np.errstate(over="ignore", invalid="ignore"):
             length_squared = (self.quats_wxyz.astype(np.float64) ** 2).sum(1)
+            sound_colour = (np.abs(self.sh) <= LARGEST_COEFFICIENT).all((1, 2))
         return (
             ("position not finite", np.isfinite(self.means).all(1)),
             # exp(88.7) overflows float32; NaN compares False
             ("scale not a number or above e^80", (self.log_scales <= 80).all(1)),
             ("rotation zero or not finite", np.isfinite(length_squared) & (length_squared > 1e-24)),
             ("opacity not a number", ~np.isnan(self.opacity_logits)),
-            ("colour not finite", np.isfinite(self.sh).all((1, 2))),
+            ("colour not finite or above 1e20", sound_colour),
         )

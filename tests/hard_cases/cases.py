@@ -49,7 +49,8 @@ _POISONS = {
     "-1e38": -1e38,
 }
 _FATAL = {
-    **dict.fromkeys(("means", "quats_wxyz", "sh"), ("nan", "inf", "-inf")),
+    **dict.fromkeys(("means", "quats_wxyz"), ("nan", "inf", "-inf")),
+    "sh": ("nan", "inf", "-inf", "1e38", "-1e38"),
     "log_scales": ("nan", "inf", "1e38"),
     "opacity_logits": ("nan",),
 }

@@ -1,14 +1,17 @@
 """The table of hard cases on every rasterizer that loads."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from langsplat_core.errors import BackendError
+from langsplat_core.raster import cpu_colour, load_rasterizer, spherical_harmonics
 from langsplat_core.raster.reference import ReferenceRasterizer
 from tests.backends import Backend
 from tests.close import assert_adjoint, cut_off_band
-from tests.hard_cases.cases import CASES, HUGE_IMAGE
-from tests.hard_cases.drawings import Case, Seen, draw
+from tests.hard_cases.cases import CASES, HUGE_IMAGE, ROW
+from tests.hard_cases.drawings import Case, Seen, altered, crowd, draw
 from tests.measured import Measure
 
 # What rounding can decide in a pixel: two alphas of 1/255, or one last weight alpha T before T reaches 1e-4,
@@ -84,6 +87,65 @@ def check_gradients(seen: Seen) -> None:
 @pytest.mark.parametrize("case", NAMED)
 def test_hard_case(case: Case, backend: Backend, measured: Measure) -> None:
     run_case(case, backend, measured)
+
+
+@pytest.mark.parametrize("coefficient", [1e20, 1e10, 7e4])
+def test_colours_that_overflow(backend: Backend, coefficient: float) -> None:
+    """Finite, 0 where they would be negative, and no gradient there."""
+    drawing = altered("sh", ROW, coefficient * np.array([1.0, -1.0, 0.0]), sh_degree=3)
+    sh, means, eye = drawing.gaussians.sh, drawing.gaussians.means, drawing.camera.position
+    want = spherical_harmonics.colours(sh, means, eye)
+    assert want.min() == 0
+    assert want.max() > 1e3
+    if backend.name == "cpu":
+        got = cpu_colour.colours(sh, means, eye)
+        np.testing.assert_allclose(got, want, rtol=1e-6)
+        gradients = cpu_colour.colours_backward(sh, means, eye, np.ones_like(got))
+        assert all(np.isfinite(gradient).all() for gradient in gradients)
+        assert not gradients[0].transpose(0, 2, 1)[want == 0].any()
+    if backend.name.startswith("opengl"):
+        view = backend.raster.view(drawing.gaussians, drawing.camera)
+        (texture,) = backend.raster.draw(view, ["colour"])
+        image = np.frombuffer(texture.read(), texture.dtype).reshape(27, 40, 4)[..., :3]
+        assert np.isfinite(image).all()
+        assert image.min() >= 0
+        if backend.name == "opengl-single":
+            reference = ReferenceRasterizer().view(drawing.gaussians, drawing.camera).splat(want)[0]
+            np.testing.assert_allclose(image, reference, atol=1e-4 * want.max())
+
+
+def test_dropped_rows_are_told_by_reason() -> None:
+    """One sentence per reason; a row with several faults counts once."""
+    gaussians = altered("means", [0, 1], np.nan).gaussians
+    quats, logits, sh = gaussians.quats_wxyz.copy(), gaussians.opacity_logits.copy(), gaussians.sh.copy()
+    log_scales = gaussians.log_scales.copy()
+    quats[1:5], logits[4:6], sh[6, 0, 1], log_scales[7:9, 2] = 0, np.nan, 1e38, [np.inf, 81]
+    broken = replace(gaussians, quats_wxyz=quats, opacity_logits=logits, sh=sh, log_scales=log_scales)
+    assert broken.invalid_rows() == {
+        "position not finite": 2,
+        "scale not a number or above e^80": 2,
+        "rotation zero or not finite": 3,
+        "opacity not a number": 1,
+        "colour not finite or above 1e20": 1,
+    }
+    assert (~broken.valid()).sum() == 9
+    assert crowd().gaussians.invalid_rows() == {}
+
+
+@pytest.mark.parametrize("case", NAMED)
+def test_results_do_not_depend_on_the_number_of_threads(case: Case) -> None:
+    """Forward, adjoint and gradients of the CPU backend, bit for bit."""
+    drawing = case.build()
+    target = np.random.default_rng(3).normal(size=(drawing.camera.height, drawing.camera.width, 1))
+    x = drawing.features()[:, :1]
+    results = []
+    for threads in (1, 2):
+        view = load_rasterizer("cpu", threads=threads).view(
+            drawing.gaussians, drawing.camera, drawing.settings
+        )
+        gradients = vars(view.backward(x, target, target[..., 0])).values()
+        results.append([*view.splat(x), view.gather(target), view.depth("median"), *gradients])
+    assert all(np.array_equal(one, two) for one, two in zip(*results, strict=True))
 
 
 @pytest.mark.slow

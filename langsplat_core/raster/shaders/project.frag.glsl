@@ -15,11 +15,12 @@ uniform vec4 tangents;     // clamp of x/z and y/z: left, top, right, bottom
 uniform float dilation;    // px^2
 uniform float alpha_min;
 uniform bool antialiased;
+uniform float colour_max;  // largest number of the image
 uniform int sh_count;      // 1, 4, 9 or 16
 
 layout(location = 0) out vec4 placement;  // mean in px, camera z, opacity (0: not drawn)
 layout(location = 1) out vec4 shape;      // long axis (unit vector), 1 / standard deviation along and across, 1/px
-layout(location = 2) out vec4 colour;     // display colour seen from the camera, >= 0
+layout(location = 2) out vec4 colour;     // display colour seen from the camera, 0 to colour_max
 
 // Standard deviations beyond this many pixels look the same; its fourth power still fits a float.
 const float LARGEST_PX = 1e9;
@@ -56,7 +57,7 @@ vec3 radiance(ivec2 texel, vec3 d) {
         rgb += 0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * coefficient(texel, 12);
         rgb += 1.445305721320277 * z * (xx - yy) * coefficient(texel, 14);
     }
-    return max(rgb, 0.0);
+    return clamp(rgb, 0.0, colour_max);
 }
 
 mat3 rotation(vec4 q) {
