@@ -122,7 +122,7 @@ padded_inside = helper(padded)
 
 
 @helper
-def _add_weighted(sums: Array, at: int, channels: int, weight: Lanes, x: Array) -> None:
+def add_weighted(sums: Array, at: int, channels: int, weight: Lanes, x: Array) -> None:
     """sums[at + 16 channel : + 16] += weight x[channel]"""
     fours = channels & ~3
     for channel in range(0, fours, 4):
@@ -194,7 +194,7 @@ def _splat_tile(
         for row in range(low, high):
             added, before = blend_row(transmittance, row * TILE, step + w, peak - v * v, cutoffs)
             w, v = w + w_step, v + v_step
-            _add_weighted(sums, row * lines * TILE, lines, added * before, x)
+            add_weighted(sums, row * lines * TILE, lines, added * before, x)
     write_tile(sums, image, x0, y0)
     for n in range(PIXELS):
         transmittance[n] = np.float32(1) - abs(transmittance[n])

@@ -73,6 +73,10 @@ class GsplatView:
             gathered[self._rows] = grad.cpu().numpy()
         return gathered
 
+    def contributions(self) -> Array:
+        """See `LiftingView.contributions`; float32."""
+        return self.gather(np.ones((self.camera.height, self.camera.width, 1), np.float32))[:, 0]
+
     def depth(self, kind: DepthKind = "expected") -> Array:
         """See `View.depth`; float32, `expected` only."""
         if kind != "expected":

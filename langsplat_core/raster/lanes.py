@@ -217,6 +217,38 @@ def load_three(typing: Any, array: Any, index: Any) -> Any:
     return types.UniTuple(lanes16, 3)(array, types.intp), lower
 
 
+UNIT = 65535  # what stands for 1 in sixteen bits
+
+
+@intrinsic
+def load_units(typing: Any, array: Any, index: Any) -> Any:
+    """array.flat[index : index + 16] / UNIT of uint16, as lanes, unchecked."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
+        shorts = ir.VectorType(ir.IntType(16), LANES).as_pointer()
+        value = builder.load(builder.bitcast(builder.gep(data, [arguments[1]]), shorts))
+        value.align = 2
+        return builder.fmul(builder.sitofp(builder.zext(value, _INTS), _FLOATS), _constant(1 / UNIT))
+
+    return lanes16(array, types.intp), lower
+
+
+@intrinsic
+def store_units(typing: Any, array: Any, index: Any, value: Any) -> Any:
+    """array.flat[index : index + 16] = lanes in [0, 1] times UNIT, rounded, as uint16, unchecked."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        scaled = builder.fadd(builder.fmul(arguments[2], _constant(UNIT)), _constant(0.5))
+        shorts = ir.VectorType(ir.IntType(16), LANES)
+        data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
+        pointer = builder.bitcast(builder.gep(data, [arguments[1]]), shorts.as_pointer())
+        builder.store(builder.trunc(builder.fptosi(scaled, _INTS), shorts), pointer).align = 2
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, value), lower
+
+
 @intrinsic
 def lanes(typing: Any, value: Any) -> Any:
     """Sixteen times the same float."""

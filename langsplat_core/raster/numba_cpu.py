@@ -12,16 +12,14 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster import cpu_backward, cpu_blend, cpu_project, cpu_tiles, cpu_unproject
+from langsplat_core.raster import cpu_backward, cpu_blend, cpu_frozen, cpu_project, cpu_tiles, cpu_unproject
 from langsplat_core.raster.cpu_colour import colours, colours_backward
+from langsplat_core.raster.cpu_operator import TileOperator, in_fours
 from langsplat_core.raster.protocol import DepthKind
 from langsplat_core.raster.workers import Workers, plain, shared_workers
 from langsplat_core.scene import Camera, Gaussians
 
-__all__ = ["CpuRasterizer", "CpuView", "GaussianGradients", "colours", "colours_backward"]
-
-_CHANNELS_AT_ONCE = 32  # a tile's state stays in the first level cache
-
+__all__ = ["CpuRasterizer", "CpuView", "FrozenView", "GaussianGradients", "colours", "colours_backward"]
 
 @dataclass(frozen=True, eq=False)
 class GaussianGradients:
@@ -35,15 +33,13 @@ class GaussianGradients:
     means_px: Array  # (N, 2) per pixel, by the 2D mean alone (densification watches its length)
 
 
-class CpuView:
+class CpuView(TileOperator):
     """M drawn of N Gaussians, in depth order, with their tiles."""
 
     def __init__(
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, workers: Workers
     ) -> None:
         n = len(gaussians)
-        self.camera = camera
-        self._count, self._workers = n, workers
         self._lens = cpu_project.make_lens(camera, settings)
         self._cutoffs = cpu_blend.make_cutoffs(settings)
         self._rows = cpu_project.Rows(
@@ -55,50 +51,34 @@ class CpuView:
         )
         found = cpu_project.Footprints(np.empty((n, cpu_project.COLUMNS)), np.empty(n), np.empty(n, np.uint8))
         workers.run(cpu_project.project, n, self._rows, self._lens, found)
-        self._order = cpu_tiles.depth_order(found.status, found.depths.view(np.uint64))
-        self._geometry = _aligned((len(self._order), cpu_project.COLUMNS))
-        np.take(found.geometry, self._order, axis=0, out=self._geometry, mode="clip")
-        self._depths = found.depths[self._order]
-        self._tiles = cpu_tiles.bin_tiles(self._geometry, camera.width, camera.height, workers)
+        order = cpu_tiles.depth_order(found.status, found.depths.view(np.uint64))
+        self._geometry = _aligned((len(order), cpu_project.COLUMNS))
+        np.take(found.geometry, order, axis=0, out=self._geometry, mode="clip")
+        self._depths = found.depths[order]
+        tiles = cpu_tiles.bin_tiles(self._geometry, camera.width, camera.height, workers)
+        super().__init__(camera, n, order, tiles, workers)
         self.dropped = int(np.count_nonzero(found.status == cpu_project.INVALID))
 
     @property
     def radii(self) -> Array:
         """(N,) float32 px: the greater half extent of each footprint; 0 where nothing is drawn."""
-        radii = np.zeros(self._count, np.float32)
-        touches = np.diff(self._tiles.firsts) > 0
-        radii[self._order] = np.where(touches, self._geometry[:, cpu_project.HALF_WIDTH :].max(1), 0)
+        radii = np.zeros(self.count, np.float32)
+        touches = np.diff(self.tiles.firsts) > 0
+        radii[self.order] = np.where(touches, self._geometry[:, cpu_project.HALF_WIDTH :].max(1), 0)
         return radii
 
-    def splat(self, values: Array) -> tuple[Array, Array]:
-        """See `View.splat`; float32. Values must be finite."""
-        check_array("values", values, (self._count, "C"))
-        ordered = values[self._order]
-        height, width, channels = self.camera.height, self.camera.width, ordered.shape[1]
-        alpha = np.empty((height, width, 1), np.float32)
-        parts = []
-        for start in range(0, max(channels, 1), _CHANNELS_AT_ONCE):
-            part = ordered[:, start : start + _CHANNELS_AT_ONCE]
-            image = np.empty((height, width, part.shape[1]), np.float32)
-            self._over_tiles(cpu_blend.splat, _in_fours(part), self._cutoffs, image, alpha)
-            parts.append(image)
-        return parts[0] if len(parts) == 1 else np.concatenate(parts, -1), alpha[..., 0]
+    def _splat_part(self, values: Array, image: Array, alpha: Array) -> None:
+        self._over_tiles(cpu_blend.splat, values, self._cutoffs, image, alpha)
 
-    def gather(self, image: Array) -> Array:
-        """See `LiftingView.gather`; float32, summed in float64 over tiles."""
-        check_array("image", image, (self.camera.height, self.camera.width, "C"))
-        channels = image.shape[2]
-        values = np.zeros((self._count, channels), np.float32)
-        for start in range(0, channels, _CHANNELS_AT_ONCE):
-            part = plain(image[..., start : start + _CHANNELS_AT_ONCE])
-            partial = np.empty((len(self._tiles.ranks), cpu_blend.padded(part.shape[2])), np.float32)
-            out = np.zeros((self._count, part.shape[2]), np.float32)
-            self._over_tiles(cpu_blend.gather, part, self._cutoffs, partial)
-            self._workers.run(
-                cpu_blend.sum_partials, len(self._order), self._tiles, self._order, partial, out
-            )
-            values[:, start : start + _CHANNELS_AT_ONCE] = out
-        return values
+    def _gather_part(self, image: Array, partial: Array) -> None:
+        self._over_tiles(cpu_blend.gather, image, self._cutoffs, partial)
+
+    def frozen(self) -> "FrozenView":
+        """This view with W itself kept: `splat` and `gather` get cheaper the more often they are called."""
+        return FrozenView(self, self._walk)
+
+    def _walk(self, spans: Array, firsts: Array, weights: Array, alpha: Array) -> None:
+        self._over_tiles(cpu_frozen.walk, self._cutoffs, spans, firsts, weights, alpha)
 
     def backward(
         self, values: Array, image_grad: Array, alpha_grad: Array | None = None
@@ -107,25 +87,25 @@ class CpuView:
 
         They are those of image formation as it is: 0 through a capped alpha and across the cut-offs.
         """
-        n, height, width = self._count, self.camera.height, self.camera.width
+        n, height, width = self.count, self.camera.height, self.camera.width
         channels = check_array("values", values, (n, "C"))["C"]
         check_array("image_grad", image_grad, (height, width, channels))
         if alpha_grad is None:
             alpha_grad = np.zeros((height, width), np.float32)
         check_array("alpha_grad", alpha_grad, (height, width))
-        ordered = _in_fours(values[self._order])
+        ordered = in_fours(values[self.order])
         grads = (plain(image_grad), plain(alpha_grad)[..., None])
         moments = cpu_backward.MOMENTS
-        partial = np.empty((len(self._tiles.ranks), moments + ordered.shape[1]), np.float32)
+        partial = np.empty((len(self.tiles.ranks), moments + ordered.shape[1]), np.float32)
         self._over_tiles(cpu_backward.backward, ordered, grads, self._cutoffs, partial)
         out = cpu_unproject.ParameterGradients(
             *(np.zeros((n, *shape), np.float32) for shape in ((3,), (3,), (4,), (), (channels,), (2,)))
         )
-        self._workers.run(
+        self.workers.run(
             cpu_unproject.to_parameters,
-            len(self._order),
-            self._tiles,
-            self._order,
+            len(self.order),
+            self.tiles,
+            self.order,
             self._geometry,
             partial,
             self._rows,
@@ -135,7 +115,7 @@ class CpuView:
         return GaussianGradients(*out)
 
     def _over_tiles(self, kernel: Callable[..., None], *arguments: Any) -> None:
-        self._workers.run(kernel, len(self._tiles.starts) - 1, self._tiles, self._geometry, *arguments)
+        self.workers.run(kernel, len(self.tiles.starts) - 1, self.tiles, self._geometry, *arguments)
 
     def depth(self, kind: DepthKind = "expected") -> Array:
         """See `View.depth`; float32."""
@@ -144,20 +124,47 @@ class CpuView:
             self._over_tiles(cpu_blend.median_depth, self._depths, self._cutoffs, median)
             return median[..., 0]
         # Ones are blended along: alpha itself is 1 - T, which has no digits left where it is small.
-        both = np.zeros((self._count, 2), np.float32)
-        both[self._order] = np.stack([self._depths, np.ones_like(self._depths)], -1)
+        both = np.zeros((self.count, 2), np.float32)
+        both[self.order] = np.stack([self._depths, np.ones_like(self._depths)], -1)
         sums, weights = np.moveaxis(self.splat(both)[0], -1, 0)
         return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), 0)
 
 
-def _in_fours(values: Array) -> Array:
-    """(M, C) values as float32 (M, padded(C)), the last column zero where it was added."""
-    count, channels = values.shape
-    if cpu_blend.padded(channels) == channels:
-        return plain(values)
-    wide = np.zeros((count, cpu_blend.padded(channels)), np.float32)
-    wide[:, :channels] = values
-    return wide
+class FrozenView(TileOperator):
+    """A view whose blending weights are kept, each to 1 / 131070 (see `cpu_frozen`)."""
+
+    def __init__(self, view: CpuView, walk: Callable[[Array, Array, Array, Array], None]) -> None:
+        super().__init__(view.camera, view.count, view.order, view.tiles, view.workers)
+        self.dropped, self._view = view.dropped, view
+        spans = np.zeros(len(view.tiles.ranks), np.uint16)
+        self._alpha = np.empty((view.camera.height, view.camera.width, 1), np.float32)
+        nothing = np.zeros((0, cpu_tiles.TILE), np.uint16)
+        walk(spans, np.zeros(0, np.int64), nothing, self._alpha)
+        rows = (spans >> 8).astype(np.int64) - (spans & 255)
+        self._firsts = np.concatenate([[0], np.cumsum(rows)])
+        self._weights = np.empty((int(self._firsts[-1]), cpu_tiles.TILE), np.uint16)
+        walk(spans, self._firsts, self._weights, self._alpha)
+        self.tiles = view.tiles._replace(rows=spans)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of what is kept beyond the view itself."""
+        return self._weights.nbytes + self._firsts.nbytes + self.tiles.rows.nbytes + self._alpha.nbytes
+
+    def depth(self, kind: DepthKind = "expected") -> Array:
+        """See `View.depth`."""
+        return self._view.depth(kind)
+
+    def _splat_part(self, values: Array, image: Array, alpha: Array) -> None:
+        alpha[:] = self._alpha
+        self._run(cpu_frozen.splat, values, image)
+
+    def _gather_part(self, image: Array, partial: Array) -> None:
+        self._run(cpu_frozen.gather, image, partial)
+
+    def _run(self, kernel: Callable[..., None], *arguments: Array) -> None:
+        tiles = len(self.tiles.starts) - 1
+        self.workers.run(kernel, tiles, self.tiles, self._firsts, self._weights, *arguments)
 
 
 def _aligned(shape: tuple[int, int]) -> Array:
@@ -175,8 +182,8 @@ class CpuRasterizer:
 
     def __init__(self, threads: int | None = None) -> None:
         """`threads` defaults to all cores this process may use; results do not depend on it."""
-        self._workers = shared_workers(threads)
+        self.workers = shared_workers(threads)
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> CpuView:
         """See `Rasterizer.view`."""
-        return CpuView(gaussians, camera, settings, self._workers)
+        return CpuView(gaussians, camera, settings, self.workers)

@@ -38,6 +38,9 @@ class LiftingView(View, Protocol):
     def gather(self, image: Array) -> Array:
         """(H, W, C) image -> (N, C) values ``W^T y``."""
 
+    def contributions(self) -> Array:
+        """(N,) blending weight of each Gaussian summed over the picture, in pixels: ``W^T 1``."""
+
 
 class Rasterizer(Protocol):
     """A backend; stateless apart from device resources."""

@@ -151,6 +151,10 @@ class ReferenceView:
             values[i] = np.tensordot(weights, image[window], 2)
         return values
 
+    def contributions(self) -> Array:
+        """See `LiftingView.contributions`; float64."""
+        return self.gather(np.ones((self.camera.height, self.camera.width, 1)))[:, 0]
+
     def depth(self, kind: DepthKind = "expected") -> Array:
         """See `View.depth`; float64."""
         if kind == "expected":

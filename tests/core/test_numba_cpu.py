@@ -190,6 +190,40 @@ def test_weights_are_the_alpha():
     assert alpha.max() <= 1 - 1e-4 + 1e-6
 
 
+def test_contributions_are_the_summed_weights():
+    gaussians, camera = random_gaussians(200, 17), random_camera(17)
+    view, truth = CPU.view(gaussians, camera), REFERENCE.view(gaussians, camera)
+    want = truth.gather(np.ones((camera.height, camera.width, 1)))[:, 0]
+    np.testing.assert_array_equal(truth.contributions(), want)
+    np.testing.assert_allclose(view.contributions(), want, atol=1e-3)  # a flipped pixel weighs up to 1/255
+    assert abs(view.contributions().sum() - view.splat(np.zeros((200, 0)))[1].sum()) < 1e-2
+
+
+@pytest.mark.parametrize("channels", [1, 3, 12, 40])
+@pytest.mark.parametrize("size", [(70, 45), (1, 1), (33, 5)])
+def test_a_frozen_view_differs_by_its_rounding_only(channels, size):
+    gaussians, camera = random_gaussians(300, 21), random_camera(21, *size)
+    view = CPU.view(gaussians, camera)
+    frozen = view.frozen()
+    x = random_values(300, channels)
+    (image, alpha), (want, want_alpha) = frozen.splat(x), view.splat(x)
+    np.testing.assert_array_equal(alpha, want_alpha)
+    deepest = 0.5 / 65535 * 300  # every Gaussian rounded the wrong way
+    assert np.abs(image - want).max(initial=0) < min(deepest, 2e-4)
+    y = np.random.default_rng(3).uniform(-1, 1, image.shape).astype(np.float32)
+    assert np.abs(frozen.gather(y) - view.gather(y)).max() < 0.5 / 65535 * size[0] * size[1]
+    assert_adjoint(lambda v: frozen.splat(v)[0], frozen.gather, x, y)
+    np.testing.assert_array_equal(frozen.depth(), view.depth())
+    assert frozen.dropped == view.dropped
+    assert 0 < frozen.nbytes < 40 * len(view.tiles.ranks) * 16 + 16 * size[0] * size[1] + 64
+
+
+def test_a_frozen_view_of_nothing():
+    empty = CPU.view(random_gaussians(0), PLAIN).frozen()
+    assert not empty.splat(np.zeros((0, 3), np.float32))[0].any()
+    assert empty.gather(np.zeros((30, 40, 2), np.float32)).shape == (0, 2)
+
+
 def test_radii_are_positive_exactly_where_something_is_drawn():
     gaussians, camera = random_gaussians(300, 18, radius=2.0), random_camera(18)
     view = CPU.view(gaussians, camera)
@@ -264,7 +298,7 @@ def test_tiles_hold_little_more_than_what_touches_them():
         dx, dy = xs - mean[0], ys - mean[1]
         alpha = opacity * np.exp(-0.5 * (xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy))
         touched += (alpha.reshape(6, 16, 8, 16).max((1, 3)) >= 1 / 255).sum()
-    kept = len(CPU.view(gaussians, camera)._tiles.ranks)
+    kept = len(CPU.view(gaussians, camera).tiles.ranks)
     assert touched <= kept <= 1.15 * touched
 
 
