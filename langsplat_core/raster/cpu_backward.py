@@ -18,19 +18,18 @@ from langsplat_core.raster import cpu_project as cp
 from langsplat_core.raster.cpu_blend import (
     AHEAD,
     CHECK_EVERY,
-    PIXELS,
     Cutoffs,
     blend_row,
-    correlate,
     enter,
-    load_tile,
     row_offsets,
     rows_to_blend,
     running_rows,
     start_tile,
 )
+from langsplat_core.raster.cpu_planes import PIXELS, correlate, load_tile
 from langsplat_core.raster.cpu_tiles import TILE, Tiles, spread
-from langsplat_core.raster.lanes import lanes, load, ramp, reciprocal, store, store_totals, where_greater
+from langsplat_core.raster.lanes import lanes, ramp, reciprocal, store_totals, where_greater
+from langsplat_core.raster.lanes_memory import load, store
 from langsplat_core.raster.workers import helper, kernel
 
 # Columns of the partial sums (two are unused); the gradient by the values follows them.

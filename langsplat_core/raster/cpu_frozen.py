@@ -12,21 +12,18 @@ from langsplat_core.raster import cpu_project as cp
 from langsplat_core.raster.cpu_blend import (
     AHEAD,
     CHECK_EVERY,
-    PIXELS,
     Cutoffs,
-    add_weighted,
     blend_row,
-    correlate,
     enter,
-    load_tile,
     row_offsets,
     rows_to_blend,
     running_rows,
     start_tile,
-    write_tile,
 )
+from langsplat_core.raster.cpu_planes import PIXELS, add_weighted, correlate, load_tile, write_tile
 from langsplat_core.raster.cpu_tiles import TILE, Tiles, spread
-from langsplat_core.raster.lanes import UNIT, largest, load_units, prefetch, ramp, store, store_units
+from langsplat_core.raster.lanes import largest, ramp
+from langsplat_core.raster.lanes_memory import UNIT, load_units, prefetch, store, store_units
 from langsplat_core.raster.workers import helper, kernel
 
 VISIBLE = 0.5 / UNIT  # weights below round to 0

@@ -6,6 +6,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.raster import cpu_blend
+from langsplat_core.raster.cpu_planes import padded
 from langsplat_core.raster.cpu_tiles import Tiles
 from langsplat_core.raster.workers import Workers, plain
 from langsplat_core.scene import Camera
@@ -50,7 +51,7 @@ class TileOperator(ABC):
         values = np.zeros((self.count, channels), np.float32)
         for start in range(0, channels, _CHANNELS_AT_ONCE):
             part = plain(image[..., start : start + _CHANNELS_AT_ONCE])
-            partial = np.empty((len(self.tiles.ranks), cpu_blend.padded(part.shape[2])), np.float32)
+            partial = np.empty((len(self.tiles.ranks), padded(part.shape[2])), np.float32)
             out = np.zeros((self.count, part.shape[2]), np.float32)
             self._gather_part(part, partial)
             self.workers.run(cpu_blend.sum_partials, len(self.order), self.tiles, self.order, partial, out)
@@ -65,8 +66,8 @@ class TileOperator(ABC):
 def in_fours(values: Array) -> Array:
     """(M, C) values as float32 (M, padded(C)), the last column zero where it was added."""
     count, channels = values.shape
-    if cpu_blend.padded(channels) == channels:
+    if padded(channels) == channels:
         return plain(values)
-    wide = np.zeros((count, cpu_blend.padded(channels)), np.float32)
+    wide = np.zeros((count, padded(channels)), np.float32)
     wide[:, :channels] = values
     return wide

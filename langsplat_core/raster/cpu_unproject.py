@@ -9,7 +9,7 @@ from langsplat_core.raster import cpu_project as cp
 from langsplat_core.raster.cpu_backward import MOMENTS, QV, QVV, QW, QWV, QWW, Q
 from langsplat_core.raster.cpu_blend import AHEAD
 from langsplat_core.raster.cpu_tiles import Tiles
-from langsplat_core.raster.lanes import prefetch
+from langsplat_core.raster.lanes_memory import prefetch
 from langsplat_core.raster.workers import helper, kernel
 
 

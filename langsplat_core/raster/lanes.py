@@ -17,8 +17,8 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 
 LANES = 16
 Lanes = Any  # how a value of sixteen lanes is annotated in kernels
-_FLOAT, _INT = ir.FloatType(), ir.IntType(32)
-_FLOATS, _INTS = ir.VectorType(_FLOAT, LANES), ir.VectorType(_INT, LANES)
+FLOAT, INT = ir.FloatType(), ir.IntType(32)
+FLOATS, INTS = ir.VectorType(FLOAT, LANES), ir.VectorType(INT, LANES)
 _FUSE = ("contract",)  # a * b + c may round once; nothing is reordered
 
 # 2^x on [-0.5, 0.5], minimax in relative error (7.5e-8, found by iteratively reweighted least squares).
@@ -36,22 +36,22 @@ lanes16 = _Lanes()
 @register_model(_Lanes)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager: Any, numba_type: Any) -> None:
-        super().__init__(manager, numba_type, _FLOATS)
+        super().__init__(manager, numba_type, FLOATS)
 
 
-def _constant(value: float) -> ir.Constant:
-    return ir.Constant(_FLOATS, [float(value)] * LANES)
+def constant(value: float) -> ir.Constant:
+    return ir.Constant(FLOATS, [float(value)] * LANES)
 
 
-def _broadcast(builder: Any, value: Any) -> Any:
+def as_lanes(builder: Any, value: Any) -> Any:
     """A float, double or lanes as lanes."""
-    if value.type == _FLOATS:
+    if value.type == FLOATS:
         return value
     if isinstance(value.type, ir.DoubleType):
-        value = builder.fptrunc(value, _FLOAT)
-    undefined = ir.Constant(_FLOATS, ir.Undefined)
-    first = builder.insert_element(undefined, value, _INT(0))
-    return builder.shuffle_vector(first, undefined, ir.Constant(_INTS, [0] * LANES))
+        value = builder.fptrunc(value, FLOAT)
+    undefined = ir.Constant(FLOATS, ir.Undefined)
+    first = builder.insert_element(undefined, value, INT(0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(INTS, [0] * LANES))
 
 
 def _is_lanes_or_float(*arguments: types.Type) -> bool:
@@ -67,7 +67,7 @@ def _add_operator(symbol: Callable[[Any, Any], Any], instruction: str) -> None:
             return None
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        a, b = (_broadcast(builder, argument) for argument in arguments)
+        a, b = (as_lanes(builder, argument) for argument in arguments)
         return getattr(builder, instruction)(a, b, flags=_FUSE)
 
     for kinds in ((_Lanes, _Lanes), (_Lanes, types.Float), (types.Float, _Lanes)):
@@ -79,186 +79,21 @@ _add_operator(operator.sub, "fsub")
 _add_operator(operator.mul, "fmul")
 
 
-def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
-    data = context.make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _FLOATS.as_pointer())
-
-
-@intrinsic
-def load(typing: Any, array: Any, index: Any) -> Any:
-    """array[index : index + 16] of a flat float32 array, unchecked."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        value = builder.load(_pointer(context, builder, sig.args[0], *arguments))
-        value.align = 4
-        return value
-
-    return lanes16(array, types.intp), lower
-
-
-@intrinsic
-def prefetch(typing: Any, array: Any, index: Any) -> Any:
-    """Ask for the cache line of element `index` (counted flat) of a contiguous array."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
-        byte = ir.IntType(8).as_pointer()
-        signature = ir.FunctionType(ir.VoidType(), [byte, _INT, _INT, _INT])
-        fetch = builder.module.declare_intrinsic("llvm.prefetch", [byte], signature)
-        read, keep, is_data = _INT(0), _INT(3), _INT(1)
-        builder.call(fetch, [builder.bitcast(builder.gep(data, [arguments[1]]), byte), read, keep, is_data])
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp), lower
-
-
-@intrinsic
-def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
-    """array[index : index + 16] = value of a flat float32 array, unchecked."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        value = _broadcast(builder, arguments[2])
-        builder.store(value, _pointer(context, builder, sig.args[0], *arguments[:2])).align = 4
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, value), lower
-
-
-def _shuffle(builder: Any, a: Any, b: Any, picks: list[int]) -> Any:
+def shuffle(builder: Any, a: Any, b: Any, picks: list[int]) -> Any:
     """Lanes of a (0 to n - 1) and b (n to 2 n - 1)."""
-    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT, len(picks)), picks))
-
-
-def _fours(context: Any, builder: Any, array_type: Any, array: Any, index: Any, stride: Any) -> list[Any]:
-    """Pointers to four floats each, at elements index, index + stride, ... (sixteen of them)."""
-    data = context.make_array(array_type)(context, builder, array).data
-    pointers, kind = [], ir.VectorType(_FLOAT, 4).as_pointer()
-    for _ in range(LANES):
-        pointers.append(builder.bitcast(builder.gep(data, [index]), kind))
-        index = builder.add(index, stride)
-    return pointers
-
-
-@intrinsic
-def store_four(typing: Any, array: Any, index: Any, stride: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """array.flat[index + stride i : + 4] = a[i], b[i], c[i], d[i] for the sixteen i, unchecked."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        a, b, c, d = arguments[3:]
-        pointers = _fours(context, builder, sig.args[0], *arguments[:3])
-        for half in (0, 8):  # pixels half to half + 8
-            pair = [n + k for n in range(half, half + 8) for k in (0, LANES)]
-            ab, cd = _shuffle(builder, a, b, pair), _shuffle(builder, c, d, pair)
-            for n in range(8):
-                four = _shuffle(builder, ab, cd, [2 * n, 2 * n + 1, LANES + 2 * n, LANES + 2 * n + 1])
-                builder.store(four, pointers[half + n]).align = 4
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, types.intp, a, b, c, d), lower
-
-
-@intrinsic
-def load_four(typing: Any, array: Any, index: Any, stride: Any) -> Any:
-    """The inverse of `store_four`: a tuple of four lanes."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        pixels = []
-        for pointer in _fours(context, builder, sig.args[0], *arguments):
-            value = builder.load(pointer)
-            value.align = 4
-            pixels.append(value)
-        while len(pixels) > 1:  # concatenate neighbours: one vector of 64, pixel by pixel
-            width = 2 * pixels[0].type.count
-            pixels = [
-                _shuffle(builder, pixels[n], pixels[n + 1], list(range(width)))
-                for n in range(0, len(pixels), 2)
-            ]
-        picks = [[4 * n + k for n in range(LANES)] for k in range(4)]
-        channels = [_shuffle(builder, pixels[0], pixels[0], pick) for pick in picks]
-        return context.make_tuple(builder, sig.return_type, channels)
-
-    return types.UniTuple(lanes16, 4)(array, types.intp, types.intp), lower
-
-
-@intrinsic
-def store_three(typing: Any, array: Any, index: Any, a: Any, b: Any, c: Any) -> Any:
-    """array.flat[index + 3 i : + 3] = a[i], b[i], c[i] for the sixteen i, unchecked."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        a, b, c = arguments[2:]
-        both = _shuffle(builder, a, b, list(range(2 * LANES)))
-        wide = _shuffle(builder, c, c, list(range(2 * LANES)))
-        for block in range(3):
-            picks = [n // 3 + LANES * (n % 3) for n in range(block * LANES, (block + 1) * LANES)]
-            at = builder.add(arguments[1], ir.Constant(arguments[1].type, block * LANES))
-            pointer = _pointer(context, builder, sig.args[0], arguments[0], at)
-            builder.store(_shuffle(builder, both, wide, picks), pointer).align = 4
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, a, b, c), lower
-
-
-@intrinsic
-def load_three(typing: Any, array: Any, index: Any) -> Any:
-    """The inverse of `store_three`: a tuple of three lanes."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        blocks = []
-        for block in range(3):
-            at = builder.add(arguments[1], ir.Constant(arguments[1].type, block * LANES))
-            value = builder.load(_pointer(context, builder, sig.args[0], arguments[0], at))
-            value.align = 4
-            blocks.append(value)
-        both = _shuffle(builder, blocks[0], blocks[1], list(range(2 * LANES)))
-        wide = _shuffle(builder, blocks[2], blocks[2], list(range(2 * LANES)))
-        channels = [_shuffle(builder, both, wide, [3 * n + k for n in range(LANES)]) for k in range(3)]
-        return context.make_tuple(builder, sig.return_type, channels)
-
-    return types.UniTuple(lanes16, 3)(array, types.intp), lower
-
-
-UNIT = 65535  # what stands for 1 in sixteen bits
-
-
-@intrinsic
-def load_units(typing: Any, array: Any, index: Any) -> Any:
-    """array.flat[index : index + 16] / UNIT of uint16, as lanes, unchecked."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
-        shorts = ir.VectorType(ir.IntType(16), LANES).as_pointer()
-        value = builder.load(builder.bitcast(builder.gep(data, [arguments[1]]), shorts))
-        value.align = 2
-        return builder.fmul(builder.sitofp(builder.zext(value, _INTS), _FLOATS), _constant(1 / UNIT))
-
-    return lanes16(array, types.intp), lower
-
-
-@intrinsic
-def store_units(typing: Any, array: Any, index: Any, value: Any) -> Any:
-    """array.flat[index : index + 16] = lanes in [0, 1] times UNIT, rounded, as uint16, unchecked."""
-
-    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        scaled = builder.fadd(builder.fmul(arguments[2], _constant(UNIT)), _constant(0.5))
-        shorts = ir.VectorType(ir.IntType(16), LANES)
-        data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
-        pointer = builder.bitcast(builder.gep(data, [arguments[1]]), shorts.as_pointer())
-        builder.store(builder.trunc(builder.fptosi(scaled, _INTS), shorts), pointer).align = 2
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, value), lower
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(INT, len(picks)), picks))
 
 
 @intrinsic
 def lanes(typing: Any, value: Any) -> Any:
     """Sixteen times the same float."""
-    return lanes16(value), lambda context, builder, sig, args: _broadcast(builder, args[0])
+    return lanes16(value), lambda context, builder, sig, args: as_lanes(builder, args[0])
 
 
 @intrinsic
 def ramp(typing: Any) -> Any:
     """0, 1, ... 15."""
-    values = ir.Constant(_FLOATS, [float(i) for i in range(LANES)])
+    values = ir.Constant(FLOATS, [float(i) for i in range(LANES)])
     return lanes16(), lambda context, builder, sig, args: values
 
 
@@ -281,14 +116,14 @@ def smaller(typing: Any, a: Any, b: Any) -> Any:
 
 
 def _select(builder: Any, comparison: str, a: Any, b: Any, yes: Any, no: Any) -> Any:
-    a, b, yes, no = (_broadcast(builder, value) for value in (a, b, yes, no))
+    a, b, yes, no = (as_lanes(builder, value) for value in (a, b, yes, no))
     return builder.select(builder.fcmp_ordered(comparison, a, b), yes, no)
 
 
 @intrinsic
 def reciprocal(typing: Any, value: Any) -> Any:
     """1 / value"""
-    return lanes16(value), lambda context, builder, sig, args: builder.fdiv(_constant(1), args[0])
+    return lanes16(value), lambda context, builder, sig, args: builder.fdiv(constant(1), args[0])
 
 
 @intrinsic
@@ -296,20 +131,18 @@ def exp2(typing: Any, power: Any) -> Any:
     """2^power for power <= 0.5, relative error 2e-7; powers below -100 give 2^-100."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        low = _constant(-100)
+        low = constant(-100)
         power = builder.select(builder.fcmp_ordered(">", arguments[0], low), arguments[0], low)
         # Conversion truncates, and power - 0.5 <= 0: so this rounds to the nearest integer.
-        whole = builder.fptosi(builder.fsub(power, _constant(0.5)), _INTS)
-        rest = builder.fsub(power, builder.sitofp(whole, _FLOATS))
-        result = _constant(_EXP2[-1])
+        whole = builder.fptosi(builder.fsub(power, constant(0.5)), INTS)
+        rest = builder.fsub(power, builder.sitofp(whole, FLOATS))
+        result = constant(_EXP2[-1])
         for coefficient in _EXP2[-2::-1]:
             product = builder.fmul(result, rest, flags=_FUSE)
-            result = builder.fadd(product, _constant(coefficient), flags=_FUSE)
+            result = builder.fadd(product, constant(coefficient), flags=_FUSE)
         # Multiplying by 2^whole is an addition to the exponent's bits.
-        bits = builder.add(
-            builder.bitcast(result, _INTS), builder.shl(whole, ir.Constant(_INTS, [23] * LANES))
-        )
-        return builder.bitcast(bits, _FLOATS)
+        bits = builder.add(builder.bitcast(result, INTS), builder.shl(whole, ir.Constant(INTS, [23] * LANES)))
+        return builder.bitcast(bits, FLOATS)
 
     return lanes16(power), lower
 
@@ -320,10 +153,10 @@ def _fold(builder: Any, value: Any, combine: Callable[[Any, Any], Any]) -> Any:
     while width > 1:
         width //= 2
         low, high = (
-            ir.Constant(ir.VectorType(_INT, width), list(range(start, start + width))) for start in (0, width)
+            ir.Constant(ir.VectorType(INT, width), list(range(start, start + width))) for start in (0, width)
         )
         value = combine(builder.shuffle_vector(value, value, low), builder.shuffle_vector(value, value, high))
-    return builder.extract_element(value, _INT(0))
+    return builder.extract_element(value, INT(0))
 
 
 @intrinsic
@@ -357,15 +190,15 @@ def store_totals(typing: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d:
             starts = [n + side for n in range(0, LANES, 2 * run) for side in (0, LANES)]
             even = [n + k for n in starts for k in range(run)]
             odd = [n + run + k for n in starts for k in range(run)]
-            return builder.fadd(_shuffle(builder, x, y, even), _shuffle(builder, x, y, odd))
+            return builder.fadd(shuffle(builder, x, y, even), shuffle(builder, x, y, odd))
 
         a, b, c, d = arguments[2:]
         value = merge(merge(a, b, 1), merge(c, d, 1), 2)  # lanes: a b c d a b c d ...
         for width in (8, 4):
             low, high = list(range(width)), list(range(width, 2 * width))
-            value = builder.fadd(_shuffle(builder, value, value, low), _shuffle(builder, value, value, high))
+            value = builder.fadd(shuffle(builder, value, value, low), shuffle(builder, value, value, high))
         data = context.make_array(sig.args[0])(context, builder, arguments[0]).data
-        pointer = builder.bitcast(builder.gep(data, [arguments[1]]), ir.VectorType(_FLOAT, 4).as_pointer())
+        pointer = builder.bitcast(builder.gep(data, [arguments[1]]), ir.VectorType(FLOAT, 4).as_pointer())
         builder.store(value, pointer).align = 4
         return context.get_dummy_value()
 
