@@ -73,8 +73,8 @@ def _notes(report: "CompactReport") -> list[str]:
         else f"derived from the change, if the scene has {report.assumed_psnr:g} dB"
     )
     lines = [
-        f"loss: {report.loss:.3f} dB of {report.budget:g} allowed, "
-        f"worst view {report.worst_loss:.2f} dB ({how})",
+        f"loss: {report.loss:.3f} dB of {report.budget:g} allowed, worst view {report.worst_loss:.2f} dB; "
+        f"{report.unseen_loss:.3f} dB before the measuring views had a say ({how})",
         f"pictures: PSNR {report.likeness:.1f} dB against those of the original",
         f"views: {report.ranking_views} ranked the Gaussians, {report.measuring_views} others measured; "
         f"{report.views_from}",

@@ -3,8 +3,10 @@
 Gaussians are ranked by their contribution to one group of views (`evaluation.contribution`). A second group,
 which had no say in that order, measures what the pictures lose. For every SH degree that the budget allows
 by itself, from the scene's own downward, the smallest number of Gaussians within the budget is found by
-bisection; the degree with the fewest bytes wins. Everything is measured as the target format stores it, and
-the file's own content is read back and measured once more before it takes its name.
+bisection; the degree with the fewest numbers wins. The contribution of the last Gaussian kept becomes a
+threshold, and only now the second group has a say too: whatever contributes more than that to any of its
+views is kept after all. Everything is measured as the target format stores it, and the file's own content is
+read back and measured before it takes its name.
 """
 
 import math
@@ -34,7 +36,7 @@ from langsplat_core.formats.sog import META_NAME
 from langsplat_core.pipeline.compact_views import Views, choose_views
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.numba_cpu import CpuRasterizer
-from langsplat_core.raster.protocol import Rasterizer
+from langsplat_core.raster.protocol import LiftingRasterizer, Rasterizer
 from langsplat_core.scene import SH_COUNTS, Scene
 
 RESOLUTION = 256  # the number of Gaussians is found to this fraction of the whole
@@ -50,7 +52,7 @@ class Weight:
     sh_degree: int
     disk_bytes: int  # in the target format, with language field and cameras
     memory_bytes: int  # arrays of the Gaussians, extra properties and language field
-    render_ms: float  # median over the measuring views, CPU backend; before and after drawn in turn
+    render_ms: float  # mean over the measuring views, CPU backend; before and after drawn in turn
     psnr: float | None  # mean against the photographs, dB; None without
 
 
@@ -60,16 +62,18 @@ class CompactReport:
 
     before: Weight
     after: Weight
+    source_bytes: int  # the scene as given, in its own format
     budget: float
+    unseen_loss: float  # mean, of what the ranking views alone chose: a guess for any other view
+    loss: float  # mean, of the file
+    worst_loss: float  # of any one view, of the file
     assumed_psnr: float | None  # None: measured against photographs
     likeness: float  # PSNR of the compact pictures against the original ones, mean, at most 100
+    threshold: float  # no dropped Gaussian contributes more to any view, display values times pixels
     ranking_views: int
     measuring_views: int
     views_from: str
     language: LanguageChange | None
-    loss: float = math.nan  # mean over views
-    worst_loss: float = math.nan  # of any one view
-    source_bytes: int = 0  # the scene as given, in its own format
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +92,16 @@ class Choice:
     sh_degree: int
 
 
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """What stays of a scene of N Gaussians."""
+
+    keep: Array  # (N,) bool
+    sh_degree: int
+    threshold: float  # no other Gaussian contributes more to any view
+    unseen_loss: float  # dB, mean over the measuring views, before these had a say
+
+
 def compact_scene(
     source: Path, out: Path, config: CompactConfig, photos: Path | None = None, progress: Progress = silent
 ) -> CompactReport:
@@ -103,31 +117,62 @@ def compact_scene(
     exposures = expose(rasterizer, scene, views.measuring, views.photographs)
     _check_likeness(exposures)
     before = _stored(scene, out)
-    order = _ranking(rasterizer, before.scene, views, progress)
-
-    def losses(candidate: Scene) -> Array:
-        return psnr_losses(rasterizer, candidate, exposures, config.assumed_psnr)
-
-    whole = Choice(len(order), before.scene.gaussians.sh_degree)
-    choice = smallest(
-        whole,
-        lambda choice: float(losses(_chosen(before.scene, order, choice)).mean()),
-        config.max_psnr_loss,
-        progress,
-    )
-    if choice is None or choice == whole:
-        what = "nothing can be dropped" if choice else "its format alone loses more than that: nothing fits"
-        raise InputError(f"{out}: within {config.max_psnr_loss} dB {what}; allow more with --max-psnr-loss")
-    candidate = _chosen(before.scene, order, choice)
+    selection = select(rasterizer, before.scene, views, exposures, config, progress)
+    candidate = reduced(before.scene, selection.keep, selection.sh_degree)
     after = _stored(candidate, out)
-    lost = losses(after.scene)
-    if not lost.mean() <= config.max_psnr_loss:
-        raise InputError(f"{out}: as stored it would lose {lost.mean():.3f} dB; not written, allow more")
-    report = _report(rasterizer, (replace(before, scene=scene), after), exposures, views, config)
-    save_scene(out, replace(candidate, path=out))
-    return replace(
-        report, source_bytes=disk_bytes(source), loss=float(lost.mean()), worst_loss=float(lost.max())
+    losses = psnr_losses(rasterizer, after.scene, exposures, config.assumed_psnr)
+    if not losses.mean() <= config.max_psnr_loss:
+        raise InputError(f"{out}: as stored it would lose {losses.mean():.3f} dB; not written, allow more")
+    weighed = _weights(rasterizer, (replace(before, scene=scene), after), exposures)
+    report = CompactReport(
+        before=weighed[0],
+        after=weighed[1],
+        source_bytes=disk_bytes(source),
+        budget=config.max_psnr_loss,
+        unseen_loss=selection.unseen_loss,
+        loss=float(losses.mean()),
+        worst_loss=float(losses.max()),
+        assumed_psnr=config.assumed_psnr if photos is None else None,
+        likeness=_likeness(rasterizer, after.scene, exposures),
+        threshold=selection.threshold,
+        ranking_views=len(views.ranking),
+        measuring_views=len(views.measuring),
+        views_from=views.origin,
+        language=_language(rasterizer, (scene, after.scene), views, config.phrases),
     )
+    save_scene(out, replace(candidate, path=out))
+    return report
+
+
+def select(
+    rasterizer: LiftingRasterizer,
+    scene: Scene,
+    views: Views,
+    exposures: Sequence[Exposure],
+    config: CompactConfig,
+    progress: Progress = silent,
+) -> Selection:
+    """What of `scene` to keep; `exposures` are those of ``views.measuring``. Raises InputError where nothing
+    is visible, nothing fits the budget or nothing can be dropped."""
+    score = contributions(rasterizer, scene, views.ranking, progress)
+    if not score.any():
+        raise InputError(f"no Gaussian of the scene is visible from {views.origin}")
+    order = np.argsort(-score, kind="stable")  # ties by index
+
+    def loss_of(choice: Choice) -> float:
+        candidate = reduced(scene, np.sort(order[: choice.count]), choice.sh_degree)
+        return float(psnr_losses(rasterizer, candidate, exposures, config.assumed_psnr).mean())
+
+    degree = scene.gaussians.sh_degree
+    choice = smallest(Choice(len(order), degree), loss_of, config.max_psnr_loss, progress)
+    if choice is None:
+        raise InputError(f"the new file's format alone loses more than {config.max_psnr_loss} dB; allow more")
+    threshold = float(score[order[choice.count - 1]])
+    keep = contributions(rasterizer, scene, views.measuring) > threshold
+    keep[order[: choice.count]] = True
+    if keep.all() and choice.sh_degree == degree:
+        raise InputError(f"nothing can be dropped within {config.max_psnr_loss} dB; allow more")
+    return Selection(keep, choice.sh_degree, threshold, loss_of(choice))
 
 
 def smallest(
@@ -202,59 +247,31 @@ def _stored(scene: Scene, out: Path) -> _Stored:
         return _Stored(load_scene(path), disk_bytes(path))
 
 
-def _ranking(rasterizer: CpuRasterizer, scene: Scene, views: Views, progress: Progress) -> Array:
-    """(N,) indices of the Gaussians by falling contribution, ties by index."""
-    score = contributions(rasterizer, scene, views.ranking, progress)
-    if not score.any():
-        raise InputError(f"no Gaussian of the scene is visible from {views.origin}")
-    return np.argsort(-score, kind="stable")
-
-
-def _chosen(scene: Scene, order: Array, choice: Choice) -> Scene:
-    """The first ``choice.count`` of `order`, in the scene's own order."""
-    return reduced(scene, np.sort(order[: choice.count]), choice.sh_degree)
-
-
 def _numbers(sh_degree: int) -> int:
     """Numbers of a Gaussian that any format must hold: position, scale, rotation, opacity, colour."""
     return 11 + 3 * SH_COUNTS[sh_degree]
 
 
-def _report(
-    rasterizer: Rasterizer,
-    pair: tuple[_Stored, _Stored],
-    exposures: Sequence[Exposure],
-    views: Views,
-    config: CompactConfig,
-) -> CompactReport:
-    """Everything but the loss itself and the size of the source."""
-    scenes = (pair[0].scene, pair[1].scene)
-    weights = []
-    for stored, milliseconds in zip(pair, _render_times(rasterizer, scenes, exposures), strict=True):
-        own = stored.scene
-        weights.append(
-            Weight(
-                gaussians=len(own.gaussians),
-                sh_degree=own.gaussians.sh_degree,
-                disk_bytes=stored.disk_bytes,
-                memory_bytes=memory_bytes(own),
-                render_ms=milliseconds,
-                psnr=_truth(rasterizer, own, exposures),
-            )
+def _weights(
+    rasterizer: Rasterizer, pair: tuple[_Stored, _Stored], exposures: Sequence[Exposure]
+) -> list[Weight]:
+    times = _render_times(rasterizer, (pair[0].scene, pair[1].scene), exposures)
+    return [
+        Weight(
+            gaussians=len(stored.scene.gaussians),
+            sh_degree=stored.scene.gaussians.sh_degree,
+            disk_bytes=stored.disk_bytes,
+            memory_bytes=memory_bytes(stored.scene),
+            render_ms=milliseconds,
+            psnr=_truth(rasterizer, stored.scene, exposures),
         )
-    pictures = [(np.clip(draw(rasterizer, scenes[1], e.camera)[1], 0, 1), e.original) for e in exposures]
-    photographed = any(exposure.photograph is not None for exposure in exposures)
-    return CompactReport(
-        before=weights[0],
-        after=weights[1],
-        budget=config.max_psnr_loss,
-        assumed_psnr=None if photographed else config.assumed_psnr,
-        likeness=float(np.mean([psnr(*pair) for pair in pictures])),
-        ranking_views=len(views.ranking),
-        measuring_views=len(views.measuring),
-        views_from=views.origin,
-        language=_language(rasterizer, scenes, exposures, config.phrases),
-    )
+        for stored, milliseconds in zip(pair, times, strict=True)
+    ]
+
+
+def _likeness(rasterizer: Rasterizer, scene: Scene, exposures: Sequence[Exposure]) -> float:
+    pictures = [np.clip(draw(rasterizer, scene, exposure.camera)[1], 0, 1) for exposure in exposures]
+    return float(np.mean([psnr(new, e.original) for new, e in zip(pictures, exposures, strict=True)]))
 
 
 def _truth(rasterizer: Rasterizer, scene: Scene, exposures: Sequence[Exposure]) -> float | None:
@@ -267,7 +284,7 @@ def _truth(rasterizer: Rasterizer, scene: Scene, exposures: Sequence[Exposure]) 
 
 
 def _language(
-    rasterizer: Rasterizer, scenes: tuple[Scene, Scene], exposures: Sequence[Exposure], more: Sequence[str]
+    rasterizer: Rasterizer, scenes: tuple[Scene, Scene], views: Views, more: Sequence[str]
 ) -> LanguageChange | None:
     field = scenes[0].language
     if field is None:
@@ -278,19 +295,20 @@ def _language(
         from langsplat_core.semantics.clip import load_text_encoder  # imports torch
 
         encoder = load_text_encoder(field.encoder_id)
-    return language_change(rasterizer, scenes, [e.camera for e in exposures], phrases, encoder)
+    return language_change(rasterizer, scenes, views.measuring, phrases, encoder)
 
 
 def _render_times(
     rasterizer: Rasterizer, scenes: tuple[Scene, Scene], exposures: Sequence[Exposure]
 ) -> tuple[float, float]:
-    """Median milliseconds of a picture of each scene: projection, colours and blending. Drawn in turn, so
-    that another program's load falls on both."""
-    times: tuple[list[float], list[float]] = ([], [])
+    """Milliseconds of a picture of each scene (projection, colours and blending): the best of `ROUNDS` per
+    view, averaged over views. Drawn in turn, so that another program's load falls on both."""
+    seconds = np.full((len(exposures), 2), np.inf)
     for _ in range(ROUNDS):
-        for exposure in exposures:
-            for scene, spent in zip(scenes, times, strict=True):
+        for best, exposure in zip(seconds, exposures, strict=True):
+            for which, scene in enumerate(scenes):
                 start = time.perf_counter()
                 draw(rasterizer, scene, exposure.camera)
-                spent.append(1e3 * (time.perf_counter() - start))
-    return float(np.median(times[0])), float(np.median(times[1]))
+                best[which] = min(best[which], time.perf_counter() - start)
+    before, after = 1e3 * seconds.mean(0)
+    return float(before), float(after)
