@@ -5,6 +5,8 @@ import sys
 from tyro.extras import SubcommandApp
 
 from langsplat_core.cli.bench import BenchRaster
+from langsplat_core.cli.bench_load import BenchLoad
+from langsplat_core.cli.compact import Compact
 from langsplat_core.cli.convert import Convert
 from langsplat_core.cli.demo import DemoBuild, DemoDataset, DemoEncoder
 from langsplat_core.cli.evaluate import EvalSynthetic
@@ -21,10 +23,12 @@ def _parse(args: list[str]) -> Command:
     demo.command(name="encoder")(DemoEncoder)
     evaluate.command(name="synthetic")(EvalSynthetic)
     bench.command(name="raster")(BenchRaster)
+    bench.command(name="load")(BenchLoad)
     app = SubcommandApp()
     app.command(name="train")(Train)
     app.command(name="query")(QueryScene)
     app.command(name="convert")(Convert)
+    app.command(name="compact")(Compact)
     app.command(name="inspect")(Inspect)
     app.command(name="doctor")(Doctor)
     app.command(demo, name="demo", help="Make the bundled scene, its photographs and its encoder.")
