@@ -68,6 +68,16 @@ def gl_rasterizers(gl_session: Any) -> Iterator[dict[str, Any]]:
 @pytest.fixture(params=NAMES)
 def backend(request: pytest.FixtureRequest) -> Backend:
     """Each rasterizer in turn; one that cannot load here is skipped with its reason."""
+    return _backend(request)
+
+
+@pytest.fixture(params=NAMES[1:])
+def fast_backend(request: pytest.FixtureRequest) -> Backend:
+    """The same without the reference."""
+    return _backend(request)
+
+
+def _backend(request: pytest.FixtureRequest) -> Backend:
     try:
         return Backend(request.param, _load(request.param, request), *_PROMISES[request.param])
     except BackendError as error:

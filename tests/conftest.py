@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.backends import backend, gl_rasterizers
+from tests.backends import backend, fast_backend, gl_rasterizers
 from tests.gl_context import gl, gl_session
 from tests.measured import measured, print_measured
 
-__all__ = ["backend", "gl", "gl_rasterizers", "gl_session", "measured", "real_data"]
+__all__ = ["backend", "fast_backend", "gl", "gl_rasterizers", "gl_session", "measured", "real_data"]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
