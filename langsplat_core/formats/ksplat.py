@@ -104,7 +104,7 @@ def _check_sizes(sections: list[dict[str, Any]], level: int, left: int, path: Pa
                 f"{path}: a section of SH degree {section['degree']}, of {section['gaussians']} Gaussians in "
                 f"{section['places']} places; the file is damaged"
             )
-        if level and section["buckets"] and section["bucket_bytes"] < 12:
+        if level and section["gaussians"] and section["bucket_bytes"] < 12:
             raise FormatError(
                 f"{path}: buckets of {section['bucket_bytes']} bytes; expected 12, their centre"
             )
@@ -128,8 +128,9 @@ def _read_section(file: BinaryIO, section: dict[str, Any], main: dict[str, Any],
     rows = np.frombuffer(file.read(section["places"] * layout.itemsize), layout)[:count]
     with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers make rows that are dropped later
         means = rows["position"].astype(np.float64)
-        if level:
-            centres = np.frombuffer(buckets, "u1").reshape(section["buckets"], -1)[:, :12].copy().view("<f4")
+        if level and count:
+            centres = np.frombuffer(buckets, "u1").reshape(section["buckets"], section["bucket_bytes"])
+            centres = centres[:, :12].copy().view("<f4")
             code_range = section["range"] or 32767
             means = (means - code_range) / code_range * section["side"] / 2
             means += centres[_bucket_of_rows(section, partial, path)]

@@ -21,6 +21,7 @@ from langsplat_core.formats.inria_layout import SH_C0
 from langsplat_core.formats.opening import open_for_reading
 from langsplat_core.scene import Gaussians
 
+HUGE = 1e12  # world units that no Gaussian of a real scene has
 _RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
 
 
@@ -39,13 +40,12 @@ def read_splat(path: Path | str) -> Gaussians:
                 "is truncated or not a .splat"
             )
         rows = np.frombuffer(file.read(size), _RECORD)
-    # Nothing else in the file tells it from noise, of which seven rows in eight have a negative scale.
+    # Nothing else in the file tells it from noise, whose floats are negative, not finite or enormous.
     with np.errstate(invalid="ignore"):
-        sound = np.isfinite(rows["position"]).all(1) & (rows["scale"] >= 0).all(1)
-    if sound.sum() < len(rows) / 2:
-        raise FormatError(
-            f"{path}: {len(rows) - sound.sum()} of {len(rows)} rows are no Gaussians; not a .splat"
-        )
+        sound = (np.abs(rows["position"]) < HUGE).all(1) & (rows["scale"] >= 0).all(1)
+        sound &= (rows["scale"] < HUGE).all(1)
+    if sound.mean() < 0.9:
+        raise FormatError(f"{path}: not a .splat: {(~sound).sum()} of {len(rows)} rows are no Gaussians")
     return Gaussians(
         means=rows["position"],
         log_scales=log_of_scales(rows["scale"]),
@@ -59,15 +59,16 @@ def write_splat(path: Path | str, gaussians: Gaussians) -> None:
     """Write the Gaussians in their order, atomically, without their view dependence.
 
     Colours and opacities are rounded to 1/255 (colours beyond 0..1 are cut off), rotations to 1/128 per
-    component; positions and scales stay exact.
+    component; positions and scales stay exact. A row that cannot be drawn is written with opacity 0.
     """
+    valid = gaussians.valid()
+    drawn = gaussians.take(valid)
     rows = np.zeros(len(gaussians), _RECORD)
-    rows["position"] = gaussians.means
-    with np.errstate(over="ignore"):
-        rows["scale"] = np.exp(gaussians.log_scales)
-    rows["colour"][:, :3] = to_bytes((0.5 + SH_C0 * gaussians.sh[:, 0]) * 255)
-    rows["colour"][:, 3] = to_bytes(sigmoid(gaussians.opacity_logits) * 255)
-    rows["rotation"] = to_bytes(unit(gaussians.quats_wxyz.astype(np.float64)) * 128 + 128)
+    rows["position"][valid] = drawn.means
+    rows["scale"][valid] = np.exp(drawn.log_scales)
+    rows["colour"][valid, :3] = to_bytes((0.5 + SH_C0 * drawn.sh[:, 0]) * 255)
+    rows["colour"][valid, 3] = to_bytes(sigmoid(drawn.opacity_logits) * 255)
+    rows["rotation"][valid] = to_bytes(unit(drawn.quats_wxyz.astype(np.float64)) * 128 + 128)
     with atomic_path(path) as temporary:
         temporary.write_bytes(rows.tobytes())
 
@@ -84,5 +85,5 @@ def log_of_scales(scales: Array) -> Array:
 
 
 def to_bytes(values: Array) -> Array:
-    """Rounded and clipped to uint8; NaN becomes 0."""
-    return np.clip(np.rint(np.nan_to_num(values, nan=0)), 0, 255).astype(np.uint8)
+    """Rounded and clipped to uint8."""
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)

@@ -51,7 +51,7 @@ def read_spz_scene(path: Path | str) -> Scene:
     packed = read_packed(Path(path))
     blocks, signs = packed.blocks, _signs_to_rdf(packed.axes)
     count, degree = len(blocks["alphas"]), min(packed.sh_degree, 3)
-    rest = blocks["sh"].reshape(count, -1, 3)[:, : SH_COUNTS[degree] - 1]
+    rest = blocks["sh"].reshape(count, blocks["sh"].shape[1] // 3, 3)[:, : SH_COUNTS[degree] - 1]
     rest = (rest.astype(np.float32) - 128) / 128 * _coefficient_signs(signs, rest.shape[1])[:, None]
     base = (blocks["colours"] / 255 - 0.5) / COLOUR_SCALE
     gaussians = Gaussians(
@@ -68,37 +68,38 @@ def write_spz(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
     """Write .spz version 3, atomically; rows keep their order.
 
     Positions are rounded to 1/4096 world unit, or finer where the Gaussians are smaller than that; scales
-    to a factor of 2^(1/22), within e^-10 to e^5.9; coefficients to 1/128, within -1 to 1; colours and
-    opacities as `Packed` has them. A row that cannot be drawn is written with opacity 0. Raises InputError
-    for a scene so large that its positions cannot be told apart in 24 bits.
+    to 1/16 in the logarithm, within e^-10 to e^5.9; coefficients to 1/128, within -1 to 1 (other
+    writers round them to 1/16 and 1/8, for still smaller files); colours and opacities to 1/255. A row that
+    cannot be drawn is written with opacity 0. Raises InputError for a scene so large that 24 bits cannot tell
+    its positions apart.
     """
     valid = gaussians.valid()
-    means = np.where(valid[:, None], gaussians.means, 0).astype(np.float64)
-    bits = _fractional_bits(means[valid], gaussians.log_scales[valid], Path(path))
+    drawn = gaussians.take(valid)
+    bits = _fractional_bits(drawn, Path(path))
     signs = _signs_to_rdf(AXES_RUB)  # half a turn, its own inverse
-    codes = np.rint(means * signs * 2.0**bits).astype("<i4")
-    rest = gaussians.sh[:, 1:] * _coefficient_signs(signs, gaussians.sh.shape[1] - 1)[:, None]
-    with np.errstate(over="ignore", invalid="ignore"):
-        blocks = {
-            "positions": codes[..., None].view(np.uint8)[..., :3].reshape(-1, 9),
-            "alphas": to_bytes(np.where(valid, sigmoid(gaussians.opacity_logits), 0) * 255)[:, None],
-            "colours": to_bytes((gaussians.sh[:, 0] * COLOUR_SCALE + 0.5) * 255),
-            "scales": to_bytes((gaussians.log_scales + 10) * 16),
-            "rotations": _rotation_codes(
-                np.where(valid[:, None], gaussians.quats_wxyz, [1, 0, 0, 0]) * _quaternion_signs(signs)
-            ),
-            "sh": to_bytes(rest.reshape(len(rest), -1) * 128 + 128),
-        }
+    codes = np.rint(drawn.means.astype(np.float64) * signs * 2.0**bits).astype("<i4")
+    rest = drawn.sh[:, 1:] * _coefficient_signs(signs, drawn.sh.shape[1] - 1)[:, None]
+    coded = {
+        "positions": codes[..., None].view(np.uint8)[..., :3].reshape(-1, 9),
+        "alphas": to_bytes(sigmoid(drawn.opacity_logits) * 255)[:, None],
+        "colours": to_bytes((drawn.sh[:, 0] * COLOUR_SCALE + 0.5) * 255),
+        "scales": to_bytes((drawn.log_scales + 10) * 16),
+        "rotations": _rotation_codes(drawn.quats_wxyz * _quaternion_signs(signs)),
+        "sh": to_bytes(rest.reshape(len(rest), 3 * rest.shape[1]) * 128 + 128),
+    }
+    blocks = {name: np.zeros((len(valid), code.shape[1]), np.uint8) for name, code in coded.items()}
+    for name, code in coded.items():
+        blocks[name][valid] = code
     write_packed(path, Packed(3, gaussians.sh_degree, bits, antialiased, AXES_RUB, blocks))
 
 
-def _fractional_bits(means: Array, log_scales: Array, path: Path) -> int:
+def _fractional_bits(drawn: Gaussians, path: Path) -> int:
     """As many as other writers use, more for a small scene, fewer for a large one."""
-    if len(means) == 0:
+    if len(drawn) == 0:
         return FRACTIONAL_BITS
-    reach = max(float(np.abs(means).max()), 1e-30)
+    reach = max(float(np.abs(drawn.means).max()), 1e-30)
     most = int(np.floor(np.log2((2**23 - 1) / reach)))
-    size = float(np.median(log_scales.max(axis=1)))  # logarithm of a typical Gaussian's longest axis
+    size = float(np.median(drawn.log_scales.max(axis=1)))  # logarithm of a typical Gaussian's longest axis
     least = int(np.ceil(-size / np.log(2))) if np.isfinite(size) else 0  # a step of its size
     if most < min(least, FRACTIONAL_BITS):
         raise InputError(

@@ -1,26 +1,32 @@
 """Files that are damaged, or made to harm: each ends in one FormatError or InputError, in little memory."""
 
+import gzip
 import io
 import json
 import struct
 import tracemalloc
 import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 from PIL import Image
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.formats import (
+    load_gaussians,
     read_cameras,
     read_features,
+    read_ksplat,
     read_language,
     read_ply,
     read_sog,
+    read_splat,
+    read_spz_scene,
     write_cameras,
     write_features,
     write_language,
@@ -34,6 +40,7 @@ from tests.core.file_samples import (
     write_folder,
     zipped,
 )
+from tests.core.splat_samples import ksplat_bytes, splat_bytes, spz_bytes
 from tests.scenes import random_camera, random_gaussians
 
 SCENE = random_gaussians(20, sh_degree=1)
@@ -68,6 +75,14 @@ KINDS: dict[str, tuple[str, Callable[[Path], bytes], Callable[[Path], object]]] 
     "ascii ply": ("a.ply", lambda _: ascii_ply(random_gaussians(5)), read_ply),
     "compressed ply": ("a.ply", lambda _: compressed_ply(SCENE), read_ply),
     "sog": ("a.sog", lambda _: zipped(sog_files(SCENE)), read_sog),
+    "splat": ("a.splat", lambda _: splat_bytes(SCENE), read_splat),
+    "ksplat": ("a.ksplat", lambda _: ksplat_bytes([SCENE], 2), read_ksplat),
+    "spz 3": ("a.spz", lambda _: spz_bytes(SCENE, 3), read_spz_scene),
+    "spz 4": (
+        "a.spz",
+        lambda _: spz_bytes(SCENE, 4, flags=2, records=struct.pack("<III", 7, 4, 0)),
+        read_spz_scene,
+    ),
     "sidecar": (
         "a.langsplat.safetensors",
         written(lambda path: write_language(path, random_field(20), SCENE.means)),
@@ -130,9 +145,11 @@ def test_truncated_at_many_places(tmp_path, bounded, kind):
     places = {*range(0, size, max(1, size // 150)), *range(size - 12, size)}
     # The last number of an ascii file can lose digits, and the line feed behind JSON means nothing.
     harmless = {"ascii ply": reader.sample.rfind(b" ") + 2, "cameras": size - 1}.get(kind, size)
-    for count, place in enumerate(sorted(places), start=1):
+    for place in sorted(places):
+        refused = reader.refused
         reader(reader.sample[:place])
-        assert place >= harmless or reader.refused == count
+        # nothing in a .splat tells how many Gaussians follow
+        assert reader.refused > refused or place >= harmless or (kind == "splat" and place % 32 == 0 < place)
 
 
 def damage(sample: bytes, rng: np.random.Generator) -> bytes:
@@ -262,6 +279,75 @@ def test_a_meta_of_gigabytes(tmp_path, bounded):
         read_sog(folder)
     with pytest.raises(FormatError, match="never exceeds"):
         read_cameras(folder / "meta.json")
+
+
+def zeros(size: int) -> Iterator[bytes]:
+    for _ in range(size >> 20):
+        yield bytes(1 << 20)
+
+
+def test_spz_streams_that_unfold_to_gigabytes(tmp_path, bounded):
+    """Zeros are legal Gaussians, and compress a thousand times or more."""
+    path = tmp_path / "a.spz"
+    count = (128 << 20) // 20
+    for claimed, message in ((count, "the file can hold"), (5, "more than 1048576 bytes behind")):
+        with gzip.open(path, "wb", compresslevel=1) as file:
+            file.write(b"NGSP" + struct.pack("<IIBBBB", 3, claimed, 0, 12, 0, 0))
+            for part in zeros(129 << 20):
+                file.write(part)
+        assert path.stat().st_size < 1 << 20
+        with pytest.raises(FormatError, match=message):
+            read_spz_scene(path)
+
+
+def spz_4_of_zeros(count: int, claimed: int, path: Path) -> None:
+    """Streams for `count` Gaussians in a file that says `claimed`."""
+    frames, sizes = [], [9, 1, 3, 3, 4]
+    for width in sizes:
+        packer = zstandard.ZstdCompressor().compressobj()  # without the size in its header
+        frames.append(
+            b"".join(packer.compress(part) for part in zeros(count * width + 1048575)) + packer.flush()
+        )
+    table = [struct.pack("<QQ", len(f), claimed * w) for f, w in zip(frames, sizes, strict=True)]
+    header = b"NGSP" + struct.pack("<IIBBBBI12x", 4, claimed, 0, 12, 0, 5, 32)
+    path.write_bytes(header + b"".join(table) + b"".join(frames))
+
+
+def test_spz_4_streams_that_unfold_to_gigabytes(tmp_path, bounded):
+    path = tmp_path / "a.spz"
+    for claimed, message in ((1 << 23, "cannot be in a file of"), (5, "fewer or more than the 45 bytes")):
+        spz_4_of_zeros(1 << 23, claimed, path)
+        assert path.stat().st_size < 1 << 20
+        with pytest.raises(FormatError, match=message):
+            read_spz_scene(path)
+    frame = zstandard.ZstdCompressor().compress(bytes(100))
+    frame = frame[:4] + bytes([0xE0]) + struct.pack("<Q", 10**12) + frame[6:]  # of a size of 10^12
+    content = spz_bytes(random_gaussians(5), 4)
+    old = struct.unpack_from("<Q", content, 32)[0]
+    start = 32 + 5 * 16
+    path.write_bytes(
+        content[:32] + struct.pack("<Q", len(frame)) + content[40:start] + frame + content[start + old :]
+    )
+    with pytest.raises(FormatError, match=r"cannot be unpacked|fewer or more"):
+        read_spz_scene(path)
+
+
+@pytest.mark.parametrize("at", [4, 16, 4096, 4100, 4108, 4132])
+@pytest.mark.parametrize("count", [10**6, 2**31, 2**32 - 1])
+def test_ksplat_counts_of_what_is_not_there(tmp_path, bounded, at, count):
+    content = bytearray(ksplat_bytes([SCENE], 1))
+    struct.pack_into("<I", content, at, count)
+    (tmp_path / "a.ksplat").write_bytes(content)
+    with pytest.raises(FormatError):
+        read_ksplat(tmp_path / "a.ksplat")
+
+
+@pytest.mark.parametrize("name", ["a.ksplat", "a.spz"])
+def test_files_of_a_terabyte_of_nothing(tmp_path, bounded, name):
+    with (tmp_path / name).open("wb") as file:
+        file.truncate(10**12)  # a hole: takes no room on the disk
+    with pytest.raises(FormatError):
+        load_gaussians(tmp_path / name)
 
 
 def ply_with(line: str, body: bytes = b"") -> bytes:
