@@ -35,6 +35,20 @@ def _sum_over_tiles(rank: int, tiles: Tiles, partial: Array, sums: Array) -> Non
 
 
 @helper
+def _fetch(i: int, rows: cp.Rows, out: ParameterGradients) -> None:
+    """Ask for the rows of Gaussian `i`: depth order is a random order in memory."""
+    row = np.int64(i)
+    prefetch(rows.means, 3 * row)
+    prefetch(rows.log_scales, 3 * row)
+    prefetch(rows.quats_wxyz, 4 * row)
+    prefetch(rows.opacity_logits, row)
+    prefetch(out.means, 3 * row)
+    prefetch(out.log_scales, 3 * row)
+    prefetch(out.quats_wxyz, 4 * row)
+    prefetch(out.values, out.values.shape[1] * row)
+
+
+@helper
 def _footprint_gradient(g: Array, moments: Array) -> tuple[float, float, cp.Point]:
     """Gradient by the 2D mean, and by the 2D covariance (a symmetric matrix's xx, xy, yy).
 
@@ -165,6 +179,7 @@ def to_parameters(
     work, by_b, by_turn = np.empty((3, 3, 3)), np.empty((2, 3)), np.empty((3, 3))
     r = lens.rotation
     for rank in range(first, last):
+        _fetch(order[min(rank + AHEAD, last - 1)], rows, out)
         i = order[rank]
         _sum_over_tiles(rank, tiles, partial, sums)
         for channel in range(out.values.shape[1]):
