@@ -2,13 +2,15 @@
 
 It is a baseline, so it is made as fast as tensors allow: projection of all Gaussians at once, a radix sort
 into tiles of 16x16 pixels, tiles of like length blended together in steps that stay in cache, tiles that are
-opaque dropped after every step, and gradients step by step through autograd, so that no picture's worth of
-weights is ever held. Image formation is that of `raster/reference.py`. In float64 its gradients, which
+opaque dropped after every step, one group of tiles per thread (PyTorch's own threads meet after every
+operation, which here takes less time than the meeting), and gradients group by group through autograd, so
+that no picture's worth of weights is ever held. Image formation is that of `raster/reference.py`. In float64 its gradients, which
 autograd derives and nobody wrote, serve the benchmark as the truth.
 """
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -21,9 +23,11 @@ from langsplat_core.scene import Camera, Gaussians
 
 TILE = 16
 PIXELS = TILE * TILE
-_STEP = 64  # Gaussians of a tile that are blended at once
-_TILES = 32  # tiles that are blended together: 32 * 64 * 256 float32 numbers fill 2 MiB
+_STEP = 32  # Gaussians of a tile that are blended at once
+_TILES = 16  # tiles that are blended together: 16 * 32 * 256 float32 numbers fill half a MiB
 _NEVER = -1e4  # logarithm of the opacity that fills a short tile up
+_T = TypeVar("_T")
+_Used = list[tuple[Tensor, list[Tensor]]]  # rows of the tables that a step read, and its leaves
 
 
 class Footprints(NamedTuple):
@@ -146,8 +150,10 @@ class TorchView:
         picture = torch.zeros(lines * self._bins.columns, PIXELS, channels + 1, dtype=self._kind)
         tables = self._tables(values)
         with torch.no_grad():
-            for tiles in self._groups(torch.arange(len(picture))):
-                picture[tiles] = self._blend(tiles, tables, [])
+            for tiles, blended in self._over_groups(
+                torch.arange(len(picture)), lambda tiles: self._blend(tiles, tables, None)
+            ):
+                picture[tiles] = blended
         picture = picture.reshape(lines, self._bins.columns, TILE, TILE, channels + 1)
         whole = picture.transpose(1, 2).reshape(lines * TILE, self._bins.columns * TILE, channels + 1).numpy()
         whole = whole[: self.camera.height, : self.camera.width]
@@ -158,9 +164,13 @@ class TorchView:
         grads = self._grad_tiles(image_grad)
         tables = self._tables(values)
         sums = [torch.zeros_like(table) for table in tables]
-        for tiles in self._groups(grads.abs().amax((1, 2)).nonzero()[:, 0]):
-            used: list[tuple[Tensor, list[Tensor]]] = []
+
+        def group(tiles: Tensor) -> _Used:
+            used: _Used = []
             (self._blend(tiles, tables, used)[..., :-1] * grads[tiles]).sum().backward()
+            return used
+
+        for _, used in self._over_groups(grads.abs().amax((1, 2)).nonzero()[:, 0], group):
             for index, leaves in used:
                 for total, leaf in zip(sums, leaves, strict=True):
                     assert leaf.grad is not None  # every leaf enters the picture
@@ -195,17 +205,27 @@ class TorchView:
         tiles = whole.reshape(lines, TILE, columns, TILE, channels).transpose(1, 2)
         return tiles.reshape(-1, PIXELS, channels)
 
-    def _groups(self, tiles: Tensor) -> Iterator[Tensor]:
-        """Tiles that are not empty, in groups of like length."""
+    def _over_groups(self, tiles: Tensor, work: Callable[[Tensor], _T]) -> Iterator[tuple[Tensor, _T]]:
+        """Groups of tiles of like length, the longest first, without those that are empty; and what `work`
+        makes of each, one group per thread at a time."""
         lengths = self._bins.starts.diff()[tiles]
-        order = lengths.sort().indices
-        return iter(tiles[order[lengths[order] > 0]].split(_TILES))
+        order = lengths.sort(descending=True).indices
+        groups = tiles[order[lengths[order] > 0]].split(_TILES)
+        threads, graded = torch.get_num_threads(), torch.is_grad_enabled()
 
-    def _blend(self, tiles: Tensor, tables: list[Tensor], used: list[tuple[Tensor, list[Tensor]]]) -> Tensor:
-        """(B,) tiles -> (B, 256, C + 1) blended values and alpha.
+        def alone(group: Tensor) -> _T:
+            with torch.set_grad_enabled(graded):  # is a setting of each thread
+                return work(group)
 
-        With gradients enabled `used` receives the rows of the tables that each step read, and its leaves.
-        """
+        try:
+            torch.set_num_threads(1)
+            with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+                yield from zip(groups, pool.map(alone, groups), strict=True)
+        finally:
+            torch.set_num_threads(threads)
+
+    def _blend(self, tiles: Tensor, tables: list[Tensor], used: _Used | None) -> Tensor:
+        """(B,) tiles -> (B, 256, C + 1) blended values and alpha; `used` collects leaves for gradients."""
         bins, settings = self._bins, self._settings
         starts, ends = bins.starts[tiles], bins.starts[tiles + 1]
         corners = TILE * torch.stack([tiles % bins.columns, tiles // bins.columns], 1)[:, None].double()
@@ -213,27 +233,28 @@ class TorchView:
         total = torch.zeros(len(tiles), PIXELS, tables[2].shape[1], dtype=self._kind)
         clear = torch.ones(len(tiles), 1, PIXELS, dtype=self._kind)
         alive = torch.arange(len(tiles))
+        done: list[tuple[Tensor, Tensor]] = []
         for start in range(0, int((ends - starts).max()), _STEP):
             places = starts[alive, None] + start + torch.arange(_STEP)
             inside = places < ends[alive, None]
             index = torch.where(inside, bins.ranks[places.clamp(max=len(bins.ranks) - 1)], len(tables[0]) - 1)
             leaves = [(tables[0][index] - corners[alive]).to(self._kind), tables[1][index], tables[2][index]]
-            if torch.is_grad_enabled():
+            if used is not None:
                 leaves = [leaf.requires_grad_() for leaf in leaves]
                 used.append((index, leaves))
             alphas = _alphas(leaves[0], leaves[1], centres, settings)
             behind = (1 - alphas).cumprod(1) * clear
             weights = alphas * (behind / (1 - alphas)) * (behind > settings.transmittance_min)
-            total = total.index_add(0, alive, weights.transpose(1, 2) @ leaves[2])
+            total = torch.baddbmm(total, weights.transpose(1, 2), leaves[2])
             clear = behind[:, -1:]
-            running = (clear.detach().amax((1, 2)) > settings.transmittance_min) & (
-                ends[alive] - starts[alive] > start + _STEP
-            )
+            running = clear.detach().amax((1, 2)) > settings.transmittance_min
+            running &= ends[alive] - starts[alive] > start + _STEP
             if not bool(running.all()):
-                alive, clear = alive[running], clear[running]
+                done.append((alive[~running], total[~running]))
+                alive, clear, total = alive[running], clear[running], total[running]
             if len(alive) == 0:
                 break
-        return total
+        return torch.cat([part for _, part in done])[torch.cat([which for which, _ in done]).argsort()]
 
 
 def _alphas(means: Tensor, shapes: Tensor, centres: Tensor, settings: RasterSettings) -> Tensor:
