@@ -18,8 +18,9 @@ from langsplat_core.scene import LEVELS, Camera, look_at
 POINTS = 20_000  # sparse points, as structure from motion would give
 _FIRST_ROOM = 2_000_000  # the demo encoder was trained in rooms of lower numbers only
 _LIGHT_SAMPLES = 40  # rays per vertex towards the lamp, and again towards the sky
+_LIGHT_CELL = 0.006  # metres between the places where light is gathered, where it varies
 _POINT_NOISE = 0.004  # metres, standard deviation
-LIGHT = Light(np.array([-0.9, -1.0, 1.7]))
+LIGHT = Light(np.array([-1.25, -1.05, 1.55]))
 # (share of the views, elevation in degrees, distance in metres, height of the target above the table)
 _RINGS = ((0.4, 24.0, 1.5, 0.0), (0.35, 42.0, 1.25, 0.02), (0.25, 33.0, 0.92, 0.06))
 
@@ -44,7 +45,7 @@ def write_dataset(out: Path, seed: int, views: int, size: tuple[int, int], progr
     folder.mkdir(parents=True, exist_ok=True)
     truth.mkdir(exist_ok=True)
     progress("rendering photographs", 0.0)
-    renderer = Renderer(world, LIGHT, samples=_LIGHT_SAMPLES)
+    renderer = Renderer(world, LIGHT, samples=_LIGHT_SAMPLES, cell=_LIGHT_CELL)
     for done, camera in enumerate(cameras):
         if not (truth / f"{camera.name}.npz").exists():
             _write_view(renderer, world, camera, out)

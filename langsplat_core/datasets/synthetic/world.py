@@ -26,13 +26,14 @@ class World:
     triangles: Array  # (T, 3) int32
     piece_of: Array  # (T,) int32 row of `materials` and `ids`
     materials: tuple[Material, ...]
+    frames: Array  # (P, 3, 3) rotation of every piece from its object's frame into the world
     ids: Array  # (P, 3) int32 label ids of every piece: subpart, part, whole
     labels: tuple[Label, ...]  # indexed by id
     solid: Array  # (T,) bool: surfaces that an outline of the room's objects should cover (not the room)
 
 
 @dataclass(frozen=True, eq=False)
-class _Placed:
+class Placed:
     thing: Thing
     turn: Array  # (3, 3)
     offset: Array  # (3,)
@@ -56,10 +57,10 @@ def _small_things(rng: np.random.Generator, count: int, palette: tuple[str, ...]
     return things
 
 
-def _on_table(things: list[Thing], rng: np.random.Generator) -> list[_Placed]:
+def _on_table(things: list[Thing], rng: np.random.Generator) -> list[Placed]:
     """Places without overlap of footprints, tall things towards the rim; what finds no place is left out."""
     half = np.array([0.68, 0.5])
-    placed: list[_Placed] = []
+    placed: list[Placed] = []
     taken: list[tuple[Array, float]] = []
     for thing in sorted(things, key=lambda thing: -thing.radius):
         radius = thing.radius * ENLARGED
@@ -68,12 +69,12 @@ def _on_table(things: list[Thing], rng: np.random.Generator) -> list[_Placed]:
             if all(np.linalg.norm(spot - at) > radius + r + 0.012 for at, r in taken):
                 taken.append((spot, radius))
                 turn = rotation_about("z", rng.uniform(0, 360))
-                placed.append(_Placed(thing, turn, np.array([*spot, 0.0]), ENLARGED))
+                placed.append(Placed(thing, turn, np.array([*spot, 0.0]), ENLARGED))
                 break
     return placed
 
 
-def _fill_bowls(placed: list[_Placed], rng: np.random.Generator) -> list[_Placed]:
+def _fill_bowls(placed: list[Placed], rng: np.random.Generator) -> list[Placed]:
     """Fruit inside every bowl and on every plate."""
     kit, fruit = Kit(rng), []
     for host in placed:
@@ -89,24 +90,24 @@ def _fill_bowls(placed: list[_Placed], rng: np.random.Generator) -> list[_Placed
             lift = 0.032 if host.thing.word == "bowl" else 0.013
             tilt = rotation_about("z", rng.uniform(0, 360)) @ rotation_about("x", rng.uniform(-12, 12))
             fruit.append(
-                _Placed(builder(kit, colour), tilt, host.offset + at + (0, 0, lift * ENLARGED), ENLARGED)
+                Placed(builder(kit, colour), tilt, host.offset + at + (0, 0, lift * ENLARGED), ENLARGED)
             )
     return fruit
 
 
-def _room(rng: np.random.Generator) -> list[_Placed]:
+def _room(rng: np.random.Generator) -> list[Placed]:
     kit, down = Kit(rng), np.array([0, 0, -furniture.TABLE_TOP])
-    placed = [_Placed(thing, np.eye(3), down) for thing in furniture.shell(kit)]
-    placed.append(_Placed(furniture.table(kit, kit.pick("brown", "beige")), np.eye(3), down))
+    placed = [Placed(thing, np.eye(3), down) for thing in furniture.shell(kit)]
+    placed.append(Placed(furniture.table(kit, kit.pick("brown", "beige")), np.eye(3), down))
     around = rng.permutation(4) * 90.0
     seats = (furniture.chair(kit, kit.pick(*BRIGHT)), furniture.stool(kit, kit.pick(*BRIGHT)))
     for seat, angle in zip(seats, around, strict=False):
         turn = rotation_about("z", angle)
-        placed.append(_Placed(seat, turn, turn @ (rng.uniform(-0.2, 0.2), 0.95, 0) + down))
+        placed.append(Placed(seat, turn, turn @ (rng.uniform(-0.2, 0.2), 0.95, 0) + down))
     for angle in around[:3]:
         turn = rotation_about("z", angle)
         at = turn @ (rng.uniform(-0.9, 0.9), furniture.ROOM / 2 - 0.03, rng.uniform(0.2, 0.55))
-        placed.append(_Placed(furniture.picture(kit, kit.pick("brown", "black", "white")), turn, at))
+        placed.append(Placed(furniture.picture(kit, kit.pick("brown", "black", "white")), turn, at))
     return placed
 
 
@@ -118,16 +119,17 @@ def build_world(seed: int, objects: int = 12, palette: tuple[str, ...] = COLOURS
     rng = np.random.default_rng((seed, 7))
     room = _room(rng)
     table = _on_table(_small_things(rng, objects, palette), rng)
-    return _assemble([*room, *table, *_fill_bowls(table, rng)])
+    return assemble([*room, *table, *_fill_bowls(table, rng)])
 
 
-def _assemble(placed: list[_Placed]) -> World:
+def assemble(placed: list[Placed]) -> World:
     """One set of arrays from placed things; ids count up through wholes, parts and subparts."""
     columns: dict[str, list[Array]] = {key: [] for key in ("v", "n", "l", "t", "p")}
     labels: list[Label] = []
     known: dict[tuple[object, ...], int] = {}
     ids: list[list[int]] = []
     materials: list[Material] = []
+    frames: list[Array] = []
     offset = 0
 
     def number(key: tuple[object, ...], level: int, thing: Thing, piece: Piece) -> int:
@@ -151,6 +153,7 @@ def _assemble(placed: list[_Placed]) -> World:
             columns["t"].append(mesh.triangles + offset)
             columns["p"].append(np.full(len(mesh.triangles), len(materials)))
             materials.append(piece.material)
+            frames.append(item.turn)
             offset += len(mesh.vertices)
     whole_words = [labels[row[2]].word for row in ids]
     solid = np.array([word not in ("floor", "wall") for word in whole_words])
@@ -162,6 +165,7 @@ def _assemble(placed: list[_Placed]) -> World:
         np.concatenate(columns["t"]).astype(np.int32),
         piece_of,
         tuple(materials),
+        np.stack(frames),
         np.array(ids, np.int32),
         tuple(labels),
         solid[piece_of],
