@@ -1,14 +1,28 @@
-"""What may stand in a room: builders of small objects and the colours each one comes in."""
+"""The vocabulary of things: builders of every class and the colours each one comes in."""
 
 from collections.abc import Callable
 
-from langsplat_core.datasets.synthetic import tableware, toys
+from langsplat_core.datasets.synthetic import (
+    animals,
+    clothes,
+    food,
+    furniture,
+    places,
+    tableware,
+    tools,
+    toys,
+    utensils,
+    vehicles,
+)
 from langsplat_core.datasets.synthetic.colours import COLOURS
 from langsplat_core.datasets.synthetic.parts import Kit, Thing
 
 Builder = Callable[[Kit, str], Thing]
 BRIGHT = tuple(word for word in COLOURS if word not in ("gray", "beige", "brown", "black"))
-# What may stand on the table, and the colours it comes in.
+_FUR = ("brown", "beige", "white", "gray", "pink", "blue", "purple")
+_WOOD = ("brown", "beige", "white", "red", "blue", "green", "yellow", "gray")
+_METAL = ("gray", "black", "red", "blue", "green", "turquoise", "white")
+# What rooms put on the table, which is what the bundled encoder was trained on.
 SMALL: dict[str, tuple[Builder, tuple[str, ...]]] = {
     "mug": (tableware.mug, COLOURS),
     "teapot": (tableware.teapot, COLOURS),
@@ -20,14 +34,67 @@ SMALL: dict[str, tuple[Builder, tuple[str, ...]]] = {
     "lamp": (tableware.lamp, BRIGHT),
     "book": (tableware.book, COLOURS),
     "clock": (tableware.clock, COLOURS),
-    "orange": (toys.orange, ("orange",)),
-    "apple": (toys.apple, ("red", "green", "yellow")),
-    "banana": (toys.banana, ("yellow",)),
+    "orange": (food.orange, ("orange",)),
+    "apple": (food.apple, ("red", "green", "yellow")),
+    "banana": (food.banana, ("yellow",)),
     "car": (toys.car, COLOURS),
     "block": (toys.block, COLOURS),
     "ball": (toys.toy_ball, COLOURS),
     "gift": (toys.gift, COLOURS),
-    "duck": (toys.duck, ("yellow", "pink", "blue", "white", "green", "orange", "red", "purple")),
+    "duck": (animals.duck, ("yellow", "pink", "blue", "white", "green", "orange", "red", "purple")),
     "house": (toys.house, COLOURS),
     "robot": (toys.robot, COLOURS),
 }
+# Everything that is small enough for a table.
+TABLE_TOP: dict[str, tuple[Builder, tuple[str, ...]]] = {
+    **SMALL,
+    "candle": (utensils.candle, (*BRIGHT, "beige")),
+    "pan": (utensils.pan, ("black", "gray", "red", "blue", "turquoise", "green", "orange")),
+    "wine glass": (
+        utensils.goblet,
+        ("white", "green", "blue", "turquoise", "red", "purple", "pink", "yellow"),
+    ),
+    "basket": (utensils.basket, BRIGHT),
+    "carrot": (food.carrot, ("orange",)),
+    "cake": (food.cake, ("pink", "white", "brown", "yellow", "green", "turquoise", "purple")),
+    "donut": (food.donut, ("pink", "brown", "white", "turquoise", "yellow", "purple", "green")),
+    "ice cream": (food.ice_cream, ("pink", "white", "brown", "green", "yellow", "turquoise", "purple")),
+    "burger": (food.burger, ("brown",)),
+    "train": (vehicles.train, COLOURS),
+    "truck": (vehicles.truck, COLOURS),
+    "airplane": (vehicles.airplane, COLOURS),
+    "boat": (vehicles.boat, COLOURS),
+    "rocket": (vehicles.rocket, COLOURS),
+    "teddy bear": (animals.teddy_bear, _FUR),
+    "rabbit": (animals.rabbit, ("white", "brown", "gray", "beige", "pink", "blue")),
+    "penguin": (animals.penguin, ("black", "blue", "gray", "purple", "turquoise", "green")),
+    "fish": (animals.fish, (*BRIGHT, "gray")),
+    "snail": (animals.snail, COLOURS),
+    "scissors": (tools.scissors, COLOURS),
+    "umbrella": (tools.umbrella, COLOURS),
+    "camera": (tools.camera, COLOURS),
+    "laptop": (tools.laptop, _METAL),
+    "headphones": (tools.headphones, COLOURS),
+    "globe": (tools.globe, ("blue", "turquoise", "purple", "gray", "black", "pink")),
+    "guitar": (tools.guitar, COLOURS),
+    "drum": (tools.drum, COLOURS),
+    "hat": (clothes.hat, COLOURS),
+    "shoe": (clothes.shoe, COLOURS),
+    "backpack": (clothes.backpack, COLOURS),
+    "snowman": (places.snowman, (*BRIGHT, "black")),
+    "windmill": (places.windmill, COLOURS),
+    "castle": (places.castle, ("gray", "beige", "brown", "pink", "white", "orange", "yellow", "purple")),
+    "cactus": (places.cactus, (*BRIGHT, "brown")),
+}
+# Life-size, standing on the floor; pictures hang on walls.
+FURNITURE: dict[str, tuple[Builder, tuple[str, ...]]] = {
+    "table": (furniture.table, ("brown", "beige")),
+    "chair": (furniture.chair, BRIGHT),
+    "stool": (furniture.stool, BRIGHT),
+    "sofa": (furniture.sofa, COLOURS),
+    "bed": (furniture.bed, COLOURS),
+    "shelf": (furniture.shelf, _WOOD),
+    "cabinet": (furniture.cabinet, _WOOD),
+    "picture": (furniture.picture, ("brown", "black", "white")),
+}
+EVERYTHING = {**TABLE_TOP, **FURNITURE}

@@ -15,7 +15,8 @@ Texture = Literal[
 ]  # fmt: skip
 
 Substance = Literal[
-    "plastic", "ceramic", "glass", "metal", "wood", "cloth", "paper", "plaster", "leaf", "skin", "rubber", "wax"
+    "plastic", "ceramic", "glass", "metal", "wood", "cloth", "paper", "plaster", "leaf", "skin", "rubber",
+    "wax",
 ]  # what it is made of: decides highlight, relief and fine mottling
 
 Word = TypeVar("Word", bound=str)

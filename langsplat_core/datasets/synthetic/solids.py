@@ -1,4 +1,4 @@
-"""More solids for builders: rods, rings, cones, rounded boxes, cut-out plates. Metres, z up, faces outwards."""
+"""More solids: rods, rings, cones, rounded boxes, cut-out boards. Metres, z up, triangles face outwards."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ def rod(start: Point | Array, stop: Point | Array, radius: float, end: float = 0
     heads = [a - axis * radius * s for s in np.sin(bend)] + [b + axis * last * s for s in np.sin(bend[::-1])]
     radii = [radius * c + 1e-6 for c in np.cos(bend)] + [last * c + 1e-6 for c in np.cos(bend[::-1])]
     mesh = tube(np.stack(heads), np.array(radii), around)
-    # About the nearer end's centre, so that a limb's side has no lean; faces of unequal size would give it one.
+    # About the nearer end's centre: means of faces of unequal size would make the side lean.
     centre = np.where((np.arange(len(heads)) < 5)[:, None], a, b).repeat(around + 1, axis=0)
     normals = mesh.vertices - centre
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Builders of fruit, toys and presents. Each takes a `Kit` and a colour word; front is -y, metres."""
+"""Builders of toys and presents. Each takes a `Kit` and a colour word; front is -y, metres."""
 
 import numpy as np
 
@@ -14,46 +14,6 @@ from langsplat_core.datasets.synthetic.shapes import (
     slab,
     tube,
 )
-
-
-def orange(kit: Kit, colour: str) -> Thing:
-    r = kit.size(0.045, 0.055)
-    stub = cylinder(0.007, 0.006, 10).moved((0, 0, 1.9 * r))
-    fruit = ball(r).stretched((1, 1, 0.96)).moved((0, 0, 0.96 * r))
-    return Thing("orange", "orange", (
-        Piece("peel", "", fruit, kit.paint("orange", "peel", 0.3)),
-        Piece("stem", "", stub, kit.paint("green")),
-    ))  # fmt: skip
-
-
-def apple(kit: Kit, colour: str) -> Thing:
-    r = kit.size(0.048, 0.056)
-    profile = ((0, 0.12), (0.35, 0.02), (0.8, 0.35), (1, 1.0), (0.9, 1.5), (0.55, 1.8), (0.2, 1.74), (0, 1.6))
-    fruit = lathe([(a * r, b * r) for a, b in profile], 32)
-    stalk = tube(np.array([(0, 0, 1.58), (0.05, 0, 1.85), (0.16, 0, 2.1)]) * r, 0.0035, 8)
-    blade = ball(0.5, 14).stretched((0.04, 0.018, 0.005)).turned(rotation_about("y", -25))
-    return Thing("apple", colour, (
-        Piece("skin", "", fruit, kit.paint(colour, "speckled", 0.5)),
-        Piece("stem", "", stalk, kit.paint("brown")),
-        Piece("leaf", "", blade.moved((0.025, 0, 1.98 * r)), kit.paint("green", "leaf")),
-    ))  # fmt: skip
-
-
-def banana(kit: Kit, colour: str) -> Thing:
-    bend, skin = kit.size(0.1, 0.13), kit.paint("yellow", "speckled", 0.2)
-    line = arc((0, 0), bend, 195, 345, 22)
-    thick = 0.0235 * np.sqrt(np.clip(1 - np.linspace(-0.93, 0.97, 22) ** 4, 0, 1)) + 0.003
-    lie = rotation_about("x", 90)
-    body = tube(line, thick, 14).turned(lie)
-    a, b = arc((0, 0), bend, 345, 356, 5), arc((0, 0), bend, 192, 195, 3)
-    stem = tube(a, np.array([0.009, 0.007, 0.006, 0.007, 0.0001]), 10).turned(lie)
-    tip = tube(b, np.array([0.0001, 0.007, 0.0095]), 10).turned(lie)
-    lift = (0.0, -0.7 * bend, 0.026)
-    return Thing("banana", "yellow", (
-        Piece("peel", "", body.moved(lift), skin),
-        Piece("stem", "", stem.moved(lift), kit.paint("green")),
-        Piece("tip", "", tip.moved(lift), kit.paint("brown")),
-    ))  # fmt: skip
 
 
 def car(kit: Kit, colour: str) -> Thing:
@@ -135,26 +95,6 @@ def gift(kit: Kit, colour: str) -> Thing:
         Piece("box", "", box(w, d, h), wrap),
         Piece("ribbon", "", bands, ribbon),
         Piece("ribbon", "bow", join([*loops, ball(0.014, 12)]).moved((0, 0, h + 0.02)), ribbon),
-    ))  # fmt: skip
-
-
-def duck(kit: Kit, colour: str) -> Thing:
-    r = kit.size(0.07, 0.085)
-    coat = kit.paint(colour, gloss=0.45)
-    trunk = ball(r).stretched((1.3, 1, 0.82)).moved((0, 0, 0.8 * r))
-    tail = slab([(0, 0), (0.5 * r, 0.12 * r), (0.62 * r, 0.5 * r)], 0.5 * r).moved((0.9 * r, 0, 0.9 * r))
-    wings = [
-        ball(r * 0.55, 18).stretched((1.2, 0.3, 0.7)).moved((0.2 * r, y * 0.95 * r, 0.9 * r)) for y in (-1, 1)
-    ]
-    head = ball(0.62 * r).moved((-0.75 * r, 0, 1.85 * r))
-    eyes = [ball(0.1 * r, 12).moved((-1.22 * r, y * 0.33 * r, 2.02 * r)) for y in (-1, 1)]
-    beak = ball(0.3 * r, 16).stretched((1.25, 0.9, 0.42)).moved((-1.42 * r, 0, 1.72 * r))
-    return Thing("duck", colour, (
-        Piece("body", "", join([trunk, tail]), coat),
-        Piece("body", "wing", join(wings), kit.paint(colour, gloss=0.3)),
-        Piece("head", "", head, coat),
-        Piece("head", "eyes", join(eyes), kit.paint("black", gloss=0.9)),
-        Piece("head", "beak", beak, kit.paint(kit.other(colour, "orange", "red"))),
     ))  # fmt: skip
 
 
