@@ -60,7 +60,10 @@ def read_compressed(file: BinaryIO, file_size: int, header: PlyHeader, path: Pat
             f"{path}: {chunk.count} chunks for {vertex.count} Gaussians; expected one for every {CHUNK_SIZE}"
         )
     bounds = _read_columns(file, file_size, header, chunk, bound_names, path).astype(np.float64)
-    packed = _read_columns(file, file_size, header, vertex, PACKED, path).astype(np.uint32)
+    packed = _read_columns(file, file_size, header, vertex, PACKED, path)
+    if not ((packed >= 0) & (packed < 2**32)).all():  # NaN compares False
+        raise FormatError(f"{path}: packed numbers beyond 32 bits; expected uint")
+    packed = packed.astype(np.uint32)
     position, rotation, scale, colour = packed.T
     of_chunk = np.arange(vertex.count) // CHUNK_SIZE
     rgba = np.stack([colour >> shift & 255 for shift in (24, 16, 8, 0)], axis=1) / 255

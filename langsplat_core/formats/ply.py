@@ -33,7 +33,7 @@ from langsplat_core.formats.inria_layout import (
 )
 from langsplat_core.formats.opening import open_for_reading
 from langsplat_core.formats.ply_body import CHUNK_ROWS, fill_columns, iterate_rows
-from langsplat_core.formats.ply_header import TYPE_NAMES, PlyElement, PlyHeader, read_ply_header
+from langsplat_core.formats.ply_header import TYPE_NAMES, PlyElement, PlyHeader, is_name, read_ply_header
 from langsplat_core.scene import Gaussians, Scene
 
 LAYOUT = "the layout"  # NumPy field of all its columns together; no PLY property has a name with a blank
@@ -129,7 +129,7 @@ def write_ply(
 
 def _check_extras(extras: Mapping[str, Array], names: tuple[str, ...]) -> None:
     for name, values in extras.items():
-        if name in names or name.startswith("f_rest_") or name.split() != [name]:
+        if name in names or name.startswith("f_rest_") or not is_name(name):
             raise InputError(f"{name!r} cannot be an extra property of a PLY: rename it")
         if values.dtype.str[1:] not in TYPE_NAMES:
             raise InputError(f"extra property {name!r} is of type {values.dtype}, which no PLY can hold")

@@ -9,6 +9,7 @@ import numpy as np
 from langsplat_core.errors import FormatError
 
 HEADER_LIMIT = 64 * 1024  # bytes; a real header of 62 properties takes about 1.5 KiB
+NAME_LIMIT = 64  # characters; the longest of known programs has 17
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONG_NAMES = {
     "i1": ("char", "int8"),
@@ -99,7 +100,7 @@ def _parse(lines: list[str], size: int, path: Path) -> PlyHeader:
         elif keyword == "format" and words and words[0] in BYTE_ORDERS:
             byte_order = BYTE_ORDERS[words[0]]
         elif keyword == "element" and len(words) == 2:
-            elements.append(PlyElement(words[0], _count(words, path), ()))
+            elements.append(PlyElement(_name(words[0], path), _count(words, path), ()))
         elif keyword == "property" and elements:
             last = elements[-1]
             elements[-1] = PlyElement(last.name, last.count, (*last.properties, _property(words, line, path)))
@@ -113,6 +114,17 @@ def _parse(lines: list[str], size: int, path: Path) -> PlyHeader:
     return PlyHeader(byte_order, tuple(elements), tuple(comments), size)
 
 
+def is_name(word: str) -> bool:
+    """Whether an element or property may be called so: names are shown in messages, in one line."""
+    return word.isprintable() and word.split() == [word] and len(word) <= NAME_LIMIT
+
+
+def _name(word: str, path: Path) -> str:
+    if not is_name(word):
+        raise FormatError(f"{path}: the header has the name {word[:40]!r}; expected a short printable word")
+    return word
+
+
 def _count(words: list[str], path: Path) -> int:
     # isdecimal refuses signs, and twenty digits are far beyond any file (int() of a million is slow)
     if not (words[1].isascii() and words[1].isdecimal() and len(words[1]) <= 20):
@@ -124,11 +136,12 @@ def _count(words: list[str], path: Path) -> int:
 
 def _property(words: list[str], line: str, path: Path) -> PlyProperty:
     if len(words) == 2 and words[0] in _TYPES:
-        return PlyProperty(words[1], _TYPES[words[0]])
+        return PlyProperty(_name(words[1], path), _TYPES[words[0]])
     if len(words) == 4 and words[0] == "list" and words[1] in _TYPES and words[2] in _TYPES:
+        name = _name(words[3], path)
         if _TYPES[words[1]].startswith("f"):
-            raise FormatError(f"{path}: list {words[3]!r} has a length of type {words[1]}; expected int")
-        return PlyProperty(words[3], _TYPES[words[2]], _TYPES[words[1]])
+            raise FormatError(f"{path}: list {name!r} has a length of type {words[1]}; expected int")
+        return PlyProperty(name, _TYPES[words[2]], _TYPES[words[1]])
     raise FormatError(f"{path}: header line {line[:60]!r} is not a valid property")
 
 
