@@ -33,7 +33,7 @@ def cut_off_band(view: ReferenceView, relative: float = BAND) -> Array:
         dy = (np.arange(y0, min(y1, height)) + 0.5 - f.means_px[i, 1])[:, None]
         xx, xy, yy = f.conics[i]
         power = -0.5 * (xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy)
-        alpha = np.minimum(f.opacities[i] * np.exp(power), settings.alpha_max)
+        alpha = np.minimum(f.opacities[i] * np.exp(power), float(np.float32(settings.alpha_max)))
         open_here, before = running[window], transmittance[window]
         after = before * (1 - alpha)
         hit = open_here & (alpha >= settings.alpha_min)

@@ -76,7 +76,7 @@ def render(
             continue
         offset = pixels - means_px[n]
         power = -0.5 * (offset @ torch.linalg.inv(covariance[n]) * offset).sum(1)
-        alpha = torch.clamp(opacity[n] * torch.exp(power), max=settings.alpha_max)
+        alpha = torch.clamp(opacity[n] * torch.exp(power), max=float(np.float32(settings.alpha_max)))
         hit = running & (alpha.detach() >= settings.alpha_min)
         stop = hit & ((transmittance * (1 - alpha)).detach() <= settings.transmittance_min)
         running = running & ~stop

@@ -9,7 +9,8 @@ Image formation, from top to bottom (constants in `config.RasterSettings`):
 3. alpha(u) = min(0.99, opacity * exp(-1/2 (u-m)^T cov^-1 (u-m))) at pixel centres u; alphas below 1/255
    are skipped, so a Gaussian's extent is the ellipse where alpha equals 1/255.
 4. Front to back by camera z, ties by index: weight = alpha * T, T <- T (1 - alpha); a pixel stops before
-   the Gaussian that would bring T to 1e-4 or below.
+   the Gaussian that would bring T to 1e-4 or below. The cap of 0.99 is the float32 next to it, as in every
+   kernel: two capped layers then leave T just below 1e-4, where the double nearest 0.99 leaves it just above.
 """
 
 from dataclasses import dataclass
@@ -110,6 +111,7 @@ class ReferenceView:
     def _weights(self):  # type: ignore[no-untyped-def]
         """Yield (index, window, weights, transmittance after) front to back: steps 3 and 4."""
         f, s = self.footprints, self.settings
+        alpha_max = np.float64(np.float32(s.alpha_max))
         height, width = self.camera.height, self.camera.width
         transmittance = np.ones((height, width))
         running = np.ones((height, width), bool)
@@ -123,7 +125,7 @@ class ReferenceView:
             dy = (np.arange(y0, y1) + 0.5 - f.means_px[i, 1])[:, None]
             xx, xy, yy = f.conics[i]
             alpha = f.opacities[i] * np.exp(-0.5 * (xx * dx**2 + 2 * xy * dx * dy + yy * dy**2))
-            alpha = np.minimum(s.alpha_max, alpha)
+            alpha = np.minimum(alpha_max, alpha)
             hit = running[window] & (alpha >= s.alpha_min)
             next_transmittance = transmittance[window] * (1 - alpha)
             stops = hit & (next_transmittance <= s.transmittance_min)

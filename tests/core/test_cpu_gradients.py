@@ -18,6 +18,15 @@ from tests.scenes import random_camera, random_gaussians, random_values
 PARAMETERS = ("means", "log_scales", "quats_wxyz", "opacity_logits")
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """torch's threads only wait for each other on tensors this small."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 def compare_with_autograd(gaussians, camera, settings=INRIA, channels=3):
     """1e-3 relative for every entry of every gradient; pixels at a cut-off carry no loss."""
     x = random_values(len(gaussians), channels, 1)

@@ -38,7 +38,7 @@ def run_case(case: Case, backend: Backend, measured: Measure) -> None:
     assert seen.alpha.min() >= 0
     assert seen.alpha.max() <= 1
     assert seen.view.dropped == case.dropped == sum(seen.drawing.gaussians.invalid_rows().values())
-    if case.compare:
+    if case.compare and backend.name != "reference":
         compare(seen, measured)
     if hasattr(seen.view, "gather"):
         check_adjoint(seen)
