@@ -29,11 +29,11 @@ MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
 HEADER_SIZE, HEADER_SIZE_4 = 16, 32
 ANTIALIASED, EXTENDED = 0x1, 0x2  # flags
 AXES_RECORD, AXES_RUB = 0xADBE0003, 4
-EXTENSION_LIMIT = 1024 * 1024  # bytes of all extension records; real ones have some tens
 SH_COUNTS = (1, 4, 9, 16, 25)  # of degree 0 to 4, the base colour included
 # Quantised Gaussians compress 3 to 1 at best. A file that claims to have gained 64 to 1 is made to
 # exhaust memory.
 BYTES_PER_BYTE = 64
+PIECE = 65536  # bytes read at once behind the blocks; extension records have some tens
 SLACK = 1024 * 1024  # bytes, for small files of equal Gaussians
 
 
@@ -72,7 +72,9 @@ def read_packed(path: Path) -> Packed:
                 with gzip.GzipFile(fileobj=file) as unzipped:
                     return _read_one_stream(unzipped, BYTES_PER_BYTE * size + SLACK, path)  # type: ignore[arg-type]
             except (OSError, EOFError, zlib.error) as error:
-                raise FormatError(f"{path}: not a whole gzip stream ({str(error)[:80]})") from None
+                raise FormatError(
+                    f"{path}: not a whole gzip stream ({str(error)[:80]}); fetch it again"
+                ) from None
         if start == MAGIC + b"\x04\0\0\0":
             return _read_streams(file, size, path)
         return _read_one_stream(file, size, path)
@@ -119,10 +121,17 @@ def _read_one_stream(file: BinaryIO, limit: int, path: Path) -> Packed:
     blocks = [file.read(size) for size in sizes]
     if sum(map(len, blocks)) < sum(sizes):
         raise FormatError(f"{path}: truncated: {header.count} Gaussians need {sum(sizes)} bytes")
-    behind = file.read(EXTENSION_LIMIT + 1)  # to the end, where gzip has its checksum
-    if len(behind) > EXTENSION_LIMIT:
-        raise FormatError(f"{path}: more than {EXTENSION_LIMIT} bytes behind its {header.count} Gaussians")
+    behind = file.read(PIECE)
+    _read_to_the_end(file, limit - HEADER_SIZE - sum(sizes) - len(behind), path)
     return header.packed(_axes(behind if header.flags & EXTENDED else b"", path), blocks)
+
+
+def _read_to_the_end(file: BinaryIO, limit: int, path: Path) -> None:
+    """Where gzip has its checksum. Other programs' data may lie before it, of at most `limit` bytes."""
+    while piece := file.read(PIECE):
+        limit -= len(piece)
+        if limit < 0:
+            raise FormatError(f"{path}: too many bytes behind its Gaussians; the file is damaged")
 
 
 def _read_streams(file: BinaryIO, file_size: int, path: Path) -> Packed:
@@ -133,7 +142,7 @@ def _read_streams(file: BinaryIO, file_size: int, path: Path) -> Packed:
         raise FormatError(f"{path}: truncated: an .spz of version 4 has a header of {HEADER_SIZE_4} bytes")
     table_at = struct.unpack_from("<I", start, 16)[0]
     records_size = table_at - HEADER_SIZE_4
-    if not 0 <= records_size <= min(EXTENSION_LIMIT, file_size):
+    if not 0 <= records_size <= file_size:
         raise FormatError(f"{path}: its table at byte {table_at} of {file_size}; the file is damaged")
     records = file.read(records_size)
     sizes = [header.count * width for width in widths(4, header.sh_degree).values()]

@@ -148,6 +148,8 @@ def test_rows_that_cannot_be_drawn_stay_but_are_not_seen(tmp_path):
     np.testing.assert_array_equal(got.log_scales[4], -10)
     assert np.abs(got.means[4:] - scene.means[4:]).max() <= POSITION[3] + 1e-7
     empty = scene.take(np.zeros(0, int))
+    (tmp_path / "c.spz").write_bytes(spz_bytes(empty, 4))
+    assert len(read_spz_scene(tmp_path / "c.spz").gaussians) == 0
     write_spz(tmp_path / "b.spz", empty)
     assert len(read_spz_scene(tmp_path / "b.spz").gaussians) == 0
 
@@ -185,7 +187,7 @@ BROKEN = {
     "a wrong checksum": (lambda: spz_bytes(WANT, 3)[:-8] + bytes(8), "not a whole gzip stream"),
     "much behind": (
         lambda: gzip.compress(gzip.decompress(spz_bytes(WANT, 3)) + bytes(2**21)),
-        "more than 1048576",
+        "too many bytes behind",
     ),
     "4: 2^32 of them": (lambda: version4(8, "<I", 2**32 - 1), "not those of 4294967295 Gaussians"),
     "4: the header alone": (lambda: version4(8, "<I", 30)[:30], "truncated: an .spz of version 4"),

@@ -290,7 +290,7 @@ def test_spz_streams_that_unfold_to_gigabytes(tmp_path, bounded):
     """Zeros are legal Gaussians, and compress a thousand times or more."""
     path = tmp_path / "a.spz"
     count = (128 << 20) // 20
-    for claimed, message in ((count, "the file can hold"), (5, "more than 1048576 bytes behind")):
+    for claimed, message in ((count, "the file can hold"), (5, "too many bytes behind")):
         with gzip.open(path, "wb", compresslevel=1) as file:
             file.write(b"NGSP" + struct.pack("<IIBBBB", 3, claimed, 0, 12, 0, 0))
             for part in zeros(129 << 20):
