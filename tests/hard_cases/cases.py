@@ -321,6 +321,13 @@ CASES: tuple[Case, ...] = (
     Case("needles 1 : 10^7", "finite and the reference's", lambda: _needles(1e7, 1.0), draws_something),
     Case("needles longer than the world", "finite and the reference's",
          lambda: _needles(1e9, 1e3), draws_something),
+    *(
+        Case(f"all scales e^{logs}", "finite and the reference's",
+             lambda logs=logs: altered("log_scales", np.s_[:], logs), draws_something)
+        for logs in ((79, 79, 79), (-np.inf, 79, 79), (40, 0, -40), (7, -5, -6))
+    ),
+    Case("needles as wide as 3.7e-9", "the thinnest of a public scene, anisotropy 10^8: the reference's",
+         lambda: altered("log_scales", np.s_[:], np.log([0.4, 3.7e-9, 3.7e-9])), draws_something),
     Case("pancakes seen edge on", "a line as thick as the dilation", _pancakes_edge_on, draws_something),
     Case("logits of +-100, +-800 and +-inf", "opacity 1 and 0, never NaN", _logits, draws_something),
     Case("all logits -inf", "nothing is drawn",
@@ -354,6 +361,8 @@ CASES: tuple[Case, ...] = (
     Case("another order of the rows", "the same picture bit for bit", lambda: crowd(6), _permuted),
     *(_sizes(*size) for size in ((1, 1), (1, 37), (37, 1), (16, 16), (17, 33), (48, 32))),
     *(_crop_of(*crop) for crop in ((30, 17, 20, 11), (16, 16, 48, 24), (5, 5, 0, 0))),
+    Case("seventy tiles", "every pixel is the reference's",
+         lambda: Drawing(random_gaussians(400, 19), random_camera(19, 150, 110)), draws_something),
     Case("no Gaussians", "an empty picture of the right shape",
          lambda: replace(crowd(), gaussians=random_gaussians(0)), draws_nothing),
     Case("all behind the camera", "an empty picture",

@@ -67,6 +67,7 @@ def check_adjoint(seen: Seen) -> None:
     """<W x, y> = <x, W^T y>, and nothing for rows that are not drawn."""
     y = np.random.default_rng(1).normal(size=seen.image.shape).astype(np.float32)
     gathered = seen.view.gather(y)
+    assert gathered.shape == seen.drawing.features().shape
     assert np.isfinite(gathered).all()
     assert not gathered[~seen.drawing.gaussians.valid()].any()
     assert_adjoint(lambda x: seen.view.splat(x)[0], seen.view.gather, seen.drawing.features(), y)
@@ -79,7 +80,9 @@ def check_gradients(seen: Seen) -> None:
     by_alpha = rng.normal(size=seen.alpha.shape)
     gradients = seen.view.backward(seen.drawing.features(), by_image, by_alpha)
     dropped = ~seen.drawing.gaussians.valid()
+    assert gradients.values.shape == seen.drawing.features().shape
     for name, gradient in vars(gradients).items():
+        assert len(gradient) == len(dropped)
         assert np.isfinite(gradient).all(), name
         assert not gradient[dropped].any(), name
 
@@ -139,13 +142,14 @@ def test_results_do_not_depend_on_the_number_of_threads(case: Case) -> None:
     target = np.random.default_rng(3).normal(size=(drawing.camera.height, drawing.camera.width, 1))
     x = drawing.features()[:, :1]
     results = []
-    for threads in (1, 2):
+    for threads in (1, 2, 5):
         view = load_rasterizer("cpu", threads=threads).view(
             drawing.gaussians, drawing.camera, drawing.settings
         )
         gradients = vars(view.backward(x, target, target[..., 0])).values()
         results.append([*view.splat(x), view.gather(target), view.depth("median"), *gradients])
-    assert all(np.array_equal(one, two) for one, two in zip(*results, strict=True))
+    for other in results[1:]:
+        assert all(np.array_equal(one, two) for one, two in zip(results[0], other, strict=True))
 
 
 @pytest.mark.slow
