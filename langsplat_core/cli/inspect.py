@@ -3,47 +3,87 @@
 import ctypes.util
 import importlib.metadata
 import importlib.util
+import json
 import os
 import platform
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from itertools import accumulate
 from pathlib import Path
 
-import numpy as np
 import tyro
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
+from langsplat_core.evaluation.anatomy import NEEDLE, OPACITY_EDGES, Anatomy, disk_bytes, dissect
 from langsplat_core.formats import load_scene
-from langsplat_core.scene import LEVELS
 
 
 @dataclass(frozen=True)
 class Inspect:
-    """Print what a scene file holds."""
+    """Print what a scene file holds, how healthy its rows are and where its bytes go."""
 
     scene: tyro.conf.Positional[Path]
     """Any readable scene."""
+    json: bool = False
+    """Print JSON."""
 
     def run(self) -> None:
-        scene = load_scene(self.scene)
-        gaussians, field = scene.gaussians, scene.language
-        valid = gaussians.valid()
-        low, high = (
-            np.quantile(gaussians.means[valid], [0.01, 0.99], axis=0) if valid.any() else np.zeros((2, 3))
-        )
-        print(f"Gaussians        {len(gaussians)} ({len(gaussians) - int(valid.sum())} invalid rows)")
-        print(f"SH degree        {gaussians.sh_degree}")
-        print(f"antialiased      {'yes, as Mip-Splatting' if scene.antialiased else 'no'}")
-        print(f"extra properties {', '.join(scene.extras) or 'none'}")
-        print(f"bounds (1-99 %)  {np.round(low, 3).tolist()} to {np.round(high, 3).tolist()}")
-        print(f"cameras          {len(scene.cameras)}")
-        if field is None:
-            print("language field   none")
+        anatomy = dissect(load_scene(self.scene))
+        size = disk_bytes(self.scene)
+        if self.json:
+            print(json.dumps({"scene": str(self.scene), "disk_bytes": size, **asdict(anatomy)}, indent=1))
             return
-        print(f"language field   codec {field.codec.kind}, d = {field.codec.latent_dim}")
-        print(f"text encoder     {field.encoder_id}, {field.codec.vector_dim} numbers")
-        print(f"phrasebook       {len(field.phrasebook)} phrases")
-        for name, confidence in zip(LEVELS, field.confidence, strict=True):
-            share = float((confidence > 0).mean()) if len(field) else 0.0
-            print(f"{name:<16} {100 * share:.1f} % of the Gaussians observed")
+        table = Table.grid(padding=(0, 2))
+        for name, value in [("on disk", f"{size / 1e6:.2f} MB, companions included"), *_lines(anatomy)]:
+            table.add_row(name, Text(value))
+        Console().print(table)
+
+
+def _lines(a: Anatomy) -> list[tuple[str, str]]:
+    """Rows of the report: a name, and a value for people."""
+    reasons = "".join(f"; {count} {reason}" for reason, count in a.invalid.items())
+    low, high = (" ".join(f"{value:.3g}" for value in corner) for corner in a.bounds)
+    median, most, largest = ("infinite" if ratio is None else f"{ratio:.3g}" for ratio in a.anisotropy)
+    hidden, *shares = accumulate(a.opacity_shares)  # of the Gaussians below each edge
+    below = [f"{_percent(s)} < {edge:g}" for s, edge in zip(shares, OPACITY_EDGES[2:-1], strict=False)]
+    lines = [
+        ("in memory", f"{a.memory_bytes / 1e6:.2f} MB"),
+        ("Gaussians", f"{a.gaussians:,}"),
+        ("invalid rows", f"{a.invalid_rows}{reasons}"),
+        ("duplicates", f"{a.duplicates}"),
+        ("bounds (1-99 %)", f"{low}  to  {high}"),
+        ("opacity", ", ".join([f"{_percent(hidden)} never drawn", *below])),
+        (
+            "anisotropy",
+            f"median {median}, 99 % {most}, largest {largest}; {a.needles} > {NEEDLE:g}",
+        ),
+        (
+            "SH degree",
+            f"{a.sh_degree}; energy by degree {' + '.join(f'{100 * e:.3g} %' for e in a.sh_energy)}",
+        ),
+        ("antialiased", "yes (Mip-Splatting)" if a.antialiased else "no"),
+        ("extra properties", ", ".join(a.extras) or "none"),
+        ("cameras", f"{a.cameras}" if a.cameras else "none"),
+    ]
+    field = a.language
+    if field is None:
+        return [*lines, ("language field", "none")]
+    observed = ", ".join(f"{name} {_percent(share)}" for name, share in field.observed.items())
+    return [
+        *lines,
+        (
+            "language field",
+            f"codec {field.codec}, d = {field.latent_dim}; {field.bytes / 1e6:.2f} MB in memory",
+        ),
+        ("text encoder", f"{field.encoder}, {field.vector_dim} numbers"),
+        ("phrasebook", f"{field.phrases} phrases"),
+        ("observed", observed),
+    ]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
 
 
 @dataclass(frozen=True)

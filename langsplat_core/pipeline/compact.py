@@ -13,7 +13,7 @@ import math
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import CompactConfig
 from langsplat_core.errors import InputError
+from langsplat_core.evaluation.anatomy import disk_bytes, memory_bytes
 from langsplat_core.evaluation.contribution import (
     Exposure,
     contributions,
@@ -31,8 +32,7 @@ from langsplat_core.evaluation.contribution import (
     reduced,
 )
 from langsplat_core.evaluation.language_change import LanguageChange, language_change
-from langsplat_core.formats import cameras_json, companion_path, language, load_scene, save_scene
-from langsplat_core.formats.sog import META_NAME
+from langsplat_core.formats import load_scene, save_scene
 from langsplat_core.pipeline.compact_views import Views, choose_views
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.numba_cpu import CpuRasterizer
@@ -41,6 +41,7 @@ from langsplat_core.scene import SH_COUNTS, Scene
 
 RESOLUTION = 256  # the number of Gaussians is found to this fraction of the whole
 ROUNDS = 3  # timed pictures of every measuring view
+PHRASES = 8  # at most, of the phrasebook, asked before and after
 STRANGERS = 10.0  # dB: a scene that is this far from the photographs does not show what they show
 
 
@@ -202,23 +203,6 @@ def smallest(
     return best
 
 
-def disk_bytes(scene: Path) -> int:
-    """Size of a scene file, or of a folder's files, with the companions beside it."""
-    path = scene.parent if scene.name == META_NAME else scene
-    own = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
-    companions = [companion_path(scene, suffix) for suffix in (language.SUFFIX, cameras_json.SUFFIX)]
-    return sum(file.stat().st_size for file in [*own, *companions] if file.is_file())
-
-
-def memory_bytes(scene: Scene) -> int:
-    """Of the arrays that grow with the number of Gaussians."""
-    arrays = [getattr(scene.gaussians, field.name) for field in fields(scene.gaussians)]
-    arrays += list(scene.extras.values())
-    if scene.language is not None:
-        arrays += [scene.language.latents, scene.language.confidence]
-    return sum(array.nbytes for array in arrays)
-
-
 def _check(source: Path, out: Path, config: CompactConfig) -> None:
     if not 0 <= config.max_psnr_loss < math.inf:
         raise InputError(f"--max-psnr-loss {config.max_psnr_loss}: must be 0 dB or more")
@@ -289,7 +273,8 @@ def _language(
     field = scenes[0].language
     if field is None:
         return None
-    phrases = list(dict.fromkeys([*field.phrasebook, *(" ".join(text.lower().split()) for text in more)]))
+    stored = [phrase for phrase in field.phrasebook if phrase == phrase.lower()][:PHRASES]
+    phrases = list(dict.fromkeys([*(" ".join(text.lower().split()) for text in more), *stored]))
     encoder = None
     if any(phrase not in field.phrasebook for phrase in phrases):
         from langsplat_core.semantics.clip import load_text_encoder  # imports torch
