@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from langsplat_core.config import PictureConfig
-from langsplat_core.datasets.synthetic.dataset import LIGHT, build_room, orbit_cameras, truth_ids
+from langsplat_core.datasets.synthetic.dataset import LIGHT, orbit_cameras, truth_ids
 from langsplat_core.datasets.synthetic.render import Renderer
+from langsplat_core.datasets.synthetic.world import BRIGHT, World, build_world
 from langsplat_core.evaluation.metrics import intersection_over_union, majority
 from langsplat_core.formats import load_scene
 from langsplat_core.pipeline.demo import SEED, SIZE, VIEWS
@@ -24,6 +25,11 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.clip import load_text_encoder
 
 ASSETS = Path(str(files("langsplat_assets")))
+
+
+def build_room(seed: int) -> World:
+    """The room that the bundled scene was trained in."""
+    return build_world(2_000_000 + seed, palette=BRIGHT)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,8 @@ from PIL import Image
 
 from langsplat_core.arrays import Array
 from langsplat_core.datasets.synthetic.render import Light, Picture, Renderer
-from langsplat_core.datasets.synthetic.world import BRIGHT, World, build_world
+from langsplat_core.datasets.synthetic.rooms import Tier
+from langsplat_core.datasets.synthetic.world import World, build_room
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
 from langsplat_core.progress import Progress
@@ -22,11 +23,13 @@ _LIGHT_CELL = 0.006  # metres between the places where light is gathered, where 
 _POINT_NOISE = 0.004  # metres, standard deviation
 LIGHT = Light(np.array([-1.25, -1.05, 1.55]))
 # (share of the views, elevation in degrees, distance in metres, height of the target above the table)
-_RINGS = ((0.4, 24.0, 1.5, 0.0), (0.35, 42.0, 1.25, 0.02), (0.25, 33.0, 0.92, 0.06))
+_RINGS = ((0.3, 23.0, 1.5, 0.0), (0.3, 42.0, 1.25, 0.02), (0.25, 33.0, 0.92, 0.06), (0.15, 50.0, 1.75, -0.2))
 
 
-def write_dataset(out: Path, seed: int, views: int, size: tuple[int, int], progress: Progress) -> None:
-    """Render the room of `seed` into folder `out`.
+def write_dataset(
+    out: Path, seed: int, views: int, size: tuple[int, int], progress: Progress, tier: Tier = "clutter"
+) -> None:
+    """Render the room of `seed` and difficulty `tier` into folder `out`.
 
     views: number of photographs, >= 4; size: (width, height) in pixels, at least 16 each. Written are
     images/view_000.png ..., points.ply, truth/view_000.npz (`ids`: (3, H, W) int32 label ids at subpart,
@@ -39,7 +42,7 @@ def write_dataset(out: Path, seed: int, views: int, size: tuple[int, int], progr
         raise InputError(
             f"demo dataset: {views} views of {size[0]}x{size[1]}: it needs at least 4 views of 16x16"
         )
-    world = build_room(seed)
+    world = photographed_room(seed, tier)
     cameras = orbit_cameras(views, size, seed)
     folder, truth = out / "images", out / "truth"
     folder.mkdir(parents=True, exist_ok=True)
@@ -55,9 +58,9 @@ def write_dataset(out: Path, seed: int, views: int, size: tuple[int, int], progr
     _write_transforms(cameras, out / "transforms.json")
 
 
-def build_room(seed: int) -> World:
+def photographed_room(seed: int, tier: Tier = "clutter") -> World:
     """The room that `write_dataset` photographs; the demo encoder has never seen one of them."""
-    return build_world(_FIRST_ROOM + seed, palette=BRIGHT)
+    return build_room(_FIRST_ROOM + seed, tier)
 
 
 def truth_ids(world: World, picture: Picture) -> Array:
@@ -67,7 +70,7 @@ def truth_ids(world: World, picture: Picture) -> Array:
 
 
 def orbit_cameras(views: int, size: tuple[int, int], seed: int) -> list[Camera]:
-    """Cameras on three rings around the table, the lowest ones closest; jittered by the seed.
+    """Cameras on four rings around the table, low, high, close and far; jittered by the seed.
 
     Names are shuffled over the rings, so that every n-th view in name order is a fair sample of them.
     """

@@ -10,9 +10,10 @@ from langsplat_core.datasets.synthetic.captions import Label, label_region
 from langsplat_core.datasets.synthetic.catalogue import BRIGHT, SMALL
 from langsplat_core.datasets.synthetic.colours import COLOURS
 from langsplat_core.datasets.synthetic.parts import Kit, Material, Piece, Thing
+from langsplat_core.datasets.synthetic.placement import Placed
+from langsplat_core.datasets.synthetic.rooms import ENLARGED, Tier, furnished
 from langsplat_core.datasets.synthetic.shapes import rotation_about
 
-ENLARGED = 1.3  # small objects are shown larger than life, so that their parts are worth looking at
 ALWAYS = ("mug", "lamp", "bowl")  # every room has these
 
 
@@ -30,14 +31,6 @@ class World:
     ids: Array  # (P, 3) int32 label ids of every piece: subpart, part, whole
     labels: tuple[Label, ...]  # indexed by id
     solid: Array  # (T,) bool: surfaces that an outline of the room's objects should cover (not the room)
-
-
-@dataclass(frozen=True, eq=False)
-class Placed:
-    thing: Thing
-    turn: Array  # (3, 3)
-    offset: Array  # (3,)
-    scale: float = 1.0
 
 
 def _small_things(rng: np.random.Generator, count: int, palette: tuple[str, ...]) -> list[Thing]:
@@ -120,6 +113,15 @@ def build_world(seed: int, objects: int = 12, palette: tuple[str, ...] = COLOURS
     room = _room(rng)
     table = _on_table(_small_things(rng, objects, palette), rng)
     return assemble([*room, *table, *_fill_bowls(table, rng)])
+
+
+def build_room(seed: int, tier: Tier = "clutter") -> World:
+    """The furnished room of a seed: the same arguments always give the same room, object for object.
+
+    tier: "separate" objects at a distance, "clutter" on the table and the floor, or "occlusion": packed
+    tightly, with look-alikes (the same class in other colours, the same colour on other classes).
+    """
+    return assemble(furnished(seed, tier))
 
 
 def assemble(placed: list[Placed]) -> World:
