@@ -17,7 +17,7 @@ class BenchLoad:
     count: int = 2_500_000
     """Gaussians in the file, which takes 248 bytes each in the temporary folder while it runs."""
     repeats: int = 3
-    """Readings with each; the median counts."""
+    """Readings with each; the fastest counts."""
     out: Path = Path("bench_out")
     """Folder for load.md and load.json."""
 

@@ -8,7 +8,6 @@ peak memory is that of the whole process. The file has just been written, so it 
 import hashlib
 import json
 import re
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -40,7 +39,7 @@ class Loading:
     reader: Reader
     rows: int
     file_bytes: int
-    seconds: float  # median over fresh interpreters
+    seconds: float  # the least of several: other programs only ever add to it
     kept_bytes: int  # of the arrays that remain
     peak_bytes: int | None  # greatest resident memory of the process; None where the system does not tell
     same: bool  # whether the arrays are those that `langsplat` read
@@ -92,7 +91,7 @@ def _summary(reader: Reader, rows: int, size: int, runs: list[dict[str, object]]
         reader,
         rows,
         size,
-        statistics.median(float(str(run["seconds"])) for run in runs),
+        min(float(str(run["seconds"])) for run in runs),
         int(str(runs[0]["kept"])),
         max(peaks) if peaks else None,
         all(run["digest"] == truth for run in runs),

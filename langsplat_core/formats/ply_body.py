@@ -6,8 +6,10 @@ costs nothing.
 
 import warnings
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
+from threading import Lock
 from typing import BinaryIO
 
 import numpy as np
@@ -17,6 +19,7 @@ from langsplat_core.errors import FormatError
 from langsplat_core.formats.ply_header import PlyElement, PlyHeader
 
 CHUNK_ROWS = 2048  # about 0.5 MB of a degree-3 scene: the columns are then picked out of the cache
+THREADS = 2  # which NumPy lets run at once; one core does not use the whole bandwidth of the memory
 
 
 def iterate_rows(
@@ -55,20 +58,37 @@ def fill_columns(
     arbitrary.
     """
     place = {prop.name: index for index, prop in enumerate(element.properties)}
-    indices = {names: np.array([place[name] for name in names]) for names in tables}
-    with np.errstate(over="ignore", invalid="ignore"):
-        for start, rows in chunks:
-            part = slice(start, start + len(rows))
-            grid = _as_grid(rows)
-            for names, table in tables.items():
-                if grid is not None:
-                    # `clip` lets NumPy write into the table directly; no index is out of range
-                    np.take(grid, indices[names], axis=1, out=table[part], mode="clip")
-                    continue
-                for index, name in enumerate(names):
-                    table[part, index] = rows[name]
-            for name, column in columns.items():
-                column[part] = rows[name]
+    parts = [(names, np.array([place[name] for name in names]), table) for names, table in tables.items()]
+    taking = Lock()
+
+    def work() -> None:
+        while True:
+            with taking:
+                start, rows = next(chunks, (0, None))
+            if rows is None:
+                return
+            _store(rows, slice(start, start + len(rows)), parts, columns)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        for done in [pool.submit(work) for _ in range(THREADS)]:
+            done.result()
+
+
+def _store(
+    rows: Array, at: slice, tables: list[tuple[tuple[str, ...], Array, Array]], columns: Mapping[str, Array]
+) -> None:
+    """One chunk into place; a table comes as (names, their indices among the properties, array)."""
+    with np.errstate(over="ignore", invalid="ignore"):  # which holds for the calling thread only
+        grid = _as_grid(rows)
+        for names, indices, table in tables:
+            if grid is not None:
+                # `clip` lets NumPy write into the table directly; no index is out of range
+                np.take(grid, indices, axis=1, out=table[at], mode="clip")
+                continue
+            for index, name in enumerate(names):
+                table[at, index] = rows[name]
+        for name, column in columns.items():
+            column[at] = rows[name]
 
 
 def _as_grid(rows: Array) -> Array | None:
