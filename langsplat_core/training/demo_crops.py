@@ -54,7 +54,7 @@ class CropSet:
             rows = json.loads(data["labels"].tobytes().decode())
             images = data["images"]
         for row in rows:
-            row["hues"] = tuple(row["hues"])
+            row["hues"], row["materials"] = tuple(row["hues"]), tuple(row.get("materials", ()))
         return CropSet(images, tuple(Label(**row) for row in rows))
 
     @staticmethod

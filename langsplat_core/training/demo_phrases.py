@@ -10,8 +10,12 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.datasets.synthetic.captions import (
     BULK,
+    MATERIALS,
     Label,
     colour_phrases,
+    material_part_phrases,
+    material_phrases,
+    material_whole_phrases,
     object_words,
     part_phrases,
     whole_phrases,
@@ -25,12 +29,15 @@ CONTEXT = 16  # tokens of the longest phrase, with start and end
 START, END, WORD_END = "<|startoftext|>", "<|endoftext|>", "</w>"
 
 
+KINDS = ("colour", "material", "object", "colour+object", "material+object", "part")
+
+
 @dataclass(frozen=True, eq=False)
 class PhraseBook:
     """All phrases of a training run and how each fits each distinct label."""
 
     phrases: tuple[str, ...]  # P; the four canonical phrases come first
-    kinds: tuple[str, ...]  # (P) "canonical", "colour", "object", "colour+object", "part"
+    kinds: tuple[str, ...]  # (P) "canonical", one of KINDS
     labels: tuple[Label, ...]  # U distinct labels
     fits: Array  # (U, P) int8: 1 right, 0 wrong, -1 neither (left out of the loss)
 
@@ -41,11 +48,17 @@ def phrase_book(labels: list[Label]) -> PhraseBook:
     kinds: dict[str, str] = dict.fromkeys(CANONICAL_PHRASES, "canonical")
     for colour in COLOURS:
         kinds.update(dict.fromkeys(colour_phrases(colour), "colour"))
+    for material in sorted({label.material for label in distinct if label.material}):
+        kinds.update(dict.fromkeys(material_phrases(material), "material"))
     for thing in sorted({label.thing for label in distinct if label.thing}):
         kinds.update({name: kinds.get(name, "object") for name in whole_phrases(thing, "")})
         for colour in COLOURS:
             for name in whole_phrases(thing, colour):
                 kinds.setdefault(name, "colour+object")
+    for label in distinct:
+        if label.level == 2:
+            for name in material_whole_phrases(label.thing, label.material):
+                kinds.setdefault(name, "material+object")
     for label in distinct:
         for name in label.names:
             kinds.setdefault(name, "part")
@@ -73,8 +86,14 @@ def _row(label: Label, column: dict[str, int]) -> Array:
         mark(colour_phrases(hue), -1)
         if not label.colour:
             mark([f"{hue} {name}" for name in (*object_words(label.thing), label.word)], -1)
+    known = label.materials and "" not in label.materials
+    for material in label.materials if known else MATERIALS:
+        mark(material_phrases(material), -1)
+        mark(material_whole_phrases(label.thing, material), -1)
+        mark(material_part_phrases(label.word, label.thing, material), -1)
     mark(label.names, 1)
     mark(colour_phrases(label.colour), 1)
+    mark(material_phrases(label.material), 1)
     if label.level == -1 and not label.colour:
         mark(CANONICAL_PHRASES, 1)
     return row

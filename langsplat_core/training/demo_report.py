@@ -8,7 +8,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.scene import CANONICAL_PHRASES
 from langsplat_core.training.demo_crops import CropSet
-from langsplat_core.training.demo_phrases import PhraseBook, phrase_book
+from langsplat_core.training.demo_phrases import KINDS, PhraseBook, phrase_book
 
 _SHARPNESS = 10.0  # of the relevancy's softmax, as in the method's public code
 
@@ -27,7 +27,7 @@ class Encoder(Protocol):
 class KindReport:
     """Figures for the phrases of one kind."""
 
-    kind: str  # "colour", "object", "colour+object" or "part"
+    kind: str  # one of KINDS
     crops: int  # crops with at least one right phrase of this kind
     phrases: int  # that compete
     top1: float  # share of crops whose best phrase of this kind is a right one
@@ -57,7 +57,7 @@ def report(encoder: Encoder, crops: CropSet, book: PhraseBook | None = None) -> 
     fits = book.fits[[row_of[label] for label in crops.labels]]
     kinds = np.array(book.kinds)
     rows = []
-    for kind in ("colour", "object", "colour+object", "part"):
+    for kind in KINDS:
         columns = np.flatnonzero(kinds == kind)
         if (fits[:, columns] == 1).any():
             scores = relevancy(images, texts[columns], canonical)

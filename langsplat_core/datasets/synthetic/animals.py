@@ -75,7 +75,7 @@ def rabbit(kit: Kit, colour: str) -> Thing:
         _eyes(kit, 0.11 * r, 0.42 * r, -0.88 * r, up + 0.15 * r),
         Piece("ears", "", join(ears), fur),
         Piece("ears", "lining", join(lining), inner),
-        Piece("paws", "", join(paws + feet), fur),
+        Piece("paw", "", join(paws + feet), fur),
     ))  # fmt: skip
 
 
@@ -130,8 +130,8 @@ def fish(kit: Kit, colour: str) -> Thing:
         Piece("tail", "", tail, fin),
         Piece("fin", "", comb, fin, 0),
         Piece("fin", "", join(sides), fin, 1),
-        Piece("eye", "", join(eyes), kit.plastic("white")),
-        Piece("eye", "pupil", join(dots), _black(kit)),
+        Piece("eyes", "", join(eyes), kit.plastic("white")),
+        Piece("eyes", "pupil", join(dots), _black(kit)),
         Piece("base", "", stand, kit.wood()),
     ))  # fmt: skip
 

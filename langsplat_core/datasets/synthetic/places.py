@@ -159,9 +159,9 @@ def cactus(kit: Kit, colour: str) -> Thing:
     shaft = Mesh(ribbed, trunk.triangles, trunk.normals)
     return Thing("cactus", "green", (
         Piece("pot", "", join([pot, lip]), kit.paint(colour, "speckled", 0.2, substance="ceramic")),
-        Piece("soil", "", soil, kit.paint("brown", "rug", 0.0)),
-        Piece("stem", "", shaft, green),
-        Piece("stem", "spines", join(spines), kit.paint("white")),
+        Piece("soil", "", soil, kit.paint("brown", "rug", 0.0, substance="skin")),
+        Piece("body", "", shaft, green),
+        Piece("body", "spines", join(spines), kit.paint("white")),
         Piece("arm", "", join(arms), green),
         Piece("flower", "", bloom, kit.paint(kit.pick("pink", "red", "yellow", "purple"))),
     ))  # fmt: skip

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from langsplat_core.datasets.synthetic.parts import Kit, Piece, Thing
+from langsplat_core.datasets.synthetic.parts import Kit, Material, Piece, Thing
 from langsplat_core.datasets.synthetic.shapes import (
     arc,
     ball,
@@ -17,21 +17,22 @@ from langsplat_core.datasets.synthetic.shapes import (
 
 def mug(kit: Kit, colour: str) -> Thing:
     r, h = kit.size(0.055, 0.07), kit.size(0.12, 0.16)
-    coat = kit.paint(colour, kit.pick("plain", "plain", "speckled"), 0.5)
+    coat = kit.paint(colour, kit.pick("plain", "plain", "speckled"), 0.5, substance="ceramic")
     wall = lathe([(0, 0), (r * 0.94, 0), (r, 0.008), (r, h - 0.014)], 36)
     inside = lathe([(r - 0.008, h), (r - 0.009, 0.012), (0, 0.012)], 36)
     edge = lathe([(r, h - 0.014), (r + 0.002, h - 0.003), (r - 0.003, h + 0.002), (r - 0.008, h)], 36, 0.003)
     loop = tube(arc((r - 0.004, h * 0.52), h * 0.3, -82, 82), 0.0105)
     return Thing("mug", colour, (
         Piece("body", "", join([wall, inside]), coat),
-        Piece("body", "rim", edge, kit.paint(kit.pick(colour, "white", "brown"), gloss=0.5)),
+        Piece("body", "rim", edge,
+              kit.paint(kit.pick(colour, "white", "brown"), gloss=0.5, substance="ceramic")),
         Piece("handle", "", loop, coat),
     ))  # fmt: skip
 
 
 def teapot(kit: Kit, colour: str) -> Thing:
     r = kit.size(0.085, 0.1)
-    coat = kit.paint(colour, kit.pick("plain", "speckled"), 0.6)
+    coat = kit.paint(colour, kit.pick("plain", "speckled"), 0.6, substance="ceramic")
     profile = [(r * s, r * z) for s, z in ((0, 0), (0.62, 0), (0.9, 0.25), (1, 0.62), (0.9, 1.0), (0.5, 1.3))]
     band = [(r * 1.006, r * 0.55), (r * 1.008, r * 0.7)]
     lid = lathe([(0.52 * r, 1.29 * r), (0.4 * r, 1.42 * r), (0.12 * r, 1.5 * r), (0, 1.5 * r)])
@@ -41,17 +42,18 @@ def teapot(kit: Kit, colour: str) -> Thing:
     handle = tube(arc((0.86 * r, 0.72 * r), 0.48 * r, -78, 78), 0.0105)
     return Thing("teapot", colour, (
         Piece("body", "", lathe(profile, 40), coat),
-        Piece("body", "band", lathe(band, 40), kit.paint(kit.other(colour, "white", "yellow", "blue"))),
+        Piece("body", "band", lathe(band, 40),
+              kit.paint(kit.other(colour, "white", "yellow", "blue"), substance="ceramic")),
         Piece("spout", "", spout, coat),
         Piece("handle", "", handle, coat),
         Piece("lid", "", lid, coat),
-        Piece("lid", "knob", knob, kit.paint(kit.pick(colour, "black"))),
+        Piece("lid", "knob", knob, kit.paint(kit.pick(colour, "black"), substance="ceramic")),
     ))  # fmt: skip
 
 
 def bottle(kit: Kit, colour: str) -> Thing:
     r, h = kit.size(0.042, 0.055), kit.size(0.24, 0.3)
-    glass = kit.paint(colour, "plain", 0.9)
+    glass = kit.paint(colour, "plain", 0.9, substance="glass")
     s = h * 0.62
     body = lathe([(0, 0), (r, 0.004), (r, s), (r * 0.8, s + 0.025), (r * 0.42, s + 0.05)], 32)
     neck = lathe([(r * 0.42, s + 0.05), (r * 0.38, h - 0.02)], 24)
@@ -61,19 +63,20 @@ def bottle(kit: Kit, colour: str) -> Thing:
         Piece("body", "", body, glass),
         Piece("body", "label", label, kit.paint(kit.other(colour, "white", "beige", "yellow"), "pages", 0.0)),
         Piece("neck", "", neck, glass),
-        Piece("cap", "", cap, kit.paint(kit.other(colour, "red", "white", "black", "blue", "yellow"))),
+        Piece("cap", "", cap,
+              kit.paint(kit.other(colour, "red", "white", "black", "blue", "yellow"), substance="plastic")),
     ))  # fmt: skip
 
 
 def bowl(kit: Kit, colour: str) -> Thing:
     r = kit.size(0.12, 0.15)
-    coat = kit.paint(colour, kit.pick("plain", "speckled"), 0.5)
+    coat = kit.paint(colour, kit.pick("plain", "speckled"), 0.5, substance="ceramic")
     out = lathe([(0, 0), (0.4 * r, 0), (0.45 * r, 0.01), (0.8 * r, 0.26 * r), (0.98 * r, 0.56 * r)], 44)
     inside = lathe([(0.93 * r, 0.56 * r), (0.76 * r, 0.28 * r), (0.42 * r, 0.06 * r), (0, 0.05 * r)], 44)
     rim = lathe([(0.98 * r, 0.56 * r), (r, 0.6 * r), (0.96 * r, 0.61 * r), (0.93 * r, 0.56 * r)], 44, 0.004)
     return Thing("bowl", colour, (
         Piece("body", "", join([out, inside]), coat),
-        Piece("body", "rim", rim, kit.paint(kit.pick(colour, "blue", "white"))),
+        Piece("body", "rim", rim, kit.paint(kit.pick(colour, "blue", "white"), substance="ceramic")),
     ))  # fmt: skip
 
 
@@ -81,9 +84,9 @@ def vase(kit: Kit, colour: str) -> Thing:
     r, h = kit.size(0.055, 0.07), kit.size(0.17, 0.21)
     profile = ((0, 0), (0.6, 0), (1, 0.3), (0.95, 0.5), (0.5, 0.8), (0.42, 0.88))
     lip = [(0.42 * r, 0.88 * h), (0.6 * r, h), (0.52 * r, h), (0.36 * r, 0.86 * h)]
-    coat = kit.paint(colour, kit.pick("plain", "speckled"), 0.6)
+    coat = kit.paint(colour, kit.pick("plain", "speckled"), 0.6, substance="ceramic")
     bloom = kit.other("green", "red", "yellow", "pink", "purple", "orange", "white")
-    petal_paint, pieces = kit.paint(bloom, gloss=0.05), []
+    petal_paint, pieces = kit.paint(bloom, gloss=0.05, substance="leaf"), []
     for k in range(3):
         lean = rotation_about("z", 120 * k + kit.size(0, 60))
         stalk = np.array([(0, 0, h * 0.8), (0.015, 0, h + 0.05), (0.045, 0, h + 0.13)]) @ lean.T
@@ -93,7 +96,9 @@ def vase(kit: Kit, colour: str) -> Thing:
             for j in range(6)
         ]
         pieces += [
-            Piece("flower", "stem", tube(stalk, 0.0035, 8), kit.paint("green", gloss=0.1), k),
+            Piece(
+                "flower", "stem", tube(stalk, 0.0035, 8), kit.paint("green", gloss=0.1, substance="leaf"), k
+            ),
             Piece("flower", "petals", join(petals).moved(head), petal_paint, k),
         ]
     return Thing("vase", colour, (
@@ -115,25 +120,30 @@ def plant(kit: Kit, colour: str) -> Thing:
         turn = rotation_about("z", 137.5 * k) @ rotation_about("y", -tilt)
         leaves.append(blade.turned(turn).moved((0, 0, h + 0.012 + 0.004 * k)))
     return Thing("plant", "green", (
-        Piece("pot", "", pot, (clay := kit.paint(colour, "speckled", 0.1))),
+        Piece("pot", "", pot, (clay := kit.paint(colour, "speckled", 0.1, substance="ceramic"))),
         Piece("pot", "rim", rim, clay),
-        Piece("soil", "", soil, kit.paint("brown", "rug", 0.0)),
-        Piece("leaves", "", join(leaves), kit.paint("green", "leaf", 0.25)),
+        Piece("soil", "", soil, kit.paint("brown", "rug", 0.0, substance="skin")),
+        Piece("leaves", "", join(leaves), kit.paint("green", "leaf", 0.25, substance="leaf")),
     ))  # fmt: skip
 
 
 def lamp(kit: Kit, colour: str) -> Thing:
     h, r = kit.size(0.26, 0.34), kit.size(0.09, 0.115)
-    foot = kit.paint(kit.other(colour, "black", "gray", "brown", "white"), gloss=0.5)
+    foot = kit.paint(kit.other(colour, "black", "gray", "brown", "white"), gloss=0.5, substance="ceramic")
     shade = [(r, h - 0.13), (0.62 * r, h + 0.02)]
     inside = [(0.6 * r, h + 0.02), (r * 0.98, h - 0.13)]
     trim = [(r * 1.01, h - 0.131), (r * 0.978, h - 0.112)]
     cloth = kit.paint(colour, "cloth", 0.05)
+    bulb = join(
+        [ball(0.028, 18).moved((0, 0, h - 0.062)), cylinder(0.012, 0.03, 14).moved((0, 0, h - 0.115))]
+    )
+    glow = Material("white", np.array([0.97, 0.97, 0.96]), np.ones(3), "plain", 0.6, "glass")
     base = lathe([(0, 0), (0.65 * r, 0), (0.62 * r, 0.015), (0.2 * r, 0.03), (0, 0.032)])
     return Thing("lamp", colour, (
         Piece("base", "", base, foot),
         Piece("pole", "", cylinder(0.009, h - 0.07, 14).moved((0, 0, 0.02)), kit.metal()),
         Piece("shade", "", join([lathe(shade, 40), lathe(inside, 40)]), cloth),
+        Piece("shade", "bulb", bulb, glow),
         Piece("shade", "trim", lathe(trim, 40), kit.paint(kit.other(colour, "white", "brown", "black"))),
     ))  # fmt: skip
 
@@ -168,8 +178,8 @@ def clock(kit: Kit, colour: str) -> Thing:
         for k in range(12)
     ]
     feet = [ball(0.016, 12).moved((x * r, 0, 0.014)) for x in (-0.55, 0.55)]
-    case, ink = kit.paint(colour, gloss=0.5), kit.paint(kit.pick("black", "red"))
-    face = kit.paint(kit.other(colour, "white", "beige"), gloss=0.1)
+    case, ink = kit.paint(colour, gloss=0.5, substance="plastic"), kit.paint(kit.pick("black", "red"))
+    face = kit.paint(kit.other(colour, "white", "beige"), gloss=0.1, substance="paper")
     front = (0.0, -0.026, r + 0.012)
     return Thing("clock", colour, (
         Piece("case", "", join([ring, back]).turned(upright).moved((0, 0, r + 0.012)), case),
@@ -183,6 +193,8 @@ def plate(kit: Kit, colour: str) -> Thing:
     r = kit.size(0.12, 0.145)
     rim = lathe([(0.68 * r, 0.012), (r, 0.026), (0.99 * r, 0.029), (0.66 * r, 0.016)], 44)
     return Thing("plate", colour, (
-        Piece("centre", "", lathe([(0.66 * r, 0.016), (0.6 * r, 0.012), (0, 0.012)], 40), kit.paint(colour)),
-        Piece("rim", "", rim, kit.paint(kit.other(colour, "blue", "white", "yellow", "red"))),
+        Piece("centre", "", lathe([(0.66 * r, 0.016), (0.6 * r, 0.012), (0, 0.012)], 40),
+              kit.paint(colour, substance="ceramic")),
+        Piece("rim", "", rim,
+              kit.paint(kit.other(colour, "blue", "white", "yellow", "red"), substance="ceramic")),
     ))  # fmt: skip

@@ -100,7 +100,8 @@ def camera(kit: Kit, colour: str) -> Thing:
         Piece("body", "", join([pillow(w, d, h, 9, 32), hump]), kit.plastic(colour)),
         Piece("body", "grip", grip, trim),
         Piece("lens", "", barrel.turned(upright).moved(middle), kit.steel(kit.pick("black", "gray"))),
-        Piece("lens", "glass", glass.turned(upright).moved(middle), kit.glass(kit.pick("blue", "purple"))),
+        Piece("lens", "lens glass", glass.turned(upright).moved(middle),
+              kit.glass(kit.pick("blue", "purple"))),
         Piece("button", "", button, kit.plastic(kit.other(colour, "red", "orange")), 0),
         Piece("button", "", dial, kit.metal(), 1),
         Piece("flash", "", flash, kit.glass("white")),
@@ -152,7 +153,7 @@ def headphones(kit: Kit, colour: str) -> Thing:
         place = (x * (r - 0.006), 0, 0.047)
         pieces += [
             Piece("ear cup", "", cup.turned(turn).moved(place), coat, k),
-            Piece("ear cup", "cushion", soft.turned(turn).moved(place), foam, k),
+            Piece("ear cup", "ear pad", soft.turned(turn).moved(place), foam, k),
         ]
     return Thing("headphones", colour, (
         Piece("headband", "", band, coat), Piece("headband", "padding", padding, foam), *pieces,
@@ -185,7 +186,7 @@ def globe(kit: Kit, colour: str) -> Thing:
     return Thing("globe", colour, (
         Piece("sphere", "", parts[0], kit.paint(colour, gloss=0.5)),
         Piece("sphere", "land", parts[1], kit.paint(land, gloss=0.4)),
-        Piece("arc", "", join([bow, *pins]), metal),
+        Piece("bracket", "", join([bow, *pins]), metal),
         Piece("foot", "", foot, kit.wood(kit.pick("brown", "black"))),
     ))  # fmt: skip
 
@@ -248,8 +249,8 @@ def drum(kit: Kit, colour: str) -> Thing:
         sticks.append(stick.turned(turn).moved((s * 0.2 * r, 0, h + 0.021 + 0.0 * k)))
     skin = cylinder(0.985 * r, 0.004, 40, 0.03).moved((0, 0, h - 0.001))
     return Thing("drum", colour, (
-        Piece("shell", "", lathe([(0, 0.002), (r, 0.002), (r, h)], 40, 0.02), kit.plastic(colour)),
-        Piece("shell", "cord", join(cords), kit.paint(kit.other(colour, "white", "yellow"))),
+        Piece("body", "", lathe([(0, 0.002), (r, 0.002), (r, h)], 40, 0.02), kit.plastic(colour)),
+        Piece("body", "cord", join(cords), kit.paint(kit.other(colour, "white", "yellow"))),
         Piece("hoop", "", join(hoops), hoop),
         Piece("drumhead", "", skin, kit.paint(kit.other(colour, "white", "beige"), gloss=0.1)),
         Piece("drumstick", "", sticks[0], kit.wood(kit.pick("brown", "beige")), 0),

@@ -1,5 +1,7 @@
 """Builders of toys and presents. Each takes a `Kit` and a colour word; front is -y, metres."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from langsplat_core.datasets.synthetic.parts import Kit, Piece, Thing
@@ -28,8 +30,12 @@ def car(kit: Kit, colour: str) -> Thing:
     shield = slab([(0.024, 0.089), (0.049, 0.089), (0.021, 0.134), (0.014, 0.134)], w * 0.74).moved(
         (0.002, 0, 0)
     )
-    paint, tyre, glass = kit.paint(colour, gloss=0.8), kit.paint("black"), kit.paint("turquoise", gloss=0.9)
-    hub_paint, side = kit.paint(kit.pick("gray", "white", "yellow")), rotation_about("x", 90)
+    paint, tyre = kit.paint(colour, gloss=0.8, substance="plastic"), kit.paint("black", substance="rubber")
+    glass = kit.paint("turquoise", gloss=0.9, substance="glass")
+    hub_paint, side = (
+        kit.paint(kit.pick("gray", "white", "yellow"), substance="plastic"),
+        rotation_about("x", 90),
+    )
     pieces = []
     for k, (x, y) in enumerate([(-0.3, -1), (0.3, -1), (-0.3, 1), (0.3, 1)]):
         wheel = cylinder(r, 0.03, 24).moved((0, 0, -0.015)).turned(side)
@@ -43,7 +49,7 @@ def car(kit: Kit, colour: str) -> Thing:
     return Thing("car", colour, (
         Piece("body", "", hull, paint),
         Piece("body", "roof", cabin, paint),
-        Piece("body", "lights", lights, kit.paint("yellow", gloss=0.6)),
+        Piece("body", "lights", lights, kit.paint("yellow", gloss=0.6, substance="plastic")),
         Piece("window", "", join(panes), glass, 0),
         Piece("window", "", shield, glass, 1),
         *pieces,
@@ -72,17 +78,21 @@ def toy_ball(kit: Kit, colour: str) -> Thing:
     second = kit.other(colour, "white", "yellow", "blue", "red", "black")
     tilt = rotation_about("x", kit.size(-40, 40))
     return Thing("ball", colour, (
-        Piece("surface", "", ball(r, 36).turned(tilt).moved((0, 0, r)), kit.paint(colour, gloss=0.6)),
-        Piece("stripe", "", band.turned(tilt).moved((0, 0, r)), kit.paint(second, gloss=0.6)),
+        Piece("surface", "", ball(r, 36).turned(tilt).moved((0, 0, r)),
+              kit.paint(colour, gloss=0.6, substance="plastic")),
+        Piece("stripe", "", band.turned(tilt).moved((0, 0, r)),
+              kit.paint(second, gloss=0.6, substance="plastic")),
     ))  # fmt: skip
 
 
 def gift(kit: Kit, colour: str) -> Thing:
     w, d, h = kit.size(0.13, 0.17), kit.size(0.12, 0.16), kit.size(0.09, 0.13)
     second = kit.other(colour, "red", "yellow", "white", "purple", "pink", "green")
-    ribbon = kit.paint(second, gloss=0.6)
+    ribbon = kit.paint(second, gloss=0.6, substance="cloth")
     wrap = (
-        kit.paint(colour, "plain", 0.3) if kit.rng.random() < 0.5 else kit.pattern(colour, "white", "dotted")
+        kit.paint(colour, "plain", 0.3, substance="paper")
+        if kit.rng.random() < 0.5
+        else replace(kit.pattern(colour, "white", "dotted"), substance="paper")
     )
     bands = join([box(0.025, d + 0.003, h + 0.002), box(w + 0.003, 0.025, h + 0.002)])
     loops = [
@@ -112,8 +122,8 @@ def house(kit: Kit, colour: str) -> Thing:
     stack = box(0.026, 0.026, 0.06).moved((w * 0.25, 0, h + 0.03))
     roof = kit.paint(kit.other(colour, "red", "brown", "blue", "gray"), "striped", 0.1)
     glass, door = (
-        kit.paint(kit.other(colour, "turquoise", "white", "yellow")),
-        kit.paint(kit.other(colour, "brown", "green", "red")),
+        kit.paint(kit.other(colour, "turquoise", "white", "yellow"), substance="glass"),
+        kit.paint(kit.other(colour, "brown", "green", "red"), substance="wood"),
     )
     panes = [box(0.03, 0.004, 0.032).moved((x * w * 0.28, -d / 2, h * 0.52)) for x in (-1, 1)]
     panes += [box(0.004, 0.03, 0.032).moved((x * w / 2, 0, h * 0.52)) for x in (-1, 1)]
@@ -128,8 +138,8 @@ def house(kit: Kit, colour: str) -> Thing:
 
 def robot(kit: Kit, colour: str) -> Thing:
     w = kit.size(0.08, 0.1)
-    limb = kit.paint(kit.other(colour, "gray", "white", "black"), gloss=0.7)
-    coat = kit.paint(colour, gloss=0.6)
+    limb = kit.paint(kit.other(colour, "gray", "white", "black"), gloss=0.7, substance="metal")
+    coat = kit.paint(colour, gloss=0.6, substance="metal")
     pieces = []
     for k, x in enumerate((-1, 1)):
         leg = join([cylinder(0.014, 0.07, 16), box(0.036, 0.055, 0.016).moved((0, -0.008, 0))])
@@ -149,6 +159,6 @@ def robot(kit: Kit, colour: str) -> Thing:
         Piece("body", "panel", panel, kit.paint(kit.other(colour, "yellow", "white", "turquoise"))),
         Piece("head", "", head, coat),
         Piece("head", "eyes", join(eyes), kit.paint(kit.pick("black", "red", "yellow"), gloss=0.9)),
-        Piece("head", "antenna", rod, kit.paint(kit.pick("red", "yellow"))),
+        Piece("head", "antenna", rod, kit.paint(kit.pick("red", "yellow"), substance="plastic")),
         *pieces,
     ))  # fmt: skip

@@ -43,7 +43,7 @@ def candle(kit: Kit, colour: str) -> Thing:
     return Thing("candle", colour, (
         Piece("holder", "", join([dish, cup]), brass),
         Piece("holder", "ring", finger, brass),
-        Piece("stick", "", join([stick, *drips]), kit.paint(colour, gloss=0.25)),
+        Piece("stick", "", join([stick, *drips]), kit.paint(colour, gloss=0.25, substance="wax")),
         Piece("wick", "", wick, kit.paint("black", gloss=0.0)),
         Piece("flame", "", flame.moved((0.002, 0, low + h)),
               kit.paint(kit.pick("yellow", "orange"), gloss=0.0)),
@@ -89,10 +89,10 @@ def goblet(kit: Kit, colour: str) -> Thing:
     rim = ring(0.78 * r, 0.02 * r + 0.0012, 36, 8).moved((0, 0, h))
     glass = kit.glass(colour)
     return Thing("wine glass", colour, (
-        Piece("cup", "", join([shell, inside]), glass),
-        Piece("cup", "rim", rim,
+        Piece("body", "", join([shell, inside]), glass),
+        Piece("body", "rim", rim,
               kit.paint(kit.pick(colour, "yellow", "white"), gloss=0.9, substance="glass")),
-        Piece("cup", "drink", drink,
+        Piece("body", "drink", drink,
               kit.paint(kit.other(colour, "red", "yellow", "purple", "orange"), gloss=0.6)),
         Piece("stem", "", pole, glass),
         Piece("foot", "", foot, glass),

@@ -94,14 +94,14 @@ def airplane(kit: Kit, colour: str) -> Thing:
         gear += [tyre, rod((x * n, y, 0.015), (x * n, y * 0.7, up - 0.01), 0.004)]
     return Thing("airplane", colour, (
         Piece("body", "", tube(line, thick, 24), coat),
-        Piece("body", "windows", join(panes), kit.glass("turquoise")),
+        Piece("body", "window", join(panes), kit.glass("turquoise")),
         Piece("body", "cockpit", glass, kit.glass(kit.pick("blue", "black"))),
         Piece("wing", "", wing.moved((0.0, 0, up - 0.012)), second, 0),
         Piece("tail", "", tail.moved((n / 2 - 0.032, 0, up + 0.012)), second),
         Piece("tail", "rudder", rudder.moved((n / 2 - 0.052, 0, up + 0.016)), second),
         Piece("propeller", "", join([*[b.moved(nose) for b in blades], ball(0.011, 14).moved(nose)]),
               kit.steel("gray")),
-        Piece("wheels", "", join(gear), kit.plastic("black")),
+        Piece("wheel", "", join(gear), kit.plastic("black")),
     ))  # fmt: skip
 
 
@@ -201,6 +201,7 @@ def truck(kit: Kit, colour: str) -> Thing:
     heap = lathe([(0.47 * w, 0.066), (0.3 * w, 0.1), (0.1 * w, 0.122), (0, 0.124)], 24).stretched(
         (1.15, 1, 1)
     )
+    sand = kit.paint(kit.pick("brown", "beige"), "rug", 0.0, substance="skin")
     pieces = []
     black = kit.paint("black", gloss=0.3, substance="rubber")
     for k, (x, y) in enumerate((x, y) for x in (-0.32, 0.08, 0.36) for y in (-1, 1)):
@@ -210,7 +211,7 @@ def truck(kit: Kit, colour: str) -> Thing:
         Piece("cab", "", join([cab, chassis]), kit.plastic(colour)),
         Piece("cab", "window", join([shield, sides]), kit.glass("turquoise")),
         Piece("cab", "lights", lights, kit.plastic("yellow")),
-        Piece("bed", "", bed, bed_paint),
-        Piece("bed", "load", heap.moved((0.18 * n, 0, 0)), kit.paint(kit.pick("brown", "beige"), "rug", 0.0)),
+        Piece("container", "", bed, bed_paint),
+        Piece("container", "load", heap.moved((0.18 * n, 0, 0)), sand),
         *pieces,
     ))  # fmt: skip
