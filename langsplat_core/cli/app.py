@@ -8,7 +8,7 @@ from langsplat_core.cli.bench import BenchRaster
 from langsplat_core.cli.bench_load import BenchLoad
 from langsplat_core.cli.compact import Compact
 from langsplat_core.cli.convert import Convert
-from langsplat_core.cli.demo import DemoBuild, DemoDataset, DemoEncoder
+from langsplat_core.cli.demo import DemoBuild, DemoDataset, DemoEncoder, DemoSheet
 from langsplat_core.cli.evaluate import EvalSynthetic
 from langsplat_core.cli.inspect import Doctor, Inspect
 from langsplat_core.cli.query import QueryScene
@@ -21,6 +21,7 @@ def _parse(args: list[str]) -> Command:
     demo.command(name="build")(DemoBuild)
     demo.command(name="dataset")(DemoDataset)
     demo.command(name="encoder")(DemoEncoder)
+    demo.command(name="sheet")(DemoSheet)
     evaluate.command(name="synthetic")(EvalSynthetic)
     bench.command(name="raster")(BenchRaster)
     bench.command(name="load")(BenchLoad)

@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from langsplat_core.config import DemoEncoderConfig
+from langsplat_core.files import atomic_path
 from langsplat_core.progress import TerminalProgress
 
 
@@ -67,3 +68,28 @@ class DemoBuild:
         with TerminalProgress() as progress:
             report = build_demo(self.out, self.seed, self.steps, progress)
         print(f"{self.out}: {report.gaussians} Gaussians, held-out PSNR {report.psnr:.2f} dB")
+
+
+@dataclass(frozen=True)
+class DemoSheet:
+    """Draw every class of object that the generator knows, so that one sees what its words mean."""
+
+    out: Path
+    """The picture to write, *.png."""
+    seed: int = 0
+    """Another seed draws other examples."""
+    side: int = 128
+    """Pixels per example."""
+    instances: int = 3
+    """Examples of every class."""
+
+    def run(self) -> None:
+        from PIL import Image
+
+        from langsplat_core.datasets.synthetic.sheet import contact_sheet
+
+        with TerminalProgress() as progress:
+            picture = contact_sheet(self.instances, self.side, self.seed, progress)
+        with atomic_path(self.out) as path:
+            Image.fromarray(picture).save(path, "PNG")
+        print(f"{self.out}: {picture.shape[1]}x{picture.shape[0]} pixels")
