@@ -37,11 +37,14 @@ def default_camera(width: int, height: int) -> Camera:
     return look_at(np.array([0.0, 0.0, -2.6]), np.zeros(3), np.array([0.0, -1.0, 0.0]), (width, height))
 
 
+Pair = tuple[int, tuple[int, int]]  # Gaussians, (width, height)
+
+
 def sweep(
-    counts: tuple[int, ...], sizes: tuple[tuple[int, int], ...], pivot: int
-) -> list[tuple[int, tuple[int, int]]]:
-    """(count, size) of the random scenes: every count at the middle size, every size at `pivot` Gaussians,
-    and `PROMISED`; small ones first, so that the time of large ones can be foretold."""
+    counts: tuple[int, ...], sizes: tuple[tuple[int, int], ...], pivot: int, extra: tuple[Pair, ...] = ()
+) -> list[Pair]:
+    """The random scenes: every count at the middle size, every size at `pivot` Gaussians, and `extra`; small
+    ones first, so that the time of large ones can be foretold."""
     middle = sorted(sizes)[len(sizes) // 2]
-    pairs = {(count, middle) for count in counts} | {(pivot, size) for size in sizes}
+    pairs = {(count, middle) for count in counts} | {(pivot, size) for size in sizes} | set(extra)
     return sorted(pairs, key=lambda pair: (pair[0], pair[1][0] * pair[1][1]))

@@ -121,6 +121,6 @@ def count_need(footprints: Footprints, width: int, height: int, settings: Raster
         footprints.extents_px,
         footprints.opacities,
         np.ones((height, width)),
-        np.array([settings.alpha_min, settings.alpha_max, settings.transmittance_min]),
+        np.array([settings.alpha_min, np.float32(settings.alpha_max), settings.transmittance_min]),
     )
     return Need(int(rows), int(entries))

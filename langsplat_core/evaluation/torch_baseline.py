@@ -4,8 +4,8 @@ It is a baseline, so it is made as fast as tensors allow: projection of all Gaus
 into tiles of 16x16 pixels, tiles of like length blended together in steps that stay in cache, tiles that are
 opaque dropped after every step, one group of tiles per thread (PyTorch's own threads meet after every
 operation, which here takes less time than the meeting), and gradients group by group through autograd, so
-that no picture's worth of weights is ever held. Image formation is that of `raster/reference.py`. In float64 its gradients, which
-autograd derives and nobody wrote, serve the benchmark as the truth.
+that no picture's worth of weights is ever held. Image formation is that of `raster/reference.py`. In float64
+its gradients, which autograd derives and nobody wrote, serve the benchmark as the truth.
 """
 
 from collections.abc import Callable, Iterator
@@ -58,7 +58,9 @@ def project(leaves: list[Tensor], camera: Camera, settings: RasterSettings) -> F
     x, y, depth = points.unbind(1)
     margin_x = (settings.fov_clamp - 1) * 0.5 * camera.width / camera.fx
     margin_y = (settings.fov_clamp - 1) * 0.5 * camera.height / camera.fy
-    tx = (x / depth).clamp(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
+    tx = (x / depth).clamp(
+        -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x
+    )
     ty = (y / depth).clamp(
         -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y
     )
@@ -121,7 +123,9 @@ def _bin_tiles(footprints: Footprints, camera: Camera) -> _Bins:
 class TorchView:
     """M drawn of N Gaussians in depth order, with their tiles."""
 
-    def __init__(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, kind: torch.dtype) -> None:
+    def __init__(
+        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, kind: torch.dtype
+    ) -> None:
         self.camera, self._settings, self._kind = camera, settings, kind
         valid = gaussians.valid()
         self.dropped = int((~valid).sum())
@@ -210,7 +214,7 @@ class TorchView:
         makes of each, one group per thread at a time."""
         lengths = self._bins.starts.diff()[tiles]
         order = lengths.sort(descending=True).indices
-        groups = tiles[order[lengths[order] > 0]].split(_TILES)
+        groups = [group for group in tiles[order[lengths[order] > 0]].split(_TILES) if len(group)]
         threads, graded = torch.get_num_threads(), torch.is_grad_enabled()
 
         def alone(group: Tensor) -> _T:
@@ -263,7 +267,7 @@ def _alphas(means: Tensor, shapes: Tensor, centres: Tensor, settings: RasterSett
     xx, xy, yy, log_opacity = (shapes[..., n : n + 1] for n in range(4))
     columns, rows = log_opacity - 0.5 * xx * dx * dx, -0.5 * yy * dy * dy
     power = torch.addcmul(columns[..., None, :] + rows[..., None], dy[..., None], (-xy * dx)[..., None, :])
-    alphas = power.flatten(2).exp().clamp(max=settings.alpha_max)
+    alphas = power.flatten(2).exp().clamp(max=float(np.float32(settings.alpha_max)))
     return alphas * (alphas >= settings.alpha_min)
 
 
