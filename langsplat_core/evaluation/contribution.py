@@ -6,10 +6,12 @@ adjoint sums this over pixels without ever listing them: with one gather of [1, 
 
     W_i = sum_p w_pi,    E_i = sum_p w_pi |c_i - C_p|^2 = |c_i|^2 W_i - 2 c_i . (W^T C)_i + (W^T |C|^2)_i,
 
-and by Cauchy-Schwarz sum_p w_pi |c_i - C_p| <= sqrt(W_i E_i), the contribution of i to this view: an upper
-bound of the total change, in display values times pixels. Over views the largest counts, so that what only
-one view shows is not averaged away. On the bundled scene, ranking by it instead of by sum_views W_i halves
-the loss at the same number of Gaussians.
+and by Cauchy-Schwarz sum_p w_pi |c_i - C_p| <= sqrt(W_i E_i), an upper bound of the total change in display
+values times pixels. That is of one Gaussian taken away alone. Many of one colour hold a white wall up
+together, though each has nothing but its like behind it; so every Gaussian counts as at least `ALONE` away
+from the picture: its contribution is sqrt(W_i (E_i + ALONE^2 W_i)). Over views the largest counts, so that
+what only one view shows is not averaged away. On the bundled scene, at 77 % of the Gaussians, the mean loss
+(the worst view's) is 0.21 (1.3) dB; ranked by W_i it is 0.42 (1.3), by sqrt(W_i E_i) 0.30 (3.4).
 
 **Loss.** With photographs, the loss in PSNR is measured on them. Without, it is derived from how far the
 compact picture lies from the original one: removing something from a trained scene is, to first order,
@@ -34,6 +36,7 @@ from langsplat_core.raster.numba_cpu import colours
 from langsplat_core.raster.protocol import LiftingRasterizer, Rasterizer, View
 from langsplat_core.scene import SH_COUNTS, Camera, Scene
 
+ALONE = 0.055  # display values, RGB distance; see above
 SMALLEST_ERROR = 1e-10  # mean squared error that stands for none, 100 dB
 
 
@@ -77,7 +80,8 @@ def contributions(
         sums = view.gather(np.concatenate(stacked, -1)).astype(np.float64)
         weight, own = sums[:, 0], own.astype(np.float64)
         error = (own**2).sum(1) * weight - 2 * (own * sums[:, 1:4]).sum(1) + sums[:, 4]
-        np.maximum(largest, np.sqrt(weight * np.maximum(error, 0)), out=largest)
+        score = np.sqrt(weight * (np.maximum(error, 0) + ALONE**2 * weight))
+        np.maximum(largest, score, out=largest)
         progress("ranking Gaussians", (index + 1) / len(cameras))
     return largest
 

@@ -67,7 +67,7 @@ class CompactReport:
     budget: float
     unseen_loss: float  # mean, of what the ranking views alone chose: a guess for any other view
     loss: float  # mean, of the file
-    worst_loss: float  # of any one view, of the file
+    worst_loss: float  # of any one view, ranking ones included, of the file
     assumed_psnr: float | None  # None: measured against photographs
     likeness: float  # PSNR of the compact pictures against the original ones, mean, at most 100
     threshold: float  # no dropped Gaussian contributes more to any view, display values times pixels
@@ -124,6 +124,7 @@ def compact_scene(
     losses = psnr_losses(rasterizer, after.scene, exposures, config.assumed_psnr)
     if not losses.mean() <= config.max_psnr_loss:
         raise InputError(f"{out}: as stored it would lose {losses.mean():.3f} dB; not written, allow more")
+    truth = _truth(rasterizer, scene, exposures) or config.assumed_psnr
     weighed = _weights(rasterizer, (replace(before, scene=scene), after), exposures)
     report = CompactReport(
         before=weighed[0],
@@ -132,7 +133,7 @@ def compact_scene(
         budget=config.max_psnr_loss,
         unseen_loss=selection.unseen_loss,
         loss=float(losses.mean()),
-        worst_loss=float(losses.max()),
+        worst_loss=max(float(losses.max()), _worst(rasterizer, scene, after.scene, views, truth)),
         assumed_psnr=config.assumed_psnr if photos is None else None,
         likeness=_likeness(rasterizer, after.scene, exposures),
         threshold=selection.threshold,
@@ -251,6 +252,14 @@ def _weights(
         )
         for stored, milliseconds in zip(pair, times, strict=True)
     ]
+
+
+def _worst(rasterizer: Rasterizer, before: Scene, after: Scene, views: Views, psnr_before: float) -> float:
+    """dB lost in the ranking view that loses most; one at a time, for their pictures may be many."""
+    return max(
+        float(psnr_losses(rasterizer, after, expose(rasterizer, before, [camera], [None]), psnr_before)[0])
+        for camera in views.ranking
+    )
 
 
 def _likeness(rasterizer: Rasterizer, scene: Scene, exposures: Sequence[Exposure]) -> float:

@@ -11,6 +11,7 @@ from langsplat_core.config import CompactConfig
 from langsplat_core.datasets import Capture
 from langsplat_core.errors import InputError
 from langsplat_core.evaluation.contribution import (
+    ALONE,
     contributions,
     draw,
     estimated_loss,
@@ -59,7 +60,7 @@ def source(scene, tmp_path):
 
 def test_a_contribution_bounds_what_its_removal_changes():
     """One Gaussian on black, against the float64 reference: the picture is C = w c, and the score is
-    sqrt(W E) with E = sum w |c - C|^2, never less than sum w |c - C|."""
+    sqrt(W (E + ALONE^2 W)) with E = sum w |c - C|^2, never less than sum w |c - C|."""
     gaussians = random_gaussians(12, seed=3, scale_range=(0.1, 0.3))
     alone = [gaussians.take(np.array([row])) for row in range(12)]
     camera = cameras()[0].resized(32, 24)
@@ -71,7 +72,7 @@ def test_a_contribution_bounds_what_its_removal_changes():
         colour = np.maximum(one.sh[0, 0].astype(float) * 0.28209479177387814 + 0.5, 0)
         distance = np.linalg.norm(colour * (1 - weight), axis=-1)  # |c - C|, with C = w c
         total = (weight[..., 0] * distance).sum()
-        exact = np.sqrt(weight.sum() * (weight[..., 0] * distance**2).sum())
+        exact = np.sqrt(weight.sum() * (weight[..., 0] * (distance**2 + ALONE**2)).sum())
         assert score == pytest.approx(exact, rel=1e-4, abs=1e-6)
         assert score >= total * (1 - 1e-4)
 
