@@ -193,6 +193,13 @@ def test_an_image_beyond_the_driver_is_refused(gl, raster):
         raster.view(random_gaussians(3), camera)
 
 
+def test_a_context_that_is_not_current_is_one_line(gl_session, raster):
+    with gl_session:
+        pass  # and none is current afterwards
+    with pytest.raises(BackendError, match="not current"):
+        raster.view(random_gaussians(3), random_camera())
+
+
 def test_front_to_back_is_stable():
     rng = np.random.default_rng(0)
     for depths in (rng.integers(0, 9, 500).astype(float), rng.uniform(size=500), np.zeros(7), np.zeros(0)):

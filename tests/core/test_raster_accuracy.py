@@ -179,6 +179,34 @@ def test_more_random_scenes(fast_backend: Backend, measured: Measure) -> None:
     check_random_scenes(seeds, fast_backend, measured)
 
 
+def corner_case(width: int, height: int) -> tuple[Gaussians, Camera, Camera]:
+    """Gaussians of a few pixels in the last corner of an image, its camera, and that of the corner alone."""
+    camera = random_camera(3, width, height, distance=3.0, off_centre=False)
+    rng, n = np.random.default_rng(0), 300
+    depths = rng.uniform(2, 4, n)
+    pixels = rng.uniform((width - 40, height - 30), (width, height), (n, 2))
+    in_camera = np.column_stack([(pixels - (camera.cx, camera.cy)) / camera.fx, np.ones(n)]) * depths[:, None]
+    means = (in_camera - camera.world_to_camera[:3, 3]) @ camera.rotation
+    log_scales = np.log(rng.uniform(0.2, 3, (n, 3)) * 3 / camera.fx)
+    corner = replace(camera, width=40, height=30, cx=camera.cx - (width - 40), cy=camera.cy - (height - 30))
+    return replace(random_gaussians(n, 3), means=means, log_scales=log_scales), camera, corner
+
+
+@pytest.mark.parametrize("size", [(1920, 1080), pytest.param((3840, 2160), marks=pytest.mark.slow)])
+def test_far_corner_of_a_large_image(fast_backend: Backend, measured: Measure, size: tuple[int, int]) -> None:
+    """Pixel positions are largest there, and a float32 has the fewest digits left for the fraction: on the
+    GPU an opaque Gaussian of sub-pixel size is off by 5e-8 per pixel of the image's width."""
+    gaussians, camera, corner = corner_case(*size)
+    x = random_values(len(gaussians), 3)
+    reference = REFERENCE.view(gaussians, corner, fast_backend.expected_settings(INRIA))
+    band = cut_off_band(reference, 3 * fast_backend.band)
+    image = fast_backend.raster.view(gaussians, camera).splat(x)[0][-30:, -40:]
+    error = np.abs(image - reference.splat(x)[0]).max(-1)
+    measured(f"{fast_backend.name}, corner of {size[0]} px", "error away from cut-offs", error[~band].max())
+    positions = 5e-8 * size[0] if fast_backend.name == "opengl-single" else 0.0
+    assert error[~band].max() <= max(fast_backend.tolerance, positions)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("name", REAL)

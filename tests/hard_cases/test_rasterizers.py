@@ -11,7 +11,7 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from tests.backends import Backend
 from tests.close import assert_adjoint, cut_off_band
 from tests.hard_cases.cases import CASES, HUGE_IMAGE, ROW
-from tests.hard_cases.drawings import Case, Seen, altered, crowd, draw
+from tests.hard_cases.drawings import Case, Drawing, Seen, altered, balls, crowd, draw
 from tests.measured import Measure
 
 # What rounding can decide in a pixel: two alphas of 1/255, or one last weight alpha T before T reaches 1e-4,
@@ -20,12 +20,12 @@ MOST_AT_A_CUT_OFF = 2 / 255 + 0.99 * 1e-4 / (1 - 0.99)
 NAMED = [pytest.param(case, id=case.name) for case in CASES]
 
 
-def run_case(case: Case, backend: Backend, measured: Measure) -> None:
-    """Everything the table's docstring promises."""
+def run_case(case: Case, drawing: Drawing, backend: Backend, measured: Measure) -> Seen:
+    """Everything the table's docstring promises of every case."""
     if case.only and backend.name not in case.only:
         pytest.skip("too long for this backend")
     try:
-        seen = draw(backend, case.build())
+        seen = draw(backend, drawing)
     except BackendError as error:
         if backend.name != "cuda":
             raise
@@ -33,7 +33,7 @@ def run_case(case: Case, backend: Backend, measured: Measure) -> None:
     camera, channels = seen.drawing.camera, seen.drawing.features().shape[1]
     assert seen.image.shape == (camera.height, camera.width, channels)
     assert np.isfinite(seen.image).all()
-    assert np.isfinite(seen.view.depth()).all()
+    check_depth(seen)
     assert seen.alpha.shape == (camera.height, camera.width)
     assert seen.alpha.min() >= 0
     assert seen.alpha.max() <= 1
@@ -46,7 +46,16 @@ def run_case(case: Case, backend: Backend, measured: Measure) -> None:
         check_gradients(seen)
     if hasattr(seen.view, "frozen"):
         check_frozen(seen)
-    case.check(seen)
+    return seen
+
+
+def check_depth(seen: Seen) -> None:
+    """Finite, and positive only where something is drawn."""
+    assert np.isfinite(seen.view.depth()).all()
+    if not seen.backend.name.startswith("opengl") and seen.backend.name != "cuda":
+        median = seen.view.depth("median")
+        assert np.isfinite(median).all()
+        assert not median[seen.alpha < 0.5 - 1e-6].any()
 
 
 def compare(seen: Seen, measured: Measure) -> None:
@@ -103,7 +112,15 @@ def check_gradients(seen: Seen) -> None:
 
 @pytest.mark.parametrize("case", NAMED)
 def test_hard_case(case: Case, backend: Backend, measured: Measure) -> None:
-    run_case(case, backend, measured)
+    case.check(run_case(case, case.build(), backend, measured))
+
+
+@pytest.mark.parametrize("case", NAMED)
+def test_hard_case_antialiased(case: Case, backend: Backend, measured: Measure) -> None:
+    """What holds for every case, with Mip-Splatting's compensation."""
+    drawing = case.build()
+    settings = replace(drawing.settings, antialiased=True)
+    run_case(case, replace(drawing, settings=settings), backend, measured)
 
 
 @pytest.mark.parametrize("coefficient", [1e20, 1e10, 7e4])
@@ -168,4 +185,12 @@ def test_results_do_not_depend_on_the_number_of_threads(case: Case) -> None:
 
 @pytest.mark.slow
 def test_huge_image(backend: Backend, measured: Measure) -> None:
-    run_case(HUGE_IMAGE, backend, measured)
+    HUGE_IMAGE.check(run_case(HUGE_IMAGE, HUGE_IMAGE.build(), backend, measured))
+
+
+@pytest.mark.slow
+def test_more_intersections_than_an_int32_holds() -> None:
+    """17000 Gaussians that fill 129600 tiles each: one line, before any memory is asked for."""
+    gaussians = balls(np.linspace(2.0, 3.0, 17_000), 0.1, 1e6)
+    with pytest.raises(BackendError, match="smaller"):
+        load_rasterizer("cpu").view(gaussians, HUGE_IMAGE.build().camera)
