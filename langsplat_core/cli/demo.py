@@ -5,7 +5,7 @@ The work is imported when it is done: torch and open3d take seconds that --help 
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -26,12 +26,14 @@ class DemoDataset:
     """Number of photographs."""
     size: tuple[int, int] = (640, 480)
     """Width and height, pixels."""
+    tier: Literal["separate", "clutter", "occlusion"] = "clutter"
+    """How hard the room is: objects apart, cluttered, or packed with look-alikes."""
 
     def run(self) -> None:
         from langsplat_core.datasets.synthetic.dataset import write_dataset
 
         with TerminalProgress() as progress:
-            write_dataset(self.out, self.seed, self.views, self.size, progress)
+            write_dataset(self.out, self.seed, self.views, self.size, progress, self.tier)
         print(f"{self.out}: {self.views} photographs with ground truth")
 
 

@@ -10,10 +10,13 @@ from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.datasets.synthetic import dataset, shapes
 from langsplat_core.datasets.synthetic.colours import COLOURS, colour_word, from_lch, random_colour, to_lch
 from langsplat_core.datasets.synthetic.dataset import write_dataset
+from langsplat_core.datasets.synthetic.light import Tracer, bake
 from langsplat_core.datasets.synthetic.parts import Kit
+from langsplat_core.datasets.synthetic.placement import apart, footprint
 from langsplat_core.datasets.synthetic.render import Light, Renderer
+from langsplat_core.datasets.synthetic.rooms import furnished
 from langsplat_core.datasets.synthetic.textures import noise
-from langsplat_core.datasets.synthetic.world import SMALL, build_world
+from langsplat_core.datasets.synthetic.world import SMALL, build_room, build_world
 from langsplat_core.errors import InputError
 from langsplat_core.progress import silent
 from langsplat_core.scene import look_at
@@ -197,3 +200,68 @@ def test_interrupted_dataset_goes_on(tmp_path, coarse_light):
 def test_dataset_refuses_useless_sizes(tmp_path):
     with pytest.raises(InputError, match="at least 4 views"):
         write_dataset(tmp_path, 0, 2, (64, 48), silent)
+
+
+def small_things(placed):
+    """What was put down on the table or the floor, without the fruit in bowls and on plates."""
+    hosts = [p for p in placed if p.scale != 1.0]
+    held = {"orange", "apple"}
+    return [p for p in hosts if p.thing.word not in held or p.offset[2] < 0.004]
+
+
+@pytest.mark.parametrize("tier", ["separate", "clutter", "occlusion"])
+def test_things_stand_apart_on_a_surface(tier):
+    placed = small_things(furnished(5, tier))
+    assert len(placed) >= 6
+    for item in placed:
+        lowest = min(
+            (p.mesh.vertices @ item.turn.T * item.scale + item.offset)[:, 2].min() for p in item.thing.pieces
+        )
+        height = min((0.0, -0.72, -0.708), key=lambda level: abs(level - lowest))  # table, floor, rug
+        assert lowest - height == pytest.approx(0.001, abs=2e-4)
+    corners = [footprint(item) for item in placed]
+    for row, one in enumerate(corners):
+        for other, item in zip(corners[:row], placed, strict=False):
+            if abs(item.offset[2] - placed[row].offset[2]) < 0.4:
+                assert apart(one, other, 0.0)
+
+
+def test_rectangles_that_touch_are_not_apart():
+    square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
+    turned = (square - 0.5) @ shapes.rotation_about("z", 45)[:2, :2].T
+    assert apart(square, square + (1.1, 0), 0.05)
+    assert not apart(square, square + (1.1, 0), 0.2)
+    assert not apart(square, turned + (1.6, 0.5), 0.0)  # its corner reaches to 0.89
+    assert apart(square, turned + (1.75, 0.5), 0.0)
+
+
+def test_tiers_grow_harder():
+    rooms = {tier: build_room(5, tier) for tier in ("separate", "clutter", "occlusion")}
+    wholes = {tier: [x for x in room.labels if x.level == 2] for tier, room in rooms.items()}
+    assert len(wholes["separate"]) < len(wholes["clutter"]) < len(wholes["occlusion"])
+    words = [label.word for label in wholes["occlusion"]]
+    alike = {word for word in set(words) if words.count(word) >= 3} - {"wall"}
+    hues = {word: {x.colour for x in wholes["occlusion"] if x.word == word} for word in alike}
+    assert sum(len(colours) >= 2 for colours in hues.values()) >= 3  # the same class in other colours
+    again = build_room(5, "occlusion")
+    np.testing.assert_array_equal(again.vertices, rooms["occlusion"].vertices)
+
+
+def test_baked_light_agrees_with_what_it_is_made_of():
+    """An open table under the lamp: no bounce but the sky's; the lattice agrees with the vertices."""
+    world = build_world(3)
+    light = Light(np.array([-0.9, -1.0, 1.7]))
+    tracer = Tracer(world)
+    coarse, fine = bake(tracer, world, light, 6, 0.0), bake(tracer, world, light, 6, 0.006)
+    np.testing.assert_array_equal(coarse.vertices, fine.vertices)
+    assert (coarse.cells == 0).all()
+    rows = np.flatnonzero(fine.cells > 0)
+    assert len(rows) > 500
+    n = fine.cells[rows]
+    corners = np.stack(
+        [fine.start[rows], fine.start[rows] + (n + 1) * (n + 2) // 2 - 1, fine.start[rows] + n], 1
+    )
+    # Corner order: first (0, 0), second (n, 0), third (0, n). The same points, gathered again.
+    np.testing.assert_allclose(fine.lattice[corners], fine.vertices[world.triangles[rows]], atol=1e-5)
+    assert fine.lattice.min() >= 0
+    assert fine.lattice[:, 3].max() <= 1.6

@@ -23,7 +23,7 @@ _LIGHT_CELL = 0.006  # metres between the places where light is gathered, where 
 _POINT_NOISE = 0.004  # metres, standard deviation
 LIGHT = Light(np.array([-1.25, -1.05, 1.55]))
 # (share of the views, elevation in degrees, distance in metres, height of the target above the table)
-_RINGS = ((0.3, 23.0, 1.5, 0.0), (0.3, 42.0, 1.25, 0.02), (0.25, 33.0, 0.92, 0.06), (0.15, 50.0, 1.75, -0.2))
+_RINGS = ((0.3, 23.0, 1.5, 0.0), (0.3, 42.0, 1.25, 0.02), (0.25, 36.0, 1.0, 0.05), (0.15, 50.0, 1.75, -0.2))
 
 
 def write_dataset(

@@ -40,7 +40,7 @@ _BY_TEXTURE = {
 }  # fmt: skip
 # How strongly a pattern is also carved: change of the light per unit of the pattern's weight.
 _RELIEF = {
-    "wood": 0.14, "planks": 0.2, "cloth": 0.2, "tiles": 0.22, "rug": 0.7, "plaster": 0.2, "leaf": 0.35,
+    "wood": 0.1, "planks": 0.2, "cloth": 0.3, "tiles": 0.22, "rug": 0.5, "plaster": 0.12, "leaf": 0.35,
     "peel": 0.5, "pages": 0.15, "striped": 0.2, "painting": 0.1, "metal": 0.05,
 }  # fmt: skip
 

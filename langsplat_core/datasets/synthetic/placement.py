@@ -8,7 +8,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.datasets.synthetic.parts import Thing
 from langsplat_core.datasets.synthetic.shapes import rotation_about
 
-_TRIES = 160  # places that are looked at for one object before it is left out
+_CLEARANCE = 0.001  # metres under an object: a flat bottom in the very plane it stands on would flicker
+_TRIES = 400  # places that are looked at for one object before it is left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +68,8 @@ class Surface:
         middle = (low + high) / 2 * (1, 1, 0)
         for _ in range(_TRIES):
             turn = rotation_about("z", rng.uniform(0, 360))
-            spot = self.centre + np.array([*rng.uniform(-self.half, self.half), -low[2] * self.scale])
+            height = _CLEARANCE - low[2] * self.scale
+            spot = self.centre + np.array([*rng.uniform(-self.half, self.half), height])
             placed = Placed(thing, turn, spot - turn @ middle * self.scale, self.scale)
             corners = footprint(placed)
             inside = (np.abs(corners - self.centre[:2]) <= self.half).all()

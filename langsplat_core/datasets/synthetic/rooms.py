@@ -25,12 +25,13 @@ class _Plan:
     gap: float  # metres between footprints
     crowd: int  # see Surface
     classes: int  # different classes among them; 0: all different
+    largest: float = 1.0  # square metres of an object's footprint
 
 
 _PLANS: dict[Tier, _Plan] = {
     "separate": _Plan(8, 0, 0.07, 1, 0),
     "clutter": _Plan(17, 5, 0.012, 2, 0),
-    "occlusion": _Plan(28, 6, 0.003, 8, 9),
+    "occlusion": _Plan(34, 6, 0.003, 6, 9, 0.032),
 }
 
 
@@ -41,7 +42,7 @@ def furnished(seed: int, tier: Tier) -> list[Placed]:
     room = _large_things(kit)
     objects = _chosen(kit, plan)
     table = Surface(np.zeros(3), _HALF_TABLE, plan.gap, ENLARGED, plan.crowd)
-    on_table = [table.stand(thing, rng) for thing in _tall_last(objects[: plan.table])]
+    on_table = [table.stand(thing, rng) for thing in _wide_first(objects[: plan.table])]
     floor = Surface(np.array([0, 0, -furniture.TABLE_TOP]), np.array([1.5, 1.5]), 0.03, ENLARGED)
     floor.taken = [
         footprint(item) for item in room if item.thing.word not in ("floor", "rug", "wall", "picture")
@@ -52,14 +53,15 @@ def furnished(seed: int, tier: Tier) -> list[Placed]:
     return [*room, *(thing for group in small for thing in group), *lying]
 
 
-def _tall_last(things: list[Thing]) -> list[Thing]:
+def _area(thing: Thing) -> float:
+    """Of the box around a thing as it stands in the room, seen from above, square metres."""
+    low, high = bounds(thing)
+    return float(np.prod((high - low)[:2])) * ENLARGED**2
+
+
+def _wide_first(things: list[Thing]) -> list[Thing]:
     """Wide things find room only while there is some."""
-
-    def width(thing: Thing) -> float:
-        low, high = bounds(thing)
-        return float(-np.prod((high - low)[:2]))
-
-    return sorted(things, key=width)
+    return sorted(things, key=lambda thing: -_area(thing))
 
 
 def _chosen(kit: Kit, plan: _Plan) -> list[Thing]:
@@ -68,13 +70,17 @@ def _chosen(kit: Kit, plan: _Plan) -> list[Thing]:
     names = [str(name) for name in kit.rng.permutation(list(TABLE_TOP))]
     alike = plan.classes > 0
     if alike:
-        names = names[: plan.classes] * (count // plan.classes + 1)
+        small = [
+            name for name in names if _area(TABLE_TOP[name][0](kit, TABLE_TOP[name][1][0])) < plan.largest
+        ]
+        names = small[: plan.classes] * (count // plan.classes + 1)
     shared = [str(word) for word in kit.rng.permutation(BRIGHT)[:4]]
     used: dict[str, int] = {}
     things = []
     for name in names[:count]:
         builder, own = TABLE_TOP[name]
         words = [word for word in own if word in (shared if alike else BRIGHT)] or list(own)
+        words += [word for word in own if word not in words][: max(3 - len(words), 0)]
         # With look-alikes an object's neighbours in class differ in colour, not the room's objects at large.
         key = name if alike else ""
         fewest = min(used.get(key + word, 0) for word in words)

@@ -74,10 +74,10 @@ def _scatter(value):  # type: ignore[no-untyped-def]
 def _wood(v, x, y, z):  # type: ignore[no-untyped-def]
     """Growth rings about an axis far below the board, and fine pores along the grain (x)."""
     bend = noise_at(v, x / 1.3, y / 0.5, z / 0.5)
-    ring = _fraction(math.hypot(y + 0.11, z + 0.6) * 26 + 0.55 * bend)
-    band = ring * ring * min(1.0, (1 - ring) * 9)
-    pores = noise_at(v, x / 0.5, y / 0.022, z / 0.022)
-    return 0.75 * band + 0.2 * pores + 0.14 * bend + 0.05
+    ring = _fraction(math.hypot(y + 0.11, z + 0.5) * 62 + 0.9 * bend)
+    band = ring * ring * min(1.0, (1 - ring) * 6)
+    pores = noise_at(v, x / 1.1, y / 0.05, z / 0.05)
+    return 0.75 * band + 0.13 * pores + 0.2 * bend + 0.1
 
 
 @_compiled
@@ -103,7 +103,9 @@ def _tiles(v, x, y, z):  # type: ignore[no-untyped-def]
 @_compiled
 def _cloth(v, x, y, z):  # type: ignore[no-untyped-def]
     a, b, c = math.sin(x * 1300), math.sin(y * 1300), math.sin(z * 1300)
-    return 0.45 + 0.2 * (a * b + b * c + c * a) + 0.28 * noise_at(v, x / 0.11, y / 0.11, z / 0.11)
+    fibres = noise_at(v, x / 0.045, y / 0.045, z / 0.045)
+    broad = noise_at(v, x / 0.17, y / 0.17, z / 0.17)
+    return 0.45 + 0.05 * (a * b + b * c + c * a) + 0.15 * fibres + 0.16 * broad
 
 
 @_compiled
@@ -112,7 +114,7 @@ def _rug(v, x, y, z):  # type: ignore[no-untyped-def]
     a, b = x / 0.3, y / 0.3
     lattice = abs(a - math.floor(a + 0.5)) + abs(b - math.floor(b + 0.5))
     drawn = (0.82 < inside < 0.9) or (inside < 0.78 and 0.38 < lattice < 0.48)
-    pile = 0.13 * noise_at(v, x / 0.12, y / 0.12, z / 0.12) + 0.1 * math.sin(x * 500) * math.sin(y * 500)
+    pile = 0.09 * noise_at(v, x / 0.06, y / 0.06, z / 0.06) + 0.1 * math.sin(x * 500) * math.sin(y * 500)
     return (0.9 if drawn else 0.05) + pile
 
 
@@ -143,7 +145,9 @@ def _small(kind, v, x, y, z):  # type: ignore[no-untyped-def]
     if kind == 10:  # striped
         return 1.1 if _fraction(y / 0.022) > 0.72 else 0.2 * noise_at(v, x / 0.1, y / 0.1, z / 0.1)
     if kind == 8:  # plaster
-        return 0.4 + 0.4 * noise_at(v, x / 0.16, y / 0.16, z / 0.16) + 0.5 * noise_at(v, x / 2.9, y / 2.3, z)
+        return (
+            0.4 + 0.08 * noise_at(v, x / 0.16, y / 0.16, z / 0.16) + 0.14 * noise_at(v, x / 2.9, y / 2.3, z)
+        )
     a, b, c = x / 0.034, y / 0.034, z / 0.034
     a, b, c = a - math.floor(a + 0.5), b - math.floor(b + 0.5), c - math.floor(c + 0.5)
     return 1.0 if a * a + b * b + c * c < 0.09 else 0.0  # dotted
