@@ -91,16 +91,17 @@ def _read_columns(
     file.seek(header.size)
     chunks = iterate_rows(file, file_size, header, element, path)
     out = np.empty((element.count, len(names)))
-    for start, rows in chunks:
-        for column, name in enumerate(names):
-            out[start : start + len(rows), column] = rows[name]
+    with np.errstate(invalid="ignore"):  # a signalling NaN becomes an ordinary one
+        for start, rows in chunks:
+            for column, name in enumerate(names):
+                out[start : start + len(rows), column] = rows[name]
     return out
 
 
 def _read_rest(file: BinaryIO, file_size: int, header: PlyHeader, vertex: PlyElement, path: Path) -> Array:
     """(N, 3 (K - 1)) channel-major coefficients; K = 1 without the element `sh`."""
     element = header.element("sh")
-    if element is None:
+    if element is None or not element.properties:
         return np.zeros((vertex.count, 0))
     if element.count != vertex.count or len(element.properties) not in REST_COUNTS:
         raise FormatError(

@@ -3,14 +3,18 @@
 import json
 import tracemalloc
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import numpy as np
 import plyfile
 import pytest
 
+from langsplat_core.cli import query
 from langsplat_core.cli.convert import Convert
+from langsplat_core.cli.query import QueryScene
 from langsplat_core.config import INRIA, PictureConfig
 from langsplat_core.errors import InputError
+from langsplat_core.evaluation.synthetic import evaluate
 from langsplat_core.formats import (
     companion_path,
     language,
@@ -20,6 +24,7 @@ from langsplat_core.formats import (
     save_scene,
     write_ply,
 )
+from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Scene
@@ -35,6 +40,9 @@ from tests.core.file_samples import (
     write_folder,
 )
 from tests.scenes import random_camera, random_gaussians
+from tests.viewer.fakes import blobs
+from tests.viewer.fakes import cameras as fake_cameras
+from tests.viewer.fakes import language as fake_language
 
 N = 40
 PICTURE = PictureConfig(display="alpha")
@@ -248,6 +256,29 @@ def test_the_same_gaussians_with_another_mark_are_projected_anew(tmp_path):
     first = channels.render(scene, Layers(), camera, "none").alpha
     second = channels.render(replace(scene, antialiased=False), Layers(), camera, "none").alpha
     assert np.abs(first - second).max() > 0.05
+
+
+class Recorder:
+    """The CPU rasterizer, which notes the settings it is given."""
+
+    def __init__(self) -> None:
+        self.seen: list = []
+
+    def view(self, gaussians, camera, settings=INRIA):
+        self.seen.append(settings)
+        return load_rasterizer("cpu").view(gaussians, camera, settings)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_queries_and_evaluation_draw_as_the_file_says(tmp_path, monkeypatch, antialiased):
+    scene = Scene(blobs(), fake_language(phrasebook=True), fake_cameras(1), None, antialiased)
+    save_scene(tmp_path / "a.ply", scene)
+    recorder = Recorder()
+    monkeypatch.setattr(query, "load_rasterizer", lambda _: recorder)
+    QueryScene(tmp_path / "a.ply", ("book",)).run()
+    truth = SimpleNamespace(phrases=(), labels=lambda name: np.zeros((3, 120, 160), int))
+    evaluate(QueryEngine(load_scene(tmp_path / "a.ply")), recorder, scene.cameras, truth)
+    assert [settings.antialiased for settings in recorder.seen] == [antialiased] * 2
 
 
 # ---- conversion ----

@@ -189,6 +189,17 @@ def test_every_property_as_a_list_or_missing_or_twice(reader):
         assert reader(content.replace(line, line.replace(b" n", b" m"))) is not None  # an extra property
 
 
+def test_compressed_files_that_fuzzing_found(reader):
+    """An element without properties; doubles and signalling NaN in place of packed numbers and bounds."""
+    content = compressed_ply(random_gaussians(3, sh_degree=1))
+    bare = content.replace(b"".join(b"property uchar f_rest_%d\n" % i for i in range(9)), b"")
+    assert reader(bare).gaussians.sh_degree == 0
+    assert reader(content.replace(b"uint packed_color", b"float packed_color")) is None
+    header, body = content.split(b"end_header\n")
+    nan = b"\x01\x00\xa0\x7f"  # little endian; signalling
+    assert not reader(header + b"end_header\n" + nan + body[4:]).gaussians.valid().any()
+
+
 # ---- random damage that knows the header ----
 
 INSERTS = [
