@@ -186,7 +186,7 @@ def burger(kit: Kit, colour: str) -> Thing:
         ],
         40,
     )
-    under = lathe([(0.0, 0.0), (0.9 * r, 0.0), (1.0 * r, 0.012), (0.98 * r, 0.03), (0, 0.031)], 36)
+    under = lathe([(0.0, 0.0), (0.9 * r, 0.0), (1.0 * r, 0.012), (0.98 * r, 0.03), (0, 0.031)], 36, 0.02)
     meat = pillow(2.04 * r, 2.04 * r, 0.026, 3, 30).moved((0, 0, 0.03))
     cheese = sheet(1.62 * r, 1.62 * r, 0.02)
     droop = np.maximum(np.abs(cheese.vertices[:, :2]).sum(1) - 1.15 * r, 0) * 0.55

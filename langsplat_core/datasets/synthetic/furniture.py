@@ -87,12 +87,12 @@ def bed(kit: Kit, colour: str) -> Thing:
     ]
     head = join(
         [
-            box(w, 0.05, 0.75, 0.07).moved((0, n / 2, 0.1)),
+            box(w, 0.05, 0.75, 0.1).moved((0, n / 2, 0.1)),
             pillow(w + 0.06, 0.08, 0.07, 5, 20).moved((0, n / 2, 0.83)),
         ]
     )
-    foot = box(w, 0.05, 0.36, 0.07).moved((0, -n / 2, 0.1))
-    frame = box(w, n, 0.16, 0.1).moved((0, 0, 0.14))
+    foot = box(w, 0.05, 0.36, 0.1).moved((0, -n / 2, 0.1))
+    frame = box(w, n, 0.16, 0.15).moved((0, 0, 0.14))
     mattress = pillow(w - 0.04, n - 0.06, 0.2, 8, 32).moved((0, 0, 0.28))
     quilt = pillow(w + 0.05, 0.66 * n, 0.27, 7, 36).moved((0, -0.15 * n, 0.26))
     fold = pillow(w + 0.06, 0.12 * n, 0.05, 4, 28).moved((0, 0.14 * n, 0.49))

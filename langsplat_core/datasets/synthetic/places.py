@@ -127,7 +127,7 @@ def castle(kit: Kit, colour: str) -> Thing:
 def cactus(kit: Kit, colour: str) -> Thing:
     """Green, with two arms, flowers and spines, in a pot of the given colour."""
     r, h = kit.size(0.03, 0.036), kit.size(0.15, 0.19)
-    pot = lathe([(0, 0), (0.05, 0), (0.062, 0.062)], 32)
+    pot = lathe([(0, 0), (0.05, 0), (0.062, 0.062)], 32, 0.02)
     lip = lathe([(0.066, 0.06), (0.067, 0.075), (0.058, 0.075), (0.056, 0.06)], 32, 0.006)
     soil = lathe([(0.058, 0.066), (0, 0.068)], 28)
     trunk = rod((0, 0, 0.06), (0, 0, 0.06 + h - r), r, around=28)
@@ -151,7 +151,8 @@ def cactus(kit: Kit, colour: str) -> Thing:
         turn, z = np.radians(kit.size(0, 360)), kit.size(0.075, 0.05 + h - r)
         out = np.array([np.cos(turn), np.sin(turn), 0.0])
         start = out * r * (1 + 0.14 * np.cos(9 * turn)) + (0, 0, z)
-        spines.append(rod(start, start + out * 0.009 + (0, 0, 0.003), 0.001, 0.0003, 3))
+        tip = start + out * 0.009 + (0, 0, 0.003)
+        spines.append(tube(np.stack([start, tip]), np.array([0.001, 1e-4]), 4))
     petals = [ball(0.012, 8).stretched((1, 0.6, 0.4)).moved((0.011, 0, 0)).turned(rotation_about("z", 60 * k))
               for k in range(6)]  # fmt: skip
     bloom = join([*petals, ball(0.007, 8)]).moved((0, 0, 0.06 + h))

@@ -92,7 +92,7 @@ def vase(kit: Kit, colour: str) -> Thing:
         stalk = np.array([(0, 0, h * 0.8), (0.015, 0, h + 0.05), (0.045, 0, h + 0.13)]) @ lean.T
         head = stalk[-1] + (0, 0, 0.005)
         petals = [
-            ball(0.022, 14).stretched((1, 0.7, 0.35)).moved((0.024, 0, 0)).turned(rotation_about("z", 60 * j))
+            ball(0.022, 10).stretched((1, 0.7, 0.35)).moved((0.024, 0, 0)).turned(rotation_about("z", 60 * j))
             for j in range(6)
         ]
         pieces += [
@@ -116,7 +116,7 @@ def plant(kit: Kit, colour: str) -> Thing:
     leaves = []
     for k in range(int(kit.rng.integers(14, 20))):
         length, tilt = kit.size(0.07, 0.11), kit.size(15, 75)
-        blade = ball(0.5, 16).stretched((length, length * 0.42, 0.008)).moved((length * 0.62, 0, 0))
+        blade = ball(0.5, 12).stretched((length, length * 0.42, 0.008)).moved((length * 0.62, 0, 0))
         turn = rotation_about("z", 137.5 * k) @ rotation_about("y", -tilt)
         leaves.append(blade.turned(turn).moved((0, 0, h + 0.012 + 0.004 * k)))
     return Thing("plant", "green", (
