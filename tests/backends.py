@@ -33,11 +33,11 @@ class Backend:
 
 
 # Half floats keep 11 bits and every layer rounds once. Mesa's software driver rounds towards zero, so that
-# errors add up: at most 5e-3 and on average 1e-3 for the 150 layers of a random scene.
+# errors add up: at most 7e-3 and on average 1e-3 for the 150 layers of a random scene.
 _PROMISES = {
     "reference": (1e-12, 1e-9),
     "cpu": (2e-5, 1e-4),
-    "opengl-half": (6e-3, 1e-3),
+    "opengl-half": (8e-3, 1e-3),
     "opengl-single": (2e-5, 1e-3),
     "cuda": (2e-5, 1e-3),
 }

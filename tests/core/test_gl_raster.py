@@ -198,6 +198,8 @@ def test_a_context_that_is_not_current_is_one_line(gl_session, raster):
         pass  # and none is current afterwards
     with pytest.raises(BackendError, match="not current"):
         raster.view(random_gaussians(3), random_camera())
+    with gl_session:
+        assert raster.view(random_gaussians(3), random_camera()).splat(np.ones((3, 1)))[1].any()
 
 
 def test_front_to_back_is_stable():
