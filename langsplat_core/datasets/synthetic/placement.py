@@ -30,23 +30,26 @@ def bounds(thing: Thing) -> tuple[Array, Array]:
 
 def footprint(placed: Placed) -> Array:
     """(4, 2) corners of the upright box around a placed thing, seen from above, in world metres."""
-    low, high = bounds(placed.thing)
-    corners = np.array(
-        [(x, y, 0) for x, y in ((low[0], low[1]), (high[0], low[1]), high[:2], (low[0], high[1]))]
-    )
-    world: Array = (corners * placed.scale) @ placed.turn.T + placed.offset
+    world: Array = (_base(placed.thing) * placed.scale) @ placed.turn.T + placed.offset
     return world[:, :2]
 
 
-def apart(one: Array, other: Array, gap: float) -> bool:
-    """Whether two rectangles (4, 2) keep a distance of `gap` along one of their four directions."""
-    for shape in (one, other):
-        for edge in (shape[1] - shape[0], shape[2] - shape[1]):
-            axis = edge / max(float(np.linalg.norm(edge)), 1e-12)
-            a, b = one @ axis, other @ axis
-            if a.min() - b.max() > gap or b.min() - a.max() > gap:
-                return True
-    return False
+def _base(thing: Thing) -> Array:
+    """(4, 3) corners, in order around, of the box around a thing in its own frame, at height 0."""
+    low, high = bounds(thing)
+    return np.array([(x, y, 0) for x, y in (low[:2], (high[0], low[1]), high[:2], (low[0], high[1]))])
+
+
+def apart(one: Array, other: Array, gap: float) -> Array:
+    """(...) whether rectangles (..., 4, 2) keep a distance of `gap` from one rectangle (4, 2) along one of
+    the four directions of their sides."""
+    axes = np.concatenate(
+        [np.diff(one[..., :3, :], axis=-2), np.diff(np.broadcast_to(other, one.shape)[..., :3, :], axis=-2)],
+        axis=-2,
+    )
+    axes /= np.maximum(np.linalg.norm(axes, axis=-1, keepdims=True), 1e-12)
+    a, b = one @ axes.swapaxes(-1, -2), other @ axes.swapaxes(-1, -2)  # (..., 4 corners, 4 axes)
+    return np.asarray(((a.min(-2) - b.max(-2) > gap) | (b.min(-2) - a.max(-2) > gap)).any(-1))
 
 
 @dataclass(eq=False)
@@ -62,26 +65,20 @@ class Surface:
 
     def stand(self, thing: Thing, rng: np.random.Generator) -> Placed | None:
         """Put a thing down at a free place, turned at random; None where there is no room for it."""
-        low, high = bounds(thing)
-        best: tuple[float, Placed, Array] | None = None
-        found = 0
-        middle = (low + high) / 2 * (1, 1, 0)
-        for _ in range(_TRIES):
-            turn = rotation_about("z", rng.uniform(0, 360))
-            height = _CLEARANCE - low[2] * self.scale
-            spot = self.centre + np.array([*rng.uniform(-self.half, self.half), height])
-            placed = Placed(thing, turn, spot - turn @ middle * self.scale, self.scale)
-            corners = footprint(placed)
-            inside = (np.abs(corners - self.centre[:2]) <= self.half).all()
-            if not inside or not all(apart(corners, other, self.gap) for other in self.taken):
-                continue
-            found += 1
-            reach = float(np.linalg.norm(spot[:2] - self.centre[:2]))
-            if best is None or reach < best[0]:
-                best = (reach, placed, corners)
-            if found >= self.crowd:
-                break
-        if best is None:
+        base, lowest = _base(thing)[:, :2] * self.scale, bounds(thing)[0][2]
+        middle = base.mean(0)
+        angles = rng.uniform(0, 360, _TRIES)
+        turns = np.stack([rotation_about("z", angle) for angle in angles])
+        spots = self.centre[:2] + rng.uniform(-self.half, self.half, (_TRIES, 2))
+        corners = (base - middle) @ turns[:, :2, :2].swapaxes(1, 2) + spots[:, None]
+        free = (np.abs(corners - self.centre[:2]) <= self.half).all((1, 2))
+        for other in self.taken:
+            free &= apart(corners, other, self.gap)
+        rows = np.flatnonzero(free)[: self.crowd]
+        if not len(rows):
             return None
-        self.taken.append(best[2])
-        return best[1]
+        row = rows[np.linalg.norm(spots[rows] - self.centre[:2], axis=1).argmin()]
+        self.taken.append(corners[row])
+        height = self.centre[2] + _CLEARANCE - lowest * self.scale
+        offset = np.array([*(spots[row] - turns[row, :2, :2] @ middle), height])
+        return Placed(thing, turns[row], offset, self.scale)

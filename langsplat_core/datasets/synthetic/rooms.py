@@ -1,6 +1,7 @@
 """Furnished rooms of three tiers of difficulty: what is in them and where it stands."""
 
 from dataclasses import dataclass
+from itertools import islice
 from typing import Literal
 
 import numpy as np
@@ -70,10 +71,10 @@ def _chosen(kit: Kit, plan: _Plan) -> list[Thing]:
     names = [str(name) for name in kit.rng.permutation(list(TABLE_TOP))]
     alike = plan.classes > 0
     if alike:
-        small = [
+        small = (
             name for name in names if _area(TABLE_TOP[name][0](kit, TABLE_TOP[name][1][0])) < plan.largest
-        ]
-        names = small[: plan.classes] * (count // plan.classes + 1)
+        )
+        names = list(islice(small, plan.classes)) * (count // plan.classes + 1)
     shared = [str(word) for word in kit.rng.permutation(BRIGHT)[:4]]
     used: dict[str, int] = {}
     things = []
