@@ -149,6 +149,18 @@ def test_no_word_stands_for_two_different_things(things):
     assert clashes <= SHARED
 
 
+def test_no_phrase_names_a_whole_and_a_part(things):
+    """A snowman's hat is a hat; any other phrase for a part must not be one for a thing."""
+    wholes, parts = set(), set()
+    for group in things.values():
+        for thing in group[:3]:
+            for piece in thing.pieces:
+                labels = [label_region(level, thing, piece) for level in range(3)]
+                wholes.update(labels[2].names)
+                parts.update(labels[0].names, labels[1].names)
+    assert {phrase for phrase in wholes & parts if phrase.split()[-1] != "hat"} == set()
+
+
 def test_synonym_tables_start_with_their_own_word():
     for table in (captions.OBJECT_SYNONYMS, captions.PART_SYNONYMS):
         assert all(words[0] == word and len(set(words)) == len(words) for word, words in table.items())

@@ -27,7 +27,7 @@ OBJECT_SYNONYMS: dict[str, tuple[str, ...]] = {
     "basket": ("basket", "wicker basket"),
     "cake": ("cake", "birthday cake"),
     "donut": ("donut", "doughnut"),
-    "ice cream": ("ice cream", "ice cream cone"),
+    "ice cream": ("ice cream", "icecream"),
     "burger": ("burger", "hamburger"),
     "train": ("train", "locomotive"),
     "truck": ("truck", "lorry"),
