@@ -282,7 +282,7 @@ def _language(
     field = scenes[0].language
     if field is None:
         return None
-    stored = [phrase for phrase in field.phrasebook if phrase == phrase.lower()][:PHRASES]
+    stored = list(field.phrasebook)[:PHRASES]
     phrases = list(dict.fromkeys([*(" ".join(text.lower().split()) for text in more), *stored]))
     encoder = None
     if any(phrase not in field.phrasebook for phrase in phrases):

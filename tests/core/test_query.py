@@ -64,7 +64,7 @@ def two_blob_scene(linear: bool = True) -> tuple[Scene, np.ndarray, np.ndarray]:
     confidence = np.ones((3, 2 * count), np.float32)
     confidence[0] = 0
     field = LanguageField(latents, confidence, codec, np.eye(D, dtype=np.float32)[8:12], "none")
-    phrasebook = {"left": np.eye(D, dtype=np.float32)[0], "nowhere": np.eye(D, dtype=np.float32)[5]}
+    phrasebook = {"Left": np.eye(D, dtype=np.float32)[0], "nowhere": np.eye(D, dtype=np.float32)[5]}
     field = LanguageField(latents, confidence, codec, field.canonical, "none", phrasebook)
     camera = look_at(np.zeros(3), np.array([0, 0, 4.0]), np.array([0, -1.0, 0]), (64, 48))
     return Scene(gaussians, field, (camera,)), means[:count], means[count:]
