@@ -33,6 +33,8 @@ class BenchRaster:
     def run(self) -> None:
         if not self.channels or min(self.channels) < 1:
             raise InputError("--channels must be one or more numbers of at least 1")
+        if not self.sizes:
+            raise InputError("--sizes must be one or more pairs of a width and a height")
         if min((*self.counts, self.pivot, *(side for size in self.sizes for side in size))) < 1:
             raise InputError("--counts, --sizes and --pivot must be 1 or more")
         from langsplat_core.evaluation.bench_raster import Plan, quick_plan, run_plan

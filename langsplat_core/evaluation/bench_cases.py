@@ -43,8 +43,10 @@ Pair = tuple[int, tuple[int, int]]  # Gaussians, (width, height)
 def sweep(
     counts: tuple[int, ...], sizes: tuple[tuple[int, int], ...], pivot: int, extra: tuple[Pair, ...] = ()
 ) -> list[Pair]:
-    """The random scenes: every count at the middle size, every size at `pivot` Gaussians, and `extra`; small
-    ones first, so that the time of large ones can be foretold."""
+    """The random scenes: every count at the middle size, every size at `pivot` Gaussians, and those of
+    `extra` whose count and size are asked for; small ones first, so that the time of large ones can be
+    foretold."""
     middle = sorted(sizes)[len(sizes) // 2]
-    pairs = {(count, middle) for count in counts} | {(pivot, size) for size in sizes} | set(extra)
+    pairs = {(count, middle) for count in counts} | {(pivot, size) for size in sizes}
+    pairs |= {(count, size) for count, size in extra if count in (*counts, pivot) and size in sizes}
     return sorted(pairs, key=lambda pair: (pair[0], pair[1][0] * pair[1][1]))

@@ -1,6 +1,6 @@
 """Time, error and memory of one operation after another, for every rasterizer, in one run.
 
-* Time: median of the calls that fit into half a second (at least three), after a first call that is not
+* Time: median of the calls that fit into 0.3 seconds (at least three), after a first call that is not
   counted. A call of more than two seconds is measured once.
 * Error: against the float64 reference (`bench_truth`), from a call of its own.
 * Memory: how far the process's resident set rises at its highest during the first call, with the heap's
@@ -26,7 +26,7 @@ from langsplat_core.evaluation.torch_baseline import TorchRasterizer
 from langsplat_core.raster.protocol import Rasterizer
 from langsplat_core.scene import Camera
 
-_CALLS, _BUDGET_S = 15, 0.5  # at most this many calls, begun within this time
+_CALLS, _BUDGET_S = 15, 0.3  # at most this many calls, begun within this time
 _ONCE_S = 2.0  # a call that takes longer is its own measurement
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 

@@ -13,7 +13,7 @@ _COMPARED = {
     "splat": "splat: pixels",
     "gather": "gather: values",
     "backward": "backward: relative",
-    "frozen": "frozen: pixels, gathered (triangles)",
+    "frozen": "frozen (triangles: gathered)",
 }
 _ORDER = ("project", "frame", "splat", "gather", "backward", "freeze", "frozen splat", "frozen gather")
 
@@ -31,7 +31,7 @@ def plot(rows: Sequence[Measurement], path: Path) -> None:
     size = _busiest(random)
     here = [r for r in random if (r.width, r.height) == size]
     channels = sorted({r.channels for r in rows})
-    styles = {channels[-1]: "--", channels[0]: "-"}
+    styles = {channels[0]: "-"} | ({channels[-1]: "--"} if len(channels) > 1 else {})
     backends = list(dict.fromkeys(r.backend for r in rows))
     colours = {name: _COLOURS.get(name, f"C{n}") for n, name in enumerate(backends)}
     figure, grid = pyplot.subplots(3, 4, figsize=(13, 10), layout="constrained", squeeze=False)

@@ -37,7 +37,6 @@ class Plan:
     scenes: tuple[Path, ...] = ()
     limit_s: float = 60.0
     cold: bool = False
-    promised: bool = True  # also the scenes that the promised ratios speak of
 
 
 def quick_plan(plan: Plan) -> Plan:
@@ -48,7 +47,6 @@ def quick_plan(plan: Plan) -> Plan:
         sizes=((160, 120), (320, 240), (640, 480)),
         pivot=10_000,
         limit_s=min(plan.limit_s, 3.0),
-        promised=False,
     )
 
 
@@ -143,8 +141,7 @@ def run_plan(plan: Plan, progress: Progress = silent) -> Report:
 
 
 def _pairs(plan: Plan) -> list[tuple[int, tuple[int, int]]]:
-    extra = bench_report.PROMISED_CASES if plan.promised else ()
-    return sweep(plan.counts, plan.sizes, plan.pivot, extra)
+    return sweep(plan.counts, plan.sizes, plan.pivot, bench_report.PROMISED_CASES)
 
 
 def _cases(plan: Plan) -> Iterator[Case]:
