@@ -31,8 +31,8 @@ class GlRasterizer:
     `precision` is that of the accumulated image. "half" suits a screen: every layer rounds once, which
     adds up to 4e-3 on average and 2e-2 at most on trained scenes where the driver rounds towards zero, as
     Mesa's software driver does (there "single" is the faster one, too); values up to 65504. "single"
-    suits measurements: but for the cut-offs within 2e-5 in images of 400 pixels a side and 1e-4 in those of
-    1920, as pixel positions are float32.
+    suits measurements: but for the cut-offs within 2e-5 in images of 400 pixels a side, 1e-4 in those of
+    1920 and for needles across the image, as pixel positions are float32.
     """
 
     name = "opengl"
