@@ -22,6 +22,15 @@ from tests.close import assert_close_off_cuts, assert_gradient, cut_off_band
 from tests.scenes import random_camera, random_gaussians, random_values
 
 
+@pytest.fixture(autouse=True)
+def one_torch_thread():
+    """Scenes here are tiny, and PyTorch's threads spin while they wait for one another."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 def measurement(
     gaussians=100, milliseconds=1.0, operation="splat", backend="cpu", size=(320, 240), channels=3
 ):
