@@ -71,7 +71,7 @@ def room_crops(seed: int, views: int) -> CropSet:
     angle, height = rng.uniform(0, 2 * np.pi), rng.uniform(1.2, 2.0)
     position = np.array([1.4 * np.cos(angle), 1.4 * np.sin(angle), height])
     light = Light(position, rng.uniform(0.3, 0.9), rng.uniform(0.6, 1.15), rng.uniform(0.75, 1.3))
-    renderer = Renderer(world, light, samples=12)
+    renderer = Renderer(world, light, samples=10)
     images: list[Array] = []
     labels: list[Label] = []
     for _ in range(views):
