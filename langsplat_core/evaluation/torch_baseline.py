@@ -8,7 +8,7 @@ that no picture's worth of weights is ever held. Image formation is that of `ras
 its gradients, which autograd derives and nobody wrote, serve the benchmark as the truth.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, TypeVar
 
@@ -25,6 +25,7 @@ TILE = 16
 PIXELS = TILE * TILE
 _STEP = 32  # Gaussians of a tile that are blended at once
 _TILES = 16  # tiles that are blended together: 16 * 32 * 256 float32 numbers fill half a MiB
+_ROWS = 16384  # Gaussians that are projected together
 _NEVER = -1e4  # logarithm of the opacity that fills a short tile up
 _T = TypeVar("_T")
 _Used = list[tuple[Tensor, list[Tensor]]]  # rows of the tables that a step read, and its leaves
@@ -120,19 +121,36 @@ def _bin_tiles(footprints: Footprints, camera: Camera) -> _Bins:
     return _Bins(starts, ranks[order], columns)
 
 
+def _in_threads(pieces: Sequence[Tensor], work: Callable[[Tensor], _T]) -> list[_T]:
+    """`work` of every piece, one piece per thread at a time; PyTorch itself uses one thread meanwhile."""
+    threads, graded = torch.get_num_threads(), torch.is_grad_enabled()
+
+    def alone(piece: Tensor) -> _T:
+        with torch.set_grad_enabled(graded):  # is a setting of each thread
+            return work(piece)
+
+    try:
+        torch.set_num_threads(1)
+        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            return list(pool.map(alone, pieces))
+    finally:
+        torch.set_num_threads(threads)
+
+
 class TorchView:
     """M drawn of N Gaussians in depth order, with their tiles."""
 
     def __init__(
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, kind: torch.dtype
     ) -> None:
-        self.camera, self._settings, self._kind = camera, settings, kind
+        self.camera, self.settings, self._kind = camera, settings, kind
         valid = gaussians.valid()
         self.dropped = int((~valid).sum())
         arrays = (gaussians.means, gaussians.log_scales, gaussians.quats_wxyz, gaussians.opacity_logits)
         self._all = [torch.from_numpy(array).to(kind) for array in arrays]
         with torch.no_grad():
-            found = project(self._all, camera, settings)
+            pieces = _in_threads(torch.arange(len(valid)).split(_ROWS), self._project)
+            found = Footprints(*(torch.cat(parts) for parts in zip(*pieces, strict=True)))
             (low, high) = found.means_px - found.extents_px, found.means_px + found.extents_px
             size = torch.tensor([camera.width, camera.height])
             drawn = torch.from_numpy(valid) & (found.depths > settings.near)
@@ -180,17 +198,25 @@ class TorchView:
                     assert leaf.grad is not None  # every leaf enters the picture
                     total.index_add_(0, index.reshape(-1), leaf.grad.flatten(0, 1).to(total.dtype))
         by_means_px, by_shapes, by_values = (total[:-1] for total in sums)
-        drawn = [part[self._rows].requires_grad_() for part in self._all]
-        again = project(drawn, self.camera, self._settings)
-        torch.autograd.backward([again.means_px, again.shapes], [by_means_px, by_shapes])
-        found = [leaf.grad for leaf in drawn] + [by_values[:, :-1], by_means_px.to(self._kind)]
+
+        def pull_back(piece: Tensor) -> list[Tensor | None]:
+            leaves = [part[self._rows[piece]].requires_grad_() for part in self._all]
+            again = project(leaves, self.camera, self.settings)
+            torch.autograd.backward([again.means_px, again.shapes], [by_means_px[piece], by_shapes[piece]])
+            return [leaf.grad for leaf in leaves]
+
+        pieces = _in_threads(torch.arange(len(self._rows)).split(_ROWS), pull_back)
+        found = [torch.cat(parts) for parts in zip(*pieces, strict=True)]
+        found += [by_values[:, :-1], by_means_px.to(self._kind)]
         full = []
         for part in found:
-            assert part is not None
             whole = torch.zeros(len(self._all[0]), *part.shape[1:], dtype=self._kind)
             whole[self._rows] = part
             full.append(whole.numpy())
         return GaussianGradients(*full)
+
+    def _project(self, rows: Tensor) -> Footprints:
+        return project([part[rows] for part in self._all], self.camera, self.settings)
 
     def _tables(self, values: Array) -> list[Tensor]:
         """Positions, shapes and values with a one behind them, each with a last row that draws nothing."""
@@ -215,22 +241,11 @@ class TorchView:
         lengths = self._bins.starts.diff()[tiles]
         order = lengths.sort(descending=True).indices
         groups = [group for group in tiles[order[lengths[order] > 0]].split(_TILES) if len(group)]
-        threads, graded = torch.get_num_threads(), torch.is_grad_enabled()
-
-        def alone(group: Tensor) -> _T:
-            with torch.set_grad_enabled(graded):  # is a setting of each thread
-                return work(group)
-
-        try:
-            torch.set_num_threads(1)
-            with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-                yield from zip(groups, pool.map(alone, groups), strict=True)
-        finally:
-            torch.set_num_threads(threads)
+        return zip(groups, _in_threads(groups, work), strict=True)
 
     def _blend(self, tiles: Tensor, tables: list[Tensor], used: _Used | None) -> Tensor:
         """(B,) tiles -> (B, 256, C + 1) blended values and alpha; `used` collects leaves for gradients."""
-        bins, settings = self._bins, self._settings
+        bins, settings = self._bins, self.settings
         starts, ends = bins.starts[tiles], bins.starts[tiles + 1]
         corners = TILE * torch.stack([tiles % bins.columns, tiles // bins.columns], 1)[:, None].double()
         centres = torch.arange(TILE, dtype=self._kind) + 0.5
