@@ -70,7 +70,7 @@ class _Opened:
     """A scene with all that the window's thread should not have to compute."""
 
     scene: Scene
-    unusable: int  # Gaussians with NaN or a zero quaternion; they are not drawn
+    unusable: dict[str, int]  # reason -> Gaussians that are therefore not drawn
     extent: Extent
     view: OrbitCamera
     latent: Array | None
@@ -105,7 +105,7 @@ def open_scene(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = lamb
         viewer.services.warm_up(scene, backend)
         progress(f"preparing {path.name}", 0.9)
         latent = None if scene.language is None else latent_colours(scene.language)
-        unusable = len(scene.gaussians) - int(scene.gaussians.valid().sum())
+        unusable = scene.gaussians.invalid_rows()
         extent = extent_of(scene)
         return _Opened(scene, unusable, extent, default_view(scene, extent), latent)
 
@@ -129,7 +129,8 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     if scene.language is None and state.picture.display in NEEDS_FIELD:
         state.picture = replace(state.picture, display="rgb")
     viewer.answers = Answers(scene, viewer.services.load_encoder, viewer.services.encoder_id)
-    not_drawn = f", {opened.unusable:,} of them unusable and not drawn" if opened.unusable else ""
+    reasons = ", ".join(f"{count:,} with {reason}" for reason, count in opened.unusable.items())
+    not_drawn = f"; not drawn: {reasons}" if reasons else ""
     state.say(f"{path.name}: {len(scene.gaussians):,} Gaussians{not_drawn}")
     if scene.language is None:
         state.say(NO_FIELD)

@@ -25,23 +25,32 @@ PICK_ALPHA = 0.1  # a pixel with less alpha shows nothing that could be picked
 _DISPLAYS = ("rgb", "latent", "relevancy", "segmentation", "depth", "alpha")  # as composite.frag.glsl counts
 
 
+def is_software(ctx: moderngl.Context) -> bool:
+    """Whether the driver draws on the CPU."""
+    renderer = ctx.info["GL_RENDERER"].lower()
+    return any(name in renderer for name in SOFTWARE_RENDERERS)
+
+
 def suits_opengl(ctx: moderngl.Context) -> bool:
     """Whether backend "auto" becomes "opengl": not on a driver before 4.1, and not on one that draws on
     the CPU, where the compiled CPU rasterizer is several times faster."""
-    renderer = ctx.info["GL_RENDERER"].lower()
-    return ctx.version_code >= 410 and not any(name in renderer for name in SOFTWARE_RENDERERS)
+    return ctx.version_code >= 410 and not is_software(ctx)
 
 
 class FrameRenderer:
     """Draws a scene into framebuffers of one context, OpenGL 3.3 or newer.
 
     `backend` "auto" is "opengl" or "cpu", see `suits_opengl`; the attribute of that name says which it
-    became. `precision` is that of the OpenGL rasterizer's images. Raises BackendError where a rasterizer
-    cannot load.
+    became. `precision` is that of the OpenGL rasterizer's images; None is half, but single on a software
+    driver, which is faster with it and rounds half precision towards zero. Raises BackendError where a
+    rasterizer cannot load.
     """
 
     def __init__(
-        self, ctx: moderngl.Context, backend: Backend = "auto", precision: Literal["half", "single"] = "half"
+        self,
+        ctx: moderngl.Context,
+        backend: Backend = "auto",
+        precision: Literal["half", "single"] | None = None,
     ) -> None:
         if backend == "auto":
             backend = "opengl" if suits_opengl(ctx) else "cpu"
@@ -49,7 +58,7 @@ class FrameRenderer:
         self._ctx = ctx
         self._source: ChannelSource
         if backend == "opengl":
-            self._source = GlSource(ctx, precision)
+            self._source = GlSource(ctx, precision or ("single" if is_software(ctx) else "half"))
         else:
             self._source = ArraySource(ctx, load_rasterizer(backend))
         self._program = ctx.program(

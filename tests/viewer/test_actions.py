@@ -95,7 +95,7 @@ def test_unusable_gaussians_are_counted(viewer):
     viewer.services = replace(viewer.services, load_scene=lambda path: scene)
     actions.open_scene(viewer, Path("holes.ply"))
     settle(viewer)
-    assert viewer.state.messages[0].text == "holes.ply: 360 Gaussians, 2 of them unusable and not drawn"
+    assert viewer.state.messages[0].text == "holes.ply: 360 Gaussians; not drawn: 2 with position not finite"
     assert np.isfinite(viewer.state.view.camera(160, 120).world_to_camera).all()
 
 
