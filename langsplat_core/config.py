@@ -1,6 +1,7 @@
 """Every setting a user can change, as frozen dataclasses; the command line is derived from them."""
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal
 
 
@@ -132,12 +133,13 @@ class TrainConfig:
 class DemoEncoderConfig:
     """Training of the small CLIP that comes with the program (`langsplat demo encoder`)."""
 
-    rooms: int = 300  # random rooms that crops are rendered from
+    start: Path | None = None  # folder of an earlier demo encoder to begin from; None: random weights
+    rooms: int = 400  # random rooms that crops are rendered from
     views: int = 3  # photographs of each room
     plain_crops: int = 8_000  # crops of nothing but a colour or a texture
     steps: int = 8_000
     batch: int = 128  # crops per step
-    phrases: int = 128  # phrases per step
+    phrases: int = 192  # phrases per step
     lr: float = 1e-3
     seed: int = 0
 

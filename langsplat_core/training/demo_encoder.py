@@ -21,7 +21,7 @@ from torch.nn import functional as F
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DemoEncoderConfig
-from langsplat_core.datasets.synthetic.world import SMALL
+from langsplat_core.datasets.synthetic.catalogue import TABLE_TOP
 from langsplat_core.files import atomic_path
 from langsplat_core.progress import Progress
 from langsplat_core.scene import CANONICAL_PHRASES
@@ -80,6 +80,21 @@ def normalised(crops: Array) -> Tensor:
     return (pixels - torch.tensor(MEAN).view(3, 1, 1)) / torch.tensor(STD).view(3, 1, 1)
 
 
+def begin_from(model: Any, vocabulary: dict[str, int], folder: Path) -> None:
+    """Give `model` the weights of the encoder in `folder`, and every token of `vocabulary` (token -> row)
+    that it knows its old vector."""
+    from transformers import CLIPModel, CLIPTokenizerFast
+
+    old = CLIPModel.from_pretrained(folder).state_dict()
+    old_rows = CLIPTokenizerFast.from_pretrained(folder).get_vocab()
+    tokens = "text_model.embeddings.token_embedding.weight"
+    vectors = model.state_dict()[tokens].clone()
+    for token, row in vocabulary.items():
+        if token in old_rows:
+            vectors[row] = old[tokens][old_rows[token]]
+    model.load_state_dict({**old, tokens: vectors})
+
+
 class Sampler:
     """Draws batches: crops of rare words more often, one right phrase per crop, and random others."""
 
@@ -93,7 +108,7 @@ class Sampler:
         keys = [(label.word, label.thing, label.level) for label in crops.labels]
         count = Counter(keys)
         # Rare words more often; whole things on the table most, for they are what people ask for.
-        whole = [_WHOLE_WEIGHT if level == 2 and word in SMALL else 1.0 for word, _, level in keys]
+        whole = [_WHOLE_WEIGHT if level == 2 and word in TABLE_TOP else 1.0 for word, _, level in keys]
         weight = np.array([count[key] ** -0.6 for key in keys]) * whole
         self._weight = weight / weight.sum()
         self._start, self._end = ends
@@ -248,7 +263,10 @@ def train_demo_encoder(out: Path, config: DemoEncoderConfig, progress: Progress)
     ends = (tokenizer.bos_token_id, tokenizer.eos_token_id)
     sampler = Sampler(crops, book, token_of, ends)
     torch.manual_seed(config.seed)
-    run = _Run(build_model(len(tokenizer), *ends), sampler.class_counts, config)
+    model = build_model(len(tokenizer), *ends)
+    if config.start is not None:
+        begin_from(model, tokenizer.get_vocab(), config.start)
+    run = _Run(model, sampler.class_counts, config)
     run.resume(work / "state.pt")
     while run.step < config.steps:
         run.advance(sampler.batch(config, np.random.default_rng((config.seed, 17, run.step))))
@@ -304,7 +322,7 @@ class _Run:
     def save(self, path: Path) -> None:
         """Write everything needed to go on."""
         state = {
-            "config": json.dumps(asdict(self.config)), "step": self.step, "model": self.model.state_dict(),
+            "config": json.dumps(asdict(self.config), default=str), "step": self.step, "model": self.model.state_dict(),
             "mean": self.mean.state_dict(), "heads": self.heads.state_dict(),
             "optimiser": self.optimiser.state_dict(),
         }  # fmt: skip
@@ -316,7 +334,7 @@ class _Run:
         if not path.exists():
             return
         state = torch.load(path, weights_only=True)
-        if state["config"] != json.dumps(asdict(self.config)):
+        if state["config"] != json.dumps(asdict(self.config), default=str):
             return
         self.step = state["step"]
         self.model.load_state_dict(state["model"])
