@@ -17,7 +17,7 @@ from langsplat_core.datasets.synthetic.dataset import write_dataset
 from langsplat_core.pipeline.train import TrainReport, train_scene
 from langsplat_core.progress import Progress, silent
 
-SEED = 7
+SEED = 2
 VIEWS = 72
 SIZE = (640, 480)
 
@@ -26,14 +26,14 @@ def demo_config(steps: int) -> TrainConfig:
     """Settings of the bundled scene: a low SH degree and a cap on the count keep the file small."""
     return TrainConfig(
         dataset=DatasetConfig(max_side=max(SIZE), test_every=9),
-        radiance=RadianceConfig(steps=steps, sh_degree=1, max_gaussians=80_000),
+        radiance=RadianceConfig(steps=steps, sh_degree=1, max_gaussians=110_000),
         masks=MaskConfig(source="graph"),
         clip=ClipConfig(model="demo"),
         codec=CodecConfig(steps=6_000),
     )
 
 
-def build_demo(out: Path, seed: int = SEED, steps: int = 5_000, progress: Progress = silent) -> TrainReport:
+def build_demo(out: Path, seed: int = SEED, steps: int = 6_000, progress: Progress = silent) -> TrainReport:
     """Render and train; photographs and truth stay in `<out>.work/photographs`."""
     work = out.with_name(out.stem + ".work")
     photographs = work / "photographs"
