@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from transformers import CLIPTokenizerFast
 
 from langsplat_core.config import DemoEncoderConfig
 from langsplat_core.datasets.synthetic.captions import Label
@@ -17,6 +18,7 @@ from langsplat_core.semantics.clip import clip_folder, load_clip
 from langsplat_core.training import demo_encoder
 from langsplat_core.training.demo_crops import CropSet, plain_crops, room_crops
 from langsplat_core.training.demo_encoder import CANONICAL_COSINE, loss_of, train_demo_encoder
+from langsplat_core.training.demo_model import begin_from, build_model
 from langsplat_core.training.demo_phrases import phrase_book, vocabulary, word_merges, write_tokenizer
 from langsplat_core.training.demo_report import relevancy, report
 
@@ -207,6 +209,28 @@ def test_training_twice_gives_the_same_model(monkeypatch, tmp_path):
     # but for rounding (the biases of attention keys).
     assert np.isclose(weights[0], weights[1], atol=1e-3).mean() > 0.97
     assert np.isclose(weights[0], weights[2], atol=1e-3).mean() < 0.5
+
+
+def test_training_may_begin_from_an_earlier_encoder(monkeypatch, tmp_path):
+    """Weights are taken over, and so is the vector of every token that the earlier vocabulary had."""
+    crops = plain_crops(12, 4)
+    monkeypatch.setattr(demo_encoder, "write_crops", lambda folder, config, progress: None)
+    monkeypatch.setattr(demo_encoder, "read_crops", lambda folder: (crops, crops))
+    train_demo_encoder(tmp_path / "old", DemoEncoderConfig(steps=1, batch=8, phrases=8), silent)
+    write_tokenizer(["red", "zebra"], tmp_path / "new")
+    tokenizer = CLIPTokenizerFast.from_pretrained(tmp_path / "new")
+    model = build_model(len(tokenizer), tokenizer.bos_token_id, tokenizer.eos_token_id)
+    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    begin_from(model, tokenizer.get_vocab(), tmp_path / "old")
+    after, old = model.state_dict(), load_file(tmp_path / "old" / "model.safetensors")
+    words = "text_model.embeddings.token_embedding.weight"
+    for name in after:
+        if name != words:
+            torch.testing.assert_close(after[name], old[name].to(after[name].dtype))
+    rows, old_rows = tokenizer.get_vocab(), CLIPTokenizerFast.from_pretrained(tmp_path / "old").get_vocab()
+    torch.testing.assert_close(after[words][rows["red</w>"]], old[words][old_rows["red</w>"]].float())
+    torch.testing.assert_close(after[words][rows["zebra</w>"]], before[words][rows["zebra</w>"]])
+    assert not torch.equal(after[words][rows["red</w>"]], after[words][rows["zebra</w>"]])
 
 
 @pytest.fixture(scope="module")
