@@ -79,7 +79,7 @@ _PROMISES = (
     ),
     _Promise(
         "3 channels, 31k, 320x240: PyTorch frame / CPU frame",
-        _Which("pytorch", "frame", *_SMALL, 3), _Which("cpu", "frame", *_SMALL, 3), 10.0, True,
+        _Which("pytorch", "frame", *_SMALL, 3), _Which("cpu", "frame", *_SMALL, 3), 50.0, True,
     ),
     _Promise(
         "3 channels, 31k, 320x240: PyTorch backward / CPU backward",
@@ -91,7 +91,11 @@ _PROMISES = (
     ),
     _Promise(
         "200k, 960x720: CPU splat of 12 / of 3 channels",
-        _Which("cpu", "splat", *_LARGE, 12), _Which("cpu", "splat", *_LARGE, 3), 2.0, False,
+        _Which("cpu", "splat", *_LARGE, 12), _Which("cpu", "splat", *_LARGE, 3), 1.6, False,
+    ),
+    _Promise(
+        "200k, 960x720: CPU frame of 12 / of 3 channels",
+        _Which("cpu", "frame", *_LARGE, 12), _Which("cpu", "frame", *_LARGE, 3), 1.6, False,
     ),
     _Promise(
         "3 channels, 31k, 320x240: CPU frame / frozen splat",
@@ -99,11 +103,11 @@ _PROMISES = (
     ),
     _Promise(
         "3 channels, 31k, 320x240: CPU splat / frozen splat",
-        _Which("cpu", "splat", *_SMALL, 3), _Which("cpu", "frozen splat", *_SMALL, 3), 1.5, True,
+        _Which("cpu", "splat", *_SMALL, 3), _Which("cpu", "frozen splat", *_SMALL, 3), 4.0, True,
     ),
     _Promise(
         "3 channels, 31k, 320x240: CPU gather / frozen gather",
-        _Which("cpu", "gather", *_SMALL, 3), _Which("cpu", "frozen gather", *_SMALL, 3), 1.5, True,
+        _Which("cpu", "gather", *_SMALL, 3), _Which("cpu", "frozen gather", *_SMALL, 3), 4.0, True,
     ),
 )  # fmt: skip
 
