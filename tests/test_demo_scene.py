@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from langsplat_core.config import PictureConfig
-from langsplat_core.datasets.synthetic.dataset import LIGHT, orbit_cameras, truth_ids
+from langsplat_core.datasets.synthetic.dataset import LIGHT, orbit_cameras, photographed_room, truth_ids
 from langsplat_core.datasets.synthetic.render import Renderer
-from langsplat_core.datasets.synthetic.world import BRIGHT, World, build_world
 from langsplat_core.evaluation.metrics import intersection_over_union, majority
 from langsplat_core.formats import load_scene
 from langsplat_core.pipeline.demo import SEED, SIZE, VIEWS
@@ -25,11 +24,6 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.clip import load_text_encoder
 
 ASSETS = Path(str(files("langsplat_assets")))
-
-
-def build_room(seed: int) -> World:
-    """The room that the bundled scene was trained in."""
-    return build_world(2_000_000 + seed, palette=BRIGHT)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +41,7 @@ def held_out(scene: Scene) -> list[tuple[Camera, np.ndarray]]:
     """Three views that training did not see, and their label ids."""
     trained = {camera.name for camera in scene.cameras}
     cameras = [camera for camera in orbit_cameras(VIEWS, SIZE, SEED) if camera.name not in trained][:3]
-    world = build_room(SEED)
+    world = photographed_room(SEED)
     renderer = Renderer(world, LIGHT, samples=1)  # labels need no light
     return [(camera, truth_ids(world, renderer.picture(camera, oversample=1))) for camera in cameras]
 
@@ -68,7 +62,7 @@ def test_it_has_everything_a_query_needs(scene):
 def ask(engine: QueryEngine, phrase: str, thing: str, held_out) -> tuple[list[float], list[bool]]:
     """IoU and hits of one phrase in the views where its thing is visible."""
     answer = engine.run(phrase)
-    labels = build_room(SEED).labels
+    labels = photographed_room(SEED).labels
     ids = [number for number, label in enumerate(labels) if label.level == 2 and label.thing == thing]
     overlaps, hits = [], []
     for camera, truth in held_out:
@@ -102,7 +96,7 @@ def test_typed_words_find_their_things(engine, held_out):
 
 def test_place_is_where_the_thing_is(engine):
     """In metres, against the vertices of the car."""
-    world = build_room(SEED)
+    world = photographed_room(SEED)
     whole = world.ids[world.piece_of][:, 2]
     car = [number for number, label in enumerate(world.labels) if label.level == 2 and label.thing == "car"]
     corners = world.vertices[world.triangles[np.isin(whole, car)]].reshape(-1, 3)

@@ -39,7 +39,7 @@ class DemoDataset:
 
 @dataclass(frozen=True)
 class DemoEncoder:
-    """Train the small demo CLIP from scratch, or from an earlier one, on procedural crops. Resumes when interrupted."""
+    """Train the small demo CLIP on procedural crops. Resumes when interrupted."""
 
     out: Path
     """Folder to write: model, tokenizer, vocabulary."""

@@ -22,8 +22,8 @@ BRIGHT = tuple(word for word in COLOURS if word not in ("gray", "beige", "brown"
 _FUR = ("brown", "beige", "white", "gray", "pink", "blue", "purple")
 _WOOD = ("brown", "beige", "white", "red", "blue", "green", "yellow", "gray")
 _METAL = ("gray", "black", "red", "blue", "green", "turquoise", "white")
-# What rooms put on the table, which is what the bundled encoder was trained on.
-SMALL: dict[str, tuple[Builder, tuple[str, ...]]] = {
+# Everything that is small enough for a table.
+TABLE_TOP: dict[str, tuple[Builder, tuple[str, ...]]] = {
     "mug": (tableware.mug, COLOURS),
     "teapot": (tableware.teapot, COLOURS),
     "bottle": (tableware.bottle, ("green", "blue", "brown", "turquoise", "red", "purple", "white", "pink")),
@@ -44,10 +44,6 @@ SMALL: dict[str, tuple[Builder, tuple[str, ...]]] = {
     "duck": (animals.duck, ("yellow", "pink", "blue", "white", "green", "orange", "red", "purple")),
     "house": (toys.house, COLOURS),
     "robot": (toys.robot, COLOURS),
-}
-# Everything that is small enough for a table.
-TABLE_TOP: dict[str, tuple[Builder, tuple[str, ...]]] = {
-    **SMALL,
     "candle": (utensils.candle, (*BRIGHT, "beige")),
     "pan": (utensils.pan, ("black", "gray", "red", "blue", "turquoise", "green", "orange")),
     "wine glass": (
