@@ -55,12 +55,14 @@ class DemoEncoder:
 
 @dataclass(frozen=True)
 class DemoBuild:
-    """Make the demo scene: render its photographs, then train it with the ordinary pipeline."""
+    """Make the demo scene: render its photographs, train it with the ordinary pipeline, compact it."""
 
     out: Path
     """The scene to write, *.ply."""
     seed: int = 2
     """Another seed is another room."""
+    tier: Literal["separate", "clutter", "occlusion"] = "clutter"
+    """How hard the room is: objects apart, cluttered, or packed with look-alikes."""
     steps: int = 6_000
     """Steps of radiance training."""
 
@@ -68,8 +70,9 @@ class DemoBuild:
         from langsplat_core.pipeline.demo import build_demo
 
         with TerminalProgress() as progress:
-            report = build_demo(self.out, self.seed, self.steps, progress)
-        print(f"{self.out}: {report.gaussians} Gaussians, held-out PSNR {report.psnr:.2f} dB")
+            report = build_demo(self.out, self.seed, self.tier, self.steps, progress)
+        kept, trained = report.after, report.before.gaussians
+        print(f"{self.out}: {kept.gaussians} Gaussians of {trained} trained, held-out PSNR {kept.psnr:.2f} dB")
 
 
 @dataclass(frozen=True)
