@@ -145,6 +145,23 @@ class DemoEncoderConfig:
 
 
 @dataclass(frozen=True)
+class BenchmarkConfig:
+    """Fresh rooms, and the method that is measured in them (`langsplat eval synthetic`)."""
+
+    tiers: tuple[Literal["separate", "clutter", "occlusion"], ...] = ("separate", "clutter", "occlusion")
+    seeds: tuple[int, ...] = (101,)  # one room of every tier each; never that of the bundled scene
+    views: int = 48  # photographs of each room; every eighth is held out
+    size: tuple[int, int] = (400, 300)  # width and height, pixels
+    steps: int = 1_500  # of radiance training
+    max_gaussians: int = 50_000
+    masks: Literal["truth", "graph"] = "truth"  # the true regions, or the segmenter that needs no weights
+    encoder: str = "demo"  # "demo" for the bundled one, a folder, or a hub id
+    codec_steps: int = 6_000
+    cut: Literal["floor", "median", "range"] = "floor"  # where a map is cut into a mask, see `query.cut`
+    budget: bool = False  # also swap one stage at a time for one that makes no mistake
+
+
+@dataclass(frozen=True)
 class CompactConfig:
     """How small a scene may be made (`langsplat compact`)."""
 

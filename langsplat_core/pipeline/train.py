@@ -71,7 +71,7 @@ def train_scene(
     train, held_out = capture.split(config.dataset.test_every)
     clock.lap("photographs")
 
-    gaussians = _radiance(capture, train, config, work, progress)
+    gaussians = trained_gaussians(capture, train, config, work, progress)
     clock.lap("radiance")
 
     features = describe_capture(
@@ -85,7 +85,7 @@ def train_scene(
     views = [(capture.cameras[i], item) for i, item in zip(train, features, strict=True)]
     clock.lap("masks and vectors")
 
-    language, codec_cosine = _language(gaussians, views, encoder, config, progress)
+    language, codec_cosine = language_field(gaussians, views, encoder, config, progress)
     clock.lap("language field")
 
     save_scene(out, Scene(gaussians, language, tuple(capture.cameras[i] for i in train)))
@@ -110,9 +110,10 @@ def train_scene(
     return report
 
 
-def _radiance(
+def trained_gaussians(
     capture: Capture, train: list[int], config: TrainConfig, work: Path, progress: Progress
 ) -> Gaussians:
+    """The Gaussians of the photographs at `train`, from `work` where they were trained before."""
     photographs = capture_digest(capture, train)
     # The backend changes who computes, not what: a run may move between machines.
     settings = replace(config.radiance, backend="auto")
@@ -127,9 +128,10 @@ def _radiance(
     return gaussians
 
 
-def _language(
+def language_field(
     gaussians: Gaussians, views: Views, encoder: ClipEncoder, config: TrainConfig, progress: Progress
 ) -> tuple[LanguageField, float]:
+    """The language field of the views' mask vectors, and the codec's mean cosine on these."""
     rasterizer = CpuRasterizer()
     mask_vectors = np.concatenate([features.vectors for _, features in views])
     if len(mask_vectors) == 0:

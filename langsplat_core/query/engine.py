@@ -10,7 +10,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.query.localize import Neighbourhood, Place, build_neighbourhood, locate
-from langsplat_core.query.relevancy import latent_relevancy
+from langsplat_core.query.relevancy import CHUNK, latent_relevancy, relevancy
 from langsplat_core.query.table import SphereTable, build_table
 from langsplat_core.scene import LEVELS, AutoencoderCodec, LanguageField, Scene
 
@@ -45,9 +45,11 @@ class QueryResult:
 class QueryEngine:
     """Queries against one scene. What depends on the scene alone is computed at the first query."""
 
-    def __init__(self, scene: Scene, encoder: TextEncoder | None = None) -> None:
+    def __init__(self, scene: Scene, encoder: TextEncoder | None = None, exact: bool = False) -> None:
+        """`exact` decodes at every Gaussian instead of looking up: 2 KB each, to measure the table by."""
         self.scene = scene
         self.encoder = encoder
+        self.exact = exact
 
     @property
     def field(self) -> LanguageField:
@@ -66,6 +68,17 @@ class QueryEngine:
         if not isinstance(field.codec, AutoencoderCodec) or field.codec.latent_dim != 3:
             return None
         return build_table(field.codec, self._known_latents(), field.canonical)
+
+    @cached_property
+    def _decoded(self) -> tuple[Array, Array]:
+        """Rows of `_known_latents` with a meaning, and their (M, D) decoded vectors."""
+        latents = self._known_latents()
+        rows = np.flatnonzero(np.linalg.norm(latents, axis=1) > 1e-6)
+        vectors = np.empty((len(rows), self.field.codec.vector_dim), np.float32)
+        for start in range(0, len(rows), CHUNK):
+            part = slice(start, start + CHUNK)
+            vectors[part] = self.field.codec.decode(latents[rows[part]])
+        return rows, vectors
 
     def _known_latents(self) -> Array:
         """(3 N, d) latents, zero where a Gaussian was never observed."""
@@ -105,7 +118,11 @@ class QueryEngine:
     def relevancy(self, vector: Array) -> Array:
         """(D,) unit text vector -> (3, N) float32 relevancy per level and Gaussian."""
         field = self.field
-        if self._table is not None:
+        if self.exact:
+            rows, vectors = self._decoded
+            values = np.zeros(field.confidence.size, np.float32)
+            values[rows] = relevancy(vectors, vector[None], field.canonical)[:, 0]
+        elif self._table is not None:
             values = self._table.relevancy(vector)
         else:
             values = latent_relevancy(field.codec, self._known_latents(), vector[None], field.canonical)[:, 0]

@@ -14,7 +14,7 @@ from langsplat_core.cli.convert import Convert
 from langsplat_core.cli.query import QueryScene
 from langsplat_core.config import INRIA, PictureConfig
 from langsplat_core.errors import InputError
-from langsplat_core.evaluation.synthetic import evaluate
+from langsplat_core.evaluation.synthetic import ask, evaluate
 from langsplat_core.formats import (
     companion_path,
     language,
@@ -277,7 +277,7 @@ def test_queries_and_evaluation_draw_as_the_file_says(tmp_path, monkeypatch, ant
     monkeypatch.setattr(query, "load_rasterizer", lambda _: recorder)
     QueryScene(tmp_path / "a.ply", ("book",)).run()
     truth = SimpleNamespace(phrases=(), labels=lambda name: np.zeros((3, 120, 160), int))
-    evaluate(QueryEngine(load_scene(tmp_path / "a.ply")), recorder, scene.cameras, truth)
+    evaluate(ask(QueryEngine(load_scene(tmp_path / "a.ply")), ()), recorder, scene.cameras, truth)
     assert [settings.antialiased for settings in recorder.seen] == [antialiased] * 2
 
 

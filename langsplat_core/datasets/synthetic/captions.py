@@ -217,6 +217,15 @@ class Label:
         return (*names, *material_part_phrases(self.word, self.thing, self.material))
 
     @property
+    def phrase(self) -> str:
+        """The phrase that says most about the region, e.g. "handle of the red mug"; "" for no object."""
+        if not self.thing:
+            return ""
+        if self.level == 2 or self.word == self.thing:
+            return f"{self.colour} {self.thing}".strip()
+        return f"{self.word} of the " + f"{self.thing_colour} {self.thing}".strip()
+
+    @property
     def words(self) -> tuple[str, ...]:
         """Every phrase that is right for the region, its colour or material alone included."""
         alone = (*colour_words(self.colour), *MATERIALS.get(self.material, ()))

@@ -34,9 +34,9 @@ def write_dataset(
     views: number of photographs, >= 4; size: (width, height) in pixels, at least 16 each. Written are
     images/view_000.png ..., points.ply, truth/view_000.npz (`ids`: (3, H, W) int32 label ids at subpart,
     part and whole level, -1 where there is nothing; `depth`: (H, W) float32 metres along the camera's z),
-    truth/labels.json (id -> level, word, colour, words) and, last, transforms.json in nerfstudio's
-    convention (OpenGL camera-to-world). A view counts as done when its truth file is there, so an
-    interrupted call goes on where it stopped. Raises InputError for a size or number out of range.
+    truth/labels.json (id -> level, word, thing, colour, phrase, words) and, last, transforms.json in
+    nerfstudio's convention (OpenGL camera-to-world). A view counts as done when its truth file is there, so
+    an interrupted call goes on where it stopped. Raises InputError for a size or number out of range.
     """
     if views < 4 or min(size) < 16:
         raise InputError(
@@ -105,6 +105,7 @@ def _write_labels(world: World, path: Path) -> None:
             "word": label.word,
             "thing": label.thing,
             "colour": label.colour,
+            "phrase": label.phrase,
             "words": label.words,
         }
         for number, label in enumerate(world.labels)
