@@ -72,7 +72,7 @@ class DemoBuild:
         with TerminalProgress() as progress:
             report = build_demo(self.out, self.seed, self.tier, self.steps, progress)
         kept, trained = report.after, report.before.gaussians
-        print(f"{self.out}: {kept.gaussians} Gaussians of {trained} trained, held-out PSNR {kept.psnr:.2f} dB")
+        print(f"{self.out}: {kept.gaussians} Gaussians of {trained} trained, held-out {kept.psnr:.2f} dB")
 
 
 @dataclass(frozen=True)
