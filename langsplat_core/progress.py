@@ -35,15 +35,16 @@ class TerminalProgress:
         self._tasks: dict[str, int] = {}
 
     def __enter__(self) -> "TerminalProgress":
-        self._bar.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._bar.stop()
+        if self._tasks:  # stopping a bar that never began prints an empty line before the error's own
+            self._bar.stop()
 
     def __call__(self, label: str, fraction: float) -> None:
+        self._bar.start()
         stage = label.partition(":")[0]  # text behind a colon may change while a stage runs
         if stage not in self._tasks:
             self._tasks[stage] = self._bar.add_task(label, total=1.0)
