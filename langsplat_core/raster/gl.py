@@ -33,6 +33,9 @@ class GlRasterizer:
     Mesa's software driver does (there "single" is the faster one, too); values up to 65504. "single"
     suits measurements: but for the cut-offs within 2e-5 in images of 400 pixels a side, 1e-4 in those of
     1920 and for needles across the image, as pixel positions are float32.
+
+    Blending goes back to front and cannot stop: behind layers that would end a pixel more is drawn, with the
+    weight that was left, at most 1e-2 and mostly below 1e-3.
     """
 
     name = "opengl"
