@@ -12,9 +12,10 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.query.localize import Neighbourhood, Place, build_neighbourhood, locate
 from langsplat_core.query.relevancy import CHUNK, latent_relevancy, relevancy
 from langsplat_core.query.table import SphereTable, build_table
-from langsplat_core.scene import LEVELS, AutoencoderCodec, LanguageField, Scene
+from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, AutoencoderCodec, LanguageField, Scene
 
 FOUND = 0.6  # smoothed peak relevancy from which a phrase counts as present; 0.5 is the floor
+SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them
 NO_FIELD = "this scene has no language field: it can be looked at, not searched; `langsplat train` makes one"
 
 
@@ -50,6 +51,7 @@ class QueryEngine:
         self.scene = scene
         self.encoder = encoder
         self.exact = exact
+        self._checked: TextEncoder | None = None  # the encoder that was found to be the scene's
 
     @property
     def field(self) -> LanguageField:
@@ -113,7 +115,21 @@ class QueryEngine:
                 f"the encoder gives {vector.shape[0]} numbers, the scene was made with "
                 f"{self.field.codec.vector_dim} by {self.field.encoder_id}; give that one with --encoder"
             )
+        self._refuse_a_stranger(self.encoder)
         return vector
+
+    def _refuse_a_stranger(self, encoder: TextEncoder) -> None:
+        """An encoder that turns the canonical phrases into other vectors than the scene's is not the one that
+        it was made with, whatever its name: answers would be noise."""
+        if encoder is self._checked:
+            return
+        canonical = np.asarray(encoder.encode_texts(list(CANONICAL_PHRASES)), np.float64)
+        if ((canonical * self.field.canonical).sum(1) < SAME_ENCODER).any():
+            raise EncoderError(
+                f"the scene was made with other weights of {self.field.encoder_id}; give those with "
+                "--encoder, or make the scene again"
+            )
+        self._checked = encoder
 
     def relevancy(self, vector: Array) -> Array:
         """(D,) unit text vector -> (3, N) float32 relevancy per level and Gaussian."""

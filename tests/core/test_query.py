@@ -178,6 +178,13 @@ def test_engine_errors_say_what_to_do():
     with pytest.raises(EncoderError, match="3 numbers"):
         QueryEngine(scene, Small()).run("red")
 
+    class Stranger(Small):
+        def encode_texts(self, texts):
+            return np.roll(np.eye(D, dtype=np.float32), 3, axis=1)[: len(texts)]
+
+    with pytest.raises(EncoderError, match="other weights"):
+        QueryEngine(scene, Stranger()).run("red")
+
 
 def test_an_empty_scene_can_be_asked():
     scene, *_ = two_blob_scene()

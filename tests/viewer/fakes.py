@@ -5,7 +5,15 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array, logit, unit
-from langsplat_core.scene import Camera, Gaussians, LanguageField, LinearCodec, Scene, look_at
+from langsplat_core.scene import (
+    CANONICAL_PHRASES,
+    Camera,
+    Gaussians,
+    LanguageField,
+    LinearCodec,
+    Scene,
+    look_at,
+)
 
 WORDS = ("mug", "book", "plant")  # each an axis of the vector space; the fourth is the canonical phrases'
 CENTRES = np.array([[-1.2, 0.0, 0.0], [0.0, 0.0, 0.0], [1.2, 0.0, 0.0]])
@@ -73,7 +81,7 @@ class FakeEncoder:
     """Knows `WORDS`."""
 
     def encode_texts(self, texts: list[str]) -> Array:
-        return np.stack([axis(WORDS.index(text)) for text in texts])
+        return np.stack([axis(3 if text in CANONICAL_PHRASES else WORDS.index(text)) for text in texts])
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
         return tuple(word for word in text.split() if word not in WORDS)
