@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, unit
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
 from langsplat_core.evaluation.synthetic import Truth
@@ -68,6 +68,19 @@ def told_vectors(features: ImageFeatures, ids: Array, vectors: Mapping[int, Arra
         for row, number in pairs[:, np.argsort(counts, kind="stable")].T:  # the most frequent comes last
             told[row] = vectors.get(int(number), features.vectors[row])
     return replace(features, vectors=told)
+
+
+def among_pictures(told: Sequence[ImageFeatures], seen: Sequence[ImageFeatures]) -> list[ImageFeatures]:
+    """Text vectors moved by one vector, the same for all, to where the encoder puts pictures.
+
+    CLIP's pictures and phrases lie in two separate clouds ("Mind the gap", Liang et al. 2022). Against the
+    canonical phrases, which are text, every text vector is right or wrong by more than any picture can be:
+    relevancy saturates. What is shifted is the mean of `told`, onto the mean of `seen`; the differences
+    between phrases, which are what a perfect embedding has, stay.
+    """
+    shift = np.concatenate([item.vectors for item in seen]).mean(0)
+    shift = shift - np.concatenate([item.vectors for item in told]).mean(0)
+    return [replace(item, vectors=unit(item.vectors + shift).astype(np.float32)) for item in told]
 
 
 def phrase_vectors(truth: Truth, encoder: TextEncoder) -> dict[int, Array]:

@@ -122,7 +122,9 @@ def read_truth(dataset: Path) -> Truth:
     for item in labels.values():
         for text, kind in _asked(item):
             ids = tuple(int(key) for key, other in labels.items() if text in other["words"])
-            phrases.setdefault(text, Phrase(text, kind, ids))
+            # A part without finer regions is its own subpart: the coarsest level gives a phrase its kind.
+            if text not in phrases or KINDS.index(kind) < KINDS.index(phrases[text].kind):
+                phrases[text] = Phrase(text, kind, ids)
     words = frozenset(word for item in labels.values() for word in item["words"])
     names = {int(key): item.get("phrase", "") for key, item in labels.items()}
     return Truth(folder, tuple(phrases.values()), words, names)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from langsplat_core.arrays import Array
 from langsplat_core.evaluation.synthetic import KINDS, Asked, DirectScore, Score, Truth, found_rate
 from langsplat_core.files import atomic_path
 
@@ -21,6 +22,10 @@ class Measured:
     objects: int  # that were asked
     rejected: float  # share of absent objects that are answered with "not here"
     absent: int  # that were asked
+    separation: (
+        float  # chance that a present object's peak exceeds an absent one's: 1 where a threshold exists
+    )
+    peaks: dict[str, float]  # smoothed peak relevancy of every object that was asked, absent ones included
     unknown: tuple[str, ...]  # phrases left out, because the encoder was never taught their words
     query_ms: float  # median, from text to place
     name: str = ""
@@ -52,8 +57,14 @@ def measured(
     asked: Asked, truth: Truth, absent: Sequence[str], scores: Sequence[Score], direct: Sequence[DirectScore]
 ) -> Measured:
     """Collect what was asked of a scene."""
-    accepted, objects = found_rate(asked, (p.text for p in truth.phrases if p.kind == "object"))
+    present = [phrase.text for phrase in truth.phrases if phrase.kind == "object"]
+    accepted, objects = found_rate(asked, present)
     found, count = found_rate(asked, absent)
+    peaks = {
+        text: round(asked.answers[text].peak, 4) for text in [*present, *absent] if text in asked.answers
+    }
+    inside = np.array([peaks[text] for text in present if text in peaks])
+    outside = np.array([peaks[text] for text in absent if text in peaks])
     return Measured(
         scores=tuple(scores),
         direct=tuple(direct),
@@ -61,9 +72,19 @@ def measured(
         objects=objects,
         rejected=1 - found,
         absent=count,
+        separation=separation(inside, outside),
+        peaks=peaks,
         unknown=asked.unknown,
         query_ms=1000 * asked.seconds,
     )
+
+
+def separation(present: Array, absent: Array) -> float:
+    """Chance that one of `present` (P,) exceeds one of `absent` (A,), ties half; 1 without either."""
+    if len(present) == 0 or len(absent) == 0:
+        return 1.0
+    above = (present[:, None] > absent).mean() + 0.5 * (present[:, None] == absent).mean()
+    return float(above)
 
 
 def pooled(scores: Iterable[Score]) -> tuple[int, float, float]:
@@ -92,7 +113,16 @@ def score_table(reports: Sequence[RoomReport]) -> str:
 
 def room_table(reports: Sequence[RoomReport]) -> str:
     """Markdown: the method, per tier, what is not per kind of phrase."""
-    head = ("tier", "Gaussians", "PSNR dB", "objects found", "absent rejected", "ms/query", "ms/picture")
+    head = (
+        "tier",
+        "Gaussians",
+        "PSNR dB",
+        "objects found",
+        "absent rejected",
+        "separation %",
+        "ms/query",
+        "ms/picture",
+    )
     lines = [_row(head), "|" + "---|" * len(head)]
     for tier, rooms in _by_tier(reports):
         ours = [room.measured[0] for room in rooms]
@@ -105,6 +135,7 @@ def room_table(reports: Sequence[RoomReport]) -> str:
             f"{np.mean([room.psnr for room in rooms]):.1f}",
             f"{_percent(accepted)} % of {objects}",
             f"{_percent(rejected)} % of {absent}",
+            _percent(float(np.mean([m.separation for m in ours]))),
             f"{np.median([m.query_ms for m in ours]):.1f}",
             f"{np.median([m.frame_ms for m in ours]):.1f}",
         )))  # fmt: skip

@@ -4,10 +4,9 @@ truth; and an error budget, which swaps one stage at a time for one that makes n
 import hashlib
 import statistics
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -27,7 +26,13 @@ from langsplat_core.datasets.synthetic.catalogue import EVERYTHING
 from langsplat_core.datasets.synthetic.dataset import write_dataset
 from langsplat_core.datasets.synthetic.rooms import Tier
 from langsplat_core.errors import InputError
-from langsplat_core.evaluation.oracles import TruthMasks, phrase_vectors, told_vectors, true_labels
+from langsplat_core.evaluation.oracles import (
+    TruthMasks,
+    among_pictures,
+    phrase_vectors,
+    told_vectors,
+    true_labels,
+)
 from langsplat_core.evaluation.synthetic import (
     Asked,
     Reading,
@@ -44,6 +49,7 @@ from langsplat_core.formats.language import means_checksum
 from langsplat_core.pipeline.demo import SEED
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import Views, language_field, trained_gaussians
+from langsplat_core.pipeline.variants import Variant, variants
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.pixels import splatted_relevancy
@@ -58,34 +64,6 @@ from langsplat_core.training.radiance import evaluate_views
 HOLD_OUT = 8  # every so many views, one is not trained on
 WIDE = 128  # numbers per latent where the codec should lose nothing: 1.5 KB per Gaussian
 FRAMES = 5  # timed pictures of one phrase
-Masks = Literal["truth", "graph"]
-
-
-@dataclass(frozen=True)
-class Variant:
-    """Which stages are the method's own, and which make no mistake."""
-
-    name: str
-    masks: Masks
-    vectors: Literal["image", "text"] = "image"  # text: of every region's true words
-    codec: Literal["autoencoder", "linear"] = "autoencoder"  # linear: of `WIDE` numbers
-    query: Literal["table", "exact", "paper"] = "table"
-
-
-def variants(masks: Masks, budget: bool) -> list[Variant]:
-    """The method first; with `budget`, then one variant per stage, which differs in that stage alone."""
-    method = Variant("the method", masks)
-    if not budget:
-        return [method]
-    perfect = [replace(method, name="perfect masks", masks="truth")] if masks != "truth" else []
-    return [
-        method,
-        *perfect,
-        replace(method, name="perfect embeddings", vectors="text"),
-        replace(method, name="no codec", codec="linear"),
-        replace(method, name="exact query", query="exact"),
-        replace(method, name="the paper's order", query="paper"),
-    ]
 
 
 def run_benchmark(config: BenchmarkConfig, work: Path, progress: Progress = silent) -> list[RoomReport]:
@@ -215,10 +193,11 @@ class Room:
         self._lap(f"masks ({variant.masks}) and vectors", start)
         if variant.vectors == "text":
             words = phrase_vectors(self.truth, self.encoder)
-            features = [
+            told = [
                 told_vectors(item, self.truth.labels(camera.name), words)
                 for item, camera in zip(features, cameras, strict=True)
             ]
+            features = among_pictures(told, features)
         return list(zip(cameras, features, strict=True))
 
     def scene(self, variant: Variant) -> tuple[Scene, float]:
@@ -227,7 +206,7 @@ class Room:
         if variant.codec == "linear":
             codec = replace(codec, kind="linear", latent_dim=min(WIDE, self.encoder.dim))
         what = (means_checksum(self.gaussians.means), variant.masks, variant.vectors, codec, self.weights)
-        path = self.folder / f"{stage_key('scene', 1, *what)}.ply"
+        path = self.folder / f"{stage_key('scene', 2, *what)}.ply"
         views = self.views(variant)
         if not path.exists():
             start = time.perf_counter()

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from langsplat_core.arrays import unit
 from langsplat_core.cli.evaluate import EvalSynthetic
@@ -19,6 +20,7 @@ from langsplat_core.evaluation import synthetic
 from langsplat_core.evaluation.oracles import (
     MIN_REGION,
     TruthMasks,
+    among_pictures,
     phrase_vectors,
     told_vectors,
     true_labels,
@@ -34,16 +36,18 @@ from langsplat_core.evaluation.synthetic import (
     read_truth,
     relevancy_maps,
 )
+from langsplat_core.evaluation.synthetic_report import separation
 from langsplat_core.formats import load_scene
-from langsplat_core.pipeline.benchmark import run_benchmark, variants
+from langsplat_core.pipeline.benchmark import run_benchmark
 from langsplat_core.pipeline.demo import SEED
+from langsplat_core.pipeline.variants import variants
 from langsplat_core.progress import silent
 from langsplat_core.query.cut import CUT_RULES, cut_level
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.relevancy import latent_relevancy
 from langsplat_core.raster.numba_cpu import CpuRasterizer
-from langsplat_core.scene import LanguageField, Scene
+from langsplat_core.scene import CANONICAL_PHRASES, LanguageField, Scene
 from langsplat_core.semantics.masks import label_maps
 from langsplat_core.semantics.store import ImageFeatures
 from tests.core.test_query import random_codec, two_blob_scene
@@ -52,6 +56,15 @@ from tests.scenes import random_camera, random_gaussians
 TINY = BenchmarkConfig(
     tiers=("separate",), views=8, size=(64, 48), steps=60, max_gaussians=3_000, codec_steps=60, budget=True
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Layers this small are many times slower on several threads where other work wants the cores too."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
@@ -175,6 +188,22 @@ def test_perfect_embeddings_are_text_vectors_of_the_true_words():
     np.testing.assert_array_equal(told.labels, labels)
 
 
+def test_text_vectors_are_moved_as_one():
+    rng = np.random.default_rng(1)
+    labels = np.zeros((3, 2, 2), np.int32)
+
+    def described(mean):
+        return ImageFeatures(labels, unit(rng.normal(size=(6, 8)) + mean).astype(np.float32))
+
+    told, seen = [described(2.0), described(2.0)], [described(-2.0), described(-2.0)]
+    moved = among_pictures(told, seen)
+    shift = np.mean([item.vectors for item in seen], (0, 1)) - np.mean(
+        [item.vectors for item in told], (0, 1)
+    )
+    for got, text in zip(moved, told, strict=True):
+        np.testing.assert_allclose(got.vectors, unit(text.vectors + shift), atol=1e-6)
+
+
 def test_every_region_of_a_room_has_a_right_phrase():
     for label in build_room(5, "separate").labels:
         assert label.phrase in label.words or not label.phrase
@@ -224,7 +253,14 @@ def test_direct_overlap_has_its_closed_form():
     assert score.mean_iou == pytest.approx((30 / 100 + 70 / 120) / 2)
 
 
-@pytest.mark.parametrize(("rule", "expected"), [("floor", 0.7), ("median", 0.6), ("range", 0.1 + 0.7 * 0.8)])
+@pytest.mark.parametrize(
+    ("rule", "expected"),
+    [
+        ("floor", 0.7),
+        ("median", 0.6),
+        ("range", 0.1 + 0.7 * 0.8),
+    ],
+)
 def test_cuts(rule, expected):
     values = np.array([[0.1, 0.3], [0.3, 0.9]])
     assert cut_level(rule, values, peak=0.9, median=0.3) == pytest.approx(expected)
@@ -235,6 +271,11 @@ def test_a_cut_never_lets_a_flat_map_through(rule):
     assert not (np.full((4, 4), 0.5) > cut_level(rule, np.full((4, 4), 0.5), 0.5, 0.5)).any()
 
 
+def test_separation_is_the_chance_of_the_right_order():
+    assert separation(np.array([0.9, 0.5]), np.array([0.5, 0.1, 0.6])) == pytest.approx(4.5 / 6)
+    assert separation(np.array([0.9]), np.zeros(0)) == 1.0
+
+
 def test_absent_things_have_no_other_name_in_the_room():
     truth = Truth(None, (), frozenset({"mug", "cup", "orange", "couch"}))
     assert truth.absent(["mug", "orange", "sofa", "lamp", "apple"]) == ["apple", "lamp"]
@@ -242,8 +283,9 @@ def test_absent_things_have_no_other_name_in_the_room():
 
 def test_unknown_phrases_are_named_not_asked():
     scene, *_ = two_blob_scene()
+    rows = {text: 8 + row for row, text in enumerate(CANONICAL_PHRASES)}  # as the scene has them
     axes = SimpleNamespace(
-        encode_texts=lambda texts: np.eye(16, dtype=np.float32)[[0] * len(texts)],
+        encode_texts=lambda texts: np.eye(16, dtype=np.float32)[[rows.get(text, 0) for text in texts]],
         unknown_words=Speller().unknown_words,
     )
     asked = ask(QueryEngine(scene, axes), ["mug", "red cactus", "mug"])
