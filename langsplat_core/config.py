@@ -157,7 +157,7 @@ class BenchmarkConfig:
     masks: Literal["truth", "graph"] = "truth"  # the true regions, or the segmenter that needs no weights
     encoder: str = "demo"  # "demo" for the bundled one, a folder, or a hub id
     codec_steps: int = 4_000
-    cut: Literal["floor", "median", "range"] = "floor"  # where a map is cut into a mask, see `query.cut`
+    cut: Literal["floor", "median", "range"] = "median"  # where a map is cut into a mask, see `query.cut`
     budget: bool = False  # also swap one stage at a time for one that makes no mistake
 
 
