@@ -31,6 +31,7 @@ from langsplat_core.training.demo_model import (
     STD,
     begin_from,
     build_model,
+    calibrate_canonical,
     export,
     image_features,
     image_vectors,
@@ -52,6 +53,8 @@ _KEPT_PATCHES = 0.55  # share of the patches shown to the model during training 
 _AVERAGING = 0.998  # decay of the running mean of the weights, which is what is saved
 _WHOLE_WEIGHT = 8.0  # crops of small objects are drawn this much more often than others of their count
 _SAVE_EVERY = 250  # steps
+FLOOR_COSINE = 0.20  # of a nameable crop with the canonical phrases once trained: relevancy 0.5 lies there
+_CALIBRATION_CROPS = 2_500
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +220,21 @@ def train_demo_encoder(out: Path, config: DemoEncoderConfig, progress: Progress)
         if run.step % _SAVE_EVERY == 0 or run.step == config.steps:
             run.save(work / "state.pt")
             export(run.mean, out)
+    canonical = tokenizer(list(CANONICAL_PHRASES), return_tensors="pt", padding=True).input_ids
+    calibrate_canonical(run.mean, canonical, _nameable(run.mean, crops, config.seed), FLOOR_COSINE)
+    export(run.mean, out)
+
+
+def _nameable(model: Any, crops: CropSet, seed: int) -> Tensor:
+    """(M, 512) unit vectors of some crops that show a thing or a part."""
+    rows = [row for row, label in enumerate(crops.labels) if label.thing] or list(range(len(crops.labels)))
+    chosen = np.random.default_rng((seed, 19)).permutation(rows)[:_CALIBRATION_CROPS]
+    with torch.no_grad():
+        parts = [
+            image_vectors(model, image_features(model, normalised(crops.images[chosen[start : start + 256]])))
+            for start in range(0, len(chosen), 256)
+        ]
+    return torch.cat(parts)
 
 
 class _Run:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.func import functional_call
 from torch.nn import functional as F
 
 from langsplat_core.arrays import Array
@@ -15,6 +16,7 @@ from langsplat_core.training.demo_crops import CROP
 from langsplat_core.training.demo_phrases import CONTEXT
 
 MEAN, STD = (0.32, 0.28, 0.25), (0.30, 0.28, 0.27)  # of the training crops, black surroundings included
+_CALIBRATION_STEPS = 200
 
 
 def build_model(tokens: int, start: int, end: int) -> Any:
@@ -81,6 +83,29 @@ def text_vectors(model: Any, tokens: Tensor) -> Tensor:
     """(P, 512) unit vectors of (P, L) tokens."""
     pooled = model.text_model(input_ids=tokens).pooler_output
     return F.normalize(model.text_projection(pooled).float(), dim=-1)
+
+
+def calibrate_canonical(model: Any, tokens: Tensor, images: Tensor, cosine: float) -> None:
+    """Move the word vectors of the four canonical phrases, and nothing else, until their cosine with `images`
+    is `cosine` on average.
+
+    tokens: (4, L) int64, one word each, behind the start token; images: (M, 512) unit vectors of crops that
+    show something nameable. Relevancy 0.5 then lies where a user wants it, between right and wrong phrases.
+    """
+    rows = tokens[:, 1]
+    words = model.text_model.embeddings.token_embedding.weight.detach().float()
+    moved = torch.zeros(len(rows), words.shape[1], requires_grad=True)
+    optimiser = torch.optim.Adam([moved], lr=0.02)
+    for _ in range(_CALIBRATION_STEPS):
+        weights = {"embeddings.token_embedding.weight": words.index_add(0, rows, moved)}
+        pooled = functional_call(model.text_model, weights, kwargs={"input_ids": tokens}).pooler_output
+        texts = F.normalize(model.text_projection(pooled).float(), dim=-1)
+        loss = ((images @ texts.T - cosine) ** 2).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    with torch.no_grad():
+        model.text_model.embeddings.token_embedding.weight.index_add_(0, rows, moved.detach())
 
 
 def export(model: Any, out: Path) -> None:

@@ -18,7 +18,7 @@ from langsplat_core.semantics.clip import clip_folder, load_clip
 from langsplat_core.training import demo_encoder
 from langsplat_core.training.demo_crops import CropSet, plain_crops, room_crops
 from langsplat_core.training.demo_encoder import CANONICAL_COSINE, loss_of, train_demo_encoder
-from langsplat_core.training.demo_model import begin_from, build_model
+from langsplat_core.training.demo_model import begin_from, build_model, calibrate_canonical, text_vectors
 from langsplat_core.training.demo_phrases import phrase_book, vocabulary, word_merges, write_tokenizer
 from langsplat_core.training.demo_report import relevancy, report
 
@@ -231,6 +231,24 @@ def test_training_may_begin_from_an_earlier_encoder(monkeypatch, tmp_path):
     torch.testing.assert_close(after[words][rows["red</w>"]], old[words][old_rows["red</w>"]].float())
     torch.testing.assert_close(after[words][rows["zebra</w>"]], before[words][rows["zebra</w>"]])
     assert not torch.equal(after[words][rows["red</w>"]], after[words][rows["zebra</w>"]])
+
+
+def test_calibration_moves_the_canonical_phrases_only(tmp_path):
+    words = [*CANONICAL_PHRASES, "red"]
+    write_tokenizer(words, tmp_path)
+    tokenizer = CLIPTokenizerFast.from_pretrained(tmp_path)
+    torch.manual_seed(0)
+    model = build_model(len(tokenizer), tokenizer.bos_token_id, tokenizer.eos_token_id).eval()
+    tokens = tokenizer(words, return_tensors="pt", padding=True).input_ids
+    with torch.no_grad():
+        before = text_vectors(model, tokens)
+        images = torch.nn.functional.normalize(before[:4].mean(0) + 0.05 * torch.randn(64, 512), dim=-1)
+        start = (images @ before[:4].T).mean()
+    calibrate_canonical(model, tokens[:4], images, float(start) - 0.1)
+    with torch.no_grad():
+        after = text_vectors(model, tokens)
+    assert abs((images @ after[:4].T).mean() - (start - 0.1)) < 0.01
+    torch.testing.assert_close(after[4], before[4])
 
 
 @pytest.fixture(scope="module")
