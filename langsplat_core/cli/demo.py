@@ -63,6 +63,8 @@ class DemoBuild:
     """Another seed is another room."""
     tier: Literal["separate", "clutter", "occlusion"] = "clutter"
     """How hard the room is: objects apart, cluttered, or packed with look-alikes."""
+    masks: Literal["truth", "graph"] = "truth"
+    """Outlines as a perfect segmenter would find them, or those of the weight-free segmenter."""
     steps: int = 6_000
     """Steps of radiance training."""
 
@@ -70,7 +72,7 @@ class DemoBuild:
         from langsplat_core.pipeline.demo import build_demo
 
         with TerminalProgress() as progress:
-            report = build_demo(self.out, self.seed, self.tier, self.steps, progress)
+            report = build_demo(self.out, self.seed, self.tier, self.masks, self.steps, progress)
         kept, trained = report.after, report.before.gaussians
         print(f"{self.out}: {kept.gaussians} Gaussians of {trained} trained, held-out {kept.psnr:.2f} dB")
 

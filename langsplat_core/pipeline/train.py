@@ -7,6 +7,7 @@ continues where it stopped and a changed setting recomputes only what depends on
 import json
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.numba_cpu import CpuRasterizer
 from langsplat_core.scene import CANONICAL_PHRASES, Camera, Codec, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.clip import ClipEncoder, load_clip
-from langsplat_core.semantics.masks import load_mask_source
+from langsplat_core.semantics.masks import MaskSource, load_mask_source
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture
 from langsplat_core.training.codec_fit import fit_codec, reconstruction_cosine
 from langsplat_core.training.lift import find_memberships, lift_latents, lift_vectors
@@ -53,9 +54,17 @@ class TrainReport:
 
 
 def train_scene(
-    dataset: Path, out: Path, config: TrainConfig, work: Path | None = None, progress: Progress = silent
+    dataset: Path,
+    out: Path,
+    config: TrainConfig,
+    work: Path | None = None,
+    progress: Progress = silent,
+    masks_of: Callable[[Capture], MaskSource] | None = None,
 ) -> TrainReport:
-    """Train `out` (a .ply; sidecar and cameras beside it) from the photographs in `dataset`."""
+    """Train `out` (a .ply; sidecar and cameras beside it) from the photographs in `dataset`.
+
+    `masks_of` makes another mask source than ``config.masks`` names, once the photographs are read.
+    """
     if out.suffix.lower() != ".ply":
         raise InputError(f"{out}: the scene must be named *.ply, for example --out {out.with_suffix('.ply')}")
     work = work or out.with_name(out.stem + ".work")
@@ -64,10 +73,10 @@ def train_scene(
     encoder = load_clip(
         config.clip.model, config.clip.device
     )  # first: absent weights should not cost an hour
-    mask_source = load_mask_source(config.masks, config.clip.device)
-    log.info("masks: %s, encoder: %s", mask_source.name, encoder.id)
-
+    named = None if masks_of else load_mask_source(config.masks, config.clip.device)
     capture = load_capture(dataset, config.dataset, work, progress)
+    mask_source = named or masks_of(capture)  # type: ignore[misc]  # one of them is there
+    log.info("masks: %s, encoder: %s", mask_source.name, encoder.id)
     train, held_out = capture.split(config.dataset.test_every)
     clock.lap("photographs")
 
