@@ -11,10 +11,10 @@ PICTURES = {
     "colours.png": [],
     "latent_whole.png": ["--display", "latent", "--level", "whole"],
     "latent_part.png": ["--display", "latent", "--level", "part"],
-    "purple_car.png": ["--query", "purple car"],
-    "window.png": ["--query", "window"],
+    "blue_gift.png": ["--query", "blue gift"],
+    "keyboard.png": ["--query", "keyboard"],
     "segmentation.png": [
-        *("--query", "banana", "--query", "purple car", "--query", "green apple"),
+        *("--query", "teddy bear", "--query", "blue gift", "--query", "burger"),
         *("--display", "segmentation"),
     ],
 }

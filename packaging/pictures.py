@@ -19,7 +19,7 @@ STILLS = {
     "latent_whole.png": ["--display", "latent", "--level", "whole"],
     "latent_part.png": ["--display", "latent", "--level", "part"],
     "segmentation.png": [
-        *("--query", "banana", "--query", "purple car", "--query", "green apple"),
+        *("--query", "teddy bear", "--query", "blue gift", "--query", "burger"),
         *("--display", "segmentation"),
     ],
 }
@@ -52,7 +52,7 @@ def main() -> None:
     for name, options in STILLS.items():
         command = [sys.executable, "-m", "langsplat_viewer", "--headless", "--camera", CAMERA]
         subprocess.run([*command, "--out", str(OUT / name), *options], check=True)
-    window_picture(OUT / "window.png", ("purple car",))
+    window_picture(OUT / "window.png", ("blue gift",))
 
 
 if __name__ == "__main__":
