@@ -158,7 +158,7 @@ def run(*args: object) -> int:
         (["query", "missing.ply", "cup"], "missing.ply"),
         (["inspect", "."], "folder"),
         (["convert", "missing.ply", "out.ply"], "missing.ply"),
-        (["convert", "missing.ply", "out.obj"], "only .ply"),
+        (["convert", "missing.ply", "out.obj"], ".ply, .spz, .splat"),
         (["nonsense"], "nonsense"),
     ],
 )

@@ -5,7 +5,13 @@ from pathlib import Path
 
 import tyro
 
-from langsplat_core.formats import load_scene, load_without_language, rematch_language, save_scene
+from langsplat_core.formats import (
+    check_writable,
+    load_scene,
+    load_without_language,
+    rematch_language,
+    save_scene,
+)
 
 
 @dataclass(frozen=True)
@@ -23,6 +29,7 @@ class Convert:
     carried over to the Gaussians of SOURCE by nearest position."""
 
     def run(self) -> None:
+        check_writable(self.out)  # before minutes are spent on reading
         if self.rematch is None:
             scene = load_scene(self.source)
         else:

@@ -28,6 +28,7 @@ from langsplat_core.scene import Gaussians, Scene
 
 __all__ = [
     "SUPPORTED",
+    "check_writable",
     "companion_path",
     "load_gaussians",
     "load_scene",
@@ -101,6 +102,12 @@ def _read_scene(path: Path) -> Scene:
     raise InputError(f"{path}: not a scene of a known kind; supported: {SUPPORTED}")
 
 
+def check_writable(path: Path | str) -> None:
+    """InputError unless `save_scene` can write a file of this name's ending."""
+    if Path(path).suffix.lower() not in _WRITERS:
+        raise InputError(f"{path}: scenes are written as {', '.join(_WRITERS)}; choose such a name")
+
+
 def save_scene(path: Path | str, scene: Scene) -> None:
     """Write `scene` as .ply, .spz or .splat, by its name, with its companions; those it lacks are removed.
 
@@ -111,9 +118,8 @@ def save_scene(path: Path | str, scene: Scene) -> None:
     but never a scene beside companions of another.
     """
     path = Path(path)
-    write = _WRITERS.get(path.suffix.lower())
-    if write is None:
-        raise InputError(f"{path}: scenes are written as {', '.join(_WRITERS)}; choose such a name")
+    check_writable(path)
+    write = _WRITERS[path.suffix.lower()]
     sidecar, cameras = companion_path(path, language.SUFFIX), companion_path(path, cameras_json.SUFFIX)
     with ExitStack() as renames:  # which it makes in the reverse order of the following lines
         if scene.cameras:

@@ -124,7 +124,8 @@ def test_the_demo_scene_as_spz(tmp_path, demo, views, measured: Measure):
     value = psnr(got, want, views)
     measured("demo scene", "PSNR .spz", value)
     assert value > 48
-    assert (tmp_path / "demo.spz").stat().st_size < DEMO.stat().st_size / 5
+    # 29 bytes a Gaussian of SH degree 1 before compression, 104 in the PLY
+    assert (tmp_path / "demo.spz").stat().st_size < DEMO.stat().st_size * 29 / 104
 
 
 def test_the_demo_scene_as_splat(tmp_path, demo, views, measured: Measure):
