@@ -32,7 +32,7 @@ from langsplat_core.evaluation.contribution import (
     reduced,
 )
 from langsplat_core.evaluation.language_change import LanguageChange, language_change
-from langsplat_core.formats import load_scene, save_scene
+from langsplat_core.formats import check_writable, load_scene, save_scene
 from langsplat_core.pipeline.compact_views import Views, choose_views
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.numba_cpu import CpuRasterizer
@@ -205,6 +205,7 @@ def smallest(
 
 
 def _check(source: Path, out: Path, config: CompactConfig) -> None:
+    check_writable(out)
     if not 0 <= config.max_psnr_loss < math.inf:
         raise InputError(f"--max-psnr-loss {config.max_psnr_loss}: must be 0 dB or more")
     if not 0 < config.assumed_psnr < math.inf:
