@@ -12,7 +12,7 @@ from langsplat_viewer.frame import FrameRenderer
 from langsplat_viewer.options import scene_path, services
 from langsplat_viewer.window import Window, WindowRequest
 
-OUT = Path(__file__).parent / "pictures"
+OUT = Path(__file__).parent.parent / "docs" / "pictures"
 CAMERA = "3"
 STILLS = {
     "colours.png": [],
@@ -47,7 +47,7 @@ def window_picture(path: Path, queries: tuple[str, ...]) -> None:
 
 
 def main() -> None:
-    """Write every picture into `packaging/pictures`."""
+    """Write every picture into `docs/pictures`."""
     OUT.mkdir(exist_ok=True)
     for name, options in STILLS.items():
         command = [sys.executable, "-m", "langsplat_viewer", "--headless", "--camera", CAMERA]

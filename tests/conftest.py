@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.backends import backend, fast_backend, gl_rasterizers
-from tests.gl_context import gl, gl_session
-from tests.measured import measured, print_measured
+from tests.support.backends import backend, fast_backend, gl_rasterizers
+from tests.support.gl_context import gl, gl_session
+from tests.support.measured import measured, print_measured
 
 __all__ = ["backend", "fast_backend", "gl", "gl_rasterizers", "gl_session", "measured", "real_data"]
 

@@ -13,9 +13,9 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import Display, LevelChoice
+from langsplat_core.display.compose import latent_colours
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import NO_FIELD, QueryResult
-from langsplat_core.query.picture import latent_colours
 from langsplat_core.scene import Scene
 from langsplat_viewer.answers import Answers, LoadEncoder
 from langsplat_viewer.controls import (

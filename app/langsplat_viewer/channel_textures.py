@@ -7,7 +7,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.raster import Rasterizer
-from langsplat_core.raster.gl import GlRasterizer, GlView, Source
+from langsplat_core.raster.opengl.rasterizer import GlRasterizer, GlView, Source
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.channels import ArrayChannels, Extra, Layers
 

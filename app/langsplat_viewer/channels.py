@@ -7,8 +7,8 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, PictureConfig
+from langsplat_core.display.compose import Channels
 from langsplat_core.errors import BackendError
-from langsplat_core.query.picture import Channels
 from langsplat_core.raster import Rasterizer, View
 from langsplat_core.scene import Camera, Gaussians, Scene
 
@@ -90,7 +90,7 @@ class ArrayChannels:
 
     def render(self, scene: Scene, layers: Layers, camera: Camera, extra: Extra) -> Channels:
         """Colours, alpha and `extra`, in one pass."""
-        from langsplat_core.raster.cpu_colour import colours  # numba: a second that OpenGL need not wait for
+        from langsplat_core.raster.cpu.colour import colours  # numba: a second that OpenGL need not wait for
 
         gaussians = scene.gaussians
         values = [colours(gaussians.sh, gaussians.means, camera.position)]

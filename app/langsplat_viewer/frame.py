@@ -12,9 +12,9 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
-from langsplat_core.query import picture as rules
+from langsplat_core.display import compose as rules
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.gl_draw import drawing, set_uniforms, shader
+from langsplat_core.raster.opengl.draw import drawing, set_uniforms, shader
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.channel_textures import ArraySource, ChannelSource, GlSource, Textures
 from langsplat_viewer.channels import Extra, Layers, camera_key, depth_range
@@ -22,7 +22,7 @@ from langsplat_viewer.channels import Extra, Layers, camera_key, depth_range
 Backend = Literal["auto", "opengl", "cpu", "cuda"]
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swr ", "software", "swiftshader", "basic render")
 PICK_ALPHA = 0.1  # a pixel with less alpha shows nothing that could be picked
-_DISPLAYS = ("rgb", "latent", "relevancy", "segmentation", "depth", "alpha")  # as composite.frag.glsl counts
+_DISPLAYS = ("rgb", "latent", "relevancy", "segmentation", "depth", "alpha")  # as compose.frag counts
 
 
 def is_software(ctx: moderngl.Context) -> bool:
@@ -62,7 +62,8 @@ class FrameRenderer:
         else:
             self._source = ArraySource(ctx, load_rasterizer(backend))
         self._program = ctx.program(
-            vertex_shader=shader("fullscreen.vert", 330), fragment_shader=shader("composite.frag", 330)
+            vertex_shader=shader("fullscreen.vert", 330),
+            fragment_shader=shader("compose.frag", 330, "langsplat_core.display"),
         )
         self._vao = ctx.vertex_array(self._program, [])
         self._turbo = ctx.texture((len(rules.TURBO), 1), 3, rules.TURBO.tobytes())

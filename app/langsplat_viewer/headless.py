@@ -4,10 +4,10 @@ import moderngl
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
+from langsplat_core.display.compose import compose
 from langsplat_core.errors import BackendError
-from langsplat_core.query.picture import compose
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.gl_context import create_egl_context
+from langsplat_core.raster.opengl.context import create_egl_context
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.channels import ArrayChannels, Layers
 from langsplat_viewer.frame import Backend, FrameRenderer, suits_opengl

@@ -9,10 +9,10 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import Display, LevelChoice, PictureConfig
+from langsplat_core.display.compose import latent_colours
 from langsplat_core.errors import BackendError, InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryResult
-from langsplat_core.query.picture import latent_colours
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_viewer.actions import Services
 from langsplat_viewer.answers import Answers

@@ -37,7 +37,7 @@ class BenchRaster:
             raise InputError("--sizes must be one or more pairs of a width and a height")
         if min((*self.counts, self.pivot, *(side for size in self.sizes for side in size))) < 1:
             raise InputError("--counts, --sizes and --pivot must be 1 or more")
-        from langsplat_core.evaluation.bench_raster import Plan, quick_plan, run_plan
+        from langsplat_core.lab.speed.raster import Plan, quick_plan, run_plan
 
         plan = Plan(self.counts, self.sizes, self.pivot, self.channels, self.scenes, self.limit, self.cold)
         if self.quick:

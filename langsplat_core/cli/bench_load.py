@@ -5,8 +5,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from langsplat_core.errors import InputError
-from langsplat_core.evaluation.load_speed import as_table, measure_loading
 from langsplat_core.files import atomic_path
+from langsplat_core.lab.speed.load import as_table, measure_loading
 from langsplat_core.progress import TerminalProgress
 
 

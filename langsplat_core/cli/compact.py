@@ -13,7 +13,7 @@ from langsplat_core.config import CompactConfig
 from langsplat_core.progress import TerminalProgress
 
 if TYPE_CHECKING:
-    from langsplat_core.pipeline.compact import CompactReport
+    from langsplat_core.compaction.compact import CompactReport
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Compact:
     config: Annotated[CompactConfig, tyro.conf.arg(name="")] = field(default_factory=CompactConfig)
 
     def run(self) -> None:
-        from langsplat_core.pipeline.compact import compact_scene
+        from langsplat_core.compaction.compact import compact_scene
 
         out = self.out or self.scene.with_name(self.scene.name.split(".")[0] + ".compact.ply")
         with TerminalProgress() as progress:

@@ -30,7 +30,7 @@ class DemoDataset:
     """How hard the room is: objects apart, cluttered, or packed with look-alikes."""
 
     def run(self) -> None:
-        from langsplat_core.datasets.synthetic.dataset import write_dataset
+        from langsplat_core.lab.world.photographs import write_dataset
 
         with TerminalProgress() as progress:
             write_dataset(self.out, self.seed, self.views, self.size, progress, self.tier)
@@ -46,7 +46,7 @@ class DemoEncoder:
     config: Annotated[DemoEncoderConfig, tyro.conf.arg(name="")] = field(default_factory=DemoEncoderConfig)
 
     def run(self) -> None:
-        from langsplat_core.training.demo_encoder import train_demo_encoder
+        from langsplat_core.lab.encoder.train import train_demo_encoder
 
         with TerminalProgress() as progress:
             train_demo_encoder(self.out, self.config, progress)
@@ -69,7 +69,7 @@ class DemoBuild:
     """Steps of radiance training."""
 
     def run(self) -> None:
-        from langsplat_core.pipeline.demo import build_demo
+        from langsplat_core.lab.demo import build_demo
 
         with TerminalProgress() as progress:
             report = build_demo(self.out, self.seed, self.tier, self.masks, self.steps, progress)
@@ -93,7 +93,7 @@ class DemoSheet:
     def run(self) -> None:
         from PIL import Image
 
-        from langsplat_core.datasets.synthetic.sheet import contact_sheet
+        from langsplat_core.lab.world.sheet import contact_sheet
 
         with TerminalProgress() as progress:
             picture = contact_sheet(self.instances, self.side, self.seed, progress)

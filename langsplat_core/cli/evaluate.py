@@ -44,13 +44,13 @@ class EvalSynthetic:
         self._run_rooms()
 
     def _run_rooms(self) -> None:
-        from langsplat_core.evaluation.synthetic_report import (
+        from langsplat_core.lab.rooms.benchmark import run_benchmark
+        from langsplat_core.lab.rooms.report import (
             budget_table,
             room_table,
             save_json,
             score_table,
         )
-        from langsplat_core.pipeline.benchmark import run_benchmark
 
         with TerminalProgress() as progress:
             reports = run_benchmark(self.config, self.work, progress)
@@ -66,8 +66,8 @@ class EvalSynthetic:
 
     def _run_scene(self, path: Path, dataset: Path) -> None:
         from langsplat_core.datasets import load_capture
-        from langsplat_core.datasets.synthetic.catalogue import EVERYTHING
-        from langsplat_core.evaluation.synthetic import Reading, ask, evaluate, found_rate, read_truth
+        from langsplat_core.lab.rooms.scoring import Reading, ask, evaluate, found_rate, read_truth
+        from langsplat_core.lab.world.objects.catalogue import EVERYTHING
         from langsplat_core.query.engine import NO_FIELD, QueryEngine
         from langsplat_core.raster import load_rasterizer
         from langsplat_core.semantics.clip import load_text_encoder

@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from langsplat_core.evaluation.anatomy import NEEDLE, OPACITY_EDGES, Anatomy, disk_bytes, dissect
 from langsplat_core.formats import load_scene
+from langsplat_core.formats.summary import NEEDLE, OPACITY_EDGES, Anatomy, disk_bytes, dissect
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.colmap_model import ModelCamera, SparseModel, has_model, read_model
 from langsplat_core.datasets.images import Photo, develop, shortened
-from langsplat_core.datasets.lens import (
+from langsplat_core.datasets.intrinsics import (
     BrownDistortion,
     ColmapDistortion,
     Distortion,

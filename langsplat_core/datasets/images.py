@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.lens import Lens
+from langsplat_core.datasets.intrinsics import Lens
 from langsplat_core.datasets.undistort import pinhole_for, resample, source_positions
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress

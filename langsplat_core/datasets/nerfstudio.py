@@ -20,7 +20,7 @@ from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
 from langsplat_core.arrays import Array
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.images import PHOTO_SUFFIXES, UNREADABLE, Photo, develop, shortened
-from langsplat_core.datasets.lens import BrownDistortion, Distortion, FisheyeDistortion, Lens
+from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, FisheyeDistortion, Lens
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.progress import Progress
 

@@ -5,7 +5,7 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.lens import Distortion, Lens
+from langsplat_core.datasets.intrinsics import Distortion, Lens
 from langsplat_core.errors import InputError
 from langsplat_core.scene import Camera
 

@@ -22,14 +22,14 @@ from langsplat_core.files import atomic_path
 from langsplat_core.formats import read_ply, save_scene, write_ply
 from langsplat_core.pipeline.stages import capture_digest, stage_key
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster.numba_cpu import CpuRasterizer
+from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import CANONICAL_PHRASES, Camera, Codec, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.clip import ClipEncoder, load_clip
 from langsplat_core.semantics.masks import MaskSource, load_mask_source
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture
-from langsplat_core.training.codec_fit import fit_codec, reconstruction_cosine
-from langsplat_core.training.lift import find_memberships, lift_latents, lift_vectors
-from langsplat_core.training.radiance import evaluate_views, train_radiance
+from langsplat_core.training.language.codec_fit import fit_codec, reconstruction_cosine
+from langsplat_core.training.language.lift import find_memberships, lift_latents, lift_vectors
+from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 
 log = logging.getLogger("langsplat")
 

@@ -9,7 +9,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.query.localize import Neighbourhood, Place, build_neighbourhood, locate
+from langsplat_core.query.places import Neighbourhood, Place, build_neighbourhood, locate
 from langsplat_core.query.relevancy import CHUNK, latent_relevancy, relevancy
 from langsplat_core.query.table import SphereTable, build_table
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, AutoencoderCodec, LanguageField, Scene

@@ -8,7 +8,7 @@ Both are gated by alpha, because an uncovered pixel's zero latent decodes to a c
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.query.picture import gated_mean
+from langsplat_core.display.compose import gated_mean
 from langsplat_core.query.relevancy import latent_relevancy
 from langsplat_core.raster.protocol import View
 from langsplat_core.scene import LanguageField

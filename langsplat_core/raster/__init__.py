@@ -28,9 +28,9 @@ class _Backend(NamedTuple):
 BACKENDS: Mapping[str, _Backend] = MappingProxyType(
     {
         "reference": _Backend("langsplat_core.raster.reference", "ReferenceRasterizer", "cpu"),
-        "cpu": _Backend("langsplat_core.raster.numba_cpu", "CpuRasterizer", "reference"),
-        "opengl": _Backend("langsplat_core.raster.gl", "GlRasterizer", "cpu"),
-        "cuda": _Backend("langsplat_core.raster.gsplat_cuda", "GsplatRasterizer", "cpu"),
+        "cpu": _Backend("langsplat_core.raster.cpu.rasterizer", "CpuRasterizer", "reference"),
+        "opengl": _Backend("langsplat_core.raster.opengl.rasterizer", "GlRasterizer", "cpu"),
+        "cuda": _Backend("langsplat_core.raster.gsplat", "GsplatRasterizer", "cpu"),
     }
 )
 

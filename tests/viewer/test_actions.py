@@ -16,7 +16,7 @@ from langsplat_core.scene import Scene
 from langsplat_viewer import actions, saving
 from langsplat_viewer.actions import Services, Viewer
 from langsplat_viewer.state import GLIDE_SECONDS, MAX_MESSAGES, ViewerState
-from tests.viewer.fakes import CENTRES, FakeEncoder, blob_scene
+from tests.support.fakes import CENTRES, FakeEncoder, blob_scene
 
 SCENES = {
     "blobs.ply": blob_scene(),

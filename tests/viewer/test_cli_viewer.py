@@ -15,7 +15,7 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_viewer import __main__ as program
 from langsplat_viewer import options
 from langsplat_viewer.options import parse_size
-from tests.viewer.fakes import CENTRES, FakeEncoder, blob_scene
+from tests.support.fakes import CENTRES, FakeEncoder, blob_scene
 
 MUG, BOOK, PLANT = CENTRES
 

@@ -29,8 +29,8 @@ from langsplat_viewer.controls import (
     with_fov,
     zoom,
 )
-from tests.scenes import random_camera, random_gaussians
-from tests.viewer.fakes import blob_scene
+from tests.support.fakes import blob_scene
+from tests.support.scenes import random_camera, random_gaussians
 
 SIZE = (320, 200)
 

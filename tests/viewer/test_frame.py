@@ -10,13 +10,13 @@ import pytest
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import Display, PictureConfig
-from langsplat_core.query.picture import Channels, compose
+from langsplat_core.display.compose import Channels, compose
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Gaussians, Scene, look_at
 from langsplat_viewer.channels import ArrayChannels, Layers, depth_range
 from langsplat_viewer.frame import FrameRenderer, suits_opengl
 from langsplat_viewer.headless import render_picture
-from tests.scenes import random_camera, random_gaussians, random_values
+from tests.support.scenes import random_camera, random_gaussians, random_values
 
 DISPLAYS: tuple[Display, ...] = ("rgb", "latent", "relevancy", "segmentation", "depth", "alpha")
 COUNT = 150
@@ -189,7 +189,7 @@ def test_the_viewport_alone_is_drawn_and_stretched(gl, frame):
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks libGL.so.1")
 def test_a_user_interface_finds_a_plain_state(gl, frame):
-    from tests.core.test_gl_raster import gl_state
+    from tests.raster.opengl.test_rasterizer import gl_state
 
     target = gl.framebuffer([gl.texture((64, 64), 4)])
     target.use()
@@ -256,7 +256,7 @@ from langsplat_core.config import PictureConfig
 from langsplat_core.errors import BackendError
 from langsplat_core.scene import Scene
 from langsplat_viewer.frame import FrameRenderer
-from tests.scenes import random_camera, random_gaussians
+from tests.support.scenes import random_camera, random_gaussians
 ctx = moderngl.create_context(standalone=True, backend="egl", require=330)
 assert ctx.version_code == 330, ctx.version_code
 renderer = FrameRenderer(ctx)
@@ -306,7 +306,7 @@ from langsplat_core.errors import BackendError
 from langsplat_viewer.headless import render_picture
 from langsplat_core.config import PictureConfig
 from langsplat_core.scene import Scene
-from tests.scenes import random_camera, random_gaussians
+from tests.support.scenes import random_camera, random_gaussians
 scene = Scene(random_gaussians(20))
 for backend in ("auto", "cpu"):
     assert render_picture(scene, random_camera(), PictureConfig(), backend=backend).any()

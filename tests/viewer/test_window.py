@@ -15,7 +15,7 @@ from langsplat_core.formats import save_scene
 from langsplat_viewer.canvas import REST_SECONDS, Canvas
 from langsplat_viewer.controls import default_view, extent_of, orbit
 from langsplat_viewer.state import ViewerState
-from tests.viewer.fakes import blob_scene
+from tests.support.fakes import blob_scene
 
 ROOT = Path(__file__).parents[2]
 

@@ -21,7 +21,7 @@ from langsplat_core.scene import Scene
 from langsplat_viewer.actions import Services
 from langsplat_viewer.frame import FrameRenderer
 from langsplat_viewer.window import Window, WindowRequest
-from tests.viewer.fakes import CENTRES, FakeEncoder
+from tests.support.fakes import CENTRES, FakeEncoder
 
 MUG, BOOK, PLANT = CENTRES
 

@@ -3,8 +3,8 @@
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
 from langsplat_core.config import LevelChoice
+from langsplat_core.display.compose import QUERY_COLOURS
 from langsplat_core.query.engine import NO_FIELD
-from langsplat_core.query.picture import QUERY_COLOURS
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions
 from langsplat_viewer.actions import Viewer

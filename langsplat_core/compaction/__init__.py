@@ -1,0 +1,1 @@
+"""`langsplat compact`: a scene with no more Gaussians than it needs."""

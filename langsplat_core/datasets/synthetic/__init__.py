@@ -1,1 +1,0 @@
-"""A procedural room with labelled objects, photographed by ray casting: the demo data and its truth."""

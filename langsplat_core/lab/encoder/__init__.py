@@ -1,0 +1,1 @@
+"""Training of the small CLIP that comes with the program."""

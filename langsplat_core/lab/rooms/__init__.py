@@ -1,0 +1,1 @@
+"""`langsplat eval synthetic`: the method measured in fresh rooms, beside oracles."""

@@ -1,0 +1,273 @@
+"""The benchmark on procedural rooms: freshly rendered, trained by the ordinary pipeline, compared with the
+truth; and an error budget, which swaps one stage at a time for one that makes no mistake."""
+
+import hashlib
+import statistics
+import time
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import (
+    BenchmarkConfig,
+    ClipConfig,
+    CodecConfig,
+    DatasetConfig,
+    MaskConfig,
+    RadianceConfig,
+    TrainConfig,
+)
+from langsplat_core.datasets import load_capture
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.errors import InputError
+from langsplat_core.files import atomic_path
+from langsplat_core.formats import load_scene, save_scene
+from langsplat_core.formats.language import means_checksum
+from langsplat_core.lab.demo import SEED
+from langsplat_core.lab.rooms.oracles import (
+    TruthMasks,
+    among_pictures,
+    phrase_vectors,
+    told_vectors,
+    true_labels,
+)
+from langsplat_core.lab.rooms.report import Measured, RoomReport, measured
+from langsplat_core.lab.rooms.scoring import (
+    Asked,
+    Reading,
+    Truth,
+    ask,
+    evaluate,
+    evaluate_direct,
+    read_truth,
+)
+from langsplat_core.lab.rooms.variants import Variant, variants
+from langsplat_core.lab.world.objects.catalogue import EVERYTHING
+from langsplat_core.lab.world.photographs import write_dataset
+from langsplat_core.lab.world.rooms import Tier
+from langsplat_core.pipeline.stages import stage_key
+from langsplat_core.pipeline.train import Views, language_field, trained_gaussians
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.pixels import splatted_relevancy
+from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
+from langsplat_core.scene import Gaussians, Scene
+from langsplat_core.semantics.clip import ClipEncoder, clip_folder, load_clip
+from langsplat_core.semantics.masks import MaskSource, load_mask_source
+from langsplat_core.semantics.store import FeatureStore, describe_capture
+from langsplat_core.training.language.codec_fit import reconstruction_cosine
+from langsplat_core.training.radiance.train import evaluate_views
+
+HOLD_OUT = 8  # every so many views, one is not trained on
+WIDE = 128  # numbers per latent where the codec should lose nothing: 1.5 KB per Gaussian
+FRAMES = 5  # timed pictures of one phrase
+
+
+def run_benchmark(config: BenchmarkConfig, work: Path, progress: Progress = silent) -> list[RoomReport]:
+    """Measure every tier and seed. What is in `work` from an earlier run with the same settings is not made
+    again. Raises InputError for settings that cannot be measured."""
+    _check(config)
+    encoder = load_clip(config.encoder)
+    weights = _digest(clip_folder(config.encoder, "--encoder"))
+    reports = []
+    for tier in config.tiers:
+        for seed in config.seeds:
+            label = f"{tier} {seed}, "
+            room = Room(config, tier, seed, work, (encoder, weights), _labelled(progress, label))
+            reports.append(room.report())
+    return reports
+
+
+def _labelled(progress: Progress, prefix: str) -> Progress:
+    return lambda label, fraction: progress(prefix + label, fraction)
+
+
+def _check(config: BenchmarkConfig) -> None:
+    if not config.tiers or not config.seeds:
+        raise InputError("eval synthetic: name at least one of --tiers and one of --seeds")
+    if SEED in config.seeds:
+        raise InputError(
+            f"--seeds {SEED} is the bundled scene's room, on which things were tuned; take another seed"
+        )
+    if min(config.seeds) < 0:
+        raise InputError("--seeds must be 0 or more")
+    if config.views < HOLD_OUT or min(config.steps, config.codec_steps, config.max_gaussians) < 1:
+        raise InputError(f"eval synthetic: it needs at least {HOLD_OUT} --views, and 1 step and Gaussian")
+
+
+def _digest(folder: Path) -> str:
+    """Of an encoder's weights: a folder may be filled with others under the same name."""
+    digest = hashlib.sha256()
+    for path in sorted([*folder.glob("*.safetensors"), *folder.glob("*.bin")]):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def train_config(config: BenchmarkConfig) -> TrainConfig:
+    """The settings with which every room is trained."""
+    return TrainConfig(
+        dataset=DatasetConfig(max_side=max(config.size), test_every=HOLD_OUT),
+        radiance=RadianceConfig(steps=config.steps, sh_degree=1, max_gaussians=config.max_gaussians),
+        clip=ClipConfig(model=config.encoder),
+        codec=CodecConfig(steps=config.codec_steps),
+    )
+
+
+class Room:
+    """One room and everything that is derived from it, each made once, when it is first needed."""
+
+    def __init__(
+        self,
+        config: BenchmarkConfig,
+        tier: Tier,
+        seed: int,
+        work: Path,
+        encoder: tuple[ClipEncoder, str],
+        progress: Progress,
+    ) -> None:
+        width, height = config.size
+        self.config, self.tier, self.seed, self.progress = config, tier, seed, progress
+        self.encoder, self.weights = encoder
+        self.folder = work / f"{tier}-{seed}-{config.views}x{width}x{height}"
+        self.settings = train_config(config)
+        self.seconds: dict[str, float] = {}
+
+    @cached_property
+    def capture(self) -> Capture:
+        """The photographs."""
+        folder, start = self.folder / "photographs", time.perf_counter()
+        if not (folder / "transforms.json").exists():
+            write_dataset(folder, self.seed, self.config.views, self.config.size, self.progress, self.tier)
+        capture = load_capture(folder, self.settings.dataset, self.folder, self.progress)
+        self._lap("photographs", start)
+        return capture
+
+    @cached_property
+    def truth(self) -> Truth:
+        """What is in them."""
+        assert self.capture
+        return read_truth(self.folder / "photographs")
+
+    @cached_property
+    def gaussians(self) -> Gaussians:
+        """Trained without the held-out views."""
+        train, _ = self.capture.split(HOLD_OUT)
+        start = time.perf_counter()
+        gaussians = trained_gaussians(self.capture, train, self.settings, self.folder, self.progress)
+        self._lap("radiance", start)
+        return gaussians
+
+    @cached_property
+    def labels(self) -> Array:
+        """(3, N) what every Gaussian truly is."""
+        path = self.folder / f"{stage_key('labels', 1, means_checksum(self.gaussians.means))}.npy"
+        if not path.exists():
+            start = time.perf_counter()
+            views = [(camera, self.truth.labels(camera.name)) for camera in self.capture.cameras]
+            labels = true_labels(CpuRasterizer(), self.gaussians, views, self.progress)
+            with atomic_path(path) as temporary:
+                np.save(temporary, labels, allow_pickle=False)
+            self._lap("labels of the Gaussians", start)
+        stored: Array = np.load(path, allow_pickle=False)
+        return stored
+
+    def views(self, variant: Variant) -> Views:
+        """The training views with masks and vectors."""
+        source: MaskSource = load_mask_source(MaskConfig(source="graph"))
+        if variant.masks == "truth":
+            source = TruthMasks(self.capture, self.truth)
+        train, _ = self.capture.split(HOLD_OUT)
+        cameras = [self.capture.cameras[i] for i in train]
+        start = time.perf_counter()
+        features = describe_capture(
+            [self.capture.images[i] for i in train],
+            [camera.name for camera in cameras],
+            source,
+            self.encoder,
+            FeatureStore(self.folder / f"features-{variant.masks}-{self.weights}"),
+            self.progress,
+        )
+        self._lap(f"masks ({variant.masks}) and vectors", start)
+        if variant.vectors == "text":
+            words = phrase_vectors(self.truth, self.encoder)
+            told = [
+                told_vectors(item, self.truth.labels(camera.name), words)
+                for item, camera in zip(features, cameras, strict=True)
+            ]
+            features = among_pictures(told, features)
+        return list(zip(cameras, features, strict=True))
+
+    def scene(self, variant: Variant) -> tuple[Scene, float]:
+        """The searchable scene, and the mean cosine of mask vectors with what the codec makes of them."""
+        codec = self.settings.codec
+        if variant.codec == "linear":
+            codec = replace(codec, kind="linear", latent_dim=min(WIDE, self.encoder.dim))
+        what = (means_checksum(self.gaussians.means), variant.masks, variant.vectors, codec, self.weights)
+        path = self.folder / f"{stage_key('scene', 2, *what)}.ply"
+        views = self.views(variant)
+        if not path.exists():
+            start = time.perf_counter()
+            settings = replace(self.settings, codec=codec)
+            field, _ = language_field(self.gaussians, views, self.encoder, settings, self.progress)
+            save_scene(path, Scene(self.gaussians, field, tuple(camera for camera, _ in views)))
+            self._lap(f"language field ({variant.name})", start)
+        scene = load_scene(path)
+        assert scene.language is not None
+        vectors = np.concatenate([features.vectors for _, features in views])
+        return scene, reconstruction_cosine(scene.language.codec, vectors)
+
+    def measure(self, variant: Variant) -> Measured:
+        """Ask everything; the method's own order of work but for what `variant` says."""
+        scene, cosine = self.scene(variant)
+        start = time.perf_counter()
+        engine = QueryEngine(scene, self.encoder, exact=variant.query == "exact")
+        absent = self.truth.absent(EVERYTHING)
+        asked = ask(engine, [*(phrase.text for phrase in self.truth.phrases), *absent])
+        reading = Reading(variant.query == "paper", self.config.cut)
+        held_out = [self.capture.cameras[i] for i in self.capture.split(HOLD_OUT)[1]]
+        progress = _labelled(self.progress, f"{variant.name}: ")
+        scores = evaluate(asked, CpuRasterizer(), held_out, self.truth, reading, progress)
+        direct = evaluate_direct(asked, self.labels, self.truth, self.config.cut)
+        result = measured(asked, self.truth, absent, scores, direct)
+        self._lap(f"queries ({variant.name})", start)
+        return replace(
+            result,
+            **{key: getattr(variant, key) for key in ("name", "masks", "vectors", "codec", "query")},
+            codec_cosine=cosine,
+            frame_ms=1000 * self._frame_seconds(asked),
+        )
+
+    def _frame_seconds(self, asked: Asked) -> float:
+        """Median of projecting one held-out view and splatting one phrase into it."""
+        camera = self.capture.cameras[self.capture.split(HOLD_OUT)[1][0]]
+        values = np.stack([answer.values for answer in asked.answers.values()][:1], 1)
+        times = []
+        for _ in range(FRAMES):
+            start = time.perf_counter()
+            splatted_relevancy(CpuRasterizer().view(self.gaussians, camera), values, 0.3)
+            times.append(time.perf_counter() - start)
+        return statistics.median(times)
+
+    def report(self) -> RoomReport:
+        """Measure what the settings ask for."""
+        _, held_out = self.capture.split(HOLD_OUT)
+        rows = [self.measure(variant) for variant in variants(self.config.masks, self.config.budget)]
+        views = evaluate_views(self.gaussians, self.capture, held_out)
+        return RoomReport(
+            tier=self.tier,
+            seed=self.seed,
+            views=len(self.capture) - len(held_out),
+            held_out=len(held_out),
+            gaussians=len(self.gaussians),
+            psnr=float(np.mean([view.psnr for view in views])),
+            encoder=self.encoder.id,
+            cut=self.config.cut,
+            measured=tuple(rows),
+            seconds=self.seconds,
+        )
+
+    def _lap(self, name: str, start: float) -> None:
+        self.seconds[name] = round(self.seconds.get(name, 0.0) + time.perf_counter() - start, 1)

@@ -1,0 +1,133 @@
+"""What each stage of the method would give if it made no mistake, from a procedural room's ground truth."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import sparse
+
+from langsplat_core.arrays import Array, unit
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.errors import InputError
+from langsplat_core.lab.rooms.scoring import Truth
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.engine import TextEncoder
+from langsplat_core.raster.protocol import LiftingRasterizer
+from langsplat_core.scene import LEVELS, Camera, Gaussians
+from langsplat_core.semantics.masks import LevelMasks
+from langsplat_core.semantics.store import ImageFeatures
+from langsplat_core.training.language.lift import find_memberships
+
+MIN_REGION = 16  # px: of a smaller region not even an oracle's crop shows anything
+
+
+class TruthMasks:
+    """A `semantics.masks.MaskSource` that knows: the regions of the truth, at its three levels.
+
+    A photograph is recognised by its content, since a mask source is given nothing else.
+    """
+
+    name = "truth"
+    key = json.dumps(["truth", 1, MIN_REGION])
+
+    def __init__(self, capture: Capture, truth: Truth) -> None:
+        self._truth = truth
+        pairs = zip(capture.images, capture.cameras, strict=True)
+        self._names = {_digest(image): camera.name for image, camera in pairs}
+
+    def __call__(self, image: Array, progress: Progress) -> LevelMasks:
+        """Masks of an image (H, W, 3) uint8 of the capture; InputError for any other."""
+        name = self._names.get(_digest(image))
+        if name is None:
+            raise InputError(f"{self._truth.folder}: has no truth for this photograph; render the room again")
+        stacks = []
+        for ids in self._truth.labels(name):
+            found, pixels = np.unique(ids[ids >= 0], return_counts=True)
+            stacks.append(ids == found[pixels >= MIN_REGION][:, None, None])
+        progress("reading the truth", 1.0)
+        subpart, part, whole = (np.ones(len(stack), np.float32) for stack in stacks)
+        return LevelMasks((stacks[0], stacks[1], stacks[2]), (subpart, part, whole))
+
+
+def _digest(image: Array) -> str:
+    return hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest()
+
+
+def told_vectors(features: ImageFeatures, ids: Array, vectors: Mapping[int, Array]) -> ImageFeatures:
+    """`features` as if the encoder had read what most of every region's pixels truly are.
+
+    ids: (3, H, W) truth; vectors: id -> (D,) unit text vector. A region that mostly shows nothing, or
+    something without a name, keeps its own vector.
+    """
+    told = features.vectors.copy()
+    for labels, truth in zip(features.labels, ids, strict=True):
+        inside = labels >= 0
+        pairs, counts = np.unique(np.stack([labels[inside], truth[inside]]), axis=1, return_counts=True)
+        for row, number in pairs[:, np.argsort(counts, kind="stable")].T:  # the most frequent comes last
+            told[row] = vectors.get(int(number), features.vectors[row])
+    return replace(features, vectors=told)
+
+
+def among_pictures(told: Sequence[ImageFeatures], seen: Sequence[ImageFeatures]) -> list[ImageFeatures]:
+    """Text vectors moved by one vector, the same for all, to where the encoder puts pictures.
+
+    CLIP's pictures and phrases lie in two separate clouds ("Mind the gap", Liang et al. 2022). Against the
+    canonical phrases, which are text, every text vector is right or wrong by more than any picture can be:
+    relevancy saturates. What is shifted is the mean of `told`, onto the mean of `seen`; the differences
+    between phrases, which are what a perfect embedding has, stay.
+    """
+    shift = np.concatenate([item.vectors for item in seen]).mean(0)
+    shift = shift - np.concatenate([item.vectors for item in told]).mean(0)
+    return [replace(item, vectors=unit(item.vectors + shift).astype(np.float32)) for item in told]
+
+
+def phrase_vectors(truth: Truth, encoder: TextEncoder) -> dict[int, Array]:
+    """The text vector of every id's own phrase, such as "handle of the red mug"; ids without one,
+    or with words that the encoder was never taught, are left out."""
+    texts = sorted({text for text in truth.names.values() if text and not encoder.unknown_words(text)})
+    known = dict(zip(texts, encoder.encode_texts(texts), strict=True))
+    return {number: known[text] for number, text in truth.names.items() if text in known}
+
+
+def true_labels(
+    rasterizer: LiftingRasterizer,
+    gaussians: Gaussians,
+    views: Sequence[tuple[Camera, Array]],
+    progress: Progress = silent,
+) -> Array:
+    """(3, N) int64: the truth id that each Gaussian shows most of, ``argmax W^T onehot(ids)`` over all views.
+
+    views: cameras with their (3, H, W) ids; -1 for Gaussians that none of them shows.
+    """
+    columns: list[Array] = []
+    described = []
+    for camera, ids in views:
+        rows, numbers = _as_rows(ids)
+        described.append((camera, ImageFeatures(rows, np.zeros((len(numbers), 1), np.float32))))
+        columns.append(numbers)
+    members = find_memberships(rasterizer, gaussians, described, progress=progress)
+    numbers = np.concatenate(columns)
+    result = np.full((len(LEVELS), len(gaussians)), -1, np.int64)
+    for level in range(len(LEVELS)):
+        chosen = np.flatnonzero(members.levels == level)
+        known, column = np.unique(numbers[chosen], return_inverse=True)
+        if len(known) == 0:
+            continue
+        same = sparse.csr_matrix((np.ones(len(chosen), np.float32), (np.arange(len(chosen)), column)))
+        weights = (members.weights[:, chosen] @ same).tocsr()
+        best = np.asarray(weights.argmax(axis=1)).ravel()
+        result[level] = np.where(np.diff(weights.indptr) > 0, known[best], -1)
+    return result
+
+
+def _as_rows(ids: Array) -> tuple[Array, Array]:
+    """(3, H, W) ids -> the same as rows that count through the levels, and (M,) the id of each row."""
+    rows = np.full(ids.shape, -1, np.int32)
+    numbers: list[int] = []
+    for level, truth in enumerate(ids):
+        for number in np.unique(truth[truth >= 0]):
+            rows[level][truth == number] = len(numbers)
+            numbers.append(int(number))
+    return rows, np.array(numbers, np.int64)

@@ -1,0 +1,250 @@
+"""A scene against the ground truth of the procedural room it was photographed in.
+
+Scores follow LERF and LangSplat: localisation (is the peak of the mean-filtered relevancy map on the
+thing?) and segmentation (intersection over union), per view and phrase, averaged per kind of phrase; the same
+overlap directly among the Gaussians; and rejection: how many absent objects are answered with "not here".
+"""
+
+import json
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import PictureConfig
+from langsplat_core.errors import InputError
+from langsplat_core.evaluation.metrics import intersection_over_union, majority
+from langsplat_core.lab.world.captions import object_words
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.cut import CutRule, cut_level
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
+from langsplat_core.query.places import peak_pixel
+from langsplat_core.raster.protocol import Rasterizer, View
+from langsplat_core.scene import Camera
+
+MIN_PIXELS = 150  # a thing with fewer visible pixels in a view is not asked for there
+MIN_GAUSSIANS = 20  # nor one with fewer Gaussians directly
+# px: the paper's mean filter for localisation, and its code's majority vote over a mask, both of pictures of
+# 731 rows; smaller pictures get smaller windows, or a part would be lost in one
+FILTER, VOTE, PAPER_ROWS = 20, 7, 731
+CHANNELS = 32  # phrases that are splatted at a time
+KINDS = ("object", "colour+object", "part", "subpart")  # of phrases, in the order of tables
+
+
+@dataclass(frozen=True)
+class Phrase:
+    """A phrase and what it is true for."""
+
+    text: str
+    kind: str  # one of KINDS
+    ids: tuple[int, ...]  # truth ids, of any level
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What `langsplat demo dataset` knows about its photographs."""
+
+    folder: Path
+    phrases: tuple[Phrase, ...]
+    words: frozenset[str]  # every phrase that is right for anything in the room
+    names: Mapping[int, str] = field(default_factory=dict)  # id -> the phrase that says most about it
+
+    def labels(self, name: str) -> Array:
+        """(3, H, W) ids of the photograph with this stem, -1 where nothing is."""
+        with np.load(self.folder / f"{name}.npz", allow_pickle=False) as stored:
+            return np.asarray(stored["ids"]).astype(np.int64)
+
+    def absent(self, things: Iterable[str]) -> list[str]:
+        """Those of `things` that nothing in the room may be called by, nor by a synonym of theirs."""
+        return sorted(thing for thing in things if self.words.isdisjoint(object_words(thing)))
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How an answer becomes a map and a mask."""
+
+    paper_order: bool = False  # blend latents and decode pixels, instead of blending relevancies
+    cut: CutRule = "floor"
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What the engine says to one phrase."""
+
+    vector: Array  # (D,) of the phrase
+    level: int
+    values: Array  # (N,) relevancy at that level
+    peak: float
+    median: float  # of the values of Gaussians with a meaning
+    found: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """Answers to all phrases, each asked once."""
+
+    engine: QueryEngine
+    answers: Mapping[str, Answer]
+    unknown: tuple[str, ...]  # phrases with words that the encoder was never taught: not asked
+    seconds: float  # median of one query from text to place; 0 where nothing was asked
+
+
+@dataclass(frozen=True)
+class Score:
+    """One kind of phrase, in views."""
+
+    kind: str
+    queries: int  # (view, phrase) pairs
+    mean_iou: float
+    localisation: float  # share of pairs whose peak lies on the thing
+
+
+@dataclass(frozen=True)
+class DirectScore:
+    """One kind of phrase, among the Gaussians themselves."""
+
+    kind: str
+    phrases: int
+    mean_iou: float
+
+
+def read_truth(dataset: Path) -> Truth:
+    """The truth beside the photographs; InputError where there is none."""
+    folder = dataset / "truth"
+    if not (folder / "labels.json").is_file():
+        raise InputError(f"{dataset}: no truth/labels.json; make one with `langsplat demo dataset --out DIR`")
+    labels = json.loads((folder / "labels.json").read_text(encoding="utf-8"))
+    phrases: dict[str, Phrase] = {}
+    for item in labels.values():
+        for text, kind in _asked(item):
+            ids = tuple(int(key) for key, other in labels.items() if text in other["words"])
+            # A part without finer regions is its own subpart: the coarsest level gives a phrase its kind.
+            if text not in phrases or KINDS.index(kind) < KINDS.index(phrases[text].kind):
+                phrases[text] = Phrase(text, kind, ids)
+    words = frozenset(word for item in labels.values() for word in item["words"])
+    names = {int(key): item.get("phrase", "") for key, item in labels.items()}
+    return Truth(folder, tuple(phrases.values()), words, names)
+
+
+def _asked(item: dict[str, str]) -> Iterator[tuple[str, str]]:
+    """The phrases that are asked about one region: (text, kind)."""
+    if item["level"] == "whole" and item["thing"]:
+        yield item["thing"], "object"
+        if item["colour"]:
+            yield f"{item['colour']} {item['thing']}", "colour+object"
+    elif item["level"] in ("part", "subpart") and item["word"] not in ("", item["thing"], "body"):
+        yield f"{item['thing']} {item['word']}", item["level"]
+
+
+def ask(engine: QueryEngine, texts: Iterable[str]) -> Asked:
+    """Ask every phrase once; the engine has answered before, so that no time goes into preparation."""
+    answers: dict[str, Answer] = {}
+    unknown, seconds = [], []
+    for text in dict.fromkeys(texts):
+        if engine.encoder is not None and engine.encoder.unknown_words(text):
+            unknown.append(text)
+            continue
+        if not answers:
+            engine.run(text)
+        start = time.perf_counter()
+        result = engine.run(text)
+        seconds.append(time.perf_counter() - start)
+        values = result.relevancy[result.level]
+        known = engine.field.confidence[result.level] > 0
+        median = float(np.median(values[known])) if known.any() else 0.0
+        vector = engine.text_vector(text)
+        answers[text] = Answer(vector, result.level, values, result.peak, median, result.found)
+    return Asked(engine, answers, tuple(unknown), float(np.median(seconds)) if seconds else 0.0)
+
+
+def evaluate(
+    asked: Asked,
+    rasterizer: Rasterizer,
+    cameras: Sequence[Camera],
+    truth: Truth,
+    reading: Reading | None = None,
+    progress: Progress = silent,
+) -> list[Score]:
+    """Every phrase that was asked, in every view where its thing is visible."""
+    reading = reading or Reading()
+    scene = asked.engine.scene
+    results: dict[str, list[tuple[float, bool]]] = {}
+    for done, camera in enumerate(cameras):
+        labels = truth.labels(camera.name)
+        view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
+        masks = {p: _mask(labels, p) for p in truth.phrases if p.text in asked.answers}
+        visible = [phrase for phrase, mask in masks.items() if mask.sum() >= MIN_PIXELS]
+        answers = [asked.answers[phrase.text] for phrase in visible]
+        for phrase, answer, relevancy in zip(
+            visible, answers, relevancy_maps(asked.engine, view, answers, reading.paper_order), strict=True
+        ):
+            result = _judge(relevancy, answer, masks[phrase], reading.cut)
+            results.setdefault(phrase.kind, []).append(result)
+        progress("asking phrases", (done + 1) / len(cameras))
+    return [
+        Score(kind, len(rows), float(np.mean([r[0] for r in rows])), float(np.mean([r[1] for r in rows])))
+        for kind, rows in sorted(results.items(), key=lambda item: KINDS.index(item[0]))
+    ]
+
+
+def relevancy_maps(
+    engine: QueryEngine, view: View, answers: Sequence[Answer], paper_order: bool
+) -> Iterator[Array]:
+    """(H, W) relevancy of each answer. A pixel is splatted, and in the paper's order decoded, once for all
+    phrases (at each level)."""
+    gate = PictureConfig().alpha_gate
+    if not paper_order:
+        for start in range(0, len(answers), CHANNELS):
+            values = np.stack([answer.values for answer in answers[start : start + CHANNELS]], 1)
+            yield from np.moveaxis(splatted_relevancy(view, values, gate), 2, 0)
+        return
+    maps: list[Array | None] = [None] * len(answers)
+    for level in {answer.level for answer in answers}:
+        rows = [row for row, answer in enumerate(answers) if answer.level == level]
+        vectors = np.stack([answers[row].vector for row in rows])
+        decoded = decoded_relevancy(view, engine.field, level, vectors, gate)
+        for column, row in enumerate(rows):
+            maps[row] = decoded[..., column]
+    yield from (item for item in maps if item is not None)
+
+
+def _mask(labels: Array, phrase: Phrase) -> Array:
+    return np.asarray(np.isin(labels, phrase.ids).any(axis=0))
+
+
+def _judge(relevancy: Array, answer: Answer, truth: Array, rule: CutRule) -> tuple[float, bool]:
+    """IoU of the map after the cut, and whether its peak hits."""
+    scale = len(relevancy) / PAPER_ROWS
+    cut = cut_level(rule, relevancy, answer.peak, answer.median)
+    found = majority(relevancy > cut, round(VOTE * scale) | 1)
+    column, row, _ = peak_pixel(relevancy, round(FILTER * scale))
+    return intersection_over_union(found, truth), bool(truth[row, column])
+
+
+def evaluate_direct(asked: Asked, labels: Array, truth: Truth, rule: CutRule = "floor") -> list[DirectScore]:
+    """The overlap without any view. labels: (3, N) the true id of every Gaussian at each level, -1 for those
+    that no photograph shows, which count on neither side (see `oracles.true_labels`)."""
+    seen = (labels >= 0).any(axis=0)
+    results: dict[str, list[float]] = {}
+    for phrase in truth.phrases:
+        right = _mask(labels, phrase)[seen]
+        if phrase.text not in asked.answers or right.sum() < MIN_GAUSSIANS:
+            continue
+        answer = asked.answers[phrase.text]
+        values = answer.values[seen]
+        found = values > cut_level(rule, values, answer.peak, answer.median)
+        results.setdefault(phrase.kind, []).append(intersection_over_union(found, right))
+    return [
+        DirectScore(kind, len(rows), float(np.mean(rows)))
+        for kind, rows in sorted(results.items(), key=lambda item: KINDS.index(item[0]))
+    ]
+
+
+def found_rate(asked: Asked, texts: Iterable[str]) -> tuple[float, int]:
+    """Share of `texts` that were answered with a place, and of how many; unknown phrases do not count."""
+    found = [asked.answers[text].found for text in texts if text in asked.answers]
+    return (float(np.mean(found)) if found else 0.0), len(found)

@@ -1,0 +1,1 @@
+"""`langsplat bench`: speed against error."""

@@ -1,0 +1,1 @@
+"""Colour, substance, light and the camera that sees them."""

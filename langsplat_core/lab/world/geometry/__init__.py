@@ -1,0 +1,1 @@
+"""Triangle meshes of simple solids."""

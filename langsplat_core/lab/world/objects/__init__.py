@@ -1,0 +1,1 @@
+"""What stands in a room: builders of every class of thing."""

@@ -1,0 +1,167 @@
+"""A folder of photographs of a procedural room, with cameras, sparse points and ground truth."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import InputError
+from langsplat_core.files import atomic_path
+from langsplat_core.lab.world.appearance.render import Light, Picture, Renderer
+from langsplat_core.lab.world.assembly import World, build_room
+from langsplat_core.lab.world.rooms import Tier
+from langsplat_core.progress import Progress
+from langsplat_core.scene import LEVELS, Camera, look_at
+
+POINTS = 20_000  # sparse points, as structure from motion would give
+_FIRST_ROOM = 2_000_000  # the demo encoder was trained in rooms of lower numbers only
+_LIGHT_SAMPLES = 40  # rays per vertex towards the lamp, and again towards the sky
+_LIGHT_CELL = 0.006  # metres between the places where light is gathered, where it varies
+_POINT_NOISE = 0.004  # metres, standard deviation
+LIGHT = Light(np.array([-1.25, -1.05, 1.55]))
+# (share of the views, elevation in degrees, distance in metres, height of the target above the table)
+_RINGS = ((0.3, 23.0, 1.5, 0.0), (0.3, 42.0, 1.25, 0.02), (0.25, 36.0, 1.0, 0.05), (0.15, 50.0, 1.75, -0.2))
+
+
+def write_dataset(
+    out: Path, seed: int, views: int, size: tuple[int, int], progress: Progress, tier: Tier = "clutter"
+) -> None:
+    """Render the room of `seed` and difficulty `tier` into folder `out`.
+
+    views: number of photographs, >= 4; size: (width, height) in pixels, at least 16 each. Written are
+    images/view_000.png ..., points.ply, truth/view_000.npz (`ids`: (3, H, W) int32 label ids at subpart,
+    part and whole level, -1 where there is nothing; `depth`: (H, W) float32 metres along the camera's z),
+    truth/labels.json (id -> level, word, thing, colour, phrase, words) and, last, transforms.json in
+    nerfstudio's convention (OpenGL camera-to-world). A view counts as done when its truth file is there, so
+    an interrupted call goes on where it stopped. Raises InputError for a size or number out of range.
+    """
+    if views < 4 or min(size) < 16:
+        raise InputError(
+            f"demo dataset: {views} views of {size[0]}x{size[1]}: it needs at least 4 views of 16x16"
+        )
+    world = photographed_room(seed, tier)
+    cameras = orbit_cameras(views, size, seed)
+    folder, truth = out / "images", out / "truth"
+    folder.mkdir(parents=True, exist_ok=True)
+    truth.mkdir(exist_ok=True)
+    progress("rendering photographs", 0.0)
+    renderer = Renderer(world, LIGHT, samples=_LIGHT_SAMPLES, cell=_LIGHT_CELL)
+    for done, camera in enumerate(cameras):
+        if not (truth / f"{camera.name}.npz").exists():
+            _write_view(renderer, world, camera, out)
+        progress("rendering photographs", (done + 1) / views)
+    _write_labels(world, truth / "labels.json")
+    _write_points(world, renderer, seed, out / "points.ply")
+    _write_transforms(cameras, out / "transforms.json")
+
+
+def photographed_room(seed: int, tier: Tier = "clutter") -> World:
+    """The room that `write_dataset` photographs; the demo encoder has never seen one of them."""
+    return build_room(_FIRST_ROOM + seed, tier)
+
+
+def truth_ids(world: World, picture: Picture) -> Array:
+    """(3, H, W) int32 label ids of a picture at subpart, part and whole level, -1 where nothing is."""
+    ids = np.where(picture.pieces[..., None] >= 0, world.ids[picture.pieces], -1)
+    return np.moveaxis(ids, -1, 0).astype(np.int32)
+
+
+def orbit_cameras(views: int, size: tuple[int, int], seed: int) -> list[Camera]:
+    """Cameras on four rings around the table, low, high, close and far; jittered by the seed.
+
+    Names are shuffled over the rings, so that every n-th view in name order is a fair sample of them.
+    """
+    rng = np.random.default_rng((seed, 3))
+    cameras: list[Camera] = []
+    counts = [round(share * views) for share, *_ in _RINGS[:-1]]
+    counts.append(views - sum(counts))
+    for (_, elevation, distance, height), count in zip(_RINGS, counts, strict=True):
+        for k in range(count):
+            azimuth = 2 * np.pi * (k + rng.uniform(-0.2, 0.2) + 0.37 * elevation) / count
+            tilt = np.radians(elevation + rng.uniform(-4, 4))
+            reach = distance * rng.uniform(0.95, 1.05)
+            out = np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
+            target = np.array([*rng.uniform(-0.12, 0.12, 2), height])
+            cameras.append(look_at(target + reach * out, target, np.array([0.0, 0, 1]), size, 46.0))
+    order = rng.permutation(views)
+    return [replace(cameras[row], name=f"view_{k:03d}") for k, row in enumerate(order)]
+
+
+def _write_view(renderer: Renderer, world: World, camera: Camera, out: Path) -> None:
+    picture = renderer.picture(camera)
+    with atomic_path(out / "images" / f"{camera.name}.png") as path:
+        Image.fromarray(picture.image).save(path)
+    with atomic_path(out / "truth" / f"{camera.name}.npz") as path:
+        np.savez_compressed(path, ids=truth_ids(world, picture), depth=picture.depth)
+
+
+def _write_labels(world: World, path: Path) -> None:
+    rows = {
+        str(number): {
+            "level": LEVELS[label.level],
+            "word": label.word,
+            "thing": label.thing,
+            "colour": label.colour,
+            "phrase": label.phrase,
+            "words": label.words,
+        }
+        for number, label in enumerate(world.labels)
+    }
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+def _write_points(world: World, renderer: Renderer, seed: int, path: Path) -> None:
+    """Points on the surfaces, denser on the objects than on the room, with noise and colours."""
+    from plyfile import PlyData, PlyElement
+
+    rng = np.random.default_rng((seed, 4))
+    corners = world.vertices[world.triangles].astype(np.float64)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    objects = world.solid & (corners[:, :, 2].max(1) > -0.05)
+    weight = area * np.where(objects, 8.0, 1.0)
+    chosen = rng.choice(len(area), POINTS, p=weight / weight.sum())
+    uv = np.sort(rng.random((POINTS, 2)), 1)
+    uv = np.stack([uv[:, 0], uv[:, 1] - uv[:, 0]], 1)
+    spread = np.stack([1 - uv.sum(1), uv[:, 0], uv[:, 1]], 1)
+    points = (corners[chosen] * spread[..., None]).sum(1) + rng.normal(0, _POINT_NOISE, (POINTS, 3))
+    colours = renderer.colours_at(chosen, uv, np.array([0.0, 0.0, 3.0]))
+    row = np.dtype([(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")])
+    table = np.empty(POINTS, row)
+    for axis, name in enumerate("xyz"):
+        table[name] = points[:, axis]
+    for channel, name in enumerate(("red", "green", "blue")):
+        table[name] = colours[:, channel]
+    with atomic_path(path) as temporary:
+        PlyData([PlyElement.describe(table, "vertex")]).write(str(temporary))
+
+
+def camera_to_world_gl(camera: Camera) -> Array:
+    """(4, 4) camera-to-world in OpenGL's frame (x right, y up, z backwards), as transforms.json has it."""
+    return np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def _write_transforms(cameras: list[Camera], path: Path) -> None:
+    first = cameras[0]
+    content = {
+        "camera_model": "PINHOLE",
+        "w": first.width,
+        "h": first.height,
+        "fl_x": first.fx,
+        "fl_y": first.fy,
+        "cx": first.cx,
+        "cy": first.cy,
+        "ply_file_path": "points.ply",
+        "frames": [
+            {
+                "file_path": f"images/{camera.name}.png",
+                "transform_matrix": camera_to_world_gl(camera).tolist(),
+            }
+            for camera in cameras
+        ],
+    }
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,1 @@
+"""The CPU rasterizer: compiled kernels from projection to blending, and their gradients."""

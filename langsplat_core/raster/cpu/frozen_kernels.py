@@ -1,0 +1,123 @@
+"""Frozen geometry: the blending weights W of one CPU view, kept, so that `splat` and `gather` need no
+exponential and no transmittance again.
+
+A weight is kept as sixteen bits of fixed point, a row of a tile as sixteen of them: W is off by at most
+1 / 131070 in every entry, and `gather` is still the exact adjoint of `splat`.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.compiled import helper, kernel
+from langsplat_core.raster.cpu.blend import write_alpha
+from langsplat_core.raster.cpu.lanes import Lanes, largest
+from langsplat_core.raster.cpu.lanes_memory import UNIT, load_units, prefetch, store, store_units
+from langsplat_core.raster.cpu.planes import add_weighted, correlate, load_tile, write_tile
+from langsplat_core.raster.cpu.tiles import TILE, Tiles, pack_span, spread, unpack_span
+from langsplat_core.raster.cpu.walk import (
+    AHEAD,
+    PIXELS,
+    Cutoffs,
+    nothing_to_close,
+    nothing_to_open,
+    start_tile,
+    walk,
+)
+
+VISIBLE = 0.5 / UNIT  # weights below round to 0
+
+
+@helper
+def _look_at_row(work: Any, mine: Any, s: int, row: int, low: int, added: Lanes, before: Lanes) -> None:
+    """spans[s] grows to hold `row` if one of its weights counts; an empty span is 0."""
+    spans = work[0]
+    if largest(added * before) >= VISIBLE:
+        start, _ = unpack_span(spans[s])
+        spans[s] = pack_span(row if spans[s] == 0 else start, row + 1)
+
+
+@kernel
+def find_spans(
+    first: int, last: int, tiles: Tiles, geometry: Array, cutoffs: Cutoffs, spans: Array, alpha: Array
+) -> None:
+    """Of every intersection the rows that have a weight: (I,) uint16 spans, 0 at first, as `Tiles.rows`; and
+    (H, W, 1) alpha."""
+    count = tiles.starts.shape[0] - 1
+    height, width, _ = alpha.shape
+    for i in range(first, last):
+        tile = spread(i, count)
+        transmittance = start_tile(tile, tiles, width, height)
+        work = (spans,)
+        walk(tile, tiles, geometry, cutoffs, transmittance, work, nothing_to_open, _look_at_row, nothing_to_close)
+        write_alpha(transmittance, alpha, tile, tiles)
+
+
+@helper
+def _keep_row(work: Any, mine: Any, s: int, row: int, low: int, added: Lanes, before: Lanes) -> None:
+    spans, firsts, weights = work
+    start, end = unpack_span(spans[s])
+    if start <= row < end:
+        store_units(weights, (firsts[s] + row - start) * TILE, added * before)
+
+
+@kernel
+def keep_weights(
+    first: int,
+    last: int,
+    tiles: Tiles,
+    geometry: Array,
+    cutoffs: Cutoffs,
+    size: tuple[int, int],
+    spans: Array,
+    firsts: Array,
+    weights: Array,
+) -> None:
+    """Fill (R, 16) uint16 weights, those of intersection s from row firsts[s] on. size: width, height."""
+    count = tiles.starts.shape[0] - 1
+    for i in range(first, last):
+        tile = spread(i, count)
+        transmittance = start_tile(tile, tiles, size[0], size[1])
+        work = (spans, firsts, weights)
+        walk(tile, tiles, geometry, cutoffs, transmittance, work, nothing_to_open, _keep_row, nothing_to_close)
+
+
+@kernel
+def splat(
+    first: int, last: int, tiles: Tiles, firsts: Array, weights: Array, values: Array, image: Array
+) -> None:
+    """(M, padded(C)) values in depth order -> fills (H, W, C) image; `tiles.rows` are the spans of
+    `find_spans`."""
+    count, lines = tiles.starts.shape[0] - 1, values.shape[1]
+    sums = np.empty(PIXELS * lines, np.float32)
+    for i in range(first, last):
+        tile = spread(i, count)
+        sums[:] = 0
+        end = tiles.starts[tile + 1]
+        for s in range(tiles.starts[tile], end):
+            low, high = unpack_span(tiles.rows[s])
+            prefetch(values, np.int64(tiles.ranks[min(s + AHEAD, end - 1)]) * lines)
+            x = values[tiles.ranks[s]]
+            at = firsts[s] * TILE
+            for row in range(low, high):
+                add_weighted(sums, row * lines * TILE, lines, load_units(weights, at), x)
+                at += TILE
+        write_tile(sums, image, tile, tiles.columns)
+
+
+@kernel
+def gather(
+    first: int, last: int, tiles: Tiles, firsts: Array, weights: Array, image: Array, partial: Array
+) -> None:
+    """(H, W, C) image -> fills (I, padded(C)) partial sums of ``W^T y``."""
+    count, lines = tiles.starts.shape[0] - 1, partial.shape[1]
+    planes, buffer = np.empty(PIXELS * lines, np.float32), np.empty(PIXELS, np.float32)
+    for i in range(first, last):
+        tile = spread(i, count)
+        load_tile(planes, image, tile, tiles.columns)
+        for s in range(tiles.starts[tile], tiles.starts[tile + 1]):
+            low, high = unpack_span(tiles.rows[s])
+            for row in range(high - low):
+                store(buffer, row * TILE, load_units(weights, (firsts[s] + row) * TILE))
+            correlate(planes, lines, buffer, low, high, partial, s, 0)

@@ -1,0 +1,236 @@
+"""Projection of Gaussians for the CPU backend: steps 1 and 2 of `reference.py`, compiled.
+
+Everything here is float64, in the reference's order of operations: depths agree with it bit for bit, and
+coordinates of a million world units lose nothing. It costs about 0.1 microseconds a Gaussian.
+
+A footprint is kept as the triangular factor of its conic, not as the conic: with (dx, dy) = pixel - mean,
+
+    log2(alpha) = log2(opacity) - w^2 - v^2,   w = a (dx - k dy),   v = c dy,
+
+where a^2 = log2(e)/2 * yy/det, k = xy/yy, c^2 = log2(e)/2 / yy (completing the square in dx; xx, xy, yy
+and det are the 2D covariance's). A long thin footprint's conic is a difference of huge products; its factor
+is not, so float32 pixels suffice.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.compiled import helper, kernel
+from langsplat_core.config import RasterSettings
+from langsplat_core.scene import Camera
+from langsplat_core.scene.gaussians import LARGEST_COEFFICIENT
+
+COLUMNS = 8  # of the geometry: one cache line a row
+INVALID, UNDRAWN, DRAWN = 0, 1, 2  # what `project` says of a row
+MEAN_X, MEAN_Y, FACTOR_A, FACTOR_K, FACTOR_C, LOG2_OPACITY, HALF_WIDTH, HALF_HEIGHT = range(8)  # columns
+HALF_LOG2_E = 0.5 / np.log(2.0)
+LN2 = np.log(2.0)
+COMPENSATION_MIN = 0.005**2  # floor of det before / det after dilation, as gsplat has it
+_MAX_LOG_SCALE, _MIN_QUAT_SQUARED = 80.0, 1e-24  # see Gaussians.valid
+_LARGEST_BITS = int(np.float32(LARGEST_COEFFICIENT).view(np.uint32))  # positive floats order as their bits
+
+
+Point = tuple[float, float, float]
+
+
+class Rows(NamedTuple):
+    """N Gaussians as `Gaussians` stores them."""
+
+    means: Array  # (N, 3) float32
+    log_scales: Array  # (N, 3) float32
+    quats_wxyz: Array  # (N, 4) float32
+    opacity_logits: Array  # (N,) float32
+    sh_bits: Array  # (N, 3 K) uint32: the SH coefficients' bits, only to see whether they are usable
+
+
+class Footprints(NamedTuple):
+    """What `project` fills in."""
+
+    geometry: Array  # (N, 8) float64, columns MEAN_X to HALF_HEIGHT; only where DRAWN
+    depths: Array  # (N,) float64 camera z; only where DRAWN
+    status: Array  # (N,) uint8
+
+
+class KernelCamera(NamedTuple):
+    """What the kernels need to know of a camera and the settings."""
+
+    rotation: Array  # (3, 3) world to camera
+    translation: Array  # (3,)
+    fx: float  # px
+    fy: float
+    cx: float
+    cy: float
+    width: float  # px
+    height: float
+    left: float  # limits of |x/z| and |y/z| in the Jacobian, on each side of the axis
+    right: float
+    top: float
+    bottom: float
+    near: float
+    dilation: float
+    alpha_min: float
+    antialiased: bool
+
+
+def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
+    """The clamp is 1.3 times the half field of view beyond the image's borders; see `reference.project`."""
+    margin_x = (settings.fov_clamp - 1) * 0.5 * camera.width / camera.fx
+    margin_y = (settings.fov_clamp - 1) * 0.5 * camera.height / camera.fy
+    return KernelCamera(
+        rotation=np.ascontiguousarray(camera.rotation),
+        translation=np.ascontiguousarray(camera.world_to_camera[:3, 3]),
+        fx=float(camera.fx),
+        fy=float(camera.fy),
+        cx=float(camera.cx),
+        cy=float(camera.cy),
+        width=float(camera.width),
+        height=float(camera.height),
+        left=camera.cx / camera.fx + margin_x,
+        right=(camera.width - camera.cx) / camera.fx + margin_x,
+        top=camera.cy / camera.fy + margin_y,
+        bottom=(camera.height - camera.cy) / camera.fy + margin_y,
+        near=float(settings.near),
+        dilation=float(settings.dilation),
+        alpha_min=float(settings.alpha_min),
+        antialiased=bool(settings.antialiased),
+    )
+
+
+@helper
+def camera_point(mean: Array, camera: KernelCamera) -> Point:
+    r, t = camera.rotation, camera.translation
+    m0, m1, m2 = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
+    return (
+        r[0, 0] * m0 + r[0, 1] * m1 + r[0, 2] * m2 + t[0],
+        r[1, 0] * m0 + r[1, 1] * m1 + r[1, 2] * m2 + t[1],
+        r[2, 0] * m0 + r[2, 1] * m1 + r[2, 2] * m2 + t[2],
+    )
+
+
+@helper
+def _jacobian(x: float, y: float, z: float, camera: KernelCamera) -> tuple[float, float, float, float]:
+    """Non-zero entries (0,0), (0,2), (1,1), (1,2) of d(pixel)/d(camera point), taken at the clamped point."""
+    tx = min(max(x / z, -camera.left), camera.right)
+    ty = min(max(y / z, -camera.top), camera.bottom)
+    return camera.fx / z, -camera.fx * tx / z, camera.fy / z, -camera.fy * ty / z
+
+
+@helper
+def fill_axes(
+    point: Point, log_scales: Array, quat: Array, camera: KernelCamera, work: Array
+) -> tuple[Point, float]:
+    """work[0] <- rotation of the quaternion, work[1] <- B = J R (two rows), work[2] <- A = B rotation
+    diag(s); returns the scales s and the inverse length of the quaternion."""
+    x, y, z = point
+    j00, j02, j11, j12 = _jacobian(x, y, z, camera)
+    q0, q1, q2, q3 = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
+    inverse = 1 / np.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+    q0, q1, q2, q3 = q0 * inverse, q1 * inverse, q2 * inverse, q3 * inverse
+    turn, b, a = work[0], work[1], work[2]
+    turn[0, 0], turn[0, 1], turn[0, 2] = (
+        1 - 2 * (q2 * q2 + q3 * q3),
+        2 * (q1 * q2 - q0 * q3),
+        2 * (q1 * q3 + q0 * q2),
+    )
+    turn[1, 0], turn[1, 1], turn[1, 2] = (
+        2 * (q1 * q2 + q0 * q3),
+        1 - 2 * (q1 * q1 + q3 * q3),
+        2 * (q2 * q3 - q0 * q1),
+    )
+    turn[2, 0], turn[2, 1], turn[2, 2] = (
+        2 * (q1 * q3 - q0 * q2),
+        2 * (q2 * q3 + q0 * q1),
+        1 - 2 * (q1 * q1 + q2 * q2),
+    )
+    scales = (
+        np.exp(np.float64(log_scales[0])),
+        np.exp(np.float64(log_scales[1])),
+        np.exp(np.float64(log_scales[2])),
+    )
+    for n in range(3):
+        b[0, n] = j00 * camera.rotation[0, n] + j02 * camera.rotation[2, n]
+        b[1, n] = j11 * camera.rotation[1, n] + j12 * camera.rotation[2, n]
+    for r in range(2):
+        a[r, 0] = (b[r, 0] * turn[0, 0] + b[r, 1] * turn[1, 0] + b[r, 2] * turn[2, 0]) * scales[0]
+        a[r, 1] = (b[r, 0] * turn[0, 1] + b[r, 1] * turn[1, 1] + b[r, 2] * turn[2, 1]) * scales[1]
+        a[r, 2] = (b[r, 0] * turn[0, 2] + b[r, 1] * turn[1, 2] + b[r, 2] * turn[2, 2]) * scales[2]
+    return scales, inverse
+
+
+@helper
+def covariance(a: Array, dilation: float) -> tuple[float, float, float, float, float]:
+    """2D covariance xx, xy, yy with dilation, its determinant, and the determinant before dilation.
+
+    det(A A^T) = |row0 x row1|^2 (Cauchy-Binet): no cancellation, however thin the needle.
+    """
+    xx = a[0, 0] * a[0, 0] + a[0, 1] * a[0, 1] + a[0, 2] * a[0, 2]
+    yy = a[1, 0] * a[1, 0] + a[1, 1] * a[1, 1] + a[1, 2] * a[1, 2]
+    xy = a[0, 0] * a[1, 0] + a[0, 1] * a[1, 1] + a[0, 2] * a[1, 2]
+    c0 = a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]
+    c1 = a[0, 2] * a[1, 0] - a[0, 0] * a[1, 2]
+    c2 = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    sharp = c0 * c0 + c1 * c1 + c2 * c2
+    return xx + dilation, xy, yy + dilation, sharp + dilation * (xx + yy) + dilation * dilation, sharp
+
+
+@helper
+def opacity_of(logit: float) -> float:
+    e = np.exp(-abs(np.float64(logit)))
+    return (1.0 if logit >= 0 else e) / (1 + e)
+
+
+@helper
+def _is_valid(rows: Rows, i: int) -> bool:
+    """The compiled twin of `Gaussians.valid`."""
+    mean, log_scales, quat, sh_bits = rows.means[i], rows.log_scales[i], rows.quats_wxyz[i], rows.sh_bits[i]
+    ok = not np.isnan(rows.opacity_logits[i])
+    squared = 0.0
+    for n in range(3):
+        ok &= np.isfinite(mean[n]) & (log_scales[n] <= _MAX_LOG_SCALE)
+    for n in range(4):
+        squared += np.float64(quat[n]) * np.float64(quat[n])
+    highest = np.uint32(0)
+    for n in range(sh_bits.shape[0]):
+        highest = max(highest, sh_bits[n] & np.uint32(0x7FFFFFFF))
+    return ok & np.isfinite(squared) & (squared > _MIN_QUAT_SQUARED) & (highest <= np.uint32(_LARGEST_BITS))
+
+
+@kernel
+def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Footprints) -> None:
+    """Fill `out` for rows [first, last).
+
+    A Gaussian whose alpha = alpha_min contour meets no pixel centre is UNDRAWN.
+    """
+    work = np.empty((3, 3, 3))
+    for i in range(first, last):
+        if not _is_valid(rows, i):
+            out.status[i] = INVALID
+            continue
+        out.status[i] = UNDRAWN
+        x, y, z = camera_point(rows.means[i], camera)
+        opacity = opacity_of(rows.opacity_logits[i])
+        if not (z > camera.near and opacity >= camera.alpha_min):
+            continue
+        fill_axes((x, y, z), rows.log_scales[i], rows.quats_wxyz[i], camera, work)
+        xx, xy, yy, det, sharp = covariance(work[2], camera.dilation)
+        if camera.antialiased:
+            opacity *= np.sqrt(max(sharp / det, COMPENSATION_MIN))
+            if opacity < camera.alpha_min:
+                continue
+        reach = np.sqrt(2 * np.log(max(opacity / camera.alpha_min, 1.0)))
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        wide, high = reach * np.sqrt(xx), reach * np.sqrt(yy)
+        right, bottom = camera.width - 0.5, camera.height - 0.5  # the last pixel's centre
+        if u + wide < 0.5 or u - wide > right or v + high < 0.5 or v - high > bottom:
+            continue
+        out.status[i] = DRAWN
+        out.depths[i] = z
+        g = out.geometry[i]
+        g[MEAN_X], g[MEAN_Y] = u, v
+        g[FACTOR_A] = np.sqrt(HALF_LOG2_E * yy / det)
+        g[FACTOR_K] = xy / yy
+        g[FACTOR_C] = np.sqrt(HALF_LOG2_E / yy)
+        g[LOG2_OPACITY] = np.log2(opacity)
+        g[HALF_WIDTH], g[HALF_HEIGHT] = wide, high

@@ -1,0 +1,152 @@
+"""The CPU backend: compiled, parallel over tiles, exact adjoint, true gradients.
+
+Results do not depend on the number of threads: tiles are independent, and sums over tiles are made
+per Gaussian in a fixed order.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from langsplat_core.arrays import Array, check_array
+from langsplat_core.compiled import Workers, plain, shared_workers
+from langsplat_core.config import INRIA, RasterSettings
+from langsplat_core.raster.cpu import blend, blend_backward, projection, projection_backward
+from langsplat_core.raster.cpu.colour import colours, colours_backward
+from langsplat_core.raster.cpu.frozen import FrozenView
+from langsplat_core.raster.cpu.operator import TileOperator, in_fours
+from langsplat_core.raster.cpu.tiles import bin_tiles, depth_order
+from langsplat_core.raster.cpu.walk import make_cutoffs
+from langsplat_core.raster.protocol import DepthKind
+from langsplat_core.scene import Camera, Gaussians
+
+__all__ = ["CpuRasterizer", "CpuView", "FrozenView", "GaussianGradients", "colours", "colours_backward"]
+
+@dataclass(frozen=True, eq=False)
+class GaussianGradients:
+    """Gradient of a scalar by every parameter of N Gaussians, float32; 0 for those that are not drawn."""
+
+    means: Array  # (N, 3) per world unit
+    log_scales: Array  # (N, 3)
+    quats_wxyz: Array  # (N, 4) by the unnormalised quaternion
+    opacity_logits: Array  # (N,)
+    values: Array  # (N, C)
+    means_px: Array  # (N, 2) per pixel, by the 2D mean alone (densification watches its length)
+
+
+class CpuView(TileOperator):
+    """M drawn of N Gaussians, in depth order, with their tiles."""
+
+    def __init__(
+        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, workers: Workers
+    ) -> None:
+        n = len(gaussians)
+        self._kernel_camera = projection.kernel_camera(camera, settings)
+        self._cutoffs = make_cutoffs(settings)
+        self._rows = projection.Rows(
+            plain(gaussians.means),
+            plain(gaussians.log_scales),
+            plain(gaussians.quats_wxyz),
+            plain(gaussians.opacity_logits),
+            plain(gaussians.sh).reshape(n, gaussians.sh.shape[1] * 3).view(np.uint32),
+        )
+        found = projection.Footprints(np.empty((n, projection.COLUMNS)), np.empty(n), np.empty(n, np.uint8))
+        workers.run(projection.project, n, self._rows, self._kernel_camera, found)
+        order = depth_order(found.status, found.depths.view(np.uint64))
+        self._geometry = _aligned((len(order), projection.COLUMNS))
+        np.take(found.geometry, order, axis=0, out=self._geometry, mode="clip")
+        self._depths = found.depths[order]
+        tiles = bin_tiles(self._geometry, camera.width, camera.height, workers)
+        super().__init__(camera, n, order, tiles, workers)
+        self.dropped = int(np.count_nonzero(found.status == projection.INVALID))
+
+    @property
+    def radii(self) -> Array:
+        """(N,) float32 px: the greater half extent of each footprint; 0 where nothing is drawn."""
+        radii = np.zeros(self.count, np.float32)
+        touches = np.diff(self.tiles.firsts) > 0
+        radii[self.order] = np.where(touches, self._geometry[:, projection.HALF_WIDTH :].max(1), 0)
+        return radii
+
+    def _splat_part(self, values: Array, image: Array, alpha: Array) -> None:
+        self._over_tiles(blend.splat, values, self._cutoffs, image, alpha)
+
+    def _gather_part(self, image: Array, partial: Array) -> None:
+        self._over_tiles(blend.gather, image, self._cutoffs, partial)
+
+    def frozen(self) -> "FrozenView":
+        """This view with W itself kept: `splat` and `gather` get cheaper the more often they are called."""
+        return FrozenView(self, lambda kernel, *rest: self._over_tiles(kernel, self._cutoffs, *rest))
+
+    def backward(
+        self, values: Array, image_grad: Array, alpha_grad: Array | None = None
+    ) -> GaussianGradients:
+        """Gradients of a loss, given those by `splat(values)`: (H, W, C) by the image, (H, W) by alpha.
+
+        They are those of image formation as it is: 0 through a capped alpha and across the cut-offs.
+        """
+        n, height, width = self.count, self.camera.height, self.camera.width
+        channels = check_array("values", values, (n, "C"))["C"]
+        check_array("image_grad", image_grad, (height, width, channels))
+        if alpha_grad is None:
+            alpha_grad = np.zeros((height, width), np.float32)
+        check_array("alpha_grad", alpha_grad, (height, width))
+        ordered = in_fours(values[self.order])
+        grads = (plain(image_grad), plain(alpha_grad)[..., None])
+        moments = blend_backward.MOMENTS
+        partial = np.empty((len(self.tiles.ranks), moments + ordered.shape[1]), np.float32)
+        self._over_tiles(blend_backward.backward, ordered, grads, self._cutoffs, partial)
+        out = projection_backward.ParameterGradients(
+            *(np.zeros((n, *shape), np.float32) for shape in ((3,), (3,), (4,), (), (channels,), (2,)))
+        )
+        self.workers.run(
+            projection_backward.to_parameters,
+            len(self.order),
+            self.tiles,
+            self.order,
+            self._geometry,
+            partial,
+            self._rows,
+            self._kernel_camera,
+            out,
+        )
+        return GaussianGradients(*out)
+
+    def _over_tiles(self, kernel: Callable[..., None], *arguments: Any) -> None:
+        self.workers.run(kernel, len(self.tiles.starts) - 1, self.tiles, self._geometry, *arguments)
+
+    def depth(self, kind: DepthKind = "expected") -> Array:
+        """See `View.depth`; float32."""
+        if kind == "median":
+            median = np.empty((self.camera.height, self.camera.width, 1), np.float32)
+            self._over_tiles(blend.median_depth, self._depths, self._cutoffs, median)
+            return median[..., 0]
+        # Ones are blended along: alpha itself is 1 - T, which has no digits left where it is small.
+        both = np.zeros((self.count, 2), np.float32)
+        both[self.order] = np.stack([self._depths, np.ones_like(self._depths)], -1)
+        sums, weights = np.moveaxis(self.splat(both)[0], -1, 0)
+        return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), 0)
+
+
+def _aligned(shape: tuple[int, int]) -> Array:
+    """An empty float64 array whose rows of eight begin at cache lines of 64 bytes."""
+    memory = np.empty(shape[0] * shape[1] + 7)
+    start = (-memory.ctypes.data // 8) % 8
+    return memory[start : start + shape[0] * shape[1]].reshape(shape)
+
+
+class CpuRasterizer:
+    """Kernels are compiled at first use (some seconds) and cached beside the package, or in the user's cache
+    folder where that cannot be written."""
+
+    name = "cpu"
+
+    def __init__(self, threads: int | None = None) -> None:
+        """`threads` defaults to all cores this process may use; results do not depend on it."""
+        self.workers = shared_workers(threads)
+
+    def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> CpuView:
+        """See `Rasterizer.view`."""
+        return CpuView(gaussians, camera, settings, self.workers)

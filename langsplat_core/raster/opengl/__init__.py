@@ -1,0 +1,1 @@
+"""The OpenGL rasterizer: Gaussians through the graphics pipeline."""

@@ -1,0 +1,1 @@
+"""The language field: mask vectors lifted onto Gaussians, and the codec fitted to them."""

@@ -1,0 +1,216 @@
+"""Radiance training: Gaussians fitted to photographs as in 3D Gaussian Splatting (Kerbl et al. 2023).
+
+One step draws one photograph's view, compares, and moves every parameter by Adam; densification,
+pruning and opacity resets follow the `Schedule`. On the CPU a run is deterministic given its seed and
+resumes from a checkpoint exactly where it stopped.
+"""
+
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from langsplat_core.arrays import Array, sigmoid
+from langsplat_core.config import INRIA, RadianceConfig
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.errors import InputError
+from langsplat_core.progress import Cancelled, Progress, silent
+from langsplat_core.scene import Camera, Gaussians
+from langsplat_core.training.radiance.checkpoint import fingerprint, load_checkpoint, save_checkpoint
+from langsplat_core.training.radiance.densify import accumulate, densify, reset_opacities
+from langsplat_core.training.radiance.differentiable import Backend, DifferentiableRenderer, renderer_for
+from langsplat_core.training.radiance.initialise import initial_gaussians
+from langsplat_core.training.radiance.losses import psnr, radiance_loss, ssim
+from langsplat_core.training.radiance.schedule import Schedule, schedule_for
+from langsplat_core.training.radiance.state import TrainingState, adam_step, clean_gradients, start
+
+COARSE_MIN_SIDE = 64  # px: smaller pictures are never halved
+SMALLEST_EXTENT = 0.05  # of the distance to the scene: one camera, or cameras in one place, have no extent
+
+OnStep = Callable[[TrainingState, float], None]  # (state after the step, its loss)
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """How well one photograph is reproduced."""
+
+    name: str
+    psnr: float  # dB
+    ssim: float
+
+
+class _Pictures:
+    """Photographs and cameras of the training views, whole and at half size."""
+
+    def __init__(self, capture: Capture, indices: Sequence[int], device: torch.device) -> None:
+        views = [(capture.cameras[index], capture.images[index]) for index in indices]
+        self._fine = [(camera, torch.tensor(image, device=device)) for camera, image in views]
+        halves = [_halved(camera, image) for camera, image in views]
+        self._coarse = [(camera, torch.tensor(image, device=device)) for camera, image in halves]
+
+    def __len__(self) -> int:
+        return len(self._fine)
+
+    def at(self, index: int, coarse: bool) -> tuple[Camera, Tensor]:
+        """The camera and its (H, W, 3) float picture in [0, 1]."""
+        camera, picture = (self._coarse if coarse else self._fine)[index]
+        return camera, picture.float().div_(255)
+
+
+def _halved(camera: Camera, image: Array) -> tuple[Camera, Array]:
+    """The view at half its size, by area averages; a small one as it is."""
+    if min(camera.width, camera.height) < COARSE_MIN_SIDE:
+        return camera, image
+    size = (camera.width // 2, camera.height // 2)
+    return camera.resized(*size), np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What stays the same from step to step."""
+
+    config: RadianceConfig
+    schedule: Schedule
+    pictures: _Pictures
+    renderer: DifferentiableRenderer
+    extent: float  # world units
+
+
+def train_radiance(
+    capture: Capture,
+    config: RadianceConfig,
+    train_indices: Sequence[int],
+    checkpoint: Path | None = None,
+    progress: Progress = silent,
+    on_step: OnStep | None = None,
+) -> Gaussians:
+    """Fit Gaussians to the photographs at `train_indices`; returns those that can be seen.
+
+    With a `checkpoint` path the run continues from that file if it exists, and writes it every
+    `config.checkpoint_every` steps, at the end, and when it is interrupted (Ctrl-C, or `Cancelled` from
+    `progress` or `on_step`). Raises InputError when there is nothing to train on or the checkpoint
+    belongs to another run, BackendError when the chosen backend does not work.
+    """
+    if not train_indices:
+        raise InputError("no photographs to train on; give a capture with at least one training view")
+    renderer = renderer_for(config.backend)
+    seed = initial_gaussians(capture, train_indices, config.sh_degree, config.max_gaussians, config.seed)
+    extent = _extent(capture, seed)
+    pictures = _Pictures(capture, train_indices, renderer.device)
+    run = _Run(config, schedule_for(config, extent), pictures, renderer, extent)
+    made_from = fingerprint(capture, config, train_indices) if checkpoint else ""
+    if checkpoint and checkpoint.exists():
+        state = load_checkpoint(checkpoint, made_from, renderer.device)
+    else:
+        state = start(seed, config.seed, renderer.device)
+
+    def save() -> None:
+        if checkpoint:
+            save_checkpoint(checkpoint, state, made_from)
+
+    with _one_torch_thread(), _interrupts_between_steps() as raise_if_interrupted:
+        try:
+            while state.step < config.steps:
+                loss = _step(run, state)
+                progress(f"Training Gaussians: {len(state)} Gaussians", state.step / config.steps)
+                if on_step:
+                    on_step(state, loss)
+                raise_if_interrupted()
+                if state.step % config.checkpoint_every == 0 or state.step == config.steps:
+                    save()
+        except (KeyboardInterrupt, Cancelled):
+            save()
+            raise
+    return _visible(state.gaussians())
+
+
+def evaluate_views(
+    gaussians: Gaussians, capture: Capture, indices: Sequence[int], backend: Backend = "auto"
+) -> list[ViewScore]:
+    """Draw the views at `indices` and score them against the photographs; colours are clamped to [0, 1]."""
+    renderer = renderer_for(backend)
+    state = start(gaussians, 0, renderer.device)
+    pictures = _Pictures(capture, indices, renderer.device)
+    scores = []
+    with torch.no_grad():
+        for index in range(len(pictures)):
+            camera, target = pictures.at(index, coarse=False)
+            image = renderer.render(state.values, camera, gaussians.sh_degree).image.clamp(0, 1)
+            scores.append(ViewScore(camera.name, psnr(image, target), float(ssim(image, target))))
+    return scores
+
+
+def _extent(capture: Capture, gaussians: Gaussians) -> float:
+    """The cameras' extent, or a twentieth of their distance to the Gaussians when that is larger."""
+    centre = np.mean([camera.position for camera in capture.cameras], axis=0)
+    distance = float(np.median(np.linalg.norm(gaussians.means - centre, axis=1)))
+    return max(capture.extent(), SMALLEST_EXTENT * distance)
+
+
+def _step(run: _Run, state: TrainingState) -> float:
+    """One photograph, one update; returns the loss before it."""
+    schedule, step = run.schedule, state.step + 1
+    if not state.queue:
+        state.queue = [int(index) for index in state.rng.permutation(len(run.pictures))]
+    camera, target = run.pictures.at(state.queue.pop(), coarse=step <= schedule.coarse_until)
+    rendered = run.renderer.render(state.values, camera, schedule.active_sh_degree(step))
+    loss = radiance_loss(rendered.image, target, run.config.lambda_dssim)
+    loss.backward()
+    clean_gradients(state)
+    if step < schedule.densify_until:
+        accumulate(state, rendered.means_px_grad(), rendered.visible, (camera.width, camera.height))
+    adam_step(state, schedule.learning_rates(step))
+    if schedule.densifies(step):
+        densify(state, run.config, run.extent, prune_large=schedule.prunes_large(step))
+    if schedule.resets_opacity(step):
+        reset_opacities(state)
+    state.step = step
+    return float(loss.detach())
+
+
+def _visible(gaussians: Gaussians) -> Gaussians:
+    """Without the rows that no picture can show: invalid ones and those that never reach alpha 1/255."""
+    return gaussians.take(gaussians.valid() & (sigmoid(gaussians.opacity_logits) >= INRIA.alpha_min))
+
+
+@contextmanager
+def _one_torch_thread() -> Iterator[None]:
+    """Torch's own threads wait by spinning and so take the cores from the rasterizer's; what torch does on
+    the CPU here (loss, Adam) is small. With two cores this is a third faster, on a busy machine far more.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextmanager
+def _interrupts_between_steps() -> Iterator[Callable[[], None]]:
+    """Hold Ctrl-C back while a step runs, because half a step is no state to resume from.
+
+    Yields a function that raises the KeyboardInterrupt that came meanwhile. Other threads than the main
+    one never receive it and need no care.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: None
+        return
+    pending: list[int] = []
+    previous = signal.signal(signal.SIGINT, lambda number, _: pending.append(number))
+
+    def raise_if_interrupted() -> None:
+        if pending:
+            raise KeyboardInterrupt
+
+    try:
+        yield raise_if_interrupted
+    finally:
+        signal.signal(signal.SIGINT, previous if previous is not None else signal.SIG_DFL)

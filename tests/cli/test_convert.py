@@ -1,0 +1,141 @@
+"""`langsplat convert` to every format that is written: what of a scene arrives, what the picture loses."""
+
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from langsplat_core.arrays import Array
+from langsplat_core.cli.convert import Convert
+from langsplat_core.errors import FormatError
+from langsplat_core.formats import companion_path, language, load_scene, save_scene
+from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.spherical_harmonics import colours
+from langsplat_core.scene import Camera, Gaussians, Scene
+from tests.support.file_samples import random_field
+from tests.support.measured import Measure
+from tests.support.scenes import random_camera, random_gaussians
+
+DEMO = Path(str(files("langsplat_assets"))) / "demo" / "scene.ply"
+WRITTEN = (".ply", ".spz", ".splat")
+
+
+def full_scene(n: int = 30) -> Scene:
+    cameras = tuple(random_camera(seed) for seed in range(3))
+    return Scene(random_gaussians(n, sh_degree=1), random_field(n), cameras, antialiased=True)
+
+
+def convert(source: Path, out: Path, rematch: Path | None = None) -> Scene:
+    Convert(source, out, rematch).run()
+    return load_scene(out)
+
+
+@pytest.mark.parametrize("suffix", WRITTEN)
+def test_companions_and_antialiasing_arrive(tmp_path, suffix):
+    want = full_scene()
+    save_scene(tmp_path / "a.ply", want)
+    got = convert(tmp_path / "a.ply", tmp_path / f"b{suffix}")
+    assert got.language is not None
+    np.testing.assert_array_equal(got.language.latents, want.language.latents)
+    assert got.language.phrasebook.keys() == want.language.phrasebook.keys()
+    assert [camera.name for camera in got.cameras] == [camera.name for camera in want.cameras]
+    assert got.antialiased == (suffix != ".splat")
+    assert np.abs(got.gaussians.means - want.gaussians.means).max() <= (0.5 / 4096 if suffix == ".spz" else 0)
+
+
+def test_scenes_of_one_name_keep_their_own_sidecars(tmp_path):
+    """Positions differ by rounding, so that one sidecar could not serve both."""
+    save_scene(tmp_path / "a.ply", full_scene())
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    for suffix in (".spz", ".splat"):
+        convert(tmp_path / "a.ply", tmp_path / f"a{suffix}")
+    assert {path: path.read_bytes() for path in before} == before
+    assert load_scene(tmp_path / "a.ply").language is not None
+    back = convert(tmp_path / "a.spz", tmp_path / "c" / "a.ply")  # and on to the other
+    assert back.language is not None
+    save_scene(tmp_path / "a.spz", replace(full_scene(), language=None))
+    assert load_scene(tmp_path / "a.spz").language is None
+    assert load_scene(tmp_path / "a.ply").language is not None
+
+
+def test_a_sidecar_of_other_gaussians_is_refused_and_can_be_rematched(tmp_path):
+    save_scene(tmp_path / "a.ply", full_scene())
+    convert(tmp_path / "a.ply", tmp_path / "a.spz")
+    sidecar = companion_path(tmp_path / "a.spz", language.SUFFIX)
+    sidecar.write_bytes(companion_path(tmp_path / "a.ply", language.SUFFIX).read_bytes())
+    with pytest.raises(FormatError, match="other positions"):
+        load_scene(tmp_path / "a.spz")
+    got = convert(tmp_path / "a.spz", tmp_path / "b.spz", sidecar)
+    assert got.language is not None
+    np.testing.assert_array_equal(got.language.latents, full_scene().language.latents)
+
+
+def test_a_write_that_fails_leaves_the_old_scene(tmp_path, monkeypatch):
+    save_scene(tmp_path / "a.spz", full_scene())
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def full_disk(*_: object) -> None:
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("langsplat_core.formats.write_language", full_disk)
+    with pytest.raises(OSError, match="No space"):
+        save_scene(tmp_path / "a.spz", full_scene())
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+# ---- the demo scene: picture and size ----
+
+
+def picture(gaussians: Gaussians, camera: Camera) -> Array:
+    seen = colours(gaussians.sh, gaussians.means, camera.position).astype(np.float32)
+    image, _ = load_rasterizer("cpu").view(gaussians, camera).splat(seen)
+    return np.clip(image, 0, 1)
+
+
+def psnr(scene: Gaussians, truth: Gaussians, cameras: list[Camera]) -> float:
+    errors = [np.square(picture(scene, camera) - picture(truth, camera)).mean() for camera in cameras]
+    return float(-10 * np.log10(np.mean(errors)))
+
+
+@pytest.fixture(scope="module")
+def demo() -> Scene:
+    return load_scene(DEMO)
+
+
+@pytest.fixture(scope="module")
+def views(demo: Scene) -> list[Camera]:
+    return [camera.resized(240, 180) for camera in demo.cameras[::16]]
+
+
+def test_the_demo_scene_as_spz(tmp_path, demo, views, measured: Measure):
+    got = convert(DEMO, tmp_path / "demo.spz").gaussians
+    want = demo.gaussians
+    # Half a step of what the format stores
+    assert np.abs(got.means - want.means).max() <= 0.5 / 4096 + 1e-7
+    held = want.log_scales > -10  # below, e^-10 = 4.5e-5 world units is written: far below a pixel
+    assert np.abs(got.log_scales - want.log_scales)[held].max() <= 0.5 / 16 + 1e-5
+    inside = np.abs(want.sh[:, 0]) <= 0.5 / 0.15
+    assert np.abs(got.sh[:, 0] - want.sh[:, 0])[inside].max() <= 0.5 / 255 / 0.15 + 1e-5
+    assert np.abs(got.sh[:, 1:] - want.sh[:, 1:]).max() <= 0.5 / 128 + 1e-6
+    # A base colour is off by at most 0.28 * 0.5 / 255 / 0.15 = 3.7e-3, evenly, thus by 2.1e-3 in the mean
+    # square: 53 dB for one Gaussian per pixel, and blending averages. Scales (3 %) act on edges alone.
+    value = psnr(got, want, views)
+    measured("demo scene", "PSNR .spz", value)
+    assert value > 48
+    # 29 bytes a Gaussian of SH degree 1 before compression, 104 in the PLY
+    assert (tmp_path / "demo.spz").stat().st_size < DEMO.stat().st_size * 29 / 104
+
+
+def test_the_demo_scene_as_splat(tmp_path, demo, views, measured: Measure):
+    got = convert(DEMO, tmp_path / "demo.splat").gaussians
+    value = psnr(got, demo.gaussians, views)
+    measured("demo scene", "PSNR .splat", value)
+    # What is lost is the view dependence and what base colours have beyond 0..1; the rest is rounding
+    base = np.clip(demo.gaussians.sh[:, :1], -0.5 / 0.28209479, 0.5 / 0.28209479)
+    without = replace(demo.gaussians, sh=base)
+    value = psnr(got, without, views)
+    measured("demo scene", "PSNR .splat, rounding alone", value)
+    assert value > 55
+    assert (tmp_path / "demo.splat").stat().st_size == 32 * len(demo.gaussians)

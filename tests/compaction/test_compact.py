@@ -1,0 +1,264 @@
+"""A compact scene keeps its error budget, its meaning and its order, or is not written."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from langsplat_core.cli import run as command_line
+from langsplat_core.cli.compact import Compact
+from langsplat_core.compaction import compact
+from langsplat_core.compaction import views as compact_views
+from langsplat_core.compaction.compact import Choice, compact_scene, select, smallest
+from langsplat_core.compaction.contribution import (
+    ALONE,
+    contributions,
+    draw,
+    estimated_loss,
+    expose,
+    psnr,
+    psnr_losses,
+)
+from langsplat_core.compaction.views import HOLD_OUT, choose_views, ring_cameras
+from langsplat_core.config import CompactConfig
+from langsplat_core.datasets import Capture
+from langsplat_core.errors import InputError
+from langsplat_core.formats import load_scene, save_scene
+from langsplat_core.progress import silent
+from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
+from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.scene import Camera, Scene, look_at
+from tests.support.file_samples import random_field
+from tests.support.scenes import random_gaussians
+
+N = 400
+CONFIG = CompactConfig(max_psnr_loss=0.3, max_side=64)
+
+
+def cameras(count: int = 14) -> tuple[Camera, ...]:
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return tuple(
+        look_at(3 * np.array([np.cos(a), 0.3 * np.sin(3 * a), np.sin(a)]), np.zeros(3), [0, -1, 0], (64, 48))
+        for a in angles
+    )
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """Half of it faint, so that there is something to drop; with every kind of companion."""
+    gaussians = random_gaussians(N, seed=5, sh_degree=1, scale_range=(0.02, 0.1))
+    gaussians.opacity_logits[::2] = -5.0
+    gaussians.sh[:, 1:] *= 0.05
+    extras = {"age": np.arange(N, dtype=np.float32)}
+    return Scene(gaussians, random_field(N, phrases=("red mug", "door")), cameras(), extras=extras)
+
+
+@pytest.fixture
+def source(scene, tmp_path):
+    save_scene(tmp_path / "scene.ply", scene)
+    return tmp_path / "scene.ply"
+
+
+def test_a_contribution_bounds_what_its_removal_changes():
+    """One Gaussian on black, against the float64 reference: the picture is C = w c, and the score is
+    sqrt(W (E + ALONE^2 W)) with E = sum w |c - C|^2, never less than sum w |c - C|."""
+    gaussians = random_gaussians(12, seed=3, scale_range=(0.1, 0.3))
+    alone = [gaussians.take(np.array([row])) for row in range(12)]
+    camera = cameras()[0].resized(32, 24)
+    for one in alone:
+        scene = Scene(one)
+        score = contributions(CpuRasterizer(), scene, [camera])[0]
+        view = ReferenceRasterizer().view(one, camera)
+        weight = view.splat(np.ones((1, 1)))[0]
+        colour = np.maximum(one.sh[0, 0].astype(float) * 0.28209479177387814 + 0.5, 0)
+        distance = np.linalg.norm(colour * (1 - weight), axis=-1)  # |c - C|, with C = w c
+        total = (weight[..., 0] * distance).sum()
+        exact = np.sqrt(weight.sum() * (weight[..., 0] * (distance**2 + ALONE**2)).sum())
+        assert score == pytest.approx(exact, rel=1e-4, abs=1e-6)
+        assert score >= total * (1 - 1e-4)
+
+
+def test_the_largest_contribution_over_views_counts(scene):
+    rasterizer, views = CpuRasterizer(), scene.cameras[:3]
+    each = [contributions(rasterizer, scene, [view]) for view in views]
+    np.testing.assert_array_equal(contributions(rasterizer, scene, views), np.max(each, axis=0))
+
+
+def test_loss_without_photographs_is_that_of_uncorrelated_errors(scene):
+    """Photographs made as the picture plus noise of known strength: measured and derived loss agree."""
+    rasterizer, view = CpuRasterizer(), scene.cameras[0].resized(256, 192)
+    less = scene.take(np.arange(N) % 9 > 0)
+    picture = np.clip(draw(rasterizer, scene, view)[1], 0, 1)
+    noise = np.random.default_rng(0).normal(0, 10 ** (-30 / 20), picture.shape)
+    truth = replace(expose(rasterizer, scene, [view], [None])[0], photograph=picture + noise)
+    measured = psnr_losses(rasterizer, less, [truth], 30.0)[0]
+    derived = psnr_losses(rasterizer, less, expose(rasterizer, scene, [view], [None]), 30.0)[0]
+    assert measured > 0.5
+    assert derived == pytest.approx(measured, abs=0.1)  # the noise is finite: 147 000 numbers
+    assert estimated_loss(1e-3, 30.0) == pytest.approx(10 * np.log10(2))
+
+
+def test_nothing_that_any_view_needs_is_dropped(scene):
+    rasterizer = CpuRasterizer()
+    views = choose_views(scene, None, CONFIG, silent)
+    exposures = expose(rasterizer, scene, views.measuring, views.photographs)
+    selection = select(rasterizer, scene, views, exposures, CONFIG)
+    score = contributions(rasterizer, scene, (*views.ranking, *views.measuring))
+    assert 0 < (~selection.keep).sum() < N
+    assert score[~selection.keep].max() <= selection.threshold
+    assert selection.unseen_loss <= CONFIG.max_psnr_loss
+
+
+def test_views_that_measure_do_not_rank(scene):
+    views = choose_views(scene, None, CONFIG, silent)
+    assert len(views.measuring) == len(scene.cameras) // HOLD_OUT
+    assert len(views.ranking) + len(views.measuring) == len(scene.cameras)
+    assert not set(map(id, views.ranking)) & set(map(id, views.measuring))
+    thinned = choose_views(scene, None, replace(CONFIG, views=4), silent)
+    assert (len(thinned.ranking), len(thinned.measuring)) == (2, 2)
+    with pytest.raises(InputError, match="at least 2"):
+        choose_views(scene, None, replace(CONFIG, views=1), silent)
+
+
+def test_budget_companions_and_order_survive_the_file(scene, source, tmp_path):
+    out = tmp_path / "out.ply"
+    report = compact_scene(source, out, CONFIG)
+    small = load_scene(out)
+    assert report.after.gaussians == len(small.gaussians) < 0.9 * N
+    rows = small.extras["age"].astype(int)
+    assert (np.diff(rows) > 0).all()
+    count = small.gaussians.sh.shape[1]
+    np.testing.assert_array_equal(small.gaussians.sh, scene.gaussians.sh[rows, :count])
+    np.testing.assert_array_equal(small.language.latents, scene.language.latents[:, rows])
+    assert len(small.cameras) == len(scene.cameras)
+    held = choose_views(scene, None, CONFIG, silent).measuring
+    losses = psnr_losses(
+        CpuRasterizer(), small, expose(CpuRasterizer(), scene, held, [None] * len(held)), CONFIG.assumed_psnr
+    )
+    assert losses.mean() == pytest.approx(report.loss)
+    assert report.loss <= CONFIG.max_psnr_loss
+    assert [answer.phrase for answer in report.language.answers] == ["red mug", "door"]
+    assert report.before.memory_bytes == 4 * N * (3 + 3 + 4 + 1 + 12 + 1 + 3 * 4)
+    sizes = [file.stat().st_size for file in tmp_path.iterdir() if file.name.startswith("out.")]
+    assert len(sizes) == 3
+    assert report.after.disk_bytes == sum(sizes)
+
+
+def test_the_same_scene_gives_the_same_bytes(source, tmp_path):
+    for name in ("a.ply", "b.ply"):
+        compact_scene(source, tmp_path / name, CONFIG)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_a_tighter_budget_keeps_more(source, tmp_path):
+    counts = []
+    for budget in (0.02, 0.2, 2.0):
+        report = compact_scene(source, tmp_path / "out.ply", replace(CONFIG, max_psnr_loss=budget))
+        assert report.loss <= budget
+        counts.append(report.after.gaussians * (1 + report.after.sh_degree))
+    assert counts[0] > counts[1] > counts[2]
+
+
+def test_a_scene_without_cameras_is_seen_from_a_ring(scene, tmp_path):
+    save_scene(tmp_path / "bare.ply", replace(scene, cameras=(), language=None))
+    report = compact_scene(tmp_path / "bare.ply", tmp_path / "out.ply", replace(CONFIG, views=12))
+    assert "ring" in report.views_from
+    assert report.language is None
+    centre, radius = scene.bounds()
+    for camera in ring_cameras(scene, 12):
+        pixel, depth = camera.project(centre[None])
+        assert depth[0] > radius
+        np.testing.assert_allclose(pixel[0], (camera.width / 2, camera.height / 2), atol=1e-6)
+
+
+def test_a_format_that_costs_more_than_the_budget_is_refused(source, tmp_path, capsys):
+    out = tmp_path / "out.splat"  # eight bits per colour and opacity, no view dependence
+    tight = replace(CONFIG, max_psnr_loss=1e-6)
+    assert command_line.main("langsplat", lambda: Compact(source, out=out, config=tight)) == 2
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "format alone" in message
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "out", "words"),
+    [
+        ({"max_psnr_loss": -1.0}, "out.ply", "max-psnr-loss"),
+        ({"max_psnr_loss": float("nan")}, "out.ply", "max-psnr-loss"),
+        ({"assumed_psnr": 0.0}, "out.ply", "assumed-psnr"),
+        ({}, "scene.ply", "choose another --out"),
+        ({}, "out.xyz", "choose such a name"),
+    ],
+)
+def test_unusable_arguments_are_one_line(source, tmp_path, changes, out, words):
+    before = source.read_bytes()
+    with pytest.raises(InputError, match=words) as caught:
+        compact_scene(source, tmp_path / out, replace(CONFIG, **changes))
+    assert "\n" not in str(caught.value)
+    assert source.read_bytes() == before
+
+
+def test_a_scene_that_no_view_sees_is_refused(scene, tmp_path):
+    away = tuple(look_at(np.array([9.0, 0, z]), np.array([20.0, 0, 0]), [0, -1, 0], (32, 24)) for z in (0, 1))
+    save_scene(tmp_path / "scene.ply", replace(scene, cameras=away))
+    with pytest.raises(InputError, match="visible"):
+        compact_scene(tmp_path / "scene.ply", tmp_path / "out.ply", CONFIG)
+
+
+def test_interruption_leaves_the_old_file(source, tmp_path, monkeypatch):
+    out = tmp_path / "out.ply"
+    compact_scene(source, out, CONFIG)
+    old = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+
+    def interrupted(label: str, fraction: float) -> None:
+        if label.startswith("finding"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        compact_scene(source, out, replace(CONFIG, max_psnr_loss=1.0), progress=interrupted)
+    monkeypatch.setattr(compact, "psnr_losses", lambda *_: np.array([0.0, 9.0]))  # a loss nobody foresaw
+    with pytest.raises(InputError):
+        compact_scene(source, out, CONFIG)
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == old
+
+
+def test_bisection_finds_the_edge_and_weighs_degrees():
+    def loss_of(choice: Choice) -> float:
+        return (1000 - choice.count) / 1000 + 0.1 * (1 - choice.sh_degree)
+
+    best = smallest(Choice(1000, 1), loss_of, 0.3)
+    assert best.sh_degree == 0  # 800 of 14 numbers beat 700 of 23
+    assert 800 <= best.count <= 800 + 1000 // 256 + 1
+    assert smallest(Choice(1000, 1), lambda choice: 1.0, 0.3) is None
+    assert smallest(Choice(1000, 1), lambda c: 0.0 if c == Choice(1000, 1) else 1.0, 0.3) == Choice(1000, 1)
+
+
+def test_photographs_of_another_world_are_refused(scene):
+    named = [replace(camera, name=f"v{i}") for i, camera in enumerate(scene.cameras)]
+    compact_views._check_same_world(named, named, "photos")
+    matrix = np.eye(4)
+    matrix[0, 3] = 0.2
+    moved = [replace(camera, world_to_camera=camera.world_to_camera @ matrix) for camera in named]
+    with pytest.raises(InputError, match="lie elsewhere"):
+        compact_views._check_same_world(named, moved, "photos")
+
+
+def test_photographs_held_out_from_training_measure(scene, source, tmp_path, monkeypatch):
+    """The dataset has two views more than the scene was trained on, and noise that the scene lacks."""
+    rng = np.random.default_rng(0)
+    shot = [replace(camera, name=f"v{i}") for i, camera in enumerate(scene.cameras)]
+    pictures = [np.clip(draw(CpuRasterizer(), scene, camera)[1], 0, 1) for camera in shot]
+    noisy = [np.clip(255 * p + rng.normal(0, 12, p.shape), 0, 255).astype(np.uint8) for p in pictures]
+    capture = Capture(tuple(shot), tuple(noisy), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    monkeypatch.setattr(compact_views, "load_capture", lambda *_: capture)
+    save_scene(source, replace(scene, cameras=tuple(shot[2:])))
+    report = compact_scene(source, tmp_path / "out.ply", CONFIG, photos=tmp_path)
+    assert (report.ranking_views, report.measuring_views) == (12, 2)
+    assert report.assumed_psnr is None
+    assert report.before.psnr - report.after.psnr == pytest.approx(report.loss)
+    truth = [psnr(p, n.astype(np.float32) / 255) for p, n in zip(pictures[:2], noisy[:2], strict=True)]
+    assert report.before.psnr == pytest.approx(np.mean(truth), abs=1e-3)
+    strangers = replace(capture, images=tuple(255 - image for image in noisy))
+    monkeypatch.setattr(compact_views, "load_capture", lambda *_: strangers)
+    with pytest.raises(InputError, match="something else"):
+        compact_scene(source, tmp_path / "out.ply", CONFIG, photos=tmp_path)

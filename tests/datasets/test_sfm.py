@@ -1,0 +1,254 @@
+"""Structure from motion and triangulation, on a small textured room whose shape is known."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import DatasetConfig
+from langsplat_core.datasets import load_capture
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.intrinsics import BrownDistortion, Lens
+from langsplat_core.datasets.known_poses import add_points, neighbouring_views, random_points
+from langsplat_core.datasets.sfm import pairs_by_name
+from langsplat_core.errors import InputError
+from langsplat_core.progress import Cancelled, silent
+from langsplat_core.scene import Camera, look_at
+from tests.support.photographed import distance_to_room, photograph, poses, write_photos
+
+VIEWS = 6
+LENS = Lens(400, 300, 380.0, 380.0, 200.0, 150.0, BrownDistortion(-0.06))
+CONFIG = DatasetConfig(max_side=400)
+STAGES = [
+    "preparing photographs",
+    "finding features",
+    "matching photographs",
+    "locating cameras",
+    "reading photographs",
+]
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six photographs of the room, one of pure noise, one broken file and one that is no photograph."""
+    folder = tmp_path_factory.mktemp("dataset") / "images"
+    write_photos(folder, LENS, poses(VIEWS))
+    noise = np.random.default_rng(0).integers(0, 256, (300, 400, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(folder / "zz_noise.JPG")
+    (folder / "aa_broken.jpg").write_bytes(b"\xff\xd8\xff not a picture")
+    (folder / "notes.txt").write_text("not a photograph")
+    return folder.parent
+
+
+@pytest.fixture(scope="module")
+def located(
+    photos: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Capture, Path, list[str], list[str]]:
+    """The capture, its work folder, the labels seen, the warnings given. The run is cancelled once, after
+    features were found, and then repeated."""
+    work = tmp_path_factory.mktemp("work")
+
+    def cancel(label: str, _: float) -> None:
+        if label == "matching photographs":
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        load_capture(photos, CONFIG, work, cancel)
+
+    labels: list[str] = []
+    messages: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: messages.append(record.getMessage())  # type: ignore[method-assign]
+    logging.getLogger("langsplat").addHandler(handler)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pycolmap, "extract_features", _never)
+        capture = load_capture(photos, CONFIG, work, lambda label, _: labels.append(label))
+    logging.getLogger("langsplat").removeHandler(handler)
+    return capture, work, labels, messages
+
+
+def _never(**_: object) -> None:
+    raise AssertionError("computed again")
+
+
+def aligned(points: Array, source: Array, target: Array) -> Array:
+    """`points` moved by the similarity that best takes `source` (N, 3) to `target` (Umeyama 1991)."""
+    a, b = source - source.mean(0), target - target.mean(0)
+    left, stretch, right = np.linalg.svd(b.T @ a)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(left @ right))])
+    rotation = left @ sign @ right
+    scale = (stretch * np.diag(sign)).sum() / (a**2).sum()
+    return scale * (points - source.mean(0)) @ rotation.T + target.mean(0)
+
+
+def test_cameras_are_found_where_they_were(located) -> None:  # type: ignore[no-untyped-def]
+    capture, _, labels, _ = located
+    assert [camera.name for camera in capture.cameras] == [f"view_{i}" for i in range(VIEWS)]
+    assert list(dict.fromkeys(labels)) == STAGES
+    centres = np.array([camera.position for camera in capture.cameras])
+    truth = np.array([-m[:3, :3].T @ m[:3, 3] for m in poses(VIEWS)])
+    assert np.abs(aligned(centres, centres, truth) - truth).max() < 0.02  # of a room 4 units wide
+    room = aligned(capture.points, centres, truth)
+    assert len(room) > 300
+    assert np.median(distance_to_room(room)) < 0.01
+
+
+def test_what_was_left_out_is_reported(located) -> None:  # type: ignore[no-untyped-def]
+    _, _, _, messages = located
+    assert any("aa_broken.jpg" in message and "cannot be read" in message for message in messages)
+    assert any("zz_noise.JPG" in message and "could not be located" in message for message in messages)
+
+
+def test_a_second_run_computes_nothing(
+    photos: Path,
+    located,  # type: ignore[no-untyped-def]
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    capture, work, _, _ = located
+    for name in ("extract_features", "match_image_pairs", "incremental_mapping"):
+        monkeypatch.setattr(pycolmap, name, _never)
+    again = load_capture(photos, CONFIG, work)
+    np.testing.assert_array_equal(again.points, capture.points)
+    np.testing.assert_array_equal(again.cameras[3].world_to_camera, capture.cameras[3].world_to_camera)
+    assert sorted(path.name for path in (work / "sfm").iterdir()) == ["inputs.json", "sparse"]
+
+
+def test_changed_photographs_are_computed_again(
+    photos: Path,
+    located,  # type: ignore[no-untyped-def]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for photo in (photos / "images").glob("*.png"):
+        (tmp_path / photo.name).write_bytes(photo.read_bytes())
+    _, work, _, _ = located
+    monkeypatch.setattr(pycolmap, "extract_features", _never)
+    with pytest.raises(AssertionError, match="computed again"):
+        load_capture(tmp_path, CONFIG, work)
+
+
+def known(count: int = VIEWS, size: tuple[int, int] = (320, 240)) -> Capture:
+    """The room through pinholes at the true poses, without points."""
+    lens = Lens(*size, 300.0, 300.0, size[0] / 2, size[1] / 2)
+    cameras = [Camera(*size, 300, 300, lens.cx, lens.cy, m, f"v{i}") for i, m in enumerate(poses(count))]
+    images = [photograph(lens, camera.world_to_camera) for camera in cameras]
+    return Capture(tuple(cameras), tuple(images), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+
+
+def test_known_poses_give_points_in_their_own_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = known(4)
+    labels: list[str] = []
+    found = add_points(capture, tmp_path, lambda label, _: labels.append(label))
+    assert list(dict.fromkeys(labels)) == ["finding features", "matching photographs", "triangulating points"]
+    assert found.cameras is capture.cameras
+    assert len(found.points) > 200
+    assert np.median(distance_to_room(found.points)) < 0.01  # no fitting here: the very same world
+    camera, image = capture.cameras[0], capture.images[0]
+    pixels, depth = camera.project(found.points)
+    seen = (depth > 0) & (pixels >= 0).all(1) & (pixels < (320, 240)).all(1)
+    x, y = pixels[seen].astype(int).T
+    assert np.median(np.abs(image[y, x].astype(float) - found.colours[seen])) < 12
+
+    monkeypatch.setattr(pycolmap, "extract_features", _never)
+    np.testing.assert_array_equal(add_points(capture, tmp_path, silent).points, found.points)
+
+
+def test_featureless_views_start_from_random_points(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    capture = known(3)
+    flat = [np.full_like(image, 90) for image in capture.images]
+    blank = Capture(capture.cameras, tuple(flat), capture.points, capture.colours)
+    with caplog.at_level(logging.WARNING, "langsplat"):
+        found = add_points(blank, tmp_path, silent)
+    assert "random" in caplog.text
+    assert len(found.points) == 20_000
+    assert (found.colours == 90).all()
+
+
+def test_random_points_lie_where_several_cameras_look() -> None:
+    capture = known()
+    points, colours = random_points(capture, 2000)
+    assert points.shape == colours.shape == (2000, 3)
+    seen = np.zeros(2000, int)
+    for camera in capture.cameras:
+        pixels, depth = camera.project(points)
+        seen += (depth > 0) & (pixels >= 0).all(1) & (pixels < (320, 240)).all(1)
+    assert (seen >= 2).all()
+    again, _ = random_points(capture, 2000)
+    np.testing.assert_array_equal(points, again)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_random_points_when_the_axes_do_not_meet(count: int) -> None:
+    eyes = [np.array([float(i), 0, 0]) for i in range(count)]
+    cameras = tuple(look_at(eye, eye + (0, 0, 1), np.array([0, -1, 0]), (32, 24)) for eye in eyes)
+    images = (np.zeros((24, 32, 3), np.uint8),) * count
+    capture = Capture(cameras, images, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    points, _ = random_points(capture, 500)
+    assert len(points) == 500
+    assert np.isfinite(points).all()
+    assert (points[:, 2] > 0).all()
+
+
+def test_every_pair_of_few_photographs_and_a_linked_selection_of_many() -> None:
+    few = pairs_by_name([str(i) for i in range(5)])
+    assert len(few) == len(set(few)) == 10
+    many = pairs_by_name([f"{i:04d}" for i in range(400)])
+    assert len(many) == len(set(many)) < 400 * 20
+    linked = {(int(a), int(b)) for a, b in many}
+    assert all((i, i + 1) in linked for i in range(399))
+    assert (0, 256) in linked
+
+
+def test_neighbouring_views_look_a_similar_way() -> None:
+    ring = [
+        look_at(
+            np.array([np.cos(a), np.sin(a), 0]), 2 * np.array([np.cos(a), np.sin(a), 0]), [0, 0, 1], (9, 9)
+        )
+        for a in np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    ]
+    pairs = neighbouring_views(tuple(ring))
+    steps = {min(j - i, 24 - (j - i)) for i, j in pairs}
+    assert steps == {1, 2, 3, 4, 5}  # 15 degrees each: 75 at most, never back to back
+    assert neighbouring_views(tuple(ring[:1])) == []
+
+
+def test_copies_are_upright_and_keep_the_focal_length(tmp_path: Path) -> None:
+    """COLMAP ignores the EXIF orientation, so the copies must be turned and must not say so again."""
+    exif = Image.Exif()
+    exif[0x0112] = 6  # stored lying on its side
+    exif[0x0110] = "Camera 1"
+    exif.get_ifd(0x8769)[0xA405] = 35  # mm, as on 36 x 24 mm film
+    for index in range(3):
+        Image.linear_gradient("L").resize((90, 60)).convert("RGB").save(tmp_path / f"{index}.jpg", exif=exif)
+
+    def cancel(label: str, _: float) -> None:
+        if label == "finding features":
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        load_capture(tmp_path, CONFIG, tmp_path / "work", cancel)
+    camera = pycolmap.infer_camera_from_image(tmp_path / "work/sfm/images/00000.jpg")
+    assert (camera.width, camera.height) == (60, 90)
+    assert camera.has_prior_focal_length
+    assert camera.focal_length == pytest.approx(35 / np.hypot(36, 24) * np.hypot(60, 90), rel=0.01)
+    with Image.open(tmp_path / "work/sfm/images/00002.jpg") as copy:
+        assert copy.getexif().get(0x0112, 1) == 1
+
+
+def test_too_few_photographs_say_so(tmp_path: Path) -> None:
+    write_photos(tmp_path / "two", LENS.resized(64, 48), poses(2))
+    with pytest.raises(InputError, match="has 2 photographs; at least 3"):
+        load_capture(tmp_path / "two", CONFIG, tmp_path / "work")
+
+
+def test_photographs_that_do_not_overlap_say_so(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for index in range(3):
+        Image.fromarray(rng.integers(0, 256, (120, 160, 3), dtype=np.uint8)).save(tmp_path / f"{index}.png")
+    with pytest.raises(InputError, match="of 3 photographs could be located") as caught:
+        load_capture(tmp_path, CONFIG, tmp_path / "work")
+    assert "\n" not in str(caught.value)

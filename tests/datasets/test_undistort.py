@@ -1,0 +1,156 @@
+"""Lenses, their inverses, and the pictures made from them."""
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from langsplat_core.arrays import Array
+from langsplat_core.datasets.colmap import lens_of
+from langsplat_core.datasets.colmap_model import CAMERA_MODELS, ModelCamera
+from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, Lens
+from langsplat_core.datasets.undistort import (
+    pinhole_for,
+    resample,
+    source_positions,
+    undistorted_points,
+)
+from langsplat_core.errors import InputError
+from tests.support.photographed import photograph, pinhole_picture, poses, psnr
+
+WIDTH, HEIGHT = 320, 240
+FOCAL = {"f": 260.0, "fx": 260.0, "fy": 255.0, "cx": 166.0, "cy": 117.0}
+COEFFICIENTS = {
+    "k": -0.08, "k0": 0.01, "k1": -0.12, "k2": 0.03, "k3": -0.01, "k4": 0.004, "k5": 0.002, "k6": -0.001,
+    "p0": 0.002, "p1": 0.001, "p2": -0.0015, "omega": 0.7, "alpha": 0.4, "beta": 1.1,
+    "sx1": 0.001, "sy1": -0.001, "s0": 0.001, "s1": 0.0005, "s2": -0.001, "s3": 0.0002,
+}  # fmt: skip
+
+
+def camera_of(model: str) -> ModelCamera:
+    keys = next(keys for name, keys in CAMERA_MODELS.values() if name == model)
+    params = tuple((FOCAL | COEFFICIENTS)[key] for key in keys.split())
+    return ModelCamera(model, WIDTH, HEIGHT, params)
+
+
+ALL_MODELS = [name for name, _ in CAMERA_MODELS.values()]
+DISTORTED = [name for name in ALL_MODELS if name not in ("PINHOLE", "SIMPLE_PINHOLE")]
+PHONE = Lens(640, 480, 600.0, 604.0, 326.0, 236.0, BrownDistortion(0.06, -0.08, -0.001, 0.0002))
+BARREL = Lens(640, 480, 420.0, 420.0, 310.0, 246.0, BrownDistortion(-0.25, 0.06))
+FISHEYE = Lens(640, 480, 400.0, 397.0, 322.0, 239.0, FisheyeDistortion(0.02, -0.01, 0.003, -0.001))
+
+
+def test_the_table_of_models_is_colmaps() -> None:
+    theirs = {}
+    for name, number in pycolmap.CameraModelId.__members__.items():
+        if name not in ("INVALID", "EQUIRECTANGULAR"):  # neither is a pinhole with a lens
+            camera = pycolmap.Camera.create_from_model_name(1, name, 100.0, 200, 100)
+            theirs[int(number)] = (name, len(camera.params_info.split(",")))
+    assert {n: (name, len(keys.split())) for n, (name, keys) in CAMERA_MODELS.items()} == theirs
+
+
+@pytest.mark.parametrize("model", ALL_MODELS)
+def test_pixels_agree_with_colmap(model: str) -> None:
+    camera = camera_of(model)
+    xy = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 2))
+    xy[0] = 0  # the axis, where the fisheye formula divides zero by zero
+    theirs = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=list(camera.params))
+    want = theirs.img_from_cam(np.concatenate([xy, np.ones((200, 1))], 1))
+    np.testing.assert_allclose(lens_of(camera).pixels(xy), want, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", [*map(lens_of, map(camera_of, DISTORTED)), PHONE, BARREL, FISHEYE])
+def test_undistort_then_distort_comes_back(lens: Lens) -> None:
+    assert lens.distortion is not None
+    grid = np.stack(np.meshgrid(np.linspace(0, lens.width, 33), np.linspace(0, lens.height, 25)), -1)
+    pixels = grid.reshape(-1, 2)
+    distorted = (pixels - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
+    back = lens.pixels(undistorted_points(lens.distortion, distorted))
+    assert np.abs(back - pixels).max() < 1e-6  # px
+
+
+@pytest.mark.parametrize("lens", [*map(lens_of, map(camera_of, DISTORTED)), PHONE, BARREL, FISHEYE])
+def test_the_pinhole_shows_no_outside_and_wastes_little(lens: Lens) -> None:
+    camera = pinhole_for(lens, 10_000)
+    outline = source_positions(lens, camera)
+    assert outline.min() >= 0
+    assert (outline <= (lens.width, lens.height)).all()
+    # Every edge lies close to the photograph's: nothing more than the rectangle's nature is cut off.
+    margins = [
+        outline[..., 0].min(),
+        outline[..., 1].min(),
+        lens.width - outline[..., 0].max(),
+        lens.height - outline[..., 1].max(),
+    ]
+    assert max(margins) < 3  # px
+
+
+def test_a_pinhole_keeps_the_whole_photograph() -> None:
+    lens = Lens(1000, 601, 800.0, 810.0, 480.0, 310.0, BrownDistortion())
+    assert lens.distortion is None
+    camera = pinhole_for(lens, 500)
+    assert (camera.width, camera.height) == (500, 300)
+    np.testing.assert_allclose((camera.fx, camera.cx), (400.0, 240.0))
+    np.testing.assert_allclose((camera.fy, camera.cy), (810 * 300 / 601, 310 * 300 / 601))
+    assert pinhole_for(lens, 5000).width == 1000  # never enlarged
+
+
+@pytest.mark.parametrize("lens", [PHONE, BARREL, FISHEYE, Lens(640, 480, 500.0, 490.0, 310.0, 250.0)])
+@pytest.mark.parametrize("max_side", [10_000, 213])
+def test_the_picture_is_what_the_pinhole_sees(lens: Lens, max_side: int) -> None:
+    pose = poses(3)[1]
+    camera = pinhole_for(lens, max_side)
+    assert max(camera.width, camera.height) <= max_side
+    posed = type(camera)(*_intrinsics(camera), pose)
+    positions = None if lens.distortion is None else source_positions(lens, camera)
+    got = resample(Image.fromarray(photograph(lens, pose)), lens, camera, positions)
+    # A shrunk picture averages over the area of its pixels; so must the truth.
+    samples = 1 if max_side > 1000 else 4
+    match = psnr(got, pinhole_picture(posed, samples))
+    # The shrunk photograph has the right magnification at its centre; towards the edges of a barrel or
+    # fisheye lens, which squeezes them, some detail is lost with the shrinking: 38.4 dB at worst.
+    assert match > (40 if max_side > 1000 else 37)
+    w, h, fx, fy, cx, cy = _intrinsics(camera)
+    half_a_pixel_off = type(camera)(w, h, fx, fy, cx + 0.5, cy, pose)
+    assert psnr(got, pinhole_picture(half_a_pixel_off, samples)) < match - 5
+
+
+def _intrinsics(camera) -> tuple[int, int, float, float, float, float]:  # type: ignore[no-untyped-def]
+    return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
+
+
+def test_shrinking_averages_in_the_distorted_path_too() -> None:
+    stripes = np.zeros((480, 640, 3), np.uint8)
+    stripes[:, ::2] = 255
+    camera = pinhole_for(PHONE, 80)
+    got = resample(Image.fromarray(stripes), PHONE, camera, source_positions(PHONE, camera))
+    assert np.abs(got.astype(float) - 127.5).max() < 20
+
+
+def test_a_wide_fisheye_is_cut_at_the_largest_angle() -> None:
+    wide = Lens(800, 800, 260.0, 260.0, 400.0, 400.0, FisheyeDistortion())  # 176 degrees across
+    camera = pinhole_for(wide, 800)
+    corner = np.hypot(camera.cx / camera.fx, camera.cy / camera.fy)
+    assert np.degrees(np.arctan(corner)) == pytest.approx(65, abs=0.5)
+
+
+def test_a_lens_that_folds_over_is_cut_before_the_fold() -> None:
+    folding = Lens(640, 480, 300.0, 300.0, 320.0, 240.0, BrownDistortion(-0.4))  # folds at radius 0.91
+    camera = pinhole_for(folding, 2000)
+    corner = np.hypot(camera.cx / camera.fx, camera.cy / camera.fy)
+    assert 0.5 < corner < 0.92
+    assert source_positions(folding, camera).min() >= 0
+
+
+@pytest.mark.parametrize("k1", [np.nan, 1e300, -1e12])
+def test_an_impossible_lens_is_refused_in_one_line(k1: float) -> None:
+    lens = Lens(640, 480, 300.0, 300.0, 320.0, 240.0, BrownDistortion(k1))
+    with pytest.raises(InputError) as caught:
+        pinhole_for(lens, 800)
+    assert "\n" not in str(caught.value)
+
+
+def test_points_beyond_the_cap_come_back_on_its_circle() -> None:
+    far: Array = np.array([[5.0, 0.0]])
+    xy = undistorted_points(FisheyeDistortion(), far)
+    np.testing.assert_allclose(xy, [[np.tan(np.radians(65)), 0]], atol=1e-9)

@@ -1,0 +1,190 @@
+"""The whole path on a tiny scene: photographs in, searchable scene out, interrupted and resumed."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from langsplat_core.cli.app import _parse
+from langsplat_core.cli.run import main
+from langsplat_core.config import (
+    ClipConfig,
+    CodecConfig,
+    DatasetConfig,
+    LiftConfig,
+    MaskConfig,
+    RadianceConfig,
+    TrainConfig,
+)
+from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.formats import load_scene
+from langsplat_core.pipeline.stages import stage_key
+from langsplat_core.pipeline.train import train_scene
+from langsplat_core.progress import Cancelled
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.spherical_harmonics import colours
+from langsplat_core.scene import look_at
+from tests.semantics.test_clip import tiny_clip
+from tests.support.scenes import random_gaussians
+
+SIZE = (64, 48)
+VIEWS = 5
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photographs of a few large Gaussians, as a nerfstudio folder, and a tiny encoder beside them."""
+    folder = tmp_path_factory.mktemp("room")
+    (folder / "images").mkdir()
+    gaussians = random_gaussians(60, 5, scale_range=(0.15, 0.4))
+    frames = []
+    for index in range(VIEWS):
+        angle = 0.5 * index
+        eye = 3 * np.array([np.sin(angle), -0.2, -np.cos(angle)])
+        camera = look_at(eye, np.zeros(3), np.array([0.0, -1, 0]), SIZE)
+        view = load_rasterizer("cpu").view(gaussians, camera)
+        image, _ = view.splat(colours(gaussians.sh, gaussians.means, camera.position).astype(np.float32))
+        name = f"images/photo_{index}.png"
+        Image.fromarray((255 * np.clip(image, 0, 1)).astype(np.uint8)).save(folder / name)
+        pose = np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    intrinsics = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(gaussians)}\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    body = "".join("{} {} {}\n".format(*mean) for mean in gaussians.means)
+    (folder / "points.ply").write_text(header + body)
+    transforms = {**intrinsics, "w": SIZE[0], "h": SIZE[1], "ply_file_path": "points.ply", "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(transforms))
+    tiny_clip(folder / "encoder")
+    return folder
+
+
+def settings(room: Path) -> TrainConfig:
+    return TrainConfig(
+        dataset=DatasetConfig(max_side=64, test_every=4),
+        radiance=RadianceConfig(steps=20, sh_degree=0, checkpoint_every=5),
+        masks=MaskConfig(source="graph"),
+        clip=ClipConfig(model=str(room / "encoder"), device="cpu"),
+        codec=CodecConfig(steps=30),
+        phrases=("red mug",),
+    )
+
+
+def test_photographs_become_a_searchable_scene(room, tmp_path):
+    out = tmp_path / "scene.ply"
+    report = train_scene(room, out, settings(room))
+    scene = load_scene(out)
+    assert scene.language is not None
+    assert report.views == len(scene.cameras) == 3
+    assert report.held_out == 2
+    assert report.gaussians == len(scene.gaussians) > 0
+    assert report.psnr is not None
+    assert report.observed > 0.5
+    assert report.masks == "graph (no weights)"
+    np.testing.assert_allclose(np.linalg.norm(scene.language.canonical, axis=1), 1, atol=1e-5)
+    result = QueryEngine(scene).run("Red  Mug")  # from the phrasebook: no encoder is loaded
+    assert result.relevancy.shape == (3, len(scene.gaussians))
+    assert 0 < result.peak < 1
+    assert json.loads((tmp_path / "scene.work" / "report.json").read_text())["views"] == 3
+
+    # The same command again changes nothing and repeats no stage.
+    stages = sorted((tmp_path / "scene.work").glob("radiance-*.ply"))
+    before = [path.stat().st_mtime_ns for path in stages]
+    again = train_scene(room, out, settings(room))
+    assert len(before) == 1
+    assert [path.stat().st_mtime_ns for path in stages] == before
+    assert again.psnr == report.psnr
+    assert again.mask_count == report.mask_count
+
+
+@pytest.mark.parametrize("mode", ["mean", "one-pass"])
+def test_other_liftings(room, tmp_path, mode):
+    config = replace(
+        settings(room), lift=LiftConfig(mode=mode), codec=CodecConfig(kind="linear", latent_dim=8)
+    )
+    train_scene(room, tmp_path / "scene.ply", config)
+    field = load_scene(tmp_path / "scene.ply").language
+    assert field is not None
+    assert field.codec.kind == "linear"
+    assert np.isfinite(field.latents).all()
+
+
+@pytest.mark.parametrize("stage", ["reading", "Training", "masks", "lifting", "codec"])
+def test_an_interrupted_run_leaves_no_scene_and_resumes(room, tmp_path, stage):
+    def stop(label: str, fraction: float) -> None:
+        if label.startswith(stage):
+            raise Cancelled
+
+    out = tmp_path / "scene.ply"
+    with pytest.raises(Cancelled):
+        train_scene(room, out, settings(room), progress=stop)
+    assert not list(tmp_path.glob("*.ply"))
+    assert not list(tmp_path.glob("*.safetensors"))
+    train_scene(room, out, settings(room))
+    assert load_scene(out).language is not None
+
+
+def test_what_cannot_be_used_is_said_before_anything_is_made(room, tmp_path):
+    with pytest.raises(InputError, match=r"\*\.ply"):
+        train_scene(room, tmp_path / "scene.splat", settings(room))
+    absent = replace(settings(room), clip=ClipConfig(model=str(tmp_path / "nothing")))
+    with pytest.raises(EncoderError, match=r"--clip\.model"):
+        train_scene(room, tmp_path / "scene.ply", absent)
+    with pytest.raises(InputError):
+        train_scene(tmp_path / "missing", tmp_path / "scene.ply", settings(room))
+    assert not list(tmp_path.glob("**/*.ply"))
+
+
+def test_stage_keys_follow_settings():
+    a, b = RadianceConfig(steps=5), RadianceConfig(steps=6)
+    assert stage_key("radiance", 1, a) == stage_key("radiance", 1, RadianceConfig(steps=5))
+    assert len({stage_key("radiance", 1, a), stage_key("radiance", 1, b), stage_key("radiance", 2, a)}) == 3
+
+
+def run(*args: object) -> int:
+    words = [str(arg) for arg in args]
+    return main("langsplat", lambda: _parse(words))
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["train", "photos"], "--out"),
+        (["train", "photos", "--out", "s.ply", "--radiance.steps", "many"], "radiance.steps"),
+        (["query", "missing.ply", "cup"], "missing.ply"),
+        (["inspect", "."], "folder"),
+        (["convert", "missing.ply", "out.ply"], "missing.ply"),
+        (["convert", "missing.ply", "out.obj"], ".ply, .spz, .splat"),
+        (["nonsense"], "nonsense"),
+    ],
+)
+def test_commands_end_with_one_line_and_code_2(args, says, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run(*args) == 2
+    printed = capsys.readouterr().err.strip()
+    assert says in printed
+    assert "\n" not in printed
+    assert not list(tmp_path.iterdir())
+
+
+def test_query_inspect_and_convert_commands(room, tmp_path, capsys):
+    out = tmp_path / "scene.ply"
+    train_scene(room, out, settings(room))
+    assert run("query", out, "red mug", "--json") == 0
+    answer = json.loads(capsys.readouterr().out)[0]
+    assert answer["phrase"] == "red mug"
+    assert answer["level"] in ("subpart", "part", "whole")
+    assert len(answer["pixel"]) == 2
+    assert len(answer["place"]) == 3
+    assert run("query", out, "red mug", "--mode", "paper") == 0
+    assert "score" in capsys.readouterr().out
+    assert run("query", out, "red mug", "--camera", 99) == 2
+    assert run("inspect", out) == 0
+    assert "autoencoder" in capsys.readouterr().out
+    copy = tmp_path / "copy.ply"
+    assert run("convert", out, copy) == 0
+    assert load_scene(copy).language is not None

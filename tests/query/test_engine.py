@@ -1,0 +1,245 @@
+"""Relevancy, the sphere table, levels, places and pixels."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from langsplat_core.arrays import unit
+from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
+from langsplat_core.query.places import build_neighbourhood, locate, peak_pixel
+from langsplat_core.query.relevancy import latent_relevancy, relevancy
+from langsplat_core.query.table import build_table, octahedral_to_sphere, sphere_to_octahedral
+from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.scene import (
+    AutoencoderCodec,
+    Gaussians,
+    LanguageField,
+    LinearCodec,
+    Scene,
+    look_at,
+)
+
+D = 16
+
+
+def random_codec(rng: np.random.Generator, d: int = 3) -> AutoencoderCodec:
+    """A smooth random autoencoder: untrained weights of moderate size."""
+
+    def layers(widths):
+        return tuple(
+            (
+                (rng.normal(size=(b, a)) * (1.6 / a**0.5)).astype(np.float32),
+                (0.3 * rng.normal(size=b)).astype(np.float32),
+            )
+            for a, b in pairwise(widths)
+        )
+
+    return AutoencoderCodec(layers((D, 24, d)), layers((d, 24, 32, D)))
+
+
+def blob(centre, count: int, rng: np.random.Generator) -> np.ndarray:
+    return np.asarray(centre) + 0.1 * rng.normal(size=(count, 3))
+
+
+def two_blob_scene(linear: bool = True) -> tuple[Scene, np.ndarray, np.ndarray]:
+    """Two blobs 2 units apart whose vectors are the axes 0 and 1; canonical phrases are axes 8 to 11."""
+    rng = np.random.default_rng(0)
+    count = 60
+    means = np.concatenate([blob((-1, 0, 4), count, rng), blob((1, 0, 4), count, rng)])
+    gaussians = Gaussians(
+        means=means,
+        log_scales=np.full((2 * count, 3), np.log(0.08)),
+        quats_wxyz=np.tile([1.0, 0, 0, 0], (2 * count, 1)),
+        opacity_logits=np.full(2 * count, 2.0),
+        sh=np.zeros((2 * count, 1, 3)),
+    )
+    basis = np.eye(D, dtype=np.float32)[:8]
+    vectors = np.repeat(np.eye(D, dtype=np.float32)[:2], count, 0)
+    codec = LinearCodec(basis)
+    latents = np.stack([codec.encode(vectors)] * 3).astype(np.float32)
+    latents[0] = 0  # subparts: nothing observed
+    confidence = np.ones((3, 2 * count), np.float32)
+    confidence[0] = 0
+    field = LanguageField(latents, confidence, codec, np.eye(D, dtype=np.float32)[8:12], "none")
+    phrasebook = {"Left": np.eye(D, dtype=np.float32)[0], "nowhere": np.eye(D, dtype=np.float32)[5]}
+    field = LanguageField(latents, confidence, codec, field.canonical, "none", phrasebook)
+    camera = look_at(np.zeros(3), np.array([0, 0, 4.0]), np.array([0, -1.0, 0]), (64, 48))
+    return Scene(gaussians, field, (camera,)), means[:count], means[count:]
+
+
+def test_relevancy_is_the_minimum_of_pairwise_softmaxes():
+    rng = np.random.default_rng(1)
+    vectors, phrases, canonical = (unit(rng.normal(size=(n, D))) for n in (50, 3, 4))
+    got = relevancy(vectors, phrases, canonical)
+    for i, vector in enumerate(vectors):
+        for j, phrase in enumerate(phrases):
+            pairs = [np.exp(10 * np.array([vector @ phrase, vector @ c])) for c in canonical]
+            assert got[i, j] == pytest.approx(min(p[0] / p.sum() for p in pairs), abs=1e-12)
+
+
+def test_latents_of_length_zero_mean_nothing():
+    rng = np.random.default_rng(2)
+    codec = random_codec(rng)
+    phrase, canonical = unit(rng.normal(size=(1, D))), unit(rng.normal(size=(4, D)))
+    values = latent_relevancy(codec, np.zeros((4, 3), np.float32), phrase, canonical)
+    assert (values == 0).all()
+
+
+def test_blended_latents_keep_the_meaning_of_their_direction():
+    rng = np.random.default_rng(3)
+    codec = random_codec(rng)
+    latents = unit(rng.normal(size=(20, 3))).astype(np.float32)
+    phrase, canonical = unit(rng.normal(size=(1, D))), unit(rng.normal(size=(4, D)))
+    full = latent_relevancy(codec, latents, phrase, canonical)
+    faint = latent_relevancy(codec, 0.02 * latents, phrase, canonical)
+    np.testing.assert_allclose(faint, full, atol=1e-5)
+
+
+def test_linear_codec_needs_no_decoding():
+    rng = np.random.default_rng(4)
+    basis = np.linalg.qr(rng.normal(size=(D, 6)))[0].T.astype(np.float32)
+    codec = LinearCodec(np.ascontiguousarray(basis))
+    latents = rng.normal(size=(30, 6)).astype(np.float32)
+    phrase, canonical = unit(rng.normal(size=(2, D))), unit(rng.normal(size=(4, D)))
+    want = relevancy(codec.decode(latents), phrase, canonical)
+    np.testing.assert_allclose(latent_relevancy(codec, latents, phrase, canonical), want, atol=1e-5)
+
+
+def test_octahedral_map_is_a_bijection_of_the_sphere():
+    rng = np.random.default_rng(5)
+    vectors = unit(rng.normal(size=(1000, 3)))
+    vectors = np.concatenate([vectors, np.eye(3), -np.eye(3)])
+    np.testing.assert_allclose(octahedral_to_sphere(sphere_to_octahedral(vectors)), vectors, atol=1e-12)
+    uv = sphere_to_octahedral(vectors)
+    assert uv.min() >= 0
+    assert uv.max() <= 1
+
+
+def test_table_agrees_with_exact_decoding_and_improves_with_resolution():
+    rng = np.random.default_rng(6)
+    codec = random_codec(rng)
+    latents = unit(rng.normal(size=(4000, 3))).astype(np.float32)
+    latents[:6] = np.concatenate([np.eye(3), -np.eye(3)])  # the fold's corners and edges
+    phrases, canonical = unit(rng.normal(size=(5, D))), unit(rng.normal(size=(4, D)))
+    exact = latent_relevancy(codec, latents, phrases, canonical)
+    errors = {}
+    for resolution in (48, 192):
+        table = build_table(codec, latents, canonical, resolution)
+        got = np.stack([table.relevancy(phrase) for phrase in phrases], 1)
+        errors[resolution] = np.abs(got - exact)
+    assert errors[192].mean() < 3e-4
+    assert errors[192].max() < 0.02  # at creases of the ReLU decoder
+    assert errors[192].mean() < errors[48].mean() / 6  # bilinear: second order where smooth
+
+
+def test_engine_finds_the_blob_and_its_place():
+    scene, left, _ = two_blob_scene()
+    result = QueryEngine(scene).run("left")
+    assert result.found
+    assert result.level in (1, 2)  # nothing was observed at the subpart level
+    assert result.scores[0] == 0
+    assert result.place is not None
+    assert np.linalg.norm(result.place - left.mean(0)) < 0.25
+    assert result.box is not None
+    assert (result.box[1] < 0.5).any()  # the box does not reach the other blob
+    assert result.box[1][0] < 0
+    assert (result.relevancy[2][:60] > 0.99).all()
+    assert (result.relevancy[2][60:] <= 0.5 + 1e-6).all()
+
+
+def test_engine_says_when_nothing_is_there():
+    scene, *_ = two_blob_scene()
+    result = QueryEngine(scene).run("Nowhere")
+    assert not result.found
+    assert result.peak <= 0.5 + 1e-6
+
+
+def test_engine_errors_say_what_to_do():
+    scene, *_ = two_blob_scene()
+    with pytest.raises(EncoderError, match="--encoder"):
+        QueryEngine(scene).run("right")
+    with pytest.raises(InputError, match="empty"):
+        QueryEngine(scene).run("  ")
+    with pytest.raises(InputError, match="langsplat train"):
+        QueryEngine(Scene(scene.gaussians)).run("left")
+
+    class Small:
+        def encode_texts(self, texts):
+            return np.ones((len(texts), 3), np.float32)
+
+        def unknown_words(self, text):
+            return tuple(word for word in text.split() if word == "flurb")
+
+    with pytest.raises(EncoderError, match="'flurb'"):
+        QueryEngine(scene, Small()).run("red flurb")
+    with pytest.raises(EncoderError, match="3 numbers"):
+        QueryEngine(scene, Small()).run("red")
+
+    class Stranger(Small):
+        def encode_texts(self, texts):
+            return np.roll(np.eye(D, dtype=np.float32), 3, axis=1)[: len(texts)]
+
+    with pytest.raises(EncoderError, match="other weights"):
+        QueryEngine(scene, Stranger()).run("red")
+
+
+def test_an_empty_scene_can_be_asked():
+    scene, *_ = two_blob_scene()
+    assert scene.language is not None
+    empty = Scene(
+        scene.gaussians.take(np.zeros(0, int)),
+        LanguageField(
+            scene.language.latents[:, :0],
+            scene.language.confidence[:, :0],
+            scene.language.codec,
+            scene.language.canonical,
+            "none",
+            scene.language.phrasebook,
+        ),
+    )
+    result = QueryEngine(empty).run("left")
+    assert not result.found
+    assert result.place is None
+
+
+def test_a_stray_gaussian_decides_nothing():
+    scene, *_ = two_blob_scene()
+    neighbourhood = build_neighbourhood(scene.gaussians)
+    values = np.zeros(120)
+    values[:60] = 0.8
+    values[90] = 1.0  # one wrong Gaussian in the other blob
+    smoothed = neighbourhood.smooth(values)
+    place = locate(neighbourhood, smoothed, 0.5)
+    assert place is not None
+    assert place.position[0] < 0
+
+
+def test_both_orders_agree_inside_one_object_and_are_gated_outside():
+    scene, *_ = two_blob_scene()
+    assert scene.language is not None
+    view = ReferenceRasterizer().view(scene.gaussians, scene.cameras[0])
+    engine = QueryEngine(scene)
+    phrase = engine.text_vector("left")
+    ours = splatted_relevancy(view, engine.relevancy(phrase)[2][:, None], 0.3)[..., 0]
+    paper = decoded_relevancy(view, scene.language, 2, phrase[None], 0.3)[..., 0]
+    _, alpha = view.splat(np.ones((120, 1)))
+    assert (ours[alpha <= 0.3] == 0).all()
+    assert (paper[alpha <= 0.3] == 0).all()
+    covered = alpha > 0.5
+    np.testing.assert_allclose(ours[covered], paper[covered], atol=1e-3)  # the blobs do not overlap
+    column, row, score = peak_pixel(ours, 5)
+    assert column < 32
+    assert score > 0.9
+    assert alpha[row, column] > 0.3
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (30, 40)])
+def test_peak_pixel_of_any_size(shape):
+    image = np.zeros(shape)
+    image[-1, -1] = 1
+    column, row, _ = peak_pixel(image, 20)
+    assert 0 <= column < shape[1]
+    assert 0 <= row < shape[0]

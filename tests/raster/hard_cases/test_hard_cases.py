@@ -1,0 +1,197 @@
+"""The table of hard cases on every rasterizer that loads."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from langsplat_core.errors import BackendError
+from langsplat_core.raster import load_rasterizer, spherical_harmonics
+from langsplat_core.raster.cpu import colour as cpu_colour
+from langsplat_core.raster.reference import ReferenceRasterizer
+from tests.raster.hard_cases.cases import CASES, HUGE_IMAGE, ROW
+from tests.raster.hard_cases.drawings import Case, Drawing, Seen, altered, balls, crowd, draw
+from tests.support.backends import Backend
+from tests.support.close import assert_adjoint, cut_off_band
+from tests.support.measured import Measure
+
+# What rounding can decide in a pixel: two alphas of 1/255, or one last weight alpha T before T reaches 1e-4,
+# which is largest for alpha = 0.99.
+MOST_AT_A_CUT_OFF = 2 / 255 + 0.99 * 1e-4 / (1 - 0.99)
+NAMED = [pytest.param(case, id=case.name) for case in CASES]
+
+
+def run_case(case: Case, drawing: Drawing, backend: Backend, measured: Measure) -> Seen:
+    """Everything the table's docstring promises of every case."""
+    if case.only and backend.name not in case.only:
+        pytest.skip("too long for this backend")
+    try:
+        seen = draw(backend, drawing)
+    except BackendError as error:
+        if backend.name != "cuda":
+            raise
+        pytest.skip(str(error))  # gsplat fixes some settings
+    camera, channels = seen.drawing.camera, seen.drawing.features().shape[1]
+    assert seen.image.shape == (camera.height, camera.width, channels)
+    assert np.isfinite(seen.image).all()
+    check_depth(seen)
+    assert seen.alpha.shape == (camera.height, camera.width)
+    assert seen.alpha.min() >= 0
+    assert seen.alpha.max() <= 1
+    assert seen.view.dropped == case.dropped == sum(seen.drawing.gaussians.invalid_rows().values())
+    if case.compare and backend.name != "reference":
+        compare(seen, measured)
+    if hasattr(seen.view, "gather"):
+        check_adjoint(seen)
+    if hasattr(seen.view, "backward"):
+        check_gradients(seen)
+    if hasattr(seen.view, "frozen"):
+        check_frozen(seen)
+    return seen
+
+
+def check_depth(seen: Seen) -> None:
+    """Finite, and positive only where something is drawn."""
+    assert np.isfinite(seen.view.depth()).all()
+    if not seen.backend.name.startswith("opengl") and seen.backend.name != "cuda":
+        median = seen.view.depth("median")
+        assert np.isfinite(median).all()
+        assert not median[seen.alpha < 0.5 - 1e-6].any()
+
+
+def compare(seen: Seen, measured: Measure) -> None:
+    """The picture is the reference's but at cut-offs, where an alpha of 1/255 may flip."""
+    drawing, backend = seen.drawing, seen.backend
+    settings = backend.expected_settings(drawing.settings)
+    reference = ReferenceRasterizer().view(drawing.gaussians, drawing.camera, settings)
+    want, want_alpha = reference.splat(drawing.features())
+    band = cut_off_band(reference, backend.band)
+    both = np.concatenate([seen.image, seen.alpha[..., None]], -1)
+    error = np.abs(both - np.concatenate([want, want_alpha[..., None]], -1)).max(-1)
+    worst = float(error[~band].max(initial=0))
+    measured(f"hard cases, {backend.name}", "error away from cut-offs", worst)
+    measured(f"hard cases, {backend.name}", "pixels flipped", float((error[band] > backend.tolerance).sum()))
+    assert worst <= backend.tolerance
+    assert error[band].max(initial=0) <= MOST_AT_A_CUT_OFF
+
+
+def check_adjoint(seen: Seen) -> None:
+    """<W x, y> = <x, W^T y>, and nothing for rows that are not drawn."""
+    y = np.random.default_rng(1).normal(size=seen.image.shape).astype(np.float32)
+    gathered = seen.view.gather(y)
+    assert gathered.shape == seen.drawing.features().shape
+    assert np.isfinite(gathered).all()
+    assert not gathered[~seen.drawing.gaussians.valid()].any()
+    sums = seen.view.gather(np.ones((*seen.alpha.shape, 1), np.float32))[:, 0]
+    np.testing.assert_allclose(seen.view.contributions(), sums, rtol=1e-5, atol=1e-5)
+    assert_adjoint(lambda x: seen.view.splat(x)[0], seen.view.gather, seen.drawing.features(), y)
+
+
+def check_frozen(seen: Seen) -> None:
+    """Kept weights are W to 1 / 131070 each; their gather is the adjoint of their splat."""
+    frozen, count = seen.view.frozen(), len(seen.drawing.gaussians)
+    image, alpha = frozen.splat(seen.drawing.features())
+    assert np.array_equal(alpha, seen.alpha)
+    assert np.abs(image - seen.image).max(initial=0) <= count * 0.5 / 65535 + 1e-6
+    assert frozen.dropped == seen.view.dropped
+    check_adjoint(replace(seen, view=frozen, image=image))
+
+
+def check_gradients(seen: Seen) -> None:
+    """Finite everywhere, exactly zero for dropped rows."""
+    rng = np.random.default_rng(2)
+    by_image = rng.normal(size=seen.image.shape)
+    by_alpha = rng.normal(size=seen.alpha.shape)
+    gradients = seen.view.backward(seen.drawing.features(), by_image, by_alpha)
+    dropped = ~seen.drawing.gaussians.valid()
+    assert gradients.values.shape == seen.drawing.features().shape
+    for name, gradient in vars(gradients).items():
+        assert len(gradient) == len(dropped)
+        assert np.isfinite(gradient).all(), name
+        assert not gradient[dropped].any(), name
+
+
+@pytest.mark.parametrize("case", NAMED)
+def test_hard_case(case: Case, backend: Backend, measured: Measure) -> None:
+    case.check(run_case(case, case.build(), backend, measured))
+
+
+@pytest.mark.parametrize("case", NAMED)
+def test_hard_case_antialiased(case: Case, backend: Backend, measured: Measure) -> None:
+    """What holds for every case, with Mip-Splatting's compensation."""
+    drawing = case.build()
+    settings = replace(drawing.settings, antialiased=True)
+    run_case(case, replace(drawing, settings=settings), backend, measured)
+
+
+@pytest.mark.parametrize("coefficient", [1e20, 1e10, 7e4])
+def test_colours_that_overflow(backend: Backend, coefficient: float) -> None:
+    """Finite, 0 where they would be negative, and no gradient there."""
+    drawing = altered("sh", ROW, coefficient * np.array([1.0, -1.0, 0.0]), sh_degree=3)
+    sh, means, eye = drawing.gaussians.sh, drawing.gaussians.means, drawing.camera.position
+    want = spherical_harmonics.colours(sh, means, eye)
+    assert want.min() == 0
+    assert want.max() > 1e3
+    if backend.name == "cpu":
+        got = cpu_colour.colours(sh, means, eye)
+        np.testing.assert_allclose(got, want, rtol=1e-6)
+        gradients = cpu_colour.colours_backward(sh, means, eye, np.ones_like(got))
+        assert all(np.isfinite(gradient).all() for gradient in gradients)
+        assert not gradients[0].transpose(0, 2, 1)[want == 0].any()
+    if backend.name.startswith("opengl"):
+        view = backend.raster.view(drawing.gaussians, drawing.camera)
+        (texture,) = backend.raster.draw(view, ["colour"])
+        image = np.frombuffer(texture.read(), texture.dtype).reshape(27, 40, 4)[..., :3]
+        assert np.isfinite(image).all()
+        assert image.min() >= 0
+        if backend.name == "opengl-single":
+            reference = ReferenceRasterizer().view(drawing.gaussians, drawing.camera).splat(want)[0]
+            np.testing.assert_allclose(image, reference, atol=1e-4 * want.max())
+
+
+def test_dropped_rows_are_told_by_reason() -> None:
+    """One sentence per reason; a row with several faults counts once."""
+    gaussians = altered("means", [0, 1], np.nan).gaussians
+    quats, logits, sh = gaussians.quats_wxyz.copy(), gaussians.opacity_logits.copy(), gaussians.sh.copy()
+    log_scales = gaussians.log_scales.copy()
+    quats[1:5], logits[4:6], sh[6, 0, 1], log_scales[7:9, 2] = 0, np.nan, 1e38, [np.inf, 81]
+    broken = replace(gaussians, quats_wxyz=quats, opacity_logits=logits, sh=sh, log_scales=log_scales)
+    assert broken.invalid_rows() == {
+        "position not finite": 2,
+        "scale not a number or above e^80": 2,
+        "rotation zero or not finite": 3,
+        "opacity not a number": 1,
+        "colour not finite or above 1e20": 1,
+    }
+    assert (~broken.valid()).sum() == 9
+    assert crowd().gaussians.invalid_rows() == {}
+
+
+@pytest.mark.parametrize("case", NAMED)
+def test_results_do_not_depend_on_the_number_of_threads(case: Case) -> None:
+    """Forward, adjoint and gradients of the CPU backend, bit for bit."""
+    drawing = case.build()
+    target = np.random.default_rng(3).normal(size=(drawing.camera.height, drawing.camera.width, 1))
+    x = drawing.features()[:, :1]
+    results = []
+    for threads in (1, 2, 5):
+        view = load_rasterizer("cpu", threads=threads).view(
+            drawing.gaussians, drawing.camera, drawing.settings
+        )
+        gradients = vars(view.backward(x, target, target[..., 0])).values()
+        results.append([*view.splat(x), view.gather(target), view.depth("median"), *gradients])
+    for other in results[1:]:
+        assert all(np.array_equal(one, two) for one, two in zip(results[0], other, strict=True))
+
+
+@pytest.mark.slow
+def test_huge_image(backend: Backend, measured: Measure) -> None:
+    HUGE_IMAGE.check(run_case(HUGE_IMAGE, HUGE_IMAGE.build(), backend, measured))
+
+
+@pytest.mark.slow
+def test_more_intersections_than_an_int32_holds() -> None:
+    """17000 Gaussians that fill 129600 tiles each: one line, before any memory is asked for."""
+    gaussians = balls(np.linspace(2.0, 3.0, 17_000), 0.1, 1e6)
+    with pytest.raises(BackendError, match="smaller"):
+        load_rasterizer("cpu").view(gaussians, HUGE_IMAGE.build().camera)

@@ -1,0 +1,83 @@
+"""Codecs: fitting, folding of batch normalisation, storage."""
+
+import numpy as np
+import pytest
+import torch
+
+from langsplat_core.arrays import unit
+from langsplat_core.config import CodecConfig
+from langsplat_core.scene import AutoencoderCodec, LinearCodec, codec_from_tensors
+from langsplat_core.training.language.codec_fit import _layers, _networks, fit_codec, reconstruction_cosine
+
+
+def clustered(count: int = 400, clusters: int = 12, dim: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    centres = unit(rng.normal(size=(clusters, dim)))
+    labels = rng.integers(clusters, size=count)
+    return unit(centres[labels] + 0.02 * rng.normal(size=(count, dim))).astype(np.float32), labels
+
+
+@pytest.mark.parametrize("d", [2, 3, 8])
+def test_autoencoder_keeps_a_scenes_vectors_apart(d):
+    vectors, labels = clustered()
+    codec = fit_codec(vectors, CodecConfig(latent_dim=d, steps=700, batch=128, lr=2e-3))
+    latents = codec.encode(vectors)
+    np.testing.assert_allclose(np.linalg.norm(latents, axis=1), 1, atol=1e-5)
+    assert reconstruction_cosine(codec, vectors) > 0.9
+    # what a query needs: the decoded vector is closest to its own cluster
+    centres = unit(np.stack([vectors[labels == c].mean(0) for c in range(12)]))
+    right = (codec.decode(latents) @ centres.T).argmax(1) == labels
+    assert right.mean() > 0.97
+
+
+def test_linear_codec_is_the_best_subspace():
+    vectors, _ = clustered()
+    codec = fit_codec(vectors, CodecConfig(kind="linear", latent_dim=6))
+    assert isinstance(codec, LinearCodec)
+    np.testing.assert_allclose(codec.basis @ codec.basis.T, np.eye(6), atol=1e-5)
+    kept = ((vectors @ codec.basis.T) ** 2).sum()
+    singular = np.linalg.svd(vectors.astype(np.float64), compute_uv=False)
+    assert kept == pytest.approx((singular[:6] ** 2).sum(), rel=1e-5)
+
+
+def test_folding_batch_normalisation_changes_nothing():
+    torch.manual_seed(0)
+    encoder, _ = _networks(32, 3)
+    data = torch.randn(200, 32)
+    for _ in range(5):
+        encoder(data)
+    encoder.eval()
+    with torch.no_grad():
+        want = encoder(data).numpy()
+    x = data.numpy()
+    layers = _layers(encoder)
+    for index, (weight, bias) in enumerate(layers):
+        x = x @ weight.T + bias
+        if index + 1 < len(layers):
+            x = np.maximum(x, 0)
+    np.testing.assert_allclose(x, want, atol=2e-5)
+
+
+def test_codec_survives_its_tensors():
+    vectors, _ = clustered(64)
+    for kind in ("linear", "autoencoder"):
+        codec = fit_codec(vectors, CodecConfig(kind=kind, steps=3))
+        again = codec_from_tensors(codec.kind, codec.tensors())
+        assert type(again) is type(codec)
+        np.testing.assert_array_equal(again.encode(vectors), codec.encode(vectors))
+        latents = codec.encode(vectors)
+        np.testing.assert_array_equal(again.decode(latents), codec.decode(latents))
+
+
+def test_broken_tensors_are_named():
+    with pytest.raises(ValueError, match="unknown codec kind"):
+        codec_from_tensors("vq", {})
+    with pytest.raises(ValueError, match="basis"):
+        codec_from_tensors("linear", {})
+    with pytest.raises(ValueError, match="encoder"):
+        codec_from_tensors("autoencoder", {})
+    w, b = np.zeros((3, 8), np.float32), np.zeros(3, np.float32)
+    with pytest.raises(ValueError, match="mirror"):
+        AutoencoderCodec(((w, b),), ((np.zeros((9, 3), np.float32), np.zeros(9, np.float32)),))
+    with pytest.raises(ValueError, match="codec encoder"):
+        AutoencoderCodec(((w, np.zeros(4, np.float32)),), ((w.T.copy(), np.zeros(8, np.float32)),))
