@@ -8,20 +8,31 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from langsplat_core.formats import load_scene, save_scene
+    from langsplat_core.config import TrainConfig
+    from langsplat_core.pipeline.train import train_scene
     from langsplat_core.query.engine import QueryEngine, QueryResult
-    from langsplat_core.raster import load_rasterizer
-    from langsplat_core.scene import Camera, Gaussians, LanguageField, Scene, look_at
+    from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
+    from langsplat_core.raster.render import Rendering, render
+    from langsplat_core.scene import Camera, Gaussians, Intrinsics, LanguageField, Scene, look_at
+    from langsplat_core.semantics.clip import load_text_encoder
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "load_scene": "langsplat_core.formats",
     "save_scene": "langsplat_core.formats",
+    "render": "langsplat_core.raster.render",
+    "Rendering": "langsplat_core.raster.render",
     "load_rasterizer": "langsplat_core.raster",
+    "load_lifting_rasterizer": "langsplat_core.raster",
+    "load_text_encoder": "langsplat_core.semantics.clip",
     "QueryEngine": "langsplat_core.query.engine",
     "QueryResult": "langsplat_core.query.engine",
+    "train_scene": "langsplat_core.pipeline.train",
+    "TrainConfig": "langsplat_core.config",
     "Camera": "langsplat_core.scene",
     "Gaussians": "langsplat_core.scene",
+    "Intrinsics": "langsplat_core.scene",
     "LanguageField": "langsplat_core.scene",
     "Scene": "langsplat_core.scene",
     "look_at": "langsplat_core.scene",
@@ -30,14 +41,21 @@ _HOMES = {
 __all__ = [
     "Camera",
     "Gaussians",
+    "Intrinsics",
     "LanguageField",
     "QueryEngine",
     "QueryResult",
+    "Rendering",
     "Scene",
+    "TrainConfig",
+    "load_lifting_rasterizer",
     "load_rasterizer",
     "load_scene",
+    "load_text_encoder",
     "look_at",
+    "render",
     "save_scene",
+    "train_scene",
 ]
 
 

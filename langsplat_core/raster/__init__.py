@@ -2,19 +2,29 @@
 
 from collections.abc import Mapping
 from importlib import import_module
+from importlib.util import find_spec
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from langsplat_core.errors import BackendError, InputError
-from langsplat_core.raster.protocol import DepthKind, LiftingRasterizer, LiftingView, Rasterizer, View
+from langsplat_core.raster.protocol import (
+    FreezableView,
+    LiftingRasterizer,
+    LiftingView,
+    MedianDepth,
+    Rasterizer,
+    View,
+)
 
 __all__ = [
     "BACKENDS",
-    "DepthKind",
+    "FreezableView",
     "LiftingRasterizer",
     "LiftingView",
+    "MedianDepth",
     "Rasterizer",
     "View",
+    "load_lifting_rasterizer",
     "load_rasterizer",
 ]
 
@@ -22,15 +32,16 @@ __all__ = [
 class _Backend(NamedTuple):
     module: str
     class_name: str
+    lifts: bool  # whether its views can gather
     otherwise: str  # what to try where it cannot load
 
 
 BACKENDS: Mapping[str, _Backend] = MappingProxyType(
     {
-        "reference": _Backend("langsplat_core.raster.reference", "ReferenceRasterizer", "cpu"),
-        "cpu": _Backend("langsplat_core.raster.cpu.rasterizer", "CpuRasterizer", "reference"),
-        "opengl": _Backend("langsplat_core.raster.opengl.rasterizer", "GlRasterizer", "cpu"),
-        "cuda": _Backend("langsplat_core.raster.gsplat", "GsplatRasterizer", "cpu"),
+        "reference": _Backend("langsplat_core.raster.reference", "ReferenceRasterizer", True, "cpu"),
+        "cpu": _Backend("langsplat_core.raster.cpu.rasterizer", "CpuRasterizer", True, "reference"),
+        "opengl": _Backend("langsplat_core.raster.opengl.rasterizer", "GlRasterizer", False, "cpu"),
+        "cuda": _Backend("langsplat_core.raster.gsplat", "GsplatRasterizer", True, "cpu"),
     }
 )
 
@@ -51,3 +62,30 @@ def load_rasterizer(name: str, **resources: Any) -> Rasterizer:
             f"rasterizer {name!r} cannot load ({reason}); try --backend {backend.otherwise}"
         ) from error
     return rasterizer
+
+
+def load_lifting_rasterizer(backend: str = "auto") -> LiftingRasterizer:
+    """A rasterizer whose views can gather: "cpu", "cuda", "reference", or "auto", CUDA where gsplat draws on
+    this machine, else the CPU.
+
+    Raises InputError for one that cannot gather and BackendError as `load_rasterizer` does.
+    """
+    if backend == "auto":
+        backend = "cuda" if _cuda_may_work() else "cpu"
+        try:
+            return cast(LiftingRasterizer, load_rasterizer(backend))
+        except BackendError:  # a device without working kernels
+            backend = "cpu"
+    if backend in BACKENDS and not BACKENDS[backend].lifts:
+        able = ", ".join(name for name, entry in BACKENDS.items() if entry.lifts)
+        raise InputError(f"rasterizer {backend!r} cannot lift; choose one of {able}")
+    return cast(LiftingRasterizer, load_rasterizer(backend))
+
+
+def _cuda_may_work() -> bool:
+    """Whether it is worth importing gsplat, which takes seconds: it is there, and so is a CUDA device."""
+    if find_spec("gsplat") is None or find_spec("torch") is None:
+        return False
+    from torch import cuda
+
+    return cuda.is_available()

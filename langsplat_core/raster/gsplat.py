@@ -1,23 +1,107 @@
-"""The CUDA backend: gsplat's rasterizer behind the same small interface.
+"""The CUDA backend: gsplat's rasterizer behind our interfaces. This is the only file that knows gsplat.
 
 gsplat (1.5 or newer) is an optional dependency and compiles its kernels at first use. What differs from the
-reference, all of it gsplat's own: float32 throughout, alpha capped at 0.999 in 1.5, at 0.99 from 1.6 on, and
-`gather` sums with atomics, so its last digits vary between runs.
+reference, all of it gsplat's own: float32 throughout, alpha capped at 0.999 in 1.5, at 0.99 from 1.6 on,
+`gather` sums with atomics, so its last digits vary between runs, and view directions do not contribute to the
+gradient by the means.
 """
 
 import subprocess
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from gsplat import rasterization
 from torch import Tensor
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
-from langsplat_core.raster.protocol import DepthKind
 from langsplat_core.scene import Camera, Gaussians, look_at
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceGaussians:
+    """N Gaussians as float32 tensors on the CUDA device, raw as in `Gaussians`."""
+
+    means: Tensor  # (N, 3)
+    log_scales: Tensor  # (N, 3)
+    quats_wxyz: Tensor  # (N, 4)
+    opacity_logits: Tensor  # (N,)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """One picture, differentiable by everything that it was made of."""
+
+    image: Tensor  # (H, W, C)
+    alpha: Tensor  # (H, W)
+    means_px: Tensor  # gsplat's projected means; keeps its gradient where it has one
+    visible: Tensor  # (N,) bool
+
+
+def require_device() -> None:
+    """Raises BackendError unless gsplat draws, forwards and backwards, on a CUDA device of this machine.
+
+    The first use on a machine may compile for some minutes.
+    """
+    if not torch.cuda.is_available():
+        raise BackendError("torch finds no CUDA device")
+    shapes = {"means": (1, 3), "log_scales": (1, 3), "quats_wxyz": (1, 4), "opacity_logits": (1,)}
+    one = DeviceGaussians(**{n: torch.ones(*s, device="cuda").requires_grad_() for n, s in shapes.items()})
+    camera = look_at(np.array([5.0, 5.0, 5.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]), (16, 16))
+    try:  # an import alone does not prove that there are kernels
+        draw(one, torch.ones(1, 1, device="cuda"), camera, INRIA).image.sum().backward()
+    except (ImportError, RuntimeError, OSError, AttributeError, subprocess.SubprocessError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise BackendError(
+            f"gsplat does not work here ({reason}); "
+            "install langsplat-viewer[cuda] with a matching CUDA toolkit"
+        ) from error
+
+
+def draw(
+    gaussians: DeviceGaussians,
+    values: Tensor,
+    camera: Camera,
+    settings: RasterSettings,
+    sh_degree: int | None = None,
+    view_matrix: Array | None = None,
+) -> Drawn:
+    """Blend (N, C) `values`; or with `sh_degree`, the colours of (N, K, 3) spherical harmonics.
+
+    view_matrix: (4, 4) world to camera, in place of the camera's own.
+    """
+    from gsplat import rasterization
+
+    intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
+    view = camera.world_to_camera if view_matrix is None else view_matrix
+    images, alphas, extra = rasterization(
+        means=gaussians.means,
+        quats=gaussians.quats_wxyz,
+        scales=gaussians.log_scales.exp(),
+        opacities=gaussians.opacity_logits.sigmoid(),
+        colors=values,
+        viewmats=to_device(view[None]),
+        Ks=torch.tensor([intrinsics], dtype=torch.float32, device="cuda"),
+        width=camera.width,
+        height=camera.height,
+        near_plane=settings.near,
+        eps2d=settings.dilation,
+        sh_degree=sh_degree,
+        packed=False,
+        rasterize_mode="antialiased" if settings.antialiased else "classic",
+    )
+    means_px = extra["means2d"]
+    if means_px.requires_grad:
+        means_px.retain_grad()
+    visible = extra["radii"].reshape(len(gaussians.means), -1).amin(1) > 0  # (N,) or (N, 2), by version
+    return Drawn(images[0], alphas[0, ..., 0], means_px, visible)
+
+
+def to_device(array: Array) -> Tensor:
+    """As a float32 tensor on the device."""
+    return torch.tensor(np.asarray(array), dtype=torch.float32, device="cuda")
 
 
 class GsplatView:
@@ -25,33 +109,21 @@ class GsplatView:
 
     def __init__(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> None:
         valid = gaussians.valid()
-        self.camera = camera
+        self.camera, self._settings = camera, settings
         self.dropped = int((~valid).sum())
         self._count, self._rows = len(gaussians), np.flatnonzero(valid)
         kept = gaussians.take(self._rows)
         # Relative to the camera in float64 first: float32 has no digits left far from the origin.
         means = kept.means.astype(np.float64) - camera.position
         self._depths = (means @ camera.rotation[2]).astype(np.float32)
-        view = np.eye(4)
-        view[:3, :3] = camera.rotation
-        intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        self._arguments: dict[str, Any] = {
-            "means": _to_device(means),
-            "quats": _to_device(kept.quats_wxyz),
-            "scales": _to_device(kept.log_scales).exp(),
-            "opacities": _to_device(kept.opacity_logits).sigmoid(),
-            "viewmats": _to_device(view[None]),
-            "Ks": _to_device(intrinsics[None]),
-            "width": camera.width,
-            "height": camera.height,
-            "near_plane": settings.near,
-            "eps2d": settings.dilation,
-            "rasterize_mode": "antialiased" if settings.antialiased else "classic",
-        }
+        self._turn = np.eye(4)
+        self._turn[:3, :3] = camera.rotation
+        arrays: tuple[Any, ...] = (means, kept.log_scales, kept.quats_wxyz, kept.opacity_logits)
+        self._gaussians = DeviceGaussians(*map(to_device, arrays))
 
     def _draw(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        image, alpha, _ = rasterization(colors=values, sh_degree=None, **self._arguments)
-        return image[0], alpha[0, ..., 0]
+        drawn = draw(self._gaussians, values, self.camera, self._settings, view_matrix=self._turn)
+        return drawn.image, drawn.alpha
 
     def splat(self, values: Array) -> tuple[Array, Array]:
         """See `View.splat`; float32."""
@@ -60,7 +132,7 @@ class GsplatView:
             shape = (self.camera.height, self.camera.width)
             return np.zeros((*shape, channels), np.float32), np.zeros(shape, np.float32)
         with torch.no_grad():
-            image, alpha = self._draw(_to_device(values[self._rows]))
+            image, alpha = self._draw(to_device(values[self._rows]))
         return image.cpu().numpy(), alpha.cpu().numpy()
 
     def gather(self, image: Array) -> Array:
@@ -69,7 +141,7 @@ class GsplatView:
         gathered = np.zeros((self._count, channels), np.float32)
         if len(self._rows) > 0:
             values = torch.zeros(len(self._rows), channels, device="cuda", requires_grad=True)
-            (grad,) = torch.autograd.grad(self._draw(values)[0], values, _to_device(image))
+            (grad,) = torch.autograd.grad(self._draw(values)[0], values, to_device(image))
             gathered[self._rows] = grad.cpu().numpy()
         return gathered
 
@@ -77,18 +149,12 @@ class GsplatView:
         """See `LiftingView.contributions`; float32."""
         return self.gather(np.ones((self.camera.height, self.camera.width, 1), np.float32))[:, 0]
 
-    def depth(self, kind: DepthKind = "expected") -> Array:
-        """See `View.depth`; float32, `expected` only."""
-        if kind != "expected":
-            raise BackendError("rasterizer 'cuda' has no median depth; use --backend cpu for that")
+    def depth(self) -> Array:
+        """See `View.depth`; float32."""
         both = np.ones((self._count, 2), np.float32)
         both[self._rows, 0] = self._depths
         sums, weights = np.moveaxis(self.splat(both)[0], -1, 0)
         return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), 0)
-
-
-def _to_device(array: Array) -> Tensor:
-    return torch.tensor(np.asarray(array), dtype=torch.float32, device="cuda")
 
 
 class GsplatRasterizer:
@@ -97,15 +163,7 @@ class GsplatRasterizer:
     name = "cuda"
 
     def __init__(self) -> None:
-        if not torch.cuda.is_available():
-            raise BackendError("torch finds no CUDA device")
-        one = Gaussians(np.zeros((1, 3)), np.zeros((1, 3)), np.ones((1, 4)), np.ones(1), np.zeros((1, 1, 3)))
-        camera = look_at(np.array([0.0, 0.0, 5.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]), (16, 16))
-        try:  # an import alone does not prove that there are kernels
-            self.view(one, camera).gather(np.ones((16, 16, 1), np.float32))
-        except (ImportError, RuntimeError, OSError, AttributeError, subprocess.SubprocessError) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise BackendError(f"gsplat does not work here: {reason}") from error
+        require_device()
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> GsplatView:
         """See `Rasterizer.view`. Of the settings near, dilation and antialiased apply; gsplat fixes the rest.

@@ -5,13 +5,11 @@ blending weights alpha_i T_i of the view. A backend projects a view once and the
 (``W x``) and, where it can lift, `gather` (``W^T y``, the exact adjoint).
 """
 
-from typing import Literal, Protocol
+from typing import Protocol, runtime_checkable
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.scene import Camera, Gaussians
-
-DepthKind = Literal["expected", "median"]
 
 
 class View(Protocol):
@@ -24,12 +22,17 @@ class View(Protocol):
     def splat(self, values: Array) -> tuple[Array, Array]:
         """(N, C) values -> (H, W, C) image ``W x`` without background, and (H, W) alpha = row sums of W."""
 
-    def depth(self, kind: DepthKind = "expected") -> Array:
-        """(H, W) depth along camera z, world units; 0 where nothing is drawn.
+    def depth(self) -> Array:
+        """(H, W) alpha-weighted mean depth along camera z, world units; 0 where nothing is drawn."""
 
-        `expected` is the alpha-weighted mean; `median` is the depth of the Gaussian at which the
-        transmittance falls to 0.5 or below (0 where it never does).
-        """
+
+@runtime_checkable
+class MedianDepth(Protocol):
+    """A view that also knows where half of the light is stopped."""
+
+    def median_depth(self) -> Array:
+        """(H, W) camera z, world units, of the Gaussian at which the transmittance falls to 0.5 or below; 0
+        where it never does."""
 
 
 class LiftingView(View, Protocol):
@@ -40,6 +43,14 @@ class LiftingView(View, Protocol):
 
     def contributions(self) -> Array:
         """(N,) blending weight of each Gaussian summed over the picture, in pixels: ``W^T 1``."""
+
+
+@runtime_checkable
+class FreezableView(Protocol):
+    """A lifting view that can keep W itself."""
+
+    def frozen(self) -> LiftingView:
+        """The same view with W kept in fewer digits: `splat` and `gather` get cheaper, from some calls on."""
 
 
 class Rasterizer(Protocol):

@@ -13,13 +13,13 @@ Image formation, from top to bottom (constants in `config.RasterSettings`):
    kernel: two capped layers then leave T just below 1e-4, where the double nearest 0.99 leaves it just above.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array, rotation_matrices, sigmoid
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster.protocol import DepthKind
 from langsplat_core.scene import Camera, Gaussians
 
 
@@ -85,14 +85,39 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INR
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One Gaussian's part in a picture."""
+
+    index: int
+    window: tuple[slice, slice]  # rows and columns of the picture that it may touch
+    weights: Array  # alpha T in the window, 0 where it is not added
+    after: Array  # transmittance behind it
+
+
+def alphas_in(f: Footprints, index: int, window: tuple[slice, slice], settings: RasterSettings) -> Array:
+    """Alpha of one Gaussian at the pixels of a window (rows, columns), capped but not cut off."""
+    rows, columns = window
+    dx = np.arange(columns.start, columns.stop) + 0.5 - f.means_px[index, 0]
+    dy = (np.arange(rows.start, rows.stop) + 0.5 - f.means_px[index, 1])[:, None]
+    xx, xy, yy = f.conics[index]
+    alpha = f.opacities[index] * np.exp(-0.5 * (xx * dx**2 + 2 * xy * dx * dy + yy * dy**2))
+    return np.minimum(np.float64(np.float32(settings.alpha_max)), alpha)
+
+
+def rim(f: Footprints, settings: RasterSettings, relative: float) -> Array:
+    """(N, 2) half extents of the contour alpha = alpha_min (1 - relative), px, a little generous."""
+    squared = 2 * np.log(np.maximum(f.opacities / settings.alpha_min, 1 + 1e-9))
+    return f.extents_px * np.sqrt(1 + 2.1 * relative / squared)[:, None] + 1e-3
+
+
 class ReferenceView:
     """Blending weights of one view, recomputed Gaussian by Gaussian in every call."""
 
-    def __init__(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> None:
-        self.camera, self.settings = camera, settings
-        self.footprints = project(gaussians, camera, settings)
-        self.dropped = int(len(gaussians) - gaussians.valid().sum())
-        self.order = np.argsort(self.footprints.depths, kind="stable")
+    def __init__(self, footprints: Footprints, camera: Camera, settings: RasterSettings, dropped: int) -> None:
+        self.camera, self.settings, self.footprints = camera, settings, footprints
+        self.dropped = dropped
+        self.order = np.argsort(footprints.depths, kind="stable")
         self.windows = self._windows()
 
     def _windows(self) -> tuple[Array, Array]:
@@ -108,10 +133,9 @@ class ReferenceView:
         high[f.opacities == 0] = 0
         return low, high
 
-    def _weights(self):  # type: ignore[no-untyped-def]
-        """Yield (index, window, weights, transmittance after) front to back: steps 3 and 4."""
+    def steps(self) -> Iterator[Step]:
+        """Every Gaussian that is drawn, front to back: steps 3 and 4 of the module's list."""
         f, s = self.footprints, self.settings
-        alpha_max = np.float64(np.float32(s.alpha_max))
         height, width = self.camera.height, self.camera.width
         transmittance = np.ones((height, width))
         running = np.ones((height, width), bool)
@@ -121,11 +145,7 @@ class ReferenceView:
             if x0 >= x1 or y0 >= y1:
                 continue
             window = np.s_[y0:y1, x0:x1]
-            dx = np.arange(x0, x1) + 0.5 - f.means_px[i, 0]
-            dy = (np.arange(y0, y1) + 0.5 - f.means_px[i, 1])[:, None]
-            xx, xy, yy = f.conics[i]
-            alpha = f.opacities[i] * np.exp(-0.5 * (xx * dx**2 + 2 * xy * dx * dy + yy * dy**2))
-            alpha = np.minimum(alpha_max, alpha)
+            alpha = alphas_in(f, i, window, s)
             hit = running[window] & (alpha >= s.alpha_min)
             next_transmittance = transmittance[window] * (1 - alpha)
             stops = hit & (next_transmittance <= s.transmittance_min)
@@ -133,39 +153,65 @@ class ReferenceView:
             hit &= ~stops
             weights = np.where(hit, alpha * transmittance[window], 0)
             transmittance[window] = np.where(hit, next_transmittance, transmittance[window])
-            yield i, window, weights, transmittance[window]
+            yield Step(int(i), window, weights, transmittance[window])
+
+    def cut_off_band(self, relative: float) -> Array:
+        """(H, W) True where some Gaussian's alpha, or the transmittance behind it, is within `relative` of a
+        cut-off: there rounding decides, and a fast rasterizer may come out on the other side."""
+        f, s = self.footprints, self.settings
+        size = (self.camera.width, self.camera.height)
+        band, running = np.zeros(size[::-1], bool), np.ones(size[::-1], bool)
+        transmittance = np.ones(size[::-1])
+        reach = rim(f, s, relative)
+        low = np.clip(np.floor(f.means_px - reach), 0, size).astype(int)
+        high = np.clip(np.ceil(f.means_px + reach), 0, size).astype(int)
+        for i in self.order[(f.opacities > 0)[self.order] & (low < high).all(1)[self.order]]:
+            window = np.s_[low[i, 1] : high[i, 1], low[i, 0] : high[i, 0]]
+            alpha = alphas_in(f, i, window, s)
+            after = transmittance[window] * (1 - alpha)
+            hit = running[window] & (alpha >= s.alpha_min)
+            band[window] |= running[window] & (np.abs(alpha / s.alpha_min - 1) < relative)
+            if s.transmittance_min > 0:
+                band[window] |= hit & (np.abs(after / s.transmittance_min - 1) < relative)
+            stops = hit & (after <= s.transmittance_min)
+            running[window] &= ~stops
+            transmittance[window] = np.where(hit & ~stops, after, transmittance[window])
+        return band
 
     def splat(self, values: Array) -> tuple[Array, Array]:
         """See `View.splat`; float64."""
         check_array("values", np.asarray(values), (len(self.order), "C"))
         image = np.zeros((self.camera.height, self.camera.width, values.shape[1]))
         alpha = np.zeros((self.camera.height, self.camera.width))
-        for i, window, weights, _ in self._weights():
-            image[window] += weights[..., None] * values[i]
-            alpha[window] += weights
+        for step in self.steps():
+            image[step.window] += step.weights[..., None] * values[step.index]
+            alpha[step.window] += step.weights
         return image, alpha
 
     def gather(self, image: Array) -> Array:
         """See `LiftingView.gather`; float64."""
         check_array("image", np.asarray(image), (self.camera.height, self.camera.width, "C"))
         values = np.zeros((len(self.order), image.shape[2]))
-        for i, window, weights, _ in self._weights():
-            values[i] = np.tensordot(weights, image[window], 2)
+        for step in self.steps():
+            values[step.index] = np.tensordot(step.weights, image[step.window], 2)
         return values
 
     def contributions(self) -> Array:
         """See `LiftingView.contributions`; float64."""
         return self.gather(np.ones((self.camera.height, self.camera.width, 1)))[:, 0]
 
-    def depth(self, kind: DepthKind = "expected") -> Array:
+    def depth(self) -> Array:
         """See `View.depth`; float64."""
-        if kind == "expected":
-            total, alpha = self.splat(self.footprints.depths[:, None])
-            return np.where(alpha > 0, total[..., 0] / np.where(alpha > 0, alpha, 1), 0)
+        total, alpha = self.splat(self.footprints.depths[:, None])
+        return np.where(alpha > 0, total[..., 0] / np.where(alpha > 0, alpha, 1), 0)
+
+    def median_depth(self) -> Array:
+        """See `MedianDepth.median_depth`; float64."""
         median = np.zeros((self.camera.height, self.camera.width))
-        for i, window, weights, after in self._weights():
-            first = (median[window] == 0) & (weights > 0) & (after <= 0.5)
-            median[window][first] = self.footprints.depths[i]
+        for step in self.steps():
+            passed = (step.weights > 0) & (step.after <= 0.5)
+            first = (median[step.window] == 0) & passed
+            median[step.window][first] = self.footprints.depths[step.index]
         return median
 
 
@@ -176,4 +222,5 @@ class ReferenceRasterizer:
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> ReferenceView:
         """See `Rasterizer.view`."""
-        return ReferenceView(gaussians, camera, settings)
+        dropped = int(len(gaussians) - gaussians.valid().sum())
+        return ReferenceView(project(gaussians, camera, settings), camera, settings, dropped)

@@ -17,7 +17,7 @@ from langsplat_core.formats import load_scene
 from langsplat_core.raster.reference import ReferenceRasterizer, ReferenceView
 from langsplat_core.scene import Camera, Gaussians, Scene
 from tests.support.backends import Backend
-from tests.support.close import assert_adjoint, cut_off_band
+from tests.support.close import assert_adjoint
 from tests.support.measured import Measure
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
@@ -55,7 +55,7 @@ def truth_of(gaussians: Gaussians, camera: Camera, settings: RasterSettings, wid
     both = np.column_stack([random_values(len(gaussians), 3), view.footprints.depths])
     sums, alpha = view.splat(both)
     depth = sums[..., 3] / np.where(alpha > 0, alpha, 1)
-    return Truth(sums[..., :3], alpha, depth, cut_off_band(view, width), view)
+    return Truth(sums[..., :3], alpha, depth, view.cut_off_band(width), view)
 
 
 truth_of_scene = lru_cache(maxsize=4)(truth_of)  # shared by the backends
@@ -199,7 +199,7 @@ def test_far_corner_of_a_large_image(fast_backend: Backend, measured: Measure, s
     gaussians, camera, corner = corner_case(*size)
     x = random_values(len(gaussians), 3)
     reference = REFERENCE.view(gaussians, corner, fast_backend.expected_settings(INRIA))
-    band = cut_off_band(reference, 3 * fast_backend.band)
+    band = reference.cut_off_band(3 * fast_backend.band)
     image = fast_backend.raster.view(gaussians, camera).splat(x)[0][-30:, -40:]
     error = np.abs(image - reference.splat(x)[0]).max(-1)
     measured(f"{fast_backend.name}, corner of {size[0]} px", "error away from cut-offs", error[~band].max())

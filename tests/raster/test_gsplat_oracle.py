@@ -19,6 +19,10 @@ from tests.support.scenes import random_camera, random_gaussians
 
 torch = pytest.importorskip("torch")
 oracle = pytest.importorskip("gsplat.cuda._torch_impl")
+# gsplat publishes its plain twin under private names only
+covariance_and_precision = oracle._quat_scale_to_covar_preci  # noqa: SLF001  see above
+fused_projection = oracle._fully_fused_projection  # noqa: SLF001  see above
+spherical_harmonics_of_gsplat = oracle._spherical_harmonics  # noqa: SLF001  see above
 
 
 def double(array: Array) -> "torch.Tensor":
@@ -28,9 +32,9 @@ def double(array: Array) -> "torch.Tensor":
 def gsplat_projection(gaussians: Gaussians, camera: Camera) -> tuple[Array, ...]:
     """gsplat's radii, means2d, depths, conics and compensations, in float64."""
     quats = torch.nn.functional.normalize(double(gaussians.quats_wxyz), dim=1)
-    covariances, _ = oracle._quat_scale_to_covar_preci(quats, double(gaussians.log_scales).exp())
+    covariances, _ = covariance_and_precision(quats, double(gaussians.log_scales).exp())
     intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    found = oracle._fully_fused_projection(
+    found = fused_projection(
         double(gaussians.means), covariances, double(camera.world_to_camera)[None], double(intrinsics)[None],
         camera.width, camera.height, eps2d=GSPLAT.dilation, near_plane=GSPLAT.near, calc_compensations=True,
     )  # fmt: skip
@@ -80,7 +84,7 @@ def test_spherical_harmonics(degree: int) -> None:
     gaussians, eye = random_gaussians(300, 7, degree), np.array([0.4, -2.5, 0.7])
     gaussians = replace(gaussians, sh=2.5 * gaussians.sh)
     directions = double(gaussians.means.astype(np.float64) - eye)
-    want = oracle._spherical_harmonics(degree, directions, double(gaussians.sh)).numpy() + 0.5
+    want = spherical_harmonics_of_gsplat(degree, directions, double(gaussians.sh)).numpy() + 0.5
     want = np.maximum(want, 0)
     assert (want == 0).any()
     ours = spherical_harmonics.colours(gaussians.sh, gaussians.means, eye)
@@ -91,7 +95,7 @@ def test_spherical_harmonics(degree: int) -> None:
 def test_covariance() -> None:
     gaussians = random_gaussians(200, 8, scale_range=(1e-4, 1.0))
     quats = torch.nn.functional.normalize(double(gaussians.quats_wxyz), dim=1)
-    want, precision = oracle._quat_scale_to_covar_preci(quats, double(gaussians.log_scales).exp())
+    want, precision = covariance_and_precision(quats, double(gaussians.log_scales).exp())
     scales = np.exp(gaussians.log_scales.astype(np.float64))
     half = rotation_matrices(gaussians.quats_wxyz.astype(np.float64)) * scales[:, None, :]
     ours = half @ half.transpose(0, 2, 1)

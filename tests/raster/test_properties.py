@@ -17,7 +17,7 @@ from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Gaussians
 from tests.support.backends import Backend
-from tests.support.close import assert_adjoint, cut_off_band
+from tests.support.close import assert_adjoint
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
 Case = tuple[Gaussians, Camera, RasterSettings]
@@ -117,7 +117,7 @@ def test_equal_to_the_reference(fast_backend: Backend, slow: bool) -> None:
         x = random_values(len(gaussians), 3)
         expected = fast_backend.expected_settings(raster_settings)
         reference = ReferenceRasterizer().view(gaussians, camera, expected)
-        band = cut_off_band(reference, fast_backend.band)
+        band = reference.cut_off_band(fast_backend.band)
         want, want_alpha = reference.splat(x)
         image, alpha = view_of(fast_backend, case).splat(x)
         error = np.maximum(np.abs(image - want).max(-1), np.abs(alpha - want_alpha))

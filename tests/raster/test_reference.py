@@ -10,7 +10,7 @@ from langsplat_core.config import GSPLAT, INRIA
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.spherical_harmonics import colours
 from langsplat_core.scene import Camera, Gaussians
-from tests.support.close import assert_adjoint, assert_close_off_cuts, assert_gradient, cut_off_band
+from tests.support.close import BAND, assert_adjoint, assert_close_off_cuts, assert_gradient
 from tests.support.golden import load_golden
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
@@ -48,7 +48,7 @@ def test_the_nearer_of_two_hides_the_farther():
     image, alpha = view.splat(np.eye(2))
     np.testing.assert_allclose(image[10, 10], [0.5 * 0.4, 0.6], atol=1e-7)
     np.testing.assert_allclose(alpha[10, 10], 1 - 0.5 * 0.4, atol=1e-7)
-    assert view.depth("median")[10, 10] == 3.0
+    assert view.median_depth()[10, 10] == 3.0
     np.testing.assert_allclose(view.depth()[10, 10], (0.2 * 4 + 0.6 * 3) / 0.8, atol=1e-6)
 
 
@@ -170,7 +170,7 @@ def test_the_band_finds_a_pixel_on_the_contour():
     camera = axis_camera()
     variance = (30.0 * 0.2 / 3.0) ** 2 + 0.3
     on_contour = np.exp(0.5 * 16 / variance) / 255  # alpha is 1/255 four pixels from the centre
-    band = cut_off_band(RASTER.view(balls([3.0], [on_contour]), camera))
+    band = RASTER.view(balls([3.0], [on_contour]), camera).cut_off_band(BAND)
     assert band[10, 14]
     assert band[6, 10]
     assert band.sum() == 4

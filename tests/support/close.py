@@ -9,40 +9,8 @@ from collections.abc import Callable
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import RasterSettings
-from langsplat_core.raster.reference import Footprints, ReferenceView
 
 BAND = 1e-4  # relative distance to a cut-off; float32 kernels are within about 1e-6 of it
-
-
-def cut_off_band(view: ReferenceView, relative: float = BAND) -> Array:
-    """(H, W) True where some Gaussian's alpha, or the transmittance behind it, lies at a cut-off.
-
-    At means within `relative` of it.
-    """
-    settings: RasterSettings = view.settings
-    f: Footprints = view.footprints
-    height, width = view.camera.height, view.camera.width
-    band = np.zeros((height, width), bool)
-    transmittance, running = np.ones((height, width)), np.ones((height, width), bool)
-    low, high = view.windows  # one pixel is added all round: an alpha just below the cut-off lies outside
-    for i in view.order[(high > low).all(1)[view.order]]:
-        (x0, y0), (x1, y1) = np.maximum(low[i] - 1, 0), high[i] + 1
-        window = np.s_[y0:y1, x0:x1]
-        dx = np.arange(x0, min(x1, width)) + 0.5 - f.means_px[i, 0]
-        dy = (np.arange(y0, min(y1, height)) + 0.5 - f.means_px[i, 1])[:, None]
-        xx, xy, yy = f.conics[i]
-        power = -0.5 * (xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy)
-        alpha = np.minimum(f.opacities[i] * np.exp(power), float(np.float32(settings.alpha_max)))
-        open_here, before = running[window], transmittance[window]
-        after = before * (1 - alpha)
-        hit = open_here & (alpha >= settings.alpha_min)
-        band[window] |= open_here & (np.abs(alpha - settings.alpha_min) < relative * settings.alpha_min)
-        limit = settings.transmittance_min
-        band[window] |= hit & (np.abs(after - limit) < relative * limit)
-        running[window] &= ~(hit & (after <= limit))
-        transmittance[window] = np.where(hit & running[window], after, before)
-    return band
 
 
 def assert_close_off_cuts(got: Array, want: Array, band: Array, atol: float = 2e-5) -> None:

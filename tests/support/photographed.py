@@ -8,8 +8,9 @@ import pycolmap
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from langsplat_core import arrays
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.intrinsics import Lens
+from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.datasets.undistort import undistorted_points
 from langsplat_core.scene import Camera, look_at
 
@@ -30,12 +31,14 @@ def _texture(seed: int) -> Array:
 TEXTURES = [_texture(seed) for seed in range(3)]
 
 
-def photograph(lens: Lens, world_to_camera: Array) -> Array:
+def photograph(intrinsics: PhotoIntrinsics, world_to_camera: Array) -> Array:
     """(H, W, 3) uint8: what a camera in the room sees, sampled at pixel centres."""
-    y, x = np.mgrid[: lens.height, : lens.width] + 0.5
-    xy = np.stack([(x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy], -1).reshape(-1, 2)
-    if lens.distortion is not None:
-        xy = undistorted_points(lens.distortion, xy)
+    y, x = np.mgrid[: intrinsics.height, : intrinsics.width] + 0.5
+    xy = np.stack([(x - intrinsics.cx) / intrinsics.fx, (y - intrinsics.cy) / intrinsics.fy], -1).reshape(
+        -1, 2
+    )
+    if intrinsics.distortion is not None:
+        xy = undistorted_points(intrinsics.distortion, xy)
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     origin = -rotation.T @ translation
     rays = np.concatenate([xy, np.ones((len(xy), 1))], 1) @ rotation
@@ -53,7 +56,7 @@ def photograph(lens: Lens, world_to_camera: Array) -> Array:
             picture[chosen, channel] = map_coordinates(
                 TEXTURES[index][..., channel], uv, order=1, mode="grid-wrap"
             )
-    return np.rint(picture).astype(np.uint8).reshape(lens.height, lens.width, 3)
+    return np.rint(picture).astype(np.uint8).reshape(intrinsics.height, intrinsics.width, 3)
 
 
 def poses(count: int) -> list[Array]:
@@ -72,34 +75,38 @@ def distance_to_room(points: Array) -> Array:
 
 def psnr(a: Array, b: Array) -> float:
     """dB, of two uint8 pictures."""
-    return float(10 * np.log10(255**2 / max(np.mean((a.astype(float) - b.astype(float)) ** 2), 1e-9)))
+    return arrays.psnr(a / 255, b / 255)
 
 
 def pinhole_picture(camera: Camera, samples: int = 1) -> Array:
     """What `camera` ought to show, with `samples` x `samples` samples averaged in every pixel."""
     fine = camera.resized(camera.width * samples, camera.height * samples)
-    lens = Lens(fine.width, fine.height, fine.fx, fine.fy, fine.cx, fine.cy)
-    picture = photograph(lens, camera.world_to_camera).astype(np.float64)
+    intrinsics = PhotoIntrinsics(fine.width, fine.height, fine.fx, fine.fy, fine.cx, fine.cy)
+    picture = photograph(intrinsics, camera.world_to_camera).astype(np.float64)
     blocks = picture.reshape(camera.height, samples, camera.width, samples, 3)
     return np.rint(blocks.mean((1, 3))).astype(np.uint8)
 
 
 @lru_cache(maxsize=64)  # the same few photographs serve many tests
-def sensor_picture(lens: Lens, pose: bytes) -> Image.Image:
+def sensor_picture(intrinsics: PhotoIntrinsics, pose: bytes) -> Image.Image:
     """`photograph` with 3x3 samples averaged per pixel, as a sensor does; small pictures alias without.
 
     `pose` holds the bytes of a float64 world-to-camera matrix.
     """
     matrix = np.frombuffer(pose).reshape(4, 4)
-    return Image.fromarray(photograph(lens.resized(3 * lens.width, 3 * lens.height), matrix)).reduce(3)
+    return Image.fromarray(
+        photograph(intrinsics.regridded(3 * intrinsics.width, 3 * intrinsics.height), matrix)
+    ).reduce(3)
 
 
-def write_photos(folder: Path, lens: Lens, matrices: list[Array], stem: str = "view") -> list[str]:
+def write_photos(
+    folder: Path, intrinsics: PhotoIntrinsics, matrices: list[Array], stem: str = "view"
+) -> list[str]:
     """PNG files ``<stem>_<index>.png`` in `folder`; returns their names."""
     folder.mkdir(parents=True, exist_ok=True)
     names = [f"{stem}_{index}.png" for index in range(len(matrices))]
     for name, matrix in zip(names, matrices, strict=True):
-        sensor_picture(lens, matrix.tobytes()).save(folder / name)
+        sensor_picture(intrinsics, matrix.tobytes()).save(folder / name)
     return names
 
 

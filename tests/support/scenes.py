@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from langsplat_core.arrays import Array, logit
+from langsplat_core.arrays import Array, logit, rotation_matrices
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians, look_at
 
 
@@ -60,6 +60,12 @@ def random_camera(
         height * rng.uniform(0.35, 0.65),
         camera.world_to_camera,
     )
+
+
+def covariances(g: Gaussians) -> Array:
+    """(N, 3, 3) in world units, float64."""
+    axes = rotation_matrices(g.quats_wxyz.astype(float)) * np.exp(g.log_scales.astype(float))[:, None]
+    return axes @ axes.transpose(0, 2, 1)
 
 
 def random_values(n: int, channels: int, seed: int = 0) -> Array:

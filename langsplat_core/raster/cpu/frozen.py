@@ -8,7 +8,6 @@ from langsplat_core.arrays import Array
 from langsplat_core.raster.cpu import frozen_kernels
 from langsplat_core.raster.cpu.operator import TileOperator
 from langsplat_core.raster.cpu.tiles import TILE
-from langsplat_core.raster.protocol import DepthKind
 
 
 class FrozenView(TileOperator):
@@ -33,9 +32,13 @@ class FrozenView(TileOperator):
         """Memory of what is kept beyond the view itself."""
         return self._weights.nbytes + self._firsts.nbytes + self.tiles.rows.nbytes + self._alpha.nbytes
 
-    def depth(self, kind: DepthKind = "expected") -> Array:
-        """See `View.depth`."""
-        return self._view.depth(kind)
+    def depth(self) -> Array:
+        """See `View.depth`; float32."""
+        return self._view.depth()
+
+    def median_depth(self) -> Array:
+        """See `MedianDepth.median_depth`; float32."""
+        return self._view.median_depth()
 
     def _splat_part(self, values: Array, image: Array, alpha: Array) -> None:
         alpha[:] = self._alpha

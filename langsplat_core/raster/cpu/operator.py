@@ -9,7 +9,6 @@ from langsplat_core.compiled import Workers, plain
 from langsplat_core.raster.cpu import blend
 from langsplat_core.raster.cpu.planes import padded
 from langsplat_core.raster.cpu.tiles import Tiles
-from langsplat_core.raster.protocol import DepthKind
 from langsplat_core.scene import Camera
 
 _CHANNELS_AT_ONCE = 32  # a tile's state stays in the first level cache
@@ -25,8 +24,12 @@ class TileOperator(ABC):
         self.dropped = 0
 
     @abstractmethod
-    def depth(self, kind: DepthKind = "expected") -> Array:
+    def depth(self) -> Array:
         """See `View.depth`; float32."""
+
+    @abstractmethod
+    def median_depth(self) -> Array:
+        """See `MedianDepth.median_depth`; float32."""
 
     @abstractmethod
     def _splat_part(self, values: Array, image: Array, alpha: Array) -> None:

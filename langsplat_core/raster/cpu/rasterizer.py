@@ -14,15 +14,12 @@ from langsplat_core.arrays import Array, check_array
 from langsplat_core.compiled import Workers, plain, shared_workers
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.raster.cpu import blend, blend_backward, projection, projection_backward
-from langsplat_core.raster.cpu.colour import colours, colours_backward
 from langsplat_core.raster.cpu.frozen import FrozenView
 from langsplat_core.raster.cpu.operator import TileOperator, in_fours
 from langsplat_core.raster.cpu.tiles import bin_tiles, depth_order
 from langsplat_core.raster.cpu.walk import make_cutoffs
-from langsplat_core.raster.protocol import DepthKind
 from langsplat_core.scene import Camera, Gaussians
 
-__all__ = ["CpuRasterizer", "CpuView", "FrozenView", "GaussianGradients", "colours", "colours_backward"]
 
 @dataclass(frozen=True, eq=False)
 class GaussianGradients:
@@ -117,12 +114,14 @@ class CpuView(TileOperator):
     def _over_tiles(self, kernel: Callable[..., None], *arguments: Any) -> None:
         self.workers.run(kernel, len(self.tiles.starts) - 1, self.tiles, self._geometry, *arguments)
 
-    def depth(self, kind: DepthKind = "expected") -> Array:
+    def median_depth(self) -> Array:
+        """See `MedianDepth.median_depth`; float32."""
+        median = np.empty((self.camera.height, self.camera.width, 1), np.float32)
+        self._over_tiles(blend.median_depth, self._depths, self._cutoffs, median)
+        return median[..., 0]
+
+    def depth(self) -> Array:
         """See `View.depth`; float32."""
-        if kind == "median":
-            median = np.empty((self.camera.height, self.camera.width, 1), np.float32)
-            self._over_tiles(blend.median_depth, self._depths, self._cutoffs, median)
-            return median[..., 0]
         # Ones are blended along: alpha itself is 1 - T, which has no digits left where it is small.
         both = np.zeros((self.count, 2), np.float32)
         both[self.order] = np.stack([self._depths, np.ones_like(self._depths)], -1)

@@ -17,7 +17,6 @@ from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.raster.opengl.draw import Targets, drawing, set_uniforms, shader
 from langsplat_core.raster.opengl.scene_textures import HALF_MAX, SceneTextures, front_to_back
-from langsplat_core.raster.protocol import DepthKind
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 
 MAX_TARGETS = 4  # colour attachments of one pass, three values each
@@ -106,9 +105,7 @@ class GlRasterizer:
         RGBA, premultiplied, row 0 on top. Depth comes last, as (sum of weight * camera z, alpha) in
         single precision. The images belong to the rasterizer and hold until its next `draw`.
         """
-        scene = self.scene(view.gaussians)
-        if self._current is not view:
-            self._make_current(scene, view)
+        scene = self.project(view)
         program = self._splat_program(len(sources), with_depth)
         targets = self._targets_for(view.camera, len(sources), with_depth)
         set_uniforms(
@@ -136,8 +133,14 @@ class GlRasterizer:
         vao.release()
         return targets.images
 
-    def _make_current(self, scene: SceneTextures, view: "GlView") -> None:
-        """Fill the scene's projection textures and draw order with those of `view`."""
+    def project(self, view: "GlView") -> SceneTextures:
+        """The scene's textures, with the projection and the draw order of `view` in them."""
+        scene = self.scene(view.gaussians)
+        if self._current is not view:
+            self._fill(scene, view)
+        return scene
+
+    def _fill(self, scene: SceneTextures, view: "GlView") -> None:
         camera, settings = view.camera, view.settings
         high = camera.position.astype(np.float32)
         margin_x = (settings.fov_clamp - 1) * 0.5 * camera.width / camera.fx
@@ -256,22 +259,18 @@ class GlView:
         flat = np.frombuffer(texture.read(), texture.dtype)
         return flat.reshape(self.camera.height, self.camera.width, texture.components).astype(np.float32)
 
-    def depth(self, kind: DepthKind = "expected") -> Array:
-        """See `View.depth`; float32. BackendError for "median": a blender cannot find it."""
-        if kind != "expected":
-            raise BackendError("rasterizer 'opengl' has no median depth image; use --backend cpu")
+    def depth(self) -> Array:
+        """See `View.depth`; float32."""
         total, alpha = np.moveaxis(self._read(self.rasterizer.draw(self, [], with_depth=True)[0]), -1, 0)
         return np.where(alpha > 0, total / np.where(alpha > 0, alpha, 1), 0)
 
     def depth_at(self, column: int, row: int) -> tuple[float, float]:
         """Surface depth and alpha of one pixel, from the projection read back.
 
-        The depth is the median (see `View.depth`) or, where the transmittance stays above 0.5, the
+        The depth is the median (see `MedianDepth`) or, where the transmittance stays above 0.5, the
         alpha-weighted mean; camera z in world units, 0 where nothing is drawn.
         """
-        scene = self.rasterizer.scene(self.gaussians)
-        if self.rasterizer._current is not self:
-            self.rasterizer._make_current(scene, self)
+        scene = self.rasterizer.project(self)
         order = self.order[::-1]
         x, y, z, opacity = np.frombuffer(scene.placement.read(), "f4").reshape(-1, 4)[order].T
         along_x, along_y, *inverse = np.frombuffer(scene.shape.read(), "f4").reshape(-1, 4)[order].T

@@ -12,11 +12,12 @@ import pytest
 from langsplat_core.config import GSPLAT, INRIA
 from langsplat_core.errors import BackendError, InputError
 from langsplat_core.raster import BACKENDS, load_rasterizer, spherical_harmonics
-from langsplat_core.raster.cpu.rasterizer import CpuRasterizer, colours, colours_backward
+from langsplat_core.raster.cpu.colour import colours, colours_backward
+from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.cpu.tiles import depth_order
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera
-from tests.support.close import assert_adjoint, assert_close_off_cuts, cut_off_band
+from tests.support.close import BAND, assert_adjoint, assert_close_off_cuts
 from tests.support.golden import load_golden
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
@@ -28,7 +29,7 @@ def assert_same_picture(gaussians, camera, settings=INRIA, channels=3, atol=2e-5
     """Splat, alpha, gather, depths of the CPU equal the reference's; returns the CPU's image."""
     x = random_values(len(gaussians), channels)
     fast, slow = CPU.view(gaussians, camera, settings), REFERENCE.view(gaussians, camera, settings)
-    band = cut_off_band(slow)
+    band = slow.cut_off_band(BAND)
     (image, alpha), (want, want_alpha) = fast.splat(x), slow.splat(x)
     assert image.dtype == alpha.dtype == np.float32
     assert_close_off_cuts(image, want, band, atol)
@@ -39,7 +40,7 @@ def assert_same_picture(gaussians, camera, settings=INRIA, channels=3, atol=2e-5
     assert_adjoint(lambda v: fast.splat(v)[0], fast.gather, x, y)
     depth = slow.depth()
     assert_close_off_cuts(fast.depth(), depth, band, atol * max(depth.max(), 1))
-    halves = np.abs(fast.depth("median") - slow.depth("median")) > 1e-5 * max(depth.max(), 1)
+    halves = np.abs(fast.median_depth() - slow.median_depth()) > 1e-5 * max(depth.max(), 1)
     assert halves.sum() <= 1 + band.sum()  # T of exactly 0.5 is one more step
     assert fast.dropped == slow.dropped
     return image

@@ -8,15 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from langsplat_core.arrays import Array
 from langsplat_core.config import GSPLAT, INRIA, RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.raster.opengl.context import create_egl_context
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.raster.opengl.scene_textures import front_to_back
+from langsplat_core.raster.protocol import MedianDepth
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.spherical_harmonics import colours
 from langsplat_core.scene import Camera, Gaussians
+from tests.support.gl_context import gl_state
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
 # Without the two cut-offs the image is a smooth function of its inputs, and float32 follows float64
@@ -171,7 +172,7 @@ def test_median_depth_of_one_pixel(gl, raster):
     gaussians, camera = random_gaussians(120), random_camera(1)
     reference = ReferenceRasterizer().view(gaussians, camera, SMOOTH)
     view = raster.view(gaussians, camera, SMOOTH)
-    median, mean = reference.depth("median"), reference.depth()
+    median, mean = reference.median_depth(), reference.depth()
     _, alpha = reference.splat(np.zeros((120, 0)))
     want = np.where(median > 0, median, mean)
     rows, columns = np.nonzero(np.abs(alpha - 0.5) > 1e-4)
@@ -182,9 +183,8 @@ def test_median_depth_of_one_pixel(gl, raster):
         assert covered == pytest.approx(alpha[row, column], abs=1e-5)
 
 
-def test_a_median_image_is_refused(gl, raster):
-    with pytest.raises(BackendError, match="--backend cpu"):
-        raster.view(random_gaussians(3), random_camera()).depth("median")
+def test_a_blender_promises_no_median_image(gl, raster):
+    assert not isinstance(raster.view(random_gaussians(3), random_camera()), MedianDepth)
 
 
 def test_an_image_beyond_the_driver_is_refused(gl, raster):
@@ -206,24 +206,6 @@ def test_front_to_back_is_stable():
     rng = np.random.default_rng(0)
     for depths in (rng.integers(0, 9, 500).astype(float), rng.uniform(size=500), np.zeros(7), np.zeros(0)):
         np.testing.assert_array_equal(front_to_back(depths), np.argsort(depths, kind="stable"))
-
-
-def gl_state() -> Array:
-    """What a user interface drawn next would trip over, asked of the driver itself."""
-    import ctypes
-
-    library = ctypes.CDLL("libGL.so.1")
-    blend, cull, depth_test, scissor_test = 0x0BE2, 0x0B44, 0x0B71, 0x0C11
-    enabled = [int(library.glIsEnabled(flag)) for flag in (blend, cull, depth_test, scissor_test)]
-    blend_source, blend_target, blend_equation, viewport, framebuffer = 0x80C9, 0x80C8, 0x8009, 0x0BA2, 0x8CA6
-    numbers = []
-    for name in (blend_source, blend_target, blend_equation, viewport, framebuffer):
-        buffer = (ctypes.c_int * 4)(-1, -1, -1, -1)
-        library.glGetIntegerv(name, buffer)
-        numbers += list(buffer)
-    masks = (ctypes.c_ubyte * 4)()
-    library.glGetBooleanv(0x0C23, masks)
-    return np.array([*enabled, *numbers, *masks])
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks libGL.so.1")

@@ -15,7 +15,7 @@ import numpy as np
 
 from langsplat_core.config import GSPLAT, INRIA
 from langsplat_core.scene import Camera, Gaussians
-from tests.raster.hard_cases.drawings import (
+from tests.support.hard_cases.drawings import (
     AXIS,
     Case,
     Check,

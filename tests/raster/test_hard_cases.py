@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from langsplat_core.errors import BackendError
-from langsplat_core.raster import load_rasterizer, spherical_harmonics
+from langsplat_core.raster import MedianDepth, load_rasterizer, spherical_harmonics
 from langsplat_core.raster.cpu import colour as cpu_colour
 from langsplat_core.raster.reference import ReferenceRasterizer
-from tests.raster.hard_cases.cases import CASES, HUGE_IMAGE, ROW
-from tests.raster.hard_cases.drawings import Case, Drawing, Seen, altered, balls, crowd, draw
 from tests.support.backends import Backend
-from tests.support.close import assert_adjoint, cut_off_band
+from tests.support.close import assert_adjoint
+from tests.support.hard_cases.cases import CASES, HUGE_IMAGE, ROW
+from tests.support.hard_cases.drawings import Case, Drawing, Seen, altered, balls, crowd, draw
 from tests.support.measured import Measure
 
 # What rounding can decide in a pixel: two alphas of 1/255, or one last weight alpha T before T reaches 1e-4,
@@ -53,8 +53,8 @@ def run_case(case: Case, drawing: Drawing, backend: Backend, measured: Measure) 
 def check_depth(seen: Seen) -> None:
     """Finite, and positive only where something is drawn."""
     assert np.isfinite(seen.view.depth()).all()
-    if not seen.backend.name.startswith("opengl") and seen.backend.name != "cuda":
-        median = seen.view.depth("median")
+    if isinstance(seen.view, MedianDepth):
+        median = seen.view.median_depth()
         assert np.isfinite(median).all()
         assert not median[seen.alpha < 0.5 - 1e-6].any()
 
@@ -65,7 +65,7 @@ def compare(seen: Seen, measured: Measure) -> None:
     settings = backend.expected_settings(drawing.settings)
     reference = ReferenceRasterizer().view(drawing.gaussians, drawing.camera, settings)
     want, want_alpha = reference.splat(drawing.features())
-    band = cut_off_band(reference, backend.band)
+    band = reference.cut_off_band(backend.band)
     both = np.concatenate([seen.image, seen.alpha[..., None]], -1)
     error = np.abs(both - np.concatenate([want, want_alpha[..., None]], -1)).max(-1)
     worst = float(error[~band].max(initial=0))
@@ -179,7 +179,7 @@ def test_results_do_not_depend_on_the_number_of_threads(case: Case) -> None:
             drawing.gaussians, drawing.camera, drawing.settings
         )
         gradients = vars(view.backward(x, target, target[..., 0])).values()
-        results.append([*view.splat(x), view.gather(target), view.depth("median"), *gradients])
+        results.append([*view.splat(x), view.gather(target), view.median_depth(), *gradients])
     for other in results[1:]:
         assert all(np.array_equal(one, two) for one, two in zip(results[0], other, strict=True))
 

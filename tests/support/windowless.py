@@ -1,0 +1,55 @@
+"""A viewer without a window: a fake picture, fake files, and frames on demand."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.errors import FormatError
+from langsplat_core.scene import Scene
+from langsplat_viewer import actions
+from langsplat_viewer.state import GLIDE_SECONDS, ViewerState
+from langsplat_viewer.viewer import Viewer
+from tests.support.fakes import blob_scene
+
+SCENES = {
+    "blobs.ply": blob_scene(),
+    "plain.ply": blob_scene(field=False),
+    "bare.ply": blob_scene(with_cameras=False),
+    "book.ply": blob_scene(phrasebook=True),
+}
+
+
+class FakeSurface:
+    """A picture of one colour whose surface is a plane through the origin."""
+
+    def point_at(self, u: float, v: float):
+        return None if u > 0.9 else np.array([u - 0.5, v - 0.5, 0.0])
+
+    def capture(self, state: ViewerState):
+        return np.full((6, 8, 3), 77, np.uint8)
+
+
+def load(path: Path) -> Scene:
+    if path.name not in SCENES:
+        raise FormatError(f"{path}: broken; export it again")
+    return SCENES[path.name]
+
+
+def settle(viewer: Viewer, seconds: float = 10.0) -> None:
+    """Frames until the worker has nothing left to do."""
+    end = time.monotonic() + seconds
+    while viewer.worker.current is not None:
+        assert time.monotonic() < end, "the worker never finished"
+        actions.tick(viewer, 0.0)
+        time.sleep(0.002)
+    actions.tick(viewer, 0.0)
+
+
+def arrive(viewer: Viewer) -> None:
+    """Let a gliding camera arrive."""
+    actions.tick(viewer, viewer.clock + 2 * GLIDE_SECONDS)
+
+
+def errors(viewer: Viewer) -> list[str]:
+    return [message.text for message in viewer.state.messages if message.is_error]

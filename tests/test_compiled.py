@@ -1,0 +1,79 @@
+"""Machine code that is kept on disk never outlives the sources it was made from."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core import compiled
+from langsplat_core.compiled import Workers, digest_of_sources, kernel_folder
+from langsplat_core.raster.cpu import blend, planes, tiles
+
+PACKAGE = Path(compiled.__file__).parent
+KERNEL = """
+from langsplat_core.arrays import Array
+from langsplat_core.compiled import kernel
+from langsplat_core.adding import added
+@kernel
+def run(first: int, last: int, out: Array) -> None:
+    for i in range(first, last):
+        out[i] = added(i)
+"""
+HELPER = (
+    "from langsplat_core.compiled import helper\nSTEP = {step}\n@helper\ndef added(i):\n    return i + STEP\n"
+)
+CALL = "import numpy as np; from langsplat_core.running import run; x = np.zeros(3); run(0, 3, x); print(x)"
+
+
+def test_a_change_in_another_files_helper_is_noticed(tmp_path: Path) -> None:
+    package = tmp_path / "langsplat_core"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    for name in ("arrays.py", "compiled.py", "errors.py"):
+        shutil.copy(PACKAGE / name, package / name)
+    (package / "running.py").write_text(KERNEL)
+
+    def called(step: int) -> str:
+        (package / "adding.py").write_text(HELPER.format(step=step))
+        environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+        environment["PYTHONPATH"] = str(tmp_path)
+        done = subprocess.run(
+            [sys.executable, "-c", CALL],
+            env=environment,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return done.stdout.strip()
+
+    assert called(1) == "[1. 2. 3.]"
+    assert called(5) == "[5. 6. 7.]"
+    kept = list((package / "__pycache__" / "kernels" / "running").iterdir())
+    assert len(kept) == 1  # the code of the older sources is gone
+
+
+def test_the_key_follows_imports_and_nothing_else(tmp_path: Path) -> None:
+    lonely = tmp_path / "lonely.py"
+    lonely.write_text("import numpy\n")
+    before = digest_of_sources(lonely)
+    digest_of_sources.cache_clear()
+    lonely.write_text("import numpy  # changed\n")
+    assert digest_of_sources(lonely) != before
+    sources = [Path(module.__file__ or "") for module in (blend, planes, tiles)]
+    assert len({digest_of_sources(source) for source in sources}) == 3
+    assert kernel_folder(sources[0]).parent.name == "raster.cpu.blend"
+
+
+def test_pieces_cover_a_range_once() -> None:
+    def mark(first: int, last: int, out: np.ndarray) -> None:
+        out[first:last] += 1
+
+    for count in (0, 1, 7, 100):
+        for threads in (1, 3):
+            out = np.zeros(count, int)
+            Workers(threads).run(mark, count, out)
+            assert (out == 1).all()
