@@ -3,6 +3,7 @@
 from langsplat_core.scene.camera import Camera, look_at
 from langsplat_core.scene.codec import AutoencoderCodec, Codec, LinearCodec, codec_from_tensors
 from langsplat_core.scene.gaussians import SH_COUNTS, Gaussians
+from langsplat_core.scene.intrinsics import Intrinsics
 from langsplat_core.scene.language import CANONICAL_PHRASES, LEVELS, LanguageField
 from langsplat_core.scene.scene import Scene
 
@@ -14,6 +15,7 @@ __all__ = [
     "Camera",
     "Codec",
     "Gaussians",
+    "Intrinsics",
     "LanguageField",
     "LinearCodec",
     "Scene",

@@ -1,10 +1,11 @@
 """The pinhole camera, in OpenCV's frame: x right, y down, z forward."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array
+from langsplat_core.scene.intrinsics import Intrinsics
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,18 +45,20 @@ class Camera:
         """(3, 3) world-to-camera rotation; its rows are the camera's right, down and forward axes."""
         return self.world_to_camera[:3, :3]
 
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """The camera without its pose."""
+        return Intrinsics(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+
+    def with_intrinsics(self, intrinsics: Intrinsics) -> "Camera":
+        """Another camera in the same pose; its size must be whole pixels."""
+        size = (int(intrinsics.width), int(intrinsics.height))
+        inner = (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy)
+        return Camera(*size, *inner, self.world_to_camera, self.name)
+
     def resized(self, width: int, height: int) -> "Camera":
         """The same view on another pixel grid."""
-        sx, sy = width / self.width, height / self.height
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * sx,
-            fy=self.fy * sy,
-            cx=self.cx * sx,
-            cy=self.cy * sy,
-        )
+        return self.with_intrinsics(self.intrinsics.resized(width, height))
 
     def project(self, points_world: Array) -> tuple[Array, Array]:
         """(N, 3) world points -> (N, 2) pixel positions and (N,) depths along z (may be <= 0)."""

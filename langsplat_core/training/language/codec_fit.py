@@ -5,6 +5,9 @@ batch normalisation and ReLU, latent normalised to length 1; decoder d-16-32-64-
 ReLU) and the paper's loss, L1 plus cosine distance. Linear: singular vectors.
 """
 
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
 import numpy as np
 import torch
 from torch import nn
@@ -20,17 +23,16 @@ DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
 
 def fit_codec(vectors: Array, config: CodecConfig, progress: Progress = silent) -> Codec:
     """(M, D) unit CLIP vectors -> a codec for them. Deterministic for a given seed on one machine."""
-    if config.kind == "linear":
-        return fit_linear(vectors, config.latent_dim)
-    return fit_autoencoder(vectors, config, progress)
+    return FITTERS[config.kind](vectors, config, progress)
 
 
-def fit_linear(vectors: Array, rank: int) -> LinearCodec:
-    """The `rank` leading right singular vectors: the best basis in the least-squares sense (Eckart-Young)."""
+def fit_linear(vectors: Array, config: CodecConfig, progress: Progress = silent) -> LinearCodec:
+    """The leading right singular vectors, `config.latent_dim` of them: the best basis in the least-squares
+    sense (Eckart-Young)."""
     # Through the D x D Gram matrix: D is 512, M may be a million. float64 keeps its squared condition usable.
     wide = np.asarray(vectors, np.float64)
     _, axes = np.linalg.eigh(wide.T @ wide)
-    return LinearCodec(np.ascontiguousarray(axes[:, ::-1][:, :rank].T, np.float32))
+    return LinearCodec(np.ascontiguousarray(axes[:, ::-1][:, : config.latent_dim].T, np.float32))
 
 
 def fit_autoencoder(vectors: Array, config: CodecConfig, progress: Progress = silent) -> AutoencoderCodec:
@@ -44,10 +46,15 @@ def fit_autoencoder(vectors: Array, config: CodecConfig, progress: Progress = si
         torch.set_num_threads(threads)
 
 
+FITTERS: Mapping[str, Callable[[Array, CodecConfig, Progress], Codec]] = MappingProxyType(
+    {AutoencoderCodec.kind: fit_autoencoder, LinearCodec.kind: fit_linear}
+)
+
+
 def _train(vectors: Array, config: CodecConfig, progress: Progress) -> AutoencoderCodec:
     torch.manual_seed(config.seed)
     data = torch.from_numpy(np.ascontiguousarray(vectors, np.float32))
-    encoder, decoder = _networks(data.shape[1], config.latent_dim)
+    encoder, decoder = networks(data.shape[1], config.latent_dim)
     parameters = [*encoder.parameters(), *decoder.parameters()]
     optimiser = torch.optim.Adam(parameters, lr=config.lr)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.steps)
@@ -65,7 +72,7 @@ def _train(vectors: Array, config: CodecConfig, progress: Progress) -> Autoencod
         if step % 50 == 0 or step + 1 == config.steps:
             progress(f"codec: cosine {cosine.item():.3f}", (step + 1) / config.steps)
     _settle_statistics(encoder, data)
-    return AutoencoderCodec(_layers(encoder), _layers(decoder))
+    return AutoencoderCodec(folded_layers(encoder), folded_layers(decoder))
 
 
 def reconstruction_cosine(codec: Codec, vectors: Array) -> float:
@@ -73,7 +80,7 @@ def reconstruction_cosine(codec: Codec, vectors: Array) -> float:
     return float((codec.decode(codec.encode(vectors)) * vectors).sum(1).mean())
 
 
-def _networks(dim: int, latent_dim: int) -> tuple[nn.Sequential, nn.Sequential]:
+def networks(dim: int, latent_dim: int) -> tuple[nn.Sequential, nn.Sequential]:
     encoder: list[nn.Module] = []
     width = dim
     for size in ENCODER_WIDTHS:
@@ -104,7 +111,7 @@ def _settle_statistics(encoder: nn.Sequential, data: torch.Tensor) -> None:
     encoder.eval()
 
 
-def _layers(network: nn.Sequential) -> tuple[tuple[Array, Array], ...]:
+def folded_layers(network: nn.Sequential) -> tuple[tuple[Array, Array], ...]:
     """Weights as (out, in), bias pairs, with each batch normalisation folded into the layer before it."""
     layers: list[tuple[Array, Array]] = []
     for module in network:

@@ -20,11 +20,12 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.compiled import helper, kernel, shared_workers
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster.protocol import LiftingRasterizer
+from langsplat_core.raster.protocol import FreezableView, LiftingRasterizer
 from langsplat_core.scene import LEVELS, Camera, Codec, Gaussians
 from langsplat_core.semantics.store import ImageFeatures
 
 MIN_WEIGHT = 1e-3  # a Gaussian's weight in a mask, in pixels, below which the pair is not stored
+FREEZE_FROM = 4  # gather passes over one view from which keeping its weights is cheaper
 MEDIAN_STEPS = 8
 FAINT = 2e-3  # share of a Gaussian's weight below which a mask has no say in its median
 
@@ -50,8 +51,11 @@ def find_memberships(
     blocks, levels, vectors = [], [], []
     for done, (camera, features) in enumerate(views):
         view = rasterizer.view(gaussians, camera, settings)
+        starts = range(0, len(features.vectors), chunk)
+        if len(starts) >= FREEZE_FROM and isinstance(view, FreezableView):
+            view = view.frozen()
         columns = []
-        for start in range(0, len(features.vectors), chunk):
+        for start in starts:
             size = min(chunk, len(features.vectors) - start)
             weights = view.gather(_onehot(features.labels, start, size))
             columns.append(sparse.csr_matrix(np.where(weights > MIN_WEIGHT, weights, 0).astype(np.float32)))

@@ -33,16 +33,9 @@ def fingerprint(capture: Capture, config: RadianceConfig, train_indices: Sequenc
     settings = asdict(config)
     settings.pop("checkpoint_every")
     settings.pop("backend")
-    digest = hashlib.blake2b(digest_size=16)
-    digest.update(json.dumps([settings, [int(i) for i in train_indices]], sort_keys=True).encode())
-    for camera, image in zip(capture.cameras, capture.images, strict=True):
-        numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
-        digest.update(np.array(numbers, dtype=np.float64).tobytes())
-        digest.update(camera.world_to_camera.tobytes())
-        digest.update(image.tobytes())
-    digest.update(capture.points.astype(np.float64).tobytes())
-    digest.update(capture.colours.tobytes())
-    return digest.hexdigest()
+    every = [camera.world_to_camera.tolist() for camera in capture.cameras]  # their spread sets the rates
+    facts = [settings, every, capture.digest(train_indices)]
+    return hashlib.blake2b(json.dumps(facts, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 def save_checkpoint(path: Path, state: TrainingState, made_from: str) -> None:

@@ -1,23 +1,21 @@
 """Rendering with gradients by every parameter of the Gaussians, one small interface, two backends.
 
 * CPU: the project's own kernels behind a `torch.autograd.Function`; arrays are shared, not copied.
-* CUDA: gsplat (`training.differentiable_cuda`), imported only when asked for or found.
+* CUDA: gsplat (`differentiable_cuda`), imported only when asked for or found.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.errors import BackendError
-from langsplat_core.raster.cpu.rasterizer import CpuRasterizer, CpuView, colours, colours_backward
+from langsplat_core.raster.cpu.colour import colours, colours_backward
+from langsplat_core.raster.cpu.rasterizer import CpuRasterizer, CpuView
 from langsplat_core.scene import Camera, Gaussians
-
-Backend = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +40,7 @@ class DifferentiableRenderer(Protocol):
     device: torch.device  # where parameters and pictures live
 
     def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> Rendered:
-        """Draw the raw `parameters` (see `training.state`) with harmonics up to `sh_degree`."""
+        """Draw the raw `parameters` (see `state`) with harmonics up to `sh_degree`."""
 
 
 def sh_coefficients(parameters: dict[str, Tensor], sh_degree: int) -> Tensor:
@@ -121,20 +119,3 @@ class CpuRenderer:
             probe,
         )
         return Rendered(image, alpha, visible[0], probe)
-
-
-def renderer_for(backend: Backend) -> DifferentiableRenderer:
-    """The renderer a user asked for; `auto` takes CUDA where gsplat really draws there, else the CPU.
-
-    Raises BackendError when `cuda` is asked for and cannot work.
-    """
-    if backend == "cpu" or (backend == "auto" and not torch.cuda.is_available()):
-        return CpuRenderer()
-    from langsplat_core.training.radiance.differentiable_cuda import CudaRenderer
-
-    try:
-        return CudaRenderer()
-    except BackendError:
-        if backend == "cuda":
-            raise
-        return CpuRenderer()

@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array, logit
 from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.random_points import TELLING_POINTS, inside, random_points
 from langsplat_core.raster.spherical_harmonics import C0
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 
@@ -16,8 +17,6 @@ SMALLEST_DISTANCE = 1e-7**0.5  # world units; INRIA bounds the squared distance 
 ISOLATED = 10.0  # a point is an outlier when its neighbours are this many times the median distance away
 FEWEST_POINTS = 1_000  # fewer points are topped up to this number ...
 RANDOM_POINTS = 10_000  # ... or to this one, when they are too few to show where the scene is
-TELLING_POINTS = 50
-NEAREST, FARTHEST = 0.3, 3.0  # random depths, as multiples of the distance to what the cameras look at
 
 
 def initial_gaussians(
@@ -38,8 +37,8 @@ def initial_gaussians(
     missing = min(wanted, max_gaussians) - len(points)
     if missing > 0:
         images = [capture.images[i] for i in train_indices]
-        more, more_rgb = _random_points(missing, points, cameras, images, rng)
-        points, rgb = np.concatenate([points, more]), np.concatenate([rgb, more_rgb])
+        more, colours = random_points(missing, points, cameras, images, rng)
+        points, rgb = np.concatenate([points, more]), np.concatenate([rgb, colours / 255.0])
 
     count = len(points)
     sh = np.zeros((count, SH_COUNTS[sh_degree], 3), np.float32)
@@ -62,19 +61,13 @@ def _usable_points(points: Array, rgb: Array, cameras: Sequence[Camera]) -> tupl
     points, rgb = points[first], rgb[first]
     seen = np.zeros(len(points), bool)
     for camera in cameras:
-        seen |= _inside(camera, points)
+        seen |= inside(camera, points)
     points, rgb = points[seen], rgb[seen]
     if len(points) > NEIGHBOURS:
         distance = _neighbour_distance(points)
         keep = distance <= ISOLATED * np.median(distance)
         points, rgb = points[keep], rgb[keep]
     return points, rgb
-
-
-def _inside(camera: Camera, points: Array) -> Array:
-    """(N,) True where a point lies in front of the camera and inside its picture."""
-    pixels, depths = camera.project(points)
-    return (depths > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
 
 
 def _neighbour_distance(points: Array) -> Array:
@@ -84,51 +77,3 @@ def _neighbour_distance(points: Array) -> Array:
     neighbours = min(NEIGHBOURS, len(points) - 1)
     distances, _ = cKDTree(points).query(points, k=neighbours + 1)
     return np.maximum(np.sqrt((distances[:, 1:] ** 2).mean(1)), SMALLEST_DISTANCE)
-
-
-def _look_distance(cameras: Sequence[Camera]) -> float:
-    """Typical distance from the cameras to the place they look at, world units.
-
-    That place is nearest to all optical axes in the least-squares sense; a small pull to the cameras'
-    own mean keeps parallel axes from running to infinity.
-    """
-    positions = np.array([camera.position for camera in cameras])
-    axes = np.array([camera.rotation[2] for camera in cameras])
-    spread = max(float(np.linalg.norm(positions - positions.mean(0), axis=1).max()), 1e-3)
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    pull = 1e-3 * np.eye(3)
-    centre = np.linalg.solve(
-        across.mean(0) + pull,
-        np.einsum("nij,nj->i", across, positions) / len(axes) + pull @ positions.mean(0),
-    )
-    distance = float(np.median(((centre - positions) * axes).sum(1)))
-    return distance if distance > 0.1 * spread else 2 * spread
-
-
-def _random_points(
-    count: int, points: Array, cameras: Sequence[Camera], images: Sequence[Array], rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """`count` points in the cameras' view volume with the colours of the pixels they fall on.
-
-    Depths are uniform in 1/z, so that near and far are equally dense in the pictures. Twice as many are
-    drawn and those in sight of at least half the cameras preferred: one view alone teaches no depth.
-    """
-    distance = _look_distance(cameras)
-    near, far = NEAREST * distance, FARTHEST * distance
-    if len(points) >= TELLING_POINTS:
-        depths = np.concatenate([c.project(points)[1][_inside(c, points)] for c in cameras])
-        near, far = (float(z) for z in np.quantile(depths, (0.02, 0.98)))
-    drawn = np.zeros((2 * count, 3))
-    rgb = np.zeros((2 * count, 3))
-    owner = rng.integers(len(cameras), size=2 * count)
-    for index, camera in enumerate(cameras):
-        rows = np.flatnonzero(owner == index)
-        x = rng.uniform(0, camera.width, len(rows))
-        y = rng.uniform(0, camera.height, len(rows))
-        z = 1 / rng.uniform(1 / far, 1 / near, len(rows))
-        local = np.stack([(x - camera.cx) / camera.fx * z, (y - camera.cy) / camera.fy * z, z], -1)
-        drawn[rows] = local @ camera.rotation + camera.position
-        rgb[rows] = images[index][y.astype(int), x.astype(int)] / 255.0
-    shared = np.sum([_inside(camera, drawn) for camera in cameras], axis=0)
-    best = np.argsort(shared < len(cameras) / 2, kind="stable")[:count]
-    return drawn[best], rgb[best]

@@ -42,13 +42,13 @@ def blur(pictures: Tensor) -> Tensor:
     return pictures
 
 
-def _raw_moments(picture: Tensor, target: Tensor) -> Tensor:
+def raw_moments(picture: Tensor, target: Tensor) -> Tensor:
     """(4, H, W, C): x, y, x^2 + y^2, x y. SSIM needs the two squares only as their sum."""
     squares = torch.addcmul(picture * picture, target, target)
     return torch.stack([picture, target, squares, picture * target])
 
 
-def _ssim_terms(moments: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def ssim_terms(moments: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """(4, H, W, C) blurred x, y, x^2 + y^2, xy -> the four factors of SSIM = a1 a2 / (b1 b2)."""
     mx, my, xx_yy, xy = moments
     product, squares = mx * my, torch.addcmul(mx * mx, my, my)
@@ -66,8 +66,8 @@ class _MeanSsim(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, picture: Tensor, target: Tensor) -> Tensor:
-        moments = blur(_raw_moments(picture, target))
-        a1, a2, b1, b2 = _ssim_terms(moments)
+        moments = blur(raw_moments(picture, target))
+        a1, a2, b1, b2 = ssim_terms(moments)
         similarity = (a1 * a2) / (b1 * b2)
         if ctx.needs_input_grad[0]:
             ctx.save_for_backward(picture, target, moments[0], moments[1], a1, a2, b1, b2, similarity)
@@ -126,9 +126,3 @@ def radiance_loss(picture: Tensor, target: Tensor, lambda_dssim: float) -> Tenso
     if lambda_dssim == 0:
         return l1
     return (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim(picture, target))
-
-
-def psnr(picture: Tensor, target: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB for a data range of 1; infinite for equal pictures."""
-    error = float((picture.double() - target.double()).square().mean())
-    return math.inf if error == 0 else -10 * math.log10(error)

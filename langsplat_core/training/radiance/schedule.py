@@ -38,7 +38,7 @@ class Schedule:
     sh_degree_every: int
     coarse_until: int  # up to this step pictures have half their size
     position_lr: tuple[float, float]  # first and last, world units per step
-    rates: dict[str, float]  # of all other parameters, by their names in `training.state`
+    rates: dict[str, float]  # of all other parameters, by their names in `state`
 
     def densifies(self, step: int) -> bool:
         """True where a round of densification and pruning ends the step."""

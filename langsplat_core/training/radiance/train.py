@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from langsplat_core.arrays import Array, sigmoid
+from langsplat_core.arrays import Array, psnr, sigmoid
 from langsplat_core.config import INRIA, RadianceConfig
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
@@ -25,9 +25,10 @@ from langsplat_core.progress import Cancelled, Progress, silent
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.training.radiance.checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from langsplat_core.training.radiance.densify import accumulate, densify, reset_opacities
-from langsplat_core.training.radiance.differentiable import Backend, DifferentiableRenderer, renderer_for
+from langsplat_core.training.radiance.differentiable import DifferentiableRenderer
 from langsplat_core.training.radiance.initialise import initial_gaussians
-from langsplat_core.training.radiance.losses import psnr, radiance_loss, ssim
+from langsplat_core.training.radiance.losses import radiance_loss, ssim
+from langsplat_core.training.radiance.renderers import Backend, renderer_for
 from langsplat_core.training.radiance.schedule import Schedule, schedule_for
 from langsplat_core.training.radiance.state import TrainingState, adam_step, clean_gradients, start
 
@@ -143,7 +144,8 @@ def evaluate_views(
         for index in range(len(pictures)):
             camera, target = pictures.at(index, coarse=False)
             image = renderer.render(state.values, camera, gaussians.sh_degree).image.clamp(0, 1)
-            scores.append(ViewScore(camera.name, psnr(image, target), float(ssim(image, target))))
+            decibels = psnr(image.cpu().numpy(), target.cpu().numpy())
+            scores.append(ViewScore(camera.name, decibels, float(ssim(image, target))))
     return scores
 
 

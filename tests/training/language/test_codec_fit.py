@@ -1,5 +1,7 @@
 """Codecs: fitting, folding of batch normalisation, storage."""
 
+from typing import get_args, get_type_hints
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,14 @@ import torch
 from langsplat_core.arrays import unit
 from langsplat_core.config import CodecConfig
 from langsplat_core.scene import AutoencoderCodec, LinearCodec, codec_from_tensors
-from langsplat_core.training.language.codec_fit import _layers, _networks, fit_codec, reconstruction_cosine
+from langsplat_core.scene.codec import KINDS
+from langsplat_core.training.language.codec_fit import (
+    FITTERS,
+    fit_codec,
+    folded_layers,
+    networks,
+    reconstruction_cosine,
+)
 
 
 def clustered(count: int = 400, clusters: int = 12, dim: int = 64) -> tuple[np.ndarray, np.ndarray]:
@@ -42,7 +51,7 @@ def test_linear_codec_is_the_best_subspace():
 
 def test_folding_batch_normalisation_changes_nothing():
     torch.manual_seed(0)
-    encoder, _ = _networks(32, 3)
+    encoder, _ = networks(32, 3)
     data = torch.randn(200, 32)
     for _ in range(5):
         encoder(data)
@@ -50,7 +59,7 @@ def test_folding_batch_normalisation_changes_nothing():
     with torch.no_grad():
         want = encoder(data).numpy()
     x = data.numpy()
-    layers = _layers(encoder)
+    layers = folded_layers(encoder)
     for index, (weight, bias) in enumerate(layers):
         x = x @ weight.T + bias
         if index + 1 < len(layers):
@@ -81,3 +90,26 @@ def test_broken_tensors_are_named():
         AutoencoderCodec(((w, b),), ((np.zeros((9, 3), np.float32), np.zeros(9, np.float32)),))
     with pytest.raises(ValueError, match="codec encoder"):
         AutoencoderCodec(((w, np.zeros(4, np.float32)),), ((w.T.copy(), np.zeros(8, np.float32)),))
+
+
+def test_every_kind_in_the_settings_can_be_fitted_and_read_back() -> None:
+    assert set(FITTERS) == set(KINDS) == set(get_args(get_type_hints(CodecConfig)["kind"]))
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_similarities_are_the_cosines_of_what_is_decoded(kind: str) -> None:
+    vectors, _ = clustered(60)
+    codec = fit_codec(vectors, CodecConfig(kind=kind, latent_dim=4, steps=20))  # type: ignore[arg-type]
+    latents = 0.3 * codec.encode(vectors)  # blended latents are short
+    latents[5] = 0
+    texts = unit(np.random.default_rng(2).normal(size=(7, 64))).astype(np.float32)
+    got = codec.similarities(latents, texts)
+    directions = latents / np.maximum(np.linalg.norm(latents, axis=1, keepdims=True), 1e-12)
+    want = codec.decode(directions).astype(np.float64) @ texts.T
+    want[5] = 0
+    assert got.dtype == np.float32
+    if kind == "linear":  # decode normalises; a latent of length 1 decodes to length 1 already
+        np.testing.assert_allclose(
+            np.linalg.norm(directions[:5] @ codec.tensors()["basis"], axis=1), 1, atol=1e-5
+        )
+    np.testing.assert_allclose(got, want, atol=2e-6)

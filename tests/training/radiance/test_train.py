@@ -19,8 +19,9 @@ from langsplat_core.progress import Cancelled
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.spherical_harmonics import C0, colours
 from langsplat_core.scene import Camera, Gaussians, look_at
-from langsplat_core.training.radiance.differentiable import CpuRenderer, renderer_for
+from langsplat_core.training.radiance.differentiable import CpuRenderer
 from langsplat_core.training.radiance.initialise import initial_gaussians
+from langsplat_core.training.radiance.renderers import renderer_for
 from langsplat_core.training.radiance.state import PARAMETERS, TrainingState, start
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 
