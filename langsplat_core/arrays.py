@@ -55,6 +55,16 @@ def unit(vectors: Array, epsilon: float = 1e-6) -> Array:
     return vectors / np.maximum(length, epsilon)
 
 
+def mean_squared_error(a: Array, b: Array) -> float:
+    """Of two arrays of one shape."""
+    return float(np.mean((a.astype(np.float64) - b) ** 2))
+
+
+def psnr(a: Array, b: Array) -> float:
+    """Peak signal-to-noise ratio of two pictures with values in [0, 1], dB; at most 100, for equal ones."""
+    return float(-10 * np.log10(max(mean_squared_error(a, b), 1e-10)))
+
+
 def rotation_matrices(quats_wxyz: Array) -> Array:
     """(N, 4) quaternions in order w, x, y, z, any non-zero length -> (N, 3, 3) rotations."""
     w, x, y, z = np.moveaxis(unit(quats_wxyz, 1e-30), -1, 0)

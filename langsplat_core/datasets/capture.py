@@ -1,5 +1,7 @@
 """A capture: photographs with known cameras, as every loader returns them."""
 
+import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +37,19 @@ class Capture:
         """
         test = [i for i in range(len(self)) if test_every > 1 and i % test_every == 0 and len(self) > 1]
         return [i for i in range(len(self)) if i not in test], test
+
+    def digest(self, indices: Sequence[int]) -> str:
+        """Of all that a training on the photographs at `indices` sees: these in their order, their cameras,
+        and the points. Structure from motion run again may place the same photographs in another world, so
+        names alone do not identify a capture."""
+        digest = hashlib.blake2b(digest_size=16)
+        for camera, image in ((self.cameras[i], self.images[i]) for i in indices):
+            digest.update(repr((camera.name, camera.intrinsics)).encode())
+            digest.update(camera.world_to_camera.tobytes())
+            digest.update(np.ascontiguousarray(image).data)
+        digest.update(self.points.astype(np.float64).tobytes())
+        digest.update(self.colours.tobytes())
+        return digest.hexdigest()
 
     def extent(self) -> float:
         """1.1 times the largest distance of a camera from the cameras' mean: the scene scale that the

@@ -15,7 +15,7 @@ from langsplat_core.datasets.intrinsics import (
     ColmapDistortion,
     Distortion,
     FisheyeDistortion,
-    Lens,
+    PhotoIntrinsics,
 )
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.progress import Progress
@@ -34,7 +34,7 @@ def find_model(folder: Path) -> Path | None:
     return next((f for f in (folder / "sparse" / "0", folder / "sparse") if has_model(f)), None)
 
 
-def lens_of(camera: ModelCamera) -> Lens:
+def intrinsics_of(camera: ModelCamera) -> PhotoIntrinsics:
     """The lens of a COLMAP camera; ValueError if its focal length is impossible."""
     named = camera.named()
     fx, fy, cx, cy = (named[key] for key in _INTRINSICS)
@@ -46,7 +46,7 @@ def lens_of(camera: ModelCamera) -> Lens:
         distortion = FisheyeDistortion(**rest)
     else:
         distortion = ColmapDistortion(camera.model, camera.params, fx, fy, cx, cy)
-    return Lens(camera.width, camera.height, fx, fy, cx, cy, distortion)
+    return PhotoIntrinsics(camera.width, camera.height, fx, fy, cx, cy, distortion)
 
 
 def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progress) -> Capture:
@@ -79,15 +79,15 @@ def _photo_folder(folder: Path, model: SparseModel) -> Path:
 
 def located_photos(model: SparseModel, photo_folder: Path, source: Path) -> list[Photo]:
     """The model's images as photographs in `photo_folder`; FormatError names `source` for a bad camera."""
-    lenses = {}
+    by_id = {}
     for camera_id, camera in model.cameras.items():
         try:
-            lenses[camera_id] = lens_of(camera)
+            by_id[camera_id] = intrinsics_of(camera)
         except ValueError as error:
             raise FormatError(f"{source}: camera {camera_id}: {error}; export the model again") from None
     by_name = {image.name: image for image in model.images}
     return [
-        Photo(photo_folder / name, name, lenses[image.camera_id], image.world_to_camera)
+        Photo(photo_folder / name, name, by_id[image.camera_id], image.world_to_camera)
         for name, image in by_name.items()
     ]
 

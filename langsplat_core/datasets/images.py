@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.intrinsics import Lens
+from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.datasets.undistort import pinhole_for, resample, source_positions
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress
@@ -33,7 +33,7 @@ class Photo:
 
     path: Path
     label: str  # path inside the dataset, "/" between its parts
-    lens: Lens
+    intrinsics: PhotoIntrinsics
     world_to_camera: Array  # (4, 4) float64, rigid
     upright: bool = False  # the lens describes the photograph turned as its EXIF data ask
 
@@ -90,28 +90,28 @@ def upright_copy(picture: Image.Image) -> Image.Image:
         return picture.copy()
 
 
-def _read_for(photo: Photo) -> tuple[Image.Image, Lens]:
+def _read_for(photo: Photo) -> tuple[Image.Image, PhotoIntrinsics]:
     """The picture, and the photo's lens on its pixel grid.
 
     COLMAP reads pixels as stored, other tools turn them first; when the stored shape does not fit the
     lens but the turned one does, the latter is meant.
     """
     picture = read_photo(photo.path, photo.upright)
-    if not photo.upright and not _fits(picture.size, photo.lens):
+    if not photo.upright and not _fits(picture.size, photo.intrinsics):
         picture = read_photo(photo.path, upright=True)
-    if not _fits(picture.size, photo.lens):
-        lens = photo.lens
+    if not _fits(picture.size, photo.intrinsics):
+        intrinsics = photo.intrinsics
         raise InputError(
             f"{photo.path} is {picture.width}x{picture.height} pixels but its camera is "
-            f"{lens.width}x{lens.height}; use the photographs that the cameras were computed from"
+            f"{intrinsics.width}x{intrinsics.height}; use the photographs that the cameras were computed from"
         )
-    return picture, photo.lens.resized(*picture.size)
+    return picture, photo.intrinsics.regridded(*picture.size)
 
 
-def _fits(size: tuple[int, int], lens: Lens) -> bool:
-    ratio = (size[0] * lens.height) / (size[1] * lens.width)
+def _fits(size: tuple[int, int], intrinsics: PhotoIntrinsics) -> bool:
+    ratio = (size[0] * intrinsics.height) / (size[1] * intrinsics.width)
     return (
-        abs(ratio - 1) < ASPECT_TOLERANCE or max(abs(size[0] - lens.width), abs(size[1] - lens.height)) <= 1
+        abs(ratio - 1) < ASPECT_TOLERANCE or max(abs(size[0] - intrinsics.width), abs(size[1] - intrinsics.height)) <= 1
     )
 
 
@@ -129,19 +129,19 @@ def develop(
 
     # Photographs of one lens share its pinhole and its map; a few maps are kept, not one per photograph.
     @lru_cache(maxsize=4)
-    def plan(lens: Lens) -> tuple[Camera, Array | None]:
-        camera = pinhole_for(lens, max_side)
-        return camera, None if lens.distortion is None else source_positions(lens, camera)
+    def plan(intrinsics: PhotoIntrinsics) -> tuple[Camera, Array | None]:
+        camera = pinhole_for(intrinsics, max_side)
+        return camera, None if intrinsics.distortion is None else source_positions(intrinsics, camera)
 
     def one(index: int) -> tuple[Camera, Array] | str:
         photo = photos[index]
         try:
-            picture, lens = _read_for(photo)
+            picture, intrinsics = _read_for(photo)
         except UNREADABLE as error:
             return f"{photo.label} ({error})"
-        camera, positions = plan(lens)
+        camera, positions = plan(intrinsics)
         pose = replace(camera, world_to_camera=photo.world_to_camera, name=names[index])
-        return pose, resample(picture, lens, camera, positions)
+        return pose, resample(picture, intrinsics, camera, positions)
 
     done: list[tuple[Camera, Array]] = []
     broken: list[str] = []

@@ -1,4 +1,4 @@
-"""Lenses: where a photograph's pixels look, in the conventions of COLMAP and OpenCV.
+"""Intrinsics of photographs: where a photograph's pixels look, in the conventions of COLMAP and OpenCV.
 
 A point in the camera's frame has *normalised* coordinates (x/z, y/z). A distortion maps normalised to
 distorted coordinates, and the pixel position is ``(fx * x_d + cx, fy * y_d + cy)``, with pixel centres
@@ -6,13 +6,14 @@ at +0.5. Formulas: OpenCV's "Camera Calibration and 3D Reconstruction" and "Fish
 Everything here is float64; it is the reference that resampling follows.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 import pycolmap
 
 from langsplat_core.arrays import Array
+from langsplat_core.scene import Intrinsics
 
 
 class Distortion(Protocol):
@@ -86,37 +87,22 @@ class ColmapDistortion:
 
 
 @dataclass(frozen=True)
-class Lens:
-    """Intrinsics of a photograph as it lies on disk."""
+class PhotoIntrinsics(Intrinsics):
+    """Intrinsics of a photograph as it lies on disk, of whole pixels."""
 
-    width: int  # pixels
-    height: int  # pixels
-    fx: float  # pixels, > 0
-    fy: float  # pixels, > 0
-    cx: float  # pixels from the left edge; the first pixel's centre is at 0.5
-    cy: float  # pixels from the top edge
+    width: int
+    height: int
     distortion: Distortion | None = None  # None: a pinhole
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"a photograph of {self.width}x{self.height} pixels")
-        if not (np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() and min(self.fx, self.fy) > 0):
-            raise ValueError("focal lengths must be positive and the principal point finite")
+        super().__post_init__()
         if self.distortion == BrownDistortion():  # all zero, as many files write a pinhole
             object.__setattr__(self, "distortion", None)
 
-    def resized(self, width: int, height: int) -> "Lens":
+    def regridded(self, width: int, height: int) -> "PhotoIntrinsics":
         """The same lens on another pixel grid over the same picture."""
-        sx, sy = width / self.width, height / self.height
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * sx,
-            fy=self.fy * sy,
-            cx=self.cx * sx,
-            cy=self.cy * sy,
-        )
+        inner = self.resized(width, height)
+        return PhotoIntrinsics(width, height, inner.fx, inner.fy, inner.cx, inner.cy, self.distortion)
 
     def pixels(self, xy: Array) -> Array:
         """(N, 2) normalised coordinates -> (N, 2) pixel positions in the photograph."""

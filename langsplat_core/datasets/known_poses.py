@@ -11,6 +11,7 @@ from langsplat_core.datasets import sfm
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.colmap import good_points
 from langsplat_core.datasets.colmap_model import has_model, read_model
+from langsplat_core.datasets.random_points import random_points
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
@@ -31,7 +32,8 @@ def add_points(capture: Capture, work: Path, progress: Progress) -> Capture:
         log.warning(
             "only %d points could be triangulated; starting from %d random ones", len(points), RANDOM_POINTS
         )
-        points, colours = random_points(capture, RANDOM_POINTS)
+        generator = np.random.default_rng(0)
+        points, colours = random_points(RANDOM_POINTS, points, capture.cameras, capture.images, generator)
     return Capture(capture.cameras, capture.images, points, colours)
 
 
@@ -83,47 +85,3 @@ def neighbouring_views(cameras: tuple[Camera, ...]) -> list[tuple[int, int]]:
             if np.isfinite(row[j]):
                 pairs.add((min(i, int(j)), max(i, int(j))))
     return sorted(pairs)
-
-
-def random_points(capture: Capture, count: int, seed: int = 0) -> tuple[Array, Array]:
-    """(count, 3) points on rays through random pixels, with those pixels' colours (count, 3).
-
-    Depths lie around the point nearest to all optical axes, where captures look; points that a second
-    camera sees come first, so that they are all there is when they suffice.
-    """
-    generator = np.random.default_rng(seed)
-    depths = _depths_of_interest(capture)
-    points, colours = [], []
-    for index in generator.integers(len(capture), size=4 * count):
-        camera, image = capture.cameras[index], capture.images[index]
-        x, y = generator.uniform(0, camera.width), generator.uniform(0, camera.height)
-        points.append(camera.unproject((x, y), depths[index] * generator.uniform(0.3, 1.7)))
-        colours.append(image[int(y), int(x)])
-    positions, shades = np.array(points), np.array(colours, np.uint8)
-    seen = sum(_sees(camera, positions).astype(int) for camera in capture.cameras)
-    chosen = np.sort(np.argsort(seen < 2, kind="stable")[:count])
-    return positions[chosen], shades[chosen]
-
-
-def _sees(camera: Camera, points: Array) -> Array:
-    pixels, depth = camera.project(points)
-    inside = (pixels >= 0) & (pixels < (camera.width, camera.height))
-    return inside.all(1) & (depth > 0)
-
-
-def _depths_of_interest(capture: Capture) -> Array:
-    """(N,) depth at which each camera looks at the scene, world units, > 0.
-
-    The point nearest to all axes solves ``sum (I - a a^T) (p - c) = 0``. Where axes are parallel, or meet
-    behind a camera, three times the cameras' extent is taken instead.
-    """
-    centres = np.array([camera.position for camera in capture.cameras])
-    axes = np.array([camera.rotation[2] for camera in capture.cameras])
-    fallback = 3 * capture.extent() if len(capture) > 1 else 1.0
-    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    total = projectors.sum(0)
-    if np.linalg.eigvalsh(total)[0] < 1e-3 * len(capture):
-        return np.full(len(capture), fallback)
-    focus = np.linalg.solve(total, np.einsum("nij,nj->i", projectors, centres))
-    depth = ((focus - centres) * axes).sum(1)
-    return np.where(depth > 0.05 * fallback, depth, fallback)

@@ -20,7 +20,7 @@ from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
 from langsplat_core.arrays import Array
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.images import PHOTO_SUFFIXES, UNREADABLE, Photo, develop, shortened
-from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, FisheyeDistortion, Lens
+from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, FisheyeDistortion, PhotoIntrinsics
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.progress import Progress
 
@@ -108,11 +108,11 @@ def _stored_size(path: Path) -> tuple[int, int] | None:
         return None
 
 
-def _lens(values: Json, size: tuple[int, int]) -> Lens:
+def _lens(values: Json, size: tuple[int, int]) -> PhotoIntrinsics:
     """The lens of merged top-level and per-frame values; `size` counts where they give none."""
     width, height = (round(_number(values, key, default)) for key, default in zip("wh", size, strict=True))
     fx = _focal(values, "x", width, None)
-    return Lens(
+    return PhotoIntrinsics(
         width,
         height,
         fx,

@@ -55,7 +55,7 @@ def load_photos(folder: Path, max_side: int, work: Path, progress: Progress) -> 
     _report_left_out(model, numbered)
     located = located_photos(model, workspace / "images", workspace / "sparse")
     photos = [
-        Photo(numbered[p.label], numbered[p.label].name, p.lens, p.world_to_camera, upright=True)
+        Photo(numbered[p.label], numbered[p.label].name, p.intrinsics, p.world_to_camera, upright=True)
         for p in located
     ]
     cameras, images = develop(photos, max_side, progress)

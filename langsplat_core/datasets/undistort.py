@@ -5,7 +5,7 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.intrinsics import Distortion, Lens
+from langsplat_core.datasets.intrinsics import Distortion, PhotoIntrinsics
 from langsplat_core.errors import InputError
 from langsplat_core.scene import Camera
 
@@ -64,42 +64,42 @@ def undistorted_points(distortion: Distortion, distorted: Array) -> Array:
     return xy
 
 
-def pinhole_for(lens: Lens, max_side: int) -> Camera:
+def pinhole_for(intrinsics: PhotoIntrinsics, max_side: int) -> Camera:
     """The pinhole camera (identity pose) that a photograph of `lens` is resampled to.
 
     It shows the largest upright rectangle with no pixel from outside the photograph (OpenCV's
     ``alpha = 0``), with the lens's own central magnification, then shrunk so that the longer side has at
     most `max_side` pixels. InputError if the lens leaves no such rectangle.
     """
-    if lens.distortion is None:
-        scale = min(1.0, max_side / max(lens.width, lens.height))
-        whole = Camera(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, np.eye(4))
-        return whole.resized(max(1, round(lens.width * scale)), max(1, round(lens.height * scale)))
-    left, top, right, bottom = _inner_rectangle(lens)
-    wide, high = lens.fx * (right - left), lens.fy * (bottom - top)
+    if intrinsics.distortion is None:
+        scale = min(1.0, max_side / max(intrinsics.width, intrinsics.height))
+        whole = Camera(intrinsics.width, intrinsics.height, intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, np.eye(4))
+        return whole.resized(max(1, round(intrinsics.width * scale)), max(1, round(intrinsics.height * scale)))
+    left, top, right, bottom = _inner_rectangle(intrinsics)
+    wide, high = intrinsics.fx * (right - left), intrinsics.fy * (bottom - top)
     if not (wide >= 1 and high >= 1):
-        raise InputError(f"{lens} leaves no picture once its distortion is removed; calibrate it again")
+        raise InputError(f"{intrinsics} leaves no picture once its distortion is removed; calibrate it again")
     scale = min(1.0, max_side / max(wide, high))
     width, height = max(1, int(wide * scale)), max(1, int(high * scale))
-    fx, fy = lens.fx * scale, lens.fy * scale
+    fx, fy = intrinsics.fx * scale, intrinsics.fy * scale
     # Whole pixels: what is cut off is shared between both edges.
     cx = -left * fx - (wide * scale - width) / 2
     cy = -top * fy - (high * scale - height) / 2
     return Camera(width, height, fx, fy, cx, cy, np.eye(4))
 
 
-def _inner_rectangle(lens: Lens) -> tuple[float, float, float, float]:
+def _inner_rectangle(intrinsics: PhotoIntrinsics) -> tuple[float, float, float, float]:
     """Normalised left, top, right, bottom of a rectangle wholly inside the undistorted outline."""
-    assert lens.distortion is not None
+    assert intrinsics.distortion is not None
     t = np.linspace(0, 1, BORDER_SAMPLES)
     zero, one = np.zeros_like(t), np.ones_like(t)
     sides = np.stack([np.stack(side, -1) for side in ((zero, t), (t, zero), (one, t), (t, one))])
-    pixels = sides.reshape(-1, 2) * (lens.width, lens.height)
-    distorted = (pixels - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
+    pixels = sides.reshape(-1, 2) * (intrinsics.width, intrinsics.height)
+    distorted = (pixels - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy)
     try:
-        xy = undistorted_points(lens.distortion, distorted).reshape(4, -1, 2)
+        xy = undistorted_points(intrinsics.distortion, distorted).reshape(4, -1, 2)
     except (ValueError, np.linalg.LinAlgError) as error:
-        raise InputError(f"{lens}: {error}; calibrate it again") from None
+        raise InputError(f"{intrinsics}: {error}; calibrate it again") from None
     left, top, right, bottom = xy
     return (
         float(left[:, 0].max()),
@@ -109,15 +109,15 @@ def _inner_rectangle(lens: Lens) -> tuple[float, float, float, float]:
     )
 
 
-def source_positions(lens: Lens, camera: Camera) -> Array:
+def source_positions(intrinsics: PhotoIntrinsics, camera: Camera) -> Array:
     """(H, W, 2) float64 position in the photograph of the centre of each of the camera's pixels."""
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
     grid = np.stack(np.meshgrid(x, y), -1)
-    return lens.pixels(grid.reshape(-1, 2)).reshape(grid.shape)
+    return intrinsics.pixels(grid.reshape(-1, 2)).reshape(grid.shape)
 
 
-def resample(photo: Image.Image, lens: Lens, camera: Camera, positions: Array | None) -> Array:
+def resample(photo: Image.Image, intrinsics: PhotoIntrinsics, camera: Camera, positions: Array | None) -> Array:
     """(H, W, 3) uint8 picture of `camera` from an RGB photograph of `lens`, which has the same size.
 
     `positions` is `source_positions(lens, camera)`, or None for a lens without distortion. The
@@ -127,14 +127,14 @@ def resample(photo: Image.Image, lens: Lens, camera: Camera, positions: Array | 
     if positions is None:
         size = (camera.width, camera.height)
         return np.asarray(photo if photo.size == size else photo.resize(size, Image.Resampling.LANCZOS))
-    scale = camera.fx / lens.fx
+    scale = camera.fx / intrinsics.fx
     if scale < 1:
-        size = (max(1, round(lens.width * scale)), max(1, round(lens.height * scale)))
+        size = (max(1, round(intrinsics.width * scale)), max(1, round(intrinsics.height * scale)))
         photo = photo.resize(size, Image.Resampling.LANCZOS)
     pixels = np.asarray(photo)
     # Array index i holds the pixel whose centre is at i + 0.5.
-    rows = positions[..., 1] * (pixels.shape[0] / lens.height) - 0.5
-    columns = positions[..., 0] * (pixels.shape[1] / lens.width) - 0.5
+    rows = positions[..., 1] * (pixels.shape[0] / intrinsics.height) - 0.5
+    columns = positions[..., 0] * (pixels.shape[1] / intrinsics.width) - 0.5
     out = np.empty((camera.height, camera.width, 3), np.uint8)
     for channel in range(3):
         values = map_coordinates(

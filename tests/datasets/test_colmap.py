@@ -12,7 +12,7 @@ from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.colmap import good_points
 from langsplat_core.datasets.colmap_model import read_model
-from langsplat_core.datasets.intrinsics import BrownDistortion, Lens
+from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
 from langsplat_core.errors import InputError
 from tests.support.photographed import (
     colmap_reconstruction,
@@ -25,7 +25,7 @@ from tests.support.photographed import (
 
 BANANA = Path(__file__).parents[3] / "shared" / "data" / "banana" / "colmap_640"
 PARAMS = [190.0, 188.0, 103.0, 74.0, -0.1, 0.02, 0.001, -0.001]
-LENS = Lens(200, 150, *PARAMS[:4], BrownDistortion(*PARAMS[4:]))
+LENS = PhotoIntrinsics(200, 150, *PARAMS[:4], BrownDistortion(*PARAMS[4:]))
 CONFIG = DatasetConfig(max_side=200)
 
 

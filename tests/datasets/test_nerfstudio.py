@@ -13,14 +13,14 @@ from plyfile import PlyData, PlyElement
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture
-from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, Lens
+from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, PhotoIntrinsics
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.progress import silent
 from tests.support.photographed import pinhole_picture, poses, psnr, write_photos
 
 FOX = Path(__file__).parents[3] / "shared" / "data" / "fox"
-LENS = Lens(160, 120, 150.0, 148.0, 83.0, 58.0, BrownDistortion(-0.1, 0.02, 0.001, -0.001))
+LENS = PhotoIntrinsics(160, 120, 150.0, 148.0, 83.0, 58.0, BrownDistortion(-0.1, 0.02, 0.001, -0.001))
 GLOBAL = {
     "w": 160, "h": 120, "fl_x": 150.0, "fl_y": 148.0, "cx": 83.0, "cy": 58.0,
     "k1": -0.1, "k2": 0.02, "p1": 0.001, "p2": -0.001,
@@ -36,9 +36,11 @@ def opengl_pose(world_to_camera: Array) -> list[list[float]]:
     return matrix.tolist()
 
 
-def write_dataset(folder: Path, top: dict[str, Any], lens: Lens = LENS, views: int = 3) -> dict[str, Any]:
+def write_dataset(
+    folder: Path, top: dict[str, Any], intrinsics: PhotoIntrinsics = LENS, views: int = 3
+) -> dict[str, Any]:
     matrices = poses(views)
-    names = write_photos(folder / "images", lens, matrices)
+    names = write_photos(folder / "images", intrinsics, matrices)
     frames = [
         {"file_path": f"./images/{name}", "transform_matrix": opengl_pose(matrix)}
         for name, matrix in zip(names, matrices, strict=True)
@@ -67,16 +69,16 @@ def test_pictures_are_what_the_cameras_see(tmp_path: Path) -> None:
 
 
 def test_a_fisheye_lens(tmp_path: Path) -> None:
-    lens = Lens(160, 120, 120.0, 120.0, 80.0, 60.0, FisheyeDistortion(0.02, -0.01))
+    intrinsics = PhotoIntrinsics(160, 120, 120.0, 120.0, 80.0, 60.0, FisheyeDistortion(0.02, -0.01))
     top = {"w": 160, "h": 120, "fl_x": 120.0, "fl_y": 120.0, "cx": 80.0, "cy": 60.0, "k1": 0.02, "k2": -0.01}
-    write_dataset(tmp_path, {**top, "camera_model": "OPENCV_FISHEYE"}, lens)
+    write_dataset(tmp_path, {**top, "camera_model": "OPENCV_FISHEYE"}, intrinsics)
     capture = load(tmp_path)
     assert psnr(capture.images[1], pinhole_picture(capture.cameras[1], 3)) > 33
 
 
 def test_intrinsics_from_the_field_of_view_and_the_file(tmp_path: Path) -> None:
-    lens = Lens(160, 120, 140.0, 140.0, 80.0, 60.0)
-    write_dataset(tmp_path, {"camera_angle_x": 2 * np.arctan(80 / 140.0)}, lens)
+    intrinsics = PhotoIntrinsics(160, 120, 140.0, 140.0, 80.0, 60.0)
+    write_dataset(tmp_path, {"camera_angle_x": 2 * np.arctan(80 / 140.0)}, intrinsics)
     camera = load(tmp_path).cameras[0]
     assert (camera.width, camera.height) == (160, 120)
     np.testing.assert_allclose((camera.fx, camera.fy, camera.cx, camera.cy), (140, 140, 80, 60))
@@ -155,8 +157,8 @@ def test_colours_may_be_fractions_or_absent(tmp_path: Path) -> None:
 
 
 def test_transparent_photographs_lie_over_black(tmp_path: Path) -> None:
-    lens = Lens(160, 120, 140.0, 140.0, 80.0, 60.0)
-    write_dataset(tmp_path, {"fl_x": 140.0}, lens)
+    intrinsics = PhotoIntrinsics(160, 120, 140.0, 140.0, 80.0, 60.0)
+    write_dataset(tmp_path, {"fl_x": 140.0}, intrinsics)
     pixels = np.full((120, 160, 4), 200, np.uint8)
     pixels[..., 3] = 255
     pixels[:60, :, 3] = 0

@@ -12,8 +12,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.intrinsics import BrownDistortion, Lens
-from langsplat_core.datasets.known_poses import add_points, neighbouring_views, random_points
+from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
+from langsplat_core.datasets.known_poses import add_points, neighbouring_views
 from langsplat_core.datasets.sfm import pairs_by_name
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled, silent
@@ -21,7 +21,7 @@ from langsplat_core.scene import Camera, look_at
 from tests.support.photographed import distance_to_room, photograph, poses, write_photos
 
 VIEWS = 6
-LENS = Lens(400, 300, 380.0, 380.0, 200.0, 150.0, BrownDistortion(-0.06))
+LENS = PhotoIntrinsics(400, 300, 380.0, 380.0, 200.0, 150.0, BrownDistortion(-0.06))
 CONFIG = DatasetConfig(max_side=400)
 STAGES = [
     "preparing photographs",
@@ -133,9 +133,11 @@ def test_changed_photographs_are_computed_again(
 
 def known(count: int = VIEWS, size: tuple[int, int] = (320, 240)) -> Capture:
     """The room through pinholes at the true poses, without points."""
-    lens = Lens(*size, 300.0, 300.0, size[0] / 2, size[1] / 2)
-    cameras = [Camera(*size, 300, 300, lens.cx, lens.cy, m, f"v{i}") for i, m in enumerate(poses(count))]
-    images = [photograph(lens, camera.world_to_camera) for camera in cameras]
+    intrinsics = PhotoIntrinsics(*size, 300.0, 300.0, size[0] / 2, size[1] / 2)
+    cameras = [
+        Camera(*size, 300, 300, intrinsics.cx, intrinsics.cy, m, f"v{i}") for i, m in enumerate(poses(count))
+    ]
+    images = [photograph(intrinsics, camera.world_to_camera) for camera in cameras]
     return Capture(tuple(cameras), tuple(images), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
 
@@ -166,31 +168,6 @@ def test_featureless_views_start_from_random_points(tmp_path: Path, caplog: pyte
     assert "random" in caplog.text
     assert len(found.points) == 20_000
     assert (found.colours == 90).all()
-
-
-def test_random_points_lie_where_several_cameras_look() -> None:
-    capture = known()
-    points, colours = random_points(capture, 2000)
-    assert points.shape == colours.shape == (2000, 3)
-    seen = np.zeros(2000, int)
-    for camera in capture.cameras:
-        pixels, depth = camera.project(points)
-        seen += (depth > 0) & (pixels >= 0).all(1) & (pixels < (320, 240)).all(1)
-    assert (seen >= 2).all()
-    again, _ = random_points(capture, 2000)
-    np.testing.assert_array_equal(points, again)
-
-
-@pytest.mark.parametrize("count", [1, 3])
-def test_random_points_when_the_axes_do_not_meet(count: int) -> None:
-    eyes = [np.array([float(i), 0, 0]) for i in range(count)]
-    cameras = tuple(look_at(eye, eye + (0, 0, 1), np.array([0, -1, 0]), (32, 24)) for eye in eyes)
-    images = (np.zeros((24, 32, 3), np.uint8),) * count
-    capture = Capture(cameras, images, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    points, _ = random_points(capture, 500)
-    assert len(points) == 500
-    assert np.isfinite(points).all()
-    assert (points[:, 2] > 0).all()
 
 
 def test_every_pair_of_few_photographs_and_a_linked_selection_of_many() -> None:
@@ -240,7 +217,7 @@ def test_copies_are_upright_and_keep_the_focal_length(tmp_path: Path) -> None:
 
 
 def test_too_few_photographs_say_so(tmp_path: Path) -> None:
-    write_photos(tmp_path / "two", LENS.resized(64, 48), poses(2))
+    write_photos(tmp_path / "two", LENS.regridded(64, 48), poses(2))
     with pytest.raises(InputError, match="has 2 photographs; at least 3"):
         load_capture(tmp_path / "two", CONFIG, tmp_path / "work")
 

@@ -6,9 +6,9 @@ import pytest
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.colmap import lens_of
+from langsplat_core.datasets.colmap import intrinsics_of
 from langsplat_core.datasets.colmap_model import CAMERA_MODELS, ModelCamera
-from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, Lens
+from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, PhotoIntrinsics
 from langsplat_core.datasets.undistort import (
     pinhole_for,
     resample,
@@ -35,9 +35,9 @@ def camera_of(model: str) -> ModelCamera:
 
 ALL_MODELS = [name for name, _ in CAMERA_MODELS.values()]
 DISTORTED = [name for name in ALL_MODELS if name not in ("PINHOLE", "SIMPLE_PINHOLE")]
-PHONE = Lens(640, 480, 600.0, 604.0, 326.0, 236.0, BrownDistortion(0.06, -0.08, -0.001, 0.0002))
-BARREL = Lens(640, 480, 420.0, 420.0, 310.0, 246.0, BrownDistortion(-0.25, 0.06))
-FISHEYE = Lens(640, 480, 400.0, 397.0, 322.0, 239.0, FisheyeDistortion(0.02, -0.01, 0.003, -0.001))
+PHONE = PhotoIntrinsics(640, 480, 600.0, 604.0, 326.0, 236.0, BrownDistortion(0.06, -0.08, -0.001, 0.0002))
+BARREL = PhotoIntrinsics(640, 480, 420.0, 420.0, 310.0, 246.0, BrownDistortion(-0.25, 0.06))
+FISHEYE = PhotoIntrinsics(640, 480, 400.0, 397.0, 322.0, 239.0, FisheyeDistortion(0.02, -0.01, 0.003, -0.001))
 
 
 def test_the_table_of_models_is_colmaps() -> None:
@@ -56,54 +56,62 @@ def test_pixels_agree_with_colmap(model: str) -> None:
     xy[0] = 0  # the axis, where the fisheye formula divides zero by zero
     theirs = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=list(camera.params))
     want = theirs.img_from_cam(np.concatenate([xy, np.ones((200, 1))], 1))
-    np.testing.assert_allclose(lens_of(camera).pixels(xy), want, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(intrinsics_of(camera).pixels(xy), want, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("lens", [*map(lens_of, map(camera_of, DISTORTED)), PHONE, BARREL, FISHEYE])
-def test_undistort_then_distort_comes_back(lens: Lens) -> None:
-    assert lens.distortion is not None
-    grid = np.stack(np.meshgrid(np.linspace(0, lens.width, 33), np.linspace(0, lens.height, 25)), -1)
+@pytest.mark.parametrize(
+    "intrinsics", [*map(intrinsics_of, map(camera_of, DISTORTED)), PHONE, BARREL, FISHEYE]
+)
+def test_undistort_then_distort_comes_back(intrinsics: PhotoIntrinsics) -> None:
+    assert intrinsics.distortion is not None
+    grid = np.stack(
+        np.meshgrid(np.linspace(0, intrinsics.width, 33), np.linspace(0, intrinsics.height, 25)), -1
+    )
     pixels = grid.reshape(-1, 2)
-    distorted = (pixels - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
-    back = lens.pixels(undistorted_points(lens.distortion, distorted))
+    distorted = (pixels - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy)
+    back = intrinsics.pixels(undistorted_points(intrinsics.distortion, distorted))
     assert np.abs(back - pixels).max() < 1e-6  # px
 
 
-@pytest.mark.parametrize("lens", [*map(lens_of, map(camera_of, DISTORTED)), PHONE, BARREL, FISHEYE])
-def test_the_pinhole_shows_no_outside_and_wastes_little(lens: Lens) -> None:
-    camera = pinhole_for(lens, 10_000)
-    outline = source_positions(lens, camera)
+@pytest.mark.parametrize(
+    "intrinsics", [*map(intrinsics_of, map(camera_of, DISTORTED)), PHONE, BARREL, FISHEYE]
+)
+def test_the_pinhole_shows_no_outside_and_wastes_little(intrinsics: PhotoIntrinsics) -> None:
+    camera = pinhole_for(intrinsics, 10_000)
+    outline = source_positions(intrinsics, camera)
     assert outline.min() >= 0
-    assert (outline <= (lens.width, lens.height)).all()
+    assert (outline <= (intrinsics.width, intrinsics.height)).all()
     # Every edge lies close to the photograph's: nothing more than the rectangle's nature is cut off.
     margins = [
         outline[..., 0].min(),
         outline[..., 1].min(),
-        lens.width - outline[..., 0].max(),
-        lens.height - outline[..., 1].max(),
+        intrinsics.width - outline[..., 0].max(),
+        intrinsics.height - outline[..., 1].max(),
     ]
     assert max(margins) < 3  # px
 
 
 def test_a_pinhole_keeps_the_whole_photograph() -> None:
-    lens = Lens(1000, 601, 800.0, 810.0, 480.0, 310.0, BrownDistortion())
-    assert lens.distortion is None
-    camera = pinhole_for(lens, 500)
+    intrinsics = PhotoIntrinsics(1000, 601, 800.0, 810.0, 480.0, 310.0, BrownDistortion())
+    assert intrinsics.distortion is None
+    camera = pinhole_for(intrinsics, 500)
     assert (camera.width, camera.height) == (500, 300)
     np.testing.assert_allclose((camera.fx, camera.cx), (400.0, 240.0))
     np.testing.assert_allclose((camera.fy, camera.cy), (810 * 300 / 601, 310 * 300 / 601))
-    assert pinhole_for(lens, 5000).width == 1000  # never enlarged
+    assert pinhole_for(intrinsics, 5000).width == 1000  # never enlarged
 
 
-@pytest.mark.parametrize("lens", [PHONE, BARREL, FISHEYE, Lens(640, 480, 500.0, 490.0, 310.0, 250.0)])
+@pytest.mark.parametrize(
+    "intrinsics", [PHONE, BARREL, FISHEYE, PhotoIntrinsics(640, 480, 500.0, 490.0, 310.0, 250.0)]
+)
 @pytest.mark.parametrize("max_side", [10_000, 213])
-def test_the_picture_is_what_the_pinhole_sees(lens: Lens, max_side: int) -> None:
+def test_the_picture_is_what_the_pinhole_sees(intrinsics: PhotoIntrinsics, max_side: int) -> None:
     pose = poses(3)[1]
-    camera = pinhole_for(lens, max_side)
+    camera = pinhole_for(intrinsics, max_side)
     assert max(camera.width, camera.height) <= max_side
     posed = type(camera)(*_intrinsics(camera), pose)
-    positions = None if lens.distortion is None else source_positions(lens, camera)
-    got = resample(Image.fromarray(photograph(lens, pose)), lens, camera, positions)
+    positions = None if intrinsics.distortion is None else source_positions(intrinsics, camera)
+    got = resample(Image.fromarray(photograph(intrinsics, pose)), intrinsics, camera, positions)
     # A shrunk picture averages over the area of its pixels; so must the truth.
     samples = 1 if max_side > 1000 else 4
     match = psnr(got, pinhole_picture(posed, samples))
@@ -128,14 +136,16 @@ def test_shrinking_averages_in_the_distorted_path_too() -> None:
 
 
 def test_a_wide_fisheye_is_cut_at_the_largest_angle() -> None:
-    wide = Lens(800, 800, 260.0, 260.0, 400.0, 400.0, FisheyeDistortion())  # 176 degrees across
+    wide = PhotoIntrinsics(800, 800, 260.0, 260.0, 400.0, 400.0, FisheyeDistortion())  # 176 degrees across
     camera = pinhole_for(wide, 800)
     corner = np.hypot(camera.cx / camera.fx, camera.cy / camera.fy)
     assert np.degrees(np.arctan(corner)) == pytest.approx(65, abs=0.5)
 
 
 def test_a_lens_that_folds_over_is_cut_before_the_fold() -> None:
-    folding = Lens(640, 480, 300.0, 300.0, 320.0, 240.0, BrownDistortion(-0.4))  # folds at radius 0.91
+    folding = PhotoIntrinsics(
+        640, 480, 300.0, 300.0, 320.0, 240.0, BrownDistortion(-0.4)
+    )  # folds at radius 0.91
     camera = pinhole_for(folding, 2000)
     corner = np.hypot(camera.cx / camera.fx, camera.cy / camera.fy)
     assert 0.5 < corner < 0.92
@@ -144,9 +154,9 @@ def test_a_lens_that_folds_over_is_cut_before_the_fold() -> None:
 
 @pytest.mark.parametrize("k1", [np.nan, 1e300, -1e12])
 def test_an_impossible_lens_is_refused_in_one_line(k1: float) -> None:
-    lens = Lens(640, 480, 300.0, 300.0, 320.0, 240.0, BrownDistortion(k1))
+    intrinsics = PhotoIntrinsics(640, 480, 300.0, 300.0, 320.0, 240.0, BrownDistortion(k1))
     with pytest.raises(InputError) as caught:
-        pinhole_for(lens, 800)
+        pinhole_for(intrinsics, 800)
     assert "\n" not in str(caught.value)
 
 
