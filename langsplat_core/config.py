@@ -1,7 +1,6 @@
 """Every setting a user can change, as frozen dataclasses; the command line is derived from them."""
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Literal
 
 
@@ -39,7 +38,7 @@ class RadianceConfig:
     """3D Gaussian Splatting training (Kerbl et al. 2023); defaults are those of the INRIA code.
 
     Step counts below are for `reference_steps`; a smaller `steps` scales every schedule with it and lets
-    geometry learn faster (see `training.schedule`).
+    geometry learn faster (see `training.radiance.schedule`).
     """
 
     steps: int = 30_000
@@ -114,6 +113,7 @@ class LiftConfig:
     # one-pass: the paper's latents, averaged as W^T H / W^T 1
     mode: Literal["median", "mean", "one-pass"] = "median"
     chunk: int = 32  # mask channels per gather pass
+    backend: Literal["auto", "cpu", "cuda"] = "auto"
 
 
 @dataclass(frozen=True)
@@ -127,38 +127,6 @@ class TrainConfig:
     codec: CodecConfig = field(default_factory=CodecConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     phrases: tuple[str, ...] = ()  # stored encoded in the scene: they can be asked without any encoder
-
-
-@dataclass(frozen=True)
-class DemoEncoderConfig:
-    """Training of the small CLIP that comes with the program (`langsplat demo encoder`)."""
-
-    start: Path | None = None  # folder of an earlier demo encoder to begin from; None: random weights
-    rooms: int = 400  # random rooms that crops are rendered from
-    views: int = 3  # photographs of each room
-    plain_crops: int = 8_000  # crops of nothing but a colour or a texture
-    steps: int = 8_000
-    batch: int = 128  # crops per step
-    phrases: int = 192  # phrases per step
-    lr: float = 1e-3
-    seed: int = 0
-
-
-@dataclass(frozen=True)
-class BenchmarkConfig:
-    """Fresh rooms, and the method that is measured in them (`langsplat eval synthetic`)."""
-
-    tiers: tuple[Literal["separate", "clutter", "occlusion"], ...] = ("separate", "clutter", "occlusion")
-    seeds: tuple[int, ...] = (101,)  # one room of every tier each; never that of the bundled scene
-    views: int = 48  # photographs of each room; every eighth is held out
-    size: tuple[int, int] = (400, 300)  # width and height, pixels
-    steps: int = 1_500  # of radiance training
-    max_gaussians: int = 50_000
-    masks: Literal["truth", "graph"] = "truth"  # the true regions, or the segmenter that needs no weights
-    encoder: str = "demo"  # "demo" for the bundled one, a folder, or a hub id
-    codec_steps: int = 4_000
-    cut: Literal["floor", "median", "range"] = "median"  # where a map is cut into a mask, see `query.cut`
-    budget: bool = False  # also swap one stage at a time for one that makes no mistake
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,23 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, is_dataclass
-from typing import Any
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar
 
-from langsplat_core.datasets.capture import Capture
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import FormatError
+from langsplat_core.files import atomic_path
+from langsplat_core.scene import Gaussians
+from langsplat_core.semantics.store import ImageFeatures
+
+T = TypeVar("T")
+Arrays = Mapping[str, Array]
 
 
 def stage_key(name: str, version: int, *inputs: Any) -> str:
@@ -20,18 +32,39 @@ def stage_key(name: str, version: int, *inputs: Any) -> str:
     return f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
 
 
-def capture_digest(capture: Capture, indices: Sequence[int]) -> str:
-    """A digest of the photographs at `indices`, their cameras and the points: all that training sees.
+def kept(path: Path, make: Callable[[], T], pack: Callable[[T], Arrays], unpack: Callable[[Arrays], T]) -> T:
+    """What a stage makes: taken from `path` (*.npz) where it was made before, else made and stored there,
+    whole or not at all. `pack` and `unpack` turn it into named arrays and back."""
+    if path.exists():
+        return unpack(read_arrays(path))
+    result = make()
+    with atomic_path(path) as temporary:
+        np.savez(temporary, allow_pickle=False, **pack(result))
+    return result
 
-    Structure from motion run again may place the same photographs in another world frame, so names alone
-    do not identify a capture.
-    """
-    digest = hashlib.sha256()
-    for i in indices:
-        camera = capture.cameras[i]
-        intrinsics = (camera.name, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        digest.update(repr(intrinsics).encode())
-        digest.update(camera.world_to_camera.tobytes())
-        digest.update(capture.images[i].tobytes())
-    digest.update(capture.points.tobytes())
+
+def read_arrays(path: Path) -> dict[str, Array]:
+    """The arrays of an .npz file; FormatError for a damaged one."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise FormatError(f"{path}: damaged ({error}); delete it and run again") from None
+
+
+def gaussians_digest(gaussians: Gaussians) -> str:
+    """Of every number of the Gaussians."""
+    return _digest(*(getattr(gaussians, field.name) for field in fields(gaussians)))
+
+
+def features_digest(features: list[ImageFeatures]) -> str:
+    """Of the masks and vectors of photographs, in their order."""
+    return _digest(*(array for item in features for array in (item.labels, item.vectors)))
+
+
+def _digest(*arrays: Array) -> str:
+    digest = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        digest.update(repr((array.shape, array.dtype.str)).encode())
+        digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()

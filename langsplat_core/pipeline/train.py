@@ -13,28 +13,23 @@ from pathlib import Path
 
 import numpy as np
 
-from langsplat_core.arrays import Array
-from langsplat_core.config import LiftConfig, TrainConfig
+from langsplat_core.config import TrainConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
 from langsplat_core.formats import read_ply, save_scene, write_ply
-from langsplat_core.pipeline.stages import capture_digest, stage_key
+from langsplat_core.pipeline.language import language_field
+from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.scene import CANONICAL_PHRASES, Camera, Codec, Gaussians, LanguageField, Scene
-from langsplat_core.semantics.clip import ClipEncoder, load_clip
-from langsplat_core.semantics.masks import MaskSource, load_mask_source
-from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture
-from langsplat_core.training.language.codec_fit import fit_codec, reconstruction_cosine
-from langsplat_core.training.language.lift import find_memberships, lift_latents, lift_vectors
+from langsplat_core.scene import Gaussians, Scene
+from langsplat_core.semantics.clip import load_clip
+from langsplat_core.semantics.masks import MaskSource
+from langsplat_core.semantics.sources import load_mask_source
+from langsplat_core.semantics.store import FeatureStore, describe_capture
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 
 log = logging.getLogger("langsplat")
-
-Views = list[tuple[Camera, ImageFeatures]]
-CODEC_SAMPLE = 20_000  # lifted vectors that the codec is fitted to beside the masks' own
 
 
 @dataclass(frozen=True)
@@ -70,9 +65,8 @@ def train_scene(
     work = work or out.with_name(out.stem + ".work")
     clock = _Clock()
 
-    encoder = load_clip(
-        config.clip.model, config.clip.device
-    )  # first: absent weights should not cost an hour
+    # First: absent weights should not cost an hour.
+    encoder = load_clip(config.clip.model, config.clip.device, config.clip.batch)
     named = None if masks_of else load_mask_source(config.masks, config.clip.device)
     capture = load_capture(dataset, config.dataset, work, progress)
     mask_source = named or masks_of(capture)  # type: ignore[misc]  # one of them is there
@@ -94,7 +88,7 @@ def train_scene(
     views = [(capture.cameras[i], item) for i, item in zip(train, features, strict=True)]
     clock.lap("masks and vectors")
 
-    language, codec_cosine = language_field(gaussians, views, encoder, config, progress)
+    language, codec_cosine = language_field(gaussians, views, encoder, config, work, progress)
     clock.lap("language field")
 
     save_scene(out, Scene(gaussians, language, tuple(capture.cameras[i] for i in train)))
@@ -123,10 +117,9 @@ def trained_gaussians(
     capture: Capture, train: list[int], config: TrainConfig, work: Path, progress: Progress
 ) -> Gaussians:
     """The Gaussians of the photographs at `train`, from `work` where they were trained before."""
-    photographs = capture_digest(capture, train)
     # The backend changes who computes, not what: a run may move between machines.
     settings = replace(config.radiance, backend="auto")
-    done = work / f"{stage_key('radiance', 1, settings, photographs)}.ply"
+    done = work / f"{stage_key('radiance', 2, settings, capture.digest(train))}.ply"
     if done.exists():
         return read_ply(done)
     gaussians = train_radiance(
@@ -135,73 +128,6 @@ def trained_gaussians(
     write_ply(done, gaussians)
     done.with_suffix(".checkpoint.safetensors").unlink(missing_ok=True)
     return gaussians
-
-
-def language_field(
-    gaussians: Gaussians, views: Views, encoder: ClipEncoder, config: TrainConfig, progress: Progress
-) -> tuple[LanguageField, float]:
-    """The language field of the views' mask vectors, and the codec's mean cosine on these."""
-    rasterizer = CpuRasterizer()
-    mask_vectors = np.concatenate([features.vectors for _, features in views])
-    if len(mask_vectors) == 0:
-        raise InputError(
-            "no masks were found in any photograph; try --masks.source graph, or larger photographs"
-        )
-    if config.lift.mode == "one-pass":
-        codec = fit_codec(mask_vectors, config.codec, progress)
-        latents, confidence = lift_latents(rasterizer, gaussians, views, codec, progress=progress)
-    else:
-        lifted = _lifted_vectors(gaussians, views, config.lift, progress)
-        codec = fit_codec(_codec_data(mask_vectors, lifted, config.codec.seed), config.codec, progress)
-        latents = np.stack([_encode(codec, vectors, weight) for vectors, weight in lifted])
-        confidence = np.stack([weight for _, weight in lifted])
-    field = LanguageField(
-        latents=latents,
-        confidence=confidence,
-        codec=codec,
-        canonical=encoder.encode_texts(list(CANONICAL_PHRASES)),
-        encoder_id=encoder.id,
-        phrasebook=_phrasebook(encoder, config.phrases),
-    )
-    return field, reconstruction_cosine(codec, mask_vectors)
-
-
-def _phrasebook(encoder: ClipEncoder, phrases: tuple[str, ...]) -> dict[str, Array]:
-    names = [" ".join(phrase.lower().split()) for phrase in phrases]
-    return dict(zip(names, encoder.encode_texts(names), strict=True))
-
-
-def _lifted_vectors(
-    gaussians: Gaussians, views: Views, config: LiftConfig, progress: Progress
-) -> list[tuple[Array, Array]]:
-    """Per level: (N, D) float16 unit vectors and (N,) confidence. Half precision because three levels
-    of 512 numbers for a million Gaussians are 3 GB even so; its error, 5e-4, is far below a mask's."""
-    memberships = find_memberships(CpuRasterizer(), gaussians, views, config.chunk, progress=progress)
-    levels = []
-    for vectors, confidence in lift_vectors(memberships, robust=config.mode == "median"):
-        levels.append((vectors.astype(np.float16), confidence))
-        progress("averaging mask vectors", len(levels) / 3)
-    return levels
-
-
-def _codec_data(mask_vectors: Array, lifted: list[tuple[Array, Array]], seed: int) -> Array:
-    """Mask vectors, and as many lifted ones again as `CODEC_SAMPLE` allows: those are what it encodes."""
-    generator = np.random.default_rng(seed)
-    samples = [mask_vectors]
-    for vectors, confidence in lifted:
-        seen = np.flatnonzero(confidence > 0)
-        rows = generator.permutation(seen)[: CODEC_SAMPLE // len(lifted)]
-        samples.append(vectors[rows].astype(np.float32))
-    return np.concatenate(samples)
-
-
-def _encode(codec: Codec, vectors: Array, confidence: Array, chunk: int = 65_536) -> Array:
-    """(N, D) -> (N, d) latents, zero where unobserved."""
-    latents = np.zeros((len(vectors), codec.latent_dim), np.float32)
-    for start in range(0, len(vectors), chunk):
-        part = slice(start, start + chunk)
-        latents[part] = codec.encode(vectors[part].astype(np.float32))
-    return np.where(confidence[:, None] > 0, latents, 0).astype(np.float32)
 
 
 class _Clock:

@@ -1,13 +1,11 @@
 """Masks at three levels: what every source of masks gives, and how they become one map per level."""
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array
-from langsplat_core.config import MaskConfig
-from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress
 
 
@@ -39,24 +37,6 @@ class MaskSource(Protocol):
 
     def __call__(self, image: Array, progress: Progress) -> LevelMasks:
         """Masks of an image (H, W, 3) uint8."""
-
-
-def load_mask_source(config: MaskConfig, device: Literal["auto", "cpu", "cuda"] = "auto") -> MaskSource:
-    """The source that `config` asks for; "auto" is SAM where `config.sam` names weights, else the graph.
-
-    Raises EncoderError where SAM's weights are absent, InputError where they are not named at all.
-    """
-    if config.source == "graph" or (config.source == "auto" and not config.sam):
-        from langsplat_core.semantics.graph import GraphMasks
-
-        return GraphMasks()
-    if not config.sam:
-        raise InputError(
-            "masks.source sam: name the weights too, such as `--masks.sam facebook/sam-vit-huge`"
-        )
-    from langsplat_core.semantics.sam import load_sam
-
-    return load_sam(config, device)
 
 
 def label_maps(levels: LevelMasks) -> Array:

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from safetensors.numpy import load_file
 
-from langsplat_core.cli.app import _parse
+from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.config import (
     ClipConfig,
@@ -19,17 +20,18 @@ from langsplat_core.config import (
     RadianceConfig,
     TrainConfig,
 )
-from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.errors import EncoderError, FormatError, InputError
 from langsplat_core.formats import load_scene
+from langsplat_core.pipeline import language, train
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import train_scene
 from langsplat_core.progress import Cancelled
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.spherical_harmonics import colours
-from langsplat_core.scene import look_at
-from tests.semantics.test_clip import tiny_clip
+from langsplat_core.raster.render import render
+from langsplat_core.scene import Scene, look_at
+from langsplat_core.semantics import store
 from tests.support.scenes import random_gaussians
+from tests.support.tiny_clip import tiny_clip
 
 SIZE = (64, 48)
 VIEWS = 5
@@ -46,8 +48,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
         angle = 0.5 * index
         eye = 3 * np.array([np.sin(angle), -0.2, -np.cos(angle)])
         camera = look_at(eye, np.zeros(3), np.array([0.0, -1, 0]), SIZE)
-        view = load_rasterizer("cpu").view(gaussians, camera)
-        image, _ = view.splat(colours(gaussians.sh, gaussians.means, camera.position).astype(np.float32))
+        image = render(Scene(gaussians), camera).colours
         name = f"images/photo_{index}.png"
         Image.fromarray((255 * np.clip(image, 0, 1)).astype(np.uint8)).save(folder / name)
         pose = np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1, -1, 1])
@@ -91,14 +92,70 @@ def test_photographs_become_a_searchable_scene(room, tmp_path):
     assert 0 < result.peak < 1
     assert json.loads((tmp_path / "scene.work" / "report.json").read_text())["views"] == 3
 
-    # The same command again changes nothing and repeats no stage.
-    stages = sorted((tmp_path / "scene.work").glob("radiance-*.ply"))
-    before = [path.stat().st_mtime_ns for path in stages]
+
+STAGES = ("radiance-*.ply", "features/*.npz", "memberships-*.npz", "codec-*.npz", "latents-*.npz")
+
+
+def kept_results(work: Path) -> dict[str, int]:
+    """Every file that a stage keeps, and when it was written."""
+    return {str(path): path.stat().st_mtime_ns for pattern in STAGES for path in sorted(work.glob(pattern))}
+
+
+def test_the_same_command_again_changes_nothing_and_repeats_no_stage(room, tmp_path, monkeypatch):
+    out = tmp_path / "scene.ply"
+    first = train_scene(room, out, settings(room))
+    kept = kept_results(tmp_path / "scene.work")
+    for pattern in STAGES:
+        assert list((tmp_path / "scene.work").glob(pattern)), pattern
+    before, tensors = out.read_bytes(), load_file(out.with_suffix(".langsplat.safetensors"))
+
+    def forbidden(*args: object, **kwargs: object) -> None:
+        raise AssertionError("a stage that was done is done again")
+
+    for module, name in (
+        (train, "train_radiance"),
+        (language, "find_memberships"),
+        (language, "lift_vectors"),
+        (language, "fit_codec"),
+        (store, "embed_regions"),
+    ):
+        monkeypatch.setattr(module, name, forbidden)
     again = train_scene(room, out, settings(room))
-    assert len(before) == 1
-    assert [path.stat().st_mtime_ns for path in stages] == before
-    assert again.psnr == report.psnr
-    assert again.mask_count == report.mask_count
+    assert kept_results(tmp_path / "scene.work") == kept
+    assert out.read_bytes() == before
+    for name, tensor in load_file(out.with_suffix(".langsplat.safetensors")).items():
+        np.testing.assert_array_equal(tensor, tensors.pop(name))
+    assert not tensors
+    assert (again.psnr, again.mask_count, again.codec_cosine) == (
+        first.psnr,
+        first.mask_count,
+        first.codec_cosine,
+    )
+
+
+def test_a_setting_repeats_only_what_depends_on_it(room, tmp_path):
+    out, work = tmp_path / "scene.ply", tmp_path / "scene.work"
+    train_scene(room, out, settings(room))
+    before = kept_results(work)
+    train_scene(room, out, replace(settings(room), codec=CodecConfig(steps=31)))
+    added = {Path(name).name.partition("-")[0] for name in set(kept_results(work)) - set(before)}
+    assert added == {"codec", "latents"}
+    other_machine = replace(settings(room), lift=LiftConfig(backend="cpu", chunk=7))
+    train_scene(room, out, other_machine)
+    assert len(kept_results(work)) == len(before) + 2  # who computes, and in which batches, changes nothing
+
+
+@pytest.mark.parametrize("name", ["memberships", "codec", "latents"])
+def test_a_damaged_result_is_one_line(room, tmp_path, name):
+    out, work = tmp_path / "scene.ply", tmp_path / "scene.work"
+    train_scene(room, out, settings(room))
+    for path in work.glob("*.npz"):
+        if path.name.startswith(name):
+            path.write_bytes(path.read_bytes()[:100])
+        else:
+            path.unlink()
+    with pytest.raises(FormatError, match="delete it and run again"):
+        train_scene(room, out, settings(room))
 
 
 @pytest.mark.parametrize("mode", ["mean", "one-pass"])
@@ -147,7 +204,7 @@ def test_stage_keys_follow_settings():
 
 def run(*args: object) -> int:
     words = [str(arg) for arg in args]
-    return main("langsplat", lambda: _parse(words))
+    return main("langsplat", lambda: parse(words))
 
 
 @pytest.mark.parametrize(

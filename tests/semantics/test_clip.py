@@ -5,34 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from transformers import CLIPConfig, CLIPModel, CLIPTokenizer
+from transformers import CLIPModel, CLIPTokenizer
 
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.semantics.clip import CLIP_MEAN, CLIP_STD, load_clip, load_text_encoder
-
-WORDS = ["red", "green", "mug", "apple", "handle", "object", "things"]
-SIDE = 32
-
-
-def tiny_clip(folder: Path, half: bool = False) -> CLIPModel:
-    """A CLIP of two narrow layers with a word-level vocabulary, saved in Hugging Face layout."""
-    letters = sorted({letter for word in WORDS for letter in word})
-    tokens = ["<|startoftext|>", "<|endoftext|>", *letters, *(f"{letter}</w>" for letter in letters)]
-    tokenizer = CLIPTokenizer(vocab={token: i for i, token in enumerate(tokens)}, merges=[])
-    tokenizer.save_pretrained(folder)
-    tower = {"hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2}
-    text = tower | {"vocab_size": len(tokens), "max_position_embeddings": 12}
-    text |= {"bos_token_id": 0, "eos_token_id": 1, "pad_token_id": 1}
-    torch.manual_seed(0)
-    model = CLIPModel(
-        CLIPConfig(
-            text_config=text,
-            vision_config=tower | {"image_size": SIDE, "patch_size": 8},
-            projection_dim=24,
-        )
-    ).eval()
-    (model.half() if half else model).save_pretrained(folder)
-    return model.float()
+from tests.support.tiny_clip import SIDE, WORDS, tiny_clip
 
 
 @pytest.fixture(scope="module")
