@@ -30,18 +30,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, mean_squared_error, psnr
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster.cpu.rasterizer import colours
 from langsplat_core.raster.protocol import LiftingRasterizer, Rasterizer, View
+from langsplat_core.raster.render import colours_seen, splat_colours
 from langsplat_core.scene import SH_COUNTS, Camera, Scene
 
 ALONE = 0.055  # display values, RGB distance; see above
-SMALLEST_ERROR = 1e-10  # mean squared error that stands for none, 100 dB
 
 
 @dataclass(frozen=True, eq=False)
-class Exposure:
+class MeasuringView:
     """One view on which the loss is measured."""
 
     camera: Camera
@@ -52,19 +51,19 @@ class Exposure:
 def draw(rasterizer: Rasterizer, scene: Scene, camera: Camera) -> tuple[View, Array]:
     """The projected view and its (H, W, 3) float32 picture, unclipped, without background."""
     view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
-    return view, view.splat(_colours(scene, camera))[0]
+    return view, splat_colours(view, scene.gaussians, camera).colours
 
 
-def expose(
+def measuring_views(
     rasterizer: Rasterizer, scene: Scene, cameras: Sequence[Camera], photographs: Sequence[Array | None]
-) -> list[Exposure]:
+) -> list[MeasuringView]:
     """Pictures of the original `scene`, with the (H, W, 3) uint8 photographs of the same cameras or None."""
-    exposures = []
+    views = []
     for camera, photograph in zip(cameras, photographs, strict=True):
         truth = None if photograph is None else photograph.astype(np.float32) / 255
         picture = np.clip(draw(rasterizer, scene, camera)[1], 0, 1)
-        exposures.append(Exposure(camera, picture, truth))
-    return exposures
+        views.append(MeasuringView(camera, picture, truth))
+    return views
 
 
 def contributions(
@@ -74,7 +73,7 @@ def contributions(
     largest = np.zeros(len(scene.gaussians))
     for index, camera in enumerate(cameras):
         view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
-        own = _colours(scene, camera)
+        own = colours_seen(scene.gaussians, camera)
         picture = view.splat(own)[0]
         stacked = [np.ones_like(picture[..., :1]), picture, (picture**2).sum(-1, keepdims=True)]
         sums = view.gather(np.concatenate(stacked, -1)).astype(np.float64)
@@ -87,20 +86,20 @@ def contributions(
 
 
 def psnr_losses(
-    rasterizer: Rasterizer, scene: Scene, exposures: Sequence[Exposure], assumed_psnr: float
+    rasterizer: Rasterizer, scene: Scene, views: Sequence[MeasuringView], assumed_psnr: float
 ) -> Array:
     """(V,) dB lost by `scene` in each view; negative where it comes nearer to a photograph.
 
     `assumed_psnr` (dB) is the original's, used for views without a photograph.
     """
     losses = []
-    for exposure in exposures:
-        picture = np.clip(draw(rasterizer, scene, exposure.camera)[1], 0, 1)
-        if exposure.photograph is None:
-            change = mean_squared_error(picture, exposure.original)
+    for view_ in views:
+        picture = np.clip(draw(rasterizer, scene, view_.camera)[1], 0, 1)
+        if view_.photograph is None:
+            change = mean_squared_error(picture, view_.original)
             losses.append(estimated_loss(change, assumed_psnr))
         else:
-            before, after = (psnr(image, exposure.photograph) for image in (exposure.original, picture))
+            before, after = (psnr(image, view_.photograph) for image in (view_.original, picture))
             losses.append(before - after)
     return np.array(losses)
 
@@ -110,23 +109,8 @@ def estimated_loss(change: float, assumed_psnr: float) -> float:
     return float(10 * np.log10(1 + change * 10 ** (assumed_psnr / 10)))
 
 
-def mean_squared_error(a: Array, b: Array) -> float:
-    """Of two arrays of one shape."""
-    return float(np.mean((a - b) ** 2, dtype=np.float64))
-
-
-def psnr(a: Array, b: Array) -> float:
-    """Peak signal-to-noise ratio of two pictures in [0, 1], dB; at most 100."""
-    return float(-10 * np.log10(max(mean_squared_error(a, b), SMALLEST_ERROR)))
-
-
 def reduced(scene: Scene, rows: Array, sh_degree: int) -> Scene:
     """The Gaussians at `rows` with spherical harmonics up to `sh_degree` at most."""
     kept = scene.take(rows)
     count = min(SH_COUNTS[sh_degree], kept.gaussians.sh.shape[1])
     return replace(kept, gaussians=replace(kept.gaussians, sh=kept.gaussians.sh[:, :count]))
-
-
-def _colours(scene: Scene, camera: Camera) -> Array:
-    """(N, 3) float32 as seen from the camera."""
-    return colours(scene.gaussians.sh, scene.gaussians.means, camera.position)

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.compose import gated_mean
-from langsplat_core.query.engine import QueryEngine, QueryResult, TextEncoder
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, QueryResult
 from langsplat_core.raster.protocol import Rasterizer
 from langsplat_core.scene import Camera, LanguageField, Scene
 
@@ -38,16 +39,18 @@ def language_change(
     scenes: tuple[Scene, Scene],
     cameras: Sequence[Camera],
     phrases: Sequence[str],
-    encoder: TextEncoder | None = None,
+    load_encoder: LoadEncoder | None = None,
 ) -> LanguageChange | None:
     """Compare `scenes` (before, after) in the views of `cameras`; None where either has no language field.
 
-    Raises EncoderError for a phrase outside the phrasebook without an encoder that knows it.
+    load_encoder: of a phrase outside the phrasebook, see `QueryEngine`; EncoderError where one needs it.
     """
     before, after = scenes
     if before.language is None or after.language is None:
         return None
-    results = [tuple(QueryEngine(scene, encoder).run(phrase) for phrase in phrases) for scene in scenes]
+    load = None if load_encoder is None else cache(load_encoder)  # once for both
+    engines = [QueryEngine(scene, load) for scene in scenes]
+    results = [tuple(engine.run(phrase) for phrase in phrases) for engine in engines]
     channels = [
         _channels(scene.language, found)
         for scene, found in zip((before, after), results, strict=True)

@@ -88,7 +88,7 @@ def ring_cameras(scene: Scene, count: int) -> list[Camera]:
 def _photographed(scene: Scene, photos: Path, config: CompactConfig, progress: Progress) -> Views:
     with tempfile.TemporaryDirectory() as work:  # for points that may have to be found, and that are not used
         capture = load_capture(photos, DatasetConfig(max_side=config.max_side), Path(work), progress)
-    _check_same_world(scene.cameras, capture.cameras, photos)
+    check_same_world(scene.cameras, capture.cameras, photos)
     trained = {camera.name for camera in scene.cameras}
     seen = [i for i, camera in enumerate(capture.cameras) if camera.name in trained]
     unseen = [i for i, camera in enumerate(capture.cameras) if camera.name not in trained]
@@ -112,7 +112,7 @@ def _photographed(scene: Scene, photos: Path, config: CompactConfig, progress: P
     )
 
 
-def _check_same_world(own: Sequence[Camera], photographed: Sequence[Camera], photos: Path) -> None:
+def check_same_world(own: Sequence[Camera], photographed: Sequence[Camera], photos: Path) -> None:
     places = {camera.name: camera.position for camera in own}
     pairs = [(places[c.name], c.position) for c in photographed if c.name in places]
     if not pairs:

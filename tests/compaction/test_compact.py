@@ -5,20 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from langsplat_core.arrays import psnr
 from langsplat_core.cli import run as command_line
 from langsplat_core.cli.compact import Compact
 from langsplat_core.compaction import compact
 from langsplat_core.compaction import views as compact_views
-from langsplat_core.compaction.compact import Choice, compact_scene, select, smallest
+from langsplat_core.compaction.compact import compact_scene
 from langsplat_core.compaction.contribution import (
     ALONE,
     contributions,
     draw,
     estimated_loss,
-    expose,
-    psnr,
+    measuring_views,
     psnr_losses,
 )
+from langsplat_core.compaction.selection import Choice, select, smallest
 from langsplat_core.compaction.views import HOLD_OUT, choose_views, ring_cameras
 from langsplat_core.config import CompactConfig
 from langsplat_core.datasets import Capture
@@ -90,9 +91,9 @@ def test_loss_without_photographs_is_that_of_uncorrelated_errors(scene):
     less = scene.take(np.arange(N) % 9 > 0)
     picture = np.clip(draw(rasterizer, scene, view)[1], 0, 1)
     noise = np.random.default_rng(0).normal(0, 10 ** (-30 / 20), picture.shape)
-    truth = replace(expose(rasterizer, scene, [view], [None])[0], photograph=picture + noise)
+    truth = replace(measuring_views(rasterizer, scene, [view], [None])[0], photograph=picture + noise)
     measured = psnr_losses(rasterizer, less, [truth], 30.0)[0]
-    derived = psnr_losses(rasterizer, less, expose(rasterizer, scene, [view], [None]), 30.0)[0]
+    derived = psnr_losses(rasterizer, less, measuring_views(rasterizer, scene, [view], [None]), 30.0)[0]
     assert measured > 0.5
     assert derived == pytest.approx(measured, abs=0.1)  # the noise is finite: 147 000 numbers
     assert estimated_loss(1e-3, 30.0) == pytest.approx(10 * np.log10(2))
@@ -101,7 +102,7 @@ def test_loss_without_photographs_is_that_of_uncorrelated_errors(scene):
 def test_nothing_that_any_view_needs_is_dropped(scene):
     rasterizer = CpuRasterizer()
     views = choose_views(scene, None, CONFIG, silent)
-    exposures = expose(rasterizer, scene, views.measuring, views.photographs)
+    exposures = measuring_views(rasterizer, scene, views.measuring, views.photographs)
     selection = select(rasterizer, scene, views, exposures, CONFIG)
     score = contributions(rasterizer, scene, (*views.ranking, *views.measuring))
     assert 0 < (~selection.keep).sum() < N
@@ -133,7 +134,10 @@ def test_budget_companions_and_order_survive_the_file(scene, source, tmp_path):
     assert len(small.cameras) == len(scene.cameras)
     held = choose_views(scene, None, CONFIG, silent).measuring
     losses = psnr_losses(
-        CpuRasterizer(), small, expose(CpuRasterizer(), scene, held, [None] * len(held)), CONFIG.assumed_psnr
+        CpuRasterizer(),
+        small,
+        measuring_views(CpuRasterizer(), scene, held, [None] * len(held)),
+        CONFIG.assumed_psnr,
     )
     assert losses.mean() == pytest.approx(report.loss)
     assert report.loss <= CONFIG.max_psnr_loss
@@ -235,12 +239,12 @@ def test_bisection_finds_the_edge_and_weighs_degrees():
 
 def test_photographs_of_another_world_are_refused(scene):
     named = [replace(camera, name=f"v{i}") for i, camera in enumerate(scene.cameras)]
-    compact_views._check_same_world(named, named, "photos")
+    compact_views.check_same_world(named, named, "photos")
     matrix = np.eye(4)
     matrix[0, 3] = 0.2
     moved = [replace(camera, world_to_camera=camera.world_to_camera @ matrix) for camera in named]
     with pytest.raises(InputError, match="lie elsewhere"):
-        compact_views._check_same_world(named, moved, "photos")
+        compact_views.check_same_world(named, moved, "photos")
 
 
 def test_photographs_held_out_from_training_measure(scene, source, tmp_path, monkeypatch):
