@@ -1,9 +1,12 @@
 """The layers are a rule: imports run strictly downward, and opening a scene loads nothing heavy."""
 
 import ast
+import graphlib
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parent.parent
 # From top to bottom; packages of one row never import each other.
@@ -81,6 +84,68 @@ def test_imports_run_strictly_downward():
         if module_name(path) != FACADE:
             found += violations(module_name(path), imported_modules(path))
     assert not found, "\n".join(found)
+
+
+def names_imported(path: Path, lazily_too: bool) -> list[str]:
+    """Full names that a file imports, when it is imported itself or also inside functions; what only type
+    checkers see does not count."""
+    names = []
+    waiting: list[ast.AST] = list(ast.parse(path.read_text()).body)
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            waiting += node.orelse
+        elif lazily_too or not isinstance(node, (ast.FunctionDef, ast.Lambda)):
+            waiting += ast.iter_child_nodes(node)
+    return names
+
+
+def import_graph(imports: dict[str, list[str]]) -> dict[str, set[str]]:
+    """Module -> modules it imports, both of the project; a name in a module counts as that module."""
+    graph = {}
+    for module, names in imports.items():
+        known = {name if name in imports else name.rpartition(".")[0] for name in names}
+        graph[module] = {name for name in known if name in imports and name != module}
+    return graph
+
+
+def circle_in(graph: dict[str, set[str]]) -> list[str]:
+    """Modules that import each other in a circle; empty where there is none."""
+    try:
+        list(graphlib.TopologicalSorter(graph).static_order())
+    except graphlib.CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+@pytest.mark.parametrize("lazily_too", [False, True])
+def test_no_files_import_each_other_in_a_circle(lazily_too: bool) -> None:
+    files = {module_name(path).removesuffix(".__init__"): path for path in SOURCES}
+    del files[FACADE.removesuffix(".__init__")]
+    graph = import_graph({name: names_imported(path, lazily_too) for name, path in files.items()})
+    assert circle_in(graph) == []
+
+
+def test_a_circle_would_be_found():
+    assert circle_in(import_graph({"a": ["b.name"], "b": ["c"], "c": ["a"]}))
+    assert not circle_in(import_graph({"a": ["b", "c"], "b": ["c"], "c": ["numpy"]}))
+
+
+def test_only_the_command_line_knows_the_workshop():
+    lab = "langsplat_core.lab"
+    insiders = (lab, "langsplat_core.cli")
+    strangers = [
+        module_name(path)
+        for path in SOURCES
+        if not module_name(path).startswith(insiders)
+        and any(name == lab or name.startswith(lab + ".") for name in imported_modules(path))
+    ]
+    assert not strangers
+    assert any(module_name(path).startswith(lab) for path in SOURCES)
 
 
 def test_every_module_has_a_layer():

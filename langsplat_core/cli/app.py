@@ -6,6 +6,7 @@ from tyro.extras import SubcommandApp
 
 from langsplat_core.cli.bench import BenchRaster
 from langsplat_core.cli.bench_load import BenchLoad
+from langsplat_core.cli.bench_steps import BenchSteps
 from langsplat_core.cli.compact import Compact
 from langsplat_core.cli.convert import Convert
 from langsplat_core.cli.demo import DemoBuild, DemoDataset, DemoEncoder, DemoSheet
@@ -16,7 +17,7 @@ from langsplat_core.cli.run import Command, main
 from langsplat_core.cli.train import Train
 
 
-def _parse(args: list[str]) -> Command:
+def parse(args: list[str]) -> Command:
     demo, evaluate, bench = SubcommandApp(), SubcommandApp(), SubcommandApp()
     demo.command(name="build")(DemoBuild)
     demo.command(name="dataset")(DemoDataset)
@@ -25,6 +26,7 @@ def _parse(args: list[str]) -> Command:
     evaluate.command(name="synthetic")(EvalSynthetic)
     bench.command(name="raster")(BenchRaster)
     bench.command(name="load")(BenchLoad)
+    bench.command(name="steps")(BenchSteps)
     app = SubcommandApp()
     app.command(name="train")(Train)
     app.command(name="query")(QueryScene)
@@ -46,4 +48,4 @@ def _parse(args: list[str]) -> Command:
 def entry() -> None:
     """The `langsplat` console script."""
     args = sys.argv[1:] or ["--help"]
-    sys.exit(main("langsplat", lambda: _parse(args)))
+    sys.exit(main("langsplat", lambda: parse(args)))

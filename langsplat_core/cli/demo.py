@@ -5,12 +5,12 @@ The work is imported when it is done: torch and open3d take seconds that --help 
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
-from langsplat_core.config import DemoEncoderConfig
 from langsplat_core.files import atomic_path
+from langsplat_core.lab.config import DemoEncoderConfig, MaskOrigin, Tier
 from langsplat_core.progress import TerminalProgress
 
 
@@ -26,7 +26,7 @@ class DemoDataset:
     """Number of photographs."""
     size: tuple[int, int] = (640, 480)
     """Width and height, pixels."""
-    tier: Literal["separate", "clutter", "occlusion"] = "clutter"
+    tier: Tier = "clutter"
     """How hard the room is: objects apart, cluttered, or packed with look-alikes."""
 
     def run(self) -> None:
@@ -61,9 +61,9 @@ class DemoBuild:
     """The scene to write, *.ply."""
     seed: int = 2
     """Another seed is another room."""
-    tier: Literal["separate", "clutter", "occlusion"] = "clutter"
+    tier: Tier = "clutter"
     """How hard the room is: objects apart, cluttered, or packed with look-alikes."""
-    masks: Literal["truth", "graph"] = "truth"
+    masks: MaskOrigin = "truth"
     """Outlines as a perfect segmenter would find them, or those of the weight-free segmenter."""
     steps: int = 6_000
     """Steps of radiance training."""

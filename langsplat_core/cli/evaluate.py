@@ -6,9 +6,8 @@ from typing import Annotated
 
 import tyro
 
-from langsplat_core.config import BenchmarkConfig, DatasetConfig
 from langsplat_core.errors import InputError
-from langsplat_core.formats import load_scene
+from langsplat_core.lab.config import BenchmarkConfig
 from langsplat_core.progress import TerminalProgress
 
 
@@ -65,33 +64,10 @@ class EvalSynthetic:
             save_json(self.json, asdict(self.config), reports)
 
     def _run_scene(self, path: Path, dataset: Path) -> None:
-        from langsplat_core.datasets import load_capture
-        from langsplat_core.lab.rooms.scoring import Reading, ask, evaluate, found_rate, read_truth
-        from langsplat_core.lab.world.objects.catalogue import EVERYTHING
-        from langsplat_core.query.engine import NO_FIELD, QueryEngine
-        from langsplat_core.raster import load_rasterizer
-        from langsplat_core.semantics.clip import load_text_encoder
+        from langsplat_core.lab.rooms.of_scene import measure_scene
+        from langsplat_core.lab.rooms.scoring import Reading
 
-        scene = load_scene(path)
-        if scene.language is None:
-            raise InputError(f"{path}: {NO_FIELD}")
-        truth = read_truth(dataset)
-        trained = {camera.name for camera in scene.cameras}
+        reading = Reading(self.paper_order, self.config.cut)
         with TerminalProgress() as progress:
-            capture = load_capture(dataset, DatasetConfig(max_side=100_000), dataset, progress)
-            held_out = [camera for camera in capture.cameras if camera.name not in trained]
-            if not held_out:
-                raise InputError(f"{path}: no view was held out from training")
-            engine = QueryEngine(scene, load_text_encoder(scene.language.encoder_id))
-            absent = truth.absent(EVERYTHING)
-            asked = ask(engine, [*(phrase.text for phrase in truth.phrases), *absent])
-            reading = Reading(self.paper_order, self.config.cut)
-            scores = evaluate(asked, load_rasterizer("cpu"), held_out, truth, reading, progress)
-        print("| phrases | queries | mIoU % | localisation % |\n|---|---|---|---|")
-        for score in scores:
-            shares = f"{100 * score.mean_iou:.1f} | {100 * score.localisation:.1f}"
-            print(f"| {score.kind} | {score.queries} | {shares} |")
-        found, count = found_rate(asked, absent)
-        print(f"\nabsent objects rejected: {100 * (1 - found):.0f} % of {count}")
-        if asked.unknown:
-            print(f"left out: {len(asked.unknown)} phrases with words that the encoder was never taught")
+            report = measure_scene(path, dataset, reading, progress)
+        print(report)

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from langsplat_core.formats import load_scene
-from langsplat_core.formats.summary import NEEDLE, OPACITY_EDGES, Anatomy, disk_bytes, dissect
+from langsplat_core.formats.summary import NEEDLE, OPACITY_EDGES, SceneSummary, disk_bytes, summarise
 
 
 @dataclass(frozen=True)
@@ -29,18 +29,18 @@ class Inspect:
     """Print JSON."""
 
     def run(self) -> None:
-        anatomy = dissect(load_scene(self.scene))
+        summary = summarise(load_scene(self.scene))
         size = disk_bytes(self.scene)
         if self.json:
-            print(json.dumps({"scene": str(self.scene), "disk_bytes": size, **asdict(anatomy)}, indent=1))
+            print(json.dumps({"scene": str(self.scene), "disk_bytes": size, **asdict(summary)}, indent=1))
             return
         table = Table.grid(padding=(0, 2))
-        for name, value in [("on disk", f"{size / 1e6:.2f} MB, companions included"), *_lines(anatomy)]:
+        for name, value in [("on disk", f"{size / 1e6:.2f} MB, companions included"), *_lines(summary)]:
             table.add_row(name, Text(value))
         Console().print(table)
 
 
-def _lines(a: Anatomy) -> list[tuple[str, str]]:
+def _lines(a: SceneSummary) -> list[tuple[str, str]]:
     """Rows of the report: a name, and a value for people."""
     reasons = "".join(f"; {count} {reason}" for reason, count in a.invalid.items())
     low, high = (" ".join(f"{value:.3g}" for value in corner) for corner in a.bounds)

@@ -17,6 +17,7 @@ from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.places import peak_pixel
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import LEVELS, Camera, Scene
+from langsplat_core.semantics.clip import load_text_encoder
 
 PAPER_FILTER = 20  # px, mean filter before the peak is taken (paper, implementation details)
 
@@ -47,11 +48,7 @@ class QueryScene:
         if not self.texts:
             raise InputError("no phrase given; for example: langsplat query scene.ply 'red cup'")
         camera = _camera(scene, self.camera)
-        engine = QueryEngine(scene)
-        if any(text.lower() not in scene.language.phrasebook for text in self.texts):
-            from langsplat_core.semantics.clip import load_text_encoder
-
-            engine.encoder = load_text_encoder(self.encoder or scene.language.encoder_id)
+        engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
         answers = []
         for text in self.texts:
             result = engine.run(text, self.level)

@@ -18,7 +18,7 @@ OPACITY_EDGES = (0.0, INRIA.alpha_min, 0.1, 0.5, 0.9, 1.0)
 
 
 @dataclass(frozen=True)
-class LanguageAnatomy:
+class LanguageSummary:
     """The language field in short."""
 
     codec: str
@@ -31,7 +31,7 @@ class LanguageAnatomy:
 
 
 @dataclass(frozen=True)
-class Anatomy:
+class SceneSummary:
     """Counts are of rows; shares are of valid rows, in [0, 1]."""
 
     gaussians: int
@@ -49,11 +49,11 @@ class Anatomy:
     extras: tuple[str, ...]
     cameras: int
     memory_bytes: int
-    language: LanguageAnatomy | None
+    language: LanguageSummary | None
 
 
-def dissect(scene: Scene) -> Anatomy:
-    """Every figure of `Anatomy` for a scene of any size, an empty one included."""
+def summarise(scene: Scene) -> SceneSummary:
+    """Every figure of `SceneSummary` for a scene of any size, an empty one included."""
     gaussians = scene.gaussians
     valid = gaussians.valid()
     drawn = gaussians.take(valid)
@@ -61,7 +61,7 @@ def dissect(scene: Scene) -> Anatomy:
     quantiles = np.quantile(ratios, [0.5, 0.99, 1.0], method="lower") if len(drawn) else np.ones(3)
     corners = np.quantile(drawn.means, [0.01, 0.99], axis=0) if len(drawn) else np.zeros((2, 3))
     low, high = corners.astype(float).tolist()
-    return Anatomy(
+    return SceneSummary(
         gaussians=len(gaussians),
         invalid=gaussians.invalid_rows(),
         invalid_rows=int((~valid).sum()),
@@ -133,12 +133,12 @@ def _sh_energy(gaussians: Gaussians) -> tuple[float, ...]:
     return tuple(float(per_coefficient[a:b].sum() / total) for a, b in pairwise(edges))
 
 
-def _language(field: LanguageField) -> LanguageAnatomy:
+def _language(field: LanguageField) -> LanguageSummary:
     observed = {
         name: float((confidence > 0).mean()) if len(field) else 0.0
         for name, confidence in zip(LEVELS, field.confidence, strict=True)
     }
-    return LanguageAnatomy(
+    return LanguageSummary(
         codec=field.codec.kind,
         latent_dim=field.codec.latent_dim,
         encoder=field.encoder_id,

@@ -4,8 +4,74 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+from langsplat_core.query.cut import CutRule
+
 Tier = Literal["separate", "clutter", "occlusion"]  # objects apart, cluttered, packed with look-alikes
 TIERS: tuple[Tier, ...] = get_args(Tier)
 MaskOrigin = Literal["truth", "graph"]  # the outlines a perfect segmenter would find; the weight-free one's
 
 
+@dataclass(frozen=True)
+class DemoEncoderConfig:
+    """Training of the small CLIP that comes with the program (`langsplat demo encoder`)."""
+
+    start: Path | None = None  # folder of an earlier demo encoder to begin from; None: random weights
+    rooms: int = 400  # random rooms that crops are rendered from
+    views: int = 3  # photographs of each room
+    plain_crops: int = 8_000  # crops of nothing but a colour or a texture
+    steps: int = 8_000
+    batch: int = 128  # crops per step
+    phrases: int = 192  # phrases per step
+    lr: float = 1e-3
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class BenchmarkConfig:
+    """Fresh rooms, and the method that is measured in them (`langsplat eval synthetic`)."""
+
+    tiers: tuple[Tier, ...] = TIERS
+    seeds: tuple[int, ...] = (101,)  # one room of every tier each; never that of the bundled scene
+    views: int = 48  # photographs of each room; every eighth is held out
+    size: tuple[int, int] = (400, 300)  # width and height, pixels
+    steps: int = 1_500  # of radiance training
+    max_gaussians: int = 50_000
+    masks: MaskOrigin = "truth"
+    encoder: str = "demo"  # "demo" for the bundled one, a folder, or a hub id
+    codec_steps: int = 4_000
+    cut: CutRule = "median"  # where a map is cut into a mask, see `query.cut`
+    budget: bool = False  # also swap one stage at a time for one that makes no mistake
+
+
+@dataclass(frozen=True)
+class RasterBenchConfig:
+    """What the rasterizer benchmark draws (`langsplat bench raster`)."""
+
+    counts: tuple[int, ...] = (10_000, 31_000, 100_000, 200_000, 1_000_000)
+    """Sizes of the random scenes, drawn at the middle one of --sizes."""
+    sizes: tuple[tuple[int, int], ...] = ((320, 240), (640, 480), (960, 720))
+    """Widths and heights of the picture, pixels; all are drawn with --pivot Gaussians."""
+    pivot: int = 200_000
+    """Gaussians of the random scene that is drawn at every size."""
+    channels: tuple[int, ...] = (3, 12)
+    """Values per Gaussian."""
+    scenes: tuple[Path, ...] = ()
+    """Real scenes to measure beside the random ones, from their first camera, else one that frames them."""
+    limit: float = 60.0
+    """Seconds that a single call may be expected to take; what would take longer is named and left out."""
+    cold: bool = False
+    """Also measure the first call in fresh processes, without and with compiled kernels."""
+
+
+@dataclass(frozen=True)
+class KernelStepsConfig:
+    """What the CPU kernels are measured on, whole and with one step taken out (`langsplat bench steps`)."""
+
+    scene: Path | None = None
+    """A scene to measure on; without one a random one."""
+    count: int = 200_000
+    """Gaussians of the random scene."""
+    size: tuple[int, int] = (640, 480)
+    """Width and height of the picture, pixels."""
+    channels: int = 12
+    """Values per Gaussian."""

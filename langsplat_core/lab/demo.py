@@ -5,7 +5,6 @@ and parts. Their names and colours it never sees: those come from the encoder.
 """
 
 from pathlib import Path
-from typing import Literal
 
 from langsplat_core.compaction.compact import CompactReport, compact_scene
 from langsplat_core.config import (
@@ -17,10 +16,10 @@ from langsplat_core.config import (
     RadianceConfig,
     TrainConfig,
 )
+from langsplat_core.lab.config import MaskOrigin, Tier
 from langsplat_core.lab.rooms.oracles import TruthMasks
 from langsplat_core.lab.rooms.scoring import read_truth
 from langsplat_core.lab.world.photographs import write_dataset
-from langsplat_core.lab.world.rooms import Tier
 from langsplat_core.pipeline.train import train_scene
 from langsplat_core.progress import Progress, silent
 
@@ -45,7 +44,7 @@ def build_demo(
     out: Path,
     seed: int = SEED,
     tier: Tier = "clutter",
-    masks: Literal["truth", "graph"] = "truth",
+    masks: MaskOrigin = "truth",
     steps: int = 6_000,
     progress: Progress = silent,
 ) -> CompactReport:

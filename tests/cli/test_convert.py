@@ -10,12 +10,20 @@ import pytest
 from langsplat_core.arrays import Array
 from langsplat_core.cli.convert import Convert
 from langsplat_core.errors import FormatError
-from langsplat_core.formats import companion_path, language, load_scene, save_scene
-from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.spherical_harmonics import colours
+from langsplat_core.formats import (
+    companion_path,
+    language,
+    load_scene,
+    save_scene,
+)
+from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
-from tests.support.file_samples import random_field
+from tests.support.extras import random_extras
+from tests.support.file_samples import (
+    random_field,
+)
 from tests.support.measured import Measure
+from tests.support.same import assert_same_extras
 from tests.support.scenes import random_camera, random_gaussians
 
 DEMO = Path(str(files("langsplat_assets"))) / "demo" / "scene.ply"
@@ -72,6 +80,23 @@ def test_a_sidecar_of_other_gaussians_is_refused_and_can_be_rematched(tmp_path):
     np.testing.assert_array_equal(got.language.latents, full_scene().language.latents)
 
 
+def test_rematch_keeps_cameras_mark_and_extras(tmp_path):
+    whole = replace(full_scene(40), extras=random_extras(40))
+    save_scene(tmp_path / "whole.ply", whole)
+    save_scene(tmp_path / "edited.ply", replace(whole.take(np.arange(5, 40)), language=None))
+    old = companion_path(tmp_path / "whole.ply", language.SUFFIX)
+    # a sidecar that does not fit lies beside the edited file, as an editor that saves in place leaves it
+    companion_path(tmp_path / "edited.ply", language.SUFFIX).write_bytes(old.read_bytes())
+    Convert(tmp_path / "edited.ply", tmp_path / "new.ply", rematch=old).run()
+    got = load_scene(tmp_path / "new.ply")
+    assert len(got.cameras) == 3
+    np.testing.assert_allclose(got.cameras[1].world_to_camera, whole.cameras[1].world_to_camera, atol=1e-12)
+    assert got.antialiased
+    assert_same_extras(got.extras, {name: values[5:] for name, values in whole.extras.items()})
+    assert got.language is not None
+    np.testing.assert_array_equal(got.language.latents, whole.language.latents[:, 5:])
+
+
 def test_a_write_that_fails_leaves_the_old_scene(tmp_path, monkeypatch):
     save_scene(tmp_path / "a.spz", full_scene())
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -89,9 +114,7 @@ def test_a_write_that_fails_leaves_the_old_scene(tmp_path, monkeypatch):
 
 
 def picture(gaussians: Gaussians, camera: Camera) -> Array:
-    seen = colours(gaussians.sh, gaussians.means, camera.position).astype(np.float32)
-    image, _ = load_rasterizer("cpu").view(gaussians, camera).splat(seen)
-    return np.clip(image, 0, 1)
+    return np.clip(render(Scene(gaussians), camera).colours, 0, 1)
 
 
 def psnr(scene: Gaussians, truth: Gaussians, cameras: list[Camera]) -> float:

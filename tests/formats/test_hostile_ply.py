@@ -21,9 +21,9 @@ from tests.support.file_samples import (
     ply_bytes,
     vertex_table,
 )
+from tests.support.ply_lies import lie
 from tests.support.scenes import random_gaussians
 
-TYPES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double", "int8", "float64")
 FIELDS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh")
 
 
@@ -198,86 +198,6 @@ def test_compressed_files_that_fuzzing_found(reader):
     header, body = content.split(b"end_header\n")
     nan = b"\x01\x00\xa0\x7f"  # little endian; signalling
     assert not reader(header + b"end_header\n" + nan + body[4:]).gaussians.valid().any()
-
-
-# ---- random damage that knows the header ----
-
-INSERTS = [
-    b"element face 3",
-    b"element face 0",
-    b"element a 999999999999",
-    b"element vertex 3",
-    b"property list uchar int v",
-    b"property list char int v",
-    b"property list uint double w",
-    b"property list float int v",
-    b"property double q",
-    b"property uchar q",
-    b"property float x",
-    b"property float f_rest_0",
-    b"property float f_rest_45",
-    b"property float packed_color",
-    b"property char \xff\xfe",
-    b"comment SplatRenderMode: mip",
-    b"obj_info \x00",
-    b"format ascii 1.0",
-    b"format binary_big_endian 1.0",
-    b"end_header",
-    b"ply",
-    b"",
-    b"\x00",
-    b"property",
-    b"element",
-]
-COUNTS = [0, 1, 2, 19, 21, 255, 256, 257, 2**31, 2**32, 2**63, 2**64, 10**12, -1]
-NAMES = [*inria_names(1), "chunk", "sh", "vertex", "min_x", "packed_position", "f_rest_9", "f_rest_-1", "ä"]
-
-
-def lie(content: bytes, rng: np.random.Generator) -> bytes:
-    """One to three changes to lines of the header, then perhaps a wound to the body."""
-    header, _, body = content.partition(b"end_header\n")
-    lines = header.splitlines()
-
-    def pick(choices):
-        return choices[int(rng.integers(len(choices)))]
-
-    for _ in range(int(rng.integers(1, 4))):
-        place, other = (int(i) for i in rng.integers(1, len(lines), size=2))
-        words = lines[place].split(b" ")
-        match int(rng.integers(0, 8)):
-            case 0 if len(lines) > 3:
-                del lines[place]
-            case 1:
-                lines.insert(other, lines[place])
-            case 2:
-                lines[place], lines[other] = lines[other], lines[place]
-            case 3:
-                lines.insert(place, pick(INSERTS))
-            case 4:
-                words[min(1, len(words) - 1)] = pick(TYPES).encode()
-                lines[place] = b" ".join(words)
-            case 5:
-                words[-1] = pick(NAMES).encode()
-                lines[place] = b" ".join(words)
-            case 6:
-                elements = [i for i, line in enumerate(lines) if line.startswith(b"element ")]
-                if elements:
-                    at = pick(elements)
-                    lines[at] = b" ".join([*lines[at].split(b" ")[:-1], str(pick(COUNTS)).encode()])
-            case _:
-                lines[1] = b"format " + pick([b"ascii", b"binary_little_endian", b"binary_big_endian"])
-    newline = b"\r\n" if rng.random() < 0.1 else b"\n"
-    match int(rng.integers(0, 8)):
-        case 0:
-            body = body[: int(rng.integers(0, len(body) + 1))]
-        case 1:
-            body += rng.bytes(int(rng.integers(1, 400)))
-        case 2:
-            place = int(rng.integers(0, len(body)))
-            body = body[:place] + rng.bytes(int(rng.integers(1, 40))) + body[place:]
-        case 3:
-            body = body * int(rng.integers(2, 5))
-    return newline.join([*lines, b"end_header"]) + newline + body
 
 
 def assert_survives_writing(scene: Scene, path: Path) -> None:

@@ -5,12 +5,12 @@ import struct
 import numpy as np
 import pytest
 
-from langsplat_core.arrays import Array, rotation_matrices, sigmoid
+from langsplat_core.arrays import rotation_matrices, sigmoid
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.formats import read_ksplat, read_splat, write_splat
 from langsplat_core.scene import Gaussians
 from tests.support.file_samples import C0
-from tests.support.scenes import random_gaussians
+from tests.support.scenes import covariances, random_gaussians
 from tests.support.splat_samples import ksplat_bytes, splat_bytes
 
 
@@ -158,11 +158,6 @@ def test_every_broken_rule_of_ksplat_has_its_message(put, case):
     with pytest.raises(FormatError, match=message) as caught:
         read_ksplat(put(make(), "a.ksplat"))
     assert "\n" not in str(caught.value)
-
-
-def covariances(g: Gaussians) -> Array:
-    axes = rotation_matrices(g.quats_wxyz.astype(float)) * np.exp(g.log_scales.astype(float))[:, None]
-    return axes @ axes.transpose(0, 2, 1)
 
 
 def test_real_files_agree(real_data):

@@ -12,8 +12,7 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.formats import read_splat, read_spz_scene, write_spz
 from langsplat_core.raster.spherical_harmonics import colours
 from langsplat_core.scene import Gaussians
-from tests.formats.test_splat import covariances
-from tests.support.scenes import random_gaussians
+from tests.support.scenes import covariances, random_gaussians
 from tests.support.splat_samples import spz_bytes
 
 # Half a step of each code, and the error of a rotation matrix. From version 3 on: half a step of 9 bits over

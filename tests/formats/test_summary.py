@@ -8,7 +8,7 @@ import pytest
 
 from langsplat_core.cli.inspect import Inspect
 from langsplat_core.formats import save_scene
-from langsplat_core.formats.summary import disk_bytes, dissect, duplicates
+from langsplat_core.formats.summary import disk_bytes, summarise, duplicates
 from langsplat_core.scene import Gaussians, Scene
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_camera, random_gaussians
@@ -27,7 +27,7 @@ def test_planted_faults_are_counted():
     broken.sh[3, 0, 0] = np.inf
     needles = random_gaussians(2, seed=3, sh_degree=1)
     needles.log_scales[:] = np.log([1.0, 1e-4, 1e-2])
-    found = dissect(Scene(joined(clean, broken, needles, clean.take(np.arange(5)))))
+    found = summarise(Scene(joined(clean, broken, needles, clean.take(np.arange(5)))))
     assert found.gaussians == 51
     assert found.invalid_rows == 4
     assert sum(found.invalid.values()) == 4
@@ -50,7 +50,7 @@ def test_opacity_shares_and_energy():
     gaussians.sh[:] = 0
     gaussians.sh[:, 0] = 0.5 / 0.28209479177387814  # with the offset, colour 1 everywhere
     gaussians.sh[:, 4] = 2 / 0.28209479177387814
-    found = dissect(Scene(gaussians))
+    found = summarise(Scene(gaussians))
     assert found.opacity_shares == (0.5, 0.0, 0.0, 0.25, 0.25)
     assert found.sh_energy == pytest.approx((0.2, 0.0, 0.8))
 
@@ -58,9 +58,9 @@ def test_opacity_shares_and_energy():
 def test_flat_and_empty_scenes_have_an_answer():
     flat = random_gaussians(3)
     flat.log_scales[:, 0] = -np.inf
-    assert dissect(Scene(flat)).anisotropy == (None, None, None)
-    assert dissect(Scene(flat)).needles == 3
-    empty = dissect(Scene(random_gaussians(0)))
+    assert summarise(Scene(flat)).anisotropy == (None, None, None)
+    assert summarise(Scene(flat)).needles == 3
+    empty = summarise(Scene(random_gaussians(0)))
     assert (empty.gaussians, empty.duplicates, empty.needles) == (0, 0, 0)
 
 

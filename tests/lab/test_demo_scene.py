@@ -34,7 +34,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def engine(scene: Scene) -> QueryEngine:
-    return QueryEngine(scene, load_text_encoder("demo"))
+    return QueryEngine(scene, load_text_encoder)
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ from PIL import Image, ImageFilter
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import DemoEncoderConfig
 from langsplat_core.files import atomic_path
+from langsplat_core.lab.config import TIERS, DemoEncoderConfig
 from langsplat_core.lab.world.appearance.colours import (
     COLOURS,
     from_lch,
@@ -24,7 +24,6 @@ from langsplat_core.lab.world.appearance.render import Light, Picture, Renderer
 from langsplat_core.lab.world.appearance.textures import noise
 from langsplat_core.lab.world.assembly import World, build_room
 from langsplat_core.lab.world.captions import Label
-from langsplat_core.lab.world.rooms import Tier
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera, look_at
 from langsplat_core.semantics.crops import masked_crop
@@ -32,7 +31,6 @@ from langsplat_core.semantics.crops import masked_crop
 CROP = 64  # side of a training crop, px
 _VIEW = (480, 360)  # width, height of the photographs that crops are cut from
 _LEAST = (40, 60, 90)  # px: smaller visible regions of a level are not used
-_TIERS: tuple[Tier, ...] = ("separate", "clutter", "occlusion")
 _TIER_SHARES = (0.35, 0.5, 0.15)  # of the rooms
 _CLUTTER = Label(-1, "", "", "", "", ())  # generic: the canonical phrases are right, no other
 
@@ -70,7 +68,7 @@ class CropSet:
 def room_crops(seed: int, views: int) -> CropSet:
     """Crops of `views` photographs of the room of one seed: regions of all levels and some clutter."""
     rng = np.random.default_rng((seed, 11))
-    world = build_room(seed, _TIERS[rng.choice(len(_TIERS), p=_TIER_SHARES)])
+    world = build_room(seed, TIERS[rng.choice(len(TIERS), p=_TIER_SHARES)])
     angle, height = rng.uniform(0, 2 * np.pi), rng.uniform(1.2, 2.0)
     position = np.array([1.4 * np.cos(angle), 1.4 * np.sin(angle), height])
     light = Light(position, rng.uniform(0.3, 0.9), rng.uniform(0.6, 1.15), rng.uniform(0.75, 1.3))

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -45,27 +45,31 @@ class PhraseBook:
 def phrase_book(labels: list[Label]) -> PhraseBook:
     """The phrases for a set of labels, and every object in every colour beside them."""
     distinct = tuple(dict.fromkeys(labels))
-    kinds: dict[str, str] = dict.fromkeys(CANONICAL_PHRASES, "canonical")
-    for colour in COLOURS:
-        kinds.update(dict.fromkeys(colour_phrases(colour), "colour"))
-    for material in sorted({label.material for label in distinct if label.material}):
-        kinds.update(dict.fromkeys(material_phrases(material), "material"))
-    for thing in sorted({label.thing for label in distinct if label.thing}):
-        kinds.update({name: kinds.get(name, "object") for name in whole_phrases(thing, "")})
-        for colour in COLOURS:
-            for name in whole_phrases(thing, colour):
-                kinds.setdefault(name, "colour+object")
-    for label in distinct:
-        if label.level == 2:
-            for name in material_whole_phrases(label.thing, label.material):
-                kinds.setdefault(name, "material+object")
-    for label in distinct:
-        for name in label.names:
-            kinds.setdefault(name, "part")
+    kinds = _kinds(distinct)
     phrases = tuple(kinds)
     column = {phrase: k for k, phrase in enumerate(phrases)}
     fits = np.stack([_row(label, column) for label in distinct])
     return PhraseBook(phrases, tuple(kinds.values()), distinct, fits)
+
+
+def _kinds(labels: tuple[Label, ...]) -> dict[str, str]:
+    """Every phrase and its kind, the canonical ones first; a phrase of several kinds has the first."""
+    kinds: dict[str, str] = dict.fromkeys(CANONICAL_PHRASES, "canonical")
+    for colour in COLOURS:
+        kinds.update(dict.fromkeys(colour_phrases(colour), "colour"))
+    for material in sorted({label.material for label in labels if label.material}):
+        kinds.update(dict.fromkeys(material_phrases(material), "material"))
+    for thing in sorted({label.thing for label in labels if label.thing}):
+        kinds.update({name: kinds.get(name, "object") for name in whole_phrases(thing, "")})
+        for colour in COLOURS:
+            for name in whole_phrases(thing, colour):
+                kinds.setdefault(name, "colour+object")
+    wholes = [label for label in labels if label.level == 2]
+    for name in chain.from_iterable(material_whole_phrases(label.thing, label.material) for label in wholes):
+        kinds.setdefault(name, "material+object")
+    for name in chain.from_iterable(label.names for label in labels):
+        kinds.setdefault(name, "part")
+    return kinds
 
 
 def _row(label: Label, column: dict[str, int]) -> Array:

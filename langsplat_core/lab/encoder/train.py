@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import DemoEncoderConfig
 from langsplat_core.files import atomic_path
+from langsplat_core.lab.config import DemoEncoderConfig
 from langsplat_core.lab.encoder.crops import CropSet, read_crops, write_crops
 from langsplat_core.lab.encoder.model import (
     MEAN,
@@ -52,7 +52,7 @@ _SIGMOID_SCALE, _CONTRAST_SCALE = 14.0, 20.0
 _KEPT_PATCHES = 0.55  # share of the patches shown to the model during training (FLIP, Li et al. 2023)
 _AVERAGING = 0.998  # decay of the running mean of the weights, which is what is saved
 _WHOLE_WEIGHT = 8.0  # crops of small objects are drawn this much more often than others of their count
-_SAVE_EVERY = 250  # steps
+SAVE_EVERY = 250  # steps
 FLOOR_COSINE = 0.20  # of a nameable crop with the canonical phrases once trained: relevancy 0.5 lies there
 _CALIBRATION_CROPS = 2_500
 
@@ -217,7 +217,7 @@ def train_demo_encoder(out: Path, config: DemoEncoderConfig, progress: Progress)
     while run.step < config.steps:
         run.advance(sampler.batch(config, np.random.default_rng((config.seed, 17, run.step))))
         progress(f"training: step {run.step}, loss {run.loss:.3f}", run.step / config.steps)
-        if run.step % _SAVE_EVERY == 0 or run.step == config.steps:
+        if run.step % SAVE_EVERY == 0 or run.step == config.steps:
             run.save(work / "state.pt")
             export(run.mean, out)
     canonical = tokenizer(list(CANONICAL_PHRASES), return_tensors="pt", padding=True).input_ids

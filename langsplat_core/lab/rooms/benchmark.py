@@ -12,7 +12,6 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import (
-    BenchmarkConfig,
     ClipConfig,
     CodecConfig,
     DatasetConfig,
@@ -26,12 +25,13 @@ from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
 from langsplat_core.formats import load_scene, save_scene
 from langsplat_core.formats.language import means_checksum
+from langsplat_core.lab.config import BenchmarkConfig, Tier
 from langsplat_core.lab.demo import SEED
 from langsplat_core.lab.rooms.oracles import (
     TruthMasks,
-    among_pictures,
+    moved_to_pictures,
+    oracle_vectors,
     phrase_vectors,
-    told_vectors,
     true_labels,
 )
 from langsplat_core.lab.rooms.report import Measured, RoomReport, measured
@@ -47,16 +47,17 @@ from langsplat_core.lab.rooms.scoring import (
 from langsplat_core.lab.rooms.variants import Variant, variants
 from langsplat_core.lab.world.objects.catalogue import EVERYTHING
 from langsplat_core.lab.world.photographs import write_dataset
-from langsplat_core.lab.world.rooms import Tier
+from langsplat_core.pipeline.language import Views, language_field
 from langsplat_core.pipeline.stages import stage_key
-from langsplat_core.pipeline.train import Views, language_field, trained_gaussians
+from langsplat_core.pipeline.train import trained_gaussians
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.pixels import splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.semantics.clip import ClipEncoder, clip_folder, load_clip
-from langsplat_core.semantics.masks import MaskSource, load_mask_source
+from langsplat_core.semantics.masks import MaskSource
+from langsplat_core.semantics.sources import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, describe_capture
 from langsplat_core.training.language.codec_fit import reconstruction_cosine
 from langsplat_core.training.radiance.train import evaluate_views
@@ -136,20 +137,26 @@ class Room:
         self.seconds: dict[str, float] = {}
 
     @cached_property
-    def capture(self) -> Capture:
-        """The photographs."""
+    def photographs(self) -> Path:
+        """Their folder, rendered if need be, with the truth in it."""
         folder, start = self.folder / "photographs", time.perf_counter()
         if not (folder / "transforms.json").exists():
             write_dataset(folder, self.seed, self.config.views, self.config.size, self.progress, self.tier)
-        capture = load_capture(folder, self.settings.dataset, self.folder, self.progress)
+            self._lap("photographs", start)
+        return folder
+
+    @cached_property
+    def capture(self) -> Capture:
+        """The photographs."""
+        start = time.perf_counter()
+        capture = load_capture(self.photographs, self.settings.dataset, self.folder, self.progress)
         self._lap("photographs", start)
         return capture
 
     @cached_property
     def truth(self) -> Truth:
         """What is in them."""
-        assert self.capture
-        return read_truth(self.folder / "photographs")
+        return read_truth(self.photographs)
 
     @cached_property
     def gaussians(self) -> Gaussians:
@@ -194,10 +201,10 @@ class Room:
         if variant.vectors == "text":
             words = phrase_vectors(self.truth, self.encoder)
             told = [
-                told_vectors(item, self.truth.labels(camera.name), words)
+                oracle_vectors(item, self.truth.labels(camera.name), words)
                 for item, camera in zip(features, cameras, strict=True)
             ]
-            features = among_pictures(told, features)
+            features = moved_to_pictures(told, features)
         return list(zip(cameras, features, strict=True))
 
     def scene(self, variant: Variant) -> tuple[Scene, float]:
@@ -211,7 +218,9 @@ class Room:
         if not path.exists():
             start = time.perf_counter()
             settings = replace(self.settings, codec=codec)
-            field, _ = language_field(self.gaussians, views, self.encoder, settings, self.progress)
+            field, _ = language_field(
+                self.gaussians, views, self.encoder, settings, self.folder, self.progress
+            )
             save_scene(path, Scene(self.gaussians, field, tuple(camera for camera, _ in views)))
             self._lap(f"language field ({variant.name})", start)
         scene = load_scene(path)
@@ -223,7 +232,7 @@ class Room:
         """Ask everything; the method's own order of work but for what `variant` says."""
         scene, cosine = self.scene(variant)
         start = time.perf_counter()
-        engine = QueryEngine(scene, self.encoder, exact=variant.query == "exact")
+        engine = QueryEngine(scene, lambda _: self.encoder, exact=variant.query == "exact")
         absent = self.truth.absent(EVERYTHING)
         asked = ask(engine, [*(phrase.text for phrase in self.truth.phrases), *absent])
         reading = Reading(variant.query == "paper", self.config.cut)

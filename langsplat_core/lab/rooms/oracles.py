@@ -55,7 +55,7 @@ def _digest(image: Array) -> str:
     return hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest()
 
 
-def told_vectors(features: ImageFeatures, ids: Array, vectors: Mapping[int, Array]) -> ImageFeatures:
+def oracle_vectors(features: ImageFeatures, ids: Array, vectors: Mapping[int, Array]) -> ImageFeatures:
     """`features` as if the encoder had read what most of every region's pixels truly are.
 
     ids: (3, H, W) truth; vectors: id -> (D,) unit text vector. A region that mostly shows nothing, or
@@ -70,7 +70,7 @@ def told_vectors(features: ImageFeatures, ids: Array, vectors: Mapping[int, Arra
     return replace(features, vectors=told)
 
 
-def among_pictures(told: Sequence[ImageFeatures], seen: Sequence[ImageFeatures]) -> list[ImageFeatures]:
+def moved_to_pictures(told: Sequence[ImageFeatures], seen: Sequence[ImageFeatures]) -> list[ImageFeatures]:
     """Text vectors moved by one vector, the same for all, to where the encoder puts pictures.
 
     CLIP's pictures and phrases lie in two separate clouds ("Mind the gap", Liang et al. 2022). Against the

@@ -145,7 +145,7 @@ def ask(engine: QueryEngine, texts: Iterable[str]) -> Asked:
     answers: dict[str, Answer] = {}
     unknown, seconds = [], []
     for text in dict.fromkeys(texts):
-        if engine.encoder is not None and engine.encoder.unknown_words(text):
+        if engine.unknown_words(text):
             unknown.append(text)
             continue
         if not answers:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-Masks = Literal["truth", "graph"]
+from langsplat_core.lab.config import MaskOrigin
 
 
 @dataclass(frozen=True)
@@ -11,13 +11,13 @@ class Variant:
     """Which stages are the method's own, and which make no mistake."""
 
     name: str
-    masks: Masks
+    masks: MaskOrigin
     vectors: Literal["image", "text"] = "image"  # text: of every region's true words
     codec: Literal["autoencoder", "linear"] = "autoencoder"  # linear: of `WIDE` numbers
     query: Literal["table", "exact", "paper"] = "table"
 
 
-def variants(masks: Masks, budget: bool) -> list[Variant]:
+def variants(masks: MaskOrigin, budget: bool) -> list[Variant]:
     """The method first; with `budget`, then one variant per stage, which differs in that stage alone."""
     method = Variant("the method", masks)
     if not budget:

@@ -1,8 +1,8 @@
 """What each step of the CPU kernels gains: the same kernels with one step taken out, timed in turn.
 
-`python packaging/kernel_steps.py [--scene SCENE] [--count N] [--size WxH]` copies the package to a temporary
-folder, takes one step out of the source there, and times that copy in a process of its own. Beside each time
-stands the greatest difference of its picture from that of the whole kernels. One thread, the median of nine.
+The package is copied to a temporary folder, one step is taken out of the source there, and that copy is
+timed in a process of its own (`kernel_times`). Beside each time stands the greatest difference of its
+picture from that of the whole kernels. One thread, the median of nine.
 """
 
 import json
@@ -11,15 +11,17 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-import tyro
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
+import numpy as np
 
-ROOT = Path(__file__).resolve().parents[3]
+from langsplat_core.arrays import Array
+from langsplat_core.errors import BackendError
+from langsplat_core.lab.config import KernelStepsConfig
+from langsplat_core.progress import Progress, silent
+
+PACKAGE = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class Variant:
     """One step taken out: texts of source files replaced, or the compiler told of another processor."""
 
     name: str
-    edits: tuple[tuple[str, str, str], ...] = ()  # file in raster/, text, what stands there instead
+    edits: tuple[tuple[str, str, str], ...] = ()  # file in raster/cpu/, text, what stands there instead
     environment: dict[str, str] = field(default_factory=dict)
 
 
@@ -35,7 +37,7 @@ VARIANTS = (
     Variant("whole"),
     Variant(
         "rows of the tile that the footprint misses are blended too",
-        (("blend.py", "return max(packed & 255, top), min(packed >> 8, bottom)", "return top, bottom"),),
+        (("walk.py", "return max(low, top), min(high, bottom)", "return top, bottom"),),
     ),
     Variant(
         "tiles of the bounding box, not of the ellipse",
@@ -52,12 +54,12 @@ VARIANTS = (
         (
             (
                 "projection.py",
-                "reach = np.sqrt(2 * np.log(max(opacity / lens.alpha_min, 1.0)))",
+                "reach = np.sqrt(2 * np.log(max(opacity / camera.alpha_min, 1.0)))",
                 "reach = 3.33",
             ),
         ),
     ),
-    Variant("no early stop", (("blend.py", "CHECK_EVERY = 16", "CHECK_EVERY = 2**40"),)),
+    Variant("no early stop", (("walk.py", "CHECK_EVERY = 16", "CHECK_EVERY = 2**40"),)),
     Variant(
         "the C library's exp2, not a polynomial",
         (
@@ -94,97 +96,67 @@ VARIANTS = (
     Variant("SSE2 only", environment={"NUMBA_CPU_NAME": "x86-64", "NUMBA_CPU_FEATURES": "+sse2"}),
 )
 
-_MEASURE = """
-import json, sys, time
-import numpy as np
-from langsplat_core.lab.speed.cases import default_camera, random_scene
-from langsplat_core.formats import load_scene
-from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-scene, count, width, height, channels, picture = json.loads(sys.argv[1])
-if scene:
-    opened = load_scene(scene)
-    gaussians = opened.gaussians
-    camera = opened.cameras[0] if opened.cameras else opened.framing_camera((width, height))
-    camera = camera.resized(width, height)
-else:
-    gaussians, camera = random_scene(count), default_camera(width, height)
-rng = np.random.default_rng(0)
-x = rng.uniform(size=(len(gaussians), channels)).astype(np.float32)
-y = rng.uniform(size=(camera.height, camera.width, channels)).astype(np.float32)
-raster = CpuRasterizer(1)
-view = raster.view(gaussians, camera)
-calls = {"view": lambda: raster.view(gaussians, camera), "splat": lambda: view.splat(x),
-         "gather": lambda: view.gather(y), "backward": lambda: view.backward(x, y)}
-times = {}
-for name, call in calls.items():
-    call()
-    spent = []
-    for _ in range(9):
-        start = time.thread_time()
-        call()
-        spent.append(1e3 * (time.thread_time() - start))
-    times[name] = float(np.median(spent))
-np.save(picture, view.splat(x)[0])
-print(json.dumps(times))
-"""
-
 
 @dataclass(frozen=True)
-class Steps:
-    """What each step of the CPU kernels gains."""
+class StepTimes:
+    """The kernels without one step."""
 
-    scene: Path | None = None
-    """A scene to measure on; without one a random one."""
-    count: int = 200_000
-    """Gaussians of the random scene."""
-    size: tuple[int, int] = (640, 480)
-    """Width and height of the picture, pixels."""
-    channels: int = 12
-    """Values per Gaussian."""
+    name: str
+    milliseconds: dict[str, float]  # by operation
+    changes_by: float  # largest difference of its picture from that of the whole kernels
 
 
-def main(steps: Steps) -> None:
-    import numpy as np
+def measure_steps(config: KernelStepsConfig, progress: Progress = silent) -> list[StepTimes]:
+    """Every variant in turn, the whole kernels first; some minutes.
 
-    console, rows = Console(), []
+    Raises BackendError where a variant cannot be measured.
+    """
+    rows: list[StepTimes] = []
+    whole: Array | None = None
     with tempfile.TemporaryDirectory() as folder:
-        for number, variant in enumerate(track(VARIANTS, "measuring", console=console)):
+        for number, variant in enumerate(VARIANTS):
+            progress("measuring", number / len(VARIANTS))
             place = Path(folder) / str(number)
-            shutil.copytree(ROOT / "langsplat_core", place / "langsplat_core", ignore=_compiled)
-            _take_out(variant, place / "langsplat_core" / "raster" / "cpu")
-            rows.append((variant.name, _measure(variant, steps, place), np.load(place / "picture.npy")))
-    whole_times, whole_picture = rows[0][1:]
-    table = Table("taken out", *whole_times, "picture differs by", title=f"milliseconds, {steps}")
-    for name, times, picture in rows:
-        cells = [f"{times[k]:.1f} ({times[k] / whole_times[k]:.2f}x)" for k in times]
-        table.add_row(name, *cells, f"{np.abs(picture - whole_picture).max():.1e}")
-    console.print(table)
+            ignored = shutil.ignore_patterns("__pycache__")
+            shutil.copytree(PACKAGE, place / PACKAGE.name, ignore=ignored)
+            take_out(variant, place / PACKAGE.name / "raster" / "cpu")
+            times = _times(variant, config, place)
+            picture: Array = np.load(place / "picture.npy")
+            whole = picture if whole is None else whole
+            rows.append(StepTimes(variant.name, times, float(np.abs(picture - whole).max())))
+    progress("measuring", 1.0)
+    return rows
 
 
-def _take_out(variant: Variant, raster: Path) -> None:
+def steps_table(rows: list[StepTimes]) -> str:
+    """Markdown; milliseconds, and how many times those of the whole kernels."""
+    whole = rows[0].milliseconds
+    lines = [
+        "| taken out | " + " | ".join(whole) + " | picture differs by |",
+        "|---" * (len(whole) + 2) + "|",
+    ]
+    for row in rows:
+        cells = [f"{ms:.1f} ({ms / whole[name]:.2f}x)" for name, ms in row.milliseconds.items()]
+        lines.append(f"| {row.name} | " + " | ".join(cells) + f" | {row.changes_by:.1e} |")
+    return "\n".join(lines) + "\n"
+
+
+def take_out(variant: Variant, sources: Path) -> None:
+    """Edit the files in `sources`, a copy of raster/cpu; BackendError for a text that is not there."""
     for name, old, new in variant.edits:
-        text = (raster / name).read_text()
+        text = (sources / name).read_text()
         if old not in text:
-            raise SystemExit(f"{variant.name}: {name} no longer holds {old!r}")
-        (raster / name).write_text(text.replace(old, new))
+            raise BackendError(f"{variant.name}: {name} no longer holds {old!r}")
+        (sources / name).write_text(text.replace(old, new))
 
 
-def _measure(variant: Variant, steps: Steps, place: Path) -> dict[str, float]:
-    scene = str(steps.scene.resolve()) if steps.scene else None
-    arguments = json.dumps([scene, steps.count, *steps.size, steps.channels, str(place / "picture.npy")])
+def _times(variant: Variant, config: KernelStepsConfig, place: Path) -> dict[str, float]:
+    settings = asdict(config) | {"scene": str(config.scene.resolve()) if config.scene else None}
+    command = [sys.executable, "-m", "langsplat_core.lab.speed.kernel_times", json.dumps(settings)]
     environment = os.environ | variant.environment | {"PYTHONPATH": str(place)}
-    done = subprocess.run(
-        [sys.executable, "-c", _MEASURE, arguments],
-        cwd=place, env=environment, capture_output=True, text=True,
-    )  # fmt: skip
+    environment.pop("NUMBA_CACHE_DIR", None)
+    done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise SystemExit(f"{variant.name}: {done.stderr[-2000:]}")
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def _compiled(folder: str, names: list[str]) -> list[str]:
-    return [name for name in names if name == "__pycache__"]
-
-
-if __name__ == "__main__":
-    main(tyro.cli(Steps))
+        raise BackendError(f"{variant.name}: {done.stderr.strip().splitlines()[-1:]}")
+    times: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return times

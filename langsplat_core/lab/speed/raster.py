@@ -12,6 +12,7 @@ from typing import Any
 from langsplat_core.errors import BackendError
 from langsplat_core.files import atomic_path
 from langsplat_core.formats import load_scene
+from langsplat_core.lab.config import RasterBenchConfig
 from langsplat_core.lab.speed import report as tables
 from langsplat_core.lab.speed.cases import Case, default_camera, random_scene, sweep
 from langsplat_core.lab.speed.cold_start import Start, measure_starts, starts_table
@@ -26,27 +27,14 @@ from langsplat_core.raster.opengl.context import create_egl_context
 from langsplat_core.raster.protocol import Rasterizer
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What to measure; see `langsplat bench raster --help`."""
-
-    counts: tuple[int, ...]
-    sizes: tuple[tuple[int, int], ...]
-    pivot: int
-    channels: tuple[int, ...]
-    scenes: tuple[Path, ...] = ()
-    limit_s: float = 60.0
-    cold: bool = False
-
-
-def quick_plan(plan: Plan) -> Plan:
+def quick_plan(plan: RasterBenchConfig) -> RasterBenchConfig:
     """About a minute on two cores."""
     return replace(
         plan,
         counts=(3_000, 10_000, 31_000),
         sizes=((160, 120), (320, 240), (640, 480)),
         pivot=10_000,
-        limit_s=min(plan.limit_s, 3.0),
+        limit=min(plan.limit, 3.0),
     )
 
 
@@ -113,7 +101,7 @@ _NOTES = """- ms: median of the calls after the first.
 """
 
 
-def run_plan(plan: Plan, progress: Progress = silent) -> Report:
+def run_plan(plan: RasterBenchConfig, progress: Progress = silent) -> Report:
     """Measure; a few minutes for the default plan."""
     machine = describe_machine()
     baseline: Any = TorchRasterizer()  # a `Rasterizer` whose views have no depth
@@ -121,7 +109,7 @@ def run_plan(plan: Plan, progress: Progress = silent) -> Report:
     progress("bench: compiling", 0.0)
     warm_up(backends, plan.channels)
     peak = peak_flops()
-    foresight = Foresight(plan.limit_s)
+    foresight = Foresight(plan.limit)
     rows: list[Measurement] = []
     needs: dict[tuple[str, int, int, int], Need] = {}
     total = len(plan.scenes) + len(_pairs(plan))
@@ -140,11 +128,11 @@ def run_plan(plan: Plan, progress: Progress = silent) -> Report:
     return Report(machine, rows, peak, needs, measure_starts() if plan.cold else [])
 
 
-def _pairs(plan: Plan) -> list[tuple[int, tuple[int, int]]]:
+def _pairs(plan: RasterBenchConfig) -> list[tuple[int, tuple[int, int]]]:
     return sweep(plan.counts, plan.sizes, plan.pivot, tables.PROMISED_CASES)
 
 
-def _cases(plan: Plan) -> Iterator[Case]:
+def _cases(plan: RasterBenchConfig) -> Iterator[Case]:
     for count, size in _pairs(plan):
         yield Case("random", random_scene(count), default_camera(*size))
     for path in plan.scenes:

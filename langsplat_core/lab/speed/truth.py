@@ -15,7 +15,7 @@ import scipy.sparse
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster.reference import Footprints, ReferenceView, project
+from langsplat_core.raster.reference import Footprints, ReferenceView, project, rim
 from langsplat_core.scene import Camera, Gaussians
 
 WINDOW = 64  # pixels a side
@@ -31,16 +31,6 @@ class Error:
     largest: float  # over all pixels compared
     off_cuts: float  # over those where no cut-off is near
     flips: int  # pixels near a cut-off that came out on its other side
-
-
-class _WindowView(ReferenceView):
-    """A `ReferenceView` of part of a picture, from footprints that are projected already."""
-
-    def __init__(self, footprints: Footprints, camera: Camera, settings: RasterSettings) -> None:
-        self.camera, self.settings, self.footprints = camera, settings, footprints
-        self.dropped = 0
-        self.order = np.argsort(footprints.depths, kind="stable")
-        self.windows = self._windows()
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,16 +106,10 @@ def make_truth(gaussians: Gaussians, camera: Camera, settings: RasterSettings = 
     return Truth(footprints, rows, tuple(windows))
 
 
-def _rim(footprints: Footprints, settings: RasterSettings) -> Array:
-    """(N, 2) half extents of the contour at the band's outer edge, alpha = alpha_min (1 - band), px."""
-    squared = 2 * np.log(np.maximum(footprints.opacities / settings.alpha_min, 1 + 1e-9))
-    return footprints.extents_px * np.sqrt(1 + 2.1 * _BAND / squared)[:, None] + 1e-3
-
-
 def _reaches(footprints: Footprints, settings: RasterSettings, at: tuple[slice, slice]) -> Array:
     """(N,) bool: drawn, and not wholly outside the window."""
     rows, columns = at
-    reach = _rim(footprints, settings)
+    reach = rim(footprints, settings, _BAND)
     low, high = footprints.means_px - reach, footprints.means_px + reach
     inside = (high > (columns.start, rows.start)) & (low < (columns.stop, rows.stop))
     return inside.all(1) & (footprints.opacities > 0)
@@ -155,42 +139,14 @@ def _window(
     rows, columns = at
     height, width = rows.stop - rows.start, columns.stop - columns.start
     moved = replace(footprints, means_px=footprints.means_px - (columns.start, rows.start))
-    view = _WindowView(moved, replace(camera, width=width, height=height), settings)
+    view = ReferenceView(moved, replace(camera, width=width, height=height), settings, dropped=0)
     pixels = np.arange(height * width).reshape(height, width)
     indices, where, weights = [np.empty(0, int)], [np.empty(0, int)], [np.empty(0)]
-    for i, window, part, _ in view._weights():
-        hit = part > 0
-        where.append(pixels[window][hit])
-        weights.append(part[hit])
-        indices.append(np.full(len(where[-1]), where_to[i]))
+    for step in view.steps():
+        hit = step.weights > 0
+        where.append(pixels[step.window][hit])
+        weights.append(step.weights[hit])
+        indices.append(np.full(len(where[-1]), where_to[step.index]))
     entries = (np.concatenate(weights), (np.concatenate(where), np.concatenate(indices)))
     matrix = scipy.sparse.csr_array(entries, shape=(height * width, count))
-    return Window(at, matrix, _cut_off_band(view))
-
-
-def _cut_off_band(view: ReferenceView) -> Array:
-    """(h, w) True where some Gaussian's alpha, or the transmittance behind it, lies at a cut-off."""
-    settings, f = view.settings, view.footprints
-    height, width = view.camera.height, view.camera.width
-    band, running = np.zeros((height, width), bool), np.ones((height, width), bool)
-    transmittance = np.ones((height, width))
-    rim = _rim(f, settings)
-    low = np.clip(np.floor(f.means_px - rim), 0, (width, height)).astype(int)
-    high = np.clip(np.ceil(f.means_px + rim), 0, (width, height)).astype(int)
-    for i in view.order:
-        if (low[i] >= high[i]).any():
-            continue
-        at = np.s_[low[i, 1] : high[i, 1], low[i, 0] : high[i, 0]]
-        dx = np.arange(low[i, 0], high[i, 0]) + 0.5 - f.means_px[i, 0]
-        dy = (np.arange(low[i, 1], high[i, 1]) + 0.5 - f.means_px[i, 1])[:, None]
-        xx, xy, yy = f.conics[i]
-        alpha = f.opacities[i] * np.exp(-0.5 * (xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy))
-        alpha = np.minimum(alpha, float(np.float32(settings.alpha_max)))
-        after = transmittance[at] * (1 - alpha)
-        hit = running[at] & (alpha >= settings.alpha_min)
-        band[at] |= running[at] & (np.abs(alpha / settings.alpha_min - 1) < _BAND)
-        band[at] |= hit & (np.abs(after / settings.transmittance_min - 1) < _BAND)
-        stops = hit & (after <= settings.transmittance_min)
-        running[at] &= ~stops
-        transmittance[at] = np.where(hit & ~stops, after, transmittance[at])
-    return band
+    return Window(at, matrix, view.cut_off_band(_BAND))

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.lab.config import Tier
 from langsplat_core.lab.world.captions import Label, label_region
 from langsplat_core.lab.world.objects.kit import Material, Piece, Thing
 from langsplat_core.lab.world.placement import Placed
-from langsplat_core.lab.world.rooms import Tier, furnished
+from langsplat_core.lab.world.rooms import furnished
 
 
 @dataclass(frozen=True, eq=False)

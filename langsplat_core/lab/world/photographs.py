@@ -10,16 +10,16 @@ from PIL import Image
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
+from langsplat_core.lab.config import Tier
 from langsplat_core.lab.world.appearance.render import Light, Picture, Renderer
 from langsplat_core.lab.world.assembly import World, build_room
-from langsplat_core.lab.world.rooms import Tier
 from langsplat_core.progress import Progress
 from langsplat_core.scene import LEVELS, Camera, look_at
 
 POINTS = 20_000  # sparse points, as structure from motion would give
 _FIRST_ROOM = 2_000_000  # the demo encoder was trained in rooms of lower numbers only
-_LIGHT_SAMPLES = 40  # rays per vertex towards the lamp, and again towards the sky
-_LIGHT_CELL = 0.006  # metres between the places where light is gathered, where it varies
+LIGHT_SAMPLES = 40  # rays per vertex towards the lamp, and again towards the sky
+LIGHT_CELL = 0.006  # metres between the places where light is gathered, where it varies
 _POINT_NOISE = 0.004  # metres, standard deviation
 LIGHT = Light(np.array([-1.25, -1.05, 1.55]))
 # (share of the views, elevation in degrees, distance in metres, height of the target above the table)
@@ -48,7 +48,7 @@ def write_dataset(
     folder.mkdir(parents=True, exist_ok=True)
     truth.mkdir(exist_ok=True)
     progress("rendering photographs", 0.0)
-    renderer = Renderer(world, LIGHT, samples=_LIGHT_SAMPLES, cell=_LIGHT_CELL)
+    renderer = Renderer(world, LIGHT, samples=LIGHT_SAMPLES, cell=LIGHT_CELL)
     for done, camera in enumerate(cameras):
         if not (truth / f"{camera.name}.npz").exists():
             _write_view(renderer, world, camera, out)

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 from itertools import islice
-from typing import Literal
 
 import numpy as np
 
+from langsplat_core.lab.config import Tier
 from langsplat_core.lab.world.appearance.colours import COLOURS
 from langsplat_core.lab.world.geometry.shapes import rotation_about
 from langsplat_core.lab.world.objects import furniture
@@ -13,7 +13,6 @@ from langsplat_core.lab.world.objects.catalogue import BRIGHT, FURNITURE, TABLE_
 from langsplat_core.lab.world.objects.kit import Kit, Thing
 from langsplat_core.lab.world.placement import Placed, Surface, bounds, footprint
 
-Tier = Literal["separate", "clutter", "occlusion"]
 ENLARGED = 1.3  # small objects are shown larger than life, so that their parts are worth looking at
 _HALF_TABLE = np.array([0.72, 0.545])  # metres, a little inside the table's edge
 _RUG = np.array([1.15, 0.95])  # half its sides

@@ -139,11 +139,10 @@ def test_no_word_stands_for_two_different_things(things):
             meant[word].add(("material", word))
     for word in CANONICAL_PHRASES:
         meant[word].add(("canonical", word))
-    for group in things.values():
-        for piece in group[0].pieces:
-            for region in {piece.part, piece.subpart} - {""}:
-                for word in part_words(region):
-                    meant[word].add(("part", ""))  # parts of two objects may share a word: both have handles
+    pieces = [piece for group in things.values() for piece in group[0].pieces]
+    for region in {name for piece in pieces for name in (piece.part, piece.subpart)} - {""}:
+        for word in part_words(region):
+            meant[word].add(("part", ""))  # parts of two objects may share a word: both have handles
     clashes = {word for word, roles in meant.items() if len(roles) > 1}
     assert clashes <= SHARED
 

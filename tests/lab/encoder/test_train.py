@@ -1,14 +1,13 @@
 """The demo encoder: crops, phrases, tokenizer, loss, a training in miniature, and the bundled weights."""
 
-
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
 from transformers import CLIPTokenizerFast
 
-from langsplat_core.config import DemoEncoderConfig
 from langsplat_core.errors import EncoderError
+from langsplat_core.lab.config import DemoEncoderConfig
 from langsplat_core.lab.encoder import train as demo_encoder
 from langsplat_core.lab.encoder.crops import CropSet, plain_crops, room_crops
 from langsplat_core.lab.encoder.model import begin_from, build_model, calibrate_canonical, text_vectors
@@ -171,7 +170,7 @@ def test_training_in_miniature(monkeypatch, tmp_path):
     crops = plain_crops(40, 2)
     monkeypatch.setattr(demo_encoder, "write_crops", lambda folder, config, progress: None)
     monkeypatch.setattr(demo_encoder, "read_crops", lambda folder: (crops, crops))
-    monkeypatch.setattr(demo_encoder, "_SAVE_EVERY", 2)
+    monkeypatch.setattr(demo_encoder, "SAVE_EVERY", 2)
     config = DemoEncoderConfig(steps=4, batch=8, phrases=8)
 
     def interrupt(label: str, fraction: float) -> None:

@@ -9,16 +9,17 @@ import torch
 from PIL import Image
 
 from langsplat_core.config import INRIA
+from langsplat_core.lab.config import RasterBenchConfig
 from langsplat_core.lab.speed import report as bench_report
 from langsplat_core.lab.speed.cases import default_camera, random_scene, sweep
 from langsplat_core.lab.speed.machine_limit import count_need
 from langsplat_core.lab.speed.measure import Measurement
-from langsplat_core.lab.speed.raster import Plan, run_plan
+from langsplat_core.lab.speed.raster import run_plan
 from langsplat_core.lab.speed.torch_baseline import TorchRasterizer
 from langsplat_core.lab.speed.truth import make_truth
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
-from tests.support.close import assert_close_off_cuts, assert_gradient, cut_off_band
+from tests.support.close import BAND, assert_close_off_cuts, assert_gradient
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
 
@@ -68,7 +69,7 @@ class TestBaseline:
         g, camera, x = random_gaussians(300, 1), random_camera(2), random_values(300, 3)
         reference = ReferenceRasterizer().view(g, camera)
         image, _ = TorchRasterizer().view(g, camera).splat(x)
-        assert_close_off_cuts(image, reference.splat(x)[0], cut_off_band(reference))
+        assert_close_off_cuts(image, reference.splat(x)[0], reference.cut_off_band(BAND))
 
     def test_opaque_tiles_stop_and_the_rest_go_on(self):
         """Many tiles whose Gaussians fill several steps, of which some are dropped early."""
@@ -110,7 +111,7 @@ class TestTruth:
         truth, x = make_truth(self.g, self.camera), random_values(400, 3)
         whole = ReferenceRasterizer().view(self.g, self.camera)
         image = whole.splat(x)[0]
-        band = cut_off_band(whole, 1e-3)  # as wide as the benchmark's
+        band = whole.cut_off_band(1e-3)  # as wide as the benchmark's
         assert band.any()
         for window, got in zip(truth.windows, truth.splat(x), strict=True):
             assert np.abs(got - image[window.at]).max() < 1e-12
@@ -136,7 +137,7 @@ class TestTruth:
         truth = make_truth(self.g, self.camera)
         need = count_need(truth.footprints, self.camera.width, self.camera.height)
         whole = ReferenceRasterizer().view(self.g, self.camera)
-        entries = sum(int((weights > 0).sum()) for _, _, weights, _ in whole._weights())
+        entries = sum(int((step.weights > 0).sum()) for step in whole.steps())
         assert need.entries == entries
         assert need.entries / 16 <= need.rows <= need.entries
         assert need.flops(12) - need.flops(3) == need.rows * 16 * 2 * 9
@@ -182,7 +183,7 @@ class TestReport:
 
 
 def test_a_tiny_run_writes_three_sane_files(tmp_path):
-    plan = Plan((60, 120, 200), ((40, 30),), 120, (1, 3))
+    plan = RasterBenchConfig((60, 120, 200), ((40, 30),), 120, (1, 3))
     run_plan(plan).save(tmp_path)
     record = json.loads((tmp_path / "raster.json").read_text())
     rows = record["measurements"]
@@ -209,7 +210,7 @@ def test_a_tiny_run_writes_three_sane_files(tmp_path):
 
 
 def test_what_would_take_too_long_is_named(tmp_path):
-    plan = Plan((60, 4000), ((40, 30),), 60, (1,), limit_s=1e-9)
+    plan = RasterBenchConfig((60, 4000), ((40, 30),), 60, (1,), limit=1e-9)
     report = run_plan(plan)
     assert all(r.milliseconds is not None for r in report.rows if r.gaussians == 60)
     left_out = [r for r in report.rows if r.gaussians == 4000]

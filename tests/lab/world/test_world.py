@@ -26,8 +26,8 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @pytest.fixture
 def coarse_light(monkeypatch):
-    monkeypatch.setattr(dataset, "_LIGHT_SAMPLES", 2)
-    monkeypatch.setattr(dataset, "_LIGHT_CELL", 0.0)
+    monkeypatch.setattr(dataset, "LIGHT_SAMPLES", 2)
+    monkeypatch.setattr(dataset, "LIGHT_CELL", 0.0)
 
 
 @pytest.fixture(scope="module")

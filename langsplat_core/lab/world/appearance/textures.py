@@ -128,7 +128,7 @@ def _painting(v, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _small(kind, v, x, y, z):  # type: ignore[no-untyped-def]
+def _small(kind, v, x, y, z):  # type: ignore[no-untyped-def]  # noqa: PLR0911  one row of a table each
     """The patterns of one line each."""
     if kind == 5:  # metal: brushed
         return 0.4 + 0.4 * noise_at(v, x / 0.02, y / 0.02, z / 0.5) + 0.1 * noise_at(v, x / 0.3, y / 0.3, z)
@@ -154,7 +154,7 @@ def _small(kind, v, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def weight_at(kind, v, x, y, z):  # type: ignore[no-untyped-def]
+def weight_at(kind, v, x, y, z):  # type: ignore[no-untyped-def]  # noqa: PLR0911  a table in effect
     """Weight of a material's second colour at a point, metres; `kind`: row of KINDS; `v`: the noise."""
     if kind == 0:
         return 0.16 * noise_at(v, x / 0.25, y / 0.25, z / 0.25)

@@ -15,7 +15,17 @@ Texture = Literal[
 ]  # fmt: skip
 
 Substance = Literal[
-    "plastic", "ceramic", "glass", "metal", "wood", "cloth", "paper", "plaster", "leaf", "skin", "rubber",
+    "plastic",
+    "ceramic",
+    "glass",
+    "metal",
+    "wood",
+    "cloth",
+    "paper",
+    "plaster",
+    "leaf",
+    "skin",
+    "rubber",
     "wax",
 ]  # what it is made of: decides highlight, relief and fine mottling
 

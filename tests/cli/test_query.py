@@ -1,0 +1,87 @@
+"""`langsplat query`."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from langsplat_core.cli import query
+from langsplat_core.cli.query import QueryScene
+from langsplat_core.config import INRIA
+from langsplat_core.formats import (
+    load_scene,
+    save_scene,
+)
+from langsplat_core.lab.rooms.scoring import ask, evaluate
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster import load_rasterizer
+from langsplat_core.scene import Scene
+from tests.support.fakes import FakeEncoder, axis, blobs
+from tests.support.fakes import cameras as fake_cameras
+from tests.support.fakes import language as fake_language
+
+
+class Recorder:
+    """The CPU rasterizer, which notes the settings it is given."""
+
+    def __init__(self) -> None:
+        self.seen: list = []
+
+    def view(self, gaussians, camera, settings=INRIA):
+        self.seen.append(settings)
+        return load_rasterizer("cpu").view(gaussians, camera, settings)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_queries_and_evaluation_draw_as_the_file_says(tmp_path, monkeypatch, antialiased):
+    scene = Scene(blobs(), fake_language(phrasebook=True), fake_cameras(1), None, antialiased)
+    save_scene(tmp_path / "a.ply", scene)
+    recorder = Recorder()
+    monkeypatch.setattr(query, "load_rasterizer", lambda _: recorder)
+    QueryScene(tmp_path / "a.ply", ("book",)).run()
+    truth = SimpleNamespace(phrases=(), labels=lambda name: np.zeros((3, 120, 160), int))
+    evaluate(ask(QueryEngine(load_scene(tmp_path / "a.ply")), ()), recorder, scene.cameras, truth)
+    assert [settings.antialiased for settings in recorder.seen] == [antialiased] * 2
+
+
+ASK = """
+import sys
+from langsplat_core.cli.app import entry
+sys.argv = ["langsplat", "query", "a.ply", "  Book ", "PLANT  pot"]
+try:
+    entry()
+except SystemExit as stop:
+    assert not stop.code, stop.code
+print([name for name in ("torch", "transformers") if name in sys.modules])
+"""
+
+
+def test_phrases_of_the_phrasebook_need_no_encoder(tmp_path):
+    """However they are written: loading one imports torch, which takes seconds."""
+    field = fake_language(phrasebook=True)
+    known = field.phrasebook | {"plant pot": axis(2)}
+    save_scene(tmp_path / "a.ply", Scene(blobs(), replace(field, phrasebook=known), fake_cameras(1)))
+    run = subprocess.run(
+        [sys.executable, "-c", ASK], cwd=tmp_path, env=os.environ, capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr
+    book, pot, heavy = run.stdout.splitlines()
+    assert book.startswith("Book: found")
+    assert pot.startswith("PLANT pot: found")
+    assert heavy == "[]"
+
+
+def test_another_phrase_is_answered_by_the_encoder_named(tmp_path, monkeypatch, capsys):
+    save_scene(tmp_path / "a.ply", Scene(blobs(), fake_language(phrasebook=True)))
+    loaded = []
+    monkeypatch.setattr(query, "load_text_encoder", lambda name: loaded.append(name) or FakeEncoder())
+    QueryScene(tmp_path / "a.ply", ("book",)).run()
+    assert loaded == []
+    QueryScene(tmp_path / "a.ply", ("book", "Mug", "plant"), encoder="mine").run()
+    QueryScene(tmp_path / "a.ply", ("mug",)).run()
+    assert loaded == ["mine", "fake"]
+    assert "Mug: found" in capsys.readouterr().out
