@@ -5,6 +5,7 @@ fraction of the window's resolution; as soon as it rests, once more at full reso
 """
 
 import time
+from collections.abc import Callable
 from typing import Protocol
 
 import moderngl
@@ -12,6 +13,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
+from langsplat_core.display.compose import HeatRanges
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.controls import OrbitCamera
 from langsplat_viewer.state import FrameStats, ViewerState
@@ -37,11 +39,11 @@ class Renderer(Protocol):
         target: moderngl.Framebuffer,
         camera: Camera,
         picture: PictureConfig,
-        heat_peaks: tuple[float, ...] = (),
+        heat_ranges: HeatRanges = (),
     ) -> None:
         """Draw into `target`, which has the camera's size."""
 
-    def read(self, camera: Camera, picture: PictureConfig, heat_peaks: tuple[float, ...] = ()) -> Array:
+    def read(self, camera: Camera, picture: PictureConfig, heat_ranges: HeatRanges = ()) -> Array:
         """(H, W, 3) uint8 picture."""
 
     def depth_at(self, x_px: float, y_px: float) -> float | None:
@@ -51,9 +53,13 @@ class Renderer(Protocol):
 class Canvas:
     """Keeps a texture up to date with a `ViewerState`."""
 
-    def __init__(self, ctx: moderngl.Context, renderer: Renderer) -> None:
+    def __init__(
+        self, ctx: moderngl.Context, renderer: Renderer, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
+        """`clock`, in seconds, times the drawing."""
         self._ctx = ctx
         self._renderer = renderer
+        self._clock = clock
         self._targets: dict[tuple[int, int], moderngl.Framebuffer] = {}  # by size, the latest used last
         self._textures: dict[tuple[int, int], moderngl.Texture] = {}
         self._scene: Scene | None = None
@@ -80,7 +86,7 @@ class Canvas:
         moving = now - self._moved < REST_SECONDS
         scale = self._scale() if moving and state.coarse_while_moving else 1.0
         size = (max(1, round(state.size[0] * scale)), max(1, round(state.size[1] * scale)))
-        key = (state.layers_key(), state.picture, state.view, state.size, scale, state.heat_peaks())
+        key = (state.layers_key(), state.picture, state.view, state.size, scale, state.heat_ranges())
         if key != self._drawn:
             self._drawn = key
             self._draw(state, size, scale)
@@ -107,10 +113,10 @@ class Canvas:
         self._sync(state)
         target = self._target(size)
         camera = state.view.camera(*size)
-        began = time.perf_counter()
-        self._renderer.draw(target, camera, state.picture, state.heat_peaks())
+        began = self._clock()
+        self._renderer.draw(target, camera, state.picture, state.heat_ranges())
         self._ctx.finish()
-        milliseconds = 1e3 * (time.perf_counter() - began)
+        milliseconds = 1e3 * (self._clock() - began)
         if scale == 1:
             self._fine_ms = milliseconds
         self._camera = camera
@@ -132,7 +138,7 @@ class Canvas:
         return self._targets[size]
 
     def point_at(self, u: float, v: float) -> Array | None:
-        """See `actions.Surface`."""
+        """See `viewer.Surface`."""
         if self._camera is None:
             return None
         pixel = (u * self._camera.width, v * self._camera.height)
@@ -140,8 +146,8 @@ class Canvas:
         return None if depth is None or depth <= 0 else self._camera.unproject(pixel, depth)
 
     def capture(self, state: ViewerState) -> Array:
-        """See `actions.Surface`."""
+        """See `viewer.Surface`."""
         assert state.view is not None
         self._sync(state)
         self._camera = state.view.camera(*state.size)
-        return np.asarray(self._renderer.read(self._camera, state.picture, state.heat_peaks()))
+        return np.asarray(self._renderer.read(self._camera, state.picture, state.heat_ranges()))

@@ -6,10 +6,11 @@ import moderngl
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.display.displays import Extra
 from langsplat_core.raster import Rasterizer
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer, GlView, Source
 from langsplat_core.scene import Camera, Scene
-from langsplat_viewer.channels import ArrayChannels, Extra, Layers
+from langsplat_viewer.channels import ArrayChannels, Layers
 
 Textures = tuple[moderngl.Texture, ...]  # colours with alpha and, if asked for, one further channel
 
@@ -57,10 +58,9 @@ class GlSource:
     def render(self, camera: Camera, extra: Extra) -> Textures:
         sources: list[Source] = ["colour"]
         view = self._view(camera)
-        if extra in ("latent", "relevancies"):
+        values = self._layers.values(extra)
+        if values is not None:
             if extra not in self._uploads:
-                values = self._layers.latent_rgb if extra == "latent" else self._layers.relevancies
-                assert values is not None  # Layers.extra asks only for what is there
                 self._uploads[extra] = self._rasterizer.scene(self._scene.gaussians).upload(values)
             sources.append(self._uploads[extra])
         return self._rasterizer.draw(view, sources, with_depth=extra == "depth")

@@ -1,19 +1,19 @@
 """Which channels a picture needs, and those channels as arrays. No graphics device here."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, PictureConfig
+from langsplat_core.display.colour_maps import MAX_QUERIES
 from langsplat_core.display.compose import Channels
-from langsplat_core.errors import BackendError
+from langsplat_core.display.displays import DISPLAYS, Extra
 from langsplat_core.raster import Rasterizer, View
+from langsplat_core.raster.protocol import MedianDepth
+from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Camera, Gaussians, Scene
 
-Extra = Literal["none", "latent", "relevancies", "depth"]  # what is rasterized beside colours and alpha
-MAX_QUERIES = 3
 _DEPTH_SAMPLE = 20_000  # Gaussians looked at for the depth range; quantiles need no more
 
 
@@ -22,7 +22,7 @@ class Layers:
     """Values per Gaussian that a picture may show beside the scene's own colours."""
 
     latent_rgb: Array | None = None  # (N, 3) in [0, 1]
-    relevancies: Array | None = None  # (N, Q) in [0, 1], Q from 1 to 3
+    relevancies: Array | None = None  # (N, Q) in [0, 1], Q from 1 to MAX_QUERIES
 
     def check(self, count: int) -> None:
         """ValueError where an array does not have `count` rows or the right number of columns."""
@@ -37,13 +37,13 @@ class Layers:
 
     def extra(self, picture: PictureConfig) -> Extra:
         """The channel that `picture` needs beside colours and alpha, if it is there."""
-        if picture.display == "depth":
-            return "depth"
-        if picture.display == "latent" and self.latent_rgb is not None:
-            return "latent"
-        if picture.display in ("relevancy", "segmentation") and self.relevancies is not None:
-            return "relevancies"
-        return "none"
+        extra = DISPLAYS[picture.display].extra
+        absent = extra in ("latent", "relevancies") and self.values(extra) is None
+        return "none" if absent else extra
+
+    def values(self, extra: Extra) -> Array | None:
+        """The layer that is rasterized as `extra`, if there is one."""
+        return {"latent": self.latent_rgb, "relevancies": self.relevancies}.get(extra)
 
 
 def depth_range(gaussians: Gaussians, camera: Camera) -> tuple[float, float]:
@@ -61,10 +61,16 @@ def depth_range(gaussians: Gaussians, camera: Camera) -> tuple[float, float]:
     return float(near), float(far)
 
 
+def camera_depths(gaussians: Gaussians, camera: Camera) -> Array:
+    """(N, 1) float32 camera z, world units; finite."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        depths = gaussians.means.astype(np.float64) @ camera.rotation[2] + camera.world_to_camera[2, 3]
+        return np.nan_to_num(depths.astype(np.float32))[:, None]
+
+
 def camera_key(camera: Camera) -> tuple[object, ...]:
     """Equal for cameras that give the same picture."""
-    intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    return (*intrinsics, camera.world_to_camera.tobytes())
+    return camera.intrinsics, camera.world_to_camera.tobytes()
 
 
 class ArrayChannels:
@@ -90,36 +96,22 @@ class ArrayChannels:
 
     def render(self, scene: Scene, layers: Layers, camera: Camera, extra: Extra) -> Channels:
         """Colours, alpha and `extra`, in one pass."""
-        from langsplat_core.raster.cpu.colour import colours  # numba: a second that OpenGL need not wait for
-
         gaussians = scene.gaussians
-        values = [colours(gaussians.sh, gaussians.means, camera.position)]
-        if extra == "depth":
-            with np.errstate(invalid="ignore", over="ignore"):
-                depths = gaussians.means.astype(np.float64) @ camera.rotation[2]
-            values.append(np.nan_to_num(depths + camera.world_to_camera[2, 3])[:, None])
-        elif extra == "latent" and layers.latent_rgb is not None:
-            values.append(layers.latent_rgb)
-        elif extra == "relevancies" and layers.relevancies is not None:
-            values.append(layers.relevancies)
-        image, alpha = self.view(scene, camera).splat(np.concatenate(values, 1, dtype=np.float32))
-        more = image[..., 3:]
+        values = camera_depths(gaussians, camera) if extra == "depth" else layers.values(extra)
+        drawn = splat_colours(self.view(scene, camera), gaussians, camera, values)
         return Channels(
-            rgb=image[..., :3],
-            alpha=alpha,
-            latent=more if extra == "latent" else None,
-            relevancies=more if extra == "relevancies" else None,
-            depth_sum=more[..., 0] if extra == "depth" else None,
+            rgb=drawn.colours,
+            alpha=drawn.alpha,
+            latent=drawn.values if extra == "latent" else None,
+            relevancies=drawn.values if extra == "relevancies" else None,
+            depth_sum=drawn.values[..., 0] if extra == "depth" else None,
             depth_range=depth_range(gaussians, camera) if extra == "depth" else (0.0, 1.0),
         )
 
     def depth_at(self, scene: Scene, camera: Camera, column: int, row: int) -> tuple[float, float]:
-        """Depth of the surface in a pixel (the median, or the mean where the scene is transparent there),
-        world units, 0 where there is nothing, and alpha."""
+        """Depth of the surface in a pixel (the median where the rasterizer knows it, else the mean, as where
+        the scene is transparent there), world units, 0 where there is nothing, and alpha."""
         view = self.view(scene, camera)
         _, alpha = view.splat(np.empty((len(scene.gaussians), 0), np.float32))
-        try:
-            depth = view.depth("median")[row, column]
-        except BackendError:  # CUDA has no median
-            depth = 0
-        return float(depth or view.depth("expected")[row, column]), float(alpha[row, column])
+        median = view.median_depth()[row, column] if isinstance(view, MedianDepth) else 0
+        return float(median or view.depth()[row, column]), float(alpha[row, column])

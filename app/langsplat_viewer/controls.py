@@ -11,50 +11,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from langsplat_core.arrays import Array
-from langsplat_core.scene import Camera, Scene, look_at
+from langsplat_core.scene import Camera, Intrinsics, Scene, look_at
 
 MAX_ELEVATION = math.radians(88)  # nearer to the pole a small drag would spin the picture
 DEFAULT_FOV = 50.0  # degrees, of the picture's shorter side
 FOV_RANGE = (10.0, 120.0)  # degrees
 
 
-@dataclass(frozen=True)
-class Lens:
-    """Intrinsics on a picture of reference size; any window shows that whole picture, uncropped."""
-
-    width: float  # pixels of the reference picture
-    height: float
-    fx: float  # pixels
-    fy: float
-    cx: float  # pixels from the left edge
-    cy: float  # pixels from the top edge
-
-    def fitted(self, width: int, height: int) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy in a window of `width` x `height` pixels that holds the reference picture
-        centred, as large as it goes, with square pixels kept square."""
-        s = min(width / self.width, height / self.height)
-        return (
-            self.fx * s,
-            self.fy * s,
-            (self.cx - self.width / 2) * s + width / 2,
-            (self.cy - self.height / 2) * s + height / 2,
-        )
-
-    @property
-    def fov_degrees(self) -> float:
-        """Angle of view across the shorter side."""
-        return math.degrees(2 * math.atan(0.5 * min(self.width, self.height) / min(self.fx, self.fy)))
-
-
-def symmetric_lens(fov_degrees: float = DEFAULT_FOV) -> Lens:
-    """A centred lens that sees `fov_degrees` across the window's shorter side."""
+def symmetric_intrinsics(fov_degrees: float = DEFAULT_FOV) -> Intrinsics:
+    """Of a square picture that shows `fov_degrees` across, its principal point in the centre."""
     focal = 0.5 / math.tan(math.radians(fov_degrees) / 2)
-    return Lens(1.0, 1.0, focal, focal, 0.5, 0.5)
-
-
-def lens_of(camera: Camera) -> Lens:
-    """The lens of a photograph."""
-    return Lens(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return Intrinsics(1.0, 1.0, focal, focal, 0.5, 0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +32,7 @@ class OrbitCamera:
     target: Array  # (3,) world units, on the optical axis
     distance: float  # world units from the eye to the target, > 0
     up: Array  # (3,) unit, the world's up: the axis that a sideways drag turns about
-    lens: Lens
+    intrinsics: Intrinsics  # of a picture that any window shows whole, uncropped
 
     @property
     def eye(self) -> Array:
@@ -77,7 +44,8 @@ class OrbitCamera:
         matrix = np.eye(4)
         matrix[:3, :3] = self.rotation
         matrix[:3, 3] = -self.rotation @ self.eye
-        return Camera(width, height, *self.lens.fitted(width, height), matrix)
+        inner = self.intrinsics.fitted(width, height)
+        return Camera(width, height, inner.fx, inner.fy, inner.cx, inner.cy, matrix)
 
     @property
     def elevation(self) -> float:
@@ -121,9 +89,9 @@ def roll(view: OrbitCamera, angle: float) -> OrbitCamera:
 
 def pan(view: OrbitCamera, dx: float, dy: float, size: tuple[int, int]) -> OrbitCamera:
     """Move sideways so that the target follows a drag of (dx, dy) pixels in a window of `size` pixels."""
-    fx, fy, _, _ = view.lens.fitted(*size)
+    inner = view.intrinsics.fitted(*size)
     right, down, _ = view.rotation
-    return replace(view, target=view.target - view.distance * (dx / fx * right + dy / fy * down))
+    return replace(view, target=view.target - view.distance * (dx / inner.fx * right + dy / inner.fy * down))
 
 
 def zoom(view: OrbitCamera, factor: float, min_distance: float) -> OrbitCamera:
@@ -161,12 +129,12 @@ def adopt_up(view: OrbitCamera) -> OrbitCamera:
 
 
 def with_fov(view: OrbitCamera, fov_degrees: float) -> OrbitCamera:
-    """The same view through a symmetric lens of `fov_degrees` across the shorter side."""
-    return replace(view, lens=symmetric_lens(float(np.clip(fov_degrees, *FOV_RANGE))))
+    """The same view with the principal point in the centre and `fov_degrees` across the shorter side."""
+    return replace(view, intrinsics=symmetric_intrinsics(float(np.clip(fov_degrees, *FOV_RANGE))))
 
 
 def between(start: OrbitCamera, end: OrbitCamera, t: float) -> OrbitCamera:
-    """A view on the way from `start` (t = 0) to `end` (t = 1); the lens is the end's."""
+    """A view on the way from `start` (t = 0) to `end` (t = 1); the intrinsics are the end's."""
     if t >= 1:
         return end
     ease = t * t * (3 - 2 * t)
@@ -200,7 +168,7 @@ def from_camera(camera: Camera, extent: Extent) -> OrbitCamera:
     forward = camera.rotation[2]
     distance = max(float((extent.centre - camera.position) @ forward), 0.3 * extent.radius)
     target = camera.position + distance * forward
-    return OrbitCamera(camera.rotation, target, distance, extent.up, lens_of(camera))
+    return OrbitCamera(camera.rotation, target, distance, extent.up, camera.intrinsics)
 
 
 def default_view(scene: Scene, extent: Extent) -> OrbitCamera:

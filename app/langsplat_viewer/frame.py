@@ -12,17 +12,18 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
-from langsplat_core.display import compose as rules
+from langsplat_core.display.colour_maps import MAX_QUERIES, QUERY_COLOURS, TURBO
+from langsplat_core.display.compose import HeatRanges, full_ranges, shader_defines
+from langsplat_core.display.displays import DISPLAYS, NUMBERS, Extra
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.opengl.draw import drawing, set_uniforms, shader
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.channel_textures import ArraySource, ChannelSource, GlSource, Textures
-from langsplat_viewer.channels import Extra, Layers, camera_key, depth_range
+from langsplat_viewer.channels import Layers, camera_key, depth_range
 
 Backend = Literal["auto", "opengl", "cpu", "cuda"]
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swr ", "software", "swiftshader", "basic render")
 PICK_ALPHA = 0.1  # a pixel with less alpha shows nothing that could be picked
-_DISPLAYS = ("rgb", "latent", "relevancy", "segmentation", "depth", "alpha")  # as compose.frag counts
 
 
 def is_software(ctx: moderngl.Context) -> bool:
@@ -63,10 +64,10 @@ class FrameRenderer:
             self._source = ArraySource(ctx, load_rasterizer(backend))
         self._program = ctx.program(
             vertex_shader=shader("fullscreen.vert", 330),
-            fragment_shader=shader("compose.frag", 330, "langsplat_core.display"),
+            fragment_shader=shader("compose.frag", 330, "langsplat_core.display", **shader_defines()),
         )
         self._vao = ctx.vertex_array(self._program, [])
-        self._turbo = ctx.texture((len(rules.TURBO), 1), 3, rules.TURBO.tobytes())
+        self._turbo = ctx.texture((len(TURBO), 1), 3, TURBO.tobytes())
         self._scene: Scene | None = None
         self._layers = Layers()
         self._camera: Camera | None = None  # of the last draw
@@ -81,7 +82,7 @@ class FrameRenderer:
 
     def set_layers(self, latent_rgb: Array | None, relevancies: Array | None) -> None:
         """What the displays "latent" and "relevancy" show: (N, 3) colours in [0, 1] of the level shown;
-        (N, Q) relevancies in [0, 1] of 1 to 3 queries. ValueError for other shapes."""
+        (N, Q) relevancies in [0, 1] of 1 to MAX_QUERIES queries. ValueError for other shapes."""
         layers = Layers(latent_rgb, relevancies)
         layers.check(0 if self._scene is None else len(self._scene.gaussians))
         self._source.set_layers(layers)
@@ -92,12 +93,12 @@ class FrameRenderer:
         target: moderngl.Framebuffer,
         camera: Camera,
         picture: PictureConfig,
-        heat_peaks: tuple[float, ...] = (),
+        heat_ranges: HeatRanges = (),
     ) -> None:
         """Fill `target`'s viewport with the picture and leave `target` bound.
 
         The image is rasterized at the camera's size and stretched to the viewport if that is another.
-        `heat_peaks` as in `query.picture.compose`.
+        `heat_ranges` as in `display.compose`.
         """
         if self._scene is None:
             target.clear(*picture.background, 1.0, viewport=target.viewport)
@@ -110,7 +111,7 @@ class FrameRenderer:
             self._textures = self._source.render(camera, extra)
             self._drawn = wanted
         self._camera = camera
-        set_uniforms(self._program, self._uniforms(camera, picture, heat_peaks, extra))
+        set_uniforms(self._program, self._uniforms(camera, picture, heat_ranges, extra))
         for unit, texture in enumerate((*self._textures, self._turbo)):
             texture.use(unit)
         with drawing(self._ctx, target, moderngl.NOTHING):
@@ -118,32 +119,27 @@ class FrameRenderer:
         target.use()
 
     def _uniforms(
-        self, camera: Camera, picture: PictureConfig, heat_peaks: tuple[float, ...], extra: Extra
+        self, camera: Camera, picture: PictureConfig, heat_ranges: HeatRanges, extra: Extra
     ) -> dict[str, object]:
         assert self._scene is not None
         # Without its layer a display shows the plain colours.
-        display = picture.display if extra != "none" or picture.display == "alpha" else "rgb"
-        spans = [max(peak - rules.RELEVANCY_FLOOR, rules.MIN_HEAT_SPAN) for peak in heat_peaks[:3]]
-        spans += [1 - rules.RELEVANCY_FLOOR] * (3 - len(spans))
+        display = picture.display if extra == DISPLAYS[picture.display].extra else "rgb"
         return {
             "colours": 0,
             "extra": len(self._textures) - 1,
             "turbo_table": len(self._textures),
-            "display": _DISPLAYS.index(display),
-            "query_colours": rules.QUERY_COLOURS.astype("f4").tobytes(),
-            "heat_spans": tuple(spans),
-            "relevancy_floor": rules.RELEVANCY_FLOOR,
-            "heat_fade": rules.HEAT_FADE,
+            "display": NUMBERS[display],
+            "query_colours": QUERY_COLOURS.astype("f4").tobytes(),
+            "heat_ranges": np.array(full_ranges(heat_ranges, MAX_QUERIES), "f4").tobytes(),
             "heat_opacity": picture.heat_opacity,
             "dim": picture.dim,
             "threshold": picture.threshold,
-            "segment_opacity": rules.SEGMENT_OPACITY,
             "alpha_gate": picture.alpha_gate,
             "background": picture.background,
             "depth_range": depth_range(self._scene.gaussians, camera) if extra == "depth" else (0.0, 1.0),
         }
 
-    def read(self, camera: Camera, picture: PictureConfig, heat_peaks: tuple[float, ...] = ()) -> Array:
+    def read(self, camera: Camera, picture: PictureConfig, heat_ranges: HeatRanges = ()) -> Array:
         """(H, W, 3) uint8 picture at the camera's size, row 0 on top; leaves bound what was bound."""
         size = (camera.width, camera.height)
         if self._own is None or self._own.size != size:
@@ -151,7 +147,7 @@ class FrameRenderer:
             self._own = self._ctx.framebuffer([self._ctx.texture(size, 4)])
         before = self._ctx.fbo or self._ctx.detect_framebuffer(0)
         try:
-            self.draw(self._own, camera, picture, heat_peaks)
+            self.draw(self._own, camera, picture, heat_ranges)
             pixels = self._own.read(components=3, alignment=1)
         finally:
             before.use()

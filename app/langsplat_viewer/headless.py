@@ -4,7 +4,7 @@ import moderngl
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
-from langsplat_core.display.compose import compose
+from langsplat_core.display.compose import HeatRanges, compose
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.opengl.context import create_egl_context
@@ -21,7 +21,7 @@ def render_picture(
     backend: Backend = "auto",
     latent_rgb: Array | None = None,
     relevancies: Array | None = None,
-    heat_peaks: tuple[float, ...] = (),
+    heat_ranges: HeatRanges = (),
 ) -> Array:
     """(H, W, 3) uint8 picture of `scene`, row 0 on top; layers as in `FrameRenderer.set_layers`.
 
@@ -34,12 +34,12 @@ def render_picture(
     if ctx is None:
         rasterizer = load_rasterizer("cpu" if backend == "auto" else backend)
         channels = ArrayChannels(rasterizer).render(scene, layers, camera, layers.extra(picture))
-        return compose(channels, picture, heat_peaks)
+        return compose(channels, picture, heat_ranges)
     try:
         frame = FrameRenderer(ctx, "opengl")
         frame.set_scene(scene)
         frame.set_layers(latent_rgb, relevancies)
-        return frame.read(camera, picture, heat_peaks)
+        return frame.read(camera, picture, heat_ranges)
     finally:
         ctx.release()
 

@@ -5,16 +5,18 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 
-from langsplat_core.config import Display
+from langsplat_core.config import Display, LevelChoice
+from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import InputError
 from langsplat_core.formats import load_scene
 from langsplat_core.formats.cameras_json import read_cameras
 from langsplat_core.formats.sog import META_NAME
-from langsplat_core.query.engine import NO_FIELD, TextEncoder
-from langsplat_core.scene import Camera, Scene
-from langsplat_viewer.actions import NEEDS_FIELD, Services
+from langsplat_core.query.engine import NO_FIELD
+from langsplat_core.scene import LEVELS, Camera, Scene
+from langsplat_core.semantics.clip import load_text_encoder
+from langsplat_viewer.viewer import Services
 
-DisplayChoice = Literal["auto", "rgb", "latent", "relevancy", "segmentation", "depth", "alpha"]
+DisplayChoice = Literal["auto", Display]
 MAX_SIDE = 16_384  # pixels; beyond it drivers refuse textures
 
 
@@ -80,17 +82,15 @@ def chosen_display(choice: DisplayChoice, queries: tuple[str, ...]) -> Display:
 
 def check_display(scene: Scene, display: Display, queries: tuple[str, ...]) -> None:
     """InputError for a display or query that this scene cannot answer."""
-    if scene.language is None and (queries or display in NEEDS_FIELD):
+    if scene.language is None and (queries or DISPLAYS[display].needs_field):
         raise InputError(f"{scene.path}: {NO_FIELD}")
-    if display in ("relevancy", "segmentation") and not queries:
+    if DISPLAYS[display].needs_query and not queries:
         raise InputError(f"--display {display} shows a search; add --query TEXT")
 
 
-def load_text_encoder(encoder_id: str) -> TextEncoder:
-    """The text half of CLIP; imports torch."""
-    from langsplat_core.semantics import clip
-
-    return clip.load_text_encoder(encoder_id)
+def latent_level(level: LevelChoice) -> int:
+    """Index into `scene.LEVELS` of the latents that the display "latent" shows; auto is the whole."""
+    return LEVELS.index("whole" if level == "auto" else level)
 
 
 def warm_up(scene: Scene, backend: str) -> None:

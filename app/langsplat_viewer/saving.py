@@ -8,8 +8,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
 from langsplat_core.files import atomic_path
 from langsplat_core.formats.cameras_json import write_cameras
-from langsplat_viewer.actions import Viewer
 from langsplat_viewer.jobs import one_line
+from langsplat_viewer.viewer import Viewer
 
 
 def free_name(folder: Path, stem: str, suffix: str) -> Path:

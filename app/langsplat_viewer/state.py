@@ -7,11 +7,16 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice, PictureConfig
+from langsplat_core.display.colour_maps import MAX_QUERIES
+from langsplat_core.display.compose import HeatRanges
+from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import QueryResult
+from langsplat_core.query.relevancy import FLOOR
 from langsplat_core.scene import Scene
 from langsplat_viewer.controls import Extent, OrbitCamera
 
-SLOTS = 3  # queries shown at a time: one colour each
+SLOTS = MAX_QUERIES  # queries shown at a time: one colour each
+NO_HEAT = (FLOOR, 1.0)  # heat range of a slot without an answer, whose relevancy is 0
 MAX_MESSAGES = 50
 GLIDE_SECONDS = 0.35
 
@@ -96,23 +101,27 @@ class ViewerState:
         by_slot = {q.slot: q for q in self.queries if q.slot is not None and q.result is not None}
         return [by_slot.get(slot) for slot in range(max(by_slot, default=-1) + 1)]
 
-    def heat_peaks(self) -> tuple[float, ...]:
-        """Relevancy at which the heat of each slot saturates."""
-        return tuple(q.result.peak if q is not None and q.result is not None else 1.0 for q in self.shown())
+    def heat_ranges(self) -> HeatRanges:
+        """The relevancies at which the heat of each slot is 0 and 1."""
+        results = (None if q is None else q.result for q in self.shown())
+        return tuple(NO_HEAT if result is None else result.heat_range for result in results)
 
     def layers_key(self) -> tuple[object, ...]:
         """Changes exactly when `latent_rgb` or `relevancies` would. Holds the objects themselves: the id of
         a result that is gone may be given to the next one."""
-        wants_latent = self.picture.display == "latent" and self.latent is not None
+        wants_latent = self._shows_latents() and self.latent is not None
         results = tuple(None if q is None else q.result for q in self.shown())
         return self.scene, self.latent_level if wants_latent else None, results
 
     def latent_rgb(self) -> Array | None:
         """(N, 3) colours of the latents, while they are shown."""
-        if self.picture.display != "latent" or self.latent is None:
+        if not self._shows_latents() or self.latent is None:
             return None
         colours: Array = self.latent[self.latent_level]
         return colours
+
+    def _shows_latents(self) -> bool:
+        return DISPLAYS[self.picture.display].extra == "latent"
 
     def relevancies(self) -> Array | None:
         """(N, Q) float32 relevancy of the shown queries at their levels; an unused slot is zero."""

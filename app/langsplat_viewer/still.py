@@ -9,19 +9,18 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import Display, LevelChoice, PictureConfig
-from langsplat_core.display.compose import latent_colours
+from langsplat_core.display.displays import DISPLAYS
+from langsplat_core.display.latent_colours import latent_colours
 from langsplat_core.errors import BackendError, InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryResult
 from langsplat_core.scene import LEVELS, Camera, Scene
-from langsplat_viewer.actions import Services
-from langsplat_viewer.answers import Answers
-from langsplat_viewer.controls import lens_of
 from langsplat_viewer.frame import Backend
 from langsplat_viewer.headless import render_picture
-from langsplat_viewer.options import check_display, chosen_camera
+from langsplat_viewer.options import check_display, chosen_camera, latent_level
 from langsplat_viewer.saving import save_png
 from langsplat_viewer.state import SLOTS
+from langsplat_viewer.viewer import Services
 
 DEFAULT_SIZE = (1280, 720)
 
@@ -64,7 +63,7 @@ def still_camera(scene: Scene, choice: str, size: tuple[int, int] | None) -> Cam
         return scene.framing_camera(size or DEFAULT_SIZE)
     if size is None or size == (camera.width, camera.height):
         return camera
-    return Camera(*size, *lens_of(camera).fitted(*size), camera.world_to_camera, camera.name)
+    return camera.with_intrinsics(camera.intrinsics.fitted(*size))
 
 
 def describe(result: QueryResult) -> str:
@@ -81,8 +80,8 @@ def draw_still(request: StillRequest, services: Services, progress: Progress = s
     scene = services.load_scene(request.path)
     check_display(scene, request.display, request.queries)
     camera = still_camera(scene, request.camera, request.size)
-    answers = Answers(scene, services.load_encoder, services.encoder_id)
-    results = [answers.ask(phrase, request.level, progress) for phrase in request.queries]
+    engine = services.engine(scene)
+    results = [engine.run(phrase, request.level, progress) for phrase in request.queries]
     shown = results[-SLOTS:]  # as in the window, where a fourth query takes the oldest one's colour
 
     progress("drawing", 0.8)
@@ -95,7 +94,7 @@ def draw_still(request: StillRequest, services: Services, progress: Progress = s
             backend=request.backend,
             latent_rgb=_latent(scene, request),
             relevancies=_columns(shown),
-            heat_peaks=tuple(result.peak for result in shown),
+            heat_ranges=tuple(result.heat_range for result in shown),
         )
         save_png(request.out, image)
     except MemoryError:
@@ -108,10 +107,9 @@ def draw_still(request: StillRequest, services: Services, progress: Progress = s
 
 
 def _latent(scene: Scene, request: StillRequest) -> Array | None:
-    if request.display != "latent" or scene.language is None:
+    if DISPLAYS[request.display].extra != "latent" or scene.language is None:
         return None
-    level = LEVELS.index("whole" if request.level == "auto" else request.level)
-    colours: Array = latent_colours(scene.language)[level]
+    colours: Array = latent_colours(scene.language)[latent_level(request.level)]
     return colours
 
 

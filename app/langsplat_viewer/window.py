@@ -16,14 +16,13 @@ import moderngl
 from langsplat_core.config import Display, LevelChoice
 from langsplat_core.errors import BackendError, InputError, LangSplatError
 from langsplat_viewer import actions
-from langsplat_viewer.actions import Services, Viewer
 from langsplat_viewer.canvas import Canvas, Renderer
-from langsplat_viewer.controls import from_camera
 from langsplat_viewer.frame import Backend, FrameRenderer
 from langsplat_viewer.jobs import one_line
-from langsplat_viewer.options import chosen_camera
+from langsplat_viewer.options import chosen_camera, latent_level
 from langsplat_viewer.panels import layout, navigation
 from langsplat_viewer.panels.scene import OpenDialog
+from langsplat_viewer.viewer import Services, Viewer
 
 TITLE = "LangSplat viewer"
 DEFAULT_SIZE = (1280, 800)
@@ -107,7 +106,7 @@ class Window:
         self._dialog = OpenDialog()
         self._canvas: Canvas | None = None
         self._screen: moderngl.Framebuffer | None = None
-        self._unfinished = False  # a finer picture is due
+        self.unfinished = False  # a finer picture is due
         self._titled: Path | None = None  # the scene that the window's title names
 
     def params(self) -> hello_imgui.RunnerParams:
@@ -157,22 +156,24 @@ class Window:
         """The scene of the command line is open: do what else the command line asks for."""
         state, request = viewer.state, self._request
         assert state.scene is not None
-        assert state.extent is not None
         try:
             camera = chosen_camera(state.scene, request.camera)
             if camera is not None:
-                state.view = from_camera(camera, state.extent)
+                actions.stand_at(viewer, camera)
         except InputError as error:
             state.say(str(error), is_error=True)
-        state.level = request.level
+        actions.set_level(viewer, request.level)
         for phrase in request.queries:
             actions.ask(viewer, phrase)
-        level = {"subpart": 0, "part": 1}.get(request.level, 2)
-        actions.set_display(viewer, request.display, level)
+        actions.set_display(viewer, request.display, latent_level(request.level))
 
-    def _dropped(self, window: object, paths: list[str]) -> None:
+    def drop(self, paths: list[str]) -> None:
+        """Files were dropped onto the window: open the first."""
         if paths:
             actions.open_scene(self.viewer, Path(paths[0]))
+
+    def _dropped(self, window: object, paths: list[str]) -> None:
+        self.drop(paths)
 
     def _gui(self) -> None:
         viewer = self.viewer
@@ -182,14 +183,11 @@ class Window:
         actions.tick(viewer, imgui.get_time())
         area = layout.scene_area(viewer)
         scale = imgui.get_io().display_framebuffer_scale
-        viewer.state.size = (
-            max(1, round(area.width * scale.x)),
-            max(1, round(area.height * scale.y)),
-        )
+        actions.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))
         self._title()
         layout.draw(viewer, self._dialog)
         navigation.handle(viewer, layout.scene_area(viewer))
-        busy = self._unfinished or viewer.state.glide is not None
+        busy = self.unfinished or viewer.state.glide is not None
         hello_imgui.get_runner_params().fps_idling.enable_idling = not busy
 
     def _title(self) -> None:
@@ -204,9 +202,9 @@ class Window:
         if canvas is None or self._screen is None:
             return
         try:
-            self._unfinished = canvas.update(state, imgui.get_time())
+            self.unfinished = canvas.update(state, imgui.get_time())
         except DRAW_ERRORS as error:
-            self._unfinished = False
+            self.unfinished = False
             state.say(one_line(error), is_error=True)
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels

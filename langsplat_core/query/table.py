@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from langsplat_core.arrays import Array, sigmoid
-from langsplat_core.query.relevancy import TEMPERATURE
-from langsplat_core.scene import AutoencoderCodec
+from langsplat_core.arrays import Array
+from langsplat_core.query.relevancy import from_cosines
+from langsplat_core.scene import Codec
+from langsplat_core.scene.codec import SHORTEST
 
 RESOLUTION = 192  # nodes per side; error against exact decoding falls with its square
 
@@ -46,7 +47,7 @@ class SphereTable:
 
     def relevancy(self, phrase: Array) -> Array:
         """(D,) unit phrase vector -> (M,) float32 relevancy; 0 where the latent has no meaning."""
-        nodes = sigmoid(TEMPERATURE * (self.vectors @ phrase - self.nearest_canonical))
+        nodes = from_cosines(self.vectors @ phrase, self.nearest_canonical)
         corner = np.maximum(self.corner, 0)
         u, v = self.fraction.T
         low = nodes[corner] * (1 - u) + nodes[corner + 1] * u
@@ -54,17 +55,20 @@ class SphereTable:
         return np.where(self.corner >= 0, low * (1 - v) + high * v, 0).astype(np.float32)
 
 
-def build_table(
-    codec: AutoencoderCodec, latents: Array, canonical: Array, resolution: int = RESOLUTION
-) -> SphereTable:
-    """Tabulate `codec` for (M, 3) latents; those shorter than 1e-6 have no meaning."""
-    if codec.latent_dim != 3:
-        raise ValueError(f"a sphere table needs latents of 3 numbers, the codec has {codec.latent_dim}")
+def suits_table(codec: Codec) -> bool:
+    """Whether the codec's latents lie on a sphere."""
+    return codec.latent_dim == 3 and codec.unit_latents
+
+
+def build_table(codec: Codec, latents: Array, canonical: Array, resolution: int = RESOLUTION) -> SphereTable:
+    """Tabulate `codec` for (M, 3) latents; those of no length have no meaning."""
+    if not suits_table(codec):
+        raise ValueError(f"a sphere table needs unit latents of 3 numbers; {codec.kind} has others")
     axis = np.linspace(0, 1, resolution)
     grid = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)  # row-major: first coordinate fastest
     vectors = codec.decode(octahedral_to_sphere(grid).astype(np.float32))
 
-    known = np.linalg.norm(latents, axis=1) > 1e-6
+    known = np.linalg.norm(latents, axis=1) > SHORTEST
     safe = np.where(known[:, None], latents, (0.0, 0.0, 1.0)).astype(np.float64)
     position = sphere_to_octahedral(safe) * (resolution - 1)
     cell = np.clip(np.floor(position), 0, resolution - 2).astype(np.int64)

@@ -82,14 +82,19 @@ class FeatureStore:
             ) from error
 
 
-def feature_key(image: Array, mask_source: MaskSource, encoder: ImageEncoder) -> str:
-    """A short name of everything that the features of `image` depend on."""
+def feature_key(image: Array, mask_source: MaskSource, encoder: str) -> str:
+    """A short name of everything that the features of `image` depend on; `encoder` is the encoder's
+    `fingerprint`."""
+    settings = json.dumps([VERSION, mask_source.key, encoder, image.shape])
+    return hashlib.sha256(settings.encode() + np.ascontiguousarray(image).tobytes()).hexdigest()[:16]
+
+
+def fingerprint(encoder: ImageEncoder) -> str:
+    """Tells an encoder from others, also from other weights under the same name: what it makes of a ramp."""
     side = encoder.image_size
-    # What the encoder makes of one picture tells its weights from others under the same name.
     ramp = np.linspace(0, 255, side * side * 3).reshape(1, side, side, 3).astype(np.uint8)
     made = np.round(encoder.encode_images(ramp)[0], 2) + 0.0  # minus zero is zero
-    settings = json.dumps([VERSION, mask_source.key, encoder.id, side, image.shape, made.tolist()])
-    return hashlib.sha256(settings.encode() + np.ascontiguousarray(image).tobytes()).hexdigest()[:16]
+    return json.dumps([encoder.id, side, made.tolist()])
 
 
 def describe_capture(
@@ -106,11 +111,12 @@ def describe_capture(
     `progress` interrupts the work.
     """
     label = f"masks ({mask_source.name}) and vectors"
+    made_by = fingerprint(encoder)
     found = []
     for index, (image, name) in enumerate(zip(images, names, strict=True)):
         part = _part(progress, f"{label}: {name}", index, len(images))
         part("", 0.0)
-        key = feature_key(image, mask_source, encoder)
+        key = feature_key(image, mask_source, made_by)
         if not store.has(name, key):
             labels = label_maps(mask_source(image, part))
             store.save(name, ImageFeatures(labels, embed_regions(image, labels, encoder)), key)

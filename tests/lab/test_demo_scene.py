@@ -24,6 +24,8 @@ from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.clip import load_text_encoder
 
+pytestmark = pytest.mark.long
+
 ASSETS = Path(str(files("langsplat_assets")))
 
 

@@ -1,7 +1,5 @@
 """Relevancy, the sphere table, levels, places and pixels."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -10,64 +8,12 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.places import build_neighbourhood, locate, peak_pixel
-from langsplat_core.query.relevancy import latent_relevancy, relevancy
-from langsplat_core.query.table import build_table, octahedral_to_sphere, sphere_to_octahedral
+from langsplat_core.query.relevancy import FLOOR, latent_relevancy, relevancy
+from langsplat_core.query.table import build_table, octahedral_to_sphere, sphere_to_octahedral, suits_table
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.scene import (
-    AutoencoderCodec,
-    Gaussians,
-    LanguageField,
-    LinearCodec,
-    Scene,
-    look_at,
-)
-
-D = 16
-
-
-def random_codec(rng: np.random.Generator, d: int = 3) -> AutoencoderCodec:
-    """A smooth random autoencoder: untrained weights of moderate size."""
-
-    def layers(widths):
-        return tuple(
-            (
-                (rng.normal(size=(b, a)) * (1.6 / a**0.5)).astype(np.float32),
-                (0.3 * rng.normal(size=b)).astype(np.float32),
-            )
-            for a, b in pairwise(widths)
-        )
-
-    return AutoencoderCodec(layers((D, 24, d)), layers((d, 24, 32, D)))
-
-
-def blob(centre, count: int, rng: np.random.Generator) -> np.ndarray:
-    return np.asarray(centre) + 0.1 * rng.normal(size=(count, 3))
-
-
-def two_blob_scene(linear: bool = True) -> tuple[Scene, np.ndarray, np.ndarray]:
-    """Two blobs 2 units apart whose vectors are the axes 0 and 1; canonical phrases are axes 8 to 11."""
-    rng = np.random.default_rng(0)
-    count = 60
-    means = np.concatenate([blob((-1, 0, 4), count, rng), blob((1, 0, 4), count, rng)])
-    gaussians = Gaussians(
-        means=means,
-        log_scales=np.full((2 * count, 3), np.log(0.08)),
-        quats_wxyz=np.tile([1.0, 0, 0, 0], (2 * count, 1)),
-        opacity_logits=np.full(2 * count, 2.0),
-        sh=np.zeros((2 * count, 1, 3)),
-    )
-    basis = np.eye(D, dtype=np.float32)[:8]
-    vectors = np.repeat(np.eye(D, dtype=np.float32)[:2], count, 0)
-    codec = LinearCodec(basis)
-    latents = np.stack([codec.encode(vectors)] * 3).astype(np.float32)
-    latents[0] = 0  # subparts: nothing observed
-    confidence = np.ones((3, 2 * count), np.float32)
-    confidence[0] = 0
-    field = LanguageField(latents, confidence, codec, np.eye(D, dtype=np.float32)[8:12], "none")
-    phrasebook = {"Left": np.eye(D, dtype=np.float32)[0], "nowhere": np.eye(D, dtype=np.float32)[5]}
-    field = LanguageField(latents, confidence, codec, field.canonical, "none", phrasebook)
-    camera = look_at(np.zeros(3), np.array([0, 0, 4.0]), np.array([0, -1.0, 0]), (64, 48))
-    return Scene(gaussians, field, (camera,)), means[:count], means[count:]
+from langsplat_core.scene import LanguageField, LinearCodec, Scene
+from tests.support.fakes import FakeEncoder, blob_scene
+from tests.support.two_blobs import D, random_codec, two_blob_scene
 
 
 def test_relevancy_is_the_minimum_of_pairwise_softmaxes():
@@ -135,6 +81,21 @@ def test_table_agrees_with_exact_decoding_and_improves_with_resolution():
     assert errors[192].mean() < errors[48].mean() / 6  # bilinear: second order where smooth
 
 
+def test_a_table_needs_a_sphere():
+    rng = np.random.default_rng(7)
+    canonical = unit(rng.normal(size=(4, D))).astype(np.float32)
+    flat = LinearCodec(np.eye(D, dtype=np.float32)[:3])  # 3 numbers, but of any length
+    for codec in (random_codec(rng, d=4), flat):
+        assert not suits_table(codec)
+        with pytest.raises(ValueError, match="sphere"):
+            build_table(codec, np.ones((2, codec.latent_dim), np.float32), canonical)
+
+
+def test_the_floor_is_where_phrase_and_canonical_phrases_are_as_close():
+    vectors = np.eye(D)[:1]
+    assert relevancy(vectors, vectors, np.repeat(vectors, 4, 0)).tolist() == [[FLOOR]]
+
+
 def test_engine_finds_the_blob_and_its_place():
     scene, left, _ = two_blob_scene()
     result = QueryEngine(scene).run("left")
@@ -159,7 +120,7 @@ def test_engine_says_when_nothing_is_there():
 
 def test_engine_errors_say_what_to_do():
     scene, *_ = two_blob_scene()
-    with pytest.raises(EncoderError, match="--encoder"):
+    with pytest.raises(EncoderError, match="only the phrases in the scene's phrasebook"):
         QueryEngine(scene).run("right")
     with pytest.raises(InputError, match="empty"):
         QueryEngine(scene).run("  ")
@@ -174,16 +135,46 @@ def test_engine_errors_say_what_to_do():
             return tuple(word for word in text.split() if word == "flurb")
 
     with pytest.raises(EncoderError, match="'flurb'"):
-        QueryEngine(scene, Small()).run("red flurb")
+        QueryEngine(scene, lambda _: Small()).run("red flurb")
     with pytest.raises(EncoderError, match="3 numbers"):
-        QueryEngine(scene, Small()).run("red")
+        QueryEngine(scene, lambda _: Small()).run("red")
 
     class Stranger(Small):
         def encode_texts(self, texts):
             return np.roll(np.eye(D, dtype=np.float32), 3, axis=1)[: len(texts)]
 
     with pytest.raises(EncoderError, match="other weights"):
-        QueryEngine(scene, Stranger()).run("red")
+        QueryEngine(scene, lambda _: Stranger()).run("red")
+
+
+@pytest.mark.parametrize(("encoder_id", "asked_for"), [("", "fake"), ("mine", "mine")])
+def test_the_encoder_is_loaded_once_by_the_first_phrase_that_needs_it(encoder_id, asked_for):
+    loaded = []
+
+    def load(name: str) -> FakeEncoder:
+        loaded.append(name)
+        return FakeEncoder()
+
+    engine = QueryEngine(blob_scene(phrasebook=True), load, encoder_id=encoder_id)
+    told = []
+    with pytest.raises(InputError):
+        engine.run("  ")
+    assert engine.run("  Book ", progress=lambda label, _: told.append(label)).found
+    assert engine.unknown_words("BOOK") == ()
+    assert (loaded, told) == ([], ["searching 'Book'"])
+    assert engine.run(" Plant ", progress=lambda label, _: told.append(label)).phrase == "Plant"
+    engine.run("mug", progress=lambda label, _: told.append(label))
+    assert engine.unknown_words("red mug") == ("red",)
+    assert engine.load_encoder() is engine.encoder
+    assert loaded == [asked_for]
+    assert told[1:] == ["loading the text encoder", "searching 'Plant'", "searching 'mug'"]
+
+
+def test_heat_goes_from_the_floor_to_the_peak_but_never_over_less_than_a_tenth():
+    scene, *_ = two_blob_scene()
+    found, absent = QueryEngine(scene).run("left"), QueryEngine(scene).run("nowhere")
+    assert found.heat_range == (FLOOR, found.peak)
+    assert absent.heat_range == (FLOOR, pytest.approx(FLOOR + 0.1))
 
 
 def test_an_empty_scene_can_be_asked():

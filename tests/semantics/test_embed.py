@@ -10,7 +10,13 @@ from langsplat_core.errors import FormatError
 from langsplat_core.progress import Cancelled, Progress, silent
 from langsplat_core.semantics.embed import embed_regions
 from langsplat_core.semantics.masks import LevelMasks
-from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture, feature_key
+from langsplat_core.semantics.store import (
+    FeatureStore,
+    ImageFeatures,
+    describe_capture,
+    feature_key,
+    fingerprint,
+)
 
 
 class ColourEncoder:
@@ -130,12 +136,15 @@ def test_an_absent_file_is_named(tmp_path: Path) -> None:
 
 def test_the_key_follows_all_that_matters() -> None:
     encoder, image = ColourEncoder(), red_and_blue()
-    keys = {feature_key(image, Halves(), encoder), feature_key(image, Halves("2"), encoder)}
-    keys.add(feature_key(image[::-1], Halves(), encoder))
-    keys.add(feature_key(red_and_blue(20, 10), Halves(), encoder))
+    keys = {
+        feature_key(image, Halves(), fingerprint(encoder)),
+        feature_key(image, Halves("2"), fingerprint(encoder)),
+    }
+    keys.add(feature_key(image[::-1], Halves(), fingerprint(encoder)))
+    keys.add(feature_key(red_and_blue(20, 10), Halves(), fingerprint(encoder)))
     other = ColourEncoder()
     other.id = "others"
-    keys.add(feature_key(image, Halves(), other))
+    keys.add(feature_key(image, Halves(), fingerprint(other)))
     # Upside down this picture is the same one.
     assert len(keys) == 4
 
@@ -143,8 +152,10 @@ def test_the_key_follows_all_that_matters() -> None:
         def encode_images(self, crops: np.ndarray) -> np.ndarray:
             return unit(super().encode_images(crops) * np.float32([1, 0.5, 0.2]))
 
-    assert feature_key(image, Halves(), Retrained()) not in keys  # other weights under the same name
-    assert feature_key(image, Halves(), encoder) in keys
+    assert (
+        feature_key(image, Halves(), fingerprint(Retrained())) not in keys
+    )  # other weights under the same name
+    assert feature_key(image, Halves(), fingerprint(encoder)) in keys
 
 
 def test_an_interrupted_run_continues_where_it_stopped(tmp_path: Path) -> None:

@@ -93,6 +93,7 @@ def test_shaded_balls_are_found_whole() -> None:
         assert best[2] > 0.9
 
 
+@pytest.mark.long
 def test_a_photograph_larger_than_the_working_size_keeps_its_size() -> None:
     image, ball = rendering(height=600, width=800)
     levels = nested_partitions(image)

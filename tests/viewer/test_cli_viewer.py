@@ -5,16 +5,18 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from langsplat_core.config import Display
 from langsplat_core.formats import companion_path, language, save_scene, write_cameras
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer import __main__ as program
 from langsplat_viewer import options
-from langsplat_viewer.options import parse_size
+from langsplat_viewer.options import DisplayChoice, latent_level, parse_size
 from tests.support.fakes import CENTRES, FakeEncoder, blob_scene
 
 MUG, BOOK, PLANT = CENTRES
@@ -98,7 +100,7 @@ def test_a_fixed_level_is_used_and_named(viewer, folder):
 
 def test_every_display_is_another_picture(viewer, folder):
     seen = []
-    for display in ("rgb", "latent", "relevancy", "segmentation", "depth", "alpha"):
+    for display in get_args(Display):
         code, out, _ = viewer(
             "blobs.ply", "--headless", "--out", f"{display}.png", "--query", "mug", "--display", display
         )
@@ -251,3 +253,11 @@ def test_without_a_window_no_windowing_library_is_loaded(folder):
 )
 def test_sizes(text, size):
     assert parse_size(text) == size
+
+
+def test_the_choices_are_the_displays_and_auto():
+    assert get_args(DisplayChoice) == ("auto", *get_args(Display))
+
+
+def test_latents_are_those_of_the_level_asked_for():
+    assert [latent_level(level) for level in ("subpart", "part", "whole", "auto")] == [0, 1, 2, 2]

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.scene import Camera, Gaussians, Intrinsics, Scene
 from langsplat_viewer.controls import (
     FOV_RANGE,
     MAX_ELEVATION,
-    Lens,
     OrbitCamera,
     adopt_up,
     between,
@@ -19,13 +18,12 @@ from langsplat_viewer.controls import (
     fly,
     focus,
     from_camera,
-    lens_of,
     level,
     look,
     orbit,
     pan,
     roll,
-    symmetric_lens,
+    symmetric_intrinsics,
     with_fov,
     zoom,
 )
@@ -161,7 +159,8 @@ def test_from_camera_is_the_photograph_to_the_pixel():
 @pytest.mark.parametrize("size", [(400, 100), (100, 400), (37, 23)])
 def test_a_window_of_any_shape_holds_the_whole_photograph(size):
     camera = random_camera(5)
-    fx, fy, cx, cy = lens_of(camera).fitted(*size)
+    inner = camera.intrinsics.fitted(*size)
+    fx, fy, cx, cy = inner.fx, inner.fy, inner.cx, inner.cy
     corners = np.array([[0, 0], [camera.width, camera.height]])
     x, y = ((corners - (camera.cx, camera.cy)) / (camera.fx, camera.fy) * (fx, fy) + (cx, cy)).T
     assert -1e-9 <= x[0] < x[1] <= size[0] + 1e-9
@@ -171,10 +170,10 @@ def test_a_window_of_any_shape_holds_the_whole_photograph(size):
 
 
 def test_fov_is_kept_and_bounded(view):
-    assert with_fov(view, 65.0).lens.fov_degrees == pytest.approx(65.0)
-    assert with_fov(view, 500.0).lens.fov_degrees == pytest.approx(FOV_RANGE[1])
-    assert symmetric_lens(40.0).fov_degrees == pytest.approx(40.0)
-    assert Lens(640, 480, 240, 240, 320, 240).fov_degrees == pytest.approx(90.0)
+    assert with_fov(view, 65.0).intrinsics.fov_degrees == pytest.approx(65.0)
+    assert with_fov(view, 500.0).intrinsics.fov_degrees == pytest.approx(FOV_RANGE[1])
+    assert symmetric_intrinsics(40.0).fov_degrees == pytest.approx(40.0)
+    assert Intrinsics(640, 480, 240, 240, 320, 240).fov_degrees == pytest.approx(90.0)
 
 
 def test_default_view_shows_the_scene_upright():

@@ -9,22 +9,23 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import Display, PictureConfig
+from langsplat_core.config import PictureConfig
 from langsplat_core.display.compose import Channels, compose
+from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Gaussians, Scene, look_at
+from langsplat_viewer.channel_textures import ArraySource, GlSource
 from langsplat_viewer.channels import ArrayChannels, Layers, depth_range
 from langsplat_viewer.frame import FrameRenderer, suits_opengl
-from langsplat_viewer.headless import render_picture
+from tests.support.gl_context import gl_state
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
-DISPLAYS: tuple[Display, ...] = ("rgb", "latent", "relevancy", "segmentation", "depth", "alpha")
 COUNT = 150
 SCENE = Scene(random_gaussians(COUNT, sh_degree=3))
 CAMERA = random_camera(1, distance=2.0)
 LATENT = random_values(COUNT, 3, 1)
 RELEVANCIES = random_values(COUNT, 2, 2)
-PEAKS = (0.9, 0.55)
+RANGES = ((0.5, 0.9), (0.5, 0.6))
 PICTURE = PictureConfig(background=(0.2, 0.5, 0.9))
 
 
@@ -71,9 +72,9 @@ def test_the_shader_composes_as_numpy_does(gl, monkeypatch, display, queries):
     renderer.set_scene(SCENE)
     renderer.set_layers(LATENT, random_values(COUNT, queries))
     picture = replace(PICTURE, display=display, heat_opacity=0.8, dim=0.4, threshold=0.55, alpha_gate=0.25)
-    for peaks in ((), (0.9,), (0.9, 0.52, 0.7)[:queries]):
-        got = renderer.read(CAMERA.resized(50, 40), picture, peaks)
-        assert largest_difference(got, compose(shown, picture, peaks)) <= 1
+    for ranges in ((), ((0.5, 0.9),), ((0.5, 0.9), (0.4, 0.52), (0.0, 0.7))[:queries]):
+        got = renderer.read(CAMERA.resized(50, 40), picture, ranges)
+        assert largest_difference(got, compose(shown, picture, ranges)) <= 1
     renderer.release()
 
 
@@ -82,7 +83,7 @@ def test_the_picture_is_that_of_the_reference(frame, display):
     """Either backend against float64 channels composed in NumPy. Pixels at a threshold or at a cut-off
     of image formation may flip; all others agree to 2/255."""
     picture = replace(PICTURE, display=display)
-    got = frame.read(CAMERA, picture, PEAKS)
+    got = frame.read(CAMERA, picture, RANGES)
     assert got.shape == (CAMERA.height, CAMERA.width, 3)
     difference = np.abs(got.astype(int) - reference_picture(picture)).max(-1)
     assert (difference > 2).mean() <= 2e-3
@@ -97,7 +98,7 @@ def reference_picture(picture: PictureConfig) -> Array:
     image, alpha = view.splat(np.concatenate([rgb, LATENT, RELEVANCIES, view.footprints.depths[:, None]], 1))
     depths = depth_range(gaussians, CAMERA)
     channels = Channels(image[..., :3], alpha, image[..., 3:6], image[..., 6:8], image[..., 8], depths)
-    return compose(channels, picture, PEAKS)
+    return compose(channels, picture, RANGES)
 
 
 def test_the_backends_agree_on_a_screen(gl):
@@ -114,7 +115,7 @@ def test_the_backends_agree_on_a_screen(gl):
 def test_a_missing_layer_shows_the_plain_colours(frame):
     frame.set_layers(None, None)
     plain = frame.read(CAMERA, PICTURE)
-    for display in ("latent", "relevancy", "segmentation"):
+    for display in (row.name for row in DISPLAYS.values() if row.needs_field):
         assert largest_difference(frame.read(CAMERA, replace(PICTURE, display=display)), plain) == 0
 
 
@@ -125,21 +126,31 @@ def test_layers_of_another_shape_are_refused(frame):
         frame.set_layers(None, random_values(COUNT, 4))
 
 
+def counted(method, calls: list):
+    """`method`, which also notes its arguments."""
+
+    def noting(*arguments):
+        calls.append(arguments)
+        return method(*arguments)
+
+    return noting
+
+
 def test_channels_are_kept_while_only_the_picture_settings_change(frame, monkeypatch):
     calls = []
-    render = frame._source.render
-    monkeypatch.setattr(frame._source, "render", lambda *args: calls.append(args) or render(*args))
+    for source in (GlSource, ArraySource):
+        monkeypatch.setattr(source, "render", counted(source.render, calls))
     heat = replace(PICTURE, display="relevancy")
-    first = frame.read(CAMERA, heat, PEAKS)
-    assert largest_difference(first, frame.read(CAMERA, replace(heat, heat_opacity=0.1), PEAKS)) > 20
-    frame.read(CAMERA, replace(heat, display="segmentation"), PEAKS)
+    first = frame.read(CAMERA, heat, RANGES)
+    assert largest_difference(first, frame.read(CAMERA, replace(heat, heat_opacity=0.1), RANGES)) > 20
+    frame.read(CAMERA, replace(heat, display="segmentation"), RANGES)
     assert len(calls) == 1
-    frame.read(replace(CAMERA, name="same view"), heat, PEAKS)
+    frame.read(replace(CAMERA, name="same view"), heat, RANGES)
     assert len(calls) == 1
-    frame.read(random_camera(4), heat, PEAKS)
+    frame.read(random_camera(4), heat, RANGES)
     assert len(calls) == 2
     frame.set_layers(LATENT, 1 - RELEVANCIES)
-    assert largest_difference(frame.read(CAMERA, heat, PEAKS), first) > 20
+    assert largest_difference(frame.read(CAMERA, heat, RANGES), first) > 20
     frame.set_scene(Scene(random_gaussians(20, 3)))
     frame.read(CAMERA, heat)
     assert len(calls) == 4
@@ -189,14 +200,12 @@ def test_the_viewport_alone_is_drawn_and_stretched(gl, frame):
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks libGL.so.1")
 def test_a_user_interface_finds_a_plain_state(gl, frame):
-    from tests.raster.opengl.test_rasterizer import gl_state
-
     target = gl.framebuffer([gl.texture((64, 64), 4)])
     target.use()
     gl.enable_only(0)
     gl.blend_func = 0x0302, 0x0303  # source alpha, 1 - source alpha
     before = gl_state()
-    frame.draw(target, CAMERA, replace(PICTURE, display="relevancy"), PEAKS)
+    frame.draw(target, CAMERA, replace(PICTURE, display="relevancy"), RANGES)
     np.testing.assert_array_equal(gl_state(), before)
     gl.detect_framebuffer(0).use()
     target.release()
@@ -288,41 +297,3 @@ def test_depth_range_covers_what_is_in_view():
     assert 4 < near < 4.6
     assert 5.4 < far < 6
     assert depth_range(random_gaussians(0), camera) == (0.0, 1.0)
-
-
-@pytest.mark.parametrize("display", DISPLAYS)
-def test_headless_pictures_agree(gl, display):
-    picture = replace(PICTURE, display=display)
-    layers = {"latent_rgb": LATENT, "relevancies": RELEVANCIES, "heat_peaks": PEAKS}
-    with_gl = render_picture(SCENE, CAMERA, picture, backend="opengl", **layers)
-    without = render_picture(SCENE, CAMERA, picture, backend="cpu", **layers)
-    difference = np.abs(with_gl.astype(int) - without).max(-1)
-    assert np.quantile(difference, 0.95) <= 4  # half floats, and heat colours that magnify them
-
-
-NO_DRIVER = """
-import sys
-from langsplat_core.errors import BackendError
-from langsplat_viewer.headless import render_picture
-from langsplat_core.config import PictureConfig
-from langsplat_core.scene import Scene
-from tests.support.scenes import random_camera, random_gaussians
-scene = Scene(random_gaussians(20))
-for backend in ("auto", "cpu"):
-    assert render_picture(scene, random_camera(), PictureConfig(), backend=backend).any()
-try:
-    render_picture(scene, random_camera(), PictureConfig(), backend="opengl")
-except BackendError as error:
-    assert "libegl1" in str(error) and "--backend cpu" in str(error) and "\\n" not in str(error)
-    print("refused")
-print([name for name in ("glfw", "imgui_bundle") if name in sys.modules])
-"""
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="hides EGL's drivers from its loader")
-def test_without_any_driver_the_cpu_still_makes_pictures():
-    hidden = {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent.json"}
-    run = subprocess.run(
-        [sys.executable, "-c", NO_DRIVER], env=os.environ | hidden, capture_output=True, text=True
-    )
-    assert run.stdout.split("\n")[:2] == ["refused", "[]"], run.stderr

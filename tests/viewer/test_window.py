@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import moderngl
 import numpy as np
 import pytest
 
@@ -76,12 +77,17 @@ def test_window(scenario: str, display: str, folder: Path):
 
 
 class FakeRenderer:
-    """Notes what is asked of it, and takes as long as a slow machine if told to."""
+    """Notes what is asked of it, and takes as long as it is told to, on a clock of its own."""
 
     backend = "fake"
 
-    def __init__(self) -> None:
+    def __init__(self, seconds: float = 0.0) -> None:
         self.calls: list[tuple[str, object]] = []
+        self.seconds = seconds  # that a picture takes
+        self.now = 0.0
+
+    def clock(self) -> float:
+        return self.now
 
     def set_scene(self, scene) -> None:
         self.calls.append(("scene", scene))
@@ -89,11 +95,12 @@ class FakeRenderer:
     def set_layers(self, latent_rgb, relevancies) -> None:
         self.calls.append(("layers", latent_rgb is not None))
 
-    def draw(self, target, camera, picture, heat_peaks=()) -> None:
+    def draw(self, target, camera, picture, heat_ranges=()) -> None:
         self.calls.append(("draw", (camera.width, camera.height)))
+        self.now += self.seconds
         target.clear(1.0, 0.0, 0.0, 1.0)
 
-    def read(self, camera, picture, heat_peaks=()):
+    def read(self, camera, picture, heat_ranges=()):
         return np.zeros((camera.height, camera.width, 3), np.uint8)
 
     def depth_at(self, x_px, y_px):
@@ -134,10 +141,10 @@ def test_canvas_draws_only_changes(gl, state):
 
 @pytest.mark.parametrize(("fine_ms", "coarse"), [(10, (200, 120)), (150, (100, 60)), (5000, (50, 30))])
 def test_canvas_is_coarse_only_while_a_slow_camera_moves(gl, state, fine_ms, coarse):
-    renderer = FakeRenderer()
-    canvas = Canvas(gl, renderer)
+    renderer = FakeRenderer(seconds=fine_ms / 1000)
+    canvas = Canvas(gl, renderer, renderer.clock)
     canvas.update(state, 0.0)
-    canvas._fine_ms = fine_ms
+    assert state.stats.milliseconds == pytest.approx(fine_ms)
     drawn(renderer)
     state.view = orbit(state.view, 0.1, 0)
     assert canvas.update(state, 10.0)  # a finer picture is due
@@ -149,23 +156,24 @@ def test_canvas_is_coarse_only_while_a_slow_camera_moves(gl, state, fine_ms, coa
 
 
 def test_canvas_stays_fine_if_told_so(gl, state):
-    renderer = FakeRenderer()
-    canvas = Canvas(gl, renderer)
+    renderer = FakeRenderer(seconds=5.0)
+    canvas = Canvas(gl, renderer, renderer.clock)
     state.coarse_while_moving = False
     canvas.update(state, 0.0)
-    canvas._fine_ms = 5000
     state.view = orbit(state.view, 0.1, 0)
     canvas.update(state, 10.0)
     assert drawn(renderer) == [(200, 120), (200, 120)]
 
 
 def test_canvas_keeps_few_textures(gl, state):
-    canvas = Canvas(gl, FakeRenderer())
+    canvas, seen = Canvas(gl, FakeRenderer()), []
     for width in range(20, 40):
         state.size = (width, 20)
         canvas.update(state, 0.0)
         assert canvas.texture.size == (width, 20)
-    assert len(canvas._targets) == len(canvas._textures) <= 3
+        seen.append(canvas.texture)
+    kept = [texture for texture in seen if not isinstance(texture.mglo, moderngl.InvalidObject)]
+    assert len(kept) <= 3
 
 
 def test_canvas_finds_the_point_under_the_cursor(gl, state):

@@ -18,12 +18,16 @@ from imgui_bundle.immapp import testing  # isort: skip
 from langsplat_core.errors import BackendError
 from langsplat_core.formats import load_scene
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import Services
 from langsplat_viewer.frame import FrameRenderer
+from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest
 from tests.support.fakes import CENTRES, FakeEncoder
 
 MUG, BOOK, PLANT = CENTRES
+
+
+def digit_key(digit: int) -> imgui.Key:
+    return imgui.Key[f"_{digit}"]
 
 
 class CountingRenderer(FrameRenderer):
@@ -72,7 +76,7 @@ class Session:
         """Until nothing moves and nothing is under way."""
         self.ctx.yield_(2)
         self.wait(lambda: self.window.viewer.worker.current is None and self.state.glide is None)
-        self.wait(lambda: not self.window._unfinished)
+        self.wait(lambda: not self.window.unfinished)
         self.ctx.yield_(2)
 
     def shot(self, name: str) -> np.ndarray:
@@ -89,6 +93,15 @@ class Session:
         column, row = int(x) + shot.shape[1] - width, int(y)
         return shot[row - 2 : row + 3, column - 2 : column + 3].reshape(-1, 3).mean(0)
 
+    def drag(self, start: tuple[int, int], end: tuple[int, int], steps: int = 8) -> None:
+        """With the left button, in window units; a frame for each step."""
+        self.ctx.mouse_teleport_to_pos(start)
+        self.ctx.mouse_down(0)
+        for x, y in np.linspace(start, end, steps):
+            self.ctx.mouse_teleport_to_pos((x, y))
+            self.ctx.yield_()
+        self.ctx.mouse_up(0)
+
     def search(self, phrase: str) -> None:
         self.ctx.item_click("//**/##phrase")
         self.ctx.key_chars_append_enter(phrase)
@@ -98,16 +111,21 @@ class Session:
 def look_and_search(s: Session) -> None:
     s.wait(lambda: s.state.scene is not None)
     rgb = s.shot("rgb")
-    assert s.at(rgb, MUG).argmax() == 0
-    assert s.at(rgb, BOOK).argmax() == 1
-    assert s.at(rgb, PLANT).argmax() == 2
-    panel = rgb[600, 5]
+    assert [s.at(rgb, thing).argmax() for thing in CENTRES] == [0, 1, 2]
 
     # A picture is drawn again only when something changed.
     drawn = s.renderer.count
     s.ctx.yield_(20)
     assert s.renderer.count == drawn
 
+    find_the_plant(s, rgb)
+    both = find_more(s)
+    try_displays(s, both, panel=rgb[600, 5])
+    use_keys(s)
+    save_with_a_key(s)
+
+
+def find_the_plant(s: Session, rgb: np.ndarray) -> None:
     # Typing owns the keyboard: the p of "plant" saves no picture, its a and t move nothing.
     before = s.state.view
     s.search("plant")
@@ -120,25 +138,25 @@ def look_and_search(s: Session) -> None:
     np.testing.assert_allclose(s.at(heat, BOOK), 0.45 * s.at(rgb, BOOK), atol=6)  # the rest is dimmed
 
     # The heat stays on the thing while the camera moves round it.
-    x, y = 600, 300
-    s.ctx.mouse_teleport_to_pos((x, y))
-    s.ctx.mouse_down(0)
-    for step in range(8):
-        s.ctx.mouse_teleport_to_pos((x + 8 * step, y - 3 * step))
-        s.ctx.yield_()
-    s.ctx.mouse_up(0)
+    s.drag((600, 300), (656, 279))
     moved = s.shot("moved")
     assert s.state.view is not before
     # Blended relevancy depends a little on the view; the heat map's red end is steep, its blue end far away.
     np.testing.assert_allclose(s.at(moved, PLANT), hot, atol=40)
     assert s.at(moved, PLANT)[2] < 60 < s.at(rgb, PLANT)[2]
 
+
+def find_more(s: Session) -> np.ndarray:
     s.search("sofa")
     assert "sofa" in s.state.queries[1].problem
     s.search("mug")
     both = s.shot("both")
     np.testing.assert_allclose(s.at(both, MUG), s.at(both, PLANT), atol=40)
+    return both
 
+
+def try_displays(s: Session, both: np.ndarray, panel: np.ndarray) -> None:
+    """Every display is another picture; `panel` is a pixel of the panel, which none of them may colour."""
     seen = [both]
     for label in ("Colours", "Depth", "Alpha", "Segmentation", "subpart##latent", "whole##latent"):
         s.ctx.item_click(f"//**/{label}")
@@ -150,10 +168,21 @@ def look_and_search(s: Session) -> None:
     assert (alpha.max(-1) == alpha.min(-1)).all()
     assert alpha.max() > 200
 
-    # Keys, away from the box.
+
+def use_keys(s: Session) -> None:
+    """Keys, away from the box."""
     s.ctx.mouse_teleport_to_pos((600, 550))
     s.ctx.mouse_click(0)
-    s.ctx.key_press(imgui.Key._1)
+    for digit, display in enumerate(
+        ("rgb", "depth", "alpha", "relevancy", "segmentation", "latent"), start=1
+    ):
+        s.ctx.key_press(digit_key(digit))
+        s.ctx.yield_(2)
+        assert s.state.picture.display == display
+    s.ctx.key_press(digit_key(7))
+    s.ctx.yield_(2)
+    assert (s.state.picture.display, s.state.latent_level) == ("latent", 1)
+    s.ctx.key_press(digit_key(1))
     s.ctx.key_press(imgui.Key.r)
     s.settle()
     assert s.state.picture.display == "rgb"
@@ -166,9 +195,10 @@ def look_and_search(s: Session) -> None:
     s.settle()
     s.ctx.key_press(imgui.Key.f)
     s.settle()
-    place = s.state.queries[-1].result.place
-    np.testing.assert_allclose(s.state.view.target, place)
+    np.testing.assert_allclose(s.state.view.target, s.state.queries[-1].result.place)
 
+
+def save_with_a_key(s: Session) -> None:
     s.ctx.key_press(imgui.Key.p)
     s.ctx.yield_(2)
     saved = np.asarray(Image.open(s.folder / "blobs-001.png")).astype(int)
@@ -183,16 +213,16 @@ def without_field(s: Session) -> None:
     s.settle()
     assert any("langsplat train" in message.text for message in s.state.messages)
     assert not s.ctx.item_exists("//**/##phrase")
-    s.ctx.key_press(imgui.Key._4)  # relevancy: refused with a line, not a crash
+    s.ctx.key_press(digit_key(4))  # relevancy: refused with a line, not a crash
     assert s.state.picture.display == "rgb"
 
-    s.window._dropped(None, [str(s.folder / "truncated.ply")])
+    s.window.drop([str(s.folder / "truncated.ply")])
     s.settle()
     assert s.state.messages[-1].is_error
     assert "truncated.ply" in s.state.messages[-1].text
     assert s.state.path.name == "plain.ply"
 
-    s.window._dropped(None, [str(s.folder / "blobs.ply")])
+    s.window.drop([str(s.folder / "blobs.ply")])
     s.wait(lambda: s.state.path.name == "blobs.ply")
     s.settle()
     assert s.ctx.item_exists("//**/##phrase")
@@ -228,7 +258,7 @@ def broken_renderer(s: Session) -> None:
     s.ctx.yield_(20)
     assert s.state.messages[-1].text == "the driver gave up; use --backend cpu"
     del s.renderer.draw
-    s.ctx.key_press(imgui.Key._2)
+    s.ctx.key_press(digit_key(2))
     assert s.shot("mended")[:, 400:].max() > 100
 
 

@@ -2,7 +2,9 @@
 
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_viewer.actions import Viewer
+from langsplat_viewer import actions
+from langsplat_viewer.panels.view import BUTTONS
+from langsplat_viewer.viewer import Viewer
 
 KEYS = (
     ("left drag", "turn around the centre"),
@@ -16,7 +18,7 @@ KEYS = (
     ("R", "whole scene"),
     ("F", "focus on the latest result found"),
     (", .", "previous, next training camera"),
-    ("1 ... 8", "display, in the panel's order"),
+    (f"1 ... {len(BUTTONS)}", "display, in the panel's order"),
     ("/", "type a search"),
     ("Tab", "hide or show the panel"),
     ("P", "save a picture"),
@@ -33,7 +35,7 @@ def draw(viewer: Viewer) -> None:
     imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.35, 0.5))
     imgui.set_next_window_bg_alpha(1.0)
     _, still_open = imgui.begin("Keys", True, flags)
-    viewer.state.show_help = bool(still_open)
+    actions.show_help(viewer, bool(still_open))
     if imgui.begin_table("keys", 2):
         imgui.table_setup_column("key", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(14))
         imgui.table_setup_column("does", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(17))

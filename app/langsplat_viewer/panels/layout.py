@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_viewer.actions import Viewer
 from langsplat_viewer.panels import help, query, scene, status, view
 from langsplat_viewer.panels.scene import OpenDialog
 from langsplat_viewer.panels.style import MUTED, PANEL_EM
+from langsplat_viewer.viewer import Viewer
 
 PANEL = "LangSplat"
 

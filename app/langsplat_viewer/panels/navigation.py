@@ -1,18 +1,31 @@
 """Mouse and keys over the scene -> camera moves and actions."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 from imgui_bundle import imgui
 
 from langsplat_viewer import actions, controls, saving
-from langsplat_viewer.actions import Viewer
 from langsplat_viewer.panels.layout import Area
-from langsplat_viewer.panels.view import DISPLAYS
+from langsplat_viewer.panels.view import BUTTONS
+from langsplat_viewer.viewer import Viewer
 
 NEAREST = 0.02  # of the scene's radius: the closest the camera comes to its centre of turning
 ROLL_SPEED = 1.0  # radians per second
 LONGEST_FRAME = 0.1  # seconds; a stalled frame must not throw a flying camera across the scene
+# (key, whether holding it repeats it, what it does); `help.KEYS` tells people
+SHORTCUTS: tuple[tuple[imgui.Key, bool, Callable[[Viewer], object]], ...] = (
+    (imgui.Key.r, False, actions.reset_view),
+    (imgui.Key.f, False, actions.focus_result),
+    (imgui.Key.comma, True, lambda viewer: actions.step_camera(viewer, -1)),
+    (imgui.Key.period, True, lambda viewer: actions.step_camera(viewer, 1)),
+    (imgui.Key.p, False, lambda viewer: saving.save_picture(viewer, Path.cwd())),
+    (imgui.Key.slash, False, actions.focus_search),
+    (imgui.Key.tab, False, actions.toggle_panel),
+    (imgui.Key.f1, False, actions.toggle_help),
+    (imgui.Key.escape, False, lambda viewer: actions.show_help(viewer, False)),
+)
 
 
 def handle(viewer: Viewer, area: Area) -> None:
@@ -54,28 +67,12 @@ def _held(button: int) -> bool:
 
 
 def _keys(viewer: Viewer) -> None:
-    state, key = viewer.state, imgui.Key
-    if imgui.is_key_pressed(key.r, False):
-        actions.reset_view(viewer)
-    if imgui.is_key_pressed(key.f, False):
-        actions.focus_result(viewer)
-    if imgui.is_key_pressed(key.comma):
-        actions.step_camera(viewer, -1)
-    if imgui.is_key_pressed(key.period):
-        actions.step_camera(viewer, 1)
-    if imgui.is_key_pressed(key.p, False):
-        saving.save_picture(viewer, Path.cwd())
-    if imgui.is_key_pressed(key.slash, False):
-        state.show_panel, state.focus_input = True, True
-    if imgui.is_key_pressed(key.tab, False):
-        state.show_panel = not state.show_panel
-    if imgui.is_key_pressed(key.f1, False):
-        state.show_help = not state.show_help
-    if imgui.is_key_pressed(key.escape, False):
-        state.show_help = False
-    for index, (_, display, latent_level) in enumerate(DISPLAYS):
-        if imgui.is_key_pressed(imgui.Key(key._1 + index), False):
-            actions.set_display(viewer, display, latent_level)
+    for key, repeats, act in SHORTCUTS:
+        if imgui.is_key_pressed(key, repeats):
+            act(viewer)
+    for digit, button in enumerate(BUTTONS, start=1):
+        if imgui.is_key_pressed(imgui.Key[f"_{digit}"], False):
+            actions.set_display(viewer, button.display, button.latent_level)
 
 
 def _fly(viewer: Viewer) -> None:

@@ -1,17 +1,19 @@
 """The search panel: a box to type in, and the list of what was searched."""
 
+from typing import get_args
+
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
 from langsplat_core.config import LevelChoice
-from langsplat_core.display.compose import QUERY_COLOURS
+from langsplat_core.display.colour_maps import QUERY_COLOURS
 from langsplat_core.query.engine import NO_FIELD
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions
-from langsplat_viewer.actions import Viewer
 from langsplat_viewer.panels.style import BAD, GOOD, MUTED, small_wrapped
 from langsplat_viewer.state import Query
+from langsplat_viewer.viewer import Viewer
 
-CHOICES: tuple[LevelChoice, ...] = ("auto", "subpart", "part", "whole")
+CHOICES: tuple[LevelChoice, ...] = get_args(LevelChoice)
 
 
 def draw(viewer: Viewer) -> None:
@@ -32,20 +34,18 @@ def draw(viewer: Viewer) -> None:
 
 
 def _box(viewer: Viewer) -> None:
-    state = viewer.state
     button = imgui.calc_text_size("Search").x + 2 * imgui.get_style().frame_padding.x
     imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
-    if state.focus_input:
+    if actions.take_search_focus(viewer):
         imgui.set_keyboard_focus_here()
-        state.focus_input = False
     flags = imgui.InputTextFlags_.enter_returns_true
-    entered, state.typed = imgui.input_text_with_hint("##phrase", "red mug, handle, ...", state.typed, flags)
+    hint = "red mug, handle, ..."
+    entered, typed = imgui.input_text_with_hint("##phrase", hint, viewer.state.typed, flags)
+    actions.type_phrase(viewer, typed)
     imgui.same_line()
     clicked = imgui.button("Search")
-    if (entered or clicked) and state.typed.strip():
-        actions.ask(viewer, state.typed)
-        state.typed = ""
-        state.focus_input = entered  # the next phrase can be typed at once
+    if entered or clicked:
+        actions.ask_typed(viewer, again=entered)
 
 
 def _level(viewer: Viewer) -> None:

@@ -8,8 +8,8 @@ from typing import Any
 from imgui_bundle import imgui, portable_file_dialogs
 
 from langsplat_viewer import actions, saving
-from langsplat_viewer.actions import Viewer
 from langsplat_viewer.panels.style import MUTED, small_wrapped
+from langsplat_viewer.viewer import Viewer
 
 DIALOG_PROGRAMS = ("zenity", "kdialog", "matedialog", "qarma")  # one of them draws the dialog on Linux
 
@@ -53,7 +53,7 @@ def draw(viewer: Viewer, dialog: OpenDialog) -> None:
         saving.save_view(viewer, Path.cwd())
     imgui.same_line()
     if imgui.button("Keys"):
-        state.show_help = not state.show_help
+        actions.toggle_help(viewer)
     _open_popup(viewer, dialog)
     chosen = dialog.answer()
     if chosen is not None:
@@ -73,16 +73,15 @@ def _figures(viewer: Viewer) -> str:
 def _open_popup(viewer: Viewer, dialog: OpenDialog) -> None:
     if not imgui.begin_popup("open a scene"):
         return
-    state = viewer.state
     imgui.text("Path of a scene (or drop the file onto the window)")
     if imgui.is_window_appearing():
         imgui.set_keyboard_focus_here()
     imgui.set_next_item_width(imgui.get_font_size() * 24)
     flags = imgui.InputTextFlags_.enter_returns_true
-    entered, state.path_typed = imgui.input_text("##path", state.path_typed, flags)
+    entered, typed = imgui.input_text("##path", viewer.state.path_typed, flags)
+    actions.type_path(viewer, typed)
     clicked = imgui.button("Open")
-    if (entered or clicked) and state.path_typed.strip():
-        actions.open_scene(viewer, Path(state.path_typed.strip()).expanduser())
+    if (entered or clicked) and actions.open_typed(viewer):
         imgui.close_current_popup()
     if dialog.available:
         imgui.same_line()

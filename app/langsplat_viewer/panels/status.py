@@ -3,8 +3,8 @@
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.actions import Viewer
 from langsplat_viewer.panels.style import BAD, MUTED, small_wrapped
+from langsplat_viewer.viewer import Viewer
 
 FOOT_EM = 9.5  # height of the foot
 

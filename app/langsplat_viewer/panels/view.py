@@ -1,60 +1,78 @@
 """What is shown, and from where."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import groupby
 
 from imgui_bundle import hello_imgui, imgui
 
 from langsplat_core.config import Display
+from langsplat_core.display.displays import DISPLAYS, DisplayRow
+from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions
-from langsplat_viewer.actions import Viewer
 from langsplat_viewer.controls import FOV_RANGE, adopt_up, level, with_fov
 from langsplat_viewer.panels.style import MUTED, small_wrapped
+from langsplat_viewer.viewer import Viewer
 
-# (label, display, latent level), in the order of the keys 1 to 8; labels of radio buttons
-DISPLAYS: tuple[tuple[str, Display, int | None], ...] = (
-    ("Colours", "rgb", None),
-    ("Depth", "depth", None),
-    ("Alpha", "alpha", None),
-    ("Relevancy", "relevancy", None),
-    ("Segmentation", "segmentation", None),
-    ("subpart##latent", "latent", 0),
-    ("part##latent", "latent", 1),
-    ("whole##latent", "latent", 2),
-)
-ROWS = ((0, 1, 2), (3, 4), (5, 6, 7))
+
+@dataclass(frozen=True)
+class Button:
+    """One way to look at the scene."""
+
+    label: str  # of a radio button, with imgui's suffix where another has the same
+    display: Display
+    latent_level: int | None = None  # index into LEVELS
+
+
+def _buttons(row: DisplayRow) -> tuple[Button, ...]:
+    """One for the display, but for each level one where it shows latents."""
+    if row.extra != "latent":
+        return (Button(row.label, row.name),)
+    return tuple(Button(f"{name}##{row.name}", row.name, level) for level, name in enumerate(LEVELS))
+
+
+BUTTONS = tuple(
+    button for row in DISPLAYS.values() for button in _buttons(row)
+)  # as the keys 1, 2, ... count
 
 
 def draw_display(viewer: Viewer) -> None:
     """Which channel, and how strong the heat."""
     imgui.separator_text("Display")
-    for row in ROWS:
-        if DISPLAYS[row[0]][1] == "latent":
-            imgui.align_text_to_frame_padding()
-            imgui.text("Latent")
-            imgui.same_line()
-        for place, index in enumerate(row):
-            if place:
-                imgui.same_line()
-            _display_button(viewer, *DISPLAYS[index])
+    for _, group in groupby(DISPLAYS.values(), lambda row: (row.needs_field, row.needs_query)):
+        _display_line(viewer, tuple(group))
     picture = viewer.state.picture
-    if picture.display in ("relevancy", "segmentation") and not viewer.state.shown():
+    needs_query = DISPLAYS[picture.display].needs_query
+    if needs_query and not viewer.state.shown():
         small_wrapped("search for something to see where it is", MUTED)
     if picture.display == "relevancy":
         picture = replace(picture, heat_opacity=_slider("Heat opacity", picture.heat_opacity, 0.0, 1.0))
     if picture.display == "segmentation":
         picture = replace(picture, threshold=_slider("Threshold", picture.threshold, 0.4, 1.0))
-    if picture.display in ("relevancy", "segmentation"):
+    if needs_query:
         picture = replace(picture, dim=_slider("Background", picture.dim, 0.0, 1.0))
-    viewer.state.picture = picture
+    actions.set_picture(viewer, picture)
 
 
-def _display_button(viewer: Viewer, label: str, display: Display, latent_level: int | None) -> None:
+def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
+    """Displays that need the same, beside each other; one that has several buttons is named before them."""
+    buttons = [button for row in rows for button in _buttons(row)]
+    if len(buttons) > len(rows):
+        imgui.align_text_to_frame_padding()
+        imgui.text(rows[0].label)
+        imgui.same_line()
+    for place, button in enumerate(buttons):
+        if place:
+            imgui.same_line()
+        _display_button(viewer, button)
+
+
+def _display_button(viewer: Viewer, button: Button) -> None:
     state = viewer.state
     without_field = state.scene is not None and state.scene.language is None
-    chosen = state.picture.display == display and latent_level in (None, state.latent_level)
-    imgui.begin_disabled(without_field and display in actions.NEEDS_FIELD)
-    if imgui.radio_button(label, chosen):
-        actions.set_display(viewer, display, latent_level)
+    chosen = state.picture.display == button.display and button.latent_level in (None, state.latent_level)
+    imgui.begin_disabled(without_field and DISPLAYS[button.display].needs_field)
+    if imgui.radio_button(button.label, chosen):
+        actions.set_display(viewer, button.display, button.latent_level)
     imgui.end_disabled()
 
 
@@ -79,12 +97,14 @@ def draw_camera(viewer: Viewer) -> None:
         actions.move(viewer, adopt_up)
     _tip("Take what is up in the picture as the world's up")
     if state.view is not None:
-        before = state.view.lens.fov_degrees
+        before = state.view.intrinsics.fov_degrees
         fov = _slider("Field of view", before, *FOV_RANGE, "%.0f deg")
         if abs(fov - before) > 1e-3:
             actions.move(viewer, lambda view: with_fov(view, fov))
-    state.fly_speed = _slider("Fly speed", state.fly_speed, 0.05, 4.0, "%.2f", logarithmic=True)
-    _, state.coarse_while_moving = imgui.checkbox("Coarse while moving", state.coarse_while_moving)
+    speed = _slider("Fly speed", state.fly_speed, 0.05, 4.0, "%.2f", logarithmic=True)
+    actions.set_fly_speed(viewer, speed)
+    _, coarse = imgui.checkbox("Coarse while moving", state.coarse_while_moving)
+    actions.set_coarse_while_moving(viewer, coarse)
     _tip("Draw fewer pixels while the camera moves, where drawing is slow")
     imgui.end_disabled()
 

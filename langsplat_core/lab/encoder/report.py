@@ -8,9 +8,8 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.lab.encoder.crops import CropSet
 from langsplat_core.lab.encoder.phrases import KINDS, PhraseBook, phrase_book
+from langsplat_core.query.relevancy import FLOOR, relevancy
 from langsplat_core.scene import CANONICAL_PHRASES
-
-_SHARPNESS = 10.0  # of the relevancy's softmax, as in the method's public code
 
 
 class Encoder(Protocol):
@@ -32,16 +31,9 @@ class KindReport:
     phrases: int  # that compete
     top1: float  # share of crops whose best phrase of this kind is a right one
     right: tuple[float, float, float]  # relevancy of right pairs: 10 %, 50 %, 90 % quantile
-    right_found: float  # share of right pairs with relevancy >= 0.5
-    wrong_found: float  # share of wrong pairs with relevancy >= 0.5
+    right_found: float  # share of right pairs with relevancy >= the floor
+    wrong_found: float  # share of wrong pairs with relevancy >= the floor
     separation: float  # probability that a right pair has more relevancy than a wrong one (ROC area)
-
-
-def relevancy(images: Array, texts: Array, canonical: Array) -> Array:
-    """(M, P) in [0, 1] of unit vectors: the least, over the canonical phrases c, of
-    softmax(10 [cos(image, text), cos(image, c)])[0] (LERF, and LangSplat's public code)."""
-    best = (images @ canonical.T).max(1, keepdims=True)
-    return 1 / (1 + np.exp(-_SHARPNESS * (images @ texts.T - best)))
 
 
 def report(encoder: Encoder, crops: CropSet, book: PhraseBook | None = None) -> list[KindReport]:
@@ -78,7 +70,7 @@ def _kind_report(kind: str, scores: Array, fits: Array) -> KindReport:
         scores.shape[1],
         float((fits[np.arange(len(fits)), best] == 1).mean()),
         (float(low), float(middle), float(high)),
-        float((right >= 0.5).mean()),
-        float((wrong >= 0.5).mean()),
+        float((right >= FLOOR).mean()),
+        float((wrong >= FLOOR).mean()),
         float(np.searchsorted(sorted_wrong, right).mean() / len(wrong)),
     )

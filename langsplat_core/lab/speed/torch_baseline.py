@@ -160,11 +160,6 @@ class TorchView:
             self._footprints = Footprints(*(part[self._rows] for part in found))
             self._bins = _bin_tiles(self._footprints, camera)
 
-    @property
-    def intersections(self) -> int:
-        """How many pairs of a footprint's bounding box and a tile there are."""
-        return len(self._bins.ranks)
-
     def splat(self, values: Array) -> tuple[Array, Array]:
         """See `View.splat`."""
         channels = values.shape[1]

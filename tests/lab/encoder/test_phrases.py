@@ -21,6 +21,8 @@ from langsplat_core.lab.world.objects.kit import Kit
 from langsplat_core.lab.world.sheet import contact_sheet, portrait
 from langsplat_core.scene import CANONICAL_PHRASES
 
+pytestmark = pytest.mark.long
+
 SEEDS = 20
 # Words that are right for two things because they are the same thing, or that no phrase can tell apart:
 # the fruit and the colour; a room's walls and a house's; the hat that a snowman wears.

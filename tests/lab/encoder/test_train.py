@@ -12,13 +12,15 @@ from langsplat_core.lab.encoder import train as demo_encoder
 from langsplat_core.lab.encoder.crops import CropSet, plain_crops, room_crops
 from langsplat_core.lab.encoder.model import begin_from, build_model, calibrate_canonical, text_vectors
 from langsplat_core.lab.encoder.phrases import phrase_book, vocabulary, word_merges, write_tokenizer
-from langsplat_core.lab.encoder.report import relevancy, report
+from langsplat_core.lab.encoder.report import report
 from langsplat_core.lab.encoder.train import CANONICAL_COSINE, loss_of, train_demo_encoder
 from langsplat_core.lab.world.appearance.colours import COLOURS
 from langsplat_core.lab.world.captions import Label
 from langsplat_core.progress import Cancelled, silent
 from langsplat_core.scene import CANONICAL_PHRASES
 from langsplat_core.semantics.clip import clip_folder, load_clip
+
+pytestmark = pytest.mark.long
 
 MUG = Label(2, "mug", "mug", "red", "red", ("red", "white"))
 HANDLE = Label(1, "handle", "mug", "red", "red", ("red",))
@@ -132,13 +134,6 @@ def test_loss_ignores_pairs_that_are_neither():
     other[0, 5] = 0.9
     nameable = torch.tensor([True])
     assert loss_of(cosines, fits, nameable) == loss_of(other, fits, nameable)
-
-
-def test_relevancy_is_a_softmax_against_the_nearest_canonical_phrase():
-    image, text, near, far = np.eye(4)[:1], np.eye(4)[1:2], np.array([[0.6, 0, 0.8, 0]]), np.eye(4)[3:]
-    image = image * 0.8 + text * 0.6
-    expected = np.exp(10 * 0.6) / (np.exp(10 * 0.6) + np.exp(10 * 0.48))
-    assert relevancy(image, text, np.concatenate([near, far]))[0, 0] == pytest.approx(expected)
 
 
 def test_crops_of_a_room(unseen_room, tmp_path):

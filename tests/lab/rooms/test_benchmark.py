@@ -30,6 +30,8 @@ from langsplat_core.lab.world import photographs as dataset
 from langsplat_core.progress import silent
 from langsplat_core.semantics.masks import label_maps
 
+pytestmark = pytest.mark.long
+
 TINY = BenchmarkConfig(
     tiers=("separate",), views=8, size=(64, 48), steps=60, max_gaussians=3_000, codec_steps=60, budget=True
 )

@@ -6,9 +6,9 @@ import numpy as np
 
 from langsplat_core.arrays import unit
 from langsplat_core.lab.rooms.oracles import (
-    among_pictures,
+    moved_to_pictures,
+    oracle_vectors,
     phrase_vectors,
-    told_vectors,
     true_labels,
 )
 from langsplat_core.lab.rooms.scoring import (
@@ -47,7 +47,7 @@ def test_perfect_embeddings_are_text_vectors_of_the_true_words():
     labels = np.full((3, 4, 5), -1, np.int32)
     labels[0], labels[1, :, :4], labels[1, :, 4:], labels[2] = 0, 1, 2, 3
     own = unit(np.random.default_rng(0).normal(size=(4, 512))).astype(np.float32)
-    told = told_vectors(ImageFeatures(labels, own), ids, vectors)
+    told = oracle_vectors(ImageFeatures(labels, own), ids, vectors)
     want = [encoder.encode_texts([text])[0] for text in ("red mug", "handle of the red mug")]
     np.testing.assert_array_equal(told.vectors, [want[0], want[1], own[2], want[0]])
     np.testing.assert_array_equal(told.labels, labels)
@@ -61,7 +61,7 @@ def test_text_vectors_are_moved_as_one():
         return ImageFeatures(labels, unit(rng.normal(size=(6, 8)) + mean).astype(np.float32))
 
     told, seen = [described(2.0), described(2.0)], [described(-2.0), described(-2.0)]
-    moved = among_pictures(told, seen)
+    moved = moved_to_pictures(told, seen)
     shift = np.mean([item.vectors for item in seen], (0, 1)) - np.mean(
         [item.vectors for item in told], (0, 1)
     )

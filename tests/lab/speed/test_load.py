@@ -7,6 +7,8 @@ from langsplat_core.cli.bench_load import BenchLoad
 from langsplat_core.lab.speed.load import NAMES
 from tests.support.file_samples import inria_names
 
+pytestmark = pytest.mark.long
+
 
 def test_both_readers_give_the_same_arrays_and_the_file_is_removed(tmp_path, monkeypatch, capsys):
     temporary = tmp_path / "temporary"

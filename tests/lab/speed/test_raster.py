@@ -22,6 +22,8 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from tests.support.close import BAND, assert_close_off_cuts, assert_gradient
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(autouse=True)
 def one_torch_thread():

@@ -21,6 +21,8 @@ from langsplat_core.lab.world.rooms import furnished
 from langsplat_core.progress import silent
 from langsplat_core.scene import look_at
 
+pytestmark = pytest.mark.long
+
 UP = np.array([0.0, 0.0, 1.0])
 
 

@@ -123,10 +123,6 @@ class Kit:
         """Smooth and shiny, as toys are."""
         return self.paint(word, "plain", 0.5, substance="plastic")
 
-    def ceramic(self, word: str) -> Material:
-        """Glazed, now and then speckled."""
-        return self.paint(word, self.pick("plain", "plain", "speckled"), 0.55, substance="ceramic")
-
     def glass(self, word: str) -> Material:
         """Coloured, with the strongest highlights; light does not pass."""
         return self.paint(word, "plain", 0.95, 8, substance="glass")

@@ -1,0 +1,113 @@
+"""Searching: the box, the list of queries, their colours and their level."""
+
+from langsplat_core.config import LevelChoice
+from langsplat_core.display.displays import DISPLAYS
+from langsplat_core.query.engine import NO_FIELD, QueryResult
+from langsplat_core.scene.phrases import phrase_key, tidy
+from langsplat_viewer.actions.settings import set_display, show_panel
+from langsplat_viewer.state import SLOTS, Query
+from langsplat_viewer.viewer import Viewer
+
+
+def ask(viewer: Viewer, phrase: str) -> None:
+    """Search the scene for a phrase and show where it is true."""
+    state = viewer.state
+    phrase = tidy(phrase)
+    if not phrase:
+        return
+    if state.scene is None or viewer.engine is None:
+        state.say("open a scene first, then search it", is_error=True)
+        return
+    if state.scene.language is None:
+        state.say(NO_FIELD, is_error=True)
+        return
+    key = phrase_key(phrase)
+    query = next((q for q in state.queries if phrase_key(q.phrase) == key), None)
+    if query is None:
+        query = Query(phrase)
+        state.queries.append(query)
+    show(viewer, query)
+    if not DISPLAYS[state.picture.display].needs_query:
+        set_display(viewer, "relevancy")
+    _answer(viewer, query)
+
+
+def type_phrase(viewer: Viewer, text: str) -> None:
+    """What stands in the search box."""
+    viewer.state.typed = text
+
+
+def ask_typed(viewer: Viewer, again: bool) -> None:
+    """Search for what stands in the box and empty it; `again`: the next phrase can be typed at once."""
+    if not tidy(viewer.state.typed):
+        return
+    ask(viewer, viewer.state.typed)
+    viewer.state.typed = ""
+    viewer.state.focus_input = again
+
+
+def focus_search(viewer: Viewer) -> None:
+    """Have the search box take the keyboard."""
+    show_panel(viewer, True)
+    viewer.state.focus_input = True
+
+
+def take_search_focus(viewer: Viewer) -> bool:
+    """Whether the search box takes the keyboard now; said once."""
+    wanted, viewer.state.focus_input = viewer.state.focus_input, False
+    return wanted
+
+
+def _answer(viewer: Viewer, query: Query) -> None:
+    """Have the worker answer `query` at the current level choice."""
+    engine, level = viewer.engine, viewer.state.level
+    if engine is None:
+        return
+
+    def done(result: QueryResult) -> None:
+        query.result, query.problem, query.pending = result, "", False
+
+    def failed(reason: str) -> None:
+        query.problem, query.pending = reason, False
+        viewer.state.say(reason, is_error=True)
+
+    query.pending = True
+    viewer.worker.submit(
+        f"searching '{query.phrase}'",
+        lambda progress: engine.run(query.phrase, level, progress),
+        done,
+        failed,
+    )
+
+
+def show(viewer: Viewer, query: Query) -> None:
+    """Show a query's heat; it takes the first free colour, else that of the longest shown one."""
+    if query.slot is not None:
+        return
+    shown = [q for q in viewer.state.queries if q.slot is not None]
+    free = sorted(set(range(SLOTS)) - {q.slot for q in shown})
+    query.slot = free[0] if free else shown[0].slot
+    if not free:
+        shown[0].slot = None
+    viewer.state.queries.remove(query)  # the list is in order of showing, so that the oldest is known
+    viewer.state.queries.append(query)
+
+
+def hide(viewer: Viewer, query: Query) -> None:
+    """Keep a query in the list without its heat."""
+    query.slot = None
+
+
+def remove(viewer: Viewer, query: Query) -> None:
+    """Take a query off the list."""
+    if query in viewer.state.queries:
+        viewer.state.queries.remove(query)
+
+
+def set_level(viewer: Viewer, level: LevelChoice) -> None:
+    """Choose the semantic level of all queries, or leave it to the score ("auto")."""
+    if level == viewer.state.level:
+        return
+    viewer.state.level = level
+    for query in viewer.state.queries:
+        _answer(viewer, query)

@@ -1,0 +1,48 @@
+"""The viewer without its window: its state, what acts on it, and what it needs from elsewhere."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from langsplat_core.arrays import Array
+from langsplat_core.query.engine import LoadEncoder, QueryEngine
+from langsplat_core.scene import Scene
+from langsplat_viewer.jobs import Worker
+from langsplat_viewer.state import ViewerState
+
+
+class Surface(Protocol):
+    """The picture on screen, as far as actions need it."""
+
+    def point_at(self, u: float, v: float) -> Array | None:
+        """(3,) world point of the surface at a place in the picture, fractions from the top left corner."""
+
+    def capture(self, state: ViewerState) -> Array:
+        """(H, W, 3) uint8, the scene as shown, at full resolution and without panels."""
+
+
+@dataclass(frozen=True)
+class Services:
+    """What the viewer needs from the layers below; tests put small fakes here."""
+
+    load_scene: Callable[[Path], Scene]
+    load_encoder: LoadEncoder
+    encoder_id: str = ""  # in place of the text encoder that a scene names
+    warm_up: Callable[[Scene, str], None] = lambda scene, backend: None  # first use of a backend is slow
+
+    def engine(self, scene: Scene) -> QueryEngine:
+        """What answers queries on `scene`."""
+        return QueryEngine(scene, self.load_encoder, encoder_id=self.encoder_id)
+
+
+@dataclass(eq=False)
+class Viewer:
+    """The viewer's state together with what acts on it."""
+
+    services: Services
+    state: ViewerState = field(default_factory=ViewerState)
+    worker: Worker = field(default_factory=Worker)
+    engine: QueryEngine | None = None  # of the scene shown; asked on the worker only
+    surface: Surface | None = None
+    clock: float = 0.0  # seconds, as of the last `actions.tick`

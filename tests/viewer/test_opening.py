@@ -1,0 +1,111 @@
+"""Opening scenes, without a window."""
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from langsplat_core.scene import Scene
+from langsplat_viewer import actions
+from tests.support.fakes import blob_scene
+from tests.support.windowless import SCENES, errors, settle
+
+
+def test_open_shows_the_scene_from_its_first_camera(opened):
+    state = opened.state
+    assert state.scene is SCENES["blobs.ply"]
+    assert state.opening is None
+    assert state.latent.shape == (3, 360, 3)
+    assert state.camera_index == 0
+    assert_allclose(
+        state.view.camera(160, 120).world_to_camera, state.scene.cameras[0].world_to_camera, atol=1e-9
+    )
+
+
+def test_unusable_gaussians_are_counted(viewer):
+    scene = blob_scene(field=False)
+    scene.gaussians.means[[3, 7]] = np.nan
+    viewer.services = replace(viewer.services, load_scene=lambda path: scene)
+    actions.open_scene(viewer, Path("holes.ply"))
+    settle(viewer)
+    assert viewer.state.messages[0].text == "holes.ply: 360 Gaussians; not drawn: 2 with position not finite"
+    assert np.isfinite(viewer.state.view.camera(160, 120).world_to_camera).all()
+
+
+def test_a_broken_file_leaves_the_open_scene_alone(opened):
+    before = opened.state.view
+    actions.open_scene(opened, Path("broken.ply"))
+    settle(opened)
+    assert opened.state.scene is SCENES["blobs.ply"]
+    assert opened.state.view is before
+    assert opened.state.opening is None
+    assert errors(opened) == ["broken.ply: broken; export it again"]
+
+
+def test_opening_another_scene_forgets_the_queries(opened):
+    actions.ask(opened, "mug")
+    settle(opened)
+    actions.open_scene(opened, Path("bare.ply"))
+    settle(opened)
+    assert opened.state.queries == []
+    assert opened.state.camera_index is None
+
+
+def test_a_scene_without_language_field_says_what_makes_one(viewer):
+    actions.set_display(viewer, "relevancy")
+    actions.open_scene(viewer, Path("plain.ply"))
+    settle(viewer)
+    assert viewer.state.picture.display == "rgb"
+    assert "langsplat train" in viewer.state.messages[-1].text
+    actions.ask(viewer, "mug")
+    actions.set_display(viewer, "latent")
+    assert viewer.state.queries == []
+    assert viewer.state.picture.display == "rgb"
+    assert "langsplat train" in errors(viewer)[-1]
+
+
+def test_the_window_stays_responsive_while_a_scene_is_read(viewer):
+    release = threading.Event()
+
+    def slow(path: Path) -> Scene:
+        assert release.wait(10)
+        return SCENES["blobs.ply"]
+
+    viewer.services = replace(viewer.services, load_scene=slow)
+    actions.open_scene(viewer, Path("blobs.ply"))
+    actions.tick(viewer, 0.0)  # returns although the file is still being read
+    assert viewer.state.scene is None
+    assert viewer.worker.current[0] == "opening blobs.ply"
+    release.set()
+    settle(viewer)
+    assert viewer.state.scene is not None
+
+
+def test_cancelled_opening_shows_nothing(viewer):
+    release = threading.Event()
+
+    def slow(path: Path) -> Scene:
+        assert release.wait(10)
+        return SCENES["blobs.ply"]
+
+    viewer.services = replace(viewer.services, load_scene=slow)
+    actions.open_scene(viewer, Path("blobs.ply"))
+    actions.cancel(viewer)
+    assert viewer.worker.current is None
+    assert viewer.state.opening is None
+    release.set()
+    viewer.worker.submit("after it", lambda progress: None, lambda nothing: None, pytest.fail)
+    settle(viewer)
+    assert viewer.state.scene is None
+
+
+def test_a_path_can_be_typed(viewer):
+    actions.type_path(viewer, "  ")
+    assert not actions.open_typed(viewer)
+    actions.type_path(viewer, " blobs.ply ")
+    assert actions.open_typed(viewer)
+    settle(viewer)
+    assert viewer.state.scene is SCENES["blobs.ply"]

@@ -1,0 +1,112 @@
+"""Queries, their colours and levels, without a window."""
+
+from numpy.testing import assert_allclose
+
+from langsplat_viewer import actions
+from langsplat_viewer.state import NO_HEAT
+from tests.support.fakes import CENTRES
+from tests.support.windowless import errors, settle
+
+
+def test_a_query_is_answered_and_shown(opened):
+    actions.ask(opened, "  mug ")
+    query = opened.state.queries[0]
+    assert query.pending
+    settle(opened)
+    assert (query.phrase, query.slot, query.pending, query.problem) == ("mug", 0, False, "")
+    assert query.result.found
+    assert query.result.level == 2
+    assert_allclose(query.result.place, CENTRES[0], atol=0.25)
+    assert opened.state.picture.display == "relevancy"
+    columns = opened.state.relevancies()
+    assert columns.shape == (360, 1)
+    assert columns[:120].mean() > 0.9 > 0.6 > columns[120:].mean()
+    assert opened.state.heat_ranges() == (query.result.heat_range,)
+
+
+def test_an_absent_thing_is_not_here(opened):
+    actions.ask(opened, "mug")
+    actions.set_level(opened, "part")
+    settle(opened)
+    assert not opened.state.queries[0].result.found
+
+
+def test_an_unknown_word_is_one_line(opened):
+    actions.ask(opened, "sofa")
+    settle(opened)
+    query = opened.state.queries[0]
+    assert query.result is None
+    assert "sofa" in query.problem
+    assert "\n" not in query.problem
+    assert opened.state.shown() == []
+
+
+def test_empty_and_repeated_phrases(opened):
+    actions.ask(opened, "   ")
+    assert opened.state.queries == []
+    actions.ask(opened, "mug")
+    actions.ask(opened, " Mug ")
+    settle(opened)
+    assert [query.phrase for query in opened.state.queries] == ["mug"]
+
+
+def test_a_fourth_query_takes_the_oldest_ones_colour(opened):
+    for word in ("mug", "book", "plant"):
+        actions.ask(opened, word)
+    settle(opened)
+    assert [query.slot for query in opened.state.queries] == [0, 1, 2]
+    actions.ask(opened, "mug book")
+    settle(opened)
+    slots = {query.phrase: query.slot for query in opened.state.queries}
+    assert slots == {"mug": None, "book": 1, "plant": 2, "mug book": 0}
+
+
+def test_hiding_keeps_the_colours_of_the_others(opened):
+    for word in ("mug", "book"):
+        actions.ask(opened, word)
+    settle(opened)
+    mug, book = opened.state.queries
+    actions.hide(opened, mug)
+    columns = opened.state.relevancies()
+    assert columns.shape == (360, 2)
+    assert not columns[:, 0].any()
+    assert opened.state.heat_ranges() == (NO_HEAT, book.result.heat_range)
+    assert columns[120:240, 1].mean() > 0.9
+    actions.show(opened, mug)
+    assert (mug.slot, book.slot) == (0, 1)
+    actions.remove(opened, book)
+    assert opened.state.relevancies().shape == (360, 1)
+    actions.remove(opened, mug)
+    assert opened.state.relevancies() is None
+
+
+def test_level_applies_to_every_query(opened):
+    actions.ask(opened, "plant")
+    settle(opened)
+    assert opened.state.queries[0].result.level == 2
+    key = opened.state.layers_key()
+    actions.set_level(opened, "part")
+    settle(opened)
+    assert opened.state.queries[0].result.level == 1
+    assert opened.state.layers_key() != key
+
+
+def test_asking_before_a_scene_is_open(viewer):
+    actions.ask(viewer, "mug")
+    assert "open a scene" in errors(viewer)[0]
+
+
+def test_the_box_is_emptied_by_a_search_and_by_nothing_else(opened):
+    actions.type_phrase(opened, "  ")
+    actions.ask_typed(opened, again=True)
+    assert (opened.state.typed, opened.state.queries) == ("  ", [])
+    assert not actions.take_search_focus(opened)
+    actions.type_phrase(opened, "mug ")
+    actions.ask_typed(opened, again=True)
+    assert (opened.state.typed, opened.state.queries[0].phrase) == ("", "mug")
+    assert actions.take_search_focus(opened)
+    assert not actions.take_search_focus(opened)  # said once
+    actions.show_panel(opened, False)
+    actions.focus_search(opened)
+    assert opened.state.show_panel
+    assert actions.take_search_focus(opened)

@@ -1,0 +1,55 @@
+"""What is shown and how; messages; the worker."""
+
+from numpy.testing import assert_allclose
+
+from langsplat_core.errors import InputError
+from langsplat_viewer import actions
+from langsplat_viewer.state import MAX_MESSAGES
+from tests.support.windowless import settle
+
+
+def test_layers_change_only_when_the_picture_needs_others(opened):
+    state = opened.state
+    key = state.layers_key()
+    actions.set_display(opened, "depth")
+    assert state.layers_key() == key
+    assert state.latent_rgb() is None
+    actions.set_display(opened, "latent", 2)
+    assert state.layers_key() != key
+    assert_allclose(state.latent_rgb(), state.latent[2])
+    actions.set_display(opened, "latent", 1)
+    assert_allclose(state.latent_rgb(), state.latent[1])
+
+
+def test_parts_of_the_window_come_and_go(viewer):
+    state = viewer.state
+    actions.toggle_panel(viewer)
+    actions.toggle_help(viewer)
+    assert (state.show_panel, state.show_help) == (False, True)
+    actions.toggle_panel(viewer)
+    actions.toggle_help(viewer)
+    assert (state.show_panel, state.show_help) == (True, False)
+    actions.resize(viewer, 0, 300)
+    assert state.size == (1, 300)
+
+
+def test_messages_do_not_grow_without_end(viewer):
+    for number in range(3 * MAX_MESSAGES):
+        viewer.state.say(f"message {number}")
+    viewer.state.say(f"message {3 * MAX_MESSAGES - 1}")  # repeated: once is enough
+    assert len(viewer.state.messages) == MAX_MESSAGES
+    assert viewer.state.messages[-1].text == f"message {3 * MAX_MESSAGES - 1}"
+    assert viewer.state.messages[-2].text != viewer.state.messages[-1].text
+
+
+def test_worker_delivers_in_order_and_names_user_errors_plainly(viewer):
+    seen = []
+
+    def fail(progress):
+        raise InputError("two\n lines")
+
+    viewer.worker.submit("a", lambda progress: 1, seen.append, seen.append)
+    viewer.worker.submit("b", fail, seen.append, seen.append)
+    viewer.worker.submit("c", lambda progress: progress("half", 0.5) or 3, seen.append, seen.append)
+    settle(viewer)
+    assert seen == [1, "two lines", 3]
