@@ -3,8 +3,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# One file of tests is one worker's: its fixtures are made once.
+PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: help demo test check bench pictures app clean
+.PHONY: help demo quick test slow check format bench pictures app clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -23,13 +25,24 @@ system: $(STAMP)
 demo: system  ## install everything and open the bundled scene (without a display: pictures in demo_out/)
 	$(BIN)/python packaging/demo.py
 
-test: system  ## install everything, then lint, type-check and run every test
-	$(MAKE) --no-print-directory check
-	$(BIN)/python -m pytest
+quick: check  ## lint, types, and the tests that take no time: the loop while working
+	$(PYTEST) -m "not long"
 
-check: $(STAMP)  ## ruff and mypy only
-	$(BIN)/ruff check langsplat_core app tests packaging
+test: system  ## install everything, then lint, type-check and run every test but the slow tier
+	$(MAKE) --no-print-directory check
+	$(PYTEST)
+
+slow: system  ## the slow tier alone: fuzzing at length, large scenes, accuracy on real ones
+	$(PYTEST) --slow -m slow
+
+check: $(STAMP)  ## ruff (rules and format) and mypy only
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
 	$(BIN)/mypy
+
+format: $(STAMP)  ## put every file into ruff's format
+	$(BIN)/ruff check --fix --select I
+	$(BIN)/ruff format
 
 bench: system  ## speed against error, on this machine
 	$(BIN)/langsplat bench raster --out bench_out

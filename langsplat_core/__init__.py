@@ -7,8 +7,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from langsplat_core.formats import load_scene, save_scene
     from langsplat_core.config import TrainConfig
+    from langsplat_core.formats import load_scene, save_scene
     from langsplat_core.pipeline.train import train_scene
     from langsplat_core.query.engine import QueryEngine, QueryResult
     from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer

@@ -8,7 +8,7 @@ from typing import Literal
 class RasterSettings:
     """Constants of image formation; see `INRIA` and `GSPLAT` for the two named profiles.
 
-    Sources: graphdeco-inria/diff-gaussian-rasterization and gsplat, as compared in the README.
+    Sources: graphdeco-inria/diff-gaussian-rasterization and gsplat.
     """
 
     near: float = 0.2  # Gaussians with camera z <= near are not drawn, world units

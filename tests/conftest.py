@@ -1,31 +1,48 @@
-"""Fixtures for every test, and the option that runs the slow ones."""
+"""Fixtures for every test, the option that runs the slow ones, and what tests in parallel need."""
 
+import os
 from pathlib import Path
+
+# Before torch and BLAS are imported. Networks as small as the tests' are ten times slower on two threads than
+# on one as soon as anything else wants the cores.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 
 from tests.support.backends import backend, fast_backend, gl_rasterizers
 from tests.support.gl_context import gl, gl_session
 from tests.support.measured import measured, print_measured
+from tests.support.parallel import own_kernel_cache
 
 __all__ = ["backend", "fast_backend", "gl", "gl_rasterizers", "gl_session", "measured", "real_data"]
 
+own_kernel_cache()
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--slow", action="store_true", help="run the long tier too")
+    parser.addoption("--slow", action="store_true", help="run the slow tier too")
     parser.addoption("--measured", action="store_true", help="print the errors that accuracy tests measured")
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """`make quick` does not even import modules that are long as a whole: some take seconds to load."""
+    if config.getoption("markexpr") != "not long" or collection_path.suffix != ".py":
+        return None
+    return "\npytestmark = pytest.mark.long" in collection_path.read_text(encoding="utf-8") or None
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if hasattr(config, "workerinput"):  # long ones first, so that parallel workers end at about the same time
+        items.sort(key=lambda item: item.get_closest_marker("long") is None)
     if not config.getoption("--slow"):
         for item in items:
             if "slow" in item.keywords:
-                item.add_marker(pytest.mark.skip(reason="long tier: run with --slow"))
+                item.add_marker(pytest.mark.skip(reason="slow tier: run with --slow"))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     if config.getoption("--slow") or config.getoption("--measured"):
-        print_measured(terminalreporter, config)
+        print_measured(terminalreporter)
 
 
 @pytest.fixture(scope="session")

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from langsplat_core import compiled
 from langsplat_core.compiled import Workers, digest_of_sources, kernel_folder
@@ -28,6 +29,7 @@ HELPER = (
 CALL = "import numpy as np; from langsplat_core.running import run; x = np.zeros(3); run(0, 3, x); print(x)"
 
 
+@pytest.mark.long
 def test_a_change_in_another_files_helper_is_noticed(tmp_path: Path) -> None:
     package = tmp_path / "langsplat_core"
     package.mkdir()

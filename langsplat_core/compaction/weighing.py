@@ -75,10 +75,16 @@ def weigh(
     ]
 
 
-def worst_loss(rasterizer: Rasterizer, before: Scene, after: Scene, views: Views, psnr_before: float) -> float:
+def worst_loss(
+    rasterizer: Rasterizer, before: Scene, after: Scene, views: Views, psnr_before: float
+) -> float:
     """dB lost in the ranking view that loses most; one at a time, for their pictures may be many."""
     return max(
-        float(psnr_losses(rasterizer, after, measuring_views(rasterizer, before, [camera], [None]), psnr_before)[0])
+        float(
+            psnr_losses(
+                rasterizer, after, measuring_views(rasterizer, before, [camera], [None]), psnr_before
+            )[0]
+        )
         for camera in views.ranking
     )
 

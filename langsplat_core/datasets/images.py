@@ -111,7 +111,8 @@ def _read_for(photo: Photo) -> tuple[Image.Image, PhotoIntrinsics]:
 def _fits(size: tuple[int, int], intrinsics: PhotoIntrinsics) -> bool:
     ratio = (size[0] * intrinsics.height) / (size[1] * intrinsics.width)
     return (
-        abs(ratio - 1) < ASPECT_TOLERANCE or max(abs(size[0] - intrinsics.width), abs(size[1] - intrinsics.height)) <= 1
+        abs(ratio - 1) < ASPECT_TOLERANCE
+        or max(abs(size[0] - intrinsics.width), abs(size[1] - intrinsics.height)) <= 1
     )
 
 

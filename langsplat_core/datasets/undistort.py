@@ -73,8 +73,18 @@ def pinhole_for(intrinsics: PhotoIntrinsics, max_side: int) -> Camera:
     """
     if intrinsics.distortion is None:
         scale = min(1.0, max_side / max(intrinsics.width, intrinsics.height))
-        whole = Camera(intrinsics.width, intrinsics.height, intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, np.eye(4))
-        return whole.resized(max(1, round(intrinsics.width * scale)), max(1, round(intrinsics.height * scale)))
+        whole = Camera(
+            intrinsics.width,
+            intrinsics.height,
+            intrinsics.fx,
+            intrinsics.fy,
+            intrinsics.cx,
+            intrinsics.cy,
+            np.eye(4),
+        )
+        return whole.resized(
+            max(1, round(intrinsics.width * scale)), max(1, round(intrinsics.height * scale))
+        )
     left, top, right, bottom = _inner_rectangle(intrinsics)
     wide, high = intrinsics.fx * (right - left), intrinsics.fy * (bottom - top)
     if not (wide >= 1 and high >= 1):
@@ -117,7 +127,9 @@ def source_positions(intrinsics: PhotoIntrinsics, camera: Camera) -> Array:
     return intrinsics.pixels(grid.reshape(-1, 2)).reshape(grid.shape)
 
 
-def resample(photo: Image.Image, intrinsics: PhotoIntrinsics, camera: Camera, positions: Array | None) -> Array:
+def resample(
+    photo: Image.Image, intrinsics: PhotoIntrinsics, camera: Camera, positions: Array | None
+) -> Array:
     """(H, W, 3) uint8 picture of `camera` from an RGB photograph of `lens`, which has the same size.
 
     `positions` is `source_positions(lens, camera)`, or None for a lens without distortion. The

@@ -114,7 +114,9 @@ def rim(f: Footprints, settings: RasterSettings, relative: float) -> Array:
 class ReferenceView:
     """Blending weights of one view, recomputed Gaussian by Gaussian in every call."""
 
-    def __init__(self, footprints: Footprints, camera: Camera, settings: RasterSettings, dropped: int) -> None:
+    def __init__(
+        self, footprints: Footprints, camera: Camera, settings: RasterSettings, dropped: int
+    ) -> None:
         self.camera, self.settings, self.footprints = camera, settings, footprints
         self.dropped = dropped
         self.order = np.argsort(footprints.depths, kind="stable")

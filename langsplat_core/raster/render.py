@@ -1,15 +1,15 @@
 """The front door of the rasterizers: a scene and a camera in, a picture out.
 
-    >>> import numpy as np
-    >>> from langsplat_core import Gaussians, Scene, look_at, render
-    >>> one = Gaussians(
-    ...     means=np.zeros((1, 3)), log_scales=np.full((1, 3), -1.0), quats_wxyz=np.array([[1.0, 0, 0, 0]]),
-    ...     opacity_logits=np.array([9.0]), sh=np.full((1, 1, 3), 1.0),
-    ... )
-    >>> camera = look_at(np.array([0, 0, -4.0]), np.zeros(3), np.array([0, -1.0, 0]), (64, 48))
-    >>> picture = render(Scene(one), camera, backend="reference")
-    >>> picture.colours.shape, picture.alpha.shape, round(float(picture.alpha[24, 32]), 2)
-    ((48, 64, 3), (48, 64), 0.99)
+>>> import numpy as np
+>>> from langsplat_core import Gaussians, Scene, look_at, render
+>>> one = Gaussians(
+...     means=np.zeros((1, 3)), log_scales=np.full((1, 3), -1.0), quats_wxyz=np.array([[1.0, 0, 0, 0]]),
+...     opacity_logits=np.array([9.0]), sh=np.full((1, 1, 3), 1.0),
+... )
+>>> camera = look_at(np.array([0, 0, -4.0]), np.zeros(3), np.array([0, -1.0, 0]), (64, 48))
+>>> picture = render(Scene(one), camera, backend="reference")
+>>> picture.colours.shape, picture.alpha.shape, round(float(picture.alpha[24, 32]), 2)
+((48, 64, 3), (48, 64), 0.99)
 """
 
 from dataclasses import dataclass
@@ -50,9 +50,7 @@ def render(
     return splat_colours(view, scene.gaussians, camera, values)
 
 
-def splat_colours(
-    view: View, gaussians: Gaussians, camera: Camera, values: Array | None = None
-) -> Rendering:
+def splat_colours(view: View, gaussians: Gaussians, camera: Camera, values: Array | None = None) -> Rendering:
     """The picture of a view that is projected already, in one pass; values as in `render`."""
     columns = [colours_seen(gaussians, camera)]
     if values is not None:

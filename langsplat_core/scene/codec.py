@@ -17,7 +17,6 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array, unit
 
-
 SHORTEST = 1e-6  # a latent shorter than this has no meaning
 
 

@@ -132,6 +132,7 @@ def views(demo: Scene) -> list[Camera]:
     return [camera.resized(240, 180) for camera in demo.cameras[::16]]
 
 
+@pytest.mark.long
 def test_the_demo_scene_as_spz(tmp_path, demo, views, measured: Measure):
     got = convert(DEMO, tmp_path / "demo.spz").gaussians
     want = demo.gaussians
@@ -151,6 +152,7 @@ def test_the_demo_scene_as_spz(tmp_path, demo, views, measured: Measure):
     assert (tmp_path / "demo.spz").stat().st_size < DEMO.stat().st_size * 29 / 104
 
 
+@pytest.mark.long
 def test_the_demo_scene_as_splat(tmp_path, demo, views, measured: Measure):
     got = convert(DEMO, tmp_path / "demo.splat").gaussians
     value = psnr(got, demo.gaussians, views)

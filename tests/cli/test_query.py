@@ -60,6 +60,7 @@ print([name for name in ("torch", "transformers") if name in sys.modules])
 """
 
 
+@pytest.mark.long
 def test_phrases_of_the_phrasebook_need_no_encoder(tmp_path):
     """However they are written: loading one imports torch, which takes seconds."""
     field = fake_language(phrasebook=True)

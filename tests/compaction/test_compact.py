@@ -60,6 +60,7 @@ def source(scene, tmp_path):
     return tmp_path / "scene.ply"
 
 
+@pytest.mark.long
 def test_a_contribution_bounds_what_its_removal_changes():
     """One Gaussian on black, against the float64 reference: the picture is C = w c, and the score is
     sqrt(W (E + ALONE^2 W)) with E = sum w |c - C|^2, never less than sum w |c - C|."""
@@ -148,12 +149,14 @@ def test_budget_companions_and_order_survive_the_file(scene, source, tmp_path):
     assert report.after.disk_bytes == sum(sizes)
 
 
+@pytest.mark.long
 def test_the_same_scene_gives_the_same_bytes(source, tmp_path):
     for name in ("a.ply", "b.ply"):
         compact_scene(source, tmp_path / name, CONFIG)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
+@pytest.mark.long
 def test_a_tighter_budget_keeps_more(source, tmp_path):
     counts = []
     for budget in (0.02, 0.2, 2.0):

@@ -43,6 +43,7 @@ def write_dataset(folder: Path, form: str = "bin", subfolder: str = "sparse/0", 
     (model.write_binary if form == "bin" else model.write_text)(out)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("form", ["bin", "txt"])
 def test_a_model_reads_as_pycolmap_reads_it(tmp_path: Path, form: str) -> None:
     write_dataset(tmp_path, form)
@@ -74,6 +75,7 @@ def test_a_real_model_reads_as_pycolmap_reads_it(folder: str) -> None:
         np.testing.assert_allclose(image.world_to_camera[:3], pose, atol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("form", "subfolder"), [("bin", "sparse/0"), ("txt", "sparse")])
 def test_a_capture_shows_what_its_cameras_see(tmp_path: Path, form: str, subfolder: str) -> None:
     write_dataset(tmp_path, form, subfolder)

@@ -20,6 +20,8 @@ from langsplat_core.progress import Cancelled, silent
 from langsplat_core.scene import Camera, look_at
 from tests.support.photographed import distance_to_room, photograph, poses, write_photos
 
+pytestmark = pytest.mark.long
+
 VIEWS = 6
 LENS = PhotoIntrinsics(400, 300, 380.0, 380.0, 200.0, 150.0, BrownDistortion(-0.06))
 CONFIG = DatasetConfig(max_side=400)

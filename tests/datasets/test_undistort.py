@@ -101,6 +101,7 @@ def test_a_pinhole_keeps_the_whole_photograph() -> None:
     assert pinhole_for(intrinsics, 5000).width == 1000  # never enlarged
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "intrinsics", [PHONE, BARREL, FISHEYE, PhotoIntrinsics(640, 480, 500.0, 490.0, 310.0, 250.0)]
 )

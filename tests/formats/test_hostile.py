@@ -115,6 +115,7 @@ def test_the_samples_are_good(tmp_path, bounded, kind):
     assert not reader.refused
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_truncated_at_many_places(tmp_path, bounded, kind):
     reader = Reader(kind, tmp_path)
@@ -163,6 +164,7 @@ def fuzz(kind: str, folder: Path, rounds: int, seed: int) -> None:
     assert reader.refused > rounds / 20  # the wounds do hurt
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_random_damage(tmp_path, bounded, kind):
     fuzz(kind, tmp_path, rounds=200, seed=0)
@@ -174,6 +176,7 @@ def test_much_random_damage(tmp_path, bounded, kind):
     fuzz(kind, tmp_path, rounds=10_000, seed=1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_random_bytes(tmp_path, bounded, kind):
     reader = Reader(kind, tmp_path)
@@ -185,6 +188,7 @@ def test_random_bytes(tmp_path, bounded, kind):
     assert reader.refused == 60
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_one_kind_in_place_of_another(tmp_path, bounded, kind):
     reader = Reader(kind, tmp_path)

@@ -103,11 +103,13 @@ def cut_everywhere(reader: Reader, content: bytes, step: int) -> None:
             assert reader.read() is None, place
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_cut_at_every_thousandth_byte(reader, kind):
     cut_everywhere(reader, KINDS[kind](random_gaussians(60 if kind == "ascii" else 400, sh_degree=3)), 1000)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["plain", "many types", "compressed"])
 def test_a_large_file_cut(reader, kind):
     cut_everywhere(reader, KINDS[kind](random_gaussians(6000, sh_degree=3)), 9973)
@@ -122,6 +124,7 @@ def test_a_large_file_cut_at_every_thousandth_byte(reader, kind):
 # ---- headers ----
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("newline", [b"\n", b"\r\n"])
 def test_comments_and_obj_info_anywhere(reader, kind, newline):
@@ -222,6 +225,7 @@ def fuzz(reader: Reader, kind: str, rounds: int, seed: int) -> None:
     assert rounds / 10 < reader.refused < rounds  # the lies do matter, and some are harmless
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_lying_headers(reader, kind):
     fuzz(reader, kind, rounds=200, seed=0)

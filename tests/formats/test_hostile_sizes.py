@@ -71,6 +71,7 @@ def test_a_count_that_the_images_would_have_to_be_bombs_for(tmp_path, bounded):
         read_sog(write_folder(tmp_path / "a", files))
 
 
+@pytest.mark.long
 def test_an_archive_that_unfolds_to_gigabytes(tmp_path, bounded):
     files = sog_files(SCENE)
     path = tmp_path / "a.sog"
@@ -102,6 +103,7 @@ def zeros(size: int) -> Iterator[bytes]:
         yield bytes(1 << 20)
 
 
+@pytest.mark.long
 def test_spz_streams_that_unfold_to_gigabytes(tmp_path, bounded):
     """Zeros are legal Gaussians, and compress a thousand times or more."""
     path = tmp_path / "a.spz"

@@ -8,7 +8,7 @@ import pytest
 
 from langsplat_core.cli.inspect import Inspect
 from langsplat_core.formats import save_scene
-from langsplat_core.formats.summary import disk_bytes, summarise, duplicates
+from langsplat_core.formats.summary import disk_bytes, duplicates, summarise
 from langsplat_core.scene import Gaussians, Scene
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_camera, random_gaussians

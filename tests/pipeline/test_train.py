@@ -33,6 +33,8 @@ from langsplat_core.semantics import store
 from tests.support.scenes import random_gaussians
 from tests.support.tiny_clip import tiny_clip
 
+pytestmark = pytest.mark.long
+
 SIZE = (64, 48)
 VIEWS = 5
 

@@ -1,7 +1,8 @@
 """How far every fast rasterizer is from the float64 reference: the bundled scene, real scenes, random ones.
 
-Away from cut-offs the error is bounded (`tests/backends.py`); at cut-offs, where rounding decides whether an
-alpha of 1/255 counts, pixels may flip, and their number has a budget. Figures: run with `--measured`.
+Away from cut-offs the error is bounded (`tests/support/backends.py`); at cut-offs, where rounding decides
+whether an alpha of 1/255 counts, pixels may flip, and their number has a budget. Figures: run with
+`--measured`.
 """
 
 from dataclasses import dataclass, replace
@@ -20,6 +21,8 @@ from tests.support.backends import Backend
 from tests.support.close import assert_adjoint
 from tests.support.measured import Measure
 from tests.support.scenes import random_camera, random_gaussians, random_values
+
+pytestmark = pytest.mark.long
 
 REFERENCE = ReferenceRasterizer()
 DEMO = Path(__file__).parent.parent.parent / "assets" / "demo" / "scene.ply"

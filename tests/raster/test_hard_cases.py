@@ -116,6 +116,7 @@ def test_hard_case(case: Case, backend: Backend, measured: Measure) -> None:
     case.check(run_case(case, case.build(), backend, measured))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", NAMED)
 def test_hard_case_antialiased(case: Case, backend: Backend, measured: Measure) -> None:
     """What holds for every case, with Mip-Splatting's compensation."""
@@ -167,6 +168,7 @@ def test_dropped_rows_are_told_by_reason() -> None:
     assert crowd().gaussians.invalid_rows() == {}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", NAMED)
 def test_results_do_not_depend_on_the_number_of_threads(case: Case) -> None:
     """Forward, adjoint and gradients of the CPU backend, bit for bit."""

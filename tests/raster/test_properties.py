@@ -63,6 +63,7 @@ def view_of(backend: Backend, case: Case) -> Any:
     return backend.raster.view(*case)
 
 
+@pytest.mark.long
 def test_finite_and_between_0_and_1(backend: Backend, slow: bool) -> None:
     """Values in [0, 1] give an image in [0, alpha], and the weights of a pixel add up to alpha."""
 

@@ -11,6 +11,8 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.semantics.clip import CLIP_MEAN, CLIP_STD, load_clip, load_text_encoder
 from tests.support.tiny_clip import SIDE, WORDS, tiny_clip
 
+pytestmark = pytest.mark.long  # transformers alone takes seconds to load
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:

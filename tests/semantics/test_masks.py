@@ -72,6 +72,7 @@ def assert_nested(levels: np.ndarray) -> None:
         assert pairs.shape[1] == len(np.unique(fine))  # a fine region lies in exactly one coarse region
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_partitions_are_nested_and_cover_everything(seed: int) -> None:
     image = np.random.default_rng(seed).integers(0, 256, (12, 17, 3), dtype=np.uint8)
@@ -140,6 +141,7 @@ def test_small_regions_join_their_likest_neighbour() -> None:
     assert merged[10, 10] == merged[10, 15] != merged[0, 0]
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not PHOTOGRAPH.exists(), reason="no photographs here")
 def test_a_bunch_of_bananas_is_few_regions() -> None:
     image = np.asarray(Image.open(PHOTOGRAPH))

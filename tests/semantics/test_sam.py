@@ -20,6 +20,8 @@ from langsplat_core.semantics.sam import grid_points, load_sam, preprocess, upsc
 from langsplat_core.semantics.sources import load_mask_source
 from tests.support.plain_filters import plain_box_nms, plain_mask_nms
 
+pytestmark = pytest.mark.long  # transformers alone takes seconds to load
+
 SIDE = 64
 # Random weights give random scores: thresholds that let some masks through each filter, and stop some.
 LOOSE = MaskConfig(

@@ -10,7 +10,7 @@ from langsplat_core.config import RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
 
-NAMES = ("reference", "cpu", "opengl-half", "opengl-single", "cuda")
+NAMES = ("reference", "cpu", pytest.param("opengl-half", marks=pytest.mark.long), "opengl-single", "cuda")
 
 
 @dataclass(frozen=True)

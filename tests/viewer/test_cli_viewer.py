@@ -211,6 +211,7 @@ def test_a_failed_picture_leaves_the_old_one(viewer, folder):
     assert not [path for path in folder.iterdir() if path.name.startswith(".a")]
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the message is about X11")
 @pytest.mark.parametrize("display", [None, ":987"])
 def test_no_display_suggests_a_picture_without_a_window(folder, display):
@@ -229,6 +230,7 @@ def test_no_display_suggests_a_picture_without_a_window(folder, display):
     assert "--headless" in run.stderr
 
 
+@pytest.mark.long
 def test_without_a_window_no_windowing_library_is_loaded(folder):
     code = (
         "import sys\n"

@@ -278,6 +278,7 @@ except BackendError as error:
 """
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Mesa's override")
 def test_opengl_3_3_is_enough_with_the_cpu_rasterizer(gl):
     if "llvmpipe" not in gl.info["GL_RENDERER"]:

@@ -50,6 +50,7 @@ print([name for name in ("glfw", "imgui_bundle") if name in sys.modules])
 """
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="hides EGL's drivers from its loader")
 def test_without_any_driver_the_cpu_still_makes_pictures():
     hidden = {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent.json"}

@@ -65,7 +65,9 @@ def splat(
         transmittance = start_tile(tile, tiles, width, height)
         sums[:] = 0
         work = (tiles.ranks, values, sums)
-        walk(tile, tiles, geometry, cutoffs, transmittance, work, _fetch_values, _add_values, nothing_to_close)
+        walk(
+            tile, tiles, geometry, cutoffs, transmittance, work, _fetch_values, _add_values, nothing_to_close
+        )
         write_tile(sums, image, tile, tiles.columns)
         write_alpha(transmittance, alpha, tile, tiles)
 
@@ -94,7 +96,17 @@ def gather(
         transmittance = start_tile(tile, tiles, width, height)
         load_tile(planes, image, tile, tiles.columns)
         work = (weights, planes, partial)
-        end = walk(tile, tiles, geometry, cutoffs, transmittance, work, nothing_to_open, _keep_weight, _correlate_weights)
+        end = walk(
+            tile,
+            tiles,
+            geometry,
+            cutoffs,
+            transmittance,
+            work,
+            nothing_to_open,
+            _keep_weight,
+            _correlate_weights,
+        )
         partial[end : tiles.starts[tile + 1]] = 0
 
 

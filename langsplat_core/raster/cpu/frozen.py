@@ -50,5 +50,3 @@ class FrozenView(TileOperator):
     def _run(self, kernel: Callable[..., None], *arguments: Array) -> None:
         tiles = len(self.tiles.starts) - 1
         self.workers.run(kernel, tiles, self.tiles, self._firsts, self._weights, *arguments)
-
-

@@ -50,7 +50,17 @@ def find_spans(
         tile = spread(i, count)
         transmittance = start_tile(tile, tiles, width, height)
         work = (spans,)
-        walk(tile, tiles, geometry, cutoffs, transmittance, work, nothing_to_open, _look_at_row, nothing_to_close)
+        walk(
+            tile,
+            tiles,
+            geometry,
+            cutoffs,
+            transmittance,
+            work,
+            nothing_to_open,
+            _look_at_row,
+            nothing_to_close,
+        )
         write_alpha(transmittance, alpha, tile, tiles)
 
 
@@ -80,7 +90,9 @@ def keep_weights(
         tile = spread(i, count)
         transmittance = start_tile(tile, tiles, size[0], size[1])
         work = (spans, firsts, weights)
-        walk(tile, tiles, geometry, cutoffs, transmittance, work, nothing_to_open, _keep_row, nothing_to_close)
+        walk(
+            tile, tiles, geometry, cutoffs, transmittance, work, nothing_to_open, _keep_row, nothing_to_close
+        )
 
 
 @kernel

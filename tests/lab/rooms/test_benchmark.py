@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
 from langsplat_core.cli.evaluate import EvalSynthetic
 from langsplat_core.cli.run import main
@@ -35,15 +34,6 @@ pytestmark = pytest.mark.long
 TINY = BenchmarkConfig(
     tiers=("separate",), views=8, size=(64, 48), steps=60, max_gaussians=3_000, codec_steps=60, budget=True
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Layers this small are many times slower on several threads where other work wants the cores too."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

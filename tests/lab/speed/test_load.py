@@ -3,6 +3,8 @@
 import json
 import tempfile
 
+import pytest
+
 from langsplat_core.cli.bench_load import BenchLoad
 from langsplat_core.lab.speed.load import NAMES
 from tests.support.file_samples import inria_names

@@ -61,6 +61,7 @@ def test_autograd(seed):
     assert (got.opacity_logits != 0).sum() > 15
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_autograd_itself_against_differences(antialiased):
     """The twin's gradients by torch's own check in float64; cut-offs are moved to where nothing is left."""

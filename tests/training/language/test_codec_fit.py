@@ -18,6 +18,8 @@ from langsplat_core.training.language.codec_fit import (
     reconstruction_cosine,
 )
 
+pytestmark = pytest.mark.long
+
 
 def clustered(count: int = 400, clusters: int = 12, dim: int = 64) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)

@@ -110,6 +110,7 @@ def test_gradients_are_those_of_the_reference_picture() -> None:
         assert ours == pytest.approx(ends[0] - ends[1], rel=1e-3, abs=1e-6), name
 
 
+@pytest.mark.long
 def test_training_learns_the_scene() -> None:
     config = RadianceConfig(steps=250, backend="cpu", sh_degree=0, max_gaussians=2_000)
     views = [0, 1, 2, 3, 4]
@@ -124,6 +125,7 @@ def test_training_learns_the_scene() -> None:
     assert trained.opacity_logits.min() > -5.6  # none below alpha 1/255
 
 
+@pytest.mark.long
 def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     straight_path, path = tmp_path / "straight.safetensors", tmp_path / "resumed.safetensors"
     straight = train_radiance(capture(), SHORT, [0, 1, 2], straight_path)

@@ -1,0 +1,38 @@
+"""A rasterizer of one's own, discs in place of Gaussians: what the protocol asks for, and its error."""
+
+from importlib.resources import files
+
+import numpy as np
+
+from langsplat_core import load_rasterizer, load_scene
+
+
+class DiscView:
+    def __init__(self, gaussians, camera, settings):
+        centres, self.depths = camera.project(gaussians.means)  # pixels, world units
+        variances = (np.exp(gaussians.log_scales).mean(1) * camera.fx / self.depths) ** 2 + settings.dilation
+        pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1) + 0.5
+        squared = ((pixels - centres[:, None, None]) ** 2).sum(-1) / variances[:, None, None]  # (N, H, W)
+        opacities = (self.depths > settings.near) / (1 + np.exp(-gaussians.opacity_logits))
+        self.dropped, order = 0, np.argsort(self.depths)  # rows that cannot be drawn; front to back
+        alphas = np.minimum(opacities[:, None, None] * np.exp(-0.5 * squared), settings.alpha_max)[order]
+        light = np.cumprod(1 - alphas, 0) / (1 - alphas)  # that reaches each
+        self.weights = (alphas * light)[np.argsort(order)]  # the matrix W of `langsplat_core.raster.protocol`
+
+    def splat(self, values):  # (N, C) -> W x of (H, W, C), and alpha (H, W)
+        return np.einsum("nhw,nc->hwc", self.weights, values), self.weights.sum(0)
+
+    def depth(self):  # (H, W); a view that can lift also has `gather`, W^T y, and `contributions`, W^T 1
+        return self.splat(self.depths[:, None])[0][..., 0] / np.maximum(self.weights.sum(0), 1e-9)
+
+
+class Discs:
+    name, view = "discs", staticmethod(DiscView)
+
+
+scene = load_scene(str(files("langsplat_assets") / "demo" / "scene.ply"))
+few, camera = scene.gaussians.take(slice(None, None, 32)), scene.cameras[3].resized(80, 60)
+truth, _ = load_rasterizer("reference").view(few, camera).splat(few.sh[:, 0])
+for rasterizer in (Discs(), load_rasterizer("cpu")):
+    error = np.abs(rasterizer.view(few, camera, scene.raster_settings()).splat(few.sh[:, 0])[0] - truth)
+    print(f"{rasterizer.name}: mean error {error.mean():.1e}, largest {error.max():.1e}")

@@ -1,0 +1,151 @@
+"""What the pages say can be done: commands parse, the quick ones run, links lead somewhere, Python runs."""
+
+import json
+import re
+import shlex
+import shutil
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+import tyro
+from PIL import Image
+
+from langsplat_core.cli.app import parse
+from langsplat_core.cli.run import Command, main
+from langsplat_core.formats import load_scene
+from langsplat_viewer.__main__ import ViewerCommand
+from tests.support.file_samples import compressed_ply
+from tests.support.scenes import random_gaussians
+
+ROOT = Path(__file__).parents[2]
+README = ROOT / "README.md"
+PAGES = [
+    README,
+    ROOT / "CONTRIBUTING.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *(ROOT / "assets").rglob("*.md"),
+]
+PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+def parse_viewer(words: list[str]) -> Command:
+    return tyro.cli(ViewerCommand, prog="langsplat-viewer", args=words)
+
+
+PARSERS: dict[str, Callable[[list[str]], Command]] = {"langsplat": parse, "langsplat-viewer": parse_viewer}
+
+
+def block_lines(text: str) -> list[str]:
+    """The lines of indented and fenced blocks, continued ones joined."""
+    blocks = re.findall(r"^```(?:sh|bash|console)?\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    blocks += re.findall(r"((?:^    .*\n)+)", text, re.MULTILINE)
+    joined = "\n".join(blocks).replace("\\\n", " ")
+    return [line.strip() for line in joined.splitlines()]
+
+
+def commands(text: str) -> list[list[str]]:
+    """Every command of a page, in blocks and between backticks, split into words; program first."""
+    spans = [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", PYTHON.sub("", text))]
+    found = []
+    for line in [*block_lines(text), *spans]:
+        program = line.split(" ")[0].removeprefix(".venv/bin/")
+        if program in (*PARSERS, "make") and "..." not in line and " " in line:
+            found.append([program, *shlex.split(line, comments=True)[1:]])
+    return found
+
+
+def named(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_commands_parse(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    for program, *words in commands(page.read_text()):
+        if program == "make":
+            assert words[0] in targets, words
+        elif all(word.isalpha() and word.islower() for word in words):  # a command's name alone
+            with pytest.raises(SystemExit) as stop:
+                PARSERS[program]([*words, "--help"])
+            assert stop.value.code in (0, None), words
+        else:
+            try:
+                PARSERS[program](words)
+            except SystemExit:
+                pytest.fail(f"{program} {shlex.join(words)}: {capsys.readouterr().err}")
+
+
+def test_the_readme_has_commands_and_is_short() -> None:
+    found = [" ".join(words[:2]) for words in commands(README.read_text())]
+    wanted = {"make demo", "make test", "langsplat train", "langsplat query", "langsplat compact"}
+    assert wanted <= set(found)
+    assert len(README.read_text().splitlines()) <= 125
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_links_lead_somewhere(page: Path) -> None:
+    targets = re.findall(r"\]\(([^)#]+)\)", page.read_text())
+    assert [t for t in targets if "://" not in t and not (page.parent / t).exists()] == []
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder: the files that the README's commands name."""
+    for path in Path(str(files("langsplat_assets") / "demo")).glob("scene.*"):
+        shutil.copy(path, tmp_path / path.name)
+    (tmp_path / "guitar.compressed.ply").write_bytes(compressed_ply(random_gaussians(300)))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(start: list[str], more: tuple[str, ...] = ()) -> None:
+    """The README's command that starts so."""
+    (words,) = [
+        found
+        for found in commands(README.read_text())
+        if found[: len(start)] == start and found[-1] != start[-1]
+    ]
+    assert main(words[0], lambda: PARSERS[words[0]]([*words[1:], *more])) == 0
+
+
+def test_inspect(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(["langsplat", "inspect"])
+    assert "81,288" in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_query(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(["langsplat", "query"])
+    answers = json.loads(capsys.readouterr().out)
+    assert [answer["phrase"] for answer in answers] == ["red mug", "handle"]
+    assert all(len(answer["pixel"]) == 2 for answer in answers)
+
+
+def test_convert(folder: Path) -> None:
+    run(["langsplat", "convert"])
+    assert len(load_scene(folder / "guitar.spz").gaussians) == 300
+
+
+@pytest.mark.long
+def test_a_picture_without_a_window(folder: Path) -> None:
+    run(["langsplat-viewer", "scene.ply", "--headless"], ("--size", "160x120"))
+    assert Image.open(folder / "heat.png").size == (160, 120)
+
+
+BLOCKS = [
+    pytest.param(block, id=named(page))
+    for page in PAGES
+    if page.is_file()
+    for block in PYTHON.findall(page.read_text())
+]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("block", BLOCKS)
+def test_python_runs(block: str, capsys: pytest.CaptureFixture[str]) -> None:
+    exec(compile(block, "README.md", "exec"), {})
+    shapes, answer = capsys.readouterr().out.splitlines()
+    assert shapes == "(240, 320, 3) (240, 320)"
+    assert answer.startswith("True [")
