@@ -104,6 +104,7 @@ def test_photographs_in_subfolders_keep_apart(tmp_path: Path) -> None:
     assert [camera.name for camera in capture.cameras] == ["left_0001", "right_0001"]
 
 
+@pytest.mark.long
 def test_missing_photographs_are_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_dataset(tmp_path)
     (tmp_path / "images/view_1.png").unlink()
