@@ -7,6 +7,8 @@ blending weights alpha_i T_i of the view. A backend projects a view once and the
 
 from typing import Protocol, runtime_checkable
 
+from scipy import sparse
+
 from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.scene import Camera, Gaussians
@@ -43,6 +45,17 @@ class LiftingView(View, Protocol):
 
     def contributions(self) -> Array:
         """(N,) blending weight of each Gaussian summed over the picture, in pixels: ``W^T 1``."""
+
+
+@runtime_checkable
+class LabelView(Protocol):
+    """A view that lifts label maps in one walk, however many labels there are."""
+
+    def gather_labels(self, maps: Array, count: int, least: float = 0.0) -> sparse.csr_matrix:
+        """(L, H, W) int32 labels below `count`, -1 for none -> (N, count) float32 ``W^T onehot``, in pixels.
+
+        A pixel counts once for every label that it has in any map. Entries of at most `least` are left out.
+        """
 
 
 @runtime_checkable

@@ -73,7 +73,7 @@ def splat(
 
 
 @helper
-def _keep_weight(work: Any, mine: Any, s: int, row: int, low: int, added: Lanes, before: Lanes) -> None:
+def keep_weight(work: Any, mine: Any, s: int, row: int, low: int, added: Lanes, before: Lanes) -> None:
     store(work[0], (row - low) * TILE, added * before)
 
 
@@ -104,7 +104,7 @@ def gather(
             transmittance,
             work,
             nothing_to_open,
-            _keep_weight,
+            keep_weight,
             _correlate_weights,
         )
         partial[end : tiles.starts[tile + 1]] = 0

@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import sparse
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.compiled import Workers, plain, shared_workers
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.raster.cpu import blend, blend_backward, projection, projection_backward
 from langsplat_core.raster.cpu.frozen import FrozenView
+from langsplat_core.raster.cpu.labels import gather_labels
 from langsplat_core.raster.cpu.operator import TileOperator, in_fours
 from langsplat_core.raster.cpu.tiles import bin_tiles, depth_order
 from langsplat_core.raster.cpu.walk import make_cutoffs
@@ -73,7 +75,27 @@ class CpuView(TileOperator):
     def _gather_part(self, image: Array, partial: Array) -> None:
         self._over_tiles(blend.gather, image, self._cutoffs, partial)
 
-    def frozen(self) -> "FrozenView":
+    def gather_labels(self, maps: Array, count: int, least: float = 0.0) -> sparse.csr_matrix:
+        """See `LabelView.gather_labels`."""
+        check_array("maps", maps, ("L", self.camera.height, self.camera.width))
+        if maps.max(initial=-1) >= count or maps.min(initial=-1) < -1:
+            raise ValueError(f"maps: labels {maps.min()} to {maps.max()}, expected -1 to {count - 1}")
+
+        def run(kernel: Callable[..., None], *rest: Any) -> None:
+            self._over_tiles(kernel, self._cutoffs, *rest)
+
+        found = gather_labels(
+            run, self.tiles, self.workers, np.require(maps, np.int32, ["C", "W"]), count, least
+        )
+        drawn = len(self.order)
+        place = np.full(
+            self.count, drawn
+        )  # Gaussians that are not drawn share an empty row behind the others
+        place[self.order] = np.arange(drawn)
+        indptr = np.append(found.indptr, found.indptr[-1])
+        return sparse.csr_matrix((found.data, found.indices, indptr), shape=(drawn + 1, count))[place]
+
+    def frozen(self) -> FrozenView:
         """This view with W itself kept: `splat` and `gather` get cheaper the more often they are called."""
         return FrozenView(self, lambda kernel, *rest: self._over_tiles(kernel, self._cutoffs, *rest))
 

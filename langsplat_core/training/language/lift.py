@@ -20,12 +20,11 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.compiled import helper, kernel, shared_workers
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster.protocol import FreezableView, LiftingRasterizer
+from langsplat_core.raster.protocol import LabelView, LiftingRasterizer, LiftingView
 from langsplat_core.scene import LEVELS, Camera, Codec, Gaussians
 from langsplat_core.semantics.store import ImageFeatures
 
 MIN_WEIGHT = 1e-3  # a Gaussian's weight in a mask, in pixels, below which the pair is not stored
-FREEZE_FROM = 4  # gather passes over one view from which keeping its weights is cheaper
 MEDIAN_STEPS = 8
 FAINT = 2e-3  # share of a Gaussian's weight below which a mask has no say in its median
 
@@ -47,20 +46,15 @@ def find_memberships(
     settings: RasterSettings = INRIA,
     progress: Progress = silent,
 ) -> Memberships:
-    """``W^T onehot(mask)`` over all views; `chunk` masks travel through one gather pass."""
+    """``W^T onehot(mask)`` over all views.
+
+    Where a backend cannot lift label maps in one walk, `chunk` masks travel through one gather pass.
+    """
     blocks, levels, vectors = [], [], []
     for done, (camera, features) in enumerate(views):
-        view = rasterizer.view(gaussians, camera, settings)
-        starts = range(0, len(features.vectors), chunk)
-        if len(starts) >= FREEZE_FROM and isinstance(view, FreezableView):
-            view = view.frozen()
-        columns = []
-        for start in starts:
-            size = min(chunk, len(features.vectors) - start)
-            weights = view.gather(_onehot(features.labels, start, size))
-            columns.append(sparse.csr_matrix(np.where(weights > MIN_WEIGHT, weights, 0).astype(np.float32)))
-        if columns:
-            blocks.append(sparse.hstack(columns, format="csr"))
+        if len(features.vectors):
+            view = rasterizer.view(gaussians, camera, settings)
+            blocks.append(_weights_in_masks(view, features, chunk))
             levels.append(_row_levels(features))
             vectors.append(features.vectors)
         progress("lifting masks onto the Gaussians", (done + 1) / len(views))
@@ -70,6 +64,18 @@ def find_memberships(
         )
     joined = sparse.hstack(blocks, format="csr")
     return Memberships(joined, np.concatenate(levels), np.concatenate(vectors).astype(np.float32))
+
+
+def _weights_in_masks(view: LiftingView, features: ImageFeatures, chunk: int) -> sparse.csr_matrix:
+    """(N, M) float32 weight of every Gaussian in the masks of one view, where it exceeds `MIN_WEIGHT`."""
+    count = len(features.vectors)
+    if isinstance(view, LabelView):
+        return view.gather_labels(features.labels, count, MIN_WEIGHT)
+    columns = []
+    for start in range(0, count, chunk):
+        weights = view.gather(_onehot(features.labels, start, min(chunk, count - start)))
+        columns.append(sparse.csr_matrix(np.where(weights > MIN_WEIGHT, weights, 0).astype(np.float32)))
+    return sparse.hstack(columns, format="csr")
 
 
 def _onehot(labels: Array, start: int, size: int) -> Array:

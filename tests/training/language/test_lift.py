@@ -5,6 +5,7 @@ import pytest
 from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import unit
+from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import LinearCodec
 from langsplat_core.semantics.store import ImageFeatures
@@ -38,10 +39,10 @@ def gaussians():
     return random_gaussians(25, 3)
 
 
-@pytest.mark.parametrize("chunk", [3, 32])
-def test_membership_is_the_weight_inside_the_mask(gaussians, chunk):
+@pytest.mark.parametrize(("backend", "chunk"), [("reference", 3), ("reference", 32), ("cpu", 32)])
+def test_membership_is_the_weight_inside_the_mask(gaussians, backend, chunk):
     views = make_views(gaussians)
-    memberships = find_memberships(ReferenceRasterizer(), gaussians, views, chunk)
+    memberships = find_memberships(load_lifting_rasterizer(backend), gaussians, views, chunk)
     assert memberships.weights.shape == (25, 21)
     got = memberships.weights.toarray()
     for index, (camera, features) in enumerate(views):
@@ -50,7 +51,7 @@ def test_membership_is_the_weight_inside_the_mask(gaussians, chunk):
             level = 1 if row < 4 else 2
             want = weights[features.labels[level] == row].sum(0)
             want[want <= 1e-3] = 0
-            np.testing.assert_allclose(got[:, 7 * index + row], want, rtol=1e-5)
+            np.testing.assert_allclose(got[:, 7 * index + row], want, rtol=1e-5, atol=1e-6)
     assert memberships.levels.tolist() == [1, 1, 1, 1, 2, 2, 2] * 3
 
 
