@@ -110,10 +110,14 @@ class LiftConfig:
     """How mask vectors reach the Gaussians."""
 
     # median, mean: of the CLIP vectors of the masks a Gaussian belongs to, then encoded;
-    # one-pass: the paper's latents, averaged as W^T H / W^T 1
-    mode: Literal["median", "mean", "one-pass"] = "median"
-    chunk: int = 32  # mask channels per gather pass
+    # one-pass: the paper's latents, averaged as W^T H / W^T 1; gradient: trained by Adam, as in the paper
+    mode: Literal["median", "mean", "one-pass", "gradient"] = "median"
+    chunk: int = 32  # mask channels per gather pass, where a backend cannot lift label maps at once
     backend: Literal["auto", "cpu", "cuda"] = "auto"
+    steps: int = 30_000  # of mode gradient, as are the following
+    lr: float = 2.5e-3
+    start: Literal["one-pass", "zeros-as-published"] = "one-pass"
+    seed: int = 0
 
 
 @dataclass(frozen=True)

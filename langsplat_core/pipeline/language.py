@@ -1,14 +1,16 @@
 """From masks with vectors to a language field: memberships, codec, latents, each kept in the work folder."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from scipy import sparse
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import TrainConfig
+from langsplat_core.config import LiftConfig, TrainConfig
 from langsplat_core.errors import InputError
 from langsplat_core.pipeline.stages import Arrays, features_digest, gaussians_digest, kept, stage_key
 from langsplat_core.progress import Progress
@@ -25,6 +27,7 @@ from langsplat_core.scene.phrases import phrase_key
 from langsplat_core.semantics.clip import ClipEncoder
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.codec_fit import fit_codec, reconstruction_cosine
+from langsplat_core.training.language.gradient_lift import lift_by_gradient
 from langsplat_core.training.language.lift import Memberships, find_memberships, lift_latents, lift_vectors
 
 Views = list[tuple[Camera, ImageFeatures]]
@@ -78,8 +81,7 @@ class _Stages:
     ) -> None:
         self._gaussians, self._views, self._mask_vectors = gaussians, views, mask_vectors
         self._config, self._work, self._progress = config, work, progress
-        # The backend and the batches change who computes, not what.
-        self._lift = replace(config.lift, backend="auto", chunk=0)
+        self._lift = _what_matters(config.lift)
         self._inputs = (gaussians_digest(gaussians), features_digest([features for _, features in views]))
         self._lifted = cache(self._lift_vectors)
 
@@ -100,14 +102,15 @@ class _Stages:
 
     def _fit(self) -> Codec:
         config = self._config.codec
-        if self._lift.mode == "one-pass":
+        if self._lift.mode in LATENT_LIFTS:
             return fit_codec(self._mask_vectors, config, self._progress)
         return fit_codec(_codec_data(self._mask_vectors, self._lifted(), config.seed), config, self._progress)
 
     def _lift_latents(self, codec: Codec) -> Latents:
-        if self._lift.mode == "one-pass":
-            raster = self._rasterizer()
-            return lift_latents(raster, self._gaussians, self._views, codec, progress=self._progress)
+        if self._lift.mode in LATENT_LIFTS:
+            lift = LATENT_LIFTS[self._lift.mode]
+            scene = (self._rasterizer(), self._gaussians, self._views, codec)
+            return lift(*scene, config=self._config.lift, progress=self._progress)
         lifted = self._lifted()
         latents = np.stack([_encode(codec, vectors, weight) for vectors, weight in lifted])
         return latents, np.stack([weight for _, weight in lifted])
@@ -133,6 +136,30 @@ class _Stages:
 
     def _rasterizer(self) -> LiftingRasterizer:
         return load_lifting_rasterizer(self._config.lift.backend)
+
+
+def _what_matters(config: LiftConfig) -> LiftConfig:
+    """The settings that change the result: not the backend and the batches, which change who computes."""
+    if config.mode != "gradient":
+        return LiftConfig(mode=config.mode)
+    return replace(config, backend="auto", chunk=LiftConfig.chunk)
+
+
+def _one_pass(
+    rasterizer: LiftingRasterizer,
+    gaussians: Gaussians,
+    views: Views,
+    codec: Codec,
+    config: LiftConfig,
+    progress: Progress,
+) -> Latents:
+    return lift_latents(rasterizer, gaussians, views, codec, progress=progress)
+
+
+# Modes that lift latents of a codec that is fitted to the masks' vectors alone.
+LATENT_LIFTS: Mapping[str, Callable[..., Latents]] = MappingProxyType(
+    {"one-pass": _one_pass, "gradient": lift_by_gradient}
+)
 
 
 def _pack_codec(codec: Codec) -> Arrays:

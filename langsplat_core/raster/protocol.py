@@ -62,8 +62,16 @@ class LabelView(Protocol):
 class FreezableView(Protocol):
     """A lifting view that can keep W itself."""
 
-    def frozen(self) -> LiftingView:
+    def frozen(self) -> "FrozenView":
         """The same view with W kept in fewer digits: `splat` and `gather` get cheaper, from some calls on."""
+
+
+class FrozenView(LiftingView, Protocol):
+    """A view whose W is kept."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of what is kept."""
 
 
 class Rasterizer(Protocol):

@@ -160,10 +160,10 @@ def test_a_damaged_result_is_one_line(room, tmp_path, name):
         train_scene(room, out, settings(room))
 
 
-@pytest.mark.parametrize("mode", ["mean", "one-pass"])
+@pytest.mark.parametrize("mode", ["mean", "one-pass", "gradient"])
 def test_other_liftings(room, tmp_path, mode):
     config = replace(
-        settings(room), lift=LiftConfig(mode=mode), codec=CodecConfig(kind="linear", latent_dim=8)
+        settings(room), lift=LiftConfig(mode=mode, steps=30), codec=CodecConfig(kind="linear", latent_dim=8)
     )
     train_scene(room, tmp_path / "scene.ply", config)
     field = load_scene(tmp_path / "scene.ply").language
