@@ -23,9 +23,10 @@ from langsplat_core.arrays import Array
 from langsplat_core.lab.speed.cases import Case, default_camera, random_scene
 from langsplat_core.lab.speed.torch_baseline import TorchRasterizer
 from langsplat_core.lab.speed.truth import Error, Truth
-from langsplat_core.raster.protocol import Rasterizer
+from langsplat_core.raster.protocol import FreezableView, LabelView, Rasterizer
 from langsplat_core.scene import Camera
 
+GRIDS = ((16, 12), (8, 6), (4, 3))  # cells of subparts, parts and wholes: 252 labels in all
 _CALLS, _BUDGET_S = 15, 0.3  # at most this many calls, begun within this time
 _ONCE_S = 2.0  # a call that takes longer is its own measurement
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -144,7 +145,9 @@ def operations(backend: Rasterizer, case: Case, channels: int, truth: Truth | No
             None if truth is None else lambda: _gradient_error(view, case, values, truth.masked(image), truth)
         )
         yield Operation("backward", lambda: view.backward(values, image), wrong)
-    if hasattr(view, "frozen"):
+    if isinstance(view, LabelView):
+        yield _labels(view, case.camera, truth)
+    if isinstance(view, FreezableView):
         yield Operation("freeze", view.frozen)
         yield from _linear(view.frozen(), values, image, truth, "frozen ")
 
@@ -163,6 +166,31 @@ def _linear(view: Any, values: Array, image: Array, truth: Truth | None, prefix:
         yield Operation(
             f"{prefix}gather", lambda: view.gather(image), None if truth is None else gather_error
         )
+
+
+def _labels(view: LabelView, camera: Camera, truth: Truth | None) -> Operation:
+    """Label maps of three levels (`GRIDS`), as many regions as a segmenter finds."""
+    maps, count = label_maps(camera)
+
+    def error() -> Error:
+        assert truth is not None  # only called with one
+        compared = truth.masked(np.ones((camera.height, camera.width, 1), np.float32))[..., 0] > 0
+        kept = np.where(compared, maps, -1)
+        image = np.stack([(kept == label).any(0) for label in range(count)], -1).astype(np.float32)
+        return truth.gather_error(view.gather_labels(kept, count).toarray(), image)
+
+    return Operation("labels", lambda: view.gather_labels(maps, count), None if truth is None else error)
+
+
+def label_maps(camera: Camera) -> tuple[Array, int]:
+    """(3, H, W) int32 labels of three grids of cells, and how many labels there are."""
+    row, column = np.mgrid[: camera.height, : camera.width]
+    maps, first = [], 0
+    for across, down in GRIDS:
+        cell = row * down // camera.height * across + column * across // camera.width
+        maps.append(first + cell)
+        first += across * down
+    return np.stack(maps).astype(np.int32), first
 
 
 def _inputs(case: Case, channels: int) -> tuple[Array, Array]:
