@@ -33,7 +33,7 @@ test: system  ## install everything, then lint, type-check and run every test bu
 	$(PYTEST)
 
 slow: system  ## the slow tier alone: fuzzing at length, large scenes, accuracy on real ones
-	$(PYTEST) --slow -m slow
+	$(PYTEST) --dist worksteal --slow -m slow
 
 check: $(STAMP)  ## ruff (rules and format) and mypy only
 	$(BIN)/ruff check
