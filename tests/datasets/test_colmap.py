@@ -23,6 +23,8 @@ from tests.support.photographed import (
     write_photos,
 )
 
+pytestmark = pytest.mark.long
+
 BANANA = Path(__file__).parents[3] / "shared" / "data" / "banana" / "colmap_640"
 PARAMS = [190.0, 188.0, 103.0, 74.0, -0.1, 0.02, 0.001, -0.001]
 LENS = PhotoIntrinsics(200, 150, *PARAMS[:4], BrownDistortion(*PARAMS[4:]))
@@ -43,7 +45,6 @@ def write_dataset(folder: Path, form: str = "bin", subfolder: str = "sparse/0", 
     (model.write_binary if form == "bin" else model.write_text)(out)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("form", ["bin", "txt"])
 def test_a_model_reads_as_pycolmap_reads_it(tmp_path: Path, form: str) -> None:
     write_dataset(tmp_path, form)
@@ -75,7 +76,6 @@ def test_a_real_model_reads_as_pycolmap_reads_it(folder: str) -> None:
         np.testing.assert_allclose(image.world_to_camera[:3], pose, atol=1e-9)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("form", "subfolder"), [("bin", "sparse/0"), ("txt", "sparse")])
 def test_a_capture_shows_what_its_cameras_see(tmp_path: Path, form: str, subfolder: str) -> None:
     write_dataset(tmp_path, form, subfolder)
@@ -104,7 +104,6 @@ def test_photographs_in_subfolders_keep_apart(tmp_path: Path) -> None:
     assert [camera.name for camera in capture.cameras] == ["left_0001", "right_0001"]
 
 
-@pytest.mark.long
 def test_missing_photographs_are_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_dataset(tmp_path)
     (tmp_path / "images/view_1.png").unlink()

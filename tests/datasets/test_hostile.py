@@ -18,6 +18,8 @@ from tests.support.small_datasets import (
     write_picture,
 )
 
+pytestmark = pytest.mark.long
+
 # -- not a dataset ------------------------------------------------------------------------------------------
 
 

@@ -19,6 +19,8 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.progress import silent
 from tests.support.photographed import pinhole_picture, poses, psnr, write_photos
 
+pytestmark = pytest.mark.long
+
 FOX = Path(__file__).parents[3] / "shared" / "data" / "fox"
 LENS = PhotoIntrinsics(160, 120, 150.0, 148.0, 83.0, 58.0, BrownDistortion(-0.1, 0.02, 0.001, -0.001))
 GLOBAL = {
@@ -59,7 +61,6 @@ def load(folder: Path):  # type: ignore[no-untyped-def]
     return load_nerfstudio(folder / "transforms.json", 160, silent)
 
 
-@pytest.mark.long
 def test_pictures_are_what_the_cameras_see(tmp_path: Path) -> None:
     write_dataset(tmp_path, GLOBAL)
     capture = load(tmp_path)
@@ -69,7 +70,6 @@ def test_pictures_are_what_the_cameras_see(tmp_path: Path) -> None:
         assert psnr(image, pinhole_picture(camera, 3)) > 33  # 26 when half a pixel off
 
 
-@pytest.mark.long
 def test_a_fisheye_lens(tmp_path: Path) -> None:
     intrinsics = PhotoIntrinsics(160, 120, 120.0, 120.0, 80.0, 60.0, FisheyeDistortion(0.02, -0.01))
     top = {"w": 160, "h": 120, "fl_x": 120.0, "fl_y": 120.0, "cx": 80.0, "cy": 60.0, "k1": 0.02, "k2": -0.01}
@@ -86,7 +86,6 @@ def test_intrinsics_from_the_field_of_view_and_the_file(tmp_path: Path) -> None:
     np.testing.assert_allclose((camera.fx, camera.fy, camera.cx, camera.cy), (140, 140, 80, 60))
 
 
-@pytest.mark.long
 def test_a_frame_may_have_its_own_intrinsics(tmp_path: Path) -> None:
     data = write_dataset(tmp_path, {"w": 160, "h": 120, "fl_x": 140.0, "cx": 80.0, "cy": 60.0})
     data["frames"][1].update(fl_x=111.0, fl_y=112.0, cx=70.0)
@@ -208,7 +207,6 @@ def test_neither_focal_length_nor_angle(tmp_path: Path) -> None:
         load(tmp_path)
 
 
-@pytest.mark.long
 @pytest.mark.skipif(not FOX.is_dir(), reason="real data absent")
 def test_the_real_dataset_with_missing_files(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING, "langsplat"):

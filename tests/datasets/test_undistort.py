@@ -18,6 +18,8 @@ from langsplat_core.datasets.undistort import (
 from langsplat_core.errors import InputError
 from tests.support.photographed import photograph, pinhole_picture, poses, psnr
 
+pytestmark = pytest.mark.long
+
 WIDTH, HEIGHT = 320, 240
 FOCAL = {"f": 260.0, "fx": 260.0, "fy": 255.0, "cx": 166.0, "cy": 117.0}
 COEFFICIENTS = {
@@ -101,7 +103,6 @@ def test_a_pinhole_keeps_the_whole_photograph() -> None:
     assert pinhole_for(intrinsics, 5000).width == 1000  # never enlarged
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     "intrinsics", [PHONE, BARREL, FISHEYE, PhotoIntrinsics(640, 480, 500.0, 490.0, 310.0, 250.0)]
 )

@@ -13,6 +13,8 @@ from langsplat_core.semantics.graph import GraphMasks, nested_partitions
 from langsplat_core.semantics.masks import LevelMasks, label_maps
 from langsplat_core.semantics.region_graph import RegionGraph
 
+pytestmark = pytest.mark.long
+
 DATA = Path(os.environ.get("LANGSPLAT_TEST_DATA", Path(__file__).parents[3] / "shared" / "data"))
 PHOTOGRAPH = DATA / "banana" / "colmap_640" / "images" / "DSC_0428.JPG"
 
@@ -72,7 +74,6 @@ def assert_nested(levels: np.ndarray) -> None:
         assert pairs.shape[1] == len(np.unique(fine))  # a fine region lies in exactly one coarse region
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_partitions_are_nested_and_cover_everything(seed: int) -> None:
     image = np.random.default_rng(seed).integers(0, 256, (12, 17, 3), dtype=np.uint8)
@@ -94,7 +95,6 @@ def test_shaded_balls_are_found_whole() -> None:
         assert best[2] > 0.9
 
 
-@pytest.mark.long
 def test_a_photograph_larger_than_the_working_size_keeps_its_size() -> None:
     image, ball = rendering(height=600, width=800)
     levels = nested_partitions(image)
@@ -141,7 +141,6 @@ def test_small_regions_join_their_likest_neighbour() -> None:
     assert merged[10, 10] == merged[10, 15] != merged[0, 0]
 
 
-@pytest.mark.long
 @pytest.mark.skipif(not PHOTOGRAPH.exists(), reason="no photographs here")
 def test_a_bunch_of_bananas_is_few_regions() -> None:
     image = np.asarray(Image.open(PHOTOGRAPH))

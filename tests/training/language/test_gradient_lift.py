@@ -16,6 +16,8 @@ from langsplat_core.training.language.gradient_lift import AdamState, blended, b
 from langsplat_core.training.language.lift import lift_latents
 from tests.support.scenes import random_camera, random_gaussians
 
+pytestmark = pytest.mark.long
+
 D = 4
 CODEC = LinearCodec(np.eye(3, D, dtype=np.float32))
 GAUSSIANS = random_gaussians(40, 2, scale_range=(0.1, 0.4))
