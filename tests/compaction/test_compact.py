@@ -103,8 +103,8 @@ def test_loss_without_photographs_is_that_of_uncorrelated_errors(scene):
 def test_nothing_that_any_view_needs_is_dropped(scene):
     rasterizer = CpuRasterizer()
     views = choose_views(scene, None, CONFIG, silent)
-    exposures = measuring_views(rasterizer, scene, views.measuring, views.photographs)
-    selection = select(rasterizer, scene, views, exposures, CONFIG)
+    measured = measuring_views(rasterizer, scene, views.measuring, views.photographs)
+    selection = select(rasterizer, scene, views, measured, CONFIG)
     score = contributions(rasterizer, scene, (*views.ranking, *views.measuring))
     assert 0 < (~selection.keep).sum() < N
     assert score[~selection.keep].max() <= selection.threshold
