@@ -59,6 +59,7 @@ def _record(
 
     spans[s - first] <- rows [low, high) of each intersection that were blended.
     """
+    x, y = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
     used = 0
     top, bottom = 0, TILE
@@ -71,7 +72,7 @@ def _record(
         low, high = rows_to_blend(tiles.rows[s], top, bottom)
         spans[s - first, 0], spans[s - first, 1] = low, high
         g = enter(geometry, tiles, s, min(s + AHEAD, last - 1))
-        step, peak, w, v, w_step, v_step = begin_rows(g, tile, tiles, low)
+        step, peak, w, v, w_step, v_step = begin_rows(g, x, y + low)
         for row in range(low, high):
             added, before = blend_row(state, row * TILE, step + w, peak - v * v, cutoffs)
             w, v = w + w_step, v + v_step
@@ -96,6 +97,7 @@ def _backward_tile(
     image_grad, alpha_grad = grads
     height, width, _ = image_grad.shape
     lines, columns = values.shape[1], partial.shape[1]
+    left, top = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
     state = start_tile(tile, tiles, width, height)
     spans = np.zeros((last - first, 2), np.int64)
@@ -112,7 +114,7 @@ def _backward_tile(
         used -= max(high - low, 0) * _ENTRY
         g = enter(geometry, tiles, s, max(s - AHEAD, first))
         x = values[tiles.ranks[s]]
-        step, _, offset, v, w_step, v_step = begin_rows(g, tile, tiles, low)
+        step, _, offset, v, w_step, v_step = begin_rows(g, left, top + low)
         q0 = qw = qv = qww = qwv = qvv = none = lanes(np.float32(0))
         for row in range(low, high):
             w = step + offset

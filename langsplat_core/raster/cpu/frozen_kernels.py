@@ -21,7 +21,6 @@ from langsplat_core.raster.cpu.walk import (
     PIXELS,
     Cutoffs,
     nothing_to_close,
-    nothing_to_open,
     start_tile,
     walk,
 )
@@ -30,12 +29,25 @@ VISIBLE = 0.5 / UNIT  # weights below round to 0
 
 
 @helper
+def _forget_rows(work: Any, s: int, later: int) -> int:
+    seen = work[1]
+    seen[0], seen[1] = TILE, 0
+    return 0
+
+
+@helper
 def _look_at_row(work: Any, mine: Any, s: int, row: int, low: int, added: Lanes, before: Lanes) -> None:
-    """spans[s] grows to hold `row` if one of its weights counts; an empty span is 0."""
-    spans = work[0]
+    """Note the first and the last row in which one of the weights counts."""
+    seen = work[1]
     if largest(added * before) >= VISIBLE:
-        start, _ = unpack_span(spans[s])
-        spans[s] = pack_span(row if spans[s] == 0 else start, row + 1)
+        seen[0], seen[1] = min(seen[0], row), row + 1
+
+
+@helper
+def _keep_span(work: Any, mine: Any, s: int, low: int, high: int) -> None:
+    spans, seen = work
+    if seen[1] > 0:
+        spans[s] = pack_span(seen[0], seen[1])
 
 
 @kernel
@@ -46,10 +58,11 @@ def find_spans(
     (H, W, 1) alpha."""
     count = tiles.starts.shape[0] - 1
     height, width, _ = alpha.shape
+    seen = np.empty(2, np.int64)
     for i in range(first, last):
         tile = spread(i, count)
         transmittance = start_tile(tile, tiles, width, height)
-        work = (spans,)
+        work = (spans, seen)
         walk(
             tile,
             tiles,
@@ -57,19 +70,26 @@ def find_spans(
             cutoffs,
             transmittance,
             work,
-            nothing_to_open,
+            _forget_rows,
             _look_at_row,
-            nothing_to_close,
+            _keep_span,
         )
         write_alpha(transmittance, alpha, tile, tiles)
 
 
 @helper
-def _keep_row(work: Any, mine: Any, s: int, row: int, low: int, added: Lanes, before: Lanes) -> None:
-    spans, firsts, weights = work
+def _rows_kept(work: Any, s: int, later: int) -> tuple[int, int, int]:
+    """The rows of intersection s that are kept, and where the first of them would lie if it were row 0."""
+    spans, firsts, _ = work
     start, end = unpack_span(spans[s])
+    return start, end, firsts[s] - start
+
+
+@helper
+def _keep_row(work: Any, kept: Any, s: int, row: int, low: int, added: Lanes, before: Lanes) -> None:
+    start, end, at = kept
     if start <= row < end:
-        store_units(weights, (firsts[s] + row - start) * TILE, added * before)
+        store_units(work[2], (at + row) * TILE, added * before)
 
 
 @kernel
@@ -90,9 +110,7 @@ def keep_weights(
         tile = spread(i, count)
         transmittance = start_tile(tile, tiles, size[0], size[1])
         work = (spans, firsts, weights)
-        walk(
-            tile, tiles, geometry, cutoffs, transmittance, work, nothing_to_open, _keep_row, nothing_to_close
-        )
+        walk(tile, tiles, geometry, cutoffs, transmittance, work, _rows_kept, _keep_row, nothing_to_close)
 
 
 @kernel

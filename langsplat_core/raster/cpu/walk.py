@@ -88,16 +88,13 @@ def enter(geometry: Array, tiles: Tiles, s: int, later: int) -> Array:
 
 
 @helper
-def begin_rows(
-    g: Array, tile: int, tiles: Tiles, low: int
-) -> tuple[Lanes, float, float, float, float, float]:
-    """For the rows of a tile from `low` on: of sixteen pixels the steps in w (see `projection`); the log2 of
-    the peak alpha; w and v at the first pixel's centre, and what a step of one row adds to them.
+def begin_rows(g: Array, x: float, y: float) -> tuple[Lanes, float, float, float, float, float]:
+    """For rows whose first pixel centre is (x, y): of sixteen pixels the steps in w (see `projection`);
+    the log2 of the peak alpha; w and v at (x, y), and what a step of one row adds to them.
 
     float64: across a long thin footprint w is the small difference of large numbers.
     """
-    x = tile % tiles.columns * TILE + 0.5
-    dy = tile // tiles.columns * TILE + low + 0.5 - g[cp.MEAN_Y]
+    dy = y - g[cp.MEAN_Y]
     skew = g[cp.FACTOR_A] * g[cp.FACTOR_K]
     w, v = g[cp.FACTOR_A] * (x - g[cp.MEAN_X]) - skew * dy, g[cp.FACTOR_C] * dy
     return ramp() * g[cp.FACTOR_A], g[cp.LOG2_OPACITY], w, v, -skew, g[cp.FACTOR_C]
@@ -134,6 +131,7 @@ def walk(
 ) -> int:
     """Blend the tile, changing its `transmittance`; returns the end of the intersections visited, which comes
     early where no pixel runs any more."""
+    x, y = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
     first, last = tiles.starts[tile], tiles.starts[tile + 1]
     top, bottom = 0, TILE
     for s in range(first, last):
@@ -145,7 +143,7 @@ def walk(
         later = min(s + AHEAD, last - 1)
         g = enter(geometry, tiles, s, later)
         mine = open_(work, s, later)
-        step, peak, w, v, w_step, v_step = begin_rows(g, tile, tiles, low)
+        step, peak, w, v, w_step, v_step = begin_rows(g, x, y + low)
         for row in range(low, high):
             added, before = blend_row(transmittance, row * TILE, step + w, peak - v * v, cutoffs)
             w, v = w + w_step, v + v_step
