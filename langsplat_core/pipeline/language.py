@@ -87,7 +87,8 @@ class _Stages:
 
     def codec(self) -> Codec:
         """Fitted to the masks' vectors and, unless latents are averaged themselves, to lifted ones."""
-        key = stage_key("codec", 1, *self._inputs, self._lift, self._config.codec)
+        fitted_to = "masks" if self._lift.mode in LATENT_LIFTS else self._lift.mode
+        key = stage_key("codec", 1, *self._inputs, fitted_to, self._config.codec)
         return kept(self._work / f"{key}.npz", self._fit, _pack_codec, _unpack_codec)
 
     def latents(self, codec: Codec) -> Latents:

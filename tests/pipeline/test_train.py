@@ -147,6 +147,14 @@ def test_a_setting_repeats_only_what_depends_on_it(room, tmp_path):
     assert len(kept_results(work)) == len(before) + 2  # who computes, and in which batches, changes nothing
 
 
+def test_more_steps_of_lifting_do_not_fit_the_codec_again(room, tmp_path):
+    work = tmp_path / "scene.work"
+    for steps in (10, 20):
+        config = replace(settings(room), lift=LiftConfig(mode="gradient", steps=steps))
+        train_scene(room, tmp_path / "scene.ply", config)
+    assert (len(list(work.glob("codec-*.npz"))), len(list(work.glob("latents-*.npz")))) == (1, 2)
+
+
 @pytest.mark.parametrize("name", ["memberships", "codec", "latents"])
 def test_a_damaged_result_is_one_line(room, tmp_path, name):
     out, work = tmp_path / "scene.ply", tmp_path / "scene.work"

@@ -1,4 +1,4 @@
-"""Lifting: from masks in photographs to vectors on Gaussians, through the adjoint `gather` alone.
+"""Lifting: from masks in photographs to vectors on Gaussians, through the adjoint W^T alone.
 
 Targets are constant on masks, so ``W^T onehot(mask)`` gives every Gaussian its membership in every mask,
 a sparse matrix that carries vectors of any length. Two roads use it or its shortcut:
