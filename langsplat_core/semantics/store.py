@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import overload
 from urllib.parse import quote
 
 import numpy as np
@@ -97,6 +98,27 @@ def fingerprint(encoder: ImageEncoder) -> str:
     return json.dumps([encoder.id, side, made.tolist()])
 
 
+class StoredFeatures(Sequence[ImageFeatures]):
+    """Features of photographs in a store, each read when it is looked at."""
+
+    def __init__(self, store: FeatureStore, names: Sequence[str]) -> None:
+        self._store, self._names = store, tuple(names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    @overload
+    def __getitem__(self, index: int) -> ImageFeatures: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "StoredFeatures": ...
+
+    def __getitem__(self, index: int | slice) -> "ImageFeatures | StoredFeatures":
+        if isinstance(index, slice):
+            return StoredFeatures(self._store, self._names[index])
+        return self._store.load(self._names[index])
+
+
 def describe_capture(
     images: Sequence[Array],
     names: Sequence[str],
@@ -104,7 +126,7 @@ def describe_capture(
     encoder: ImageEncoder,
     store: FeatureStore,
     progress: Progress = silent,
-) -> list[ImageFeatures]:
+) -> StoredFeatures:
     """Masks and CLIP vectors of every photograph, in order; those that `store` has already are not redone.
 
     images: (H, W, 3) uint8 each; names: unique, one per image. What is finished is in the store even when
@@ -112,7 +134,6 @@ def describe_capture(
     """
     label = f"masks ({mask_source.name}) and vectors"
     made_by = fingerprint(encoder)
-    found = []
     for index, (image, name) in enumerate(zip(images, names, strict=True)):
         part = _part(progress, f"{label}: {name}", index, len(images))
         part("", 0.0)
@@ -120,9 +141,8 @@ def describe_capture(
         if not store.has(name, key):
             labels = label_maps(mask_source(image, part))
             store.save(name, ImageFeatures(labels, embed_regions(image, labels, encoder)), key)
-        found.append(store.load(name))
     progress(label, 1.0)
-    return found
+    return StoredFeatures(store, names)
 
 
 def _part(progress: Progress, label: str, index: int, count: int) -> Progress:

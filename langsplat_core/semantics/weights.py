@@ -1,7 +1,11 @@
-"""Finding the weights of an encoder: a folder, or a model of the Hugging Face hub."""
+"""Finding and reading the weights of a model: a folder, or a model of the Hugging Face hub."""
 
-from collections.abc import Iterator
+import json
+import pickle
+import zipfile
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +15,16 @@ CONFIG = "config.json"
 SMALL_FILES = ["*.json", "*.txt"]
 SAFE = ["model.safetensors", "model-*.safetensors"]
 PICKLED = ["pytorch_model.bin", "pytorch_model-*.bin"]  # transformers reads these with weights_only
+UNREADABLE = (OSError, ValueError, TypeError, KeyError, RuntimeError, EOFError, pickle.PickleError)
+
+
+@dataclass(frozen=True)
+class Weights:
+    """A model that was found, and where it shall run."""
+
+    id: str  # hub id or folder, as it was asked for
+    folder: Path  # in Hugging Face layout
+    device: str  # of torch: "cpu", "cuda"
 
 
 def weights_folder(model: str, option: str) -> Path:
@@ -63,8 +77,20 @@ def _from_hub(model: str, option: str) -> Path:
     )
 
 
-def load_model(kind: Any, id: str, folder: Path, config: Any) -> Any:
-    """A transformers model of class `kind` in float32, ready to be asked.
+def model_type(weights: Weights) -> str:
+    """The architecture that the folder's config.json names, "" where it names none.
+
+    Raises EncoderError for a file that is no JSON.
+    """
+    try:
+        settings = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise EncoderError(f"{weights.id}: {CONFIG} cannot be read ({error})") from error
+    return str(settings.get("model_type", "")) if isinstance(settings, dict) else ""
+
+
+def load_model(kind: Any, weights: Weights, config: Any) -> Any:
+    """A transformers model of class `kind` in float32 on the device of `weights`, ready to be asked.
 
     Raises EncoderError where the folder lacks some of its weights or has them in another shape:
     transformers alone would fill those with random numbers.
@@ -72,14 +98,42 @@ def load_model(kind: Any, id: str, folder: Path, config: Any) -> Any:
     import torch
 
     options = {"local_files_only": True, "ignore_mismatched_sizes": True, "output_loading_info": True}
-    with loading_errors(id, kind.__name__):
-        model, report = kind.from_pretrained(folder, config=config, dtype=torch.float32, **options)
+    with loading_errors(weights.id, kind.__name__):
+        model, report = kind.from_pretrained(weights.folder, config=config, dtype=torch.float32, **options)
     wrong = sorted(report["missing_keys"]) or sorted(str(key[0]) for key in report["mismatched_keys"])
     if wrong:
         raise EncoderError(
-            f"{id}: not weights of {kind.__name__}: {len(wrong)} do not fit, such as {wrong[0]}"
+            f"{weights.id}: not weights of {kind.__name__}: {len(wrong)} do not fit, such as {wrong[0]}"
         )
-    return model.eval()
+    return model.eval().to(weights.device)
+
+
+def read_scalars(weights: Weights, names: Iterable[str]) -> dict[str, float]:
+    """Those of the named numbers that are among the weights, without loading the rest of them.
+
+    Half a model (a text tower) has no place for what belongs to the pair, such as a logit scale.
+    """
+    with loading_errors(weights.id, "readable"):
+        for patterns, read in ((SAFE, _safe_scalars), (PICKLED, _pickled_scalars)):
+            paths = sorted(path for pattern in patterns for path in weights.folder.glob(pattern))
+            if paths:  # transformers, too, prefers the first kind where both are there
+                return {name: value for path in paths for name, value in read(path, tuple(names)).items()}
+    return {}
+
+
+def _safe_scalars(path: Path, names: tuple[str, ...]) -> dict[str, float]:
+    from safetensors import safe_open
+
+    with safe_open(path, framework="pt") as file:
+        return {name: float(file.get_tensor(name)) for name in names if name in file.keys()}  # noqa: SIM118
+
+
+def _pickled_scalars(path: Path, names: tuple[str, ...]) -> dict[str, float]:
+    import torch
+
+    mapped = zipfile.is_zipfile(path)  # files of PyTorch before 1.6 are none, and are read whole
+    tensors = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
+    return {name: float(tensors[name]) for name in names if name in tensors}
 
 
 @contextmanager
@@ -93,7 +147,7 @@ def loading_errors(id: str, kind: str) -> Iterator[None]:
     logging.disable_progress_bar()
     try:
         yield
-    except (OSError, ValueError, TypeError, KeyError, RuntimeError, SafetensorError, EOFError) as error:
+    except (*UNREADABLE, SafetensorError) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         raise EncoderError(f"{id}: not {kind} weights that transformers can load ({lines[0]})") from error
     finally:

@@ -8,7 +8,8 @@ import torch
 from transformers import CLIPModel, CLIPTokenizer
 
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.semantics.clip import CLIP_MEAN, CLIP_STD, load_clip, load_text_encoder
+from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
+from langsplat_core.semantics.families.clip import CLIP_MEAN, CLIP_STD
 from tests.support.tiny_clip import SIDE, WORDS, tiny_clip
 
 pytestmark = pytest.mark.long  # transformers alone takes seconds to load
@@ -27,7 +28,7 @@ def crops(count: int) -> np.ndarray:
 
 def test_images_agree_with_the_whole_model(folder: Path) -> None:
     pictures = crops(5)
-    encoder = load_clip(str(folder), "cpu", batch=2)
+    encoder = load_encoder(str(folder), "cpu", batch=2)
     got = encoder.encode_images(pictures)
     assert (encoder.dim, encoder.image_size, encoder.id) == (24, SIDE, str(folder))
     model = CLIPModel.from_pretrained(folder).eval()
@@ -43,7 +44,7 @@ def test_images_agree_with_the_whole_model(folder: Path) -> None:
 def test_texts_agree_with_the_whole_model_one_at_a_time(folder: Path) -> None:
     phrases = ["red mug", "handle", "green apple things"]
     got = load_text_encoder(str(folder)).encode_texts(phrases)
-    np.testing.assert_array_equal(got, load_clip(str(folder), "cpu").encode_texts(phrases))
+    np.testing.assert_array_equal(got, load_encoder(str(folder), "cpu").encode_texts(phrases))
     model = CLIPModel.from_pretrained(folder).eval()
     tokenizer = CLIPTokenizer.from_pretrained(folder)
     for phrase, vector in zip(phrases, got, strict=True):  # alone, so without any padding
@@ -54,28 +55,50 @@ def test_texts_agree_with_the_whole_model_one_at_a_time(folder: Path) -> None:
 
 
 def test_nothing_to_encode_gives_no_rows(folder: Path) -> None:
-    encoder = load_clip(str(folder), "cpu")
+    encoder = load_encoder(str(folder), "cpu")
     assert encoder.encode_images(crops(0)).shape == (0, 24)
     assert encoder.encode_texts([]).shape == (0, 24)
 
 
 def test_half_precision_weights_are_used_in_float32(tmp_path: Path) -> None:
     tiny_clip(tmp_path, half=True)
-    vectors = load_clip(str(tmp_path), "cpu").encode_images(crops(1))
+    vectors = load_encoder(str(tmp_path), "cpu").encode_images(crops(1))
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-6)
 
 
 def test_the_folder_may_state_its_own_normalisation(tmp_path: Path) -> None:
     tiny_clip(tmp_path)
-    before = load_clip(str(tmp_path), "cpu").encode_images(crops(1))
+    before = load_encoder(str(tmp_path), "cpu").encode_images(crops(1))
     settings = '{"image_mean": [0.5, 0.5, 0.5], "image_std": [0.5, 0.5, 0.5]}'
     (tmp_path / "preprocessor_config.json").write_text(settings, encoding="utf-8")
-    assert abs(load_clip(str(tmp_path), "cpu").encode_images(crops(1)) - before).max() > 1e-4
+    assert abs(load_encoder(str(tmp_path), "cpu").encode_images(crops(1)) - before).max() > 1e-4
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"image_mean": [0.5]}', '{"image_std": [0, 0, 0]}'])
+def test_a_broken_normalisation_is_one_line(tmp_path: Path, text: str) -> None:
+    tiny_clip(tmp_path)
+    (tmp_path / "preprocessor_config.json").write_text(text, encoding="utf-8")
+    with pytest.raises(EncoderError, match=r"preprocessor_config\.json") as error:
+        load_encoder(str(tmp_path), "cpu")
+    assert "\n" not in str(error.value)
+
+
+def test_the_temperature_is_that_of_the_field(folder: Path) -> None:
+    assert load_encoder(str(folder), "cpu").temperature == 10.0
+    assert load_text_encoder("demo").temperature == 10.0  # though its own logit scale is another
+
+
+def test_pickled_weights_give_the_same_vectors(tmp_path: Path) -> None:
+    state = tiny_clip(tmp_path).state_dict()
+    before = load_encoder(str(tmp_path), "cpu").encode_images(crops(1))
+    (tmp_path / "model.safetensors").unlink()
+    torch.save(state, tmp_path / "pytorch_model.bin")
+    np.testing.assert_array_equal(load_encoder(str(tmp_path), "cpu").encode_images(crops(1)), before)
 
 
 def test_pictures_of_the_wrong_size_are_refused(folder: Path) -> None:
     with pytest.raises(ValueError, match="32 x 32"):
-        load_clip(str(folder), "cpu").encode_images(np.zeros((1, 16, 16, 3), np.uint8))
+        load_encoder(str(folder), "cpu").encode_images(np.zeros((1, 16, 16, 3), np.uint8))
 
 
 @pytest.mark.parametrize("phrase", ["", "   ", "?!"])
@@ -101,13 +124,13 @@ def test_a_vocabulary_makes_words_unknown(tmp_path: Path) -> None:
 def test_absent_weights_say_what_to_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     with pytest.raises(EncoderError, match=r"no such folder; pass `--clip\.model FOLDER`"):
-        load_clip("./nowhere")
+        load_encoder("./nowhere")
     with pytest.raises(EncoderError, match=r"no config\.json with model\.safetensors"):
-        load_clip(str(tmp_path))
+        load_encoder(str(tmp_path))
     with pytest.raises(
         EncoderError, match=r"HF_HUB_OFFLINE is set.*`hf download nobody/nothing-here`"
     ) as error:
-        load_clip("nobody/nothing-here")
+        load_encoder("nobody/nothing-here")
     assert "\n" not in str(error.value)
 
 
@@ -116,7 +139,7 @@ def test_a_truncated_file_is_one_line(tmp_path: Path) -> None:
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:2000])
     with pytest.raises(EncoderError, match=r"not CLIP\w* weights") as error:
-        load_clip(str(tmp_path), "cpu")
+        load_encoder(str(tmp_path), "cpu")
     assert "\n" not in str(error.value)
 
 
@@ -126,7 +149,7 @@ def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
     text = config.read_text(encoding="utf-8")
     config.write_text(text.replace('"intermediate_size": 48', '"intermediate_size": 40'), encoding="utf-8")
     with pytest.raises(EncoderError, match="6 do not fit, such as"):
-        load_clip(str(tmp_path), "cpu")
+        load_encoder(str(tmp_path), "cpu")
     config.write_text(text.replace('"num_hidden_layers": 2', '"num_hidden_layers": 3'), encoding="utf-8")
     with pytest.raises(EncoderError, match="16 do not fit, such as"):  # else they would be random
-        load_clip(str(tmp_path), "cpu")
+        load_encoder(str(tmp_path), "cpu")

@@ -1,28 +1,30 @@
 """SAM masks: the real loading path, with a tiny model made here, against one point at a time."""
 
+import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 from scipy import ndimage
-from transformers import SamConfig, SamModel
+from transformers import Sam2Model, SamHQModel, SamModel
 
 from langsplat_core.config import MaskConfig
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import silent
-from langsplat_core.semantics.mask_filters import (
-    clean_regions,
-    mask_boxes,
-)
-from langsplat_core.semantics.sam import grid_points, load_sam, preprocess, upscale
+from langsplat_core.semantics.mask_filters import clean_regions, mask_boxes
+from langsplat_core.semantics.sam import grid_points, load_sam
+from langsplat_core.semantics.segmenter import by_area, padded, squashed, upscale
 from langsplat_core.semantics.sources import load_mask_source
 from tests.support.plain_filters import plain_box_nms, plain_mask_nms
+from tests.support.tiny_sam import SIDE, tiny_sam, tiny_sam2, tiny_sam2_video, tiny_sam_hq
 
 pytestmark = pytest.mark.long  # transformers alone takes seconds to load
 
-SIDE = 64
 # Random weights give random scores: thresholds that let some masks through each filter, and stop some.
 LOOSE = MaskConfig(
     source="sam",
@@ -39,38 +41,13 @@ LOOSE = MaskConfig(
 )
 
 
-def tiny_sam(folder: Path) -> None:
-    torch.manual_seed(9)
-    size = {"image_size": SIDE, "patch_size": 16}
-    model = SamModel(
-        SamConfig(
-            vision_config=size
-            | {
-                "hidden_size": 16,
-                "num_hidden_layers": 2,
-                "num_attention_heads": 2,
-                "mlp_dim": 16,
-                "output_channels": 16,
-                "window_size": 2,
-                "global_attn_indexes": [1],
-                "num_pos_feats": 8,
-            },
-            prompt_encoder_config=size | {"hidden_size": 16, "image_embedding_size": SIDE // 16},
-            mask_decoder_config={
-                "hidden_size": 16,
-                "mlp_dim": 16,
-                "num_attention_heads": 2,
-                "iou_head_hidden_dim": 16,
-                "num_hidden_layers": 2,
-            },
-        )
-    )
-    with torch.no_grad():  # large enough weights that masks differ from point to point
-        for parameter in model.mask_decoder.parameters():
-            parameter.add_(torch.randn_like(parameter) * 0.4)
-        for parameter in model.prompt_encoder.parameters():
-            parameter.mul_(20)
-    model.save_pretrained(folder)
+# Likewise: a family's tiny model, its class, and what its random scores need.
+FAMILIES: dict[str, tuple[Callable[[Path], Any], Any, MaskConfig]] = {
+    "sam": (tiny_sam, SamModel, LOOSE),
+    "sam_hq": (tiny_sam_hq, SamHQModel, replace(LOOSE, predicted_iou=0.5, stability=0.9)),
+    "sam2": (tiny_sam2, Sam2Model, replace(LOOSE, predicted_iou=0.4)),
+    "sam2_video": (tiny_sam2_video, Sam2Model, replace(LOOSE, predicted_iou=0.5)),
+}
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +68,7 @@ def test_the_grid_is_made_of_cell_centres() -> None:
 
 
 def test_preprocessing_scales_the_longer_side_and_pads() -> None:
-    pixels, size = preprocess(np.full((10, 30, 3), 255, np.uint8), 64)
+    pixels, size = padded(np.full((10, 30, 3), 255, np.uint8), 64)
     assert size == (21, 64)
     assert pixels.shape == (1, 3, 64, 64)
     np.testing.assert_allclose(pixels[0, :, 0, 0], [2.2489, 2.4286, 2.6400], atol=1e-4)
@@ -106,26 +83,75 @@ def test_upscaling_forgets_the_padding() -> None:
     np.testing.assert_allclose(full[0, 5, 1:-1], columns[1:-1], atol=1e-5)
 
 
-def plain_level(image: np.ndarray, config: MaskConfig, level: int) -> list[np.ndarray]:
-    """One level by the book: one point at a time through the whole model, lists and loops."""
-    model = SamModel.from_pretrained(config.sam).eval()
-    pixels, size = preprocess(image, SIDE)
+def plain_answer(model: Any, image: np.ndarray, point: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+    """(3,) scores and (3, H, W) logits of subpart, part and whole at one point, by the whole model."""
+    height, width = image.shape[:2]
+    if isinstance(model, Sam2Model):
+        pixels, scale = squashed(image, SIDE), np.array([SIDE / width, SIDE / height])
+    else:
+        pixels, size = padded(image, SIDE)
+        scale = np.array([size[1] / width, size[0] / height])
+    given = torch.from_numpy((point * scale).astype(np.float32))[None, None, None]
+    with torch.no_grad():
+        answer = model(pixel_values=torch.from_numpy(pixels), input_points=given)
+    ious, low = answer.iou_scores[0, 0], answer.pred_masks[0, 0]
+    if isinstance(model, Sam2Model):
+        full = torch.nn.functional.interpolate(low[None], (height, width), mode="bilinear")[0]
+    else:
+        full = upscale(low, SIDE, size, (height, width))
+    if not isinstance(model, SamModel):
+        order = sorted(range(3), key=lambda k: int((low[k] > 0).sum()))
+        ious, full = ious[order], full[order]
+    return ious, full
+
+
+Found = tuple[np.ndarray, float, float]  # mask, predicted IoU, stability
+
+
+def plain_proposals(
+    model: Any, image: np.ndarray, crop: tuple[int, ...], config: MaskConfig, level: int
+) -> list[Found]:
+    left, top, right, bottom = crop
+    part = image[top:bottom, left:right]
     found = []
-    for point in grid_points(config.points_per_side, size):
-        with torch.no_grad():
-            answer = model(
-                pixel_values=torch.from_numpy(pixels), input_points=torch.from_numpy(point)[None, None, None]
-            )
-        iou = answer.iou_scores[0, 0, level].item()
-        logits = upscale(answer.pred_masks[0, 0, level][None], SIDE, size, image.shape[:2])[0].numpy()
+    for point in grid_points(config.points_per_side, part.shape[:2]):
+        ious, logits = plain_answer(model, part, point)
+        iou, logits = ious[level].item(), logits[level].numpy()
         offset = config.stability_offset
         stability = (logits > offset).sum() / max((logits > -offset).sum(), 1)
         if iou > config.predicted_iou and stability >= config.stability and (logits > 0).any():
-            found.append((logits > 0, iou, stability))
+            mask = np.zeros(image.shape[:2], bool)
+            mask[top:bottom, left:right] = logits > 0
+            if not plain_cut(mask, crop):
+                found.append((mask, iou, stability))
+    return plain_suppression(found, [iou for _, iou, _ in found], config)
+
+
+def plain_cut(mask: np.ndarray, crop: tuple[int, ...]) -> bool:
+    box, picture = mask_boxes(mask[None])[0], (0, 0, mask.shape[1], mask.shape[0])
+    sides = zip(box, crop, picture, strict=True)
+    return any(abs(b - c) <= 20 and abs(b - p) > 20 for b, c, p in sides)
+
+
+def plain_suppression(found: list[Found], scores: list[float], config: MaskConfig) -> list[Found]:
     if not found:
         return []
     boxes = mask_boxes(np.stack([mask for mask, _, _ in found]))
-    found = [found[i] for i in plain_box_nms(boxes, np.array([iou for _, iou, _ in found]), config.box_nms)]
+    return [found[i] for i in plain_box_nms(boxes, np.array(scores), config.box_nms)]
+
+
+def plain_level(
+    model: Any, image: np.ndarray, crops: list[tuple[int, ...]], config: MaskConfig, level: int
+) -> list[np.ndarray]:
+    """One level by the book: one point at a time through the whole model, lists and loops."""
+    found, areas = [], []
+    for crop in crops:
+        more = plain_proposals(model, image, crop, config, level)
+        found += more
+        areas += [(crop[2] - crop[0]) * (crop[3] - crop[1])] * len(more)
+    found = plain_suppression(found, [1 / area for area in areas], config)
+    if not found:
+        return []
     cleaned = [clean_regions(mask, config.min_region) for mask, _, _ in found]
     boxes = mask_boxes(np.stack([mask for mask, _ in cleaned]))
     again = plain_box_nms(boxes, np.array([not changed for _, changed in cleaned], float), config.box_nms)
@@ -134,20 +160,75 @@ def plain_level(image: np.ndarray, config: MaskConfig, level: int) -> list[np.nd
     return [masks[i] for i in plain_mask_nms(np.stack(masks), scores, config)]
 
 
-def test_the_whole_source_agrees_with_one_point_at_a_time(config: MaskConfig) -> None:
-    image = photograph()
+def compare(config: MaskConfig, model: Any, image: np.ndarray, crops: list[tuple[int, ...]]) -> list[int]:
+    """The masks of every level against the plain ones; returns how many there are."""
     levels = load_sam(config, "cpu")(image, silent)
-    counts = []
     for level in range(3):
-        want = plain_level(image, config, level)
-        counts.append(len(want))
+        want = plain_level(model, image, crops, config, level)
         assert len(levels.masks[level]) == len(want)
         for got, mask in zip(levels.masks[level], want, strict=True):
             assert (got ^ mask).sum() <= 2  # batches of another size: float32 logits near zero may flip
-    assert sum(counts) >= 4
+    return [len(masks) for masks in levels.masks]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_whole_source_agrees_with_one_point_at_a_time(family: str, tmp_path: Path) -> None:
+    make, kind, thresholds = FAMILIES[family]
+    make(tmp_path)
+    config, image = replace(thresholds, sam=str(tmp_path)), photograph()
+    counts = compare(config, kind.from_pretrained(tmp_path).eval(), image, [(0, 0, 80, 48)])
+    assert sum(counts) >= 3
     everything = replace(config, predicted_iou=-99.0, stability=0.0)
     loose = load_sam(everything, "cpu")(image, silent)
     assert sum(map(len, loose.masks)) > sum(counts)  # so both scores did filter something
+
+
+@pytest.mark.parametrize("family", ["sam", "sam2"])
+def test_a_layer_of_crops_agrees_with_crops_one_after_another(family: str, tmp_path: Path) -> None:
+    make, kind, thresholds = FAMILIES[family]
+    make(tmp_path)
+    config, image = replace(thresholds, sam=str(tmp_path), crop_layers=1, points_per_side=3), photograph()
+    # overlap int(48 * 512 / 1500) = 16; width (80 + 16) / 2 = 48, height (48 + 16) / 2 = 32
+    crops = [(0, 0, 48, 32), (0, 16, 48, 48), (32, 0, 80, 32), (32, 16, 80, 48)]
+    compare(config, kind.from_pretrained(tmp_path).eval(), image, [(0, 0, 80, 48), *crops])
+    assert load_sam(config, "cpu").key != load_sam(replace(config, crop_layers=0), "cpu").key
+
+
+def test_three_answers_are_put_in_order_of_size_for_each_point() -> None:
+    logits = -torch.ones(2, 3, 4, 4)
+    for point, sizes in enumerate([(3, 1, 2), (2, 2, 1)]):
+        for k, size in enumerate(sizes):
+            logits[point, k, :size] = 1 + k
+    ious, ordered = by_area(torch.tensor([[0.3, 0.1, 0.2], [0.5, 0.6, 0.4]]), logits)
+    np.testing.assert_allclose(ious, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])  # of equals the first stays first
+    assert (ordered > 0).flatten(2).sum(2).tolist() == [[4, 8, 12], [4, 8, 8]]
+    assert ordered[:, :, 0, 0].tolist() == [[2, 3, 1], [3, 1, 2]]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_pickled_weights_give_the_same_masks(family: str, tmp_path: Path) -> None:
+    make, _, thresholds = FAMILIES[family]
+    make(tmp_path)
+    config = replace(thresholds, sam=str(tmp_path), points_per_side=3)
+    before = load_sam(config, "cpu")(photograph(), silent)
+    state = load_file(tmp_path / "model.safetensors")
+    (tmp_path / "model.safetensors").unlink()
+    torch.save(state, tmp_path / "pytorch_model.bin")
+    after = load_sam(config, "cpu")(photograph(), silent)
+    for got, want in zip(after.masks, before.masks, strict=True):
+        np.testing.assert_array_equal(got, want)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_weights_that_do_not_fit_are_one_line(family: str, tmp_path: Path) -> None:
+    FAMILIES[family][0](tmp_path)
+    path = tmp_path / "config.json"
+    config = json.loads(path.read_text(encoding="utf-8"))
+    config["mask_decoder_config"]["iou_head_hidden_dim"] = 12
+    path.write_text(json.dumps(config), encoding="utf-8")
+    with pytest.raises(EncoderError, match="do not fit, such as mask_decoder") as error:
+        load_sam(MaskConfig(sam=str(tmp_path)), "cpu")
+    assert "\n" not in str(error.value)
 
 
 def test_batches_do_not_change_the_masks(config: MaskConfig) -> None:
@@ -189,6 +270,6 @@ def test_sources_are_chosen_and_absences_named(config: MaskConfig, tmp_path: Pat
         load_mask_source(MaskConfig(sam=str(tmp_path / "absent")))
     (tmp_path / "config.json").write_text('{"model_type": "clip"}', encoding="utf-8")
     (tmp_path / "model.safetensors").write_bytes(b"")
-    with pytest.raises(EncoderError, match="not Sam") as error:
+    with pytest.raises(EncoderError, match="no segmenter known here") as error:
         load_mask_source(MaskConfig(sam=str(tmp_path)))
     assert "\n" not in str(error.value)

@@ -1,0 +1,235 @@
+"""What every image-text encoder does alike: checks of phrases and pictures, batches, unit vectors.
+
+A family of models brings two towers, each a few lines (`families/`); everything a caller sees is here.
+"""
+
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from langsplat_core.arrays import Array, unit
+from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.semantics.weights import Weights
+
+OPEN_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
+VOCABULARY = "vocabulary.txt"  # beside the weights: the only words the encoder was taught, one per line
+WORD = re.compile(r"[^\W_]+(?:'[^\W_]+)?")
+EXAMPLES = 12  # known words to name where a phrase has an unknown one
+TEXT_BATCH = 64  # phrases per forward pass
+Triple = tuple[float, float, float]
+SHARE_OF_SCALE = 0.1  # of a model's logit scale: the temperature of relevancy, see `Logits.temperature`
+
+
+@dataclass(frozen=True)
+class Logits:
+    """How a model was trained to turn a cosine into a logit: scale * cosine + bias."""
+
+    scale: float
+    bias: float = 0.0  # of no effect on relevancy, which is made of differences of cosines
+
+    @property
+    def temperature(self) -> float:
+        """What a difference of cosines is multiplied by before the sigmoid of relevancy.
+
+        LERF and LangSplat take 10 for CLIP, whose training caps the scale at 100: a tenth. The scale says
+        how far apart a model's training pushed the cosines of right and wrong pairs (the larger it is, the
+        smaller the gaps that it had to make), so a tenth of it gives the margins of two families like
+        relevancies. It is a rule of proportion, not a calibration: verdicts need thresholds of their own.
+        """
+        return SHARE_OF_SCALE * self.scale
+
+
+class TextTower(Protocol):
+    """The half of a model that reads phrases."""
+
+    @property
+    def dim(self) -> int:
+        """Length D of the vectors."""
+
+    @property
+    def temperature(self) -> float:
+        """Of relevancy, see `Logits.temperature`."""
+
+    @property
+    def logits(self) -> Logits | None:
+        """As the weights state it; None where a family does not need it."""
+
+    def encode(self, texts: list[str]) -> Any:
+        """(B, D) float tensor, of any length, of B phrases."""
+
+
+class PictureTower(Protocol):
+    """The half of a model that sees pictures."""
+
+    @property
+    def image_size(self) -> int:
+        """Side of the pictures it takes, px."""
+
+    @property
+    def statistics(self) -> tuple[Array, Array]:
+        """(3,) mean and (3,) standard deviation that it expects to be taken out, of values in [0, 1]."""
+
+    def encode(self, pixels: Any) -> Any:
+        """(B, 3, S, S) float32 tensor, normalised -> (B, D) float tensor, of any length."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """An architecture: how its two halves are loaded."""
+
+    name: str  # in messages
+    text: Callable[[Weights], TextTower]
+    pictures: Callable[[Weights], PictureTower]
+
+
+class PhraseEncoder:
+    """The text half of a model, in float32; it satisfies `query.engine.TextEncoder`."""
+
+    def __init__(self, weights: Weights, tower: TextTower) -> None:
+        self.id = weights.id
+        self._tower = tower
+        self._words = _vocabulary(weights.folder)
+
+    @property
+    def dim(self) -> int:
+        """Length D of the vectors."""
+        return self._tower.dim
+
+    @property
+    def temperature(self) -> float:
+        """With which a margin of cosines, phrase minus nearest canonical phrase, becomes relevancy."""
+        return self._tower.temperature
+
+    @property
+    def logits(self) -> Logits | None:
+        """Learned scale and bias of the model's own logits, where its family states them."""
+        return self._tower.logits
+
+    def unknown_words(self, text: str) -> tuple[str, ...]:
+        """Words of `text` that the encoder was never taught; empty when it was taught open vocabulary."""
+        if self._words is None:
+            return ()
+        return tuple(word for word in WORD.findall(text.lower()) if word not in self._words)
+
+    def encode_texts(self, texts: Sequence[str]) -> Array:
+        """(M, D) float32 unit vectors of M phrases, raw: no prompt template, as in LangSplat.
+
+        Raises InputError for a phrase without a letter or digit, EncoderError for unknown words.
+        """
+        for text in texts:
+            self._check(text)
+        parts = [self._encode(list(texts[i : i + TEXT_BATCH])) for i in range(0, len(texts), TEXT_BATCH)]
+        return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
+
+    def _check(self, text: str) -> None:
+        if not WORD.search(text):
+            raise InputError(f"empty phrase {text!r}: type a word or a few, such as 'red mug'")
+        unknown = self.unknown_words(text)
+        if unknown:
+            words = sorted(self._words or ())
+            near = [match for word in unknown for match in get_close_matches(word, words, n=2)]
+            known = ", ".join(near or words[:: len(words) // EXAMPLES + 1])
+            raise EncoderError(
+                f"{', '.join(map(repr, unknown))}: not taught to the encoder '{self.id}', which knows "
+                f"{len(words)} words, such as {known}; a scene trained with `--clip.model {OPEN_MODEL}` "
+                "can be asked anything"
+            )
+
+    def _encode(self, texts: list[str]) -> Array:
+        import torch
+
+        with torch.inference_mode():
+            return unit(self._tower.encode(texts).float().cpu().numpy())
+
+
+class Encoder:
+    """Both halves of a model; it satisfies `embed.ImageEncoder` too."""
+
+    def __init__(self, text: PhraseEncoder, pictures: PictureTower, device: str, batch: int) -> None:
+        self._text = text
+        self._pictures = pictures
+        self._device = device
+        self._batch = batch
+
+    @property
+    def id(self) -> str:
+        """Hub id or folder as it was asked for; "demo" for the bundled encoder."""
+        return self._text.id
+
+    @property
+    def dim(self) -> int:
+        """Length D of the vectors."""
+        return self._text.dim
+
+    @property
+    def temperature(self) -> float:
+        """As `PhraseEncoder.temperature`."""
+        return self._text.temperature
+
+    @property
+    def logits(self) -> Logits | None:
+        """As `PhraseEncoder.logits`."""
+        return self._text.logits
+
+    @property
+    def image_size(self) -> int:
+        """Side of the pictures it takes, px."""
+        return self._pictures.image_size
+
+    def unknown_words(self, text: str) -> tuple[str, ...]:
+        """As `PhraseEncoder.unknown_words`."""
+        return self._text.unknown_words(text)
+
+    def encode_texts(self, texts: Sequence[str]) -> Array:
+        """As `PhraseEncoder.encode_texts`."""
+        return self._text.encode_texts(texts)
+
+    def encode_images(self, crops: Array | Sequence[Array]) -> Array:
+        """(M, D) float32 unit vectors of M pictures (image_size, image_size, 3) uint8, display values."""
+        size = self.image_size
+        for crop in crops:
+            if crop.shape != (size, size, 3):
+                raise ValueError(f"crops: expected {size} x {size} x 3 pictures, got shape {crop.shape}")
+        starts = range(0, len(crops), self._batch)
+        parts = [self._encode(np.stack(list(crops[i : i + self._batch]))) for i in starts]
+        return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
+
+    def _encode(self, crops: Array) -> Array:
+        import torch
+
+        mean, std = self._pictures.statistics
+        pixels = (crops.astype(np.float32) / 255 - mean) / std
+        with torch.inference_mode():
+            inputs = torch.from_numpy(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))).to(self._device)
+            return unit(self._pictures.encode(inputs).float().cpu().numpy())
+
+
+def pixel_statistics(weights: Weights, mean: Triple, std: Triple) -> tuple[Array, Array]:
+    """(3,) mean and (3,) standard deviation of the pixels a model was trained with, in [0, 1]: those that
+    the folder's preprocessor_config.json states, else `mean` and `std`.
+
+    Raises EncoderError where that file cannot be read, or states no three numbers.
+    """
+    path = weights.folder / "preprocessor_config.json"
+    try:
+        settings = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        stated = settings.get("image_mean") or mean, settings.get("image_std") or std
+        found = np.array(stated, np.float32)
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise EncoderError(f"{weights.id}: {path.name} cannot be read ({error})") from error
+    if found.shape != (2, 3) or not (found[1] > 0).all():
+        raise EncoderError(f"{weights.id}: {path.name} states no mean and deviation of three colours")
+    return found[0], found[1]
+
+
+def _vocabulary(folder: Path) -> frozenset[str] | None:
+    path = folder / VOCABULARY
+    if not path.is_file():
+        return None
+    return frozenset(path.read_text(encoding="utf-8").split())

@@ -1,0 +1,1 @@
+"""One file for each architecture that `encoders.py` and `segmenters.py` can load."""

@@ -1,0 +1,81 @@
+"""CLIP (Radford et al. 2021), OpenCLIP and the bundled demo encoder: the towers of `CLIPModel`."""
+
+from typing import Any
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import EncoderError
+from langsplat_core.semantics.encoder import Family, Logits, pixel_statistics
+from langsplat_core.semantics.weights import Weights, load_model, loading_errors
+
+CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)  # of OpenAI's CLIP, kept by OpenCLIP
+CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+TEMPERATURE = 10.0  # of LERF and LangSplat, whatever scale a checkpoint ended its training with
+
+
+class ClipText:
+    """A `TextTower`."""
+
+    def __init__(self, weights: Weights) -> None:
+        from transformers import CLIPTextModelWithProjection, CLIPTokenizerFast
+
+        self.temperature = TEMPERATURE
+        self.logits: Logits | None = None
+        self._device = weights.device
+        self._model: Any = _load(CLIPTextModelWithProjection, "text", weights)
+        self._tokenizer: Any = _load_tokenizer(CLIPTokenizerFast, weights)
+
+    @property
+    def dim(self) -> int:
+        """See `TextTower`."""
+        return int(self._model.config.projection_dim)
+
+    def encode(self, texts: list[str]) -> Any:
+        """See `TextTower`."""
+        limit = int(self._model.config.max_position_embeddings)
+        # Padding follows the end token, which attends to earlier tokens only: no attention mask is needed.
+        tokens = self._tokenizer(
+            texts, padding=True, truncation=True, max_length=limit, return_tensors="pt"
+        ).input_ids.to(self._device)
+        return self._model(input_ids=tokens).text_embeds
+
+
+class ClipPictures:
+    """A `PictureTower`."""
+
+    def __init__(self, weights: Weights) -> None:
+        from transformers import CLIPVisionModelWithProjection
+
+        self._model: Any = _load(CLIPVisionModelWithProjection, "vision", weights)
+        self.statistics: tuple[Array, Array] = pixel_statistics(weights, CLIP_MEAN, CLIP_STD)
+
+    @property
+    def image_size(self) -> int:
+        """See `PictureTower`."""
+        return int(self._model.config.image_size)
+
+    def encode(self, pixels: Any) -> Any:
+        """See `PictureTower`."""
+        return self._model(pixel_values=pixels).image_embeds
+
+
+CLIP = Family("CLIP", ClipText, ClipPictures)
+
+
+def _load(kind: Any, tower: str, weights: Weights) -> Any:
+    """One tower ("text" or "vision") with its projection."""
+    from transformers import CLIPConfig
+
+    with loading_errors(weights.id, "CLIP"):
+        config = CLIPConfig.from_pretrained(weights.folder, local_files_only=True)
+        tower_config = getattr(config, f"{tower}_config")
+        tower_config.projection_dim = config.projection_dim  # some files state it for the pair only
+    return load_model(kind, weights, tower_config)
+
+
+def _load_tokenizer(kind: Any, weights: Weights) -> Any:
+    needed = "tokenizer.json, or vocab.json and merges.txt"
+    folder = weights.folder
+    if not (folder / "tokenizer.json").is_file() and not (folder / "merges.txt").is_file():
+        raise EncoderError(f"{weights.id}: no CLIP tokenizer in this folder; it needs {needed}")
+    with loading_errors(weights.id, "CLIP"):
+        return kind.from_pretrained(folder, local_files_only=True)

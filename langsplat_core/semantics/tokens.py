@@ -1,0 +1,89 @@
+"""Phrases as rows of token numbers of one length, by the tokenizer.json that lies beside the weights.
+
+The file is read as it is, by the `tokenizers` library: what transformers' own classes add around it (which
+side is padded, whether an end token is there) differs between its versions, and one needs SentencePiece.
+"""
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from langsplat_core.errors import EncoderError
+from langsplat_core.semantics.weights import Weights
+
+FILE = "tokenizer.json"
+STATED_IN = ("tokenizer_config.json", "special_tokens_map.json")  # which token pads, which one ends
+USUAL = {"eos_token": ("</s>", "<eos>"), "pad_token": ("<pad>", "</s>")}
+
+
+@dataclass(frozen=True, eq=False)
+class Tokens:
+    """A tokenizer that always fills its rows."""
+
+    tokenizer: Any  # tokenizers.Tokenizer
+    length: int  # tokens per phrase
+    pad: int
+    end: int | None  # put behind every phrase, also behind one that was cut; None: nothing
+
+    @property
+    def is_unigram(self) -> bool:
+        """Whether it is of SentencePiece's unigram kind, as SigLIP's is and SigLIP 2's is not."""
+        return type(self.tokenizer.model).__name__ == "Unigram"
+
+    def rows(self, texts: list[str]) -> tuple[Any, Any]:
+        """(B, length) int64 tensor of token numbers, and one of 1 where a token is no padding."""
+        import torch
+
+        ids = torch.full((len(texts), self.length), self.pad)
+        used = torch.zeros_like(ids)
+        tail = [] if self.end is None else [self.end]
+        for row, found in enumerate(self.tokenizer.encode_batch(texts, add_special_tokens=False)):
+            tokens = found.ids[: self.length - len(tail)] + tail
+            ids[row, : len(tokens)] = torch.tensor(tokens)
+            used[row, : len(tokens)] = 1
+        return ids, used
+
+
+def load_tokens(weights: Weights, length: int, ends: bool) -> Tokens:
+    """Read the folder's tokenizer; `ends`: whether phrases get an end token.
+
+    Raises EncoderError where there is none, or it lacks the tokens that pad and end.
+    """
+    path = weights.folder / FILE
+    if not path.is_file():
+        raise EncoderError(f"{weights.id}: no {FILE} in this folder, which its phrases are read with")
+    tokenizer = _read(weights, str(path))
+    tokenizer.no_truncation()
+    tokenizer.no_padding()
+    pad = _number(weights, tokenizer, "pad_token")
+    return Tokens(tokenizer, length, pad, _number(weights, tokenizer, "eos_token") if ends else None)
+
+
+def _read(weights: Weights, path: str) -> Any:
+    from tokenizers import Tokenizer
+
+    try:
+        return Tokenizer.from_file(path)
+    except Exception as error:  # the library raises no narrower class for a damaged file
+        reason = (str(error).splitlines() or ["unreadable"])[0]
+        raise EncoderError(f"{weights.id}: {FILE} is no tokenizer ({reason})") from error
+
+
+def _number(weights: Weights, tokenizer: Any, role: str) -> int:
+    """The number of the token with a role: as the folder states it, else by its usual names."""
+    stated = [_stated(weights, name, role) for name in STATED_IN]
+    for token in (*stated, *USUAL[role]):
+        number = None if token is None else tokenizer.token_to_id(token)
+        if number is not None:
+            return int(number)
+    raise EncoderError(f"{weights.id}: its tokenizer has no {role}, such as {USUAL[role][0]}")
+
+
+def _stated(weights: Weights, name: str, role: str) -> str | None:
+    path = weights.folder / name
+    try:
+        token = json.loads(path.read_text(encoding="utf-8")).get(role)
+    except (OSError, ValueError, AttributeError):
+        return None
+    content = token.get("content") if isinstance(token, dict) else token
+    return content if isinstance(content, str) else None
