@@ -1,10 +1,13 @@
-"""`langsplat convert`: one scene file to another, carrying the language field along."""
+"""`langsplat convert`: one scene file to another, and to and from what other methods keep."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated, Literal
 
 import tyro
 
+from langsplat_core.config import CodecConfig
+from langsplat_core.errors import InputError
 from langsplat_core.formats import (
     check_writable,
     load_scene,
@@ -12,29 +15,134 @@ from langsplat_core.formats import (
     rematch_language,
     save_scene,
 )
+from langsplat_core.progress import TerminalProgress
+from langsplat_core.scene import Scene
+
+CHECKPOINTS = (".pth", ".pt", ".ckpt", ".npz", ".npy", ".faiss")  # no scene has such a name
+Target = Literal["scene", "langsplat", "occam", "features"]
+LevelName = Literal["subpart", "part", "whole"]
 
 
 @dataclass(frozen=True)
 class Convert:
     """Write any readable scene as .ply, .spz or .splat, with language field and cameras beside it if it has
     them. A .ply (INRIA's) keeps everything, .spz is ten times smaller and rounded, .splat is without view
-    dependence."""
+    dependence. Checkpoints of LangSplat, LangSplatV2, Occam's LGS, Dr. Splat, OpenGaussian, Feature-3DGS and
+    3D Gaussian Splatting become such a scene (see docs/files.md for what to give), and a scene becomes
+    checkpoints."""
 
     source: tyro.conf.Positional[Path]
-    """Scene to read: .ply, compressed .ply, .spz, .splat, .ksplat, SOG folder, meta.json or .sog."""
-    out: tyro.conf.Positional[Path]
-    """Scene to write: .ply, .spz or .splat."""
+    """Scene to read: .ply, compressed .ply, .spz, .splat, .ksplat, SOG folder, meta.json or .sog; or the
+    first of the files that another method has of one scene."""
+    rest: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[MORE...] OUT")]]
+    """The other method's further files, in any order, and last the scene to write: .ply, .spz or .splat; with
+    --to the folder."""
     rematch: Path | None = None
     """A language sidecar (*.langsplat.safetensors) made before the Gaussians were edited: its field is
     carried over to the Gaussians of SOURCE by nearest position."""
+    to: Target = "scene"
+    """langsplat: a folder with LangSplat's three checkpoints and its autoencoder. occam: with Occam's LGS's
+    three checkpoints of whole vectors. features: a folder of masks and vectors of photographs, `features` of
+    a training's work folder as LangSplat's language_features, or the other way."""
+    encoder: str | None = None
+    """Text encoder of the checkpoints' vectors: hub id, folder or "demo" (default: LangSplat's OpenCLIP,
+    laion/CLIP-ViT-B-16-laion2B-s34B-b88K). With a single .ply: its semantic_* are read."""
+    levels: tuple[LevelName, ...] = ()
+    """Levels of the checkpoints with features, in their order, where files and folders do not tell."""
+    phrases: tuple[str, ...] = ()
+    """Stored encoded in a scene made of checkpoints: they can be asked without any encoder."""
+    codec: CodecConfig = field(default_factory=CodecConfig)
+    """How the Gaussians of checkpoints with whole vectors keep them."""
+
+    @property
+    def sources(self) -> tuple[Path, ...]:
+        """All that is read."""
+        return (self.source, *self.rest[:-1])
+
+    @property
+    def out(self) -> Path:
+        """What is written."""
+        return self.rest[-1]
 
     def run(self) -> None:
-        check_writable(self.out)  # before minutes are spent on reading
-        if self.rematch is None:
-            scene = load_scene(self.source)
+        if not self.rest:
+            raise InputError(f"{self.source}: name what to read, and then what to write")
+        if self.to == "features":
+            self._convert_features()
+        elif self.to == "scene":
+            self._write_scene()
         else:
-            scene = load_without_language(self.source)
-            scene = replace(scene, language=rematch_language(self.rematch, scene.gaussians.means))
+            self._export()
+
+    def _write_scene(self) -> None:
+        check_writable(self.out)  # before minutes are spent on reading
+        scene = self._read()
         save_scene(self.out, replace(scene, path=self.out))
-        field = "with a language field" if scene.language else "without a language field"
-        print(f"{self.out}: {len(scene.gaussians)} Gaussians, {field}")
+        described = "with a language field" if scene.language else "without a language field"
+        print(f"{self.out}: {len(scene.gaussians)} Gaussians, {described}")
+
+    def _read(self) -> Scene:
+        first = self.source
+        foreign = len(self.sources) > 1 or first.suffix.lower() in CHECKPOINTS or self.encoder is not None
+        if foreign and self.rematch is not None:
+            raise InputError(
+                "--rematch is for one scene; import the checkpoints first, then rematch the result"
+            )
+        if foreign:
+            return self._import()
+        if self.rematch is None:
+            return load_scene(first)
+        scene = load_without_language(first)
+        return replace(scene, language=rematch_language(self.rematch, scene.gaussians.means))
+
+    def _import(self) -> Scene:
+        from langsplat_core.formats.checkpoints import read_foreign
+        from langsplat_core.pipeline.importing import import_scene  # imports torch: --help need not wait
+
+        foreign = read_foreign(self.sources, self.levels)
+        with TerminalProgress() as progress:
+            scene, report = import_scene(foreign, self.encoder, self.phrases, self.codec, progress)
+        print(f"{report.method}: {'; '.join(report.notes)}")
+        if scene.language is not None:
+            shares = ", ".join(f"{share:.0%}" for share in report.meaningful)
+            print(
+                f"with a meaning at subpart, part, whole: {shares} of the Gaussians; "
+                f"codec {report.codec} of {report.codec_size}, encoder {scene.language.encoder_id}"
+            )
+        if report.loss is not None:
+            print(
+                f"relevancy error of the codec: mean {report.loss.error_mean:.4f}, "
+                f"99 % below {report.loss.error_p99:.4f}; mean cosine {report.loss.cosine:.4f}"
+            )
+        return scene
+
+    def _export(self) -> None:
+        from langsplat_core.pipeline.exporting import export_langsplat, export_occam
+
+        scene = self._read()
+        scene = replace(scene, path=self.source)
+        with TerminalProgress() as progress:
+            if self.to == "langsplat":
+                written = export_langsplat(scene, self.out, self.source.stem)
+            else:
+                written = export_occam(scene, self.out, progress)
+        for path in written:
+            print(path)
+
+    def _convert_features(self) -> None:
+        from langsplat_core.pipeline.exporting import (
+            features_from_langsplat,
+            features_to_langsplat,
+            langsplat_stems,
+        )
+        from langsplat_core.semantics.store import FeatureStore
+
+        folder = self.source
+        if len(self.sources) > 1 or not folder.is_dir():
+            raise InputError(f"{folder}: --to features reads one folder of masks and vectors of photographs")
+        with TerminalProgress() as progress:
+            if langsplat_stems(folder):
+                count = features_from_langsplat(folder, FeatureStore(self.out), progress)
+            else:
+                count = features_to_langsplat(FeatureStore(folder), self.out, progress)
+        print(f"{self.out}: masks and vectors of {count} photographs")

@@ -7,8 +7,6 @@
 Rows are global: they count on from one map to the next.
 """
 
-import math
-import re
 from pathlib import Path
 
 import numpy as np
@@ -16,17 +14,10 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import FormatError
 from langsplat_core.files import atomic_path
-from langsplat_core.formats.opening import open_for_reading
+from langsplat_core.formats.npy import read_npy
 
 MAP_COUNT = 4
 NO_MASK = -1
-HEADER_LIMIT = 10_000  # bytes; NumPy writes 118
-# What NumPy writes, to the letter. Its own reader evaluates the text as a Python literal, and on damaged
-# headers raises tokenizer errors and warnings.
-_NPY_HEADER = re.compile(
-    rb"\{'descr': '(?P<dtype>[<>|](?:[iu][1248]|f[248]))', 'fortran_order': (?P<order>True|False), "
-    rb"'shape': \((?P<shape>(?:\d{1,18}(?:, ?)?){0,8})\), ?\} *\n?$"
-)
 
 
 def read_features(folder: Path | str, stem: str) -> tuple[Array, Array]:
@@ -35,7 +26,7 @@ def read_features(folder: Path | str, stem: str) -> tuple[Array, Array]:
     Raises InputError when a file cannot be opened and FormatError when one breaks a rule.
     """
     vectors_path, maps_path = _paths(folder, stem)
-    vectors, maps = _read_npy(vectors_path), _read_npy(maps_path)
+    vectors, maps = read_npy(vectors_path), read_npy(maps_path)
     if vectors.ndim != 2 or vectors.shape[1] < 1 or vectors.dtype.kind != "f":
         raise FormatError(f"{vectors_path}: {vectors.dtype} {vectors.shape}; expected floats of shape (M, D)")
     if not np.isfinite(vectors).all():
@@ -67,26 +58,3 @@ def write_features(folder: Path | str, stem: str, vectors: Array, maps: Array) -
 
 def _paths(folder: Path | str, stem: str) -> tuple[Path, Path]:
     return Path(folder) / f"{stem}_f.npy", Path(folder) / f"{stem}_s.npy"
-
-
-def _read_npy(path: Path) -> Array:
-    """`numpy.load` without pickles that believes the header only as far as the file is long."""
-    file, size = open_for_reading(path)
-    with file:
-        prefix = file.read(8)
-        version = prefix[6] if len(prefix) == 8 and prefix.startswith(b"\x93NUMPY") else 0
-        length_size = {1: 2, 2: 4, 3: 4}.get(version, 0)
-        length = int.from_bytes(file.read(length_size), "little")
-        header = _NPY_HEADER.match(file.read(min(length, HEADER_LIMIT)))
-        if header is None:
-            raise FormatError(f"{path}: not a .npy file of plain numbers; was it made by another program?")
-        dtype = np.dtype(header["dtype"].decode())
-        shape = tuple(int(number) for number in header["shape"].split(b",") if number.strip())
-        needed = math.prod(shape) * dtype.itemsize
-        if file.tell() + needed != size:
-            raise FormatError(
-                f"{path}: truncated or damaged: shape {shape} needs {needed} bytes, "
-                f"the file has {size - file.tell()}"
-            )
-        data = np.frombuffer(file.read(), dtype)
-    return data.reshape(shape, order="F" if header["order"] == b"True" else "C")

@@ -1,5 +1,6 @@
 """`langsplat convert` to every format that is written: what of a scene arrives, what the picture loses."""
 
+import re
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -7,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, unit
+from langsplat_core.cli.app import parse
 from langsplat_core.cli.convert import Convert
+from langsplat_core.cli.run import main
 from langsplat_core.errors import FormatError
 from langsplat_core.formats import (
     companion_path,
@@ -18,10 +21,13 @@ from langsplat_core.formats import (
 )
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.semantics.encoders import load_text_encoder
+from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from tests.support.extras import random_extras
 from tests.support.file_samples import (
     random_field,
 )
+from tests.support.foreign_files import save_model, tensor
 from tests.support.measured import Measure
 from tests.support.same import assert_same_extras
 from tests.support.scenes import random_camera, random_gaussians
@@ -36,7 +42,7 @@ def full_scene(n: int = 30) -> Scene:
 
 
 def convert(source: Path, out: Path, rematch: Path | None = None) -> Scene:
-    Convert(source, out, rematch).run()
+    Convert(source, (out,), rematch).run()
     return load_scene(out)
 
 
@@ -87,7 +93,7 @@ def test_rematch_keeps_cameras_mark_and_extras(tmp_path):
     old = companion_path(tmp_path / "whole.ply", language.SUFFIX)
     # a sidecar that does not fit lies beside the edited file, as an editor that saves in place leaves it
     companion_path(tmp_path / "edited.ply", language.SUFFIX).write_bytes(old.read_bytes())
-    Convert(tmp_path / "edited.ply", tmp_path / "new.ply", rematch=old).run()
+    Convert(tmp_path / "edited.ply", (tmp_path / "new.ply",), rematch=old).run()
     got = load_scene(tmp_path / "new.ply")
     assert len(got.cameras) == 3
     np.testing.assert_allclose(got.cameras[1].world_to_camera, whole.cameras[1].world_to_camera, atol=1e-12)
@@ -108,6 +114,88 @@ def test_a_write_that_fails_leaves_the_old_scene(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space"):
         save_scene(tmp_path / "a.spz", full_scene())
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+# ---- checkpoints of other methods ----
+
+
+def run(*words: object) -> int:
+    return main("langsplat", lambda: parse(["convert", *map(str, words)]))
+
+
+@pytest.fixture
+def checkpoints(tmp_path: Path) -> list[Path]:
+    """Of Occam's LGS, three levels of vectors as long as the demo encoder's."""
+    g, rng = random_gaussians(20, sh_degree=1), np.random.default_rng(0)
+    meanings = unit(rng.normal(size=(5, load_text_encoder("demo").dim))).astype(np.float32)
+    return [
+        save_model(tmp_path / f"chkpnt_langfeat_{level}.pth", g, tensor(meanings[rng.integers(0, 5, 20)]))
+        for level in (1, 2, 3)
+    ]
+
+
+@pytest.mark.long
+def test_checkpoints_become_a_scene_and_a_scene_checkpoints(tmp_path, checkpoints, capsys):
+    assert run(*checkpoints, tmp_path / "a.ply", "--encoder", "demo", "--phrases", "apple", "red mug") == 0
+    printed = capsys.readouterr().out
+    assert "Occam's LGS: levels (by the names of files and folders): subpart from" in printed
+    assert "codec codebook of 5, encoder demo" in printed
+    assert "relevancy error of the codec: mean 0.000" in printed
+    scene = load_scene(tmp_path / "a.ply")
+    assert scene.language is not None
+    assert set(scene.language.phrasebook) == {"apple", "red mug"}
+    assert (scene.language.confidence == 1).all()
+    assert run(tmp_path / "a.ply", tmp_path / "out", "--to", "occam") == 0
+    assert len(list((tmp_path / "out").glob("chkpnt30000_langfeat_[123].pth"))) == 3
+    assert run(tmp_path / "a.ply", tmp_path / "out", "--to", "langsplat") == 2
+    assert "--to occam" in capsys.readouterr().err
+
+
+def test_a_checkpoint_of_gaussians_alone(tmp_path, capsys):
+    g = random_gaussians(20, sh_degree=3)
+    path = save_model(tmp_path / "chkpnt30000.pth", g)
+    assert run(path, tmp_path / "a.spz") == 0
+    assert "20 Gaussians, without a language field" in capsys.readouterr().out
+    assert np.abs(load_scene(tmp_path / "a.spz").gaussians.means - g.means).max() < 1e-3
+
+
+def test_a_scene_of_an_autoencoder_becomes_langsplats(tmp_path):
+    save_scene(tmp_path / "case.ply", full_scene())
+    assert run(tmp_path / "case.ply", tmp_path / "out", "--to", "langsplat") == 0
+    made = sorted(str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*.pth"))
+    assert made == ["best_ckpt.pth", *(f"case_{level}/chkpnt30000.pth" for level in (1, 2, 3))]
+
+
+def test_masks_and_vectors_both_ways(tmp_path):
+    labels = np.arange(12, dtype=np.int32).reshape(3, 2, 2)
+    store = FeatureStore(tmp_path / "features")
+    store.save("a.jpg", ImageFeatures(labels, np.eye(12, 20, dtype=np.float32)))
+    assert run(tmp_path / "features", tmp_path / "language_features", "--to", "features") == 0
+    assert run(tmp_path / "language_features", tmp_path / "back", "--to", "features") == 0
+    np.testing.assert_array_equal(FeatureStore(tmp_path / "back").load("a").labels, labels)
+    assert run(tmp_path / "nothing", tmp_path / "back", "--to", "features") == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["{0}", "{1}", "out.ply"], "of which levels|latents of LangSplat's autoencoder"),
+        (["{0}", "out.txt"], "scenes are written as"),
+        (["{0}", "out.ply", "--rematch", "x.safetensors"], "--rematch is for one scene"),
+        (["out.ply"], "name what to read"),
+        (["{0}", "{1}", "--levels", "whole"], "scenes are written as"),
+        (["missing.pth", "out.ply"], "no such file"),
+        (["{0}", "out.ply", "--levels", "whole", "--encoder", "/nowhere"], "autoencoder"),
+    ],
+)
+def test_what_cannot_be_imported_is_one_line(tmp_path, capsys, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    g = random_gaussians(20)
+    paths = [save_model(tmp_path / f"{name}.pth", g, tensor(np.ones((20, 3), np.float32))) for name in "ab"]
+    assert run(*(word.format(*paths) for word in words)) == 2
+    error = capsys.readouterr().err
+    assert re.search(message, error)
+    assert error.count("\n") == 1
 
 
 # ---- the demo scene: picture and size ----

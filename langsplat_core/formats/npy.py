@@ -1,0 +1,72 @@
+"""Files of plain NumPy arrays, .npy and .npz, read without pickles and without belief in their headers."""
+
+import io
+import math
+import re
+import zipfile
+import zlib
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import FormatError
+from langsplat_core.formats.opening import open_for_reading
+
+MAGIC = b"\x93NUMPY"
+HEADER_LIMIT = 10_000  # bytes; NumPy writes 118
+MEMBER_LIMIT = 2**31  # bytes of one array in an .npz: packed ones may be a thousand times their file
+# What NumPy writes, to the letter. Its own reader evaluates the text as a Python literal, and on damaged
+# headers raises tokenizer errors and warnings.
+_HEADER = re.compile(
+    rb"\{'descr': '(?P<dtype>[<>|](?:[iu][1248]|f[248]))', 'fortran_order': (?P<order>True|False), "
+    rb"'shape': \((?P<shape>(?:\d{1,18}(?:, ?)?){0,8})\), ?\} *\n?$"
+)
+
+
+def read_npy(path: Path) -> Array:
+    """The array of numbers in a .npy file. Raises InputError where it cannot be opened, else FormatError."""
+    file, size = open_for_reading(path)
+    with file:
+        return _parse(file, size, str(path))
+
+
+def read_npz(path: Path) -> dict[str, Array]:
+    """The arrays of numbers in an .npz file, by their names without .npy. Raises as `read_npy` does."""
+    file, _ = open_for_reading(path)
+    arrays = {}
+    try:
+        with file, zipfile.ZipFile(file) as archive:
+            for member in archive.infolist():
+                if member.file_size > MEMBER_LIMIT:
+                    raise FormatError(f"{path}: {member.filename[:60]!r} claims {member.file_size} bytes")
+                data = archive.read(member)
+                name = member.filename.removesuffix(".npy")
+                arrays[name] = _parse(io.BytesIO(data), len(data), f"{path}: {name[:60]!r}")
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError) as error:
+        raise FormatError(f"{path}: not a whole .npz file ({str(error)[:80]})") from None
+    except (NotImplementedError, RuntimeError) as error:  # another compression; a password
+        raise FormatError(f"{path}: an .npz file of another kind ({str(error)[:80]})") from None
+    return arrays
+
+
+def _parse(file: BinaryIO, size: int, name: str) -> Array:
+    """`numpy.load` that believes the header only as far as `size` bytes of `file` go; `name` for messages."""
+    prefix = file.read(8)
+    version = prefix[6] if len(prefix) == 8 and prefix.startswith(MAGIC) else 0
+    length_size = {1: 2, 2: 4, 3: 4}.get(version, 0)
+    length = int.from_bytes(file.read(length_size), "little")
+    header = _HEADER.match(file.read(min(length, HEADER_LIMIT)))
+    if header is None:
+        raise FormatError(f"{name}: not a .npy file of plain numbers; was it made by another program?")
+    dtype = np.dtype(header["dtype"].decode())
+    shape = tuple(int(number) for number in header["shape"].split(b",") if number.strip())
+    needed = math.prod(shape) * dtype.itemsize
+    if file.tell() + needed != size:
+        raise FormatError(
+            f"{name}: truncated or damaged: shape {shape} needs {needed} bytes, "
+            f"the file has {size - file.tell()}"
+        )
+    data = np.frombuffer(file.read(), dtype)
+    return data.reshape(shape, order="F" if header["order"] == b"True" else "C")
