@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
     from langsplat_core.raster.render import Rendering, render
     from langsplat_core.scene import Camera, Gaussians, Intrinsics, LanguageField, Scene, look_at
-    from langsplat_core.semantics.clip import load_text_encoder
+    from langsplat_core.semantics.encoders import load_text_encoder
 
 __version__ = "0.1.0"
 
@@ -25,7 +25,7 @@ _HOMES = {
     "Rendering": "langsplat_core.raster.render",
     "load_rasterizer": "langsplat_core.raster",
     "load_lifting_rasterizer": "langsplat_core.raster",
-    "load_text_encoder": "langsplat_core.semantics.clip",
+    "load_text_encoder": "langsplat_core.semantics.encoders",
     "QueryEngine": "langsplat_core.query.engine",
     "QueryResult": "langsplat_core.query.engine",
     "train_scene": "langsplat_core.pipeline.train",

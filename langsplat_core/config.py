@@ -71,7 +71,11 @@ class MaskConfig:
     """Where masks come from and which are kept (paper section 3.1 and the method's public code)."""
 
     source: Literal["auto", "sam", "graph"] = "auto"  # auto: sam when `sam` names weights, else graph
-    sam: str = ""  # hub id or folder of SAM weights, e.g. facebook/sam-vit-huge
+    # hub id or folder of SAM, SAM 2 or SAM-HQ weights, e.g. facebook/sam-vit-huge
+    sam: str = ""
+    # layers of crops that SAM sees beside the whole picture, 2 x 2 in the first: 0 as the paper's text,
+    # 1 as its code, which takes five times as long
+    crop_layers: int = 0
     points_per_side: int = 32
     points_per_batch: int = 64
     predicted_iou: float = 0.7
@@ -86,7 +90,7 @@ class MaskConfig:
 
 @dataclass(frozen=True)
 class ClipConfig:
-    """The vision-language encoder."""
+    """The vision-language encoder: CLIP, SigLIP, SigLIP 2 or TIPS v2."""
 
     model: str = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"  # hub id, folder, or "demo" for the bundled one
     batch: int = 32
@@ -95,11 +99,13 @@ class ClipConfig:
 
 @dataclass(frozen=True)
 class CodecConfig:
-    """Compression of CLIP vectors to latents (paper section 3.2)."""
+    """How a Gaussian keeps a CLIP vector: by the number of a codeword, or as latents (paper section 3.2)."""
 
-    kind: Literal["autoencoder", "linear"] = "autoencoder"
-    latent_dim: int = 3
-    steps: int = 4_000
+    kind: Literal["codebook", "autoencoder", "linear"] = "codebook"
+    size: int = 0  # codewords of a codebook; 0: as many as `max_relevancy_error` asks for
+    max_relevancy_error: float = 0.005  # mean over the scene's vectors and a few hundred phrases
+    latent_dim: int = 3  # numbers that the other kinds keep
+    steps: int = 4_000  # of the autoencoder's training, as are the following
     batch: int = 256
     lr: float = 7e-4
     seed: int = 0

@@ -13,7 +13,7 @@ from langsplat_core.formats.cameras_json import read_cameras
 from langsplat_core.formats.sog import META_NAME
 from langsplat_core.query.engine import NO_FIELD
 from langsplat_core.scene import LEVELS, Camera, Scene
-from langsplat_core.semantics.clip import load_text_encoder
+from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_viewer.viewer import Services
 
 DisplayChoice = Literal["auto", Display]

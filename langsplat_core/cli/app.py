@@ -5,6 +5,7 @@ import sys
 from tyro.extras import SubcommandApp
 
 from langsplat_core.cli.bench import BenchRaster
+from langsplat_core.cli.bench_lift import BenchLift
 from langsplat_core.cli.bench_load import BenchLoad
 from langsplat_core.cli.bench_steps import BenchSteps
 from langsplat_core.cli.compact import Compact
@@ -25,6 +26,7 @@ def parse(args: list[str]) -> Command:
     demo.command(name="sheet")(DemoSheet)
     evaluate.command(name="synthetic")(EvalSynthetic)
     bench.command(name="raster")(BenchRaster)
+    bench.command(name="lift")(BenchLift)
     bench.command(name="load")(BenchLoad)
     bench.command(name="steps")(BenchSteps)
     app = SubcommandApp()

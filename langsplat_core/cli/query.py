@@ -17,7 +17,7 @@ from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.places import peak_pixel
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import LEVELS, Camera, Scene
-from langsplat_core.semantics.clip import load_text_encoder
+from langsplat_core.semantics.encoders import load_text_encoder
 
 PAPER_FILTER = 20  # px, mean filter before the peak is taken (paper, implementation details)
 

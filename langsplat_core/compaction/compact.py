@@ -36,7 +36,7 @@ from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.raster.protocol import Rasterizer
 from langsplat_core.scene import Scene
 from langsplat_core.scene.phrases import phrase_key
-from langsplat_core.semantics.clip import load_text_encoder
+from langsplat_core.semantics.encoders import load_text_encoder
 
 PHRASES = 8  # at most, of the phrasebook, asked before and after
 

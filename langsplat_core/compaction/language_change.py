@@ -9,6 +9,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.compose import gated_mean
+from langsplat_core.display.latent_colours import latent_colours
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, QueryResult
 from langsplat_core.raster.protocol import Rasterizer
 from langsplat_core.scene import Camera, LanguageField, Scene
@@ -76,8 +77,10 @@ def language_change(
 
 
 def _channels(field: LanguageField, results: Sequence[QueryResult]) -> Array:
-    """(N, 3 d + 3 Q) float32: the latents of every level, then the relevancies of every phrase."""
-    parts = [*field.latents, *(result.relevancy.T for result in results)]
+    """(N, 3 c + 3 Q) float32: the latents of every level (the colours of codewords, whose numbers cannot be
+    blended), then the relevancies of every phrase."""
+    latents = latent_colours(field) if field.codec.space == "index" else field.latents
+    parts = [*latents, *(result.relevancy.T for result in results)]
     return np.concatenate(parts, axis=1).astype(np.float32)
 
 

@@ -1,52 +1,59 @@
 """The language field of a scene: `scene.langsplat.safetensors` beside `scene.ply`.
 
 A safetensors file (an 8-byte length, a JSON header, raw little-endian tensors: nothing in it is ever
-executed). Version 1, for N Gaussians, latents of d numbers, CLIP vectors of D numbers and P phrases:
+executed). Version 2, for N Gaussians, CLIP vectors of D numbers and P phrases:
 
     tensor           type     shape      meaning
-    latents          float32  (3, N, d)  of subpart, part, whole; zero where never observed
-    confidence       float32  (3, N)     total blending weight of the observations, >= 0
-    means            float32  (N, 3)     positions of the Gaussians that the field belongs to
-    canonical        float32  (4, D)     unit text vectors of "object", "things", "stuff", "texture"
-    phrasebook       float32  (P, D)     unit text vectors of `phrases`; absent when P = 0
-    codec.*          float32             weights: codec.basis (d, D) of a linear codec; of an autoencoder
-                                         codec.{encoder,decoder}.{layer}.{weight,bias}
+    codes            uint16   (3, N)     number of the codeword at subpart, part, whole: of a codebook
+    latents          float    (3, N, d)  instead, of another codec; zero where never observed
+    confidence       float    (3, N)     total blending weight of the observations, >= 0; 0 for no meaning
+    positions        uint64   (N,)       of the Gaussians that the field belongs to, see `packed_positions`
+    corners          float32  (2, 3)     of the box of these positions
+    canonical        float    (4, D)     unit text vectors of "object", "things", "stuff", "texture"
+    phrasebook       float    (P, D)     unit text vectors of `phrases`; absent when P = 0
+    codec.*          float               of a codebook vectors (K, D) and colours (K, 3); basis (d, D) of a
+                                         linear codec; of an autoencoder
+                                         {encoder,decoder}.{layer}.{weight,bias}
 
     metadata         value
     format           "langsplat"
-    version          "1"
+    version          "2"
     encoder          hub id or folder of the text encoder
     levels           "subpart,part,whole"
-    codec            "autoencoder" or "linear"
+    codec            "codebook", "autoencoder" or "linear"
     d                latent dimension, decimal
     gaussians        N, decimal
     means_blake2b    BLAKE2b-128 of the means of the PLY, as float32 little endian, hexadecimal
     phrases          JSON list of the P phrases
+    temperature      of the softmax that reads this encoder's cosines, decimal
+    found            relevancy from which a phrase counts as present, decimal
 
-The PLY stays a plain file that other programs edit; the checksum notices it. The means are stored so that
-`rematch_language` can carry the field over to an edited PLY. Everything is float32, 24 + 12 d bytes per
-Gaussian beside 248 in the PLY: a saved scene answers exactly like the one in memory. (Float16 latents
-would save 6 d of them and tilt a unit latent by up to 0.02 degrees.)
+"float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
+like the one in memory. With a codebook as `langsplat train` makes it that is 20 bytes per Gaussian, 6 of
+them codes.
+
+The PLY stays a plain file that other programs edit; the checksum notices it, and the positions let
+`rematch_language` carry the field over to an edited PLY. Version 1 is read too: everything float32, `means`
+(N, 3) in place of positions and corners, no temperature and no found.
 """
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import FormatError
 from langsplat_core.files import atomic_path
-from langsplat_core.formats.opening import open_for_reading, parse_json
-from langsplat_core.scene import LEVELS, LanguageField, codec_from_tensors
+from langsplat_core.formats.language_tensors import CODEC, FORMAT, VERSION, Stored, read_stored
+from langsplat_core.formats.packed_positions import pack_positions
+from langsplat_core.scene import LEVELS, LanguageField
 
-FORMAT, VERSION = "langsplat", "1"
 SUFFIX = ".langsplat.safetensors"
-_CODEC = "codec."
 
 
 def means_checksum(means: Array) -> str:
@@ -58,15 +65,19 @@ def means_checksum(means: Array) -> str:
 def write_language(path: Path | str, field: LanguageField, means: Array) -> None:
     """Write `field` for the Gaussians at `means` (N, 3), atomically."""
     check_array("means", means, (len(field), 3), dtype=np.float32)
-    tensors = {
-        "latents": field.latents,
+    positions, corners = pack_positions(means)
+    indexed = field.codec.space == "index"
+    floats = {
         "confidence": field.confidence,
-        "means": means,
         "canonical": field.canonical,
-        **{_CODEC + name: tensor for name, tensor in field.codec.tensors().items()},
+        **({} if indexed else {"latents": field.latents}),
+        **({"phrasebook": np.stack(list(field.phrasebook.values()))} if field.phrasebook else {}),
+        **{CODEC + name: tensor for name, tensor in field.codec.tensors().items()},
     }
-    if field.phrasebook:
-        tensors["phrasebook"] = np.stack(list(field.phrasebook.values()))
+    tensors = {name: _narrow(tensor) for name, tensor in floats.items()}
+    tensors |= {"positions": positions, "corners": corners}
+    if indexed:
+        tensors["codes"] = field.latents[..., 0]
     metadata = {
         "format": FORMAT,
         "version": VERSION,
@@ -77,9 +88,18 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
         "gaussians": str(len(field)),
         "means_blake2b": means_checksum(means),
         "phrases": json.dumps(list(field.phrasebook), ensure_ascii=False),
+        "temperature": repr(field.reading.temperature),
+        "found": repr(field.reading.found),
     }
     with atomic_path(path) as temporary:
         save_file({name: np.ascontiguousarray(t) for name, t in tensors.items()}, temporary, metadata)
+
+
+def _narrow(tensor: Array) -> Array:
+    """As float16 where that loses nothing."""
+    with np.errstate(over="ignore"):
+        half = tensor.astype(np.float16)
+    return half if np.array_equal(half.astype(np.float32), tensor) else tensor
 
 
 def read_language(path: Path | str, means: Array) -> LanguageField:
@@ -89,13 +109,13 @@ def read_language(path: Path | str, means: Array) -> LanguageField:
     made for other Gaussians.
     """
     path = Path(path)
-    field, made_for, checksum = _read(path)
+    stored = read_stored(path)
     mend = f"; if the PLY was edited, run 'langsplat convert EDITED.ply NEW.ply --rematch {path}'"
-    if len(made_for) != len(means):
-        raise FormatError(f"{path}: made for {len(made_for)} Gaussians, the scene has {len(means)}{mend}")
-    if checksum != means_checksum(means):
+    if len(stored.field) != len(means):
+        raise FormatError(f"{path}: made for {len(stored.field)} Gaussians, the scene has {len(means)}{mend}")
+    if stored.checksum != means_checksum(means):
         raise FormatError(f"{path}: made for Gaussians at other positions than the scene's{mend}")
-    return field
+    return stored.field
 
 
 def rematch_language(
@@ -109,22 +129,21 @@ def rematch_language(
     """
     from scipy.spatial import cKDTree  # 0.2 s to import, and only this function needs it
 
-    field, old_means, _ = _read(Path(sidecar))
+    stored: Stored = read_stored(Path(sidecar))
+    field, old_means = stored.field, stored.means
     old_rows = np.flatnonzero(np.isfinite(old_means).all(1))
     new_rows = np.flatnonzero(np.isfinite(new_means).all(1))
-    latents = np.zeros((len(LEVELS), len(new_means), field.latents.shape[2]), np.float32)
+    latents = np.zeros((len(LEVELS), len(new_means), field.latents.shape[2]), field.latents.dtype)
     confidence = np.zeros((len(LEVELS), len(new_means)), np.float32)
     if len(old_rows) and len(new_rows):
         tree = cKDTree(old_means[old_rows])
         if max_distance is None:
             max_distance = _median_spacing(tree)
         distance, partner = tree.query(new_means[new_rows])
-        found = distance <= max_distance
+        found = distance <= max_distance + stored.precision
         to, source = new_rows[found], old_rows[partner[found]]
         latents[:, to], confidence[:, to] = field.latents[:, source], field.confidence[:, source]
-    return LanguageField(
-        latents, confidence, field.codec, field.canonical, field.encoder_id, field.phrasebook
-    )
+    return replace(field, latents=latents, confidence=confidence)
 
 
 def _median_spacing(tree: Any) -> float:
@@ -132,79 +151,3 @@ def _median_spacing(tree: Any) -> float:
     sample = tree.data[:: max(1, len(tree.data) // 10_000)]
     distances = tree.query(sample, k=2)[0][:, 1]  # infinite where there is no second point
     return float(np.median(np.where(np.isfinite(distances), distances, 0)))
-
-
-def _read(path: Path) -> tuple[LanguageField, Array, str]:
-    """The field, the (N, 3) means it was made for and the checksum of the PLY's."""
-    open_for_reading(path)[0].close()  # the same messages for a missing file as everywhere
-    try:
-        with safe_open(path, framework="numpy") as file:
-            metadata = file.metadata() or {}
-            _check_metadata(metadata, path)
-            tensors = {}
-            for name in file.keys():  # noqa: SIM118 (not a dictionary)
-                kind = file.get_slice(name).get_dtype()
-                if kind != "F32":
-                    raise FormatError(f"{path}: tensor {name!r} is {kind}; expected F32")
-                tensors[name] = file.get_tensor(name)
-    except SafetensorError as error:
-        raise FormatError(f"{path}: not a whole safetensors file ({error})") from None
-    return _assemble(tensors, metadata, path)
-
-
-def _check_metadata(metadata: dict[str, str], path: Path) -> None:
-    if metadata.get("format") != FORMAT:
-        raise FormatError(f"{path}: a safetensors file, but not a language field of this program")
-    if metadata.get("version") != VERSION:
-        raise FormatError(
-            f"{path}: language format version {metadata.get('version')!r}; this program reads {VERSION!r}, "
-            "update it"
-        )
-    for key in ("encoder", "levels", "codec", "d", "gaussians", "means_blake2b", "phrases"):
-        if key not in metadata:
-            raise FormatError(f"{path}: the header has no {key!r}")
-    if metadata["levels"] != ",".join(LEVELS):
-        raise FormatError(f"{path}: levels {metadata['levels'][:60]!r}; expected {','.join(LEVELS)!r}")
-
-
-def _assemble(
-    tensors: dict[str, Array], metadata: dict[str, str], path: Path
-) -> tuple[LanguageField, Array, str]:
-    for name in ("latents", "confidence", "means", "canonical"):
-        if name not in tensors:
-            raise FormatError(f"{path}: tensor {name!r} is missing")
-    means, phrases = tensors["means"], _phrases(metadata, path)
-    weights = {name.removeprefix(_CODEC): t for name, t in tensors.items() if name.startswith(_CODEC)}
-    try:
-        codec = codec_from_tensors(metadata["codec"], weights)
-        dims = check_array("means", means, ("N", 3))
-        dims = check_array("latents", tensors["latents"], (len(LEVELS), "N", codec.latent_dim), dims)
-        vectors = tensors.get("phrasebook", np.zeros((0, codec.vector_dim), np.float32))
-        check_array("phrasebook", vectors, (len(phrases), codec.vector_dim))
-        field = LanguageField(
-            tensors["latents"],
-            tensors["confidence"],
-            codec,
-            tensors["canonical"],
-            metadata["encoder"],
-            dict(zip(phrases, vectors, strict=True)),
-        )
-    except (ValueError, TypeError, IndexError) as error:
-        raise FormatError(f"{path}: {error}") from None
-    if (metadata["d"], metadata["gaussians"]) != (str(codec.latent_dim), str(len(field))):
-        raise FormatError(f"{path}: the header's d or number of Gaussians is not that of the tensors")
-    for name, tensor in tensors.items():
-        if name != "means" and not np.isfinite(tensor).all():
-            raise FormatError(f"{path}: tensor {name!r} holds numbers that are not finite")
-    if (field.confidence < 0).any():
-        raise FormatError(f"{path}: tensor 'confidence' holds negative numbers")
-    return field, means, metadata["means_blake2b"]
-
-
-def _phrases(metadata: dict[str, str], path: Path) -> list[str]:
-    phrases = parse_json(metadata["phrases"].encode(), path)
-    if not isinstance(phrases, list) or not all(isinstance(phrase, str) for phrase in phrases):
-        raise FormatError(f"{path}: the header's 'phrases' are not a list of texts")
-    if len(set(phrases)) != len(phrases):
-        raise FormatError(f"{path}: the header's 'phrases' name one phrase twice")
-    return phrases

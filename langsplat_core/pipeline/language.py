@@ -1,70 +1,94 @@
-"""From masks with vectors to a language field: memberships, codec, latents, each kept in the work folder."""
+"""From masks with vectors to a language field: memberships, groups of masks, codec, latents.
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
-from functools import cache
+Each is kept in the work folder. Memberships are kept view by view and latents block by block, so that an
+interrupted run, or one that is shared by several processes, repeats little, and so that what is held in
+memory depends on a block of Gaussians and not on all of them times all photographs.
+"""
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from scipy import sparse
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LiftConfig, TrainConfig
 from langsplat_core.errors import InputError
-from langsplat_core.pipeline.stages import Arrays, features_digest, gaussians_digest, kept, stage_key
+from langsplat_core.pipeline.crew import Crew
+from langsplat_core.pipeline.stages import (
+    Arrays,
+    features_digest,
+    gaussians_digest,
+    kept,
+    kept_array,
+    open_array,
+    read_arrays,
+    stage_key,
+)
 from langsplat_core.progress import Progress
 from langsplat_core.raster import LiftingRasterizer, load_lifting_rasterizer
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
+    LEVELS,
     Camera,
     Codec,
     Gaussians,
     LanguageField,
+    Reading,
     codec_from_tensors,
 )
+from langsplat_core.scene.codec import latent_dtype
 from langsplat_core.scene.phrases import phrase_key
-from langsplat_core.semantics.clip import ClipEncoder
+from langsplat_core.semantics.encoder import Encoder
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.codec_fit import fit_codec, reconstruction_cosine
+from langsplat_core.training.language.codec_fit import fit_codec
 from langsplat_core.training.language.gradient_lift import lift_by_gradient
-from langsplat_core.training.language.lift import Memberships, find_memberships, lift_latents, lift_vectors
+from langsplat_core.training.language.latent_lift import lift_latents
+from langsplat_core.training.language.lift import Lifted, lift_block, lift_sample
+from langsplat_core.training.language.mask_groups import MaskGroups, group_masks
+from langsplat_core.training.language.memberships import Memberships, view_pairs
+from langsplat_core.training.language.relevancy_error import CodecReport, codec_report, everyday_vocabulary
 
-Views = list[tuple[Camera, ImageFeatures]]
-Lifted = list[tuple[Array, Array]]  # per level: (N, D) float16 unit vectors, (N,) float32 confidence
-Latents = tuple[Array, Array]  # (3, N, d) and (3, N) float32
-CODEC_SAMPLE = 20_000  # lifted vectors that the codec is fitted to beside the masks' own
+Views = Sequence[tuple[Camera, ImageFeatures]]  # read when needed: they may be more than memory holds
+Latents = tuple[Array, Array]  # (3, N, d) of the codec's type, (3, N) float32
+FITTED, JUDGED = 12_000, 2_000  # Gaussians whose lifted vectors a codec is fitted to, and judged on
+MOST_CONFIDENCE = 65_504.0  # pixels; the largest number that float16 holds
 
 
 def language_field(
     gaussians: Gaussians,
     views: Views,
-    encoder: ClipEncoder,
+    encoder: Encoder,
     config: TrainConfig,
     work: Path,
     progress: Progress,
-) -> tuple[LanguageField, float]:
-    """The language field of the views' mask vectors, and the codec's mean cosine on these.
+    crew: Crew | None = None,
+) -> tuple[LanguageField, CodecReport]:
+    """The language field of the views' mask vectors, and what its codec loses.
 
-    Raises InputError where no view has a mask.
+    Raises InputError where no view has a mask, and for a codebook whose numbers the lifting would average.
     """
-    mask_vectors = np.concatenate([features.vectors for _, features in views])
-    if len(mask_vectors) == 0:
+    if config.codec.kind == "codebook" and config.lift.mode in LATENT_LIFTS:
         raise InputError(
-            "no masks were found in any photograph; try --masks.source graph, or larger photographs"
+            f"--lift.mode {config.lift.mode} averages latents, and a codebook's are numbers of codewords; "
+            "add --codec.kind autoencoder"
         )
-    stages = _Stages(gaussians, views, mask_vectors, config, work, progress)
-    codec = stages.codec()
+    stages = _Stages(gaussians, views, encoder, config, work, crew or Crew(), progress)
+    codec, report = stages.codec()
     latents, confidence = stages.latents(codec)
     field = LanguageField(
         latents=latents,
-        confidence=confidence,
+        confidence=confidence.clip(max=MOST_CONFIDENCE).astype(np.float16).astype(np.float32),
         codec=codec,
         canonical=encoder.encode_texts(list(CANONICAL_PHRASES)),
         encoder_id=encoder.id,
         phrasebook=_phrasebook(encoder, config.phrases),
+        reading=Reading(encoder.temperature),
     )
-    return field, reconstruction_cosine(codec, mask_vectors)
+    return field, report
 
 
 class _Stages:
@@ -74,69 +98,121 @@ class _Stages:
         self,
         gaussians: Gaussians,
         views: Views,
-        mask_vectors: Array,
+        encoder: Encoder,
         config: TrainConfig,
         work: Path,
+        crew: Crew,
         progress: Progress,
     ) -> None:
-        self._gaussians, self._views, self._mask_vectors = gaussians, views, mask_vectors
-        self._config, self._work, self._progress = config, work, progress
+        self._gaussians, self._views, self._encoder = gaussians, views, encoder
+        self._config, self._work, self._crew, self._progress = config, work, crew, progress
         self._lift = _what_matters(config.lift)
-        self._inputs = (gaussians_digest(gaussians), features_digest([features for _, features in views]))
-        self._lifted = cache(self._lift_vectors)
+        self._robust = self._lift.mode == "median"
+        self._vectors, digests = [], []
+        for _, features in views:
+            self._vectors.append(features.vectors)
+            digests.append(features_digest([features]))
+        if sum(map(len, self._vectors)) == 0:
+            raise InputError(
+                "no masks were found in any photograph; try --masks.source graph, or larger photographs"
+            )
+        self._inputs = (gaussians_digest(gaussians), digests)
+        self._made: tuple[Memberships, MaskGroups] | None = None
 
-    def codec(self) -> Codec:
-        """Fitted to the masks' vectors and, unless latents are averaged themselves, to lifted ones."""
+    def codec(self) -> tuple[Codec, CodecReport]:
+        """Fitted to lifted vectors and, unless it is a codebook, to the masks' own; to these alone where
+        latents are averaged themselves."""
         fitted_to = "masks" if self._lift.mode in LATENT_LIFTS else self._lift.mode
-        key = stage_key("codec", 1, *self._inputs, fitted_to, self._config.codec)
-        return kept(self._work / f"{key}.npz", self._fit, _pack_codec, _unpack_codec)
+        path = self._work / f"{stage_key('codec', 2, *self._inputs, fitted_to, self._config.codec)}.npz"
+        if self._lift.mode not in LATENT_LIFTS and not path.exists():
+            self._memberships()  # everyone's work, unlike the fit
+        return self._crew.once(lambda: kept(path, self._fit, _pack_codec, _unpack_codec))
 
     def latents(self, codec: Codec) -> Latents:
         """Of every Gaussian at every level, and the confidence in them."""
-        key = stage_key("latents", 1, *self._inputs, self._lift, self._config.codec)
-        return kept(
-            self._work / f"{key}.npz",
-            lambda: self._lift_latents(codec),
-            lambda made: {"latents": made[0], "confidence": made[1]},
-            lambda arrays: (arrays["latents"], arrays["confidence"]),
-        )
+        blocks = self._work / stage_key("latents", 2, *self._inputs, self._lift, self._config.codec)
+        done = blocks.with_name(f"{blocks.name}.npz")
+        if self._lift.mode not in LATENT_LIFTS and not done.exists():
+            self._lift_blocks(codec, blocks)
+            self._crew.meet()
+        made = self._crew.once(lambda: kept(done, lambda: self._all_latents(codec, blocks), _pack, _unpack))
+        if self._crew.leads:
+            shutil.rmtree(blocks, ignore_errors=True)
+        return made
 
-    def _fit(self) -> Codec:
-        config = self._config.codec
+    def _fit(self) -> tuple[Codec, CodecReport]:
+        config, vocabulary = self._config.codec, everyday_vocabulary(self._encoder, self._config.phrases)
+        masks = np.concatenate(self._vectors)
         if self._lift.mode in LATENT_LIFTS:
-            return fit_codec(self._mask_vectors, config, self._progress)
-        return fit_codec(_codec_data(self._mask_vectors, self._lifted(), config.seed), config, self._progress)
+            codec = fit_codec(masks, config, vocabulary, self._progress)
+            return codec, codec_report(codec, masks, vocabulary)
+        fitted, judged = self._lifted_samples()
+        data = fitted if config.kind == "codebook" and len(fitted) else np.concatenate([masks, fitted])
+        codec = fit_codec(data, config, vocabulary, self._progress)
+        return codec, codec_report(codec, judged if len(judged) else masks, vocabulary)
 
-    def _lift_latents(self, codec: Codec) -> Latents:
+    def _lifted_samples(self) -> tuple[Array, Array]:
+        """(M, D) float32 vectors of Gaussians that a codec is fitted to, and of others that judge it."""
+        memberships, groups = self._memberships()
+        order = np.random.default_rng(self._config.codec.seed).permutation(len(self._gaussians))
+        samples = []
+        for rows in (order[:FITTED], order[FITTED : FITTED + JUDGED]):
+            lifted = lift_sample(memberships, groups, np.sort(rows), self._robust, self._progress)
+            samples.append(lifted.vectors[lifted.confidence > 0])
+        return samples[0], samples[1]
+
+    def _lift_blocks(self, codec: Codec, folder: Path) -> None:
+        """This process's share of the blocks of Gaussians, each in a file."""
+        memberships, groups = self._memberships()
+
+        def lift(number: int) -> Latents:
+            return _encoded(codec, lift_block(memberships, groups, number, self._robust))
+
+        for number in self._crew.share(range(len(memberships.blocks))):
+            kept(_numbered(folder, number), partial(lift, number), _pack, _unpack)
+            self._progress("averaging mask vectors", (number + 1) / len(memberships.blocks))
+
+    def _all_latents(self, codec: Codec, folder: Path) -> Latents:
         if self._lift.mode in LATENT_LIFTS:
             lift = LATENT_LIFTS[self._lift.mode]
             scene = (self._rasterizer(), self._gaussians, self._views, codec)
             return lift(*scene, config=self._config.lift, progress=self._progress)
-        lifted = self._lifted()
-        latents = np.stack([_encode(codec, vectors, weight) for vectors, weight in lifted])
-        return latents, np.stack([weight for _, weight in lifted])
+        shape = (len(LEVELS), len(self._gaussians), codec.latent_dim)
+        latents, confidence = np.zeros(shape, latent_dtype(codec)), np.zeros(shape[:2], np.float32)
+        for number, (first, last) in enumerate(self._memberships()[0].blocks):
+            latents[:, first:last], confidence[:, first:last] = _unpack(
+                read_arrays(_numbered(folder, number))
+            )
+        return latents, confidence
 
-    def _lift_vectors(self) -> Lifted:
-        """Half precision because three levels of 512 numbers for a million Gaussians are 3 GB even so; its
-        error, 5e-4, is far below a mask's."""
-        key = stage_key("memberships", 1, *self._inputs)
-        memberships = kept(
-            self._work / f"{key}.npz", self._find_memberships, _pack_memberships, _unpack_memberships
-        )
-        levels = []
-        for vectors, confidence in lift_vectors(memberships, robust=self._lift.mode == "median"):
-            levels.append((vectors.astype(np.float16), confidence))
-            self._progress("averaging mask vectors", len(levels) / 3)
-        return levels
+    def _memberships(self) -> tuple[Memberships, MaskGroups]:
+        """Pairs of every view, in files that are read where they are needed, and the groups of the masks."""
+        if self._made is None:
+            folder = self._work / stage_key("memberships", 2, *self._inputs)
+            files = [folder / f"{index:05d}.npy" for index in range(len(self._views))]
+            rasterizer = self._rasterizer()
+            for index in self._crew.share(range(len(self._views))):
+                kept_array(files[index], partial(self._pairs, rasterizer, index))
+                self._progress("lifting masks onto the Gaussians", (index + 1) / len(self._views))
+            self._crew.meet()
+            pairs = [open_array(path) for path in files]
+            groups = self._crew.once(lambda: self._groups(folder / "groups.npz"))
+            self._made = Memberships(pairs, len(self._gaussians)), groups
+        return self._made
 
-    def _find_memberships(self) -> Memberships:
-        chunk = self._config.lift.chunk
-        return find_memberships(
-            self._rasterizer(), self._gaussians, self._views, chunk, progress=self._progress
-        )
+    def _groups(self, path: Path) -> MaskGroups:
+        return kept(path, lambda: group_masks(self._vectors), _pack_groups, self._unpack_groups)
+
+    def _pairs(self, rasterizer: LiftingRasterizer, index: int) -> Array:
+        camera, features = self._views[index]
+        return view_pairs(rasterizer, self._gaussians, camera, features, self._config.lift.chunk)
 
     def _rasterizer(self) -> LiftingRasterizer:
         return load_lifting_rasterizer(self._config.lift.backend)
+
+    def _unpack_groups(self, arrays: Arrays) -> MaskGroups:
+        edges = np.cumsum([len(view) for view in self._vectors])[:-1]
+        return MaskGroups(tuple(np.split(arrays["of_mask"], edges)), arrays["vectors"])
 
 
 def _what_matters(config: LiftConfig) -> LiftConfig:
@@ -163,46 +239,43 @@ LATENT_LIFTS: Mapping[str, Callable[..., Latents]] = MappingProxyType(
 )
 
 
-def _pack_codec(codec: Codec) -> Arrays:
-    return {"kind": np.array(codec.kind), **codec.tensors()}
+def _encoded(codec: Codec, lifted: Lifted) -> Latents:
+    """(3, n, d) latents, zero where unobserved, and (3, n) confidence."""
+    levels, count, dim = lifted.vectors.shape
+    latents = codec.encode(lifted.vectors.reshape(-1, dim)).reshape(levels, count, -1)
+    return np.where(lifted.confidence[..., None] > 0, latents, 0).astype(latents.dtype), lifted.confidence
 
 
-def _unpack_codec(arrays: Arrays) -> Codec:
-    return codec_from_tensors(str(arrays["kind"]), {k: v for k, v in arrays.items() if k != "kind"})
+def _numbered(folder: Path, number: int) -> Path:
+    return folder / f"{number:05d}.npz"
 
 
-def _pack_memberships(members: Memberships) -> Arrays:
-    weights = members.weights
-    pairs = {"data": weights.data, "indices": weights.indices, "indptr": weights.indptr}
-    return {**pairs, "levels": members.levels, "vectors": members.vectors}
+def _pack(latents: Latents) -> Arrays:
+    return {"latents": latents[0], "confidence": latents[1]}
 
 
-def _unpack_memberships(arrays: Arrays) -> Memberships:
-    shape = (len(arrays["indptr"]) - 1, len(arrays["levels"]))
-    weights = sparse.csr_matrix((arrays["data"], arrays["indices"], arrays["indptr"]), shape=shape)
-    return Memberships(weights, arrays["levels"], arrays["vectors"])
+def _unpack(arrays: Arrays) -> Latents:
+    return arrays["latents"], arrays["confidence"]
 
 
-def _phrasebook(encoder: ClipEncoder, phrases: tuple[str, ...]) -> dict[str, Array]:
+def _pack_groups(groups: MaskGroups) -> Arrays:
+    return {"of_mask": np.concatenate(groups.of_mask), "vectors": groups.vectors}
+
+
+def _pack_codec(made: tuple[Codec, CodecReport]) -> Arrays:
+    codec, report = made
+    return {
+        "kind": np.array(codec.kind),
+        "report": np.array(list(asdict(report).values())),
+        **codec.tensors(),
+    }
+
+
+def _unpack_codec(arrays: Arrays) -> tuple[Codec, CodecReport]:
+    tensors = {name: array for name, array in arrays.items() if name not in ("kind", "report")}
+    return codec_from_tensors(str(arrays["kind"]), tensors), CodecReport(*arrays["report"].tolist())
+
+
+def _phrasebook(encoder: Encoder, phrases: tuple[str, ...]) -> dict[str, Array]:
     names = [phrase_key(phrase) for phrase in phrases]
     return dict(zip(names, encoder.encode_texts(names), strict=True))
-
-
-def _codec_data(mask_vectors: Array, lifted: Lifted, seed: int) -> Array:
-    """Mask vectors, and as many lifted ones again as `CODEC_SAMPLE` allows: those are what it encodes."""
-    generator = np.random.default_rng(seed)
-    samples = [mask_vectors]
-    for vectors, confidence in lifted:
-        seen = np.flatnonzero(confidence > 0)
-        rows = generator.permutation(seen)[: CODEC_SAMPLE // len(lifted)]
-        samples.append(vectors[rows].astype(np.float32))
-    return np.concatenate(samples)
-
-
-def _encode(codec: Codec, vectors: Array, confidence: Array, chunk: int = 65_536) -> Array:
-    """(N, D) -> (N, d) latents, zero where unobserved."""
-    latents = np.zeros((len(vectors), codec.latent_dim), np.float32)
-    for start in range(0, len(vectors), chunk):
-        part = slice(start, start + chunk)
-        latents[part] = codec.encode(vectors[part].astype(np.float32))
-    return np.where(confidence[:, None] > 0, latents, 0).astype(np.float32)

@@ -43,6 +43,25 @@ def kept(path: Path, make: Callable[[], T], pack: Callable[[T], Arrays], unpack:
     return result
 
 
+def kept_array(path: Path, make: Callable[[], Array]) -> None:
+    """See to it that `path` (*.npy) holds what `make` gives, which is not called where the file is there."""
+    if not path.exists():
+        array = make()
+        with atomic_path(path) as temporary:
+            np.save(temporary, array, allow_pickle=False)
+
+
+def open_array(path: Path) -> Array:
+    """The array in `path` (*.npy), read where it is looked at; FormatError for a damaged file."""
+    try:
+        try:
+            return np.load(path, mmap_mode="r", allow_pickle=False)
+        except ValueError:  # an array without elements cannot be mapped
+            return np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise FormatError(f"{path}: damaged ({error}); delete it and run again") from None
+
+
 def read_arrays(path: Path) -> dict[str, Array]:
     """The arrays of an .npz file; FormatError for a damaged one."""
     try:

@@ -8,7 +8,7 @@ import json
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,15 +19,19 @@ from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
 from langsplat_core.formats import read_ply, save_scene, write_ply
+from langsplat_core.pipeline.crew import Crew
 from langsplat_core.pipeline.language import language_field
 from langsplat_core.pipeline.stages import stage_key
+from langsplat_core.pipeline.views import StoredViews
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Gaussians, Scene
-from langsplat_core.semantics.clip import load_clip
+from langsplat_core.semantics.encoders import load_encoder
 from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sources import load_mask_source
-from langsplat_core.semantics.store import FeatureStore, describe_capture
+from langsplat_core.semantics.store import FeatureStore, StoredFeatures, describe_capture
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
+
+REPORT = "report.json"  # in the work folder
 
 log = logging.getLogger("langsplat")
 
@@ -43,7 +47,11 @@ class TrainReport:
     masks: str  # name of the mask source
     encoder: str
     mask_count: int
-    codec_cosine: float  # mean cosine of mask vectors with their reconstruction
+    codec: str  # its kind
+    codec_size: int  # codewords of a codebook, numbers per latent of other kinds
+    codec_cosine: float  # mean, of a Gaussian's vector with what the codec makes of it
+    relevancy_error: float  # mean absolute, of what the codec makes of it, over everyday phrases
+    relevancy_error_p99: float
     observed: float  # fraction of Gaussians with a meaning at the whole level
     seconds: dict[str, float]  # per stage, of this run: a stage that was already done takes almost none
 
@@ -55,62 +63,80 @@ def train_scene(
     work: Path | None = None,
     progress: Progress = silent,
     masks_of: Callable[[Capture], MaskSource] | None = None,
+    crew: Crew | None = None,
 ) -> TrainReport:
     """Train `out` (a .ply; sidecar and cameras beside it) from the photographs in `dataset`.
 
-    `masks_of` makes another mask source than ``config.masks`` names, once the photographs are read.
+    `masks_of` makes another mask source than ``config.masks`` names, once the photographs are read. `crew`:
+    the processes that share the work; all call this with the same arguments, and one writes the scene.
     """
     if out.suffix.lower() != ".ply":
         raise InputError(f"{out}: the scene must be named *.ply, for example --out {out.with_suffix('.ply')}")
     work = work or out.with_name(out.stem + ".work")
-    clock = _Clock()
+    clock, crew = _Clock(), crew or Crew()
 
     # First: absent weights should not cost an hour.
-    encoder = load_clip(config.clip.model, config.clip.device, config.clip.batch)
+    encoder = load_encoder(config.clip.model, config.clip.device, config.clip.batch)
     named = None if masks_of else load_mask_source(config.masks, config.clip.device)
-    capture = load_capture(dataset, config.dataset, work, progress)
+    # One process solves for cameras, the others find them in the work folder.
+    capture = crew.once(lambda: load_capture(dataset, config.dataset, work, progress))
     mask_source = named or masks_of(capture)  # type: ignore[misc]  # one of them is there
     log.info("masks: %s, encoder: %s", mask_source.name, encoder.id)
     train, held_out = capture.split(config.dataset.test_every)
     clock.lap("photographs")
 
-    gaussians = trained_gaussians(capture, train, config, work, progress)
-    clock.lap("radiance")
-
-    features = describe_capture(
-        [capture.images[i] for i in train],
-        [capture.cameras[i].name for i in train],
+    store = FeatureStore(work / "features")  # keyed by mask settings, encoder and image
+    mine = crew.share(train)
+    describe_capture(
+        [capture.images[i] for i in mine],
+        [capture.cameras[i].name for i in mine],
         mask_source,
         encoder,
-        FeatureStore(work / "features"),  # keyed by mask settings, encoder and image
+        store,
         progress,
     )
-    views = [(capture.cameras[i], item) for i, item in zip(train, features, strict=True)]
+    crew.meet()
     clock.lap("masks and vectors")
 
-    language, codec_cosine = language_field(gaussians, views, encoder, config, work, progress)
+    gaussians = crew.once(lambda: trained_gaussians(capture, train, config, work, progress))
+    clock.lap("radiance")
+
+    cameras = tuple(capture.cameras[i] for i in train)
+    features = StoredFeatures(store, [camera.name for camera in cameras])
+    views = StoredViews(cameras, features)
+    language, loss = language_field(gaussians, views, encoder, config, work, progress, crew)
     clock.lap("language field")
 
-    save_scene(out, Scene(gaussians, language, tuple(capture.cameras[i] for i in train)))
-    psnr = None
-    if held_out:
-        psnr = float(np.mean([view.psnr for view in evaluate_views(gaussians, capture, held_out)]))
-    clock.lap("saving and held-out views")
-    report = TrainReport(
-        views=len(train),
-        held_out=len(held_out),
-        gaussians=len(gaussians),
-        psnr=psnr,
-        masks=mask_source.name,
-        encoder=encoder.id,
-        mask_count=sum(len(item.vectors) for item in features),
-        codec_cosine=codec_cosine,
-        observed=float((language.confidence[2] > 0).mean()) if len(gaussians) else 0.0,
-        seconds=clock.laps,
-    )
-    with atomic_path(work / "report.json") as temporary:
-        temporary.write_text(json.dumps(report.__dict__, indent=1))
-    return report
+    if crew.leads:
+        save_scene(out, Scene(gaussians, language, cameras))
+        psnr = _mean_psnr(gaussians, capture, held_out)
+        clock.lap("saving and held-out views")
+        report = TrainReport(
+            views=len(train),
+            held_out=len(held_out),
+            gaussians=len(gaussians),
+            psnr=psnr,
+            masks=mask_source.name,
+            encoder=encoder.id,
+            mask_count=sum(len(item.vectors) for item in features),
+            codec=language.codec.kind,
+            codec_size=language.codec.index_size or language.codec.latent_dim,
+            codec_cosine=loss.cosine,
+            relevancy_error=loss.error_mean,
+            relevancy_error_p99=loss.error_p99,
+            observed=float((language.confidence[2] > 0).mean()) if len(gaussians) else 0.0,
+            seconds=clock.laps,
+        )
+        with atomic_path(work / REPORT) as temporary:
+            temporary.write_text(json.dumps(asdict(report), indent=1))
+    crew.meet()
+    return TrainReport(**json.loads((work / REPORT).read_text()))
+
+
+def _mean_psnr(gaussians: Gaussians, capture: Capture, held_out: list[int]) -> float | None:
+    if not held_out:
+        return None
+    return float(np.mean([view.psnr for view in evaluate_views(gaussians, capture, held_out)]))
 
 
 def trained_gaussians(

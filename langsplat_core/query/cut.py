@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.query.relevancy import FLOOR
+from langsplat_core.semantics.relevancy import FLOOR
 
 CutRule = Literal["floor", "median", "range"]
 CUT_RULES: tuple[CutRule, ...] = get_args(CutRule)

@@ -11,14 +11,13 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.places import Neighbourhood, Place, build_neighbourhood, locate
-from langsplat_core.query.relevancy import CHUNK, FLOOR, MIN_HEAT_SPAN, latent_relevancy, relevancy
-from langsplat_core.query.table import SphereTable, build_table, suits_table
+from langsplat_core.query.lookup import Lookup, build_lookup
+from langsplat_core.query.places import Place, locate
+from langsplat_core.query.surface import Surface, build_surface
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, LanguageField, Scene
-from langsplat_core.scene.codec import SHORTEST
 from langsplat_core.scene.phrases import phrase_key, tidy
+from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN
 
-FOUND = 0.6  # smoothed peak relevancy from which a phrase counts as present; a little above the floor
 SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them
 NO_FIELD = "this scene has no language field: it can be looked at, not searched; `langsplat train` makes one"
 
@@ -47,7 +46,7 @@ class QueryResult:
     peak: float  # score of the chosen level
     place: Array | None  # (3,) world units
     box: Array | None  # (2, 3) corners, world units
-    found: bool  # peak >= FOUND
+    found: bool  # peak >= the scene's `Reading.found`
 
     @property
     def heat_range(self) -> tuple[float, float]:
@@ -67,9 +66,9 @@ class QueryEngine:
         encoder_id: str = "",
         exact: bool = False,
     ) -> None:
-        """load_encoder: usually `semantics.clip.load_text_encoder`; without one only the scene's phrasebook
-        can be asked. encoder_id: in place of the encoder that the scene names. exact: decode at every
-        Gaussian instead of looking up, 2 KB each, to measure the table by."""
+        """load_encoder: usually `semantics.encoders.load_text_encoder`; without one only the scene's own
+        phrasebook can be asked. encoder_id: in place of the encoder that the scene names. exact: decode at
+        every Gaussian instead of looking up, 2 KB each, to measure the table by."""
         self.scene = scene
         self.exact = exact
         self._load_encoder = load_encoder
@@ -105,32 +104,12 @@ class QueryEngine:
         return self._encoder
 
     @cached_property
-    def _neighbourhood(self) -> Neighbourhood:
-        return build_neighbourhood(self.scene.gaussians)
+    def _surface(self) -> Surface:
+        return build_surface(self.scene.gaussians)
 
     @cached_property
-    def _table(self) -> SphereTable | None:
-        field = self.field
-        if not suits_table(field.codec):
-            return None
-        return build_table(field.codec, self._known_latents(), field.canonical)
-
-    @cached_property
-    def _decoded(self) -> tuple[Array, Array]:
-        """Rows of `_known_latents` with a meaning, and their (M, D) decoded vectors."""
-        latents = self._known_latents()
-        rows = np.flatnonzero(np.linalg.norm(latents, axis=1) > SHORTEST)
-        vectors = np.empty((len(rows), self.field.codec.vector_dim), np.float32)
-        for start in range(0, len(rows), CHUNK):
-            part = slice(start, start + CHUNK)
-            vectors[part] = self.field.codec.decode(latents[rows[part]])
-        return rows, vectors
-
-    def _known_latents(self) -> Array:
-        """(3 N, d) latents, zero where a Gaussian was never observed."""
-        field = self.field
-        latents = np.where(field.confidence[..., None] > 0, field.latents, 0)
-        return latents.reshape(-1, field.latents.shape[-1])
+    def _lookup(self) -> Lookup:
+        return build_lookup(self.field, self.exact)
 
     def unknown_words(self, phrase: str) -> tuple[str, ...]:
         """Words for which `phrase` cannot be asked; none where the phrasebook has it. EncoderError as
@@ -181,16 +160,7 @@ class QueryEngine:
 
     def relevancy(self, vector: Array) -> Array:
         """(D,) unit text vector -> (3, N) float32 relevancy per level and Gaussian."""
-        field = self.field
-        if self.exact:
-            rows, vectors = self._decoded
-            values = np.zeros(field.confidence.size, np.float32)
-            values[rows] = relevancy(vectors, vector[None], field.canonical)[:, 0]
-        elif self._table is not None:
-            values = self._table.relevancy(vector)
-        else:
-            values = latent_relevancy(field.codec, self._known_latents(), vector[None], field.canonical)[:, 0]
-        return values.reshape(field.confidence.shape)
+        return self._lookup.relevancy(vector).reshape(self.field.confidence.shape)
 
     def run(self, phrase: str, level: LevelChoice = "auto", progress: Progress = silent) -> QueryResult:
         """Answer `phrase`. The level is chosen once for the scene, on raw relevancy, so that the picture
@@ -198,7 +168,7 @@ class QueryEngine:
         vector = self.text_vector(phrase, progress)
         progress(f"searching '{tidy(phrase)}'", 0.5)
         relevancy = self.relevancy(vector)
-        smoothed = [self._neighbourhood.smooth(values) for values in relevancy]
+        smoothed = self._surface.smooth(relevancy)
         scores = tuple(float(values.max()) if len(values) else 0.0 for values in smoothed)
         chosen = int(np.argmax(scores)) if level == "auto" else LEVELS.index(level)
         peak = scores[chosen]
@@ -211,9 +181,9 @@ class QueryEngine:
             peak=peak,
             place=None if place is None else place.position,
             box=None if place is None else place.box,
-            found=peak >= FOUND,
+            found=peak >= self.field.reading.found,
         )
 
     def _place(self, smoothed: Array, peak: float) -> Place | None:
         # Half way between the floor and the peak, but never below the floor.
-        return locate(self._neighbourhood, smoothed, max(FLOOR + 0.5 * (peak - FLOOR), FLOOR))
+        return locate(self._surface, smoothed, max(FLOOR + 0.5 * (peak - FLOOR), FLOOR))

@@ -9,9 +9,10 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.display.compose import gated_mean
-from langsplat_core.query.relevancy import latent_relevancy
+from langsplat_core.errors import InputError
 from langsplat_core.raster.protocol import View
 from langsplat_core.scene import LanguageField
+from langsplat_core.semantics.relevancy import latent_relevancy
 
 
 def splatted_relevancy(view: View, relevancy: Array, alpha_gate: float) -> Array:
@@ -23,9 +24,17 @@ def splatted_relevancy(view: View, relevancy: Array, alpha_gate: float) -> Array
 def decoded_relevancy(
     view: View, field: LanguageField, level: int, phrases: Array, alpha_gate: float
 ) -> Array:
-    """The paper's order: (Q, D) phrase vectors -> (H, W, Q) relevancy of the decoded pixel latents."""
+    """The paper's order: (Q, D) phrase vectors -> (H, W, Q) relevancy of the decoded pixel latents.
+
+    Raises InputError for a codebook, whose numbers cannot be blended.
+    """
+    if field.codec.space == "index":
+        raise InputError(
+            "the paper's order blends latents, and this scene has a codebook; train one with "
+            "`--codec.kind autoencoder`"
+        )
     blended, alpha = view.splat(field.latents[level])
     height, width, d = blended.shape
     flat = np.where(alpha[..., None] > alpha_gate, blended, 0).reshape(-1, d)
-    values = latent_relevancy(field.codec, flat, phrases, field.canonical)
+    values = latent_relevancy(field.codec, flat, phrases, field.canonical, field.reading.temperature)
     return values.reshape(height, width, len(phrases))

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.query.relevancy import from_cosines
-from langsplat_core.scene import Codec
-from langsplat_core.scene.codec import SHORTEST
+from langsplat_core.scene import Codec, Reading
+from langsplat_core.scene.codec import meaningful
+from langsplat_core.semantics.relevancy import from_cosines
 
 RESOLUTION = 192  # nodes per side; error against exact decoding falls with its square
 
@@ -44,10 +44,11 @@ class SphereTable:
     corner: Array  # (M,) int64 index of the lower left node; -1 for a latent without meaning
     fraction: Array  # (M, 2) float32 position inside the cell, in [0, 1]
     resolution: int
+    temperature: float
 
     def relevancy(self, phrase: Array) -> Array:
         """(D,) unit phrase vector -> (M,) float32 relevancy; 0 where the latent has no meaning."""
-        nodes = from_cosines(self.vectors @ phrase, self.nearest_canonical)
+        nodes = from_cosines(self.vectors @ phrase, self.nearest_canonical, self.temperature)
         corner = np.maximum(self.corner, 0)
         u, v = self.fraction.T
         low = nodes[corner] * (1 - u) + nodes[corner + 1] * u
@@ -57,10 +58,16 @@ class SphereTable:
 
 def suits_table(codec: Codec) -> bool:
     """Whether the codec's latents lie on a sphere."""
-    return codec.latent_dim == 3 and codec.unit_latents
+    return codec.latent_dim == 3 and codec.space == "sphere"
 
 
-def build_table(codec: Codec, latents: Array, canonical: Array, resolution: int = RESOLUTION) -> SphereTable:
+def build_table(
+    codec: Codec,
+    latents: Array,
+    canonical: Array,
+    temperature: float = Reading.temperature,
+    resolution: int = RESOLUTION,
+) -> SphereTable:
     """Tabulate `codec` for (M, 3) latents; those of no length have no meaning."""
     if not suits_table(codec):
         raise ValueError(f"a sphere table needs unit latents of 3 numbers; {codec.kind} has others")
@@ -68,7 +75,7 @@ def build_table(codec: Codec, latents: Array, canonical: Array, resolution: int 
     grid = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)  # row-major: first coordinate fastest
     vectors = codec.decode(octahedral_to_sphere(grid).astype(np.float32))
 
-    known = np.linalg.norm(latents, axis=1) > SHORTEST
+    known = meaningful(codec, latents)
     safe = np.where(known[:, None], latents, (0.0, 0.0, 1.0)).astype(np.float64)
     position = sphere_to_octahedral(safe) * (resolution - 1)
     cell = np.clip(np.floor(position), 0, resolution - 2).astype(np.int64)
@@ -78,4 +85,5 @@ def build_table(codec: Codec, latents: Array, canonical: Array, resolution: int 
         corner=np.where(known, cell[:, 1] * resolution + cell[:, 0], -1),
         fraction=(position - cell).astype(np.float32),
         resolution=resolution,
+        temperature=temperature,
     )

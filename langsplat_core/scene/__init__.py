@@ -1,10 +1,16 @@
 """The nouns of the project: plain typed data, no behaviour that needs a device or a file."""
 
 from langsplat_core.scene.camera import Camera, look_at
-from langsplat_core.scene.codec import AutoencoderCodec, Codec, LinearCodec, codec_from_tensors
+from langsplat_core.scene.codec import (
+    AutoencoderCodec,
+    CodebookCodec,
+    Codec,
+    LinearCodec,
+    codec_from_tensors,
+)
 from langsplat_core.scene.gaussians import SH_COUNTS, Gaussians
 from langsplat_core.scene.intrinsics import Intrinsics
-from langsplat_core.scene.language import CANONICAL_PHRASES, LEVELS, LanguageField
+from langsplat_core.scene.language import CANONICAL_PHRASES, LEVELS, LanguageField, Reading
 from langsplat_core.scene.scene import Scene
 
 __all__ = [
@@ -13,11 +19,13 @@ __all__ = [
     "SH_COUNTS",
     "AutoencoderCodec",
     "Camera",
+    "CodebookCodec",
     "Codec",
     "Gaussians",
     "Intrinsics",
     "LanguageField",
     "LinearCodec",
+    "Reading",
     "Scene",
     "codec_from_tensors",
     "look_at",

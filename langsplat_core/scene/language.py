@@ -6,27 +6,47 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array
-from langsplat_core.scene.codec import Codec
+from langsplat_core.scene.codec import Codec, latent_dtype, meaningful
 from langsplat_core.scene.phrases import phrase_key
 
 LEVELS = ("subpart", "part", "whole")  # index 0, 1, 2 wherever a level axis appears
 CANONICAL_PHRASES = ("object", "things", "stuff", "texture")  # LERF's negatives, used by LangSplat
 
 
+@dataclass(frozen=True)
+class Reading:
+    """How cosines of one text encoder are read: other encoders have another scale."""
+
+    temperature: float = 10.0  # of the softmax; 10 in the public code of LERF and LangSplat, for CLIP
+    found: float = 0.6  # smoothed peak relevancy from which a phrase counts as present
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.temperature) and self.temperature > 0 and 0 <= self.found <= 1):
+            raise ValueError(
+                f"reading: temperature {self.temperature} and found {self.found}; expected a positive number "
+                "and one in [0, 1]"
+            )
+
+
 @dataclass(frozen=True, eq=False)
 class LanguageField:
     """Latents of N Gaussians at the three levels, with everything a query needs beside them."""
 
-    latents: Array  # (3, N, d) float32; zero where a Gaussian was never observed
+    latents: Array  # (3, N, d) of the codec's type; zero where a Gaussian was never observed
     confidence: Array  # (3, N) float32 >= 0: total blending weight with which it was observed
     codec: Codec
     canonical: Array  # (4, D) float32 unit text vectors of CANONICAL_PHRASES
     encoder_id: str  # hub id or folder of the text encoder, e.g. "demo"
     phrasebook: Mapping[str, Array] = field(default_factory=dict)  # `phrase_key` -> (D,) unit vector
+    reading: Reading = field(default_factory=Reading)
 
     def __post_init__(self) -> None:
         d, big = self.codec.latent_dim, self.codec.vector_dim
-        dims = check_array("latents", self.latents, (len(LEVELS), "N", d), dtype=np.float32)
+        dims = check_array("latents", self.latents, (len(LEVELS), "N", d), dtype=latent_dtype(self.codec))
+        if self.codec.index_size and self.latents.max(initial=0) >= self.codec.index_size:
+            raise ValueError(
+                f"latents: {self.latents.max()} is not the number of one of {self.codec.index_size} codewords"
+            )
         check_array("confidence", self.confidence, (len(LEVELS), "N"), dims, dtype=np.float32)
         check_array("canonical", self.canonical, (len(CANONICAL_PHRASES), big), dtype=np.float32)
         known = {phrase_key(phrase): vector for phrase, vector in self.phrasebook.items()}
@@ -36,6 +56,13 @@ class LanguageField:
 
     def __len__(self) -> int:
         return int(self.latents.shape[1])
+
+    @property
+    def known(self) -> Array:
+        """(3, N) whether a Gaussian has a meaning at a level."""
+        flat = meaningful(self.codec, self.latents.reshape(-1, self.latents.shape[2]))
+        known: Array = (self.confidence > 0) & flat.reshape(self.confidence.shape)
+        return known
 
     def take(self, rows: Array) -> "LanguageField":
         """The field of the Gaussians at `rows` (indices or a boolean mask)."""

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.formats import (
@@ -15,6 +16,8 @@ from langsplat_core.formats import (
     rematch_language,
     write_language,
 )
+from langsplat_core.formats.packed_positions import pack_positions, step, unpack_positions
+from langsplat_core.scene import CodebookCodec, Reading
 from tests.support.file_samples import random_field
 from tests.support.same import assert_same_field
 from tests.support.scenes import random_gaussians
@@ -62,7 +65,7 @@ def rename_tensor(path: Path, old: str, new: str) -> None:
     edit(path, lambda header, data: ({new if k == old else k: v for k, v in header.items()}, data))
 
 
-@pytest.mark.parametrize("kind", ["autoencoder", "linear"])
+@pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
 @pytest.mark.parametrize("phrases", [(), ("red mug",), ("tür", 'a "quoted", {braced}\nphrase', "猫")])
 def test_what_is_written_is_read_back(tmp_path, means, kind, phrases):
     want = random_field(N, kind, phrases)
@@ -84,18 +87,19 @@ def test_the_layout_is_the_documented_one(sidecar, means):
     header = json.loads(raw[8 : 8 + size])
     metadata = header.pop("__metadata__")
     shapes = {name: tuple(entry["shape"]) for name, entry in header.items()}
-    assert {entry["dtype"] for entry in header.values()} == {"F32"}
+    kinds = {name: entry["dtype"] for name, entry in header.items()}
+    assert kinds.pop("positions") == "U64"
+    assert set(kinds.values()) == {"F32"}
     assert shapes["latents"] == (3, N, 3)
     assert shapes["confidence"] == (3, N)
-    assert shapes["means"] == (N, 3)
+    assert shapes["positions"] == (N,)
+    assert shapes["corners"] == (2, 3)
     assert shapes["canonical"] == (4, 16)
     assert shapes["phrasebook"] == (2, 16)
     assert shapes["codec.encoder.0.weight"] == (8, 16)
-    start, end = header["means"]["data_offsets"]
-    assert raw[8 + size + start : 8 + size + end] == means.astype("<f4").tobytes()
     assert metadata == {
         "format": "langsplat",
-        "version": "1",
+        "version": "2",
         "encoder": "demo",
         "levels": "subpart,part,whole",
         "codec": "autoencoder",
@@ -103,6 +107,8 @@ def test_the_layout_is_the_documented_one(sidecar, means):
         "gaussians": str(N),
         "means_blake2b": language.means_checksum(means),
         "phrases": '["red mug", "tür"]',
+        "temperature": "10.0",
+        "found": "0.6",
     }
 
 
@@ -125,8 +131,8 @@ BROKEN = {
         "not a language field",
     ),
     "a newer version": (
-        lambda p: edit_metadata(p, version="2"),
-        "version '2'; this program reads '1', update",
+        lambda p: edit_metadata(p, version="3"),
+        "version '3'; this program reads 1 and 2, update",
     ),
     "no checksum": (lambda p: edit_metadata(p, means_blake2b=None), "the header has no 'means_blake2b'"),
     "a wrong checksum": (lambda p: edit_metadata(p, means_blake2b="00"), "at other positions"),
@@ -147,22 +153,28 @@ BROKEN = {
         r"phrasebook: .*\(3, 16\)",
     ),
     "no latents": (lambda p: rename_tensor(p, "latents", "old"), "tensor 'latents' is missing"),
-    "no means": (lambda p: rename_tensor(p, "means", "old"), "tensor 'means' is missing"),
+    "no positions": (lambda p: rename_tensor(p, "corners", "old"), "tensor 'corners' is missing"),
+    "a temperature that is no number": (lambda p: edit_metadata(p, temperature="hot"), "could not convert"),
+    "a temperature of nothing": (lambda p: edit_metadata(p, temperature="0"), "temperature 0.0 and found"),
+    "a verdict that is none": (lambda p: edit_metadata(p, found="nan"), "found nan"),
     "a codec in parts": (lambda p: rename_tensor(p, "codec.encoder.0.bias", "x"), "without encoder.0.bias"),
     "latents of another shape": (
         lambda p: edit_tensor(p, "latents", shape=[N, 3, 3]),
         "latents: expected shape",
     ),
     "flat latents": (lambda p: edit_tensor(p, "latents", shape=[3 * N * 3]), "latents: expected shape"),
-    "flat means": (lambda p: edit_tensor(p, "means", shape=[N * 3]), "means: expected shape"),
+    "too few positions": (
+        lambda p: edit_tensor(p, "positions", shape=[N // 2, 2]),
+        "positions: expected shape",
+    ),
     "flat weights": (lambda p: edit_tensor(p, "codec.encoder.0.weight", shape=[128]), "safetensors: "),
     "latents of integers": (
         lambda p: edit_tensor(p, "latents", dtype="I32"),
-        "'latents' is I32; expected F32",
+        "'latents' is I32; expected F32 or F16",
     ),
     "latents of bfloat16": (
         lambda p: edit_tensor(p, "latents", dtype="BF16", shape=[3, N, 6]),
-        "'latents' is BF16; expected F32",
+        "'latents' is BF16; expected F32 or F16",
     ),
     "a shape beyond the data": (
         lambda p: edit_tensor(p, "latents", shape=[3, 10**12, 3]),
@@ -232,3 +244,82 @@ def test_rematch_of_almost_nothing(tmp_path, means, old, new):
     got = rematch_language(tmp_path / "a.safetensors", means[:new])
     assert len(got) == new
     assert (got.confidence.any(0) == (np.arange(new) < old)).all()
+
+
+def test_a_codebook_is_stored_in_small_numbers_where_that_loses_nothing(tmp_path, means):
+    field = random_field(N, "codebook")
+    codec = CodebookCodec(*(rounded(tensor) for tensor in field.codec.tensors().values()))
+    field = replace(field, codec=codec, confidence=rounded(field.confidence))
+    path = tmp_path / "a.langsplat.safetensors"
+    write_language(path, field, means)
+    header = header_of(path)
+    kinds = {name: (entry["dtype"], entry["shape"]) for name, entry in header.items()}
+    assert kinds["codes"] == ("U16", [3, N])
+    assert kinds["codec.vectors"] == ("F16", [11, 16])
+    assert kinds["confidence"] == ("F16", [3, N])
+    assert kinds["canonical"] == ("F32", [4, 16])
+    assert "latents" not in kinds
+    assert_same_field(read_language(path, means), field)
+
+
+def test_a_code_without_a_codeword_is_refused(tmp_path, means):
+    path = tmp_path / "a.langsplat.safetensors"
+    write_language(path, random_field(N, "codebook"), means)
+    rename_tensor(path, "codec.vectors", "codec.all_vectors")
+    with pytest.raises(FormatError, match="codebook codec without its vectors"):
+        read_language(path, means)
+    field = random_field(N, "codebook")
+    field.latents[1, 5] = 11
+    write_language(path, field, means)
+    with pytest.raises(FormatError, match="11 is not the number of one of 11 codewords"):
+        read_language(path, means)
+
+
+def test_version_1_still_opens(tmp_path, means):
+    """As the first release wrote it: everything float32, and the means themselves."""
+    field = random_field(N)
+    path = tmp_path / "a.langsplat.safetensors"
+    write_language(path, field, means)
+    metadata = header_of(path, metadata=True)
+    for name in ("temperature", "found"):
+        metadata.pop(name)
+    tensors = load_file(path)
+    for name in ("positions", "corners"):
+        tensors.pop(name)
+    save_file(tensors | {"means": means}, path, metadata | {"version": "1"})
+    assert_same_field(read_language(path, means), field)
+    assert_same_field(rematch_language(path, means), field)
+
+
+def test_the_reading_of_an_encoder_is_kept(tmp_path, means):
+    field = replace(random_field(N), reading=Reading(11.7, 0.55))
+    path = tmp_path / "a.langsplat.safetensors"
+    write_language(path, field, means)
+    assert read_language(path, means).reading == field.reading
+    assert rematch_language(path, means[:9]).reading == field.reading
+
+
+def test_packed_positions_are_as_near_as_they_say():
+    rng = np.random.default_rng(0)
+    means = np.concatenate([rng.normal(size=(500, 3)), 900 * rng.normal(size=(5, 3))]).astype(np.float32)
+    means[7] = np.nan
+    means[:, 2] = 4.0  # an axis without extent
+    packed, corners = pack_positions(means)
+    got = unpack_positions(packed, corners)
+    finite = np.isfinite(means).all(1)
+    assert np.isnan(got[7]).all()
+    assert np.abs(got[finite] - means[finite]).max() <= 0.51 * step(corners)
+    assert step(corners) < 0.002
+    empty, nowhere = pack_positions(np.full((2, 3), np.inf, np.float32))
+    assert np.isnan(unpack_positions(empty, nowhere)).all()
+
+
+def rounded(tensor: np.ndarray) -> np.ndarray:
+    return tensor.astype(np.float16).astype(np.float32)
+
+
+def header_of(path: Path, metadata: bool = False) -> dict:
+    raw = path.read_bytes()
+    header = json.loads(raw[8 : 8 + struct.unpack("<Q", raw[:8])[0]])
+    own = header.pop("__metadata__")
+    return own if metadata else header

@@ -23,7 +23,7 @@ from langsplat_core.query.pixels import splatted_relevancy
 from langsplat_core.query.places import peak_pixel
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Camera, Scene
-from langsplat_core.semantics.clip import load_text_encoder
+from langsplat_core.semantics.encoders import load_text_encoder
 
 pytestmark = pytest.mark.long
 

@@ -7,11 +7,12 @@ from langsplat_core.arrays import unit
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
-from langsplat_core.query.places import build_neighbourhood, locate, peak_pixel
-from langsplat_core.query.relevancy import FLOOR, latent_relevancy, relevancy
+from langsplat_core.query.places import locate, peak_pixel
+from langsplat_core.query.surface import build_surface
 from langsplat_core.query.table import build_table, octahedral_to_sphere, sphere_to_octahedral, suits_table
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import LanguageField, LinearCodec, Scene
+from langsplat_core.semantics.relevancy import FLOOR, latent_relevancy, relevancy
 from tests.support.fakes import FakeEncoder, blob_scene
 from tests.support.two_blobs import D, random_codec, two_blob_scene
 
@@ -73,7 +74,7 @@ def test_table_agrees_with_exact_decoding_and_improves_with_resolution():
     exact = latent_relevancy(codec, latents, phrases, canonical)
     errors = {}
     for resolution in (48, 192):
-        table = build_table(codec, latents, canonical, resolution)
+        table = build_table(codec, latents, canonical, resolution=resolution)
         got = np.stack([table.relevancy(phrase) for phrase in phrases], 1)
         errors[resolution] = np.abs(got - exact)
     assert errors[192].mean() < 3e-4
@@ -198,11 +199,11 @@ def test_an_empty_scene_can_be_asked():
 
 def test_a_stray_gaussian_decides_nothing():
     scene, *_ = two_blob_scene()
-    neighbourhood = build_neighbourhood(scene.gaussians)
-    values = np.zeros(120)
-    values[:60] = 0.8
-    values[90] = 1.0  # one wrong Gaussian in the other blob
-    smoothed = neighbourhood.smooth(values)
+    neighbourhood = build_surface(scene.gaussians)
+    values = np.zeros((3, 120))
+    values[2, :60] = 0.8
+    values[2, 90] = 1.0  # one wrong Gaussian in the other blob
+    smoothed = neighbourhood.smooth(values)[2]
     place = locate(neighbourhood, smoothed, 0.5)
     assert place is not None
     assert place.position[0] < 0

@@ -18,6 +18,7 @@ from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     AutoencoderCodec,
+    CodebookCodec,
     Codec,
     Gaussians,
     LanguageField,
@@ -233,6 +234,9 @@ def write_folder(folder: Path, files: dict[str, bytes]) -> Path:
 
 def random_codec(kind: str, d: int = 3, big: int = 16, seed: int = 0) -> Codec:
     rng = np.random.default_rng(seed)
+    if kind == "codebook":
+        vectors = unit(rng.normal(size=(11, big))).astype(np.float32)
+        return CodebookCodec(vectors, rng.uniform(size=(11, 3)).astype(np.float32))
     if kind == "linear":
         return LinearCodec(np.linalg.qr(rng.normal(size=(big, d)))[0].T.astype(np.float32).copy())
 
@@ -250,7 +254,10 @@ def random_field(
 ) -> LanguageField:
     rng = np.random.default_rng(seed)
     codec = random_codec(kind, seed=seed)
-    latents = unit(rng.normal(size=(3, n, codec.latent_dim))).astype(np.float32)
+    if codec.index_size:
+        latents = rng.integers(codec.index_size, size=(3, n, 1)).astype(np.uint16)
+    else:
+        latents = unit(rng.normal(size=(3, n, codec.latent_dim))).astype(np.float32)
     latents[:, ::7] = 0  # never observed
     big = codec.vector_dim
     return LanguageField(

@@ -10,7 +10,7 @@ from langsplat_core.display.latent_colours import latent_colours
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import NO_FIELD
 from langsplat_core.scene import Scene
-from langsplat_core.semantics.clip import DEMO
+from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions.settings import set_display
 from langsplat_viewer.controls import Extent, OrbitCamera, default_view, extent_of
 from langsplat_viewer.viewer import Viewer

@@ -8,12 +8,12 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.lab.encoder.crops import CropSet
 from langsplat_core.lab.encoder.phrases import KINDS, PhraseBook, phrase_book
-from langsplat_core.query.relevancy import FLOOR, relevancy
 from langsplat_core.scene import CANONICAL_PHRASES
+from langsplat_core.semantics.relevancy import FLOOR, relevancy
 
 
 class Encoder(Protocol):
-    """What is measured; `semantics.clip.ClipEncoder` is one."""
+    """What is measured; `semantics.encoders.Encoder` is one."""
 
     def encode_images(self, crops: Array, batch: int = 64) -> Array:
         """(M, D) unit vectors of (M, S, S, 3) uint8 pictures."""

@@ -4,16 +4,17 @@ truth; and an error budget, which swaps one stage at a time for one that makes n
 import hashlib
 import statistics
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import (
     ClipConfig,
-    CodecConfig,
     DatasetConfig,
     MaskConfig,
     RadianceConfig,
@@ -23,7 +24,6 @@ from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
-from langsplat_core.formats import load_scene, save_scene
 from langsplat_core.formats.language import means_checksum
 from langsplat_core.lab.config import BenchmarkConfig, Tier
 from langsplat_core.lab.demo import SEED
@@ -33,8 +33,9 @@ from langsplat_core.lab.rooms.oracles import (
     oracle_vectors,
     phrase_vectors,
     true_labels,
+    with_wrong_vectors,
 )
-from langsplat_core.lab.rooms.report import Measured, RoomReport, measured
+from langsplat_core.lab.rooms.report import Measured, RoomReport, codec_name, measured
 from langsplat_core.lab.rooms.scoring import (
     Asked,
     Reading,
@@ -54,16 +55,16 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.pixels import splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.scene import Gaussians, Scene
-from langsplat_core.semantics.clip import ClipEncoder, clip_folder, load_clip
+from langsplat_core.scene import Gaussians, LanguageField, Scene
+from langsplat_core.semantics.encoder import Encoder
+from langsplat_core.semantics.encoders import load_encoder, model_folder
 from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sources import load_mask_source
-from langsplat_core.semantics.store import FeatureStore, describe_capture
-from langsplat_core.training.language.codec_fit import reconstruction_cosine
+from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture
+from langsplat_core.training.language.relevancy_error import CodecReport
 from langsplat_core.training.radiance.train import evaluate_views
 
 HOLD_OUT = 8  # every so many views, one is not trained on
-WIDE = 128  # numbers per latent where the codec should lose nothing: 1.5 KB per Gaussian
 FRAMES = 5  # timed pictures of one phrase
 
 
@@ -71,8 +72,8 @@ def run_benchmark(config: BenchmarkConfig, work: Path, progress: Progress = sile
     """Measure every tier and seed. What is in `work` from an earlier run with the same settings is not made
     again. Raises InputError for settings that cannot be measured."""
     _check(config)
-    encoder = load_clip(config.encoder)
-    weights = _digest(clip_folder(config.encoder, "--encoder"))
+    encoder = load_encoder(config.encoder)
+    weights = weights_digest(config.encoder)
     reports = []
     for tier in config.tiers:
         for seed in config.seeds:
@@ -95,13 +96,13 @@ def _check(config: BenchmarkConfig) -> None:
         )
     if min(config.seeds) < 0:
         raise InputError("--seeds must be 0 or more")
-    if config.views < HOLD_OUT or min(config.steps, config.codec_steps, config.max_gaussians) < 1:
+    if config.views < HOLD_OUT or min(config.steps, config.max_gaussians) < 1:
         raise InputError(f"eval synthetic: it needs at least {HOLD_OUT} --views, and 1 step and Gaussian")
 
 
-def _digest(folder: Path) -> str:
+def weights_digest(model: str) -> str:
     """Of an encoder's weights: a folder may be filled with others under the same name."""
-    digest = hashlib.sha256()
+    folder, digest = model_folder(model, "--encoder"), hashlib.sha256()
     for path in sorted([*folder.glob("*.safetensors"), *folder.glob("*.bin")]):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
@@ -113,7 +114,6 @@ def train_config(config: BenchmarkConfig) -> TrainConfig:
         dataset=DatasetConfig(max_side=max(config.size), test_every=HOLD_OUT),
         radiance=RadianceConfig(steps=config.steps, sh_degree=1, max_gaussians=config.max_gaussians),
         clip=ClipConfig(model=config.encoder),
-        codec=CodecConfig(steps=config.codec_steps),
     )
 
 
@@ -126,7 +126,7 @@ class Room:
         tier: Tier,
         seed: int,
         work: Path,
-        encoder: tuple[ClipEncoder, str],
+        encoder: tuple[Encoder, str],
         progress: Progress,
     ) -> None:
         width, height = config.size
@@ -184,20 +184,23 @@ class Room:
     def views(self, variant: Variant) -> Views:
         """The training views with masks and vectors."""
         source: MaskSource = load_mask_source(MaskConfig(source="graph"))
-        if variant.masks == "truth":
+        outlines = "graph" if variant.masks == "graph" else "truth"
+        if outlines == "truth":
             source = TruthMasks(self.capture, self.truth)
         train, _ = self.capture.split(HOLD_OUT)
         cameras = [self.capture.cameras[i] for i in train]
         start = time.perf_counter()
-        features = describe_capture(
+        features: Sequence[ImageFeatures] = describe_capture(
             [self.capture.images[i] for i in train],
             [camera.name for camera in cameras],
             source,
             self.encoder,
-            FeatureStore(self.folder / f"features-{variant.masks}-{self.weights}"),
+            FeatureStore(self.folder / f"features-{outlines}-{self.weights}"),
             self.progress,
         )
         self._lap(f"masks ({variant.masks}) and vectors", start)
+        if variant.masks == "wrong":
+            features = [with_wrong_vectors(item, seed) for seed, item in enumerate(features)]
         if variant.vectors == "text":
             words = phrase_vectors(self.truth, self.encoder)
             told = [
@@ -207,32 +210,21 @@ class Room:
             features = moved_to_pictures(told, features)
         return list(zip(cameras, features, strict=True))
 
-    def scene(self, variant: Variant) -> tuple[Scene, float]:
-        """The searchable scene, and the mean cosine of mask vectors with what the codec makes of them."""
-        codec = self.settings.codec
-        if variant.codec == "linear":
-            codec = replace(codec, kind="linear", latent_dim=min(WIDE, self.encoder.dim))
-        what = (means_checksum(self.gaussians.means), variant.masks, variant.vectors, codec, self.weights)
-        path = self.folder / f"{stage_key('scene', 2, *what)}.ply"
-        views = self.views(variant)
-        if not path.exists():
-            start = time.perf_counter()
-            settings = replace(self.settings, codec=codec)
-            field, _ = language_field(
-                self.gaussians, views, self.encoder, settings, self.folder, self.progress
-            )
-            save_scene(path, Scene(self.gaussians, field, tuple(camera for camera, _ in views)))
-            self._lap(f"language field ({variant.name})", start)
-        scene = load_scene(path)
-        assert scene.language is not None
-        vectors = np.concatenate([features.vectors for _, features in views])
-        return scene, reconstruction_cosine(scene.language.codec, vectors)
+    def field(self, variant: Variant, fresh: bool = False) -> tuple[LanguageField, CodecReport, float]:
+        """What the Gaussians mean, what the codec loses, and seconds; `fresh` takes nothing that was kept."""
+        views, start = self.views(variant), time.perf_counter()
+        settings = replace(self.settings, codec=variant.codec, lift=variant.lift)
+        with TemporaryDirectory(dir=self.folder) as empty:
+            work = Path(empty) if fresh else self.folder
+            made = language_field(self.gaussians, views, self.encoder, settings, work, self.progress)
+        self._lap(f"language field ({variant.name})", start)
+        return *made, round(time.perf_counter() - start, 1)
 
-    def measure(self, variant: Variant) -> Measured:
-        """Ask everything; the method's own order of work but for what `variant` says."""
-        scene, cosine = self.scene(variant)
+    def measure(self, variant: Variant, fresh: bool = False) -> Measured:
+        """Ask everything; the method's own order of work but for what `variant` says. fresh: see `field`."""
+        field, loss, seconds = self.field(variant, fresh)
         start = time.perf_counter()
-        engine = QueryEngine(scene, lambda _: self.encoder, exact=variant.query == "exact")
+        engine = QueryEngine(Scene(self.gaussians, field), lambda _: self.encoder)
         absent = self.truth.absent(EVERYTHING)
         asked = ask(engine, [*(phrase.text for phrase in self.truth.phrases), *absent])
         reading = Reading(variant.query == "paper", self.config.cut)
@@ -244,8 +236,11 @@ class Room:
         self._lap(f"queries ({variant.name})", start)
         return replace(
             result,
-            **{key: getattr(variant, key) for key in ("name", "masks", "vectors", "codec", "query")},
-            codec_cosine=cosine,
+            **{key: getattr(variant, key) for key in ("name", "masks", "vectors", "query")},
+            codec=codec_name(field.codec),
+            bytes_per_gaussian=field.latents.nbytes / max(len(field), 1),
+            codec_loss=loss,
+            fit_seconds=seconds,
             frame_ms=1000 * self._frame_seconds(asked),
         )
 
@@ -263,7 +258,7 @@ class Room:
     def report(self) -> RoomReport:
         """Measure what the settings ask for."""
         _, held_out = self.capture.split(HOLD_OUT)
-        rows = [self.measure(variant) for variant in variants(self.config.masks, self.config.budget)]
+        rows = [self.measure(variant) for variant in variants(self.config, self.encoder.dim)]
         views = evaluate_views(self.gaussians, self.capture, held_out)
         return RoomReport(
             tier=self.tier,

@@ -11,7 +11,7 @@ from langsplat_core.lab.world.objects.catalogue import EVERYTHING
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import NO_FIELD, QueryEngine
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.semantics.clip import load_text_encoder
+from langsplat_core.semantics.encoders import load_text_encoder
 
 WHOLE = DatasetConfig(max_side=100_000)  # photographs are not shrunk
 

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import sparse
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.datasets.capture import Capture
@@ -18,7 +17,8 @@ from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import LEVELS, Camera, Gaussians
 from langsplat_core.semantics.masks import LevelMasks
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.lift import find_memberships
+from langsplat_core.training.language.mask_groups import MaskGroups
+from langsplat_core.training.language.memberships import find_memberships
 
 MIN_REGION = 16  # px: of a smaller region not even an oracle's crop shows anything
 
@@ -70,6 +70,16 @@ def oracle_vectors(features: ImageFeatures, ids: Array, vectors: Mapping[int, Ar
     return replace(features, vectors=told)
 
 
+def with_wrong_vectors(features: ImageFeatures, seed: int, share: float = 0.15) -> ImageFeatures:
+    """`features` as if the encoder had taken `share` of the regions for another of the same photograph."""
+    generator = np.random.default_rng(seed)
+    count = len(features.vectors)
+    wrong = np.flatnonzero(generator.uniform(size=count) < share)
+    vectors = features.vectors.copy()
+    vectors[wrong] = features.vectors[generator.integers(max(count, 1), size=len(wrong))]
+    return replace(features, vectors=vectors)
+
+
 def moved_to_pictures(told: Sequence[ImageFeatures], seen: Sequence[ImageFeatures]) -> list[ImageFeatures]:
     """Text vectors moved by one vector, the same for all, to where the encoder puts pictures.
 
@@ -108,17 +118,17 @@ def true_labels(
         described.append((camera, ImageFeatures(rows, np.zeros((len(numbers), 1), np.float32))))
         columns.append(numbers)
     members = find_memberships(rasterizer, gaussians, described, progress=progress)
-    numbers = np.concatenate(columns)
+    known, group = np.unique(np.concatenate(columns), return_inverse=True)
+    edges = np.cumsum([len(numbers) for numbers in columns])[:-1]
+    groups = MaskGroups(tuple(np.split(group.astype(np.int32), edges)), np.zeros((len(known), 1), np.float32))
     result = np.full((len(LEVELS), len(gaussians)), -1, np.int64)
-    for level in range(len(LEVELS)):
-        chosen = np.flatnonzero(members.levels == level)
-        known, column = np.unique(numbers[chosen], return_inverse=True)
-        if len(known) == 0:
-            continue
-        same = sparse.csr_matrix((np.ones(len(chosen), np.float32), (np.arange(len(chosen)), column)))
-        weights = (members.weights[:, chosen] @ same).tocsr()
-        best = np.asarray(weights.argmax(axis=1)).ravel()
-        result[level] = np.where(np.diff(weights.indptr) > 0, known[best], -1)
+    for number, (first, last) in enumerate(members.blocks):
+        weights = members.block(number, groups)
+        for level in range(len(LEVELS)):
+            at_level = weights[:, level * len(known) : (level + 1) * len(known)].tocsr()
+            if at_level.nnz:
+                best = np.asarray(at_level.argmax(axis=1)).ravel()
+                result[level, first:last] = np.where(np.diff(at_level.indptr) > 0, known[best], -1)
     return result
 
 

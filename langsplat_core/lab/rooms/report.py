@@ -10,6 +10,8 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.files import atomic_path
 from langsplat_core.lab.rooms.scoring import KINDS, Asked, DirectScore, Score, Truth, found_rate
+from langsplat_core.scene import Codec
+from langsplat_core.training.language.relevancy_error import CodecReport
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,9 @@ class Measured:
     vectors: str = ""
     codec: str = ""
     query: str = ""
-    codec_cosine: float = 1.0  # mean, of mask vectors with what the codec makes of them
+    bytes_per_gaussian: float = 0.0  # of its meanings at three levels
+    codec_loss: CodecReport = CodecReport(1.0, 0.0, 0.0)  # noqa: RUF009 (frozen)
+    fit_seconds: float = 0.0  # from masks to latents; what an earlier run has made is not in it
     frame_ms: float = 0.0  # median, one phrase into one view
 
 
@@ -79,6 +83,11 @@ def measured(
     )
 
 
+def codec_name(codec: Codec) -> str:
+    """Such as "codebook 512" or "autoencoder 3"."""
+    return f"{codec.kind} {codec.index_size or codec.latent_dim}"
+
+
 def separation(present: Array, absent: Array) -> float:
     """Chance that one of `present` (P,) exceeds one of `absent` (A,), ties half; 1 without either."""
     if len(present) == 0 or len(absent) == 0:
@@ -98,17 +107,30 @@ def pooled(scores: Iterable[Score]) -> tuple[int, float, float]:
 
 
 def score_table(reports: Sequence[RoomReport]) -> str:
-    """Markdown: the method, per tier and kind of phrase, pooled over the seeds."""
+    """Markdown: the method, per tier and kind of phrase: means over the rooms, and the standard deviation
+    between them where there are several."""
     lines = ["| tier | phrases | queries | mIoU % | localisation % | 3D IoU % |", "|---|---|---|---|---|---|"]
     for tier, rooms in _by_tier(reports):
         for kind in (*KINDS, "all"):
-            scores = [s for room in rooms for s in room.measured[0].scores if kind in (s.kind, "all")]
-            direct = [d for room in rooms for d in room.measured[0].direct if kind in (d.kind, "all")]
-            count, iou, localisation = pooled(scores)
+            of_rooms = [of_kind(room.measured[0], kind) for room in rooms]
+            count = sum(queries for queries, *_ in of_rooms)
             if count:
-                line = (tier, kind, count, _percent(iou), _percent(localisation), _percent(_direct(direct)))
-                lines.append(_row(line))
+                spreads = [_spread(values) for values in zip(*(row[1:] for row in of_rooms), strict=True)]
+                lines.append(_row((tier, kind, count, *spreads)))
     return "\n".join(lines)
+
+
+def of_kind(measured: Measured, kind: str) -> tuple[int, float, float, float]:
+    """Queries, mean IoU, localisation and 3-D IoU of one kind of phrase, or of all."""
+    direct = [score for score in measured.direct if kind in (score.kind, "all")]
+    return (*pooled(s for s in measured.scores if kind in (s.kind, "all")), _direct(direct))
+
+
+def _spread(shares: Sequence[float]) -> str:
+    """Percent, with the standard deviation of several."""
+    if len(shares) == 1:
+        return _percent(shares[0])
+    return f"{_percent(float(np.mean(shares)))} +/- {_percent(float(np.std(shares, ddof=1)))}"
 
 
 def room_table(reports: Sequence[RoomReport]) -> str:
@@ -143,26 +165,37 @@ def room_table(reports: Sequence[RoomReport]) -> str:
 
 
 def budget_table(reports: Sequence[RoomReport]) -> str:
-    """Markdown: per tier and swapped stage, and the difference that it makes, in percentage points."""
-    head = ("tier", "swapped", "mIoU %", "+/-", "localisation %", "+/-", "rejected %", "codec cosine")
+    """Markdown: per tier and swapped stage, means over the rooms and the difference to the method, in
+    percentage points."""
+    head = (
+        *("tier", "swapped", "mIoU %", "+/-", "localisation %", "+/-", "3D IoU %", "+/-", "rejected %"),
+        *("codec", "relevancy error mean / p99", "bytes/Gaussian"),
+    )
     lines = [_row(head), "|" + "---|" * len(head)]
     for tier, rooms in _by_tier(reports):
-        _, base_iou, base_localisation = pooled(s for room in rooms for s in room.measured[0].scores)
+        base = _means(room.measured[0] for room in rooms)
         for row in range(min(len(room.measured) for room in rooms)):
             ours = [room.measured[row] for room in rooms]
-            _, iou, localisation = pooled(s for m in ours for s in m.scores)
+            cells = [tier, f"nothing ({ours[0].masks} masks)" if row == 0 else ours[0].name]
+            for mean, of_method in zip(_means(ours), base, strict=True):
+                cells += [_percent(mean), f"{100 * (mean - of_method):+.1f}" if row else ""]
             rejected = sum(m.rejected * m.absent for m in ours) / max(sum(m.absent for m in ours), 1)
-            lines.append(_row((
-                tier,
-                f"nothing ({ours[0].masks} masks)" if row == 0 else ours[0].name,
-                _percent(iou),
-                f"{100 * (iou - base_iou):+.1f}" if row else "",
-                _percent(localisation),
-                f"{100 * (localisation - base_localisation):+.1f}" if row else "",
-                _percent(rejected),
-                f"{np.mean([m.codec_cosine for m in ours]):.4f}",
-            )))  # fmt: skip
+            lines.append(_row((*cells, _percent(rejected), *loss_cells(ours))))
     return "\n".join(lines)
+
+
+def loss_cells(measured: Sequence[Measured]) -> tuple[str, str, str]:
+    """Codec, its relevancy error, and its bytes per Gaussian, means over the rooms."""
+    mean = np.mean([m.codec_loss.error_mean for m in measured])
+    p99 = np.mean([m.codec_loss.error_p99 for m in measured])
+    names = dict.fromkeys(m.codec for m in measured)
+    bytes_each = np.mean([m.bytes_per_gaussian for m in measured])
+    return ", ".join(names), f"{mean:.4f} / {p99:.3f}", f"{bytes_each:.0f}"
+
+
+def _means(measured: Iterable[Measured]) -> tuple[float, ...]:
+    """Mean IoU, localisation and 3-D IoU over all phrases, mean over the rooms."""
+    return tuple(float(x) for x in np.mean([of_kind(m, "all")[1:] for m in measured], axis=0))
 
 
 def save_json(path: Path, settings: dict[str, object], reports: Sequence[RoomReport]) -> None:

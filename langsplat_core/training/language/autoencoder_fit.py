@@ -1,12 +1,9 @@
-"""Fitting a codec to the CLIP vectors of one scene.
+"""The paper's codec: an autoencoder of one scene's CLIP vectors.
 
-Autoencoder: LangSplat section 3.2, with the layer widths of its public code (512-256-128-64-32-d with
+LangSplat section 3.2, with the layer widths of its public code (512-256-128-64-32-d with
 batch normalisation and ReLU, latent normalised to length 1; decoder d-16-32-64-128-256-256-512 with
-ReLU) and the paper's loss, L1 plus cosine distance. Linear: singular vectors.
+ReLU) and the paper's loss, L1 plus cosine distance.
 """
-
-from collections.abc import Callable, Mapping
-from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -15,52 +12,45 @@ from torch import nn
 from langsplat_core.arrays import Array
 from langsplat_core.config import CodecConfig
 from langsplat_core.progress import Progress, silent
-from langsplat_core.scene import AutoencoderCodec, Codec, LinearCodec
+from langsplat_core.scene import AutoencoderCodec
 
 ENCODER_WIDTHS = (256, 128, 64, 32)
 DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
 
 
-def fit_codec(vectors: Array, config: CodecConfig, progress: Progress = silent) -> Codec:
-    """(M, D) unit CLIP vectors -> a codec for them. Deterministic for a given seed on one machine."""
-    return FITTERS[config.kind](vectors, config, progress)
-
-
-def fit_linear(vectors: Array, config: CodecConfig, progress: Progress = silent) -> LinearCodec:
-    """The leading right singular vectors, `config.latent_dim` of them: the best basis in the least-squares
-    sense (Eckart-Young)."""
-    # Through the D x D Gram matrix: D is 512, M may be a million. float64 keeps its squared condition usable.
-    wide = np.asarray(vectors, np.float64)
-    _, axes = np.linalg.eigh(wide.T @ wide)
-    return LinearCodec(np.ascontiguousarray(axes[:, ::-1][:, : config.latent_dim].T, np.float32))
-
-
-def fit_autoencoder(vectors: Array, config: CodecConfig, progress: Progress = silent) -> AutoencoderCodec:
-    """Adam with a cosine schedule on random batches; progress shows the batch's mean cosine."""
+def train_autoencoder(
+    vectors: Array,
+    latent_dim: int = 3,
+    steps: int = CodecConfig.steps,
+    batch: int = CodecConfig.batch,
+    lr: float = CodecConfig.lr,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> AutoencoderCodec:
+    """The autoencoder of (M, D) unit vectors: Adam with a cosine schedule on random batches; progress shows
+    the batch's mean cosine. Deterministic for a given seed on one machine."""
     # Layers this small are slower on several threads than on one, and many times slower on a busy machine.
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return _train(vectors, config, progress)
+        return _train(vectors, latent_dim, (steps, batch, lr, seed), progress)
     finally:
         torch.set_num_threads(threads)
 
 
-FITTERS: Mapping[str, Callable[[Array, CodecConfig, Progress], Codec]] = MappingProxyType(
-    {AutoencoderCodec.kind: fit_autoencoder, LinearCodec.kind: fit_linear}
-)
-
-
-def _train(vectors: Array, config: CodecConfig, progress: Progress) -> AutoencoderCodec:
-    torch.manual_seed(config.seed)
+def _train(
+    vectors: Array, latent_dim: int, settings: tuple[int, int, float, int], progress: Progress
+) -> AutoencoderCodec:
+    steps, size, lr, seed = settings
+    torch.manual_seed(seed)
     data = torch.from_numpy(np.ascontiguousarray(vectors, np.float32))
-    encoder, decoder = networks(data.shape[1], config.latent_dim)
+    encoder, decoder = networks(data.shape[1], latent_dim)
     parameters = [*encoder.parameters(), *decoder.parameters()]
-    optimiser = torch.optim.Adam(parameters, lr=config.lr)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.steps)
-    generator = torch.Generator().manual_seed(config.seed)
-    for step in range(config.steps):
-        batch = data[torch.randint(len(data), (config.batch,), generator=generator)]
+    optimiser = torch.optim.Adam(parameters, lr=lr)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    generator = torch.Generator().manual_seed(seed)
+    for step in range(steps):
+        batch = data[torch.randint(len(data), (size,), generator=generator)]
         latent = nn.functional.normalize(encoder(batch), dim=1, eps=1e-6)
         output = nn.functional.normalize(decoder(latent), dim=1, eps=1e-6)
         cosine = (output * batch).sum(1).mean()
@@ -69,15 +59,10 @@ def _train(vectors: Array, config: CodecConfig, progress: Progress) -> Autoencod
         loss.backward()
         optimiser.step()
         schedule.step()
-        if step % 50 == 0 or step + 1 == config.steps:
-            progress(f"codec: cosine {cosine.item():.3f}", (step + 1) / config.steps)
+        if step % 50 == 0 or step + 1 == steps:
+            progress(f"codec: cosine {cosine.item():.3f}", (step + 1) / steps)
     _settle_statistics(encoder, data)
     return AutoencoderCodec(folded_layers(encoder), folded_layers(decoder))
-
-
-def reconstruction_cosine(codec: Codec, vectors: Array) -> float:
-    """Mean cosine between (M, D) unit vectors and what the codec makes of them."""
-    return float((codec.decode(codec.encode(vectors)) * vectors).sum(1).mean())
 
 
 def networks(dim: int, latent_dim: int) -> tuple[nn.Sequential, nn.Sequential]:

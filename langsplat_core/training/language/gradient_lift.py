@@ -24,7 +24,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.protocol import FreezableView, LiftingRasterizer, LiftingView
 from langsplat_core.scene import Camera, Codec, Gaussians
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.lift import lift_latents
+from langsplat_core.training.language.latent_lift import lift_latents
 
 BETAS, EPSILON = (0.9, 0.999), 1e-15  # of Adam, as in the INRIA code
 PUBLISHED_EPSILON = 1e-9  # in x / (|x| + 1e-9)

@@ -1,15 +1,11 @@
-"""Lifting: from masks in photographs to vectors on Gaussians, through the adjoint W^T alone.
+"""Lifting: from masks in photographs to CLIP vectors on Gaussians, on the unit sphere.
 
-Targets are constant on masks, so ``W^T onehot(mask)`` gives every Gaussian its membership in every mask,
-a sparse matrix that carries vectors of any length. Two roads use it or its shortcut:
-
-* `median` and `mean`: each Gaussian takes the (geometric median | weighted mean) of the CLIP vectors of
-  its masks, on the unit sphere; the codec encodes that afterwards. Averaging in CLIP space never meets
-  the meaning of a third object half way between two latents.
-* `one-pass`, the paper's quantity: latents averaged directly, ``x = W^T H / W^T 1``.
+Each Gaussian takes the geometric median, or the weighted mean, of the vectors of the masks it belongs to; a
+codec encodes that afterwards. Averaging in CLIP space never meets the meaning of a third object half way
+between two latents.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -18,97 +14,61 @@ from scipy import sparse
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.compiled import helper, kernel, shared_workers
-from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster.protocol import LabelView, LiftingRasterizer, LiftingView
-from langsplat_core.scene import LEVELS, Camera, Codec, Gaussians
-from langsplat_core.semantics.store import ImageFeatures
+from langsplat_core.scene import LEVELS
+from langsplat_core.training.language.mask_groups import MaskGroups
+from langsplat_core.training.language.memberships import Memberships
 
-MIN_WEIGHT = 1e-3  # a Gaussian's weight in a mask, in pixels, below which the pair is not stored
 MEDIAN_STEPS = 8
 FAINT = 2e-3  # share of a Gaussian's weight below which a mask has no say in its median
 
 
 @dataclass(frozen=True, eq=False)
-class Memberships:
-    """How strongly N Gaussians belong to the M masks of all views."""
+class Lifted:
+    """What n Gaussians mean at the three levels."""
 
-    weights: sparse.csr_matrix  # (N, M) blending weight summed over the mask's pixels, in pixels
-    levels: Array  # (M,) index into LEVELS
-    vectors: Array  # (M, D) float32 unit CLIP vectors
-
-
-def find_memberships(
-    rasterizer: LiftingRasterizer,
-    gaussians: Gaussians,
-    views: Sequence[tuple[Camera, ImageFeatures]],
-    chunk: int = 32,
-    settings: RasterSettings = INRIA,
-    progress: Progress = silent,
-) -> Memberships:
-    """``W^T onehot(mask)`` over all views.
-
-    Where a backend cannot lift label maps in one walk, `chunk` masks travel through one gather pass.
-    """
-    blocks, levels, vectors = [], [], []
-    for done, (camera, features) in enumerate(views):
-        if len(features.vectors):
-            view = rasterizer.view(gaussians, camera, settings)
-            blocks.append(_weights_in_masks(view, features, chunk))
-            levels.append(_row_levels(features))
-            vectors.append(features.vectors)
-        progress("lifting masks onto the Gaussians", (done + 1) / len(views))
-    if not blocks:
-        return Memberships(
-            sparse.csr_matrix((len(gaussians), 0)), np.zeros(0, int), np.zeros((0, 1), np.float32)
-        )
-    joined = sparse.hstack(blocks, format="csr")
-    return Memberships(joined, np.concatenate(levels), np.concatenate(vectors).astype(np.float32))
+    vectors: Array  # (3, n, D) float32 unit vectors; zero where unobserved
+    confidence: Array  # (3, n) float32 total blending weight, in pixels
 
 
-def _weights_in_masks(view: LiftingView, features: ImageFeatures, chunk: int) -> sparse.csr_matrix:
-    """(N, M) float32 weight of every Gaussian in the masks of one view, where it exceeds `MIN_WEIGHT`."""
-    count = len(features.vectors)
-    if isinstance(view, LabelView):
-        return view.gather_labels(features.labels, count, MIN_WEIGHT)
-    columns = []
-    for start in range(0, count, chunk):
-        weights = view.gather(_onehot(features.labels, start, min(chunk, count - start)))
-        columns.append(sparse.csr_matrix(np.where(weights > MIN_WEIGHT, weights, 0).astype(np.float32)))
-    return sparse.hstack(columns, format="csr")
+def lift_block(memberships: Memberships, groups: MaskGroups, number: int, robust: bool) -> Lifted:
+    """Of the Gaussians of one block. `robust` takes the geometric median, else the mean."""
+    return lift_weights(memberships.block(number, groups), groups.vectors, robust)
 
 
-def _onehot(labels: Array, start: int, size: int) -> Array:
-    """(3, H, W) global row ids -> (H, W, size) float32 indicator of rows start .. start + size."""
-    height, width = labels.shape[1:]
-    image = np.zeros((height * width, size), np.float32)
-    for level in labels.reshape(len(LEVELS), -1):
-        inside = np.flatnonzero((level >= start) & (level < start + size))  # -1, no mask, is never inside
-        image[inside, level[inside] - start] = 1
-    return image.reshape(height, width, size)
+def lift_sample(
+    memberships: Memberships, groups: MaskGroups, rows: Array, robust: bool, progress: Progress = silent
+) -> Lifted:
+    """Of the Gaussians at `rows`, in rising order."""
+    parts = []
+    for number, (first, last) in enumerate(memberships.blocks):
+        inside = rows[(rows >= first) & (rows < last)] - first
+        if len(inside):
+            weights = memberships.block(number, groups)[inside]
+            parts.append(lift_weights(weights, groups.vectors, robust))
+        progress("averaging the masks of a sample", last / memberships.count)
+    if not parts:
+        nothing = np.zeros((len(LEVELS), 0, groups.vectors.shape[1]), np.float32)
+        return Lifted(nothing, np.zeros((len(LEVELS), 0), np.float32))
+    return Lifted(
+        np.concatenate([part.vectors for part in parts], axis=1),
+        np.concatenate([part.confidence for part in parts], axis=1),
+    )
 
 
-def _row_levels(features: ImageFeatures) -> Array:
-    """(M,) the level each global row belongs to."""
-    levels = np.zeros(len(features.vectors), int)
-    for index, labels in enumerate(features.labels):
-        levels[np.unique(labels[labels >= 0])] = index
-    return levels
+def lift_weights(weights: sparse.csr_matrix, vectors: Array, robust: bool) -> Lifted:
+    """weights: (n, 3 G) of n Gaussians in G groups of masks, level after level; vectors: (G, D) float32."""
+    levels = list(_levels(weights, vectors, robust))
+    return Lifted(np.stack([vectors for vectors, _ in levels]), np.stack([c for _, c in levels]))
 
 
-def lift_vectors(memberships: Memberships, robust: bool) -> Iterator[tuple[Array, Array]]:
-    """For each level: (N, D) float32 unit vectors (zero where unobserved) and (N,) confidence.
-
-    Confidence is the total blending weight in pixels. `robust` takes the geometric median, else the mean.
-    """
+def _levels(weights: sparse.csr_matrix, vectors: Array, robust: bool) -> Iterator[tuple[Array, Array]]:
     for level in range(len(LEVELS)):
-        columns = np.flatnonzero(memberships.levels == level)
-        weights = memberships.weights[:, columns].tocsr()
-        vectors = memberships.vectors[columns]
-        confidence = np.asarray(weights.sum(1), np.float32).ravel()
-        centre = unit(weights @ vectors).astype(np.float32)
-        if robust and len(columns):
-            strong = _without_faint(weights, confidence)
+        at_level = weights[:, level * len(vectors) : (level + 1) * len(vectors)].tocsr()
+        confidence = np.asarray(at_level.sum(1), np.float32).ravel()
+        centre = unit(at_level @ vectors).astype(np.float32)
+        if robust and at_level.nnz:
+            strong = _without_faint(at_level, confidence)
             parts = (strong.indptr, strong.indices, strong.data, vectors, centre)
             shared_workers().run(_weiszfeld, len(centre), *parts)
         yield np.where(confidence[:, None] > 0, centre, 0).astype(np.float32), confidence
@@ -162,36 +122,3 @@ def _weiszfeld(
             if length > 1e-12:
                 for k in range(dim):
                     centre[row, k] = total[k] / length
-
-
-def lift_latents(
-    rasterizer: LiftingRasterizer,
-    gaussians: Gaussians,
-    views: Sequence[tuple[Camera, ImageFeatures]],
-    codec: Codec,
-    settings: RasterSettings = INRIA,
-    progress: Progress = silent,
-) -> tuple[Array, Array]:
-    """The paper's quantity in one pass: (3, N, d) latents ``W^T H / W^T 1`` and (3, N) confidence.
-
-    H holds the encoded vector of each pixel's mask; pixels without a mask count in neither sum.
-    All three levels go through one gather per view.
-    """
-    count, d = len(gaussians), codec.latent_dim
-    total = np.zeros((count, len(LEVELS), d + 1))
-    for done, (camera, features) in enumerate(views):
-        latents = np.zeros((len(features.vectors) + 1, d + 1), np.float32)
-        latents[:-1, :d] = codec.encode(features.vectors)
-        latents[:-1, d] = 1
-        images = latents[features.labels]  # label -1 indexes the last row: zeros
-        height, width = features.labels.shape[1:]
-        stacked = np.moveaxis(images, 0, 2).reshape(height, width, -1)
-        view = rasterizer.view(gaussians, camera, settings)
-        total += view.gather(np.ascontiguousarray(stacked)).reshape(count, len(LEVELS), d + 1)
-        progress("lifting latents onto the Gaussians", (done + 1) / len(views))
-    confidence = total[..., d]
-    means = unit(total[..., :d] / np.maximum(confidence, 1e-9)[..., None])
-    return (
-        np.moveaxis(means, 1, 0).astype(np.float32).copy(),
-        confidence.T.astype(np.float32).copy(),
-    )

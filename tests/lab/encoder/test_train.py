@@ -18,7 +18,7 @@ from langsplat_core.lab.world.appearance.colours import COLOURS
 from langsplat_core.lab.world.captions import Label
 from langsplat_core.progress import Cancelled, silent
 from langsplat_core.scene import CANONICAL_PHRASES
-from langsplat_core.semantics.clip import clip_folder, load_clip
+from langsplat_core.semantics.encoders import load_encoder, model_folder
 
 pytestmark = pytest.mark.long
 
@@ -177,7 +177,7 @@ def test_training_in_miniature(monkeypatch, tmp_path):
     seen = []
     train_demo_encoder(tmp_path, config, lambda label, fraction: seen.append(fraction))
     assert seen == [0.75, 1.0]  # went on at step 3 of 4
-    encoder = load_clip(str(tmp_path), "cpu")
+    encoder = load_encoder(str(tmp_path), "cpu")
     assert (encoder.dim, encoder.image_size) == (512, 64)
     vectors = encoder.encode_images(crops.images[:3])
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-5)
@@ -247,10 +247,10 @@ def test_calibration_moves_the_canonical_phrases_only(tmp_path):
 @pytest.fixture(scope="module")
 def bundled():
     try:
-        clip_folder("demo", "--encoder")
+        model_folder("demo", "--encoder")
     except EncoderError:
         pytest.skip("the bundled demo encoder is not there")
-    return load_clip("demo", "cpu")
+    return load_encoder("demo", "cpu")
 
 
 def test_bundled_encoder_in_a_room_it_never_saw(bundled, unseen_room):

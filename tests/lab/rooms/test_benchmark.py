@@ -9,7 +9,7 @@ import pytest
 
 from langsplat_core.cli.evaluate import EvalSynthetic
 from langsplat_core.cli.run import main
-from langsplat_core.config import DatasetConfig
+from langsplat_core.config import CodecConfig, DatasetConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
 from langsplat_core.formats import load_scene
@@ -32,7 +32,13 @@ from langsplat_core.semantics.masks import label_maps
 pytestmark = pytest.mark.long
 
 TINY = BenchmarkConfig(
-    tiers=("separate",), views=8, size=(64, 48), steps=60, max_gaussians=3_000, codec_steps=60, budget=True
+    tiers=("separate",),
+    views=8,
+    size=(64, 48),
+    steps=60,
+    max_gaussians=3_000,
+    budget=True,
+    codec=CodecConfig(steps=60),
 )
 
 
@@ -65,7 +71,7 @@ def capture(run):
 def test_the_command_measures_every_stage(run):
     (room,) = run.figures["rooms"]
     assert (room["views"], room["held_out"]) == (7, 1)
-    assert [row["name"] for row in room["measured"]] == [v.name for v in variants("truth", True)]
+    assert [row["name"] for row in room["measured"]] == [v.name for v in variants(TINY, 512)]
     for row in room["measured"]:
         assert sum(score["queries"] for score in row["scores"]) > 3
         assert all(0 <= score["mean_iou"] <= 1 for score in [*row["scores"], *row["direct"]])
@@ -77,13 +83,15 @@ def test_the_command_measures_every_stage(run):
 def test_rows_differ_in_the_named_stage(run):
     by_name = {row["name"]: row for row in run.figures["rooms"][0]["measured"]}
     ours = by_name["the method"]
-    # The query's variants ask the very same field, another codec or embedding is another field.
-    assert by_name["exact query"]["codec_cosine"] == ours["codec_cosine"]
-    assert by_name["the paper's order"]["codec_cosine"] == ours["codec_cosine"]
-    assert by_name["the paper's order"]["direct"] == ours["direct"]
-    assert by_name["the paper's order"]["rejected"] == ours["rejected"]
-    assert by_name["no codec"]["codec_cosine"] > 0.99 > ours["codec_cosine"]
-    assert len(list(run.room.glob("scene-*.ply"))) == 3
+    # The paper's order asks the very same field, another codec or embedding is another field.
+    decoded, paper = by_name["autoencoder, d = 3"], by_name["autoencoder, the paper's order"]
+    assert decoded["codec_loss"] == paper["codec_loss"]
+    assert (decoded["direct"], decoded["rejected"]) == (paper["direct"], paper["rejected"])
+    assert by_name["no codec"]["codec"] == "linear 512"
+    errors = [by_name[name]["codec_loss"]["error_mean"] for name in ("no codec", "the method")]
+    assert errors[0] < 1e-5 < errors[1] < 0.02 < decoded["codec_loss"]["error_mean"]
+    assert (ours["bytes_per_gaussian"], decoded["bytes_per_gaussian"]) == (6, 36)
+    assert ours["codec"].startswith("codebook ")
 
 
 def test_a_second_run_makes_nothing_again(run):
@@ -93,11 +101,12 @@ def test_a_second_run_makes_nothing_again(run):
 
 @pytest.mark.parametrize("masks", ["truth", "graph"])
 def test_variants_swap_one_stage_at_a_time(masks):
-    method, *others = (asdict(variant) for variant in variants(masks, budget=True))
+    config = replace(TINY, masks=masks)
+    method, *others = (asdict(variant) for variant in variants(config, 512))
     swapped = [{key for key in method if key != "name" and method[key] != other[key]} for other in others]
-    expected = [{"vectors"}, {"codec"}, {"query"}, {"query"}]
+    expected = [{"vectors"}, {"codec"}, {"codec"}, {"codec", "query"}]
     assert swapped == ([{"masks"}] if masks == "graph" else []) + expected
-    assert len(variants(masks, budget=False)) == 1
+    assert len(variants(replace(config, budget=False), 512)) == 1
 
 
 def test_truth_masks_are_the_truth(run, capture):

@@ -21,9 +21,9 @@ from langsplat_core.lab.rooms.scoring import (
 from langsplat_core.query.cut import CUT_RULES, cut_level
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
-from langsplat_core.query.relevancy import latent_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import CANONICAL_PHRASES, LanguageField, Scene
+from langsplat_core.semantics.relevancy import latent_relevancy
 from tests.support.scenes import random_camera, random_gaussians
 from tests.support.two_blobs import random_codec, two_blob_scene
 
