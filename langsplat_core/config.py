@@ -1,6 +1,8 @@
 """Every setting a user can change, as frozen dataclasses; the command line is derived from them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Literal
 
 
@@ -137,6 +139,20 @@ class TrainConfig:
     codec: CodecConfig = field(default_factory=CodecConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     phrases: tuple[str, ...] = ()  # stored encoded in the scene: they can be asked without any encoder
+
+
+# The method as published (paper sections 3.1 to 3.3 and its public code): 2 x 2 crops beside the whole
+# photograph, an autoencoder of 3 numbers, features trained through the rasterizer from zeros.
+PAPER = TrainConfig(
+    radiance=RadianceConfig(coarse_fraction=0.0),
+    masks=MaskConfig(source="sam", sam="facebook/sam-vit-huge", crop_layers=1),
+    codec=CodecConfig(kind="autoencoder", steps=10_000, batch=64),
+    lift=LiftConfig(mode="gradient", start="zeros-as-published"),
+)
+TrainProfile = Literal["default", "paper"]
+TRAIN_PROFILES: Mapping[TrainProfile, TrainConfig] = MappingProxyType(
+    {"default": TrainConfig(), "paper": PAPER}
+)
 
 
 @dataclass(frozen=True)

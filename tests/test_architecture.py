@@ -13,7 +13,8 @@ ROOT = Path(__file__).parent.parent
 # From top to bottom; packages of one row never import each other.
 LAYERS = [
     ["langsplat_viewer"],
-    ["langsplat_core.cli", "langsplat_core.__main__"],
+    ["langsplat_core.__main__"],
+    ["langsplat_core.cli"],
     ["langsplat_core.lab"],
     ["langsplat_core.pipeline"],
     ["langsplat_core.evaluation", "langsplat_core.compaction"],

@@ -15,7 +15,10 @@ from langsplat_core.cli.evaluate import EvalSynthetic
 from langsplat_core.cli.inspect import Doctor, Inspect
 from langsplat_core.cli.query import QueryScene
 from langsplat_core.cli.run import Command, main
-from langsplat_core.cli.train import Train
+from langsplat_core.cli.train import train_command
+
+# Options that are asked for often enough to have a short name.
+ALIASES = {"--max-relevancy-error": "--codec.max-relevancy-error"}
 
 
 def parse(args: list[str]) -> Command:
@@ -30,7 +33,7 @@ def parse(args: list[str]) -> Command:
     bench.command(name="load")(BenchLoad)
     bench.command(name="steps")(BenchSteps)
     app = SubcommandApp()
-    app.command(name="train")(Train)
+    app.command(name="train")(train_command(args))
     app.command(name="query")(QueryScene)
     app.command(name="convert")(Convert)
     app.command(name="compact")(Compact)
@@ -39,6 +42,7 @@ def parse(args: list[str]) -> Command:
     app.command(demo, name="demo", help="Make the bundled scene, its photographs and its encoder.")
     app.command(evaluate, name="eval", help="Measure a scene against ground truth.")
     app.command(bench, name="bench", help="Speed against error, measured in one run.")
+    args = [ALIASES.get(word, word) for word in args]
     command: Command = app.cli(
         prog="langsplat",
         description="Train, query, convert and measure 3D Gaussian scenes with a language field.",

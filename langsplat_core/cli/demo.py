@@ -67,14 +67,17 @@ class DemoBuild:
     """Outlines as a perfect segmenter would find them, or those of the weight-free segmenter."""
     steps: int = 6_000
     """Steps of radiance training."""
+    gaussians: Path | None = None
+    """Keep the Gaussians of this scene of the same room, and make only their language field again."""
 
     def run(self) -> None:
         from langsplat_core.lab.demo import build_demo
 
         with TerminalProgress() as progress:
-            report = build_demo(self.out, self.seed, self.tier, self.masks, self.steps, progress)
-        kept, trained = report.after, report.before.gaussians
-        print(f"{self.out}: {kept.gaussians} Gaussians of {trained} trained, held-out {kept.psnr:.2f} dB")
+            made = build_demo(
+                self.out, self.seed, self.tier, self.masks, self.steps, self.gaussians, progress
+            )
+        print(f"{self.out}: {made}")
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,15 @@
 """`langsplat train`: photographs -> scene.ply with a language field."""
 
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from langsplat_core.config import TrainConfig
+from langsplat_core.config import TRAIN_PROFILES, TrainConfig, TrainProfile
 from langsplat_core.progress import TerminalProgress, silent
 
 
@@ -22,6 +24,10 @@ class Train:
     """The scene to write, *.ply; its language field and cameras are written beside it."""
     work: Path | None = None
     """Folder for intermediate results (default: <out>.work)."""
+    profile: TrainProfile = "default"
+    """"paper" starts from the published method's settings; options beside it still count."""
+    gaussians: Path | None = None
+    """Take the Gaussians of this scene, trained elsewhere from the same cameras, and give them a meaning."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
 
     def run(self) -> None:
@@ -31,7 +37,15 @@ class Train:
 
         crew = join_crew()
         with TerminalProgress() if crew.leads else nullcontext(silent) as progress:
-            report = train_scene(self.dataset, self.out, self.config, self.work, progress, crew=crew)
+            report = train_scene(
+                self.dataset,
+                self.out,
+                self.config,
+                self.work,
+                progress,
+                crew=crew,
+                gaussians_from=self.gaussians,
+            )
         if not crew.leads:
             return
         psnr = "no held-out views" if report.psnr is None else f"held-out PSNR {report.psnr:.2f} dB"
@@ -42,3 +56,17 @@ class Train:
             f"(99 % below {report.relevancy_error_p99:.3f}); "
             f"{sum(report.seconds.values()):.0f} s"
         )
+
+
+def train_command(args: Sequence[str]) -> type[Train]:
+    """`Train` with the settings of the profile that `args` names as defaults."""
+    names = [word for option, word in pairwise([*args, ""]) if option == "--profile"]
+    names += [word.partition("=")[2] for word in args if word.startswith("--profile=")]
+    config = next((TRAIN_PROFILES[name] for name in TRAIN_PROFILES if name in names[-1:]), TrainConfig())
+
+    @dataclass(frozen=True)
+    class ProfiledTrain(Train):
+        config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=lambda: config)
+
+    ProfiledTrain.__doc__ = Train.__doc__
+    return ProfiledTrain

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from langsplat_core.arrays import Array
+from langsplat_core.datasets.album import Album
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.datasets.undistort import pinhole_for, resample, source_positions
 from langsplat_core.errors import InputError
@@ -144,6 +145,7 @@ def develop(
         pose = replace(camera, world_to_camera=photo.world_to_camera, name=names[index])
         return pose, resample(picture, intrinsics, camera, positions)
 
+    album = Album()
     done: list[tuple[Camera, Array]] = []
     broken: list[str] = []
     with ThreadPoolExecutor(WORKERS) as pool:
@@ -151,7 +153,7 @@ def develop(
             if isinstance(result, str):
                 broken.append(result)
             else:
-                done.append(result)
+                done.append((result[0], album.keep(result[1])))
             progress("reading photographs", count / len(order))
     if not done:
         raise InputError(f"no photograph can be read: {shortened(broken)}")

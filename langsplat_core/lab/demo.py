@@ -6,10 +6,9 @@ and parts. Their names and colours it never sees: those come from the encoder.
 
 from pathlib import Path
 
-from langsplat_core.compaction.compact import CompactReport, compact_scene
+from langsplat_core.compaction.compact import compact_scene
 from langsplat_core.config import (
     ClipConfig,
-    CodecConfig,
     CompactConfig,
     DatasetConfig,
     MaskConfig,
@@ -36,7 +35,6 @@ def demo_config(steps: int) -> TrainConfig:
         radiance=RadianceConfig(steps=steps, sh_degree=1, max_gaussians=110_000),
         masks=MaskConfig(source="graph"),
         clip=ClipConfig(model="demo"),
-        codec=CodecConfig(steps=6_000),
     )
 
 
@@ -46,9 +44,11 @@ def build_demo(
     tier: Tier = "clutter",
     masks: MaskOrigin = "truth",
     steps: int = 6_000,
+    gaussians: Path | None = None,
     progress: Progress = silent,
-) -> CompactReport:
-    """Render the room of `seed` and `tier`, train, and drop what the photographs do not miss.
+) -> str:
+    """Render the room of `seed` and `tier`, train, and drop what the photographs do not miss; or, given
+    `gaussians`, a scene of that room, find only what those mean. What was made, in a line.
 
     `masks`: "truth", the outlines that a perfect segmenter would find, or "graph", the weight-free one.
 
@@ -59,5 +59,18 @@ def build_demo(
     if not (photographs / "transforms.json").exists():
         write_dataset(photographs, seed, VIEWS, SIZE, progress, tier)
     source = (lambda capture: TruthMasks(capture, read_truth(photographs))) if masks == "truth" else None
-    train_scene(photographs, trained, demo_config(steps), work, progress, source)
-    return compact_scene(trained, out, CompactConfig(max_psnr_loss=MAX_LOSS), photographs, progress)
+    config = demo_config(steps)
+    made = train_scene(
+        photographs,
+        out if gaussians else trained,
+        config,
+        work,
+        progress,
+        masks_of=source,
+        gaussians_from=gaussians,
+    )
+    if gaussians:
+        return f"{made.gaussians} Gaussians of {gaussians}, {made.codec} of {made.codec_size}"
+    report = compact_scene(trained, out, CompactConfig(max_psnr_loss=MAX_LOSS), photographs, progress)
+    kept, before = report.after, report.before.gaussians
+    return f"{kept.gaussians} Gaussians of {before} trained, held-out {kept.psnr:.2f} dB"

@@ -18,7 +18,7 @@ from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
-from langsplat_core.formats import read_ply, save_scene, write_ply
+from langsplat_core.formats import load_scene, read_ply, save_scene, write_ply
 from langsplat_core.pipeline.crew import Crew
 from langsplat_core.pipeline.language import language_field
 from langsplat_core.pipeline.stages import stage_key
@@ -64,18 +64,21 @@ def train_scene(
     progress: Progress = silent,
     masks_of: Callable[[Capture], MaskSource] | None = None,
     crew: Crew | None = None,
+    gaussians_from: Path | None = None,
 ) -> TrainReport:
     """Train `out` (a .ply; sidecar and cameras beside it) from the photographs in `dataset`.
 
     `masks_of` makes another mask source than ``config.masks`` names, once the photographs are read. `crew`:
     the processes that share the work; all call this with the same arguments, and one writes the scene.
+    `gaussians_from`: a scene in the photographs' world whose Gaussians are taken instead of training some.
     """
     if out.suffix.lower() != ".ply":
         raise InputError(f"{out}: the scene must be named *.ply, for example --out {out.with_suffix('.ply')}")
     work = work or out.with_name(out.stem + ".work")
     clock, crew = _Clock(), crew or Crew()
 
-    # First: absent weights should not cost an hour.
+    # First: absent weights, or a scene that cannot be read, should not cost an hour.
+    given = None if gaussians_from is None else load_scene(gaussians_from).gaussians
     encoder = load_encoder(config.clip.model, config.clip.device, config.clip.batch)
     named = None if masks_of else load_mask_source(config.masks, config.clip.device)
     # One process solves for cameras, the others find them in the work folder.
@@ -98,7 +101,10 @@ def train_scene(
     crew.meet()
     clock.lap("masks and vectors")
 
-    gaussians = crew.once(lambda: trained_gaussians(capture, train, config, work, progress))
+    if given is None:
+        gaussians = crew.once(lambda: trained_gaussians(capture, train, config, work, progress))
+    else:
+        gaussians = given
     clock.lap("radiance")
 
     cameras = tuple(capture.cameras[i] for i in train)

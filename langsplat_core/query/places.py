@@ -8,7 +8,6 @@ from scipy.ndimage import uniform_filter
 from langsplat_core.arrays import Array
 from langsplat_core.query.surface import Surface
 
-
 PLATEAU = 1e-3  # of relevancy: what is this close to the peak is as high
 
 

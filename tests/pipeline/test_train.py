@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from safetensors.numpy import load_file
 
 from langsplat_core.cli.app import parse
@@ -14,11 +13,8 @@ from langsplat_core.cli.run import main
 from langsplat_core.config import (
     ClipConfig,
     CodecConfig,
-    DatasetConfig,
     LiftConfig,
-    MaskConfig,
     RadianceConfig,
-    TrainConfig,
 )
 from langsplat_core.errors import EncoderError, FormatError, InputError
 from langsplat_core.formats import load_scene
@@ -27,59 +23,20 @@ from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import train_scene
 from langsplat_core.progress import Cancelled
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.raster.render import render
-from langsplat_core.scene import Scene, look_at
 from langsplat_core.semantics import store
-from tests.support.scenes import random_gaussians
-from tests.support.tiny_clip import tiny_clip
+from tests.support.tiny_room import tiny_room, tiny_settings
 
 pytestmark = pytest.mark.long
-
-SIZE = (64, 48)
-VIEWS = 5
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Photographs of a few large Gaussians, as a nerfstudio folder, and a tiny encoder beside them."""
-    folder = tmp_path_factory.mktemp("room")
-    (folder / "images").mkdir()
-    gaussians = random_gaussians(60, 5, scale_range=(0.15, 0.4))
-    frames = []
-    for index in range(VIEWS):
-        angle = 0.5 * index
-        eye = 3 * np.array([np.sin(angle), -0.2, -np.cos(angle)])
-        camera = look_at(eye, np.zeros(3), np.array([0.0, -1, 0]), SIZE)
-        image = render(Scene(gaussians), camera).colours
-        name = f"images/photo_{index}.png"
-        Image.fromarray((255 * np.clip(image, 0, 1)).astype(np.uint8)).save(folder / name)
-        pose = np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1, -1, 1])
-        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
-    intrinsics = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(gaussians)}\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
-    body = "".join("{} {} {}\n".format(*mean) for mean in gaussians.means)
-    (folder / "points.ply").write_text(header + body)
-    transforms = {**intrinsics, "w": SIZE[0], "h": SIZE[1], "ply_file_path": "points.ply", "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(transforms))
-    tiny_clip(folder / "encoder")
-    return folder
-
-
-def settings(room: Path) -> TrainConfig:
-    return TrainConfig(
-        dataset=DatasetConfig(max_side=64, test_every=4),
-        radiance=RadianceConfig(steps=20, sh_degree=0, checkpoint_every=5),
-        masks=MaskConfig(source="graph"),
-        clip=ClipConfig(model=str(room / "encoder"), device="cpu"),
-        codec=CodecConfig(steps=30),
-        phrases=("red mug",),
-    )
+    return tiny_room(tmp_path_factory.mktemp("room"))
 
 
 def test_photographs_become_a_searchable_scene(room, tmp_path):
     out = tmp_path / "scene.ply"
-    report = train_scene(room, out, settings(room))
+    report = train_scene(room, out, tiny_settings(room))
     scene = load_scene(out)
     assert scene.language is not None
     assert report.views == len(scene.cameras) == 3
@@ -112,7 +69,7 @@ def kept_results(work: Path) -> dict[str, int]:
 
 def test_the_same_command_again_changes_nothing_and_repeats_no_stage(room, tmp_path, monkeypatch):
     out = tmp_path / "scene.ply"
-    first = train_scene(room, out, settings(room))
+    first = train_scene(room, out, tiny_settings(room))
     kept = kept_results(tmp_path / "scene.work")
     for pattern in STAGES:
         assert list((tmp_path / "scene.work").glob(pattern)), pattern
@@ -131,7 +88,7 @@ def test_the_same_command_again_changes_nothing_and_repeats_no_stage(room, tmp_p
         (store, "embed_regions"),
     ):
         monkeypatch.setattr(module, name, forbidden)
-    again = train_scene(room, out, settings(room))
+    again = train_scene(room, out, tiny_settings(room))
     assert kept_results(tmp_path / "scene.work") == kept
     assert out.read_bytes() == before
     for name, tensor in load_file(out.with_suffix(".langsplat.safetensors")).items():
@@ -142,12 +99,12 @@ def test_the_same_command_again_changes_nothing_and_repeats_no_stage(room, tmp_p
 
 def test_a_setting_repeats_only_what_depends_on_it(room, tmp_path):
     out, work = tmp_path / "scene.ply", tmp_path / "scene.work"
-    train_scene(room, out, settings(room))
+    train_scene(room, out, tiny_settings(room))
     before = kept_results(work)
-    train_scene(room, out, replace(settings(room), codec=CodecConfig(size=9)))
+    train_scene(room, out, replace(tiny_settings(room), codec=CodecConfig(size=9)))
     added = {Path(name).name.partition("-")[0] for name in set(kept_results(work)) - set(before)}
     assert added == {"codec", "latents"}
-    other_machine = replace(settings(room), lift=LiftConfig(backend="cpu", chunk=7))
+    other_machine = replace(tiny_settings(room), lift=LiftConfig(backend="cpu", chunk=7))
     train_scene(room, out, other_machine)
     assert len(kept_results(work)) == len(before) + 2  # who computes, and in which batches, changes nothing
 
@@ -156,7 +113,7 @@ def test_more_steps_of_lifting_do_not_fit_the_codec_again(room, tmp_path):
     work = tmp_path / "scene.work"
     for steps in (10, 20):
         config = replace(
-            settings(room),
+            tiny_settings(room),
             lift=LiftConfig(mode="gradient", steps=steps),
             codec=CodecConfig(kind="autoencoder", steps=30),
         )
@@ -167,21 +124,20 @@ def test_more_steps_of_lifting_do_not_fit_the_codec_again(room, tmp_path):
 @pytest.mark.parametrize("name", ["memberships-*/*.npy", "memberships-*/*.npz", "codec-*", "latents-*"])
 def test_a_damaged_result_is_one_line(room, tmp_path, name):
     out, work = tmp_path / "scene.ply", tmp_path / "scene.work"
-    train_scene(room, out, settings(room))
+    train_scene(room, out, tiny_settings(room))
     damaged = sorted(work.glob(name))
     for path in damaged:
         path.write_bytes(path.read_bytes()[:100])
     for path in {*work.glob("*.npz"), *work.glob("memberships-*/*")} - set(damaged):
         path.unlink()
     with pytest.raises(FormatError, match="delete it and run again"):
-        train_scene(room, out, settings(room))
+        train_scene(room, out, tiny_settings(room))
 
 
 @pytest.mark.parametrize("mode", ["mean", "one-pass", "gradient"])
 def test_other_liftings(room, tmp_path, mode):
-    config = replace(
-        settings(room), lift=LiftConfig(mode=mode, steps=30), codec=CodecConfig(kind="linear", latent_dim=8)
-    )
+    linear = CodecConfig(kind="linear", latent_dim=8)
+    config = replace(tiny_settings(room), lift=LiftConfig(mode=mode, steps=30), codec=linear)
     if mode != "mean":
         with pytest.raises(InputError, match=r"add --codec\.kind autoencoder"):
             train_scene(room, tmp_path / "scene.ply", replace(config, codec=CodecConfig()))
@@ -200,21 +156,21 @@ def test_an_interrupted_run_leaves_no_scene_and_resumes(room, tmp_path, stage):
 
     out = tmp_path / "scene.ply"
     with pytest.raises(Cancelled):
-        train_scene(room, out, settings(room), progress=stop)
+        train_scene(room, out, tiny_settings(room), progress=stop)
     assert not list(tmp_path.glob("*.ply"))
     assert not list(tmp_path.glob("*.safetensors"))
-    train_scene(room, out, settings(room))
+    train_scene(room, out, tiny_settings(room))
     assert load_scene(out).language is not None
 
 
 def test_what_cannot_be_used_is_said_before_anything_is_made(room, tmp_path):
     with pytest.raises(InputError, match=r"\*\.ply"):
-        train_scene(room, tmp_path / "scene.splat", settings(room))
-    absent = replace(settings(room), clip=ClipConfig(model=str(tmp_path / "nothing")))
+        train_scene(room, tmp_path / "scene.splat", tiny_settings(room))
+    absent = replace(tiny_settings(room), clip=ClipConfig(model=str(tmp_path / "nothing")))
     with pytest.raises(EncoderError, match=r"--clip\.model"):
         train_scene(room, tmp_path / "scene.ply", absent)
     with pytest.raises(InputError):
-        train_scene(tmp_path / "missing", tmp_path / "scene.ply", settings(room))
+        train_scene(tmp_path / "missing", tmp_path / "scene.ply", tiny_settings(room))
     assert not list(tmp_path.glob("**/*.ply"))
 
 
@@ -252,7 +208,7 @@ def test_commands_end_with_one_line_and_code_2(args, says, tmp_path, monkeypatch
 
 def test_query_inspect_and_convert_commands(room, tmp_path, capsys):
     out = tmp_path / "scene.ply"
-    train_scene(room, out, settings(room))
+    train_scene(room, out, tiny_settings(room))
     assert run("query", out, "red mug", "--json") == 0
     answer = json.loads(capsys.readouterr().out)[0]
     assert answer["phrase"] == "red mug"
