@@ -5,8 +5,10 @@ import sys
 from tyro.extras import SubcommandApp
 
 from langsplat_core.cli.bench import BenchRaster
+from langsplat_core.cli.bench_gains import BenchGains
 from langsplat_core.cli.bench_lift import BenchLift
 from langsplat_core.cli.bench_load import BenchLoad
+from langsplat_core.cli.bench_memory import BenchMemory
 from langsplat_core.cli.bench_steps import BenchSteps
 from langsplat_core.cli.compact import Compact
 from langsplat_core.cli.convert import Convert
@@ -29,8 +31,10 @@ def parse(args: list[str]) -> Command:
     demo.command(name="sheet")(DemoSheet)
     evaluate.command(name="synthetic")(EvalSynthetic)
     bench.command(name="raster")(BenchRaster)
+    bench.command(name="gains")(BenchGains)
     bench.command(name="lift")(BenchLift)
     bench.command(name="load")(BenchLoad)
+    bench.command(name="memory")(BenchMemory)
     bench.command(name="steps")(BenchSteps)
     app = SubcommandApp()
     app.command(name="train")(train_command(args))

@@ -70,6 +70,19 @@ class LiftBenchConfig:
 
 
 @dataclass(frozen=True)
+class GainBenchConfig:
+    """Changes of the lifting, and the rooms they are tried in (`langsplat bench gains`)."""
+
+    tier: Tier = "clutter"
+    seeds: tuple[int, ...] = (201, 202)
+    """Of the rooms; never that of the bundled scene."""
+    masks: tuple[MaskOrigin, ...] = ("truth", "wrong")
+    """Exact outlines, the same with 15 % wrong vectors, the weight-free segmenter's."""
+    size: int = 1_024
+    """Codewords, the same for all changes."""
+
+
+@dataclass(frozen=True)
 class RasterBenchConfig:
     """What the rasterizer benchmark draws (`langsplat bench raster`)."""
 

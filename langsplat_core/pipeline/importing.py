@@ -21,7 +21,6 @@ from langsplat_core.scene import (
     CodebookCodec,
     Codec,
     LanguageField,
-    Reading,
     Scene,
 )
 from langsplat_core.scene.codec import SHORTEST, latent_dtype
@@ -87,7 +86,7 @@ def import_scene(
         canonical=encoder.encode_texts(list(CANONICAL_PHRASES)),
         encoder_id=encoder.id,
         phrasebook=_phrasebook(encoder, phrases),
-        reading=Reading(encoder.temperature),
+        reading=encoder.reading,
     )
     subpart, part, whole = confidence.mean(1).tolist() if confidence.size else (0.0, 0.0, 0.0)
     size = codec.index_size or codec.latent_dim

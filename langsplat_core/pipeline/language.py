@@ -37,7 +37,6 @@ from langsplat_core.scene import (
     Codec,
     Gaussians,
     LanguageField,
-    Reading,
     codec_from_tensors,
 )
 from langsplat_core.scene.codec import latent_dtype
@@ -86,7 +85,7 @@ def language_field(
         canonical=encoder.encode_texts(list(CANONICAL_PHRASES)),
         encoder_id=encoder.id,
         phrasebook=_phrasebook(encoder, config.phrases),
-        reading=Reading(encoder.temperature),
+        reading=encoder.reading,
     )
     return field, report
 

@@ -15,10 +15,12 @@ import numpy as np
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.scene import Reading
 from langsplat_core.semantics.weights import Weights
 
 OPEN_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 VOCABULARY = "vocabulary.txt"  # beside the weights: the only words the encoder was taught, one per line
+READING = "reading.json"  # beside the weights, optional: {"found": relevancy from which a thing is there}
 WORD = re.compile(r"[^\W_]+(?:'[^\W_]+)?")
 EXAMPLES = 12  # known words to name where a phrase has an unknown one
 TEXT_BATCH = 64  # phrases per forward pass
@@ -95,6 +97,7 @@ class PhraseEncoder:
         self.id = weights.id
         self._tower = tower
         self._words = _vocabulary(weights.folder)
+        self._found = _threshold(weights)
 
     @property
     def dim(self) -> int:
@@ -105,6 +108,11 @@ class PhraseEncoder:
     def temperature(self) -> float:
         """With which a margin of cosines, phrase minus nearest canonical phrase, becomes relevancy."""
         return self._tower.temperature
+
+    @property
+    def reading(self) -> Reading:
+        """How its cosines are read, as a scene made with it stores it."""
+        return Reading(self.temperature, self._found)
 
     @property
     def logits(self) -> Logits | None:
@@ -173,6 +181,11 @@ class Encoder:
         return self._text.temperature
 
     @property
+    def reading(self) -> Reading:
+        """As `PhraseEncoder.reading`."""
+        return self._text.reading
+
+    @property
     def logits(self) -> Logits | None:
         """As `PhraseEncoder.logits`."""
         return self._text.logits
@@ -208,6 +221,16 @@ class Encoder:
         with torch.inference_mode():
             inputs = torch.from_numpy(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))).to(self._device)
             return unit(self._pictures.encode(inputs).float().cpu().numpy())
+
+
+def _threshold(weights: Weights) -> float:
+    path = weights.folder / READING
+    if not path.is_file():
+        return Reading.found
+    try:
+        return Reading(found=float(json.loads(path.read_text(encoding="utf-8"))["found"])).found
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise EncoderError(f'{weights.id}: {READING} is not {{"found": 0 to 1}} ({error!r})') from None
 
 
 def pixel_statistics(weights: Weights, mean: Triple, std: Triple) -> tuple[Array, Array]:

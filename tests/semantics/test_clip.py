@@ -8,6 +8,7 @@ import torch
 from transformers import CLIPModel, CLIPTokenizer
 
 from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.scene import Reading
 from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
 from langsplat_core.semantics.families.clip import CLIP_MEAN, CLIP_STD
 from tests.support.tiny_clip import SIDE, WORDS, tiny_clip
@@ -153,3 +154,14 @@ def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
     config.write_text(text.replace('"num_hidden_layers": 2', '"num_hidden_layers": 3'), encoding="utf-8")
     with pytest.raises(EncoderError, match="16 do not fit, such as"):  # else they would be random
         load_encoder(str(tmp_path), "cpu")
+
+
+def test_how_an_encoder_is_read_lies_beside_its_weights(tmp_path):
+    tiny_clip(tmp_path)
+    assert load_text_encoder(str(tmp_path)).reading == Reading(10.0, 0.6)
+    (tmp_path / "reading.json").write_text('{"found": 0.7}')
+    assert load_encoder(str(tmp_path), "cpu").reading == Reading(10.0, 0.7)
+    for broken in ("{}", '{"found": 2}', '{"found": "much"}', "[", '{"found": null}'):
+        (tmp_path / "reading.json").write_text(broken)
+        with pytest.raises(EncoderError, match=r"reading\.json is not"):
+            load_text_encoder(str(tmp_path))

@@ -223,6 +223,10 @@ class Room:
     def measure(self, variant: Variant, fresh: bool = False) -> Measured:
         """Ask everything; the method's own order of work but for what `variant` says. fresh: see `field`."""
         field, loss, seconds = self.field(variant, fresh)
+        return replace(self.measure_field(field, variant), codec_loss=loss, fit_seconds=seconds)
+
+    def measure_field(self, field: LanguageField, variant: Variant) -> Measured:
+        """Ask everything of what the Gaussians are said to mean."""
         start = time.perf_counter()
         engine = QueryEngine(Scene(self.gaussians, field), lambda _: self.encoder)
         absent = self.truth.absent(EVERYTHING)
@@ -239,8 +243,6 @@ class Room:
             **{key: getattr(variant, key) for key in ("name", "masks", "vectors", "query")},
             codec=codec_name(field.codec),
             bytes_per_gaussian=field.latents.nbytes / max(len(field), 1),
-            codec_loss=loss,
-            fit_seconds=seconds,
             frame_ms=1000 * self._frame_seconds(asked),
         )
 

@@ -47,16 +47,19 @@ class LiftReport:
         }
 
 
-def measure_liftings(config: LiftBenchConfig, work: Path, progress: Progress = silent) -> LiftReport:
+def measure_liftings(
+    config: LiftBenchConfig, work: Path, progress: Progress = silent, rooms: BenchmarkConfig | None = None
+) -> LiftReport:
     """In one room, whose photographs and Gaussians are made in `work` first where they are not there.
 
     Seconds are from masks with vectors to latents, everything in them, in a folder of their own that is
-    emptied first: nothing is taken from an earlier run. Raises InputError for settings without a row.
+    emptied first: nothing is taken from an earlier run. `rooms`: how the room is photographed and trained.
+    Raises InputError for settings without a row.
     """
     if not config.masks:
         raise InputError("--masks: name at least one of truth, wrong, graph")
     encoder = load_encoder("demo")
-    settings = BenchmarkConfig(tiers=(config.tier,), seeds=(config.seed,))
+    settings = rooms or BenchmarkConfig()
     room = Room(settings, config.tier, config.seed, work, (encoder, weights_digest("demo")), progress)
     rows = []
     for masks in config.masks:

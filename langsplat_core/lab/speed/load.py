@@ -144,7 +144,7 @@ def _plyfile(path: Path) -> list[Array]:
     return [columns(POSITION), columns(SCALE), columns(ROTATION), columns(("opacity",))[:, 0], sh]
 
 
-def _peak_memory() -> int | None:
+def peak_memory() -> int | None:
     """Bytes. Not getrusage: its maximum is inherited from the parent process on Linux."""
     try:
         status = Path("/proc/self/status").read_text()
@@ -161,7 +161,7 @@ def _report(reader: str, path: Path) -> dict[str, object]:
     start = time.perf_counter()
     arrays = read(path)
     seconds = time.perf_counter() - start
-    peak = _peak_memory()
+    peak = peak_memory()
     digest = hashlib.blake2b()
     for array in arrays:
         digest.update(np.ascontiguousarray(array).data)

@@ -1,0 +1,36 @@
+"""`langsplat bench gains`: small changes of the lifting, tried in fresh rooms."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from langsplat_core.files import atomic_path
+from langsplat_core.lab.config import GainBenchConfig
+from langsplat_core.progress import TerminalProgress
+
+
+@dataclass(frozen=True)
+class BenchGains:
+    """What each change that others report gains from gives here: a few minutes per room and origin of the
+    masks."""
+
+    config: Annotated[GainBenchConfig, tyro.conf.arg(name="")] = field(default_factory=GainBenchConfig)
+    work: Path = Path("eval_out")
+    """Folder for the rooms, as of `langsplat eval synthetic`."""
+    out: Path = Path("bench_out")
+    """Folder for gains.md and gains.json."""
+
+    def run(self) -> None:
+        from langsplat_core.lab.rooms.gain_bench import figures, gain_table, measure_gains
+
+        with TerminalProgress() as progress:
+            rows = measure_gains(self.config, self.work, progress)
+        table = gain_table(rows)
+        with atomic_path(self.out / "gains.md") as path:
+            path.write_text(table)
+        with atomic_path(self.out / "gains.json") as path:
+            path.write_text(json.dumps(figures(self.config, rows), indent=1))
+        print(table)

@@ -1,0 +1,205 @@
+"""Small changes of the lifting that others report gains from, one at a time (`langsplat bench gains`).
+
+Each is a function of what the masks say, tried on rooms that it was not made for; the ones that gain become
+part of `training.language`, the others stay here as the record that they were tried.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from langsplat_core.arrays import Array, sigmoid, unit
+from langsplat_core.scene import LEVELS, Gaussians
+from langsplat_core.training.language.lift import Lifted, lift_block
+from langsplat_core.training.language.mask_groups import MaskGroups, group_masks
+from langsplat_core.training.language.memberships import Memberships
+
+TINY = 1.0  # pixels: largest weight in any view below which a Gaussian is taken for an accident
+GATE = 0.1  # share of its largest weight in a view below which a Gaussian does not count as seen there
+OUTLIER = -1.5  # standard deviations of its masks' cosines below which a mask is not believed
+SAME = 0.6  # overlap over union of what two masks claim from which they are one thing
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """What vectors are lifted from."""
+
+    gaussians: Gaussians
+    members: Memberships
+    vectors: tuple[Array, ...]  # of each view, (M, D) float32 unit vectors of its masks
+
+    def lifted(self) -> Lifted:
+        """Of all Gaussians, by the geometric median."""
+        groups = group_masks(self.vectors)
+        return joined(lift_block(self.members, groups, n, True) for n in range(len(self.members.blocks)))
+
+
+def joined(parts: Iterable[Lifted]) -> Lifted:
+    """Blocks of Gaussians, one after the other."""
+    blocks = list(parts)
+    return Lifted(
+        np.concatenate([block.vectors for block in blocks], axis=1),
+        np.concatenate([block.confidence for block in blocks], axis=1),
+    )
+
+
+def as_it_is(material: Material) -> Lifted:
+    """The method."""
+    return material.lifted()
+
+
+def gate_accidents(material: Material) -> Lifted:
+    """No meaning for a Gaussian that hardly paints anything in any view."""
+    largest = _weights_per_view(material.members).max(0)
+    lifted = material.lifted()
+    return replace(lifted, confidence=np.where(largest > TINY, lifted.confidence, 0).astype(np.float32))
+
+
+def visibility_gate(material: Material) -> Lifted:
+    """A view in which a Gaussian paints far less than in its best one does not speak for it."""
+    per_view = _weights_per_view(material.members)
+    seen = per_view >= GATE * per_view.max(0)
+    pairs = [pairs[seen[v][pairs["row"]]] for v, pairs in enumerate(material.members.pairs)]
+    return replace(material, members=Memberships(pairs, material.members.count)).lifted()
+
+
+def opacity_weights(material: Material) -> Lifted:
+    """Masks count by the square root of their pixels: near views outvote far ones less."""
+    pairs = [_reweighted(pairs, np.sqrt(pairs["weight"])) for pairs in material.members.pairs]
+    return replace(material, members=Memberships(pairs, material.members.count)).lifted()
+
+
+def gate_faint(material: Material) -> Lifted:
+    """No meaning for what one can hardly see."""
+    opacity = sigmoid(material.gaussians.opacity_logits.astype(np.float64))
+    lifted = material.lifted()
+    return replace(lifted, confidence=np.where(opacity >= 0.05, lifted.confidence, 0).astype(np.float32))
+
+
+def outlier_views(material: Material) -> Lifted:
+    """Masks far below the others in cosine to the median are left out, and the median taken again."""
+    lifted = material.lifted()
+    pairs = []
+    for view, vectors in zip(material.members.pairs, material.vectors, strict=True):
+        cosine = _cosines(view, vectors, lifted)
+        pairs.append((view, cosine))
+    mean, spread = _statistics(pairs, material.members.count)
+    kept = []
+    for view, cosine in pairs:
+        row, level = view["row"], view["level"]
+        kept.append(view[cosine >= mean[level, row] + OUTLIER * spread[level, row]])
+    return replace(material, members=Memberships(kept, material.members.count)).lifted()
+
+
+def merged_masks(material: Material) -> Lifted:
+    """Masks of several views that claim the same Gaussians become one thing, whose vector is the mean."""
+    things = same_things(material.members, [len(view) for view in material.vectors])
+    everything = np.concatenate(material.vectors)
+    sums = np.zeros((things.max(initial=-1) + 1, everything.shape[1]), np.float32)
+    np.add.at(sums, things, everything)
+    groups = np.split(things.astype(np.int32), np.cumsum([len(v) for v in material.vectors])[:-1])
+    merged = MaskGroups(tuple(groups), unit(sums).astype(np.float32))
+    blocks = range(len(material.members.blocks))
+    return joined(lift_block(material.members, merged, number, True) for number in blocks)
+
+
+GAINS: Mapping[str, Callable[[Material], Lifted]] = MappingProxyType(
+    {
+        "as it is": as_it_is,
+        "Gaussians that paint < 1 px in every view have no meaning": gate_accidents,
+        "views where a Gaussian paints < 10 % of its best are left out": visibility_gate,
+        "masks weigh by the root of their pixels": opacity_weights,
+        "Gaussians below 5 % opacity have no meaning": gate_faint,
+        "masks 1.5 deviations below the others' cosine are left out": outlier_views,
+        "masks that claim the same Gaussians are merged": merged_masks,
+    }
+)
+
+
+def same_things(members: Memberships, counts: Sequence[int]) -> Array:
+    """(M,) number of the thing that each mask of all views shows.
+
+    Two masks of one level and of different views are the same where most of what they claim, among the
+    Gaussians that both views see at that level, is claimed by both.
+    """
+    firsts = np.concatenate([[0], np.cumsum(counts)])
+    labels = np.arange(firsts[-1])
+    offset = 0
+    for level in range(len(LEVELS)):
+        claims, views = _claims(members, firsts, level)
+        links = _overlapping(claims, views)
+        _, found = connected_components(links, directed=False)
+        at_level = np.flatnonzero(np.diff(claims.tocsc().indptr) > 0)
+        labels[at_level] = firsts[-1] + offset + found[at_level]
+        offset += found.max(initial=-1) + 1
+    return np.unique(labels, return_inverse=True)[1]
+
+
+def _claims(members: Memberships, firsts: Array, level: int) -> tuple[sparse.csr_matrix, Array]:
+    """(N, M) bool: masks that hold more than half of a Gaussian's weight in their view and level."""
+    rows, columns = [], []
+    for view, pairs in enumerate(members.pairs):
+        here = pairs[pairs["level"] == level]
+        total = np.bincount(here["row"], here["weight"], members.count)
+        strong = here[here["weight"] > 0.5 * total[here["row"]]]
+        rows.append(strong["row"].astype(np.int64))
+        columns.append(firsts[view] + strong["mask"].astype(np.int64))
+    joined_rows, joined_columns = np.concatenate(rows), np.concatenate(columns)
+    shape = (members.count, int(firsts[-1]))
+    ones = np.ones(len(joined_rows), np.float32)
+    views = np.searchsorted(firsts, np.arange(firsts[-1]), side="right") - 1
+    return sparse.csr_matrix((ones, (joined_rows, joined_columns)), shape), views
+
+
+def _overlapping(claims: sparse.csr_matrix, views: Array) -> sparse.csr_matrix:
+    """(M, M) links between masks of different views whose overlap over union, where both see, is large."""
+    both = (claims.T @ claims).tocoo()
+    of_view = sparse.csr_matrix((np.ones(len(views), np.float32), (np.arange(len(views)), views)))
+    seen = claims @ of_view  # (N, V): is the Gaussian claimed in the view at all
+    visible = (claims.T @ seen).toarray()  # (M, V): Gaussians of the mask that the view sees
+    a, b = both.row, both.col
+    union = visible[a, views[b]] + visible[b, views[a]] - both.data
+    same = (views[a] != views[b]) & (both.data > SAME * union)
+    shape = (claims.shape[1],) * 2
+    return sparse.csr_matrix((np.ones(int(same.sum()), bool), (a[same], b[same])), shape)
+
+
+def _weights_per_view(members: Memberships) -> Array:
+    """(V, N) float32 weight of every Gaussian in the masks of each view, all levels together."""
+    return np.stack([
+        np.bincount(pairs["row"], pairs["weight"], members.count).astype(np.float32)
+        for pairs in members.pairs
+    ])  # fmt: skip
+
+
+def _reweighted(pairs: Array, weights: Array) -> Array:
+    changed = pairs.copy()
+    changed["weight"] = weights
+    return changed
+
+
+def _cosines(pairs: Array, vectors: Array, lifted: Lifted, chunk: int = 65_536) -> Array:
+    """(P,) cosine of every pair's mask with what its Gaussian means."""
+    cosines = np.empty(len(pairs), np.float32)
+    for start in range(0, len(pairs), chunk):
+        part = pairs[start : start + chunk]
+        meant = lifted.vectors[part["level"], part["row"]]
+        cosines[start : start + chunk] = (meant * vectors[part["mask"]]).sum(1)
+    return cosines
+
+
+def _statistics(pairs: Sequence[tuple[Array, Array]], count: int) -> tuple[Array, Array]:
+    """(3, N) weighted mean and standard deviation of the cosines at every Gaussian and level."""
+    sums = np.zeros((3, len(LEVELS), count))
+    for view, cosine in pairs:
+        index = view["level"].astype(np.int64) * count + view["row"]
+        for power in range(3):
+            values = view["weight"] * cosine.astype(np.float64) ** power
+            sums[power] += np.bincount(index, values, len(LEVELS) * count).reshape(len(LEVELS), count)
+    total = np.maximum(sums[0], 1e-12)
+    mean = sums[1] / total
+    return mean, np.sqrt(np.maximum(sums[2] / total - mean**2, 0)) + 1e-3  # rounding is no outlier
