@@ -109,7 +109,7 @@ class CodecConfig:
     latent_dim: int = 3  # numbers that the other kinds keep
     steps: int = 4_000  # of the autoencoder's training, as are the following
     batch: int = 256
-    lr: float = 7e-4
+    lr: float = 3e-3  # 7e-4 in the public code: with as many steps a quarter more error
     seed: int = 0
 
 
@@ -146,7 +146,7 @@ class TrainConfig:
 PAPER = TrainConfig(
     radiance=RadianceConfig(coarse_fraction=0.0),
     masks=MaskConfig(source="sam", sam="facebook/sam-vit-huge", crop_layers=1),
-    codec=CodecConfig(kind="autoencoder", steps=10_000, batch=64),
+    codec=CodecConfig(kind="autoencoder", steps=10_000, batch=64, lr=7e-4),
     lift=LiftConfig(mode="gradient", start="zeros-as-published"),
 )
 TrainProfile = Literal["default", "paper"]

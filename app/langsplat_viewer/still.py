@@ -14,7 +14,7 @@ from langsplat_core.display.latent_colours import latent_colours
 from langsplat_core.errors import BackendError, InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryResult
-from langsplat_core.scene import LEVELS, Camera, Scene
+from langsplat_core.scene import LEVELS, Camera, Reading, Scene
 from langsplat_viewer.frame import Backend
 from langsplat_viewer.headless import render_picture
 from langsplat_viewer.options import check_display, chosen_camera, latent_level
@@ -90,7 +90,7 @@ def draw_still(request: StillRequest, services: Services, progress: Progress = s
         image = render_picture(
             scene,
             camera,
-            PictureConfig(display=request.display),
+            _picture(scene, request),
             backend=request.backend,
             latent_rgb=_latent(scene, request),
             relevancies=_columns(shown),
@@ -104,6 +104,12 @@ def draw_still(request: StillRequest, services: Services, progress: Progress = s
     except OSError as error:
         raise InputError(f"--out {request.out}: cannot be written ({error.strerror or error})") from None
     return [f"{request.out}: {size}, {request.display}", *(describe(result) for result in results)]
+
+
+def _picture(scene: Scene, request: StillRequest) -> PictureConfig:
+    """What the window shows when a scene is opened: cut where a thing counts as there."""
+    reading = Reading() if scene.language is None else scene.language.reading
+    return PictureConfig(display=request.display, threshold=reading.found)
 
 
 def _latent(scene: Scene, request: StillRequest) -> Array | None:

@@ -1,7 +1,7 @@
 """Opening scenes, and stopping what is under way."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from langsplat_core.arrays import Array
@@ -94,6 +94,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     if scene.language is None:
         state.say(NO_FIELD)
     else:
+        state.picture = replace(state.picture, threshold=scene.language.reading.found)
         _warm_up_encoder(viewer, viewer.services.encoder_id or scene.language.encoder_id)
 
 

@@ -45,7 +45,8 @@ class Gain:
 def measure_gains(
     config: GainBenchConfig, work: Path, progress: Progress = silent, rooms: BenchmarkConfig | None = None
 ) -> list[Gain]:
-    """Every change in every room; `rooms`: how they are photographed and trained. Raises InputError for settings without a room."""
+    """Every change in every room; `rooms`: how they are photographed and trained. Raises InputError for
+    settings without a room."""
     if not config.seeds or not config.masks:
         raise InputError("bench gains: name at least one of --seeds and one of --masks")
     encoder, rows = load_encoder("demo"), []

@@ -46,7 +46,7 @@ def _train(
     data = torch.from_numpy(np.ascontiguousarray(vectors, np.float32))
     encoder, decoder = networks(data.shape[1], latent_dim)
     parameters = [*encoder.parameters(), *decoder.parameters()]
-    optimiser = torch.optim.Adam(parameters, lr=lr)
+    optimiser = torch.optim.Adam(parameters, lr=lr, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     generator = torch.Generator().manual_seed(seed)
     for step in range(steps):

@@ -39,15 +39,25 @@ def spherical_kmeans(
     extra = (count - len(centres)) * EXTRA
     centres = _grown(vectors, centres, count + round(extra), generator)
     for done in range(1, rounds + 1):
-        nearest, counts, _ = _assigned(vectors, centres)
-        centres = _means(vectors, nearest, counts)[counts > 0]
+        nearest, counts, missed = _assigned(vectors, centres)
         size = count + round(extra * max(1 - 2 * done / rounds, 0))
-        while len(centres) > size:
-            _, _, missed = _assigned(vectors, centres)
-            spare = min(len(centres) - size, 1 + len(centres) // HELPING)  # two that are alike do not both go
-            centres = np.delete(centres, np.argsort(missed, kind="stable")[:spare], axis=0)
-    _, counts, _ = _assigned(vectors, centres)
-    return centres[counts > 0]
+        kept = _without_spare(missed, size)
+        centres = _means(vectors, nearest, counts)[kept & (counts > 0)]
+    while True:
+        _, counts, missed = _assigned(vectors, centres)
+        kept = _without_spare(missed, count) & (counts > 0)
+        if kept.all():
+            return centres
+        centres = centres[kept]
+
+
+def _without_spare(missed: Array, size: int) -> Array:
+    """(K,) bool: all but those missed least, where there are more than `size`; only one in `HELPING` at a
+    time, because of two that are alike neither is missed."""
+    spare = min(max(len(missed) - size, 0), 1 + len(missed) // HELPING)
+    kept = np.ones(len(missed), bool)
+    kept[np.argsort(missed, kind="stable")[:spare]] = False
+    return kept
 
 
 def _assigned(vectors: Array, centres: Array) -> tuple[Array, Array, Array]:

@@ -22,7 +22,7 @@ LARGEST_SHARE = 4  # vectors per codeword, at least: with fewer, a codebook is a
 JUDGED = 5  # every so many vectors, one is kept from the fit and judges it
 FIRST_ROUNDS, FURTHER_ROUNDS = 8, 4
 REFINEMENTS = 2  # halvings of the interval that holds the smallest codebook, by ratio
-COLOUR_STEPS = 400  # of the autoencoder of 3 numbers whose latents are the colours
+COLOUR_STEPS, COLOUR_BATCH = 300, 64  # of the autoencoder of 3 numbers whose latents are the colours
 FEWEST_FOR_COLOURS = 16  # codewords; fewer have their principal axes for colours
 
 
@@ -96,8 +96,7 @@ def codeword_colours(codewords: Array, usage: Array, config: CodecConfig) -> Arr
     codewords, each axis stretched over what (K,) usage says occurs."""
     if len(codewords) < FEWEST_FOR_COLOURS:
         return principal_colours(codewords, usage)
-    batch = min(config.batch, 2 * len(codewords))
-    codec = train_autoencoder(codewords, 3, COLOUR_STEPS, batch, config.lr, config.seed)
+    codec = train_autoencoder(codewords, 3, COLOUR_STEPS, COLOUR_BATCH, config.lr, config.seed)
     return stretched(codec.encode(codewords), usage)
 
 
