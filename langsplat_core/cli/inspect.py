@@ -74,7 +74,7 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
         *lines,
         (
             "language field",
-            f"codec {field.codec}, d = {field.latent_dim}; {field.bytes / 1e6:.2f} MB in memory",
+            f"codec {field.codec} of {field.size}; {field.bytes / 1e6:.2f} MB in memory",
         ),
         ("text encoder", f"{field.encoder}, {field.vector_dim} numbers"),
         ("phrasebook", f"{field.phrases} phrases"),

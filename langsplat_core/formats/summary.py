@@ -22,7 +22,7 @@ class LanguageSummary:
     """The language field in short."""
 
     codec: str
-    latent_dim: int
+    size: int  # codewords of a codebook, numbers per latent of other kinds
     encoder: str
     vector_dim: int
     phrases: int
@@ -140,7 +140,7 @@ def _language(field: LanguageField) -> LanguageSummary:
     }
     return LanguageSummary(
         codec=field.codec.kind,
-        latent_dim=field.codec.latent_dim,
+        size=field.codec.index_size or field.codec.latent_dim,
         encoder=field.encoder_id,
         vector_dim=field.codec.vector_dim,
         phrases=len(field.phrasebook),

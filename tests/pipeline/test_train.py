@@ -11,6 +11,7 @@ from safetensors.numpy import load_file
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.config import (
+    PAPER,
     ClipConfig,
     CodecConfig,
     LiftConfig,
@@ -223,3 +224,46 @@ def test_query_inspect_and_convert_commands(room, tmp_path, capsys):
     copy = tmp_path / "copy.ply"
     assert run("convert", out, copy) == 0
     assert load_scene(copy).language is not None
+
+
+def test_a_trained_scene_is_given_a_meaning(room, tmp_path):
+    first = tmp_path / "trained.ply"
+    train_scene(room, first, tiny_settings(room))
+    again = tmp_path / "again.ply"
+    options = ["--dataset.max-side", 64, "--dataset.test-every", 4, "--masks.source", "graph"]
+    options += ["--clip.model", room / "encoder", "--clip.device", "cpu", "--codec.size", 9]
+    assert run("train", room, "--out", again, "--gaussians", first, *options) == 0
+    assert again.read_bytes() == first.read_bytes()
+    assert not list((tmp_path / "again.work").glob("radiance*"))
+    field = load_scene(again).language
+    assert field is not None
+    assert field.codec.index_size == 9
+    assert run("train", room, "--out", again, "--gaussians", tmp_path / "missing.ply", *options) == 2
+
+
+def test_profiles_are_defaults_that_options_override():
+    plain = parse(["train", "photos", "--out", "s.ply", "--max-relevancy-error", "0.01"])
+    assert plain.config == replace(TrainConfig(), codec=CodecConfig(max_relevancy_error=0.01))
+    words = ["train", "photos", "--out", "s.ply", "--profile", "paper"]
+    assert parse(words).config == PAPER
+    assert (PAPER.codec.kind, PAPER.codec.latent_dim, PAPER.lift.steps) == ("autoencoder", 3, 30_000)
+    assert (PAPER.lift.mode, PAPER.lift.start, PAPER.masks.crop_layers) == (
+        "gradient",
+        "zeros-as-published",
+        1,
+    )
+    other = parse([*words[:-2], "--profile=paper", "--codec.latent-dim", "8"])
+    assert other.config == replace(PAPER, codec=replace(PAPER.codec, latent_dim=8))
+
+
+def test_the_papers_profile_runs_whole(room, tmp_path, capsys):
+    out = tmp_path / "scene.ply"
+    options = ["--dataset.max-side", 64, "--dataset.test-every", 4, "--radiance.steps", 10]
+    options += ["--masks.source", "graph", "--clip.model", room / "encoder", "--clip.device", "cpu"]
+    options += ["--codec.steps", 30, "--lift.steps", 20, "--phrases", "red mug"]
+    assert run("train", room, "--out", out, "--profile", "paper", *options) == 0
+    assert run("query", out, "red mug", "--mode", "paper") == 0
+    assert "score" in capsys.readouterr().out
+    field = load_scene(out).language
+    assert field is not None
+    assert field.latents.shape[2] == 3
