@@ -16,6 +16,7 @@ from langsplat_core.config import (
     CodecConfig,
     LiftConfig,
     RadianceConfig,
+    TrainConfig,
 )
 from langsplat_core.errors import EncoderError, FormatError, InputError
 from langsplat_core.formats import load_scene
