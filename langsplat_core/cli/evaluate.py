@@ -54,7 +54,7 @@ class EvalSynthetic:
         with TerminalProgress() as progress:
             reports = run_benchmark(self.config, self.work, progress)
         tables = [score_table(reports), room_table(reports)]
-        if self.config.budget:
+        if self.config.budget or self.config.ceiling:
             tables.append(budget_table(reports))
         print("\n\n".join(tables))
         unknown = sum(len(report.measured[0].unknown) for report in reports)

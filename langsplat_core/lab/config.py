@@ -45,6 +45,7 @@ class BenchmarkConfig:
     codec: CodecConfig = field(default_factory=CodecConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     cut: CutRule = "median"  # where a map is cut into a mask, see `query.cut`
+    ceiling: bool = False  # also keep all of the encoder's numbers, by which a codec is judged
     budget: bool = False  # also swap one stage at a time for one that makes no mistake
 
 

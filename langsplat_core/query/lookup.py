@@ -13,7 +13,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.query.table import build_table, suits_table
 from langsplat_core.scene import LanguageField
-from langsplat_core.semantics.relevancy import CHUNK, from_cosines, latent_relevancy, relevancy
+from langsplat_core.semantics.relevancy import CHUNK, from_cosines, latent_relevancy
 
 
 class Lookup(Protocol):
@@ -77,22 +77,23 @@ class DecodedLookup:
     field: LanguageField
 
     @cached_property
-    def _decoded(self) -> tuple[Array, Array]:
-        """Rows of (3 N,) with a meaning, and their (M, D) vectors."""
+    def _decoded(self) -> tuple[Array, Array, Array]:
+        """Rows of (3 N,) with a meaning, their (M, D) vectors, and (M,) their cosine with the nearest
+        canonical phrase."""
         field = self.field
         rows = np.flatnonzero(field.known)
         latents = field.latents.reshape(-1, field.latents.shape[-1])
         vectors = np.empty((len(rows), field.codec.vector_dim), np.float32)
+        nearest = np.empty(len(rows), np.float32)
         for start in range(0, len(rows), CHUNK):
             part = slice(start, start + CHUNK)
             vectors[part] = field.codec.decode(latents[rows[part]])
-        return rows, vectors
+            nearest[part] = (vectors[part] @ field.canonical.T).max(1)
+        return rows, vectors, nearest
 
     def relevancy(self, phrase: Array) -> Array:
         """See `Lookup`."""
-        field = self.field
-        rows, vectors = self._decoded
-        values = np.zeros(field.confidence.size, np.float32)
-        temperature = field.reading.temperature
-        values[rows] = relevancy(vectors, phrase[None], field.canonical, temperature)[:, 0]
+        rows, vectors, nearest = self._decoded
+        values = np.zeros(self.field.confidence.size, np.float32)
+        values[rows] = from_cosines(vectors @ phrase, nearest, self.field.reading.temperature)
         return values

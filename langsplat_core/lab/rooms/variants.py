@@ -30,11 +30,11 @@ def ceiling(dim: int) -> CodecConfig:
 
 
 def variants(config: BenchmarkConfig, dim: int) -> list[Variant]:
-    """The method first; with `config.budget`, then one variant per stage, which differs in that stage alone.
-    dim: numbers of the encoder's vectors."""
+    """The method first; then the ceiling of codecs, or, with `config.budget`, one variant per stage, which
+    differs in that stage alone. dim: numbers of the encoder's vectors."""
     method = Variant("the method", config.masks, codec=config.codec, lift=config.lift)
     if not config.budget:
-        return [method]
+        return [method, replace(method, name="no codec", codec=ceiling(dim))][: 1 + config.ceiling]
     perfect = [replace(method, name="perfect masks", masks="truth")] if config.masks != "truth" else []
     decoded = replace(method, name="autoencoder, d = 3", codec=autoencoder(steps=config.codec.steps))
     return [

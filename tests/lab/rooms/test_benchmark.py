@@ -113,6 +113,8 @@ def test_variants_swap_one_stage_at_a_time(masks):
     expected = [{"vectors"}, {"codec"}, {"codec"}, {"codec", "query"}]
     assert swapped == ([{"masks"}] if masks == "graph" else []) + expected
     assert len(variants(replace(config, budget=False), 512)) == 1
+    both = variants(replace(config, budget=False, ceiling=True), 512)
+    assert [variant.codec.latent_dim for variant in both if variant.name == "no codec"] == [512]
 
 
 def test_truth_masks_are_the_truth(run, capture):
