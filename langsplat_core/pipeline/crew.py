@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import TypeVar
 
+from langsplat_core.errors import InputError
+
 T = TypeVar("T")
 PATIENCE = timedelta(days=7)  # radiance training is one process's work, and the others wait for it
 
@@ -33,11 +35,19 @@ class Crew:
         return list(items[self.rank :: self.size])
 
     def meet(self) -> None:
-        """Wait for all."""
-        if self.size > 1:
-            import torch.distributed
+        """Wait for all. Raises InputError where one of them is no more."""
+        if self.size < 2:
+            return
+        import torch.distributed
 
+        try:
             torch.distributed.barrier()
+        except RuntimeError as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise InputError(
+                f"another process of this training ended ({reason[:80]}); give the same command again: what "
+                "is finished is kept"
+            ) from None
 
     def once(self, make: Callable[[], T]) -> T:
         """The result of `make`, which keeps it in a file: made by one process and read by the others."""

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from safetensors.numpy import load_file
 
+from langsplat_core.errors import InputError
 from langsplat_core.pipeline.crew import Crew, join_crew
 from langsplat_core.pipeline.views import StoredViews
 from tests.support.lifting import make_views
@@ -32,6 +33,15 @@ def test_alone_without_a_launcher(monkeypatch):
     monkeypatch.delenv("WORLD_SIZE", raising=False)
     assert join_crew() == Crew(0, 1)
     assert Crew().once(lambda: 7) == 7
+
+
+def test_a_lost_process_is_said_in_one_line(monkeypatch):
+    def lost() -> None:
+        raise RuntimeError("Connection closed by peer [127.0.0.1]:55\nmore")
+
+    monkeypatch.setattr("torch.distributed.barrier", lost)
+    with pytest.raises(InputError, match=r"ended \(Connection closed by peer .*what is finished is kept"):
+        Crew(1, 2).meet()
 
 
 def test_views_are_read_when_they_are_looked_at():
