@@ -90,21 +90,14 @@ def train_scene(
 
     store = FeatureStore(work / "features")  # keyed by mask settings, encoder and image
     mine = crew.share(train)
-    describe_capture(
-        [capture.images[i] for i in mine],
-        [capture.cameras[i].name for i in mine],
-        mask_source,
-        encoder,
-        store,
-        progress,
-    )
+    names = [capture.cameras[i].name for i in mine]
+    describe_capture([capture.images[i] for i in mine], names, mask_source, encoder, store, progress)
     crew.meet()
     clock.lap("masks and vectors")
 
-    if given is None:
+    gaussians = given
+    if gaussians is None:
         gaussians = crew.once(lambda: trained_gaussians(capture, train, config, work, progress))
-    else:
-        gaussians = given
     clock.lap("radiance")
 
     cameras = tuple(capture.cameras[i] for i in train)
