@@ -1,13 +1,12 @@
 """`langsplat bench gains`: small changes of the lifting, tried in fresh rooms."""
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from langsplat_core.files import atomic_path
+from langsplat_core.cli.bench_files import save_figures
 from langsplat_core.lab.config import GainBenchConfig
 from langsplat_core.progress import TerminalProgress
 
@@ -29,8 +28,5 @@ class BenchGains:
         with TerminalProgress() as progress:
             rows = measure_gains(self.config, self.work, progress)
         table = gain_table(rows)
-        with atomic_path(self.out / "gains.md") as path:
-            path.write_text(table)
-        with atomic_path(self.out / "gains.json") as path:
-            path.write_text(json.dumps(figures(self.config, rows), indent=1))
+        save_figures(self.out, "gains", table, figures(self.config, rows))
         print(table)

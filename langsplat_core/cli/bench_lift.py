@@ -1,12 +1,12 @@
 """`langsplat bench lift`: ways from masks to meanings, error and accuracy against time."""
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from langsplat_core.cli.bench_files import save_figures
 from langsplat_core.files import atomic_path
 from langsplat_core.lab.config import LiftBenchConfig
 from langsplat_core.progress import TerminalProgress
@@ -28,10 +28,7 @@ class BenchLift:
 
         with TerminalProgress() as progress:
             report = measure_liftings(self.config, self.work, progress)
-        with atomic_path(self.out / "lift.md") as path:
-            path.write_text(report.text)
-        with atomic_path(self.out / "lift.json") as path:
-            path.write_text(json.dumps(report.figures, indent=1, default=str))
+        save_figures(self.out, "lift", report.text, report.figures)
         with atomic_path(self.out / "lift.png") as path:
             plot(report.rows, path)
         print(report.text)

@@ -1,11 +1,10 @@
 """`langsplat bench load`: reading a large scene, in time and memory."""
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from langsplat_core.cli.bench_files import save_figures
 from langsplat_core.errors import InputError
-from langsplat_core.files import atomic_path
 from langsplat_core.lab.speed.load import as_table, measure_loading
 from langsplat_core.progress import TerminalProgress
 
@@ -27,8 +26,5 @@ class BenchLoad:
         with TerminalProgress() as progress:
             loadings = measure_loading(self.count, self.repeats, progress)
         table = as_table(loadings)
-        with atomic_path(self.out / "load.md") as path:
-            path.write_text(table)
-        with atomic_path(self.out / "load.json") as path:
-            path.write_text(json.dumps([asdict(loading) for loading in loadings], indent=1))
+        save_figures(self.out, "load", table, [asdict(loading) for loading in loadings])
         print(table)

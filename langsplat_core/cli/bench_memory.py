@@ -1,11 +1,10 @@
 """`langsplat bench memory`: what the way from masks to codes takes, and how it grows."""
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from langsplat_core.cli.bench_files import save_figures
 from langsplat_core.errors import InputError
-from langsplat_core.files import atomic_path
 from langsplat_core.progress import TerminalProgress
 
 
@@ -28,8 +27,5 @@ class BenchMemory:
         with TerminalProgress() as progress:
             costs = measure_lift_memory(self.sizes, self.picture, progress)
         table = cost_table(costs)
-        with atomic_path(self.out / "memory.md") as path:
-            path.write_text(table)
-        with atomic_path(self.out / "memory.json") as path:
-            path.write_text(json.dumps([asdict(cost) for cost in costs], indent=1))
+        save_figures(self.out, "memory", table, [asdict(cost) for cost in costs])
         print(table)

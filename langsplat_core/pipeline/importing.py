@@ -14,6 +14,7 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CodecConfig
 from langsplat_core.errors import InputError
 from langsplat_core.formats.checkpoints import ForeignScene, Leaves
+from langsplat_core.pipeline.language import encoded_phrases
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
@@ -25,8 +26,7 @@ from langsplat_core.scene import (
 )
 from langsplat_core.scene.codec import SHORTEST, latent_dtype
 from langsplat_core.scene.codec.codebook import LARGEST
-from langsplat_core.scene.phrases import phrase_key
-from langsplat_core.semantics.encoder import OPEN_MODEL, PhraseEncoder
+from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.training.language.codebook_fit import codeword_colours, rounded
 from langsplat_core.training.language.codec_fit import fit_codec
@@ -85,7 +85,7 @@ def import_scene(
         codec=codec,
         canonical=encoder.encode_texts(list(CANONICAL_PHRASES)),
         encoder_id=encoder.id,
-        phrasebook=_phrasebook(encoder, phrases),
+        phrasebook=encoded_phrases(encoder, phrases),
         reading=encoder.reading,
     )
     subpart, part, whole = confidence.mean(1).tolist() if confidence.size else (0.0, 0.0, 0.0)
@@ -96,11 +96,6 @@ def import_scene(
 
 def _first_path(foreign: ForeignScene) -> object:
     return next(path for path in foreign.paths if path is not None)
-
-
-def _phrasebook(encoder: PhraseEncoder, phrases: tuple[str, ...]) -> dict[str, Array]:
-    names = list(dict.fromkeys(phrase_key(phrase) for phrase in phrases))
-    return dict(zip(names, encoder.encode_texts(names), strict=True))
 
 
 def _codec(

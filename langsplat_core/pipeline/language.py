@@ -41,7 +41,7 @@ from langsplat_core.scene import (
 )
 from langsplat_core.scene.codec import latent_dtype
 from langsplat_core.scene.phrases import phrase_key
-from langsplat_core.semantics.encoder import Encoder
+from langsplat_core.semantics.encoder import Encoder, PhraseEncoder
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.codec_fit import fit_codec
 from langsplat_core.training.language.gradient_lift import lift_by_gradient
@@ -84,7 +84,7 @@ def language_field(
         codec=codec,
         canonical=encoder.encode_texts(list(CANONICAL_PHRASES)),
         encoder_id=encoder.id,
-        phrasebook=_phrasebook(encoder, config.phrases),
+        phrasebook=encoded_phrases(encoder, config.phrases),
         reading=encoder.reading,
     )
     return field, report
@@ -275,6 +275,7 @@ def _unpack_codec(arrays: Arrays) -> tuple[Codec, CodecReport]:
     return codec_from_tensors(str(arrays["kind"]), tensors), CodecReport(*arrays["report"].tolist())
 
 
-def _phrasebook(encoder: Encoder, phrases: tuple[str, ...]) -> dict[str, Array]:
-    names = [phrase_key(phrase) for phrase in phrases]
+def encoded_phrases(encoder: Encoder | PhraseEncoder, phrases: tuple[str, ...]) -> dict[str, Array]:
+    """A scene's phrasebook: `phrase_key` -> (D,) float32 unit vector, each phrase once."""
+    names = list(dict.fromkeys(phrase_key(phrase) for phrase in phrases))
     return dict(zip(names, encoder.encode_texts(names), strict=True))

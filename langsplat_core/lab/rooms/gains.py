@@ -67,7 +67,7 @@ def visibility_gate(material: Material) -> Lifted:
     return replace(material, members=Memberships(pairs, material.members.count)).lifted()
 
 
-def opacity_weights(material: Material) -> Lifted:
+def root_weights(material: Material) -> Lifted:
     """Masks count by the square root of their pixels: near views outvote far ones less."""
     pairs = [_reweighted(pairs, np.sqrt(pairs["weight"])) for pairs in material.members.pairs]
     return replace(material, members=Memberships(pairs, material.members.count)).lifted()
@@ -112,7 +112,7 @@ GAINS: Mapping[str, Callable[[Material], Lifted]] = MappingProxyType(
         "as it is": as_it_is,
         "Gaussians that paint < 1 px in every view have no meaning": gate_accidents,
         "views where a Gaussian paints < 10 % of its best are left out": visibility_gate,
-        "masks weigh by the root of their pixels": opacity_weights,
+        "masks weigh by the root of their pixels": root_weights,
         "Gaussians below 5 % opacity have no meaning": gate_faint,
         "masks 1.5 deviations below the others' cosine are left out": outlier_views,
         "masks that claim the same Gaussians are merged": merged_masks,
