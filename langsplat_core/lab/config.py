@@ -68,6 +68,8 @@ class LiftBenchConfig:
     """Of the autoencoders' training."""
     gradient_steps: int = 3_000
     """Of the paper's training; it takes 30 000."""
+    only: tuple[str, ...] = ()
+    """Rows whose name holds one of these texts; all of them if empty."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.lab.config import BenchmarkConfig, LiftBenchConfig
 from langsplat_core.lab.rooms.benchmark import Room, weights_digest
 from langsplat_core.lab.rooms.report import Measured, loss_cells, of_kind
-from langsplat_core.lab.rooms.variants import liftings
+from langsplat_core.lab.rooms.variants import Variant, liftings
 from langsplat_core.progress import Progress, silent
 from langsplat_core.semantics.encoders import load_encoder
 
@@ -59,13 +59,22 @@ def measure_liftings(
     if not config.masks:
         raise InputError("--masks: name at least one of truth, wrong, graph")
     encoder = load_encoder("demo")
+    chosen = {masks: _chosen(liftings(config, masks, encoder.dim), config.only) for masks in config.masks}
     settings = rooms or BenchmarkConfig()
     room = Room(settings, config.tier, config.seed, work, (encoder, weights_digest("demo")), progress)
     rows = []
-    for masks in config.masks:
-        for variant in liftings(config, masks, encoder.dim):
-            rows.append(replace(room.measure(variant, fresh=True), name=variant.name))
+    for variant in (variant for ways in chosen.values() for variant in ways):
+        rows.append(replace(room.measure(variant, fresh=True), name=variant.name))
     return LiftReport(config, len(room.gaussians), tuple(rows))
+
+
+def _chosen(ways: list[Variant], only: Sequence[str]) -> list[Variant]:
+    chosen = [way for way in ways if not only or any(text in way.name for text in only)]
+    if not chosen:
+        raise InputError(
+            f"--only {' '.join(only)}: no row has that; the rows are {', '.join(w.name for w in ways)}"
+        )
+    return chosen
 
 
 def _cells(row: Measured) -> tuple[str, ...]:

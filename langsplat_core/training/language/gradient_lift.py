@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from langsplat_core.arrays import Array, unit
+from langsplat_core.compiled import kernel, plain, shared_workers
 from langsplat_core.config import INRIA, LiftConfig, RasterSettings
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.protocol import FreezableView, LiftingRasterizer, LiftingView
@@ -48,12 +49,9 @@ class AdamState:
     def update(self, gradient: Array, lr: float) -> None:
         """One step, in place."""
         self.steps += 1
-        for moment, value, beta in ((self.first, gradient, BETAS[0]), (self.second, gradient**2, BETAS[1])):
-            moment *= beta
-            moment += (1 - beta) * value
-        corrected = lr / (1 - BETAS[0] ** self.steps)
-        scale = np.sqrt(self.second / (1 - BETAS[1] ** self.steps)) + EPSILON
-        self.x -= corrected * self.first / scale
+        corrected = (lr / (1 - BETAS[0] ** self.steps), 1 / (1 - BETAS[1] ** self.steps))
+        flat = (array.reshape(-1) for array in (self.x, self.first, self.second, plain(gradient)))
+        shared_workers().run(_adam, self.x.size, *flat, *(np.float32(factor) for factor in corrected))
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,14 +60,7 @@ class _Target:
 
     camera: Camera
     labels: Array  # (3, H, W) int32, -1 for none
-    latents: Array  # (M + 1, d) float32; the last row, which -1 indexes, is not compared
-
-    def image(self) -> tuple[Array, Array]:
-        """(H, W, 3 d) latents and (H, W, 3 d) float32 mask."""
-        height, width = self.labels.shape[1:]
-        image = np.moveaxis(self.latents[self.labels], 0, 2).reshape(height, width, -1)
-        mask = np.repeat(np.moveaxis(self.labels >= 0, 0, 2), self.latents.shape[1], axis=2)
-        return image, mask.astype(np.float32)
+    latents: Array  # (M, d) float32 of the masks
 
 
 def lift_by_gradient(
@@ -116,17 +107,63 @@ def by_features(x: Array, by_y: Array) -> Array:
 def loss_and_gradient(view: LiftingView, target: _Target, y: Array) -> tuple[float, Array]:
     """Masked L1 of one view, mean over levels, pixels and numbers, and its (3, N, d) gradient by y."""
     levels, count, d = y.shape
-    image, mask = target.image()
-    difference = view.splat(np.ascontiguousarray(np.moveaxis(y, 0, 1).reshape(count, levels * d)))[0] - image
-    difference *= mask
-    gradient = view.gather(np.sign(difference) / np.float32(difference.size))
-    return float(np.abs(difference).mean()), np.moveaxis(gradient.reshape(count, levels, d), 1, 0)
+    image = view.splat(np.ascontiguousarray(np.moveaxis(y, 0, 1).reshape(count, levels * d)))[0]
+    signs, losses = np.empty_like(image), np.empty(len(image))
+    share = np.float32(1 / image.size)
+    shared_workers().run(_compare, len(image), image, target.labels, target.latents, share, signs, losses)
+    gradient = view.gather(signs)
+    return float(losses.sum() / image.size), np.moveaxis(gradient.reshape(count, levels, d), 1, 0)
+
+
+@kernel
+def _compare(
+    first: int,
+    last: int,
+    image: Array,
+    labels: Array,
+    latents: Array,
+    share: float,
+    signs: Array,
+    losses: Array,
+) -> None:
+    """Rows [first, last) of a picture: `share` with the sign of (image - latents of the labels), zero where
+    there is no label, and the sum of the absolute differences of each row."""
+    levels, d = labels.shape[0], latents.shape[1]
+    for row in range(first, last):
+        total = 0.0
+        for column in range(image.shape[1]):
+            for channel in range(levels * d):
+                label = labels[channel // d, row, column]
+                difference = 0.0
+                if label >= 0:
+                    difference = image[row, column, channel] - latents[label, channel % d]
+                total += abs(difference)
+                signs[row, column, channel] = share * np.sign(difference)
+        losses[row] = total
+
+
+@kernel
+def _adam(
+    first: int,
+    last: int,
+    x: Array,
+    mean: Array,
+    square: Array,
+    gradient: Array,
+    rate: float,
+    correction: float,
+) -> None:
+    """Numbers [first, last). rate: lr / (1 - beta1^t); correction: 1 / (1 - beta2^t)."""
+    old, older = np.float32(BETAS[0]), np.float32(BETAS[1])
+    for i in range(first, last):
+        g = gradient[i]
+        mean[i] = old * mean[i] + (np.float32(1) - old) * g
+        square[i] = older * square[i] + (np.float32(1) - older) * g * g
+        x[i] -= rate * mean[i] / (np.sqrt(square[i] * correction) + np.float32(EPSILON))
 
 
 def _target(camera: Camera, features: ImageFeatures, codec: Codec) -> _Target:
-    latents = np.zeros((len(features.vectors) + 1, codec.latent_dim), np.float32)
-    latents[:-1] = codec.encode(features.vectors)
-    return _Target(camera, features.labels, latents)
+    return _Target(camera, np.asarray(features.labels, np.int32), plain(codec.encode(features.vectors)))
 
 
 def _shuffled(views: int, steps: int, seed: int) -> Iterator[int]:
