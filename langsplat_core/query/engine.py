@@ -11,6 +11,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
+from langsplat_core.query.cut import cut_level
 from langsplat_core.query.lookup import Lookup, build_lookup
 from langsplat_core.query.places import Place, locate
 from langsplat_core.query.surface import Surface, build_surface
@@ -47,6 +48,7 @@ class QueryResult:
     place: Array | None  # (3,) world units
     box: Array | None  # (2, 3) corners, world units
     found: bool  # peak >= the scene's `Reading.found`
+    members: Array  # (N,) bool: the Gaussians that answer, wherever they are; all of them above the cut
 
     @property
     def heat_range(self) -> tuple[float, float]:
@@ -173,6 +175,7 @@ class QueryEngine:
         chosen = int(np.argmax(scores)) if level == "auto" else LEVELS.index(level)
         peak = scores[chosen]
         place = self._place(smoothed[chosen], peak)
+        members = relevancy[chosen] > cut_level("floor", relevancy[chosen], peak, FLOOR)
         return QueryResult(
             phrase=tidy(phrase),
             level=chosen,
@@ -182,6 +185,7 @@ class QueryEngine:
             place=None if place is None else place.position,
             box=None if place is None else place.box,
             found=peak >= self.field.reading.found,
+            members=members,
         )
 
     def _place(self, smoothed: Array, peak: float) -> Place | None:
