@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from langsplat_core.files import atomic_path
-from langsplat_core.lab.config import DemoEncoderConfig, MaskOrigin, Tier
+from langsplat_core.lab.config import DemoEncoderConfig, LabelLayout, MaskOrigin, Tier
 from langsplat_core.progress import TerminalProgress
 
 
@@ -28,13 +28,17 @@ class DemoDataset:
     """Width and height, pixels."""
     tier: Tier = "clutter"
     """How hard the room is: objects apart, cluttered, or packed with look-alikes."""
+    layout: LabelLayout = "plain"
+    """lerf-ovs, 3d-ovs: the photographs in OUT/room, and every eighth labelled as in that benchmark."""
 
     def run(self) -> None:
-        from langsplat_core.lab.world.photographs import write_dataset
+        from langsplat_core.lab.rooms.label_layouts import write_labelled
 
         with TerminalProgress() as progress:
-            write_dataset(self.out, self.seed, self.views, self.size, progress, self.tier)
-        print(f"{self.out}: {self.views} photographs with ground truth")
+            folder = write_labelled(
+                self.out, self.layout, self.seed, self.views, self.size, progress, self.tier
+            )
+        print(f"{folder}: {self.views} photographs with ground truth")
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ TIERS: tuple[Tier, ...] = get_args(Tier)
 # weight-free segmenter's.
 MaskOrigin = Literal["truth", "wrong", "graph"]
 MASK_ORIGINS: tuple[MaskOrigin, ...] = get_args(MaskOrigin)
+LabelLayout = Literal["plain", "lerf-ovs", "3d-ovs"]  # how a rendered room's truth is written
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """A folder of photographs of a procedural room, with cameras, sparse points and ground truth."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,14 +26,33 @@ LIGHT = Light(np.array([-1.25, -1.05, 1.55]))
 _RINGS = ((0.3, 23.0, 1.5, 0.0), (0.3, 42.0, 1.25, 0.02), (0.25, 36.0, 1.0, 0.05), (0.15, 50.0, 1.75, -0.2))
 
 
+@dataclass(frozen=True)
+class Naming:
+    """What photographs are called."""
+
+    stem: str = "view_{:03d}"
+    suffix: str = ".png"
+    first: int = 0
+
+
+PLAIN = Naming()
+
+
 def write_dataset(
-    out: Path, seed: int, views: int, size: tuple[int, int], progress: Progress, tier: Tier = "clutter"
+    out: Path,
+    seed: int,
+    views: int,
+    size: tuple[int, int],
+    progress: Progress,
+    tier: Tier = "clutter",
+    naming: Naming = PLAIN,
 ) -> None:
     """Render the room of `seed` and difficulty `tier` into folder `out`.
 
-    views: number of photographs, >= 4; size: (width, height) in pixels, at least 16 each. Written are
-    images/view_000.png ..., points.ply, truth/view_000.npz (`ids`: (3, H, W) int32 label ids at subpart,
-    part and whole level, -1 where there is nothing; `depth`: (H, W) float32 metres along the camera's z),
+    views: number of photographs, >= 4; size: (width, height) in pixels, at least 16 each; naming: of the
+    photographs. Written are images/view_000.png ..., points.ply, truth/view_000.npz (`ids`: (3, H, W) int32
+    label ids at subpart, part and whole level, -1 where there is nothing; `depth`: (H, W) float32 metres along
+    the camera's z),
     truth/labels.json (id -> level, word, thing, colour, phrase, words) and, last, transforms.json in
     nerfstudio's convention (OpenGL camera-to-world). A view counts as done when its truth file is there, so
     an interrupted call goes on where it stopped. Raises InputError for a size or number out of range.
@@ -43,7 +62,10 @@ def write_dataset(
             f"demo dataset: {views} views of {size[0]}x{size[1]}: it needs at least 4 views of 16x16"
         )
     world = photographed_room(seed, tier)
-    cameras = orbit_cameras(views, size, seed)
+    cameras = [
+        replace(camera, name=naming.stem.format(naming.first + k))
+        for k, camera in enumerate(orbit_cameras(views, size, seed))
+    ]
     folder, truth = out / "images", out / "truth"
     folder.mkdir(parents=True, exist_ok=True)
     truth.mkdir(exist_ok=True)
@@ -51,11 +73,11 @@ def write_dataset(
     renderer = Renderer(world, LIGHT, samples=LIGHT_SAMPLES, cell=LIGHT_CELL)
     for done, camera in enumerate(cameras):
         if not (truth / f"{camera.name}.npz").exists():
-            _write_view(renderer, world, camera, out)
+            _write_view(renderer, world, camera, out, naming.suffix)
         progress("rendering photographs", (done + 1) / views)
     _write_labels(world, truth / "labels.json")
     _write_points(world, renderer, seed, out / "points.ply")
-    _write_transforms(cameras, out / "transforms.json")
+    _write_transforms(cameras, naming.suffix, out / "transforms.json")
 
 
 def photographed_room(seed: int, tier: Tier = "clutter") -> World:
@@ -90,10 +112,10 @@ def orbit_cameras(views: int, size: tuple[int, int], seed: int) -> list[Camera]:
     return [replace(cameras[row], name=f"view_{k:03d}") for k, row in enumerate(order)]
 
 
-def _write_view(renderer: Renderer, world: World, camera: Camera, out: Path) -> None:
+def _write_view(renderer: Renderer, world: World, camera: Camera, out: Path, suffix: str) -> None:
     picture = renderer.picture(camera)
-    with atomic_path(out / "images" / f"{camera.name}.png") as path:
-        Image.fromarray(picture.image).save(path)
+    with atomic_path(out / "images" / f"{camera.name}{suffix}") as path:
+        Image.fromarray(picture.image).save(path, quality=95)  # PNG has no quality and does not read it
     with atomic_path(out / "truth" / f"{camera.name}.npz") as path:
         np.savez_compressed(path, ids=truth_ids(world, picture), depth=picture.depth)
 
@@ -144,7 +166,7 @@ def camera_to_world_gl(camera: Camera) -> Array:
     return np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def _write_transforms(cameras: list[Camera], path: Path) -> None:
+def _write_transforms(cameras: list[Camera], suffix: str, path: Path) -> None:
     first = cameras[0]
     content = {
         "camera_model": "PINHOLE",
@@ -157,7 +179,7 @@ def _write_transforms(cameras: list[Camera], path: Path) -> None:
         "ply_file_path": "points.ply",
         "frames": [
             {
-                "file_path": f"images/{camera.name}.png",
+                "file_path": f"images/{camera.name}{suffix}",
                 "transform_matrix": camera_to_world_gl(camera).tolist(),
             }
             for camera in cameras

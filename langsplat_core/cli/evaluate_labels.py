@@ -1,0 +1,98 @@
+"""`langsplat eval lerf-ovs | 3d-ovs | scannet`: the field's benchmarks."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from langsplat_core.errors import InputError
+from langsplat_core.evaluation.protocols.profiles import (
+    LERF_PROFILES,
+    OVS_PROFILES,
+    LerfProtocol,
+    OvsProtocol,
+    Profile,
+)
+from langsplat_core.progress import TerminalProgress
+
+if TYPE_CHECKING:
+    from langsplat_core.evaluation.protocols.labels import Benchmark
+
+SceneAndData = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[SCENE] DATA")]
+
+
+@dataclass(frozen=True)
+class _EvalLabels:
+    paths: tyro.conf.Positional[SceneAndData]
+    """A scene of ours, or a folder with one NAME.ply for each of the benchmark's scenes; then the folder of
+    the benchmark, or one scene's folder of it. With --maps the latter alone."""
+    maps: Path | None = None
+    """Score these maps of another system, files named VIEW/PHRASE.npy or .png, instead of a scene."""
+    only: tuple[str, ...] = ()
+    """Names of the benchmark's scenes to score; all of them if empty."""
+    pictures: Path | None = None
+    """Also write one picture per query into this folder."""
+    json: Path | None = None
+    """Also write all figures to this file."""
+    encoder: str = ""
+    """Text encoder folder or hub id, in place of the one the scene names."""
+    paper_order: bool = False
+    """Blend latents and decode every pixel, as the paper does, not the relevancies; no codebook can."""
+
+    def scene_and_data(self) -> tuple[Path | None, Path]:
+        """The scene, None for maps, and the benchmark's folder."""
+        wanted = 1 if self.maps else 2
+        if len(self.paths) != wanted:
+            raise InputError(
+                "give the benchmark's folder alone with --maps"
+                if self.maps
+                else "give a scene and the benchmark's folder, or the folder alone and --maps FOLDER"
+            )
+        return (None if self.maps else self.paths[0]), self.paths[-1]
+
+    def evaluate(self, benchmark: "Benchmark", profile: Profile) -> None:
+        """Score, print the table, write what was asked for."""
+        from langsplat_core.evaluation.protocols.report import save_json, table
+        from langsplat_core.evaluation.protocols.run import Subject, run_benchmark
+        from langsplat_core.semantics.encoders import load_text_encoder
+
+        subject = Subject(self.scene_and_data()[0], self.maps, self.encoder, self.paper_order)
+        with TerminalProgress() as progress:
+            report = run_benchmark(
+                benchmark, profile, subject, load_text_encoder, self.only, self.pictures, progress
+            )
+        print(table(report))
+        if self.json is not None:
+            save_json(self.json, report)
+
+
+@dataclass(frozen=True)
+class EvalLerfOvs(_EvalLabels):
+    """LERF-OVS: mIoU and localisation in labelled frames, by a named protocol.
+
+    DATA is the folder with label/SCENE/FRAME.json. Frames are matched to views by name; the cameras of those
+    that the scene was not trained on are taken from the dataset beside the labels."""
+
+    protocol: LerfProtocol = "langsplat-code"
+    """Whose constants: filters, cut and choice of level; docs/evaluating.md lists them."""
+
+    def run(self) -> None:
+        from langsplat_core.evaluation.protocols.lerf_ovs import read_lerf_ovs
+
+        self.evaluate(read_lerf_ovs(self.scene_and_data()[1]), LERF_PROFILES[self.protocol])
+
+
+@dataclass(frozen=True)
+class EvalOvs3d(_EvalLabels):
+    """3D-OVS: mIoU of every class in every labelled view, by a named protocol.
+
+    DATA is a folder with segmentations/classes.txt and segmentations/VIEW/CLASS.png, or one of several."""
+
+    protocol: OvsProtocol = "langsplat-paper"
+    """Whose constants: cut and choice of level; docs/evaluating.md lists them."""
+
+    def run(self) -> None:
+        from langsplat_core.evaluation.protocols.ovs3d import read_3d_ovs
+
+        self.evaluate(read_3d_ovs(self.scene_and_data()[1]), OVS_PROFILES[self.protocol])

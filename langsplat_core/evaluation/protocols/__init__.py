@@ -1,0 +1,1 @@
+"""The field's benchmarks: layouts of labels, frozen profiles of the protocols, scores, reports."""
