@@ -59,8 +59,8 @@ def _visible(truth: Truth, name: str, kinds: tuple[str, ...]) -> dict[Phrase, Ar
 
 
 def write_lerf_ovs(dataset: Path, labels: Path, truth: Truth, names: list[str]) -> None:
-    """label/<scene>/<frame>.json and .jpg. A mask of several pieces, or with holes, becomes several objects of
-    one category, whose polygons joined are the mask."""
+    """label/<scene>/<frame>.json and .jpg. A mask of several pieces, or with holes, becomes several objects
+    of one category, whose polygons joined are the mask."""
     for name in names:
         photograph = (dataset / "images" / f"{name}.jpg").read_bytes()
         with atomic_path(labels / f"{name}.jpg") as path:
