@@ -14,7 +14,7 @@ from langsplat_core.cli.compact import Compact
 from langsplat_core.cli.convert import Convert
 from langsplat_core.cli.demo import DemoBuild, DemoDataset, DemoEncoder, DemoSheet
 from langsplat_core.cli.evaluate import EvalSynthetic
-from langsplat_core.cli.evaluate_labels import EvalLerfOvs, EvalOvs3d
+from langsplat_core.cli.evaluate_labels import EvalLerfOvs, EvalOvs3d, EvalScanNet
 from langsplat_core.cli.inspect import Doctor, Inspect
 from langsplat_core.cli.query import QueryScene
 from langsplat_core.cli.run import Command, main
@@ -33,6 +33,7 @@ def parse(args: list[str]) -> Command:
     evaluate.command(name="synthetic")(EvalSynthetic)
     evaluate.command(name="lerf-ovs")(EvalLerfOvs)
     evaluate.command(name="3d-ovs")(EvalOvs3d)
+    evaluate.command(name="scannet")(EvalScanNet)
     bench.command(name="raster")(BenchRaster)
     bench.command(name="gains")(BenchGains)
     bench.command(name="lift")(BenchLift)

@@ -23,7 +23,7 @@ SceneAndData = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[SCENE] DATA")
 
 
 @dataclass(frozen=True)
-class _EvalLabels:
+class _Eval:
     paths: tyro.conf.Positional[SceneAndData]
     """A scene of ours, or a folder with one NAME.ply for each of the benchmark's scenes; then the folder of
     the benchmark, or one scene's folder of it. With --maps the latter alone."""
@@ -31,14 +31,10 @@ class _EvalLabels:
     """Score these maps of another system, files named VIEW/PHRASE.npy or .png, instead of a scene."""
     only: tuple[str, ...] = ()
     """Names of the benchmark's scenes to score; all of them if empty."""
-    pictures: Path | None = None
-    """Also write one picture per query into this folder."""
     json: Path | None = None
     """Also write all figures to this file."""
     encoder: str = ""
     """Text encoder folder or hub id, in place of the one the scene names."""
-    paper_order: bool = False
-    """Blend latents and decode every pixel, as the paper does, not the relevancies; no codebook can."""
 
     def scene_and_data(self) -> tuple[Path | None, Path]:
         """The scene, None for maps, and the benchmark's folder."""
@@ -50,6 +46,14 @@ class _EvalLabels:
                 else "give a scene and the benchmark's folder, or the folder alone and --maps FOLDER"
             )
         return (None if self.maps else self.paths[0]), self.paths[-1]
+
+
+@dataclass(frozen=True)
+class _EvalLabels(_Eval):
+    pictures: Path | None = None
+    """Also write one picture per query into this folder."""
+    paper_order: bool = False
+    """Blend latents and decode every pixel, as the paper does, not the relevancies; no codebook can."""
 
     def evaluate(self, benchmark: "Benchmark", profile: Profile) -> None:
         """Score, print the table, write what was asked for."""
@@ -96,3 +100,29 @@ class EvalOvs3d(_EvalLabels):
         from langsplat_core.evaluation.protocols.ovs3d import read_3d_ovs
 
         self.evaluate(read_3d_ovs(self.scene_and_data()[1]), OVS_PROFILES[self.protocol])
+
+
+@dataclass(frozen=True)
+class EvalScanNet(_Eval):
+    """ScanNet, direct in 3D: mIoU and mAcc of 19, 15 and 10 classes among the labelled vertices.
+
+    DATA is a folder of NAME/NAME_vh_clean_2.labels.ply; maps are NAME.npy, one class id per vertex."""
+
+    def run(self) -> None:
+        from langsplat_core.evaluation.protocols.run import Subject
+        from langsplat_core.evaluation.protocols.scannet import read_scannet
+        from langsplat_core.evaluation.protocols.scannet_run import point_table, run_scannet, save_point_json
+        from langsplat_core.semantics.encoders import load_text_encoder
+
+        scene, data = self.scene_and_data()
+        with TerminalProgress() as progress:
+            report = run_scannet(
+                read_scannet(data),
+                Subject(scene, self.maps, self.encoder),
+                load_text_encoder,
+                self.only,
+                progress,
+            )
+        print(point_table(report))
+        if self.json is not None:
+            save_point_json(self.json, report)

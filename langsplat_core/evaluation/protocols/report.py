@@ -1,7 +1,7 @@
 """Scores as means, as a table for people and as JSON for programs."""
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -14,8 +14,7 @@ from langsplat_core.files import atomic_path
 
 ACCURACY_AT = (0.25, 0.5)  # IoU strictly above
 FIXED = (
-    "every constant of the protocol was fixed before a label was read; none was chosen or tuned by the "
-    "labels, and a frame's answers are cut before its masks are drawn"
+    "every constant of the protocol was fixed before a label was read; none was chosen or tuned by the labels"
 )
 COUNTED = "a query without an answer counts as wrong: IoU 0, no place"
 
@@ -110,7 +109,7 @@ def notes(report: BenchmarkReport) -> list[str]:
     lines = [
         f"{report.benchmark}, protocol {report.profile.name}: {report.profile.source}",
         f"scored: {report.subject}",
-        FIXED,
+        f"{FIXED}; a frame's answers are cut before its masks are drawn",
     ]
     reasons = dict.fromkeys(query.unanswered for query in queries if query.unanswered)
     for reason in reasons:
@@ -148,8 +147,3 @@ def write_json(path: Path, content: object) -> None:
     """A value as a JSON file, whole or not at all."""
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-
-
-def markdown_rows(rows: Iterable[Sequence[object]]) -> list[str]:
-    """Lines of a table."""
-    return [f"| {' | '.join(str(cell) for cell in row)} |" for row in rows]
