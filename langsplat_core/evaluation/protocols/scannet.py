@@ -58,8 +58,8 @@ class PointProfile:
     name: str = "direct-3d"
     source: str = (
         "OpenGaussian's task, as VALA and others report it: argmax over the class names per Gaussian, the "
-        "highest of its levels; a vertex takes the nearest Gaussian that has a meaning, since ours do not stay "
-        "on the vertices"
+        "highest of its levels; a vertex takes the nearest Gaussian that has a meaning, since ours do not "
+        "stay on the vertices"
     )
     class_sets: tuple[tuple[str, ...], ...] = (
         tuple(NYU40),
@@ -147,8 +147,8 @@ def scene_classes(
 
 
 def map_classes(folder: Path, points: LabelledPoints, profile: PointProfile) -> list[Array]:
-    """Another system's answer, `folder`/<scene>.npy: (V,) whole ids of NYU40 in the vertices' order, or (S, V)
-    with one row per set of classes."""
+    """Another system's answer, `folder`/<scene>.npy: (V,) whole ids of NYU40 in the vertices' order, or
+    (S, V) with one row per set of classes."""
     path = folder / f"{points.name}.npy"
     ids = read_npy(path)
     count = len(profile.class_sets)
