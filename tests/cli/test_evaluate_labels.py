@@ -38,6 +38,7 @@ def test_maps_of_another_system(data, capsys, protocol):
         (("lerf-ovs", "data"), "give a scene and the benchmark's folder"),
         (("lerf-ovs", "scene.ply", "data", "--maps", "maps"), "alone with --maps"),
         (("lerf-ovs", "scene.ply", "data"), "no such scene"),
+        (("lerf-ovs", "data", "--maps", "maps", "--paper-order"), "leave it out"),
         (("lerf-ovs", "absent", "--maps", "maps"), "no such folder"),
         (("3d-ovs", "data", "--maps", "maps"), "use `langsplat eval lerf-ovs`"),
         (("3d-ovs", "data", "--maps", "maps", "--protocol", "langsplat-code"), "invalid choice"),

@@ -68,6 +68,8 @@ def _read_scene(name: str, labels: Path, dataset: Path) -> LabelledScene:
         frame, without = _read_frame(path, dataset)
         frames.append(frame)
         left_out += [f"{frame.name}: {phrase} (no outline)" for phrase in without]
+    if not any(frame.labels for frame in frames):
+        raise FormatError(f"{labels}: its files label nothing; expected objects with a polygon each")
     return LabelledScene(name, tuple(frames), dataset, tuple(left_out))
 
 

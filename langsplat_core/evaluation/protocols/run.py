@@ -10,7 +10,7 @@ from langsplat_core.datasets.images import shortened
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.errors import InputError
 from langsplat_core.evaluation.protocols.labels import Benchmark, LabelledScene, without_suffix
-from langsplat_core.evaluation.protocols.profiles import OwnRule, Profile
+from langsplat_core.evaluation.protocols.profiles import MapRule, OwnRule, Profile
 from langsplat_core.evaluation.protocols.report import BenchmarkReport
 from langsplat_core.evaluation.protocols.scoring import score_scene
 from langsplat_core.evaluation.protocols.sources import MapSource, SceneSource, Source
@@ -48,6 +48,10 @@ def run_benchmark(
     Raises InputError for a scene or maps that do not belong to the labels, EncoderError where the text
     encoder cannot be loaded.
     """
+    if subject.paper_order and (subject.maps is not None or not isinstance(profile.rule, MapRule)):
+        raise InputError(
+            "--paper-order is for a scene under a protocol that reads relevancy maps; leave it out"
+        )
     scenes = _chosen(benchmark, only, subject)
     scores = {}
     for name, labelled in scenes.items():

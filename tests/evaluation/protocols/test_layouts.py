@@ -91,6 +91,12 @@ def test_a_broken_label_file_is_named(tmp_path, change, message):
     assert "\n" not in str(error.value)
 
 
+def test_labels_of_nothing(tmp_path):
+    lerf_frame(tmp_path / "label" / "a", "b", [("mug", [])])
+    with pytest.raises(FormatError, match="label nothing"):
+        read_lerf_ovs(tmp_path)
+
+
 def test_3d_ovs(tmp_path):
     scene = tmp_path / "bench"
     ovs_view(scene, "00", {"red cup": block(1, 1, 8, 8), "wall": block(0, 20, 39, 29)})
