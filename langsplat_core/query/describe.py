@@ -42,9 +42,8 @@ class Describer:
     def __init__(
         self, engine: QueryEngine, vocabulary: Sequence[str] | None = None, progress: Progress = silent
     ) -> None:
-        """vocabulary: phrases for all levels, by default the bundled ones: everyday things, and below the level
-        "whole" parts of things too. Those with words that the encoder was
-        never taught are left out.
+        """vocabulary: phrases for all levels, by default the bundled ones: everyday things, and below the
+        level "whole" parts of things too. Those with words that the encoder was never taught are left out.
 
         Raises InputError for a scene without a language field and where no phrase is left, EncoderError as
         `QueryEngine.known_vectors` does.
@@ -88,8 +87,9 @@ class Describer:
         """
         count = len(self.engine.field)
         numbers = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows, np.int64)
-        if len(numbers) and not (0 <= numbers.min() and numbers.max() < count):
-            worst = numbers.max() if numbers.max() >= count else numbers.min()
+        outside = numbers[(numbers < 0) | (numbers >= count)]
+        if len(outside):
+            worst = outside[0]
             raise InputError(f"Gaussian {worst}: the scene has Gaussians 0 to {count - 1}")
         counted = self.areas[numbers] if weights is None else np.asarray(weights, np.float64)
         if weights is None and not counted.any():  # without any surface they still mean something
@@ -143,4 +143,3 @@ class Describer:
             colour=colour,
             material=material,
         )
-

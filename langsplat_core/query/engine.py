@@ -157,11 +157,12 @@ class QueryEngine:
         known = dict(book)
         if fresh:
             encoder = self.load_encoder(progress)
+            progress("loading the text encoder", 1.0)
             fresh = [key for key in fresh if not encoder.unknown_words(key)]
         for start in range(0, len(fresh), BATCH):
             batch = fresh[start : start + BATCH]
-            progress("reading the vocabulary", start / len(fresh))
             known.update(zip(batch, self._encode(encoder, batch), strict=True))
+            progress("reading the vocabulary", (start + len(batch)) / len(fresh))
         found = tuple(key for key in keys if key in known)
         nothing = np.zeros((0, self.field.codec.vector_dim), np.float32)
         return found, np.stack([known[key] for key in found]) if found else nothing

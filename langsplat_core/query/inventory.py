@@ -1,8 +1,8 @@
 """The inventory of a scene: what is in it, where, how sure.
 
-Every meaning of the scene has its best word, and so every Gaussian. Words that cover enough of the surface are
-candidates; those that claim the same meanings are one thing by two names ("mug" and "cup"); and what is listed
-was asked for, as a phrase, and found where it was claimed.
+Every meaning of the scene has its best word, and so every Gaussian. Words that cover enough of the surface
+are candidates; those that claim the same meanings are one thing by two names ("mug" and "cup"); and what is
+listed was asked for, as a phrase, and found where it was claimed.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,6 +12,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from langsplat_core.arrays import Array
+from langsplat_core.config import LevelChoice
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.surface import Surface
@@ -23,9 +24,15 @@ LEAST_SHARE = 5e-4  # of the scene's surface that a word, with others for the sa
 LEAST_SPOT = 0.15  # of its largest spot's surface: a smaller one is a splinter of a border
 LEAST_COUNT = 12  # Gaussians of a spot
 SAME = 0.5  # overlap of claims from which two words name the same thing
+LIKELY = 0.5  # probability from which a word is listed
 RUNNERS_UP = 5  # words per meaning that may be names for it
 MOST = 200  # candidates per level, the largest first
 
+LEVEL_NAMES: tuple[LevelChoice, ...] = (
+    "subpart",
+    "part",
+    "whole",
+)  # `LEVELS`, as `QueryEngine.run` takes them
 Attributes = tuple[WordScores | None, WordScores | None]  # colours, materials
 
 
@@ -78,10 +85,17 @@ class _Claim:
 
 
 def take_inventory(
-    engine: QueryEngine, words: Sequence[WordScores], attributes: Attributes, areas: Array, progress: Progress = silent
+    engine: QueryEngine,
+    words: Sequence[WordScores],
+    attributes: Attributes,
+    areas: Array,
+    progress: Progress = silent,
 ) -> list[Entry]:
-    """Every word that is true in the scene, whole things first, then by surface. A word is listed once, at the
-    coarsest level where it is claimed and found. words: of each level; areas: (N,) as of `surface_areas`."""
+    """Every word that is true in the scene, whole things first, then by surface. A word is listed once, at
+    the coarsest level where it is claimed and found.
+
+    words: of each level; areas: (N,) as of `surface_areas`.
+    """
     field = engine.field
     held = field_meanings(field)
     entries: list[Entry] = []
@@ -95,6 +109,7 @@ def take_inventory(
                 if entry is not None:
                     entries.append(entry)
                     named.update(claim.phrases)
+        progress(f"checking words: {LEVELS[level]}", 1.0)
     return entries
 
 
@@ -114,6 +129,8 @@ def _claims(
 ) -> Iterator[_Claim]:
     """Groups of words at a level, those that cover most first."""
     best, shares = words.best(field.codec, held.latents, RUNNERS_UP)
+    if best.size == 0:  # no words, or nothing that means anything
+        return
     surface = held.surface(level, areas)
     least = LEAST_SHARE * max(float(areas.sum()), 1e-300)
     mass = np.bincount(best.ravel(), (surface[:, None] * shares).ravel())
@@ -129,14 +146,16 @@ def _claims(
         if weight.sum() < least:
             continue
         probability = float(weight @ names[winners][:, group].sum(1)) / float(weight.sum())
+        if probability < LIKELY:
+            continue
         of = held.of[level]
         rows = np.flatnonzero((of >= 0) & winners[np.maximum(of, 0)])
         yield _Claim(level, tuple(words.phrases[number] for number in numbers), rows, probability)
 
 
 def same_things(names: Array, surface: Array) -> list[list[int]]:
-    """(M, C) probabilities of C words, the most claimed first, for meanings of (M,) surface -> groups of columns
-    that name the same.
+    """(M, C) probabilities of C words, the most claimed first, for meanings of (M,) surface -> groups of
+    columns that name the same.
 
     Two words do where most of what either claims is claimed by the other as well:
     sum_m s_m min(p_ma, p_mb) >= SAME max(sum_m s_m p_ma, sum_m s_m p_mb). A word joins the first group whose
@@ -160,8 +179,8 @@ def same_things(names: Array, surface: Array) -> list[list[int]]:
 def _verified(
     engine: QueryEngine, words: WordScores, attributes: Attributes, areas: Array, claim: _Claim
 ) -> Entry | None:
-    """The claim as an entry under the first of its words that a query finds there; None where it finds none."""
-    level = LEVELS[claim.level]
+    """The claim as an entry under the first of its words that a query finds there; None if it finds none."""
+    level: LevelChoice = LEVEL_NAMES[claim.level]
     for phrase in claim.phrases:
         result = engine.run(phrase, level, vector=words.vector(phrase))
         agreed = claim.rows[result.relevancy[claim.level, claim.rows] > FLOOR]

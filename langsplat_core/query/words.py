@@ -2,10 +2,11 @@
 
     p(word | x)  =  softmax over words of  scale * (cos(x, word) - hub(word) / 2)
 
-The hub of a word is its mean cosine with the meanings of the scene that are nearest to it. Some words lie near
-every picture and would be the answer everywhere ("hubs"); what is left of the cosine says how much better a word
-fits here than where it fits anyway. It is cross-domain similarity local scaling (Conneau et al. 2018, equation 3):
-2 cos(x, w) - hub(w) - hub(x), halved, and without hub(x), which all words have in common.
+The hub of a word is its mean cosine with the meanings of the scene that are nearest to it. Some words lie
+near every picture and would be the answer everywhere ("hubs"); what is left of the cosine says how much
+better a word fits here than where it fits anyway. It is cross-domain similarity local scaling ("Word
+translation without parallel data", Conneau et al. 2018, equation 3): 2 cos(x, w) - hub(w) - hub(x), halved,
+and without hub(x), which all words have in common.
 
 The canonical phrases ("object", "things", "stuff", "texture") compete too: their share is the chance that no
 word of the vocabulary fits.
@@ -18,8 +19,8 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Codec, LanguageField
 
-# times `Reading.temperature`, which is a tenth of the encoder's own scale of logits: half of that scale for words,
-# a fifth for attributes. Found in two rooms, docs/describing.md.
+# times `Reading.temperature`, which is a tenth of the encoder's own scale of logits: half of that scale for
+# words, a fifth for attributes. Found in two rooms, docs/describing.md.
 WORD_SCALE = 5.0
 ATTRIBUTE_SCALE = 2.0
 NEAREST = 10  # meanings that make a word's hub, as in the paper
@@ -80,9 +81,11 @@ class WordScores:
         return total / total.sum()
 
     def best(self, codec: Codec, latents: Array, count: int) -> tuple[Array, Array]:
-        """(M, d) latents with a meaning -> (M, count) numbers of the most probable phrases, the best first, and
-        their (M, count) float32 probabilities; fewer where the vocabulary has fewer."""
+        """(M, d) latents with a meaning -> (M, count) numbers of the most probable phrases, the best first,
+        and their (M, count) float32 probabilities; fewer where the vocabulary has fewer."""
         count = min(count, len(self.phrases))
+        if count == 0:
+            return np.empty((len(latents), 0), np.int32), np.empty((len(latents), 0), np.float32)
         words = np.empty((len(latents), count), np.int32)
         shares = np.empty((len(latents), count), np.float32)
         for part in self._blocks(len(latents)):
@@ -125,7 +128,7 @@ def meanings(field: LanguageField) -> Array:
 
 
 def hubs(vectors: Array, bank: Array) -> Array:
-    """(V, D) unit vectors of words, (B, D) of meanings -> (V,) float32 mean cosine with the `NEAREST` ones."""
+    """(V, D) unit vectors of words, (B, D) of meanings -> (V,) float32 mean cosine with the nearest ones."""
     count = min(NEAREST, len(bank))
     if count == 0:
         return np.zeros(len(vectors), np.float32)
@@ -135,7 +138,7 @@ def hubs(vectors: Array, bank: Array) -> Array:
 
 
 def certain(words: WordScores, codec: Codec, latents: Array, weights: Array) -> Word | None:
-    """The attribute of (M, d) latents with a meaning, weighted by (M,), where it is as probable as `CERTAIN`."""
+    """The attribute of (M, d) latents with a meaning, weighted by (M,), where it is probable enough."""
     shares = words.mixture(codec, latents, weights)
     best = int(shares.argmax())
     return Word(words.phrases[best], float(shares[best])) if shares[best] >= CERTAIN else None

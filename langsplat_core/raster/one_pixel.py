@@ -15,8 +15,8 @@ def pixel_weights(
     pixel: tuple[int, int],
     settings: RasterSettings = INRIA,
 ) -> tuple[Array, Array]:
-    """(M,) int64 numbers of the Gaussians that paint `pixel` (column, row), and their (M,) float32 weights > 0,
-    alpha_i T_i, which add up to the pixel's alpha.
+    """(M,) int64 numbers of the Gaussians that paint `pixel` (column, row), and their (M,) float32 weights,
+    alpha_i T_i > 0, which add up to the pixel's alpha.
 
     Only those that could reach the pixel are projected; they keep their order, so the weights are those
     of the whole view. The pixel must lie in the picture.

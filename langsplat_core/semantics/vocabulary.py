@@ -14,7 +14,7 @@ LONGEST = 80  # characters of a phrase: CLIP reads 77 tokens, and a whole paragr
 
 
 def bundled_vocabulary(name: Bundled) -> tuple[str, ...]:
-    """The phrases of a list that comes with the program: everyday things, parts of things, colours, materials.
+    """The phrases of a bundled list: everyday things, parts of things, colours, materials.
 
     Raises InputError where it is missing from the installation.
     """
