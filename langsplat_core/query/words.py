@@ -73,8 +73,8 @@ class WordScores:
         """(M, d) latents with a meaning and (M,) weights >= 0, not all zero -> (V + C,) float64: the mean of
         their probabilities. Answers are blended, never meanings: between two things lies a third."""
         if codec.space == "index":
-            latents, inverse = np.unique(latents, axis=0, return_inverse=True)
-            weights = np.bincount(inverse.reshape(-1), weights, minlength=len(latents))
+            codes, inverse = np.unique(latents[:, 0], return_inverse=True)
+            latents, weights = codes[:, None], np.bincount(inverse, weights, minlength=len(codes))
         total = np.zeros(len(self.vectors))
         for part in self._blocks(len(latents)):
             total += weights[part].astype(np.float64) @ self.probabilities(codec, latents[part])
@@ -120,7 +120,7 @@ def meanings(field: LanguageField) -> Array:
     those of evenly spread Gaussians where there are no codewords."""
     latents = field.latents[field.known]
     if field.codec.space == "index":
-        latents, most = np.unique(latents, axis=0), BANK
+        latents, most = np.unique(latents)[:, None], BANK
     else:
         most = SAMPLES
     chosen = np.unique(np.linspace(0, len(latents) - 1, min(most, len(latents))).astype(np.int64))
