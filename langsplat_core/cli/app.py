@@ -10,9 +10,11 @@ from langsplat_core.cli.bench_lift import BenchLift
 from langsplat_core.cli.bench_load import BenchLoad
 from langsplat_core.cli.bench_memory import BenchMemory
 from langsplat_core.cli.bench_steps import BenchSteps
+from langsplat_core.cli.bench_words import BenchWords
 from langsplat_core.cli.compact import Compact
 from langsplat_core.cli.convert import Convert
 from langsplat_core.cli.demo import DemoBuild, DemoDataset, DemoEncoder, DemoSheet
+from langsplat_core.cli.describe import Describe
 from langsplat_core.cli.evaluate import EvalSynthetic
 from langsplat_core.cli.evaluate_labels import EvalLerfOvs, EvalOvs3d, EvalScanNet
 from langsplat_core.cli.inspect import Doctor, Inspect
@@ -40,9 +42,11 @@ def parse(args: list[str]) -> Command:
     bench.command(name="load")(BenchLoad)
     bench.command(name="memory")(BenchMemory)
     bench.command(name="steps")(BenchSteps)
+    bench.command(name="words")(BenchWords)
     app = SubcommandApp()
     app.command(name="train")(train_command(args))
     app.command(name="query")(QueryScene)
+    app.command(name="describe")(Describe)
     app.command(name="convert")(Convert)
     app.command(name="compact")(Compact)
     app.command(name="inspect")(Inspect)

@@ -87,6 +87,15 @@ class GainBenchConfig:
 
 
 @dataclass(frozen=True)
+class WordBenchConfig:
+    """Rooms whose things are named (`langsplat bench words`)."""
+
+    tier: Tier = "clutter"
+    seeds: tuple[int, ...] = (203,)
+    """Of the rooms; never that of the bundled scene."""
+
+
+@dataclass(frozen=True)
 class RasterBenchConfig:
     """What the rasterizer benchmark draws (`langsplat bench raster`)."""
 

@@ -1,6 +1,6 @@
 """Answering phrases on a scene: encode, look up, choose a level, find the place."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -19,6 +19,7 @@ from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, LanguageField, Scene
 from langsplat_core.scene.phrases import phrase_key, tidy
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN
 
+BATCH = 256  # phrases of a vocabulary that are encoded at a time
 SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them
 NO_FIELD = "this scene has no language field: it can be looked at, not searched; `langsplat train` makes one"
 
@@ -105,6 +106,11 @@ class QueryEngine:
             self._encoder = self._load_encoder(self._encoder_id or self.field.encoder_id)
         return self._encoder
 
+    @property
+    def surface(self) -> Surface:
+        """The surface that the scene's Gaussians lie on; built at the first call, a tenth of a second."""
+        return self._surface
+
     @cached_property
     def _surface(self) -> Surface:
         return build_surface(self.scene.gaussians)
@@ -138,14 +144,39 @@ class QueryEngine:
                 f"the encoder does not know {', '.join(repr(word) for word in unknown)}; "
                 "use other words, or a scene made with OpenCLIP weights"
             )
-        vector = np.asarray(encoder.encode_texts([key])[0], np.float32)
-        if vector.shape != (self.field.codec.vector_dim,):
+        return self._encode(encoder, [key])[0]
+
+    def known_vectors(
+        self, phrases: Iterable[str], progress: Progress = silent
+    ) -> tuple[tuple[str, ...], Array]:
+        """Those of `phrases` whose words the encoder was taught, each once as `phrase_key` has it, and their
+        (V, D) unit vectors: from the phrasebook, else encoded together. Raises EncoderError for an encoder
+        that is not the scene's, or one that cannot be loaded."""
+        book, keys = self.field.phrasebook, tuple(dict.fromkeys(map(phrase_key, phrases)))
+        fresh = [key for key in keys if key not in book]
+        known = dict(book)
+        if fresh:
+            encoder = self.load_encoder(progress)
+            progress("loading the text encoder", 1.0)
+            fresh = [key for key in fresh if not encoder.unknown_words(key)]
+        for start in range(0, len(fresh), BATCH):
+            batch = fresh[start : start + BATCH]
+            known.update(zip(batch, self._encode(encoder, batch), strict=True))
+            progress("reading the vocabulary", (start + len(batch)) / len(fresh))
+        found = tuple(key for key in keys if key in known)
+        nothing = np.zeros((0, self.field.codec.vector_dim), np.float32)
+        return found, np.stack([known[key] for key in found]) if found else nothing
+
+    def _encode(self, encoder: TextEncoder, keys: list[str]) -> Array:
+        """(M, D) of phrases that `encoder` knows; EncoderError where it is not the scene's."""
+        vectors = np.asarray(encoder.encode_texts(keys), np.float32)
+        if vectors.shape[1:] != (self.field.codec.vector_dim,):
             raise EncoderError(
-                f"the encoder gives {vector.shape[0]} numbers, the scene was made with "
+                f"the encoder gives {vectors.shape[1]} numbers, the scene was made with "
                 f"{self.field.codec.vector_dim} by {self.field.encoder_id}; give that one with --encoder"
             )
         self._check_encoder(encoder)
-        return vector
+        return vectors
 
     def _check_encoder(self, encoder: TextEncoder) -> None:
         """EncoderError unless `encoder` turns the canonical phrases into the vectors that the scene has for
@@ -164,10 +195,18 @@ class QueryEngine:
         """(D,) unit text vector -> (3, N) float32 relevancy per level and Gaussian."""
         return self._lookup.relevancy(vector).reshape(self.field.confidence.shape)
 
-    def run(self, phrase: str, level: LevelChoice = "auto", progress: Progress = silent) -> QueryResult:
+    def run(
+        self,
+        phrase: str,
+        level: LevelChoice = "auto",
+        progress: Progress = silent,
+        vector: Array | None = None,
+    ) -> QueryResult:
         """Answer `phrase`. The level is chosen once for the scene, on raw relevancy, so that the picture
-        does not flicker between levels as the camera moves. Raises as `text_vector` does."""
-        vector = self.text_vector(phrase, progress)
+        does not flicker between levels as the camera moves. vector: (D,) unit, the phrase's own, where it is
+        at hand. Raises as `text_vector` does."""
+        if vector is None:
+            vector = self.text_vector(phrase, progress)
         progress(f"searching '{tidy(phrase)}'", 0.5)
         relevancy = self.relevancy(vector)
         smoothed = self._surface.smooth(relevancy)

@@ -68,6 +68,17 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
     return Surface(rows, positions, neighbours, weights, _links(neighbours, distances.reshape(shape)))
 
 
+def surface_areas(gaussians: Gaussians) -> Array:
+    """(N,) float64 area that each Gaussian covers, world units squared: opacity times its two longest axes
+    (one standard deviation each), 0 for invalid rows. What is larger than 99 % of them counts as that: a
+    veil of a few huge Gaussians is no surface."""
+    valid = gaussians.valid()
+    scales = np.sort(np.where(valid[:, None], gaussians.log_scales, -np.inf).astype(np.float64), axis=1)
+    opacity = sigmoid(np.where(valid, gaussians.opacity_logits, -np.inf).astype(np.float64))
+    areas = opacity * np.exp(scales[:, 1:].sum(1))
+    return np.minimum(areas, np.quantile(areas, 0.99)) if len(areas) else areas
+
+
 def _links(neighbours: Array, distances: Array) -> csr_matrix:
     reach = REACH * np.median(distances, axis=1, keepdims=True) + 1e-12
     near = distances <= reach

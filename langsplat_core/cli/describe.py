@@ -1,0 +1,202 @@
+"""`langsplat describe`: words for what is in a scene."""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from langsplat_core.errors import InputError
+from langsplat_core.formats import load_scene
+from langsplat_core.progress import Progress, TerminalProgress
+from langsplat_core.query.describe import Describer, Levels, Words
+from langsplat_core.query.engine import NO_FIELD, QueryEngine
+from langsplat_core.query.inventory import Entry, Spot
+from langsplat_core.query.words import Word
+from langsplat_core.raster import load_lifting_rasterizer
+from langsplat_core.scene import LEVELS, Scene
+from langsplat_core.semantics.encoders import load_text_encoder
+from langsplat_core.semantics.vocabulary import read_vocabulary
+
+Level = Literal["subpart", "part", "whole"]
+WIDTH = 118  # characters of a table that is not written to a terminal
+
+
+@dataclass(frozen=True)
+class Describe:
+    """What is here? The best words of a vocabulary for a pixel or a Gaussian, or the scene's inventory."""
+
+    scene: tyro.conf.Positional[Path]
+    """A trained scene, *.ply with its language field beside it."""
+    camera: Annotated[int, tyro.conf.arg(metavar="INDEX")] = 0
+    """Training view in which --pixel is meant."""
+    pixel: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="X Y")] = None
+    """Column and row, counted from the top left pixel, 0 0."""
+    gaussian: Annotated[int | None, tyro.conf.arg(metavar="NUMBER")] = None
+    """One Gaussian, by its row in the file, from 0."""
+    level: Level | None = None
+    """This semantic level alone."""
+    top: int = 5
+    """Words per level."""
+    vocabulary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Your own list, one phrase per line, in place of the bundled everyday things and parts."""
+    encoder: str = ""
+    """Text encoder folder or hub id, in place of the one the scene names."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self) -> None:
+        phrases = None if self.vocabulary is None else read_vocabulary(self.vocabulary)
+        scene = load_scene(self.scene)
+        self._check(scene)
+        with TerminalProgress() as progress:
+            engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
+            describer = Describer(engine, phrases, progress)
+            answer = self._entries(describer, progress) if self._everything else self._words(describer)
+        if self.json:
+            json.dump(answer, sys.stdout, indent=1)
+            print()
+            return
+        if self._everything:
+            _print_inventory(answer["inventory"])
+        else:
+            _print_words(answer["levels"])
+        if describer.left_out:
+            names = ", ".join(describer.left_out[:3]) + (" ..." if len(describer.left_out) > 3 else "")
+            print(
+                f"{answer['asked']} phrases were compared; {len(describer.left_out)} were left out, because "
+                f"the encoder was never taught their words ({names})"
+            )
+
+    @property
+    def _everything(self) -> bool:
+        return self.pixel is None and self.gaussian is None
+
+    def _check(self, scene: Scene) -> None:
+        """InputError for arguments that do not go with the scene or each other, before anything is loaded."""
+        if scene.language is None:
+            raise InputError(f"{self.scene}: {NO_FIELD}")
+        if self.top < 1:
+            raise InputError(f"--top {self.top}: at least one word")
+        if self.pixel is not None and self.gaussian is not None:
+            raise InputError("--pixel and --gaussian are two questions; ask one of them")
+        count = len(scene.gaussians)
+        if self.gaussian is not None and not 0 <= self.gaussian < count:
+            raise InputError(f"--gaussian {self.gaussian}: the scene has Gaussians 0 to {count - 1}")
+        if self.pixel is None:
+            if self.camera != 0:
+                raise InputError(f"--camera {self.camera} needs a --pixel X Y in it")
+            return
+        if not scene.cameras:
+            raise InputError(f"{self.scene}: has no cameras, so --pixel means nothing; ask by --gaussian")
+        if not 0 <= self.camera < len(scene.cameras):
+            raise InputError(f"--camera {self.camera}: the scene has cameras 0 to {len(scene.cameras) - 1}")
+        camera, (column, row) = scene.cameras[self.camera], self.pixel
+        if not (0 <= column < camera.width and 0 <= row < camera.height):
+            raise InputError(
+                f"--pixel {column} {row}: camera {self.camera} has columns 0 to {camera.width - 1} and rows "
+                f"0 to {camera.height - 1}"
+            )
+
+    def _entries(self, describer: Describer, progress: Progress) -> dict[str, Any]:
+        """The inventory, ready for JSON."""
+        entries = [
+            _entry(entry)
+            for entry in describer.inventory(progress)
+            if self.level in (None, LEVELS[entry.level])
+        ]
+        return _asked(describer) | {"inventory": entries}
+
+    def _words(self, describer: Describer) -> dict[str, Any]:
+        """Words of the pixel or Gaussian, ready for JSON."""
+        scene = describer.engine.scene
+        levels: Levels
+        if self.pixel is not None:
+            camera = scene.cameras[self.camera]
+            levels = describer.at_pixel(load_lifting_rasterizer("cpu"), camera, self.pixel, self.top)
+            place: dict[str, Any] = {"camera": self.camera, "view": camera.name, "pixel": list(self.pixel)}
+        else:
+            levels = describer.at_gaussians(np.array([self.gaussian]), np.ones(1), self.top)
+            place = {"gaussian": self.gaussian}
+        wanted = [words for words in levels if self.level in (None, LEVELS[words.level])]
+        return place | _asked(describer) | {"levels": [_level(words) for words in wanted]}
+
+
+def _asked(describer: Describer) -> dict[str, Any]:
+    return {"asked": len(describer.words[0].phrases), "left_out": len(describer.left_out)}
+
+
+def _word(word: Word | None) -> dict[str, Any] | None:
+    return None if word is None else {"phrase": word.phrase, "probability": word.probability}
+
+
+def _level(words: Words) -> dict[str, Any]:
+    return {
+        "level": LEVELS[words.level],
+        "words": [_word(word) for word in words.words],
+        "other": words.other,
+        "known": words.known,
+        "colour": _word(words.colour),
+        "material": _word(words.material),
+    }
+
+
+def _spot(spot: Spot) -> dict[str, Any]:
+    return {
+        "centre": spot.centre.tolist(),
+        "box": spot.box.tolist(),
+        "gaussians": len(spot.rows),
+        "share": spot.share,
+        "colour": _word(spot.colour),
+        "material": _word(spot.material),
+    }
+
+
+def _entry(entry: Entry) -> dict[str, Any]:
+    return {
+        "phrase": entry.phrase,
+        "also": list(entry.also),
+        "level": LEVELS[entry.level],
+        "probability": entry.probability,
+        "score": entry.score,
+        "share": entry.share,
+        "spots": [_spot(spot) for spot in entry.spots],
+    }
+
+
+def _looks(described: dict[str, Any]) -> str:
+    return " ".join(described[key]["phrase"] for key in ("colour", "material") if described[key] is not None)
+
+
+def _print_inventory(entries: list[dict[str, Any]]) -> None:
+    table = Table("what", "also", "level", "p %", "surface %", "looks", "centre", box=None)
+    for entry in entries:
+        names = (
+            entry["phrase"],
+            ", ".join(entry["also"]),
+            entry["level"],
+            f"{100 * entry['probability']:.0f}",
+        )
+        for number, spot in enumerate(entry["spots"]):
+            centre = " ".join(f"{value:.2f}" for value in spot["centre"])
+            start = names if number == 0 else ("", "", "", "")
+            table.add_row(*start, f"{100 * spot['share']:.2f}", _looks(spot), centre)
+    console = Console()
+    Console(width=max(WIDTH, console.width)).print(table)
+    if not entries:
+        print("nothing of the vocabulary was found in the scene")
+
+
+def _print_words(levels: list[dict[str, Any]]) -> None:
+    for level in reversed(levels):
+        if not level["words"]:
+            print(f"{level['level']:<8} nothing is known here")
+            continue
+        said = ", ".join(f"{word['phrase']} {100 * word['probability']:.0f} %" for word in level["words"])
+        looks = _looks(level)
+        print(f"{level['level']:<8} {said}" + (f"; looks {looks}" if looks else ""))
