@@ -155,6 +155,7 @@ def _write_transforms(cameras: list[Camera], path: Path) -> None:
         "cx": first.cx,
         "cy": first.cy,
         "ply_file_path": "points.ply",
+        "metres_per_unit": 1.0,
         "frames": [
             {
                 "file_path": f"images/{camera.name}.png",
