@@ -36,8 +36,8 @@ Shape = Literal["scene", "points", "hull"]
 
 @dataclass(frozen=True)
 class Select:
-    """Write what a phrase names as a scene of its own, with its language field and cameras, as a point cloud or
-    as a mesh; or, with --remove, the scene without it. Prints the things that were found, best first."""
+    """Write what a phrase names as a scene of its own, with its language field and cameras, as points or as a
+    mesh; or, with --remove, the scene without it. Prints the things that were found, best first."""
 
     scene: tyro.conf.Positional[Path]
     """A trained scene, *.ply with its language field beside it."""
@@ -149,9 +149,9 @@ class Select:
             print()
             return
         print("\n".join(table(found, unit)))
-        what = {"scene": "Gaussians", "points": "points", "hull": "meshes"}[self.shape]
-        kept = f"all but the {selected} selected" if self.remove else f"of {selected} selected Gaussians"
-        print(f"{self.out}: {written} {what}, {kept}")
+        what = {"scene": "Gaussians", "points": "points", "hull": "closed hulls"}[self.shape]
+        of = f"all but the {selected} selected" if self.remove else f"of {selected} selected Gaussians"
+        print(f"{self.out}: {written} {what}, {of}")
 
 
 def chosen(found: Sequence[Instance], numbers: Sequence[int]) -> Sequence[Instance]:

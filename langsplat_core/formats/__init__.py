@@ -113,8 +113,8 @@ def check_writable(path: Path | str) -> None:
 def save_scene(path: Path | str, scene: Scene) -> None:
     """Write `scene` as .ply, .spz or .splat, by its name, with its companions; those it lacks are removed.
 
-    Only the PLY keeps everything. .spz rounds it and has neither extras nor a scale; .splat moreover has neither
-    view dependence nor the mark of antialiasing. All keep the rows' order. All files are first written whole under
+    Only the PLY keeps everything. .spz rounds it, without extras and scale; .splat moreover has neither view
+    dependence nor the mark of antialiasing. All keep the rows' order. All files are first written whole under
     temporary names. Then the old companions are removed, the scene's file renamed into place, and last the
     new companions. Interrupted anywhere, there is the old scene or the new one, perhaps without companions,
     but never a scene beside companions of another.
@@ -138,10 +138,10 @@ def save_scene(path: Path | str, scene: Scene) -> None:
 
 
 def _write_ply(path: Path, scene: Scene) -> None:
-    comments = (antialiasing.COMMENT,) if scene.antialiased else ()
+    comments = [antialiasing.COMMENT] if scene.antialiased else []
     if scene.metres_per_unit is not None:
-        comments += (metres_comment(scene.metres_per_unit),)
-    write_ply(path, scene.gaussians, comments, scene.extras)
+        comments.append(metres_comment(scene.metres_per_unit))
+    write_ply(path, scene.gaussians, tuple(comments), scene.extras)
 
 
 # By suffix; SOG is also a folder and read by name

@@ -42,8 +42,8 @@ def base_colours(gaussians: Gaussians) -> Array:
 
 
 def write_points(path: Path | str, gaussians: Gaussians, extras: Mapping[str, Array] | None = None) -> int:
-    """The means of the Gaussians that can be drawn as a PLY point cloud, red, green and blue as bytes, and each
-    of `extras`, name -> (N,), as a float property. How many points. Atomic; InputError for another suffix."""
+    """The means of the Gaussians that can be drawn as a PLY point cloud: red, green and blue as bytes, each
+    of `extras`, name -> (N,), as a float. How many points. Atomic; InputError for another suffix."""
     from plyfile import PlyData, PlyElement
 
     path = check_suffix(path, POINT_SUFFIXES)

@@ -99,7 +99,7 @@ def train_scene(
         gaussians = crew.once(lambda: trained_gaussians(capture, train, config, work, progress))
     else:
         gaussians = given.gaussians
-    metres = capture.metres_per_unit or (given and given.metres_per_unit)
+    metres = capture.metres_per_unit or (None if given is None else given.metres_per_unit)
     clock.lap("radiance")
 
     cameras = tuple(capture.cameras[i] for i in train)

@@ -68,10 +68,10 @@ def in_oriented_box(means: Array, box: OrientedBox) -> Array:
 def grow_steps(surface: Surface, selected: Array, steps: int = 1) -> Array:
     """And all that `steps` links along the surface lead to."""
     _check("number of steps", steps)
-    reached = selected[surface.rows]
+    reached: Array = selected[surface.rows]
     for _ in range(steps):
-        wider = reached | (surface.links @ reached)
-        if (wider == reached).all():
+        wider: Array = np.logical_or(reached, surface.links @ reached)
+        if np.array_equal(wider, reached):
             break
         reached = wider
     return _spread(surface, selected, reached)
