@@ -49,8 +49,8 @@ def in_sphere(means: Array, centre: Array, radius: float) -> Array:
     nowhere."""
     offsets = np.asarray(means, np.float64) - centre
     with np.errstate(invalid="ignore"):
-        inside: Array = (offsets**2).sum(1) <= radius**2
-    return inside
+        squares: Array = (offsets**2).sum(1)
+        return squares <= radius**2
 
 
 def in_box(means: Array, low: Array, high: Array) -> Array:
@@ -70,7 +70,8 @@ def grow_steps(surface: Surface, selected: Array, steps: int = 1) -> Array:
     _check("number of steps", steps)
     reached: Array = selected[surface.rows]
     for _ in range(steps):
-        wider: Array = np.logical_or(reached, surface.links @ reached)
+        linked: Array = surface.links @ reached
+        wider = reached | linked
         if np.array_equal(wider, reached):
             break
         reached = wider
