@@ -55,7 +55,7 @@ def in_sphere(means: Array, centre: Array, radius: float) -> Array:
 
 def in_box(means: Array, low: Array, high: Array) -> Array:
     """(N, 3) -> (N,) bool: between two corners (3,) along the world's axes, faces included."""
-    inside: Array = ((means >= np.asarray(low)) & (means <= np.asarray(high))).all(1)
+    inside: Array = np.all((means >= np.asarray(low)) & (means <= np.asarray(high)), axis=1)
     return inside
 
 
