@@ -33,6 +33,7 @@ class DatasetConfig:
 
     max_side: int = 800  # photographs are shrunk until their longer side has at most this many pixels
     test_every: int = 8  # every n-th view, in name order, is held out from training; 0 holds out none
+    metres_per_unit: float | None = None  # of the dataset's world; None: as transforms.json says, if it does
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,8 @@ from langsplat_core.cli.evaluate_labels import EvalLerfOvs, EvalOvs3d, EvalScanN
 from langsplat_core.cli.inspect import Doctor, Inspect
 from langsplat_core.cli.query import QueryScene
 from langsplat_core.cli.run import Command, main
+from langsplat_core.cli.scale import Scale
+from langsplat_core.cli.select import Select
 from langsplat_core.cli.train import train_command
 
 # Options that are asked for often enough to have a short name.
@@ -47,6 +49,8 @@ def parse(args: list[str]) -> Command:
     app.command(name="train")(train_command(args))
     app.command(name="query")(QueryScene)
     app.command(name="describe")(Describe)
+    app.command(name="select")(Select)
+    app.command(name="scale")(Scale)
     app.command(name="convert")(Convert)
     app.command(name="compact")(Compact)
     app.command(name="inspect")(Inspect)

@@ -63,6 +63,7 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
             f"{a.sh_degree}; energy by degree {' + '.join(f'{100 * e:.3g} %' for e in a.sh_energy)}",
         ),
         ("antialiased", "yes (Mip-Splatting)" if a.antialiased else "no"),
+        ("scale", f"{a.metres_per_unit:g} m per unit" if a.metres_per_unit else "unknown: `langsplat scale`"),
         ("extra properties", ", ".join(a.extras) or "none"),
         ("cameras", f"{a.cameras}" if a.cameras else "none"),
     ]

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from langsplat_core.cli.instances import instance_json, table, unit_of
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.errors import InputError
 from langsplat_core.formats import load_scene
@@ -38,8 +39,12 @@ class QueryScene:
     """Training view in which the pixel is reported."""
     encoder: str = ""
     """Text encoder folder or hub id, in place of the one the scene names."""
+    instances: int = 5
+    """How many of a phrase's things are listed, the best first."""
+    scale: float | None = None
+    """Metres per world unit, in place of what the scene says."""
     json: bool = False
-    """Print JSON."""
+    """Print JSON, lengths in world units."""
 
     def run(self) -> None:
         scene = load_scene(self.scene)
@@ -49,20 +54,28 @@ class QueryScene:
             raise InputError("no phrase given; for example: langsplat query scene.ply 'red cup'")
         camera = _camera(scene, self.camera)
         engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
-        answers = []
+        unit = unit_of(scene, self.scale)
+        answers, tables = [], []
         for text in self.texts:
             result = engine.run(text, self.level)
-            answers.append(_answer(result, scene, engine, camera, self.mode))
+            answer = _answer(result, scene, engine, camera, self.mode)
+            things = engine.instances(result, max(self.instances, 0)) if result.found else ()
+            answer["metres_per_unit"] = unit.length if unit.name == "m" else None
+            answer["instances"] = [instance_json(thing, number) for number, thing in enumerate(things, 1)]
+            answers.append(answer)
+            tables.append(table(things, unit))
         if self.json:
             json.dump(answers, sys.stdout, indent=1)
             print()
             return
-        for answer in answers:
+        for answer, lines in zip(answers, tables, strict=True):
             verdict = "found" if answer["found"] else "not here"
-            place = "-" if answer["place"] is None else " ".join(f"{v:.3f}" for v in answer["place"])
+            place = "-" if answer["place"] is None else f"{unit.format(answer['place'])} {unit.name}"
             print(
                 f"{answer['phrase']}: {verdict}, score {answer['score']:.3f} at level {answer['level']}, "
-                f"place {place}, pixel {answer['pixel']}"
+                f"place {place}, pixel {answer['pixel']}",
+                *lines,
+                sep="\n",
             )
 
 

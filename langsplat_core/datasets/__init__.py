@@ -1,5 +1,7 @@
 """Photographs with cameras, whatever they came with."""
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 from langsplat_core.config import DatasetConfig
@@ -31,9 +33,13 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
     path = Path(path)
     if config.max_side < 16:
         raise InputError(f"max_side is {config.max_side}; photographs need at least 16 pixels")
+    metres = config.metres_per_unit
+    if metres is not None and not 0 < metres < math.inf:
+        raise InputError(f"metres_per_unit is {metres:g}; must be above 0 and finite")
     if not path.exists():
         raise InputError(f"{path} does not exist; expected {ACCEPTED}")
     capture = _load(path, config.max_side, work, progress)
+    capture = capture if metres is None else replace(capture, metres_per_unit=metres)
     return capture if len(capture.points) else add_points(capture, work, progress)
 
 

@@ -18,6 +18,7 @@ class Capture:
     images: tuple[Array, ...]  # (H, W, 3) uint8 each, display (sRGB) values
     points: Array  # (M, 3) float64 structure-from-motion points; M may be 0
     colours: Array  # (M, 3) uint8
+    metres_per_unit: float | None = None  # > 0, how long a unit of its world is; None: unknown
 
     def __post_init__(self) -> None:
         if len(self.cameras) != len(self.images):

@@ -1,6 +1,7 @@
 """Points for datasets that bring cameras but no points: triangulated, or at the worst random."""
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ def add_points(capture: Capture, work: Path, progress: Progress) -> Capture:
         )
         generator = np.random.default_rng(0)
         points, colours = random_points(RANDOM_POINTS, points, capture.cameras, capture.images, generator)
-    return Capture(capture.cameras, capture.images, points, colours)
+    return replace(capture, points=points, colours=colours)
 
 
 def _triangulated(capture: Capture, work: Path, progress: Progress) -> tuple[Array, Array]:

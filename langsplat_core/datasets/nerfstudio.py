@@ -55,7 +55,20 @@ def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
             raise FormatError(f"{where} ({label}): {error}") from None
     _report_missing(file, missing, len(frames))
     cameras, images = develop(list(photos.values()), max_side, progress)
-    return Capture(cameras, images, *_points(file, top.get("ply_file_path")))
+    return Capture(cameras, images, *_points(file, top.get("ply_file_path")), _metres_per_unit(file, top))
+
+
+def _metres_per_unit(file: Path, top: Json) -> float | None:
+    """The key is ours: nerfstudio's own files do not say how long a unit is."""
+    if top.get("metres_per_unit") is None:
+        return None
+    try:
+        metres = _number(top, "metres_per_unit")
+    except ValueError as error:
+        raise FormatError(f"{file}: {error}") from None
+    if metres <= 0:
+        raise FormatError(f'{file}: "metres_per_unit" must be above 0, got {metres:g}')
+    return metres
 
 
 def _report_missing(file: Path, missing: list[str], total: int) -> None:

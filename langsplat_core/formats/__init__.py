@@ -19,6 +19,7 @@ from langsplat_core.formats.cameras_json import read_cameras, write_cameras
 from langsplat_core.formats.ksplat import read_ksplat
 from langsplat_core.formats.langsplat_features import read_features, write_features
 from langsplat_core.formats.language import read_language, rematch_language, write_language
+from langsplat_core.formats.metres import metres_comment, write_metres
 from langsplat_core.formats.opening import exists
 from langsplat_core.formats.ply import read_ply, read_ply_scene, write_ply
 from langsplat_core.formats.sog import META_NAME, read_sog, read_sog_scene
@@ -48,6 +49,7 @@ __all__ = [
     "write_cameras",
     "write_features",
     "write_language",
+    "write_metres",
     "write_ply",
     "write_splat",
     "write_spz",
@@ -111,7 +113,7 @@ def check_writable(path: Path | str) -> None:
 def save_scene(path: Path | str, scene: Scene) -> None:
     """Write `scene` as .ply, .spz or .splat, by its name, with its companions; those it lacks are removed.
 
-    Only the PLY keeps everything. .spz rounds it and has no extras; .splat moreover has neither view
+    Only the PLY keeps everything. .spz rounds it, without extras and scale; .splat moreover has neither view
     dependence nor the mark of antialiasing. All keep the rows' order. All files are first written whole under
     temporary names. Then the old companions are removed, the scene's file renamed into place, and last the
     new companions. Interrupted anywhere, there is the old scene or the new one, perhaps without companions,
@@ -136,8 +138,10 @@ def save_scene(path: Path | str, scene: Scene) -> None:
 
 
 def _write_ply(path: Path, scene: Scene) -> None:
-    comments = (antialiasing.COMMENT,) if scene.antialiased else ()
-    write_ply(path, scene.gaussians, comments, scene.extras)
+    comments = [antialiasing.COMMENT] if scene.antialiased else []
+    if scene.metres_per_unit is not None:
+        comments.append(metres_comment(scene.metres_per_unit))
+    write_ply(path, scene.gaussians, tuple(comments), scene.extras)
 
 
 # By suffix; SOG is also a folder and read by name

@@ -8,7 +8,7 @@ after channel: all coefficients of red, then of green, then of blue. Normals are
 As read: the properties in any order and of any scalar type, any byte order, ascii, LF or CR LF in the
 header, without normals, with further elements (ignored) and properties (kept by `read_ply_scene`), and the
 compressed variant of `compressed_ply`. Rows are kept as they are, NaN included. Header comments may say that
-the Gaussians are to be drawn antialiased (`antialiasing`).
+the Gaussians are to be drawn antialiased (`antialiasing`), and how long a unit is (`metres`).
 """
 
 from collections.abc import Mapping
@@ -31,6 +31,7 @@ from langsplat_core.formats.inria_layout import (
     check_gaussian_properties,
     sh_to_channel_major,
 )
+from langsplat_core.formats.metres import metres_by_comments
 from langsplat_core.formats.opening import open_for_reading
 from langsplat_core.formats.ply_body import CHUNK_ROWS, fill_columns, iterate_rows
 from langsplat_core.formats.ply_header import TYPE_NAMES, PlyElement, PlyHeader, is_name, read_ply_header
@@ -56,13 +57,15 @@ def read_ply_scene(path: Path | str) -> Scene:
     with file:
         header = read_ply_header(file, path)
         antialiased = antialiased_by_comments(header.comments)
+        metres = metres_by_comments(header.comments)
         vertex = header.element("vertex")
         if is_compressed(header):
-            return Scene(read_compressed(file, size, header, path), antialiased=antialiased)
+            gaussians = read_compressed(file, size, header, path)
+            return Scene(gaussians, antialiased=antialiased, metres_per_unit=metres)
         if vertex is None:
             raise FormatError(f"{path}: has no element 'vertex', so it is not a 3D Gaussian scene")
         gaussians, extras = _read_vertices(file, size, header, vertex, path)
-        return Scene(gaussians, antialiased=antialiased, extras=extras)
+        return Scene(gaussians, antialiased=antialiased, extras=extras, metres_per_unit=metres)
 
 
 def _read_vertices(

@@ -46,6 +46,7 @@ class SceneSummary:
     sh_degree: int
     sh_energy: tuple[float, ...]  # per degree: share of the squared coefficients, of 1
     antialiased: bool
+    metres_per_unit: float | None
     extras: tuple[str, ...]
     cameras: int
     memory_bytes: int
@@ -73,6 +74,7 @@ def summarise(scene: Scene) -> SceneSummary:
         sh_degree=gaussians.sh_degree,
         sh_energy=_sh_energy(drawn),
         antialiased=scene.antialiased,
+        metres_per_unit=scene.metres_per_unit,
         extras=tuple(scene.extras),
         cameras=len(scene.cameras),
         memory_bytes=memory_bytes(scene),

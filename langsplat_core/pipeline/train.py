@@ -78,7 +78,7 @@ def train_scene(
     clock, crew = _Clock(), crew or Crew()
 
     # First: absent weights, or a scene that cannot be read, should not cost an hour.
-    given = None if gaussians_from is None else load_scene(gaussians_from).gaussians
+    given = None if gaussians_from is None else load_scene(gaussians_from)
     encoder = load_encoder(config.clip.model, config.clip.device, config.clip.batch)
     named = None if masks_of else load_mask_source(config.masks, config.clip.device)
     # One process solves for cameras, the others find them in the work folder.
@@ -95,9 +95,11 @@ def train_scene(
     crew.meet()
     clock.lap("masks and vectors")
 
-    gaussians = given
-    if gaussians is None:
+    if given is None:
         gaussians = crew.once(lambda: trained_gaussians(capture, train, config, work, progress))
+    else:
+        gaussians = given.gaussians
+    metres = capture.metres_per_unit or (None if given is None else given.metres_per_unit)
     clock.lap("radiance")
 
     cameras = tuple(capture.cameras[i] for i in train)
@@ -107,7 +109,7 @@ def train_scene(
     clock.lap("language field")
 
     if crew.leads:
-        save_scene(out, Scene(gaussians, language, cameras))
+        save_scene(out, Scene(gaussians, language, cameras, metres_per_unit=metres))
         psnr = _mean_psnr(gaussians, capture, held_out)
         clock.lap("saving and held-out views")
         report = TrainReport(

@@ -12,6 +12,7 @@ from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.cut import cut_level
+from langsplat_core.query.instances import Instance, find_instances
 from langsplat_core.query.lookup import Lookup, build_lookup
 from langsplat_core.query.places import Place, locate
 from langsplat_core.query.surface import Surface, build_surface
@@ -114,6 +115,11 @@ class QueryEngine:
     @cached_property
     def _surface(self) -> Surface:
         return build_surface(self.scene.gaussians)
+
+    @property
+    def surface(self) -> Surface:
+        """What the scene's Gaussians lie on: to grow and shrink selections along."""
+        return self._surface
 
     @cached_property
     def _lookup(self) -> Lookup:
@@ -226,6 +232,11 @@ class QueryEngine:
             found=peak >= self.field.reading.found,
             members=members,
         )
+
+    def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
+        """The things among the members of an answer, best first, or only so many of them."""
+        relevancy = result.relevancy[result.level]
+        return find_instances(self._surface, self.scene.gaussians, result.members, relevancy, at_most)
 
     def _place(self, smoothed: Array, peak: float) -> Place | None:
         # Half way between the floor and the peak, but never below the floor.

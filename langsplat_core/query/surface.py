@@ -25,6 +25,7 @@ class Surface:
     neighbours: Array  # (M, k) int32 numbers in [0, M)
     weights: Array  # (M,) float32 opacity
     links: csr_matrix  # (M, M) who is next to whom on one surface; symmetric
+    anchors: Array  # (N,) int32 number of every Gaussian, if it is too faint of the nearest; -1: none is near
 
     def smooth(self, values: Array) -> Array:
         """(3, N) values of all Gaussians -> (3, M) float32 opacity-weighted means over each neighbourhood.
@@ -55,17 +56,21 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
         rows = np.flatnonzero(valid)
     k = min(NEIGHBOURS, len(rows))
     if k == 0:
-        nothing = np.zeros((0, 1), np.int32)
-        return Surface(
-            rows, np.zeros((0, 3)), nothing, np.zeros(0, np.float32), csr_matrix((0, 0), dtype=bool)
-        )
+        return _empty(len(gaussians))
     rows = rows[cKDTree(gaussians.means[rows].astype(np.float64)).indices]  # leaf by leaf: near ones meet
     positions = gaussians.means[rows].astype(np.float64)
-    distances, neighbours = cKDTree(positions).query(positions, k=k, workers=-1)
+    tree = cKDTree(positions)
+    distances, neighbours = tree.query(positions, k=k, workers=-1)
     shape = (len(rows), k)
-    neighbours = neighbours.reshape(shape).astype(np.int32)
+    distances, neighbours = distances.reshape(shape), neighbours.reshape(shape).astype(np.int32)
     weights = np.maximum(opacity[rows], FAINTEST).astype(np.float32)
-    return Surface(rows, positions, neighbours, weights, _links(neighbours, distances.reshape(shape)))
+    reach = REACH * np.median(distances, axis=1) + 1e-12
+    anchors = np.full(len(gaussians), -1, np.int32)
+    anchors[rows] = np.arange(len(rows))
+    faint = np.flatnonzero(valid & (anchors < 0))
+    gap, nearest = tree.query(gaussians.means[faint].astype(np.float64), workers=-1)
+    anchors[faint] = np.where(gap <= reach[nearest], nearest, -1)
+    return Surface(rows, positions, neighbours, weights, _links(neighbours, distances, reach), anchors)
 
 
 def surface_areas(gaussians: Gaussians) -> Array:
@@ -79,9 +84,20 @@ def surface_areas(gaussians: Gaussians) -> Array:
     return np.minimum(areas, np.quantile(areas, 0.99)) if len(areas) else areas
 
 
-def _links(neighbours: Array, distances: Array) -> csr_matrix:
-    reach = REACH * np.median(distances, axis=1, keepdims=True) + 1e-12
-    near = distances <= reach
+def _empty(count: int) -> Surface:
+    """Of `count` Gaussians none of which is valid."""
+    return Surface(
+        rows=np.zeros(0, np.int64),
+        positions=np.zeros((0, 3)),
+        neighbours=np.zeros((0, 1), np.int32),
+        weights=np.zeros(0, np.float32),
+        links=csr_matrix((0, 0), dtype=bool),
+        anchors=np.full(count, -1, np.int32),
+    )
+
+
+def _links(neighbours: Array, distances: Array, reach: Array) -> csr_matrix:
+    near = distances <= reach[:, None]
     count = len(neighbours)
     source = np.repeat(np.arange(count, dtype=np.int32), near.sum(1))
     one_way = csr_matrix((np.ones(len(source), bool), (source, neighbours[near])), shape=(count, count))

@@ -23,8 +23,11 @@ class Scene:
     path: Path | None = None
     antialiased: bool = False  # trained with Mip-Splatting's compensation, as its file says
     extras: Mapping[str, Array] = field(default_factory=dict)  # (N,) properties not read here
+    metres_per_unit: float | None = None  # > 0; None: nobody said how long a world unit is
 
     def __post_init__(self) -> None:
+        if self.metres_per_unit is not None and not 0 < self.metres_per_unit < np.inf:
+            raise ValueError(f"metres_per_unit of {self.metres_per_unit}: must be above 0 and finite")
         for name, values in self.extras.items():
             if values.shape != (len(self.gaussians),):
                 raise ValueError(f"extras[{name!r}] of shape {values.shape}, not ({len(self.gaussians)},)")

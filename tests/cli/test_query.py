@@ -1,5 +1,6 @@
 """`langsplat query`."""
 
+import json
 import os
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 from langsplat_core.cli import query
 from langsplat_core.cli.query import QueryScene
 from langsplat_core.config import INRIA
+from langsplat_core.errors import InputError
 from langsplat_core.formats import (
     load_scene,
     save_scene,
@@ -70,8 +72,9 @@ def test_phrases_of_the_phrasebook_need_no_encoder(tmp_path):
         [sys.executable, "-c", ASK], cwd=tmp_path, env=os.environ, capture_output=True, text=True
     )
     assert run.returncode == 0, run.stderr
-    book, pot, heavy = run.stdout.splitlines()
+    book, _, first, pot, _, _, heavy = run.stdout.splitlines()
     assert book.startswith("Book: found")
+    assert first.split()[0] == "1"
     assert pot.startswith("PLANT pot: found")
     assert heavy == "[]"
 
@@ -86,3 +89,32 @@ def test_another_phrase_is_answered_by_the_encoder_named(tmp_path, monkeypatch, 
     QueryScene(tmp_path / "a.ply", ("mug",)).run()
     assert loaded == ["mine", "fake"]
     assert "Mug: found" in capsys.readouterr().out
+
+
+def test_the_things_of_an_answer_are_listed(tmp_path, capsys):
+    """Two of the three blobs mean "pair", in a scene whose unit is half a metre."""
+    pair = ((axis(0) + axis(2)) / np.sqrt(2)).astype(np.float32)
+    field = replace(fake_language(), phrasebook={"pair": pair, "void": axis(6)})
+    save_scene(tmp_path / "a.ply", Scene(blobs(), field, metres_per_unit=0.5))
+    QueryScene(tmp_path / "a.ply", ("pair", "void"), json=True).run()
+    found, absent = json.loads(capsys.readouterr().out)
+    assert absent["instances"] == []
+    assert found["metres_per_unit"] == 0.5
+    assert [thing["number"] for thing in found["instances"]] == [1, 2]
+    centres = sorted(thing["centre"][0] for thing in found["instances"])
+    np.testing.assert_allclose(centres, [-1.2, 1.2], atol=0.1)
+    for thing in found["instances"]:
+        rotation = np.array(thing["oriented_box"]["rotation"])
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+        np.testing.assert_allclose(thing["size"], 2 * np.array(thing["oriented_box"]["half_extents"]))
+        assert 0.4 < thing["share"] < 0.6
+    QueryScene(tmp_path / "a.ply", ("pair",), instances=1).run()
+    verdict, heading, *rows = capsys.readouterr().out.splitlines()
+    assert " m, pixel" in verdict
+    assert "centre, m" in heading
+    (row,) = rows
+    assert abs(float(row.split()[5])) == pytest.approx(0.6, abs=0.05)
+    QueryScene(tmp_path / "a.ply", ("pair",), scale=1.0).run()
+    assert abs(float(capsys.readouterr().out.splitlines()[2].split()[5])) == pytest.approx(1.2, abs=0.1)
+    with pytest.raises(InputError, match="--scale -1"):
+        QueryScene(tmp_path / "a.ply", ("pair",), scale=-1.0).run()

@@ -215,3 +215,19 @@ def test_the_real_dataset_with_missing_files(caplog: pytest.LogCaptureFixture) -
     assert "17 of 67" in caplog.text
     assert {max(image.shape) for image in capture.images} == {128}
     assert all(image.mean() > 30 for image in capture.images)
+
+
+def test_a_dataset_may_say_how_long_its_unit_is(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path, GLOBAL)
+    assert load(tmp_path).metres_per_unit is None
+    rewrite(tmp_path, {**data, "metres_per_unit": 0.5})
+    assert load(tmp_path).metres_per_unit == 0.5
+    (tmp_path / "work").mkdir()
+    given = load_capture(tmp_path, DatasetConfig(metres_per_unit=2.0), tmp_path / "work")
+    assert given.metres_per_unit == 2.0
+    for wrong in (0, -1, "1 m", [1]):
+        rewrite(tmp_path, {**data, "metres_per_unit": wrong})
+        with pytest.raises(FormatError, match="metres_per_unit"):
+            load(tmp_path)
+    with pytest.raises(InputError, match="metres_per_unit is 0; must be above 0"):
+        load_capture(tmp_path, DatasetConfig(metres_per_unit=0.0), tmp_path / "work")

@@ -41,6 +41,7 @@ def test_photographs_become_a_searchable_scene(room, tmp_path):
     report = train_scene(room, out, tiny_settings(room))
     scene = load_scene(out)
     assert scene.language is not None
+    assert scene.metres_per_unit == 0.5
     assert report.views == len(scene.cameras) == 3
     assert report.held_out == 2
     assert report.gaussians == len(scene.gaussians) > 0

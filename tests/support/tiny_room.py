@@ -43,6 +43,7 @@ def tiny_room(folder: Path) -> Path:
     body = "".join("{} {} {}\n".format(*mean) for mean in gaussians.means)
     (folder / "points.ply").write_text(header + body)
     transforms = {**intrinsics, "w": SIZE[0], "h": SIZE[1], "ply_file_path": "points.ply", "frames": frames}
+    transforms["metres_per_unit"] = 0.5
     (folder / "transforms.json").write_text(json.dumps(transforms))
     tiny_clip(folder / "encoder")
     return folder

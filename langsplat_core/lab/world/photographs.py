@@ -177,6 +177,7 @@ def _write_transforms(cameras: list[Camera], suffix: str, path: Path) -> None:
         "cx": first.cx,
         "cy": first.cy,
         "ply_file_path": "points.ply",
+        "metres_per_unit": 1.0,
         "frames": [
             {
                 "file_path": f"images/{camera.name}{suffix}",

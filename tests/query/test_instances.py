@@ -1,0 +1,159 @@
+"""Instances: taken apart where the surface is, against plain graphs and float64 means."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.sparse.csgraph import connected_components
+
+from langsplat_core.arrays import Array, logit, sigmoid
+from langsplat_core.query.instances import (
+    BOXED,
+    CRUMB_COUNT,
+    EQUAL_SCORES,
+    connected_parts,
+    find_instances,
+)
+from langsplat_core.query.surface import Surface, build_surface
+from langsplat_core.scene import Gaussians
+from tests.support.scenes import random_gaussians
+
+
+def balls(sizes: list[int], radius: float = 0.1, opacity: float = 0.9) -> tuple[Gaussians, Array]:
+    """Balls of Gaussians one unit apart along x; and the number of its ball for each."""
+    rng = np.random.default_rng(3)
+    number = np.repeat(np.arange(len(sizes)), sizes)
+    n = len(number)
+    means = rng.uniform(-radius, radius, size=(n, 3)) + number[:, None] * [1.0, 0, 0]
+    return Gaussians(
+        means=means,
+        log_scales=np.log(rng.uniform(0.01, 0.03, size=(n, 3))),
+        quats_wxyz=np.tile([1.0, 0, 0, 0], (n, 1)),
+        opacity_logits=np.full(n, logit(np.array(opacity))),
+        sh=np.zeros((n, 1, 3)),
+    ), number
+
+
+def extents(gaussians: Gaussians) -> Array:
+    """(N,) float64, as documented: opacity times the largest cross-section."""
+    scales = np.exp(np.sort(gaussians.log_scales.astype(np.float64), axis=1))
+    return sigmoid(gaussians.opacity_logits.astype(np.float64)) * scales[:, 1] * scales[:, 2]
+
+
+def smoothed(surface: Surface, values: Array) -> Array:
+    """(M,) float64: the weighted mean over each neighbourhood."""
+    weights = surface.weights.astype(np.float64)[surface.neighbours]
+    return (weights * values.astype(np.float64)[surface.rows][surface.neighbours]).sum(1) / weights.sum(1)
+
+
+def test_parts_are_the_connected_components():
+    surface = build_surface(random_gaussians(500))
+    numbers = np.flatnonzero(np.random.default_rng(0).uniform(size=len(surface.rows)) < 0.08)
+    parts = connected_parts(surface, numbers)
+    count, labels = connected_components(surface.links[numbers][:, numbers], directed=False)
+    assert len(parts.starts) == count > 3
+    own = parts.labels[numbers]
+    for part in range(count):
+        assert len(set(labels[own == part])) == 1
+    assert sorted(parts.order) == numbers.tolist()
+    grouped = np.split(parts.order, parts.starts[1:])
+    assert all(set(parts.labels[group]) == {part} for part, group in enumerate(grouped))
+    assert (np.delete(parts.labels, numbers) < 0).all()
+
+
+def test_every_ball_is_an_instance_with_the_figures_of_a_plain_account():
+    gaussians, number = balls([60, 200, 90])
+    relevancy = np.array([0.7, 0.9, 0.8])[number] + 0.01 * np.sin(np.arange(350))
+    surface = build_surface(gaussians)
+    members = np.ones(350, bool)
+    members[5] = False
+    found = find_instances(surface, gaussians, members, relevancy)
+    assert [instance.count for instance in found] == [200, 90, 59]
+    smooth = smoothed(surface, relevancy)
+    for instance, ball in zip(found, (1, 2, 0), strict=True):
+        own = np.flatnonzero((number == ball) & members)
+        assert instance.members.tolist() == own.tolist()
+        on_surface = np.flatnonzero(np.isin(surface.rows, own))
+        weights = surface.weights[on_surface].astype(np.float64) / surface.weights[on_surface].sum()
+        points = surface.positions[on_surface]
+        assert instance.score == pytest.approx(smooth[on_surface].max(), abs=1e-6)
+        assert instance.mean == pytest.approx(weights @ relevancy[surface.rows[on_surface]], abs=1e-6)
+        np.testing.assert_allclose(instance.centre, weights @ points, atol=1e-6)
+        np.testing.assert_allclose(instance.box, np.quantile(points, [0.02, 0.98], axis=0), atol=1e-12)
+        assert instance.share == pytest.approx(
+            extents(gaussians)[own].sum() / extents(gaussians)[members].sum()
+        )
+    assert [i.count for i in find_instances(surface, gaussians, members, relevancy, at_most=2)] == [200, 90]
+
+
+def test_of_equal_scores_the_larger_comes_first():
+    gaussians, number = balls([50, 150, 80])
+    relevancy = 0.8 + np.array([0.4, 0.0, 0.2])[number] * EQUAL_SCORES
+    found = find_instances(build_surface(gaussians), gaussians, np.ones(280, bool), relevancy)
+    assert [instance.count for instance in found] == [150, 80, 50]
+
+
+def test_crumbs_are_dropped_unless_there_is_nothing_else():
+    gaussians, number = balls([400, 20, 20, 30])
+    log_scales = gaussians.log_scales.copy()
+    log_scales[number == 3] -= 4  # many, but of hardly any extent
+    gaussians = replace(gaussians, log_scales=log_scales)
+    surface, relevancy = build_surface(gaussians), np.full(len(number), 0.7)
+    relevancy[number == 1] = 0.99
+    members = np.ones(len(number), bool)
+    members[400 + CRUMB_COUNT - 1 : 420] = False
+    members[420 + CRUMB_COUNT : 440] = False
+    found = find_instances(surface, gaussians, members, relevancy)
+    assert [instance.count for instance in found] == [400, CRUMB_COUNT]
+    assert sum(instance.share for instance in found) < 1
+    (only,) = find_instances(surface, gaussians, members & (number == 1), relevancy)
+    assert only.count == CRUMB_COUNT - 1
+    assert only.share == pytest.approx(1)
+
+
+def test_faint_gaussians_go_with_the_nearest():
+    gaussians, number = balls([100, 100])
+    opacity = np.full(200, 3.0)
+    opacity[::10] = -6.0
+    means = gaussians.means.copy()
+    means[0] = [0.5, 3.0, 0]  # faint and near nothing
+    gaussians = replace(gaussians, means=means, opacity_logits=opacity)
+    surface = build_surface(gaussians)
+    assert len(surface.rows) == 180
+    assert surface.anchors[0] == -1
+    members = np.ones(200, bool)
+    members[number == 1] = False
+    members[110] = True  # faint, in the ball that is not meant
+    found = find_instances(surface, gaussians, members, np.full(200, 0.8))
+    assert [instance.members.tolist() for instance in found] == [list(range(1, 100))]
+
+
+def test_nothing_is_nothing():
+    gaussians = random_gaussians(50)
+    surface = build_surface(gaussians)
+    assert find_instances(surface, gaussians, np.zeros(50, bool), np.ones(50)) == ()
+    faint = ~np.isin(np.arange(50), surface.rows)
+    assert faint.any()
+    assert find_instances(surface, gaussians, faint, np.ones(50)) == ()
+    none = random_gaussians(0)
+    assert find_instances(build_surface(none), none, np.zeros(0, bool), np.zeros(0)) == ()
+
+
+def test_flat_and_invisible_gaussians_have_finite_shares():
+    gaussians, _ = balls([40, 40])
+    gaussians.log_scales[:, 2] = -np.inf
+    gaussians.opacity_logits[:] = -np.inf
+    surface = build_surface(gaussians)
+    found = find_instances(surface, gaussians, np.ones(80, bool), np.full(80, 0.8))
+    assert [instance.share for instance in found] == [0.0, 0.0]
+    assert all(np.isfinite(instance.centre).all() for instance in found)
+
+
+def test_boxes_of_many_points_are_taken_from_some_of_them(measured):
+    gaussians, _ = balls([5 * BOXED])
+    surface = build_surface(gaussians)
+    (found,) = find_instances(surface, gaussians, np.ones(len(gaussians), bool), np.ones(len(gaussians)))
+    assert BOXED / 2 < len(found.points) <= BOXED
+    error = np.abs(found.box - np.quantile(surface.positions, [0.02, 0.98], axis=0)).max() / 0.2
+    measured("boxes of a fifth of the points", "error of a side, share of it", error)
+    assert error < 0.01

@@ -1,0 +1,142 @@
+"""Selections: their algebra, and growing and shrinking along the surface against plain walks."""
+
+import heapq
+from math import inf, nan
+
+import numpy as np
+import pytest
+
+from langsplat_core.errors import InputError
+from langsplat_core.query import selection
+from langsplat_core.query.boxes import OrientedBox
+from langsplat_core.query.surface import Surface, build_surface
+from langsplat_core.scene import Gaussians
+from tests.support.scenes import random_gaussians
+
+
+def sheet(side: int = 20, spacing: float = 0.1) -> Gaussians:
+    """A square of opaque Gaussians in the plane z = 0, and one faint one above each."""
+    x, y = np.meshgrid(np.arange(side) * spacing, np.arange(side) * spacing)
+    flat = np.stack([x.ravel(), y.ravel(), np.zeros(side * side)], -1)
+    n = 2 * len(flat)
+    return Gaussians(
+        means=np.concatenate([flat, flat + [0, 0, 0.3 * spacing]]),
+        log_scales=np.full((n, 3), np.log(spacing / 2)),
+        quats_wxyz=np.tile([1.0, 0, 0, 0], (n, 1)),
+        opacity_logits=np.repeat([3.0, -4.0], n // 2),
+        sh=np.zeros((n, 1, 3)),
+    )
+
+
+def walked(surface: Surface, seeds: np.ndarray) -> np.ndarray:
+    """(M,) lengths of the shortest ways along links, by Dijkstra's book, in float64."""
+    lengths = np.where(seeds, 0.0, inf)
+    waiting = [(0.0, int(i)) for i in np.flatnonzero(seeds)]
+    while waiting:
+        so_far, here = heapq.heappop(waiting)
+        for there in surface.links[here].indices:
+            step = so_far + np.linalg.norm(surface.positions[here] - surface.positions[there])
+            if step < lengths[there]:
+                lengths[there] = step
+                heapq.heappush(waiting, (float(step), int(there)))
+    return lengths
+
+
+def random_selection(n: int, seed: int = 0, share: float = 0.1) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(size=n) < share
+
+
+def test_algebra():
+    a, b, c = (np.array(row, bool) for row in ([1, 1, 0, 0], [1, 0, 1, 0], [1, 0, 0, 0]))
+    assert selection.union([a, b, c]).tolist() == [True, True, True, False]
+    assert selection.intersection([a, b]).tolist() == [True, False, False, False]
+    assert selection.difference([a, b, c]).tolist() == [False, True, False, False]
+    assert selection.difference([a]).tolist() == a.tolist()
+    assert selection.difference([a]) is not a
+    assert selection.invert(c).tolist() == [False, True, True, True]
+    assert selection.of_rows(np.array([0, 3]), 4).tolist() == [True, False, False, True]
+
+
+def test_spheres_and_boxes_hold_their_faces_and_nothing_without_a_place():
+    means = np.array([[0, 0, 0], [1, 0, 0], [1.001, 0, 0], [nan, 0, 0], [0, -1, 1]], np.float32)
+    assert selection.in_sphere(means, np.zeros(3), 1.0).tolist() == [True, True, False, False, False]
+    inside = selection.in_box(means, np.array([0, -1, 0]), np.array([1, 0, 1]))
+    assert inside.tolist() == [True, True, False, False, True]
+    c = np.sqrt(0.5)
+    axes = np.array([[c, -c, 0], [c, c, 0], [0, 0, 1]])
+    turned = OrientedBox(np.zeros(3), axes, np.array([2.0, 0.125, 0.125]))
+    points = np.array([[1.4, 1.4, 0], [1.4, -1.4, 0], [0, 0, 0.125], [0, 0, inf]], np.float32)
+    assert selection.in_oriented_box(points, turned).tolist() == [True, False, True, False]
+
+
+@pytest.mark.parametrize("distance", [0.0, 0.15, 0.4, 100.0])
+def test_growing_by_a_distance_is_the_shortest_way(distance):
+    gaussians = random_gaussians(300)
+    surface = build_surface(gaussians)
+    selected = random_selection(300, share=0.03)
+    lengths = walked(surface, selected[surface.rows])
+    grown = selection.grow(surface, selected, distance)
+    assert grown[surface.rows].tolist() == (lengths <= distance).tolist()
+    assert (grown >= selected).all()
+
+
+def test_growing_by_steps_is_the_same_as_walking():
+    gaussians = random_gaussians(300)
+    surface = build_surface(gaussians)
+    selected = random_selection(300, share=0.02)
+    reached = set(np.flatnonzero(selected[surface.rows]).tolist())
+    for steps in range(4):
+        grown = selection.grow_steps(surface, selected, steps)
+        assert set(np.flatnonzero(grown[surface.rows]).tolist()) == reached
+        reached |= {int(there) for here in reached for there in surface.links[here].indices}
+
+
+def test_shrinking_undoes_growing_on_a_sheet_and_faint_ones_follow():
+    gaussians = sheet()
+    surface = build_surface(gaussians)
+    assert (surface.anchors >= 0).all()
+    start = selection.in_box(gaussians.means, np.array([0.7, 0.7, -1]), np.array([1.2, 1.2, 1]))
+    grown = selection.grow(surface, start, 0.25)
+    assert grown.sum() > start.sum()
+    opaque, faint = grown[:400], grown[400:]
+    assert opaque.tolist() == faint.tolist()
+    assert (selection.shrink(surface, grown, 0.25) >= start).all()  # closing
+    opened = selection.shrink(surface, start, 0.11)
+    assert 0 < opened.sum() < start.sum()
+    assert (opened <= start).all()
+    assert not selection.shrink(surface, start, 1.0).any()
+    assert not selection.shrink_steps(surface, start, 9).any()
+
+
+def test_a_faint_gaussian_that_is_not_selected_shrinks_nothing():
+    gaussians = sheet()
+    surface = build_surface(gaussians)
+    selected = np.ones(len(gaussians), bool)
+    selected[400:] = random_selection(400)
+    assert selection.shrink(surface, selected, 0.2).tolist() == selected.tolist()
+
+
+def test_shrinking_keeps_where_the_surface_ends():
+    gaussians = sheet(10)
+    surface = build_surface(gaussians)
+    everything = np.ones(len(gaussians), bool)
+    assert selection.shrink(surface, everything, 5.0).all()
+    assert selection.shrink_steps(surface, everything, 5).all()
+
+
+@pytest.mark.parametrize("wrong", [-1, inf, nan])
+def test_a_distance_that_cannot_be_walked(wrong):
+    surface = build_surface(sheet(5))
+    nothing = np.zeros(50, bool)
+    with pytest.raises(InputError, match="give 0 or more"):
+        selection.grow(surface, nothing, wrong)
+    with pytest.raises(InputError, match="give 0 or more"):
+        selection.shrink_steps(surface, nothing, wrong)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_scenes_of_almost_nothing(count):
+    surface = build_surface(random_gaussians(count), min_opacity=0.0)
+    for selected in (np.zeros(count, bool), np.ones(count, bool)):
+        assert selection.grow(surface, selected, 1.0).tolist() == selected.tolist()
+        assert selection.shrink_steps(surface, selected).tolist() == selected.tolist()
