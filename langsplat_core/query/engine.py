@@ -107,19 +107,10 @@ class QueryEngine:
             self._encoder = self._load_encoder(self._encoder_id or self.field.encoder_id)
         return self._encoder
 
-    @property
-    def surface(self) -> Surface:
-        """The surface that the scene's Gaussians lie on; built at the first call, a tenth of a second."""
-        return self._surface
-
     @cached_property
-    def _surface(self) -> Surface:
-        return build_surface(self.scene.gaussians)
-
-    @property
     def surface(self) -> Surface:
-        """What the scene's Gaussians lie on: to grow and shrink selections along."""
-        return self._surface
+        """What the scene's Gaussians lie on; built when first needed, a tenth of a second at 80k."""
+        return build_surface(self.scene.gaussians)
 
     @cached_property
     def _lookup(self) -> Lookup:
@@ -215,7 +206,7 @@ class QueryEngine:
             vector = self.text_vector(phrase, progress)
         progress(f"searching '{tidy(phrase)}'", 0.5)
         relevancy = self.relevancy(vector)
-        smoothed = self._surface.smooth(relevancy)
+        smoothed = self.surface.smooth(relevancy)
         scores = tuple(float(values.max()) if len(values) else 0.0 for values in smoothed)
         chosen = int(np.argmax(scores)) if level == "auto" else LEVELS.index(level)
         peak = scores[chosen]
@@ -236,8 +227,8 @@ class QueryEngine:
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
         """The things among the members of an answer, best first, or only so many of them."""
         relevancy = result.relevancy[result.level]
-        return find_instances(self._surface, self.scene.gaussians, result.members, relevancy, at_most)
+        return find_instances(self.surface, self.scene.gaussians, result.members, relevancy, at_most)
 
     def _place(self, smoothed: Array, peak: float) -> Place | None:
         # Half way between the floor and the peak, but never below the floor.
-        return locate(self._surface, smoothed, max(FLOOR + 0.5 * (peak - FLOOR), FLOOR))
+        return locate(self.surface, smoothed, max(FLOOR + 0.5 * (peak - FLOOR), FLOOR))
