@@ -10,7 +10,8 @@ if TYPE_CHECKING:
     from langsplat_core.config import TrainConfig
     from langsplat_core.formats import load_scene, save_scene
     from langsplat_core.pipeline.train import train_scene
-    from langsplat_core.query.engine import QueryEngine, QueryResult
+    from langsplat_core.query.answers import QueryResult
+    from langsplat_core.query.engine import QueryEngine
     from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
     from langsplat_core.raster.render import Rendering, render
     from langsplat_core.scene import Camera, Gaussians, Intrinsics, LanguageField, Scene, look_at

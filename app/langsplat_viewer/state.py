@@ -10,7 +10,7 @@ from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.display.colour_maps import MAX_QUERIES
 from langsplat_core.display.compose import HeatRanges
 from langsplat_core.display.displays import DISPLAYS
-from langsplat_core.query.engine import QueryResult
+from langsplat_core.query.answers import QueryResult
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.relevancy import FLOOR
 from langsplat_viewer.controls import Extent, OrbitCamera

@@ -13,7 +13,7 @@ from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.display.latent_colours import latent_colours
 from langsplat_core.errors import BackendError, InputError
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.engine import QueryResult
+from langsplat_core.query.answers import QueryResult
 from langsplat_core.scene import LEVELS, Camera, Reading, Scene
 from langsplat_viewer.frame import Backend
 from langsplat_viewer.headless import render_picture

@@ -13,7 +13,8 @@ from langsplat_core.cli.instances import instance_json, table, unit_of
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.errors import InputError
 from langsplat_core.formats import load_scene
-from langsplat_core.query.engine import NO_FIELD, QueryEngine, QueryResult
+from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.engine import NO_FIELD, QueryEngine
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.places import peak_pixel
 from langsplat_core.raster import load_rasterizer

@@ -10,7 +10,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.compose import gated_mean
 from langsplat_core.display.latent_colours import latent_colours
-from langsplat_core.query.engine import LoadEncoder, QueryEngine, QueryResult
+from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.raster.protocol import Rasterizer
 from langsplat_core.scene import Camera, LanguageField, Scene
 

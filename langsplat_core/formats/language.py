@@ -7,6 +7,8 @@ executed). Version 2, for N Gaussians, CLIP vectors of D numbers and P phrases:
     codes            uint16   (3, N)     number of the codeword at subpart, part, whole: of a codebook
     latents          float    (3, N, d)  instead, of another codec; zero where never observed
     confidence       float    (3, N)     total blending weight of the observations, >= 0; 0 for no meaning
+    things           uint16   (N,)       number of the thing a Gaussian belongs to, 65535 for none; absent
+                                         where it is not known
     positions        uint64   (N,)       of the Gaussians that the field belongs to, see `packed_positions`
     corners          float32  (2, 3)     of the box of these positions
     canonical        float    (4, D)     unit text vectors of "object", "things", "stuff", "texture"
@@ -27,9 +29,11 @@ executed). Version 2, for N Gaussians, CLIP vectors of D numbers and P phrases:
     phrases          JSON list of the P phrases
     temperature      of the softmax that reads this encoder's cosines, decimal
     found            relevancy from which a phrase counts as present, decimal
+    calibration      JSON list: constant, slope, and probability from which a phrase counts as found, see
+                     `scene.language.Calibration`; absent where the encoder has none
 
 "float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
-like the one in memory. With a codebook as `langsplat train` makes it that is 20 bytes per Gaussian, 6 of
+like the one in memory. With a codebook as `langsplat train` makes it that is 22 bytes per Gaussian, 6 of
 them codes.
 
 The PLY stays a plain file that other programs edit; the checksum notices it, and the positions let
@@ -39,7 +43,7 @@ The PLY stays a plain file that other programs edit; the checksum notices it, an
 
 import hashlib
 import json
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +55,7 @@ from langsplat_core.errors import FormatError
 from langsplat_core.files import atomic_path
 from langsplat_core.formats.language_tensors import CODEC, FORMAT, VERSION, Stored, read_stored
 from langsplat_core.formats.packed_positions import pack_positions
-from langsplat_core.scene import LEVELS, LanguageField
+from langsplat_core.scene import LEVELS, NO_THING, LanguageField
 
 SUFFIX = ".langsplat.safetensors"
 
@@ -78,6 +82,8 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
     tensors |= {"positions": positions, "corners": corners}
     if indexed:
         tensors["codes"] = field.latents[..., 0]
+    if field.things is not None:
+        tensors["things"] = field.things
     metadata = {
         "format": FORMAT,
         "version": VERSION,
@@ -91,6 +97,8 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
         "temperature": repr(field.reading.temperature),
         "found": repr(field.reading.found),
     }
+    if field.reading.calibration is not None:
+        metadata["calibration"] = json.dumps(astuple(field.reading.calibration))
     with atomic_path(path) as temporary:
         save_file({name: np.ascontiguousarray(t) for name, t in tensors.items()}, temporary, metadata)
 
@@ -135,6 +143,7 @@ def rematch_language(
     new_rows = np.flatnonzero(np.isfinite(new_means).all(1))
     latents = np.zeros((len(LEVELS), len(new_means), field.latents.shape[2]), field.latents.dtype)
     confidence = np.zeros((len(LEVELS), len(new_means)), np.float32)
+    things = np.full(len(new_means), NO_THING, np.uint16)
     if len(old_rows) and len(new_rows):
         tree = cKDTree(old_means[old_rows])
         if max_distance is None:
@@ -143,7 +152,11 @@ def rematch_language(
         found = distance <= max_distance + stored.precision
         to, source = new_rows[found], old_rows[partner[found]]
         latents[:, to], confidence[:, to] = field.latents[:, source], field.confidence[:, source]
-    return replace(field, latents=latents, confidence=confidence)
+        if field.things is not None:
+            things[to] = field.things[source]
+    return replace(
+        field, latents=latents, confidence=confidence, things=None if field.things is None else things
+    )
 
 
 def _median_spacing(tree: Any) -> float:

@@ -10,7 +10,7 @@ from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import FormatError
 from langsplat_core.formats.opening import open_for_reading, parse_json
 from langsplat_core.formats.packed_positions import step, unpack_positions
-from langsplat_core.scene import LEVELS, LanguageField, Reading, codec_from_tensors
+from langsplat_core.scene import LEVELS, Calibration, LanguageField, Reading, codec_from_tensors
 from langsplat_core.scene.codec import KINDS
 
 FORMAT, VERSION = "langsplat", "2"
@@ -23,7 +23,7 @@ _KEYS = {
     ),
 }
 _FLOATS = {"1": ("F32",), "2": ("F32", "F16")}
-_WHOLE = {"codes": "U16", "positions": "U64"}  # tensors that hold no floating-point numbers
+_WHOLE = {"codes": "U16", "things": "U16", "positions": "U64"}  # tensors that hold no floating-point numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,8 @@ def _field(
     check_array("phrasebook", vectors, (len(phrases), codec.vector_dim))
     reading = Reading()
     if metadata["version"] != "1":
-        reading = Reading(float(metadata["temperature"]), float(metadata["found"]))
+        calibration = _calibration(metadata, path)
+        reading = Reading(float(metadata["temperature"]), float(metadata["found"]), calibration)
     return LanguageField(
         latents,
         tensors["confidence"],
@@ -118,7 +119,17 @@ def _field(
         metadata["encoder"],
         dict(zip(phrases, vectors, strict=True)),
         reading,
+        tensors.get("things"),
     )
+
+
+def _calibration(metadata: dict[str, str], path: Path) -> Calibration | None:
+    if "calibration" not in metadata:
+        return None
+    numbers = parse_json(metadata["calibration"].encode(), path)
+    if not isinstance(numbers, list) or len(numbers) != 3 or not all(isinstance(n, float) for n in numbers):
+        raise FormatError(f"{path}: the header's 'calibration' is not a list of three numbers")
+    return Calibration(*numbers)
 
 
 def _means(tensors: dict[str, Array], count: int) -> tuple[Array, float]:

@@ -45,7 +45,8 @@ class BenchmarkConfig:
     encoder: str = "demo"  # "demo" for the bundled one, a folder, or a hub id
     codec: CodecConfig = field(default_factory=CodecConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
-    cut: CutRule = "median"  # where a map is cut into a mask, see `query.cut`
+    cut: CutRule | Literal["regions"] = "regions"
+    """How an answer becomes a mask: whole regions, or a rule of `query.cut` for the map."""
     ceiling: bool = False  # also keep all of the encoder's numbers, by which a codec is judged
     budget: bool = False  # also swap one stage at a time for one that makes no mistake
 

@@ -50,6 +50,7 @@ from langsplat_core.training.language.lift import Lifted, lift_block, lift_sampl
 from langsplat_core.training.language.mask_groups import MaskGroups, group_masks
 from langsplat_core.training.language.memberships import Memberships, view_pairs
 from langsplat_core.training.language.relevancy_error import CodecReport, codec_report, everyday_vocabulary
+from langsplat_core.training.language.things import find_things
 
 Views = Sequence[tuple[Camera, ImageFeatures]]  # read when needed: they may be more than memory holds
 Latents = tuple[Array, Array]  # (3, N, d) of the codec's type, (3, N) float32
@@ -86,6 +87,7 @@ def language_field(
         encoder_id=encoder.id,
         phrasebook=encoded_phrases(encoder, config.phrases),
         reading=encoder.reading,
+        things=stages.things(),
     )
     return field, report
 
@@ -138,6 +140,21 @@ class _Stages:
         if self._crew.leads:
             shutil.rmtree(blocks, ignore_errors=True)
         return made
+
+    def things(self) -> Array | None:
+        """Which thing each Gaussian belongs to; None where latents are averaged themselves, which needs no
+        memberships."""
+        if self._lift.mode in LATENT_LIFTS:
+            return None
+        path = self._work / f"{stage_key('things', 1, *self._inputs)}.npy"
+        if not path.exists():
+            self._memberships()  # everyone's work
+        self._crew.once(lambda: kept_array(path, self._find_things))
+        return np.array(open_array(path))
+
+    def _find_things(self) -> Array:
+        self._progress("finding things", 0.5)
+        return find_things(self._memberships()[0], [len(vectors) for vectors in self._vectors])
 
     def _fit(self) -> tuple[Codec, CodecReport]:
         config, vocabulary = self._config.codec, everyday_vocabulary(self._encoder, self._config.phrases)

@@ -9,7 +9,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
-from langsplat_core.query.engine import QueryResult
+from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.selection import difference, intersection, union
 
 Combination = Literal["union", "intersection", "difference"]

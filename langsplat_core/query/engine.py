@@ -1,7 +1,6 @@
-"""Answering phrases on a scene: encode, look up, choose a level, find the place."""
+"""Answering phrases on a scene: encode, look up, read (`answers`)."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
@@ -11,14 +10,13 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.cut import cut_level
+from langsplat_core.query.answers import AnswerRule, QueryResult, by_peak, by_regions
 from langsplat_core.query.instances import Instance, find_instances
 from langsplat_core.query.lookup import Lookup, build_lookup
-from langsplat_core.query.places import Place, locate
+from langsplat_core.query.regions import Regions, build_regions
 from langsplat_core.query.surface import Surface, build_surface
-from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, LanguageField, Scene
+from langsplat_core.scene import CANONICAL_PHRASES, LanguageField, Scene
 from langsplat_core.scene.phrases import phrase_key, tidy
-from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN
 
 BATCH = 256  # phrases of a vocabulary that are encoded at a time
 SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them
@@ -38,26 +36,6 @@ class TextEncoder(Protocol):
 LoadEncoder = Callable[[str], TextEncoder]  # from a hub id, a folder or "demo"; may raise EncoderError
 
 
-@dataclass(frozen=True, eq=False)
-class QueryResult:
-    """The answer to one phrase."""
-
-    phrase: str
-    level: int  # index into LEVELS
-    scores: tuple[float, float, float]  # smoothed peak relevancy per level
-    relevancy: Array  # (3, N) float32 in [0, 1] per level and Gaussian
-    peak: float  # score of the chosen level
-    place: Array | None  # (3,) world units
-    box: Array | None  # (2, 3) corners, world units
-    found: bool  # peak >= the scene's `Reading.found`
-    members: Array  # (N,) bool: the Gaussians that answer, wherever they are; all of them above the cut
-
-    @property
-    def heat_range(self) -> tuple[float, float]:
-        """The relevancies at which a heat map of this answer is coldest and hottest."""
-        return FLOOR, max(self.peak, FLOOR + MIN_HEAT_SPAN)
-
-
 class QueryEngine:
     """Queries against one scene. What depends on the scene alone is computed at the first query, and the text
     encoder is loaded when a phrase first needs it. Not for use by two threads at once."""
@@ -69,12 +47,14 @@ class QueryEngine:
         *,
         encoder_id: str = "",
         exact: bool = False,
+        rule: AnswerRule = "regions",
     ) -> None:
         """load_encoder: usually `semantics.encoders.load_text_encoder`; without one only the scene's own
         phrasebook can be asked. encoder_id: in place of the encoder that the scene names. exact: decode at
-        every Gaussian instead of looking up, 2 KB each, to measure the table by."""
+        every Gaussian instead of looking up, 2 KB each, to measure the table by. rule: see `answers`."""
         self.scene = scene
         self.exact = exact
+        self.rule = rule
         self._load_encoder = load_encoder
         self._encoder_id = encoder_id
         self._encoder: TextEncoder | None = None
@@ -111,6 +91,11 @@ class QueryEngine:
     def surface(self) -> Surface:
         """What the scene's Gaussians lie on; built when first needed, a tenth of a second at 80k."""
         return build_surface(self.scene.gaussians)
+
+    @cached_property
+    def regions(self) -> Regions:
+        """Patches of the surface that mean the same; found when first needed."""
+        return build_regions(self.surface, self.field)
 
     @cached_property
     def _lookup(self) -> Lookup:
@@ -205,30 +190,12 @@ class QueryEngine:
         if vector is None:
             vector = self.text_vector(phrase, progress)
         progress(f"searching '{tidy(phrase)}'", 0.5)
-        relevancy = self.relevancy(vector)
-        smoothed = self.surface.smooth(relevancy)
-        scores = tuple(float(values.max()) if len(values) else 0.0 for values in smoothed)
-        chosen = int(np.argmax(scores)) if level == "auto" else LEVELS.index(level)
-        peak = scores[chosen]
-        place = self._place(smoothed[chosen], peak)
-        members = relevancy[chosen] > cut_level("floor", relevancy[chosen], peak, FLOOR)
-        return QueryResult(
-            phrase=tidy(phrase),
-            level=chosen,
-            scores=(scores[0], scores[1], scores[2]),
-            relevancy=relevancy,
-            peak=peak,
-            place=None if place is None else place.position,
-            box=None if place is None else place.box,
-            found=peak >= self.field.reading.found,
-            members=members,
-        )
+        relevancy, reading = self.relevancy(vector), self.field.reading
+        if self.rule == "peak":
+            return by_peak(tidy(phrase), relevancy, self.surface, reading, level)
+        return by_regions(tidy(phrase), relevancy, self.surface, self.regions, reading, level)
 
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
         """The things among the members of an answer, best first, or only so many of them."""
         relevancy = result.relevancy[result.level]
         return find_instances(self.surface, self.scene.gaussians, result.members, relevancy, at_most)
-
-    def _place(self, smoothed: Array, peak: float) -> Place | None:
-        # Half way between the floor and the peak, but never below the floor.
-        return locate(self.surface, smoothed, max(FLOOR + 0.5 * (peak - FLOOR), FLOOR))

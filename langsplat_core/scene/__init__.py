@@ -10,14 +10,23 @@ from langsplat_core.scene.codec import (
 )
 from langsplat_core.scene.gaussians import SH_COUNTS, Gaussians
 from langsplat_core.scene.intrinsics import Intrinsics
-from langsplat_core.scene.language import CANONICAL_PHRASES, LEVELS, LanguageField, Reading
+from langsplat_core.scene.language import (
+    CANONICAL_PHRASES,
+    LEVELS,
+    NO_THING,
+    Calibration,
+    LanguageField,
+    Reading,
+)
 from langsplat_core.scene.scene import Scene
 
 __all__ = [
     "CANONICAL_PHRASES",
     "LEVELS",
+    "NO_THING",
     "SH_COUNTS",
     "AutoencoderCodec",
+    "Calibration",
     "Camera",
     "CodebookCodec",
     "Codec",

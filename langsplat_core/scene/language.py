@@ -5,12 +5,31 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from langsplat_core.arrays import Array, check_array
+from langsplat_core.arrays import Array, check_array, sigmoid
 from langsplat_core.scene.codec import Codec, latent_dtype, meaningful
 from langsplat_core.scene.phrases import phrase_key
 
 LEVELS = ("subpart", "part", "whole")  # index 0, 1, 2 wherever a level axis appears
 CANONICAL_PHRASES = ("object", "things", "stuff", "texture")  # LERF's negatives, used by LangSplat
+NO_THING = 65_535  # in `LanguageField.things`: of no thing in particular
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What an answer's best cosine margin says about whether the thing is there at all (Platt 1999):
+    ``probability = sigmoid(constant + slope * margin)``, present and absent being as likely beforehand."""
+
+    constant: float
+    slope: float
+    found: float = 0.75  # probability from which a phrase counts as found; 0.5 up to here is a weak match
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite([self.constant, self.slope]).all() and self.slope > 0 and 0.5 <= self.found <= 1):
+            raise ValueError(f"calibration: {self}; expected a positive slope, and found in [0.5, 1]")
+
+    def probability(self, margin: float) -> float:
+        """That what is asked for is there, in (0, 1)."""
+        return float(sigmoid(np.array(self.constant + self.slope * margin)))
 
 
 @dataclass(frozen=True)
@@ -18,7 +37,8 @@ class Reading:
     """How cosines of one text encoder are read: other encoders have another scale."""
 
     temperature: float = 10.0  # of the softmax; 10 in the public code of LERF and LangSplat, for CLIP
-    found: float = 0.6  # smoothed peak relevancy from which a phrase counts as present
+    found: float = 0.6  # peak relevancy from which a phrase counts as present, without a calibration
+    calibration: Calibration | None = None
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.temperature) and self.temperature > 0 and 0 <= self.found <= 1):
@@ -39,6 +59,7 @@ class LanguageField:
     encoder_id: str  # hub id or folder of the text encoder, e.g. "demo"
     phrasebook: Mapping[str, Array] = field(default_factory=dict)  # `phrase_key` -> (D,) unit vector
     reading: Reading = field(default_factory=Reading)
+    things: Array | None = None  # (N,) uint16 number of the thing that each belongs to, or NO_THING
 
     def __post_init__(self) -> None:
         d, big = self.codec.latent_dim, self.codec.vector_dim
@@ -49,6 +70,8 @@ class LanguageField:
             )
         check_array("confidence", self.confidence, (len(LEVELS), "N"), dims, dtype=np.float32)
         check_array("canonical", self.canonical, (len(CANONICAL_PHRASES), big), dtype=np.float32)
+        if self.things is not None:
+            check_array("things", self.things, ("N",), dims, dtype=np.uint16)
         known = {phrase_key(phrase): vector for phrase, vector in self.phrasebook.items()}
         object.__setattr__(self, "phrasebook", known)
         for phrase, vector in known.items():
@@ -66,4 +89,9 @@ class LanguageField:
 
     def take(self, rows: Array) -> "LanguageField":
         """The field of the Gaussians at `rows` (indices or a boolean mask)."""
-        return replace(self, latents=self.latents[:, rows], confidence=self.confidence[:, rows])
+        return replace(
+            self,
+            latents=self.latents[:, rows],
+            confidence=self.confidence[:, rows],
+            things=None if self.things is None else self.things[rows],
+        )

@@ -15,12 +15,12 @@ import numpy as np
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.scene import Reading
+from langsplat_core.scene import Calibration, Reading
 from langsplat_core.semantics.weights import Weights
 
 OPEN_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 VOCABULARY = "vocabulary.txt"  # beside the weights: the only words the encoder was taught, one per line
-READING = "reading.json"  # beside the weights, optional: {"found": relevancy from which a thing is there}
+READING = "reading.json"  # beside the weights, optional: fields of `scene.Reading`, but for the temperature
 WORD = re.compile(r"[^\W_]+(?:'[^\W_]+)?")
 EXAMPLES = 12  # known words to name where a phrase has an unknown one
 TEXT_BATCH = 64  # phrases per forward pass
@@ -97,7 +97,7 @@ class PhraseEncoder:
         self.id = weights.id
         self._tower = tower
         self._words = _vocabulary(weights.folder)
-        self._found = _threshold(weights)
+        self._reading = _reading(weights, self._tower.temperature)
 
     @property
     def dim(self) -> int:
@@ -112,7 +112,7 @@ class PhraseEncoder:
     @property
     def reading(self) -> Reading:
         """How its cosines are read, as a scene made with it stores it."""
-        return Reading(self.temperature, self._found)
+        return self._reading
 
     @property
     def logits(self) -> Logits | None:
@@ -223,14 +223,19 @@ class Encoder:
             return unit(self._pictures.encode(inputs).float().cpu().numpy())
 
 
-def _threshold(weights: Weights) -> float:
+def _reading(weights: Weights, temperature: float) -> Reading:
     path = weights.folder / READING
     if not path.is_file():
-        return Reading.found
+        return Reading(temperature)
     try:
-        return Reading(found=float(json.loads(path.read_text(encoding="utf-8"))["found"])).found
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise EncoderError(f'{weights.id}: {READING} is not {{"found": 0 to 1}} ({error!r})') from None
+        stated = json.loads(path.read_text(encoding="utf-8"))
+        calibration = Calibration(**stated["calibration"]) if "calibration" in stated else None
+        return Reading(temperature, float(stated.get("found", Reading.found)), calibration)
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise EncoderError(
+            f'{weights.id}: {READING} is not {{"found": 0 to 1, "calibration": {{"constant": number, '
+            f'"slope": number, "found": 0.5 to 1}}}} ({error!r})'
+        ) from None
 
 
 def pixel_statistics(weights: Weights, mean: Triple, std: Triple) -> tuple[Array, Array]:

@@ -2,7 +2,8 @@
 
 from langsplat_core.config import LevelChoice
 from langsplat_core.display.displays import DISPLAYS
-from langsplat_core.query.engine import NO_FIELD, QueryResult
+from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.engine import NO_FIELD
 from langsplat_core.scene.phrases import phrase_key, tidy
 from langsplat_viewer.actions.settings import set_display, show_panel
 from langsplat_viewer.state import SLOTS, Query

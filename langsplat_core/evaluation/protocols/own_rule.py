@@ -5,7 +5,7 @@ import numpy as np
 from langsplat_core.config import PictureConfig
 from langsplat_core.evaluation.protocols.profiles import OwnRule
 from langsplat_core.evaluation.protocols.reading import Prediction
-from langsplat_core.query.engine import QueryResult
+from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.pixels import splatted_relevancy
 from langsplat_core.query.places import peak_pixel
 from langsplat_core.raster.protocol import View

@@ -14,7 +14,8 @@ from langsplat_core.evaluation.protocols.map_files import file_name, read_releva
 from langsplat_core.evaluation.protocols.own_rule import own_prediction
 from langsplat_core.evaluation.protocols.profiles import MapRule, OwnRule, Profile, SilhouetteRule
 from langsplat_core.evaluation.protocols.reading import Prediction, read_maps, read_silhouette
-from langsplat_core.query.engine import QueryEngine, QueryResult
+from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.protocol import Rasterizer, View
 from langsplat_core.raster.render import splat_colours

@@ -52,6 +52,7 @@ from langsplat_core.pipeline.language import Views, language_field
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import trained_gaussians
 from langsplat_core.progress import Progress, silent
+from langsplat_core.query.answers import AnswerRule
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.pixels import splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
@@ -225,12 +226,18 @@ class Room:
         field, loss, seconds = self.field(variant, fresh)
         return replace(self.measure_field(field, variant), codec_loss=loss, fit_seconds=seconds)
 
+    def rule(self, variant: Variant) -> AnswerRule:
+        """How answers are read; the paper's own ones by their peak."""
+        return "regions" if self.config.cut == "regions" and variant.query != "paper" else "peak"
+
     def measure_field(self, field: LanguageField, variant: Variant) -> Measured:
         """Ask everything of what the Gaussians are said to mean."""
         start = time.perf_counter()
         # What is no codec has its numbers at hand; going through a codec's interface takes seconds a phrase.
         whole = field.codec.latent_dim == field.codec.vector_dim
-        engine = QueryEngine(Scene(self.gaussians, field), lambda _: self.encoder, exact=whole)
+        engine = QueryEngine(
+            Scene(self.gaussians, field), lambda _: self.encoder, exact=whole, rule=self.rule(variant)
+        )
         absent = self.truth.absent(EVERYTHING)
         asked = ask(engine, [*(phrase.text for phrase in self.truth.phrases), *absent])
         reading = Reading(variant.query == "paper", self.config.cut)

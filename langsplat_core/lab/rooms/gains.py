@@ -9,19 +9,17 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.scene import LEVELS, Gaussians
 from langsplat_core.training.language.lift import Lifted, lift_block
 from langsplat_core.training.language.mask_groups import MaskGroups, group_masks
 from langsplat_core.training.language.memberships import Memberships
+from langsplat_core.training.language.things import masks_of_things
 
 TINY = 1.0  # pixels: largest weight in any view below which a Gaussian is taken for an accident
 GATE = 0.1  # share of its largest weight in a view below which a Gaussian does not count as seen there
 OUTLIER = -1.5  # standard deviations of its masks' cosines below which a mask is not believed
-SAME = 0.6  # overlap over union of what two masks claim from which they are one thing
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,51 +119,12 @@ GAINS: Mapping[str, Callable[[Material], Lifted]] = MappingProxyType(
 
 
 def same_things(members: Memberships, counts: Sequence[int]) -> Array:
-    """(M,) number of the thing that each mask of all views shows.
-
-    Two masks of one level and of different views are the same where most of what they claim, among the
-    Gaussians that both views see at that level, is claimed by both.
-    """
-    firsts = np.concatenate([[0], np.cumsum(counts)])
-    labels = np.arange(firsts[-1])
-    offset = 0
+    """(M,) number of the thing that each mask of all views shows, at every level."""
+    labels = np.arange(sum(counts))
     for level in range(len(LEVELS)):
-        claims, views = _claims(members, firsts, level)
-        links = _overlapping(claims, views)
-        _, found = connected_components(links, directed=False)
-        at_level = np.flatnonzero(np.diff(claims.tocsc().indptr) > 0)
-        labels[at_level] = firsts[-1] + offset + found[at_level]
-        offset += found.max(initial=-1) + 1
+        found = masks_of_things(members, counts, level)
+        labels = np.where(found >= 0, len(labels) * (level + 1) + found, labels)
     return np.unique(labels, return_inverse=True)[1]
-
-
-def _claims(members: Memberships, firsts: Array, level: int) -> tuple[sparse.csr_matrix, Array]:
-    """(N, M) bool: masks that hold more than half of a Gaussian's weight in their view and level."""
-    rows, columns = [], []
-    for view, pairs in enumerate(members.pairs):
-        here = pairs[pairs["level"] == level]
-        total = np.bincount(here["row"], here["weight"], members.count)
-        strong = here[here["weight"] > 0.5 * total[here["row"]]]
-        rows.append(strong["row"].astype(np.int64))
-        columns.append(firsts[view] + strong["mask"].astype(np.int64))
-    joined_rows, joined_columns = np.concatenate(rows), np.concatenate(columns)
-    shape = (members.count, int(firsts[-1]))
-    ones = np.ones(len(joined_rows), np.float32)
-    views = np.searchsorted(firsts, np.arange(firsts[-1]), side="right") - 1
-    return sparse.csr_matrix((ones, (joined_rows, joined_columns)), shape), views
-
-
-def _overlapping(claims: sparse.csr_matrix, views: Array) -> sparse.csr_matrix:
-    """(M, M) links between masks of different views whose overlap over union, where both see, is large."""
-    both = (claims.T @ claims).tocoo()
-    of_view = sparse.csr_matrix((np.ones(len(views), np.float32), (np.arange(len(views)), views)))
-    seen = claims @ of_view  # (N, V): is the Gaussian claimed in the view at all
-    visible = (claims.T @ seen).toarray()  # (M, V): Gaussians of the mask that the view sees
-    a, b = both.row, both.col
-    union = visible[a, views[b]] + visible[b, views[a]] - both.data
-    same = (views[a] != views[b]) & (both.data > SAME * union)
-    shape = (claims.shape[1],) * 2
-    return sparse.csr_matrix((np.ones(int(same.sum()), bool), (a[same], b[same])), shape)
 
 
 def _weights_per_view(members: Memberships) -> Array:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -32,6 +33,7 @@ MIN_GAUSSIANS = 20  # nor one with fewer Gaussians directly
 # 731 rows; smaller pictures get smaller windows, or a part would be lost in one
 FILTER, VOTE, PAPER_ROWS = 20, 7, 731
 CHANNELS = 32  # phrases that are splatted at a time
+HALF = 0.5  # of what a pixel shows: from there it belongs to an answer's Gaussians
 KINDS = ("object", "colour+object", "part", "subpart")  # of phrases, in the order of tables
 
 
@@ -68,7 +70,7 @@ class Reading:
     """How an answer becomes a map and a mask."""
 
     paper_order: bool = False  # blend latents and decode pixels, instead of blending relevancies
-    cut: CutRule = "floor"
+    cut: CutRule | Literal["regions"] = "regions"
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +80,12 @@ class Answer:
     vector: Array  # (D,) of the phrase
     level: int
     values: Array  # (N,) relevancy at that level
+    members: Array  # (N,) bool
+    even: Array  # (N,) relevancy, the same all over a region
     peak: float
     median: float  # of the values of Gaussians with a meaning
     found: bool
+    probability: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +162,17 @@ def ask(engine: QueryEngine, texts: Iterable[str]) -> Asked:
         known = engine.field.confidence[result.level] > 0
         median = float(np.median(values[known])) if known.any() else 0.0
         vector = engine.text_vector(text)
-        answers[text] = Answer(vector, result.level, values, result.peak, median, result.found)
+        answers[text] = Answer(
+            vector=vector,
+            level=result.level,
+            values=values,
+            members=result.members,
+            even=result.even,
+            peak=result.peak,
+            median=median,
+            found=result.found,
+            probability=result.probability,
+        )
     return Asked(engine, answers, tuple(unknown), float(np.median(seconds)) if seconds else 0.0)
 
 
@@ -179,11 +194,11 @@ def evaluate(
         masks = {p: _mask(labels, p) for p in truth.phrases if p.text in asked.answers}
         visible = [phrase for phrase, mask in masks.items() if mask.sum() >= MIN_PIXELS]
         answers = [asked.answers[phrase.text] for phrase in visible]
-        for phrase, answer, relevancy in zip(
-            visible, answers, relevancy_maps(asked.engine, view, answers, reading.paper_order), strict=True
-        ):
-            result = _judge(relevancy, answer, masks[phrase], reading.cut)
-            results.setdefault(phrase.kind, []).append(result)
+        for phrase, result in zip(visible, _judged(asked.engine, view, answers, reading), strict=True):
+            found, peak = result
+            truth_mask = masks[phrase]
+            score = intersection_over_union(found, truth_mask), bool(truth_mask[peak])
+            results.setdefault(phrase.kind, []).append(score)
         progress("asking phrases", (done + 1) / len(cameras))
     return [
         Score(kind, len(rows), float(np.mean([r[0] for r in rows])), float(np.mean([r[1] for r in rows])))
@@ -216,16 +231,39 @@ def _mask(labels: Array, phrase: Phrase) -> Array:
     return np.asarray(np.isin(labels, phrase.ids).any(axis=0))
 
 
-def _judge(relevancy: Array, answer: Answer, truth: Array, rule: CutRule) -> tuple[float, bool]:
-    """IoU of the map after the cut, and whether its peak hits."""
-    scale = len(relevancy) / PAPER_ROWS
-    cut = cut_level(rule, relevancy, answer.peak, answer.median)
-    found = majority(relevancy > cut, round(VOTE * scale) | 1)
-    column, row, _ = peak_pixel(relevancy, round(FILTER * scale))
-    return intersection_over_union(found, truth), bool(truth[row, column])
+def _judged(
+    engine: QueryEngine, view: View, answers: Sequence[Answer], reading: Reading
+) -> Iterator[tuple[Array, tuple[int, int]]]:
+    """The mask (H, W) of each answer, and the row and column of its peak."""
+    gate = PictureConfig().alpha_gate
+    if reading.cut == "regions" and not reading.paper_order:
+        for start in range(0, len(answers), CHANNELS // 2):
+            some = answers[start : start + CHANNELS // 2]
+            columns = [*(answer.even for answer in some), *(answer.members for answer in some)]
+            maps = np.moveaxis(splatted_relevancy(view, np.stack(columns, 1), gate), 2, 0)
+            for relevancy, share in zip(maps[: len(some)], maps[len(some) :], strict=True):
+                yield _smoothed_mask(share > HALF), _peak(relevancy)
+        return
+    rule: CutRule = "floor" if reading.cut == "regions" else reading.cut
+    for answer, relevancy in zip(
+        answers, relevancy_maps(engine, view, answers, reading.paper_order), strict=True
+    ):
+        cut = cut_level(rule, relevancy, answer.peak, answer.median)
+        yield _smoothed_mask(relevancy > cut), _peak(relevancy)
 
 
-def evaluate_direct(asked: Asked, labels: Array, truth: Truth, rule: CutRule = "floor") -> list[DirectScore]:
+def _smoothed_mask(mask: Array) -> Array:
+    return majority(mask, round(VOTE * len(mask) / PAPER_ROWS) | 1)
+
+
+def _peak(relevancy: Array) -> tuple[int, int]:
+    column, row, _ = peak_pixel(relevancy, round(FILTER * len(relevancy) / PAPER_ROWS))
+    return row, column
+
+
+def evaluate_direct(
+    asked: Asked, labels: Array, truth: Truth, rule: CutRule | Literal["regions"] = "regions"
+) -> list[DirectScore]:
     """The overlap without any view. labels: (3, N) the true id of every Gaussian at each level, -1 for those
     that no photograph shows, which count on neither side (see `oracles.true_labels`)."""
     seen = (labels >= 0).any(axis=0)
@@ -236,7 +274,10 @@ def evaluate_direct(asked: Asked, labels: Array, truth: Truth, rule: CutRule = "
             continue
         answer = asked.answers[phrase.text]
         values = answer.values[seen]
-        found = values > cut_level(rule, values, answer.peak, answer.median)
+        if rule == "regions":
+            found = answer.members[seen]
+        else:
+            found = values > cut_level(rule, values, answer.peak, answer.median)
         results.setdefault(phrase.kind, []).append(intersection_over_union(found, right))
     return [
         DirectScore(kind, len(rows), float(np.mean(rows)))

@@ -1,0 +1,108 @@
+"""From relevancies to an answer: by regions of the surface, or by the peak alone, as published."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from langsplat_core.arrays import Array, sigmoid
+from langsplat_core.config import LevelChoice
+from langsplat_core.query.cut import cut_level
+from langsplat_core.query.extent import find_extent, to_margin
+from langsplat_core.query.places import locate
+from langsplat_core.query.regions import Regions
+from langsplat_core.query.surface import Surface
+from langsplat_core.scene import LEVELS, Reading
+from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN
+
+AnswerRule = Literal["regions", "peak"]
+Verdict = Literal["found", "weak match", "not here"]
+WEAK = 0.5  # probability from which what is not found is at least a weak match
+
+
+@dataclass(frozen=True, eq=False)
+class QueryResult:
+    """The answer to one phrase."""
+
+    phrase: str
+    level: int  # index into LEVELS
+    scores: tuple[float, float, float]  # best relevancy per level: of a region, or of a neighbourhood
+    relevancy: Array  # (3, N) float32 in [0, 1] per level and Gaussian
+    even: Array  # (N,) float32 relevancy at the level, the same all over a region
+    peak: float  # score of the chosen level
+    probability: float | None  # that the thing is there at all; None where the encoder is not calibrated
+    found: bool
+    members: Array  # (N,) bool: the Gaussians that answer, wherever they are
+    place: Array | None  # (3,) world units
+    box: Array | None  # (2, 3) corners, world units
+
+    @property
+    def verdict(self) -> Verdict:
+        """What to say about it."""
+        if self.found:
+            return "found"
+        return "weak match" if self.probability is not None and self.probability >= WEAK else "not here"
+
+    @property
+    def heat_range(self) -> tuple[float, float]:
+        """The relevancies at which a heat map of this answer is coldest and hottest."""
+        return FLOOR, max(self.peak, FLOOR + MIN_HEAT_SPAN)
+
+
+def by_regions(
+    phrase: str, relevancy: Array, surface: Surface, regions: Regions, reading: Reading, level: LevelChoice
+) -> QueryResult:
+    """Whole regions, cut at a share of the best one's margin (`extent`)."""
+    extent = find_extent(relevancy, surface, regions, reading.temperature, level)
+    scores = [float(sigmoid(np.array(reading.temperature * margin))) for margin in extent.margins]
+    spread = np.append(extent.inside, False)[surface.anchors]
+    even = np.where(surface.anchors >= 0, np.append(extent.even, 0)[surface.anchors], relevancy[extent.level])
+    lowest = float(extent.even[extent.inside].min(initial=1.0))
+    place = locate(surface, extent.even, np.nextafter(np.float32(lowest), np.float32(0)))
+    return QueryResult(
+        phrase=phrase,
+        level=extent.level,
+        scores=(scores[0], scores[1], scores[2]),
+        relevancy=relevancy,
+        even=even.astype(np.float32),
+        peak=scores[extent.level],
+        probability=_probability(extent.margin, reading),
+        found=_found(extent.margin, reading),
+        members=spread,
+        place=None if place is None else place.position,
+        box=None if place is None else place.box,
+    )
+
+
+def by_peak(
+    phrase: str, relevancy: Array, surface: Surface, reading: Reading, level: LevelChoice
+) -> QueryResult:
+    """The level with the highest smoothed peak, cut half way between the floor and that peak."""
+    smoothed = surface.smooth(relevancy)
+    scores = [float(values.max()) if len(values) else 0.0 for values in smoothed]
+    chosen = int(np.argmax(scores)) if level == "auto" else LEVELS.index(level)
+    peak, margin = scores[chosen], float(to_margin(np.array(max(scores)), reading.temperature))
+    place = locate(surface, smoothed[chosen], max(FLOOR + 0.5 * (peak - FLOOR), FLOOR))
+    return QueryResult(
+        phrase=phrase,
+        level=chosen,
+        scores=(scores[0], scores[1], scores[2]),
+        relevancy=relevancy,
+        even=relevancy[chosen],
+        peak=peak,
+        probability=_probability(margin, reading),
+        found=_found(margin, reading),
+        members=relevancy[chosen] > cut_level("floor", relevancy[chosen], peak, FLOOR),
+        place=None if place is None else place.position,
+        box=None if place is None else place.box,
+    )
+
+
+def _probability(margin: float, reading: Reading) -> float | None:
+    return None if reading.calibration is None else reading.calibration.probability(margin)
+
+
+def _found(margin: float, reading: Reading) -> bool:
+    if reading.calibration is not None:
+        return reading.calibration.probability(margin) >= reading.calibration.found
+    return margin >= float(to_margin(np.array(reading.found), reading.temperature))

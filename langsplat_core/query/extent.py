@@ -1,0 +1,75 @@
+"""How far an answer reaches: its level, the regions that are it, and how good the best one is.
+
+Everything is judged by the margin of a region, its cosine with the phrase minus that with the nearest
+canonical phrase: relevancy without its temperature, so that one rule fits all encoders of one family. Shares
+and differences were chosen on the rooms that the demo encoder is calibrated on, never on those that measure.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import LevelChoice
+from langsplat_core.query.regions import SMALLEST, Regions
+from langsplat_core.query.surface import Surface
+from langsplat_core.scene import LEVELS
+
+COARSER = 0.06  # of margin that a coarser level may be worse by and still be taken: things are asked for most
+SHARES = (0.4, 0.4, 0.3)  # of the best margin at each level from which a region belongs to the answer
+FAINT = 0.03  # a best margin below this is no scale to take shares of
+NARROWEST = 1e-6  # distance of a relevancy from 0 and 1, so that its margin is finite
+
+
+@dataclass(frozen=True, eq=False)
+class Extent:
+    """What of a surface answers a phrase."""
+
+    level: int  # index into LEVELS
+    margin: float  # of the best region at any level: cosine with the phrase minus nearest canonical one
+    margins: tuple[float, float, float]  # of the best region of each level
+    even: Array  # (M,) float32 relevancy at the level, the same all over a region
+    inside: Array  # (M,) bool
+
+
+def find_extent(
+    relevancy: Array, surface: Surface, regions: Regions, temperature: float, level: LevelChoice = "auto"
+) -> Extent:
+    """From the (3, N) relevancy of a phrase. level: "auto", or the one that is wanted."""
+    means = regions.means(relevancy, surface)
+    margins = [to_margin(values, temperature) for values in means]
+    best = [_best(values, sizes) for values, sizes in zip(margins, regions.sizes, strict=True)]
+    chosen = _level(best) if level == "auto" else LEVELS.index(level)
+    inside = margins[chosen] > cut(best[chosen], SHARES[chosen])
+    of = regions.of[chosen]
+    return Extent(
+        level=chosen,
+        margin=max(best),
+        margins=(best[0], best[1], best[2]),
+        even=means[chosen].astype(np.float32)[of],
+        inside=inside[of],
+    )
+
+
+def to_margin(relevancy: Array, temperature: float) -> Array:
+    """Relevancy in [0, 1] -> the margin of cosines that it stands for."""
+    clipped = np.clip(np.asarray(relevancy, np.float64), NARROWEST, 1 - NARROWEST)
+    return np.asarray(np.log(clipped / (1 - clipped)) / temperature)
+
+
+def cut(best: float, share: float) -> float:
+    """The margin above which a region belongs to an answer whose best region has the margin `best`."""
+    return share * best if best > FAINT else best - (1 - share) * FAINT
+
+
+def _best(margins: Array, sizes: Array) -> float:
+    """The best region's margin; crumbs that no neighbour took do not count where there are others."""
+    if len(margins) == 0:
+        return float(to_margin(np.zeros(1), 1.0)[0])
+    solid = margins[sizes >= SMALLEST]
+    return float((solid if len(solid) else margins).max())
+
+
+def _level(best: list[float]) -> int:
+    """The coarsest that is nearly as good as the best."""
+    return max(level for level in range(len(LEVELS)) if best[level] >= max(best) - COARSER)
