@@ -106,7 +106,8 @@ class QueryEngine:
         return self._encoder
 
     @cached_property
-    def _surface(self) -> Surface:
+    def surface(self) -> Surface:
+        """The surface that the scene's Gaussians lie on."""
         return build_surface(self.scene.gaussians)
 
     @cached_property
@@ -170,7 +171,7 @@ class QueryEngine:
         vector = self.text_vector(phrase, progress)
         progress(f"searching '{tidy(phrase)}'", 0.5)
         relevancy = self.relevancy(vector)
-        smoothed = self._surface.smooth(relevancy)
+        smoothed = self.surface.smooth(relevancy)
         scores = tuple(float(values.max()) if len(values) else 0.0 for values in smoothed)
         chosen = int(np.argmax(scores)) if level == "auto" else LEVELS.index(level)
         peak = scores[chosen]
@@ -190,4 +191,4 @@ class QueryEngine:
 
     def _place(self, smoothed: Array, peak: float) -> Place | None:
         # Half way between the floor and the peak, but never below the floor.
-        return locate(self._surface, smoothed, max(FLOOR + 0.5 * (peak - FLOOR), FLOOR))
+        return locate(self.surface, smoothed, max(FLOOR + 0.5 * (peak - FLOOR), FLOOR))
