@@ -123,7 +123,7 @@ class _Asking:
             case Union(items):
                 return _joined([self.answer(item, level) for item in items], all_needed=False)
             case Without(what, unwanted):
-                return self._without(self.answer(what, level), self.answer(unwanted))
+                return _without(self.answer(what, level), self.answer(unwanted), isinstance(unwanted, Atom))
             case Inside(part, whole):
                 return self._inside(part, whole, level)
             case Relation() | Superlative():
@@ -158,11 +158,6 @@ class _Asking:
             return [self._ask(text, level)]
         except EncoderError:
             return []
-
-    def _without(self, what: QueryResult, unwanted: QueryResult) -> QueryResult:
-        if not unwanted.found:
-            return what
-        return _restricted(what, what.members & ~unwanted.members, what)
 
     def _chosen(self, tree: Relation | Superlative, level: LevelChoice) -> QueryResult:
         what = self.answer(tree.what, level)
@@ -222,15 +217,17 @@ def cut_inside(
     own = int(np.argmax(peaks[:WHOLE])) if max(peaks[:WHOLE]) > 0 else WHOLE
     chosen = own if level == "auto" else LEVELS.index(level)
     peak, inside = peaks[chosen], there & known[chosen]
-    low = float(np.quantile(relevancy[chosen][inside], LEAST)) if inside.any() else peak
+    own_surface = thing.members & known[chosen]  # without what it touches, which may be anything
+    low = float(np.quantile(relevancy[chosen][own_surface], LEAST)) if own_surface.any() else peak
     members = inside & (relevancy[chosen] > low + SHARE * max(peak - low, SPAN))
+    fits = peak_among(surface, asked[0].relevancy[chosen], numbers) >= engine.field.reading.found
     return replace(
         asked[0],
         level=chosen,
         scores=(peaks[0], peaks[1], peaks[2]),
         relevancy=relevancy,
         peak=peak,
-        found=bool(members.any() and thing.found and all(result.found for result in asked)),
+        found=bool(members.any() and thing.found and fits),
         members=members,
     )
 
@@ -269,6 +266,17 @@ def _joined(answers: list[QueryResult], all_needed: bool) -> QueryResult:
         found=(all if all_needed else any)(answer.found for answer in answers),
         members=np.any([answer.members for answer in counting], axis=0),
     )
+
+
+def _without(what: QueryResult, unwanted: QueryResult, rivals: bool) -> QueryResult:
+    """`what` but for `unwanted`, if that is there. rivals: two names of whole things, of which the better one
+    counts: a green mug resembles "red mug", and "mug" more."""
+    if not unwanted.found:
+        return what
+    taken = unwanted.members
+    if rivals and what.level == unwanted.level:
+        taken = taken & (unwanted.relevancy[unwanted.level] >= what.relevancy[what.level])
+    return _restricted(what, ~taken, what)
 
 
 def _restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryResult:

@@ -85,7 +85,7 @@ _EXCLUSIONS = tuple(
         *("but not", "and not", "other than", "not", "without", "except"),
     )
 )
-_SEPARATE = re.compile(r"\s*[;\n]\s*|\s*,\s*(?!(?:(?:but|and)\s+)?(?:not|without|except)\b)", re.IGNORECASE)
+_SEPARATE = re.compile(r"[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)", re.IGNORECASE)
 _APOSTROPHES = str.maketrans(dict.fromkeys("’‘ʼ′＇´`", "'"))
 
 

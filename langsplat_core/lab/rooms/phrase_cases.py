@@ -74,7 +74,12 @@ def cases(truth: Truth, things: Things, seen_by: Viewer, seed: int) -> list[Case
     rng = np.random.default_rng((seed, 7))
     labels = json.loads((truth.folder / "labels.json").read_text(encoding="utf-8"))
     found: dict[str, list[Case]] = {name: [] for name in CONSTRUCTIONS}
-    every = [*_parts(truth, labels), *_sets(things, rng), *_relations(things, seen_by), *_extremes(things, seen_by)]
+    every = [
+        *_parts(truth, labels),
+        *_sets(things, rng),
+        *_relations(things, seen_by),
+        *_extremes(things, seen_by),
+    ]
     for case in every:
         found[case.construction].append(case)
     drawn = []
@@ -98,7 +103,9 @@ def _parts(truth: Truth, labels: Mapping[str, Mapping[str, str]]) -> Iterator[Ca
             yield Case(f"{phrase.kind} of thing", text, phrase.text, phrase.ids)
             yield Case(f"thing {phrase.kind}", phrase.text, phrase.text, phrase.ids)
             wholes = tuple(
-                int(key) for key, item in labels.items() if item["level"] == "whole" and item["thing"] == thing
+                int(key)
+                for key, item in labels.items()
+                if item["level"] == "whole" and item["thing"] == thing
             )
             text = f"{thing} without its {part}"
             yield Case("thing without part", text, f"{thing} without {part}", wholes, phrase.ids)
