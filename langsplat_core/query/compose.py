@@ -1,9 +1,5 @@
-"""Answers to phrases with structure: each phrase in the tree is asked for itself at its fitting level, and the
-answers are combined among Gaussians.
-
-A combined answer has the form of a simple one. Its relevancy is zero wherever it does not hold, the same at
-every level for what has parts of several; its peak is that of its weakest necessary part.
-"""
+"""Answers to phrases with structure: each phrase in the tree is asked for itself at its fitting level, and
+the answers are combined among the Gaussians (`query.combine`)."""
 
 from dataclasses import dataclass, replace
 
@@ -13,6 +9,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
+from langsplat_core.query.combine import cut_inside, grown, joined, owners, placed, restricted, without
 from langsplat_core.query.engine import QueryEngine, QueryResult
 from langsplat_core.query.grammar import parse
 from langsplat_core.query.instances import Extent, extent, most, separate, stands, upright, viewer
@@ -28,19 +25,12 @@ from langsplat_core.query.phrase_tree import (
     children,
     reading,
 )
-from langsplat_core.query.places import locate
-from langsplat_core.query.surface import Surface
 from langsplat_core.query.vocabulary import is_part
-from langsplat_core.scene import LEVELS, Camera
+from langsplat_core.scene import Camera
 from langsplat_core.scene.phrases import phrase_key, tidy
 from langsplat_core.semantics.relevancy import FLOOR
 
-WHOLE = LEVELS.index("whole")
-SHARE = 0.6  # of the way from what is typical of a thing's least fitting surface to the part's peak on it
-LEAST = 0.05  # quantile of a part's relevancy on its thing that stands for "not this part"
-SPAN = 0.02  # of relevancy: the least distance that is divided
 SAME = 0.5  # of a thing's Gaussians: what shares so many with another is the same, and not related to it
-HALF = 0.5  # of the peak: what is less is no longer the place
 SAID_BY_VIEWER = ("left of", "right of", "behind", "in front of", "leftmost", "rightmost")
 
 
@@ -68,10 +58,12 @@ def run_phrase(
     """Answer a phrase as the grammar reads it; whole, as `QueryEngine.run` does, where it finds no structure,
     or where only the whole phrase can be asked (of a phrasebook).
 
-    level: of what is asked for; the things that it is related to keep their own. viewpoint: who says "left of",
-    "right of", "behind", "in front of", "leftmost", "rightmost" and, of nothing, "nearest" and "farthest".
+    level: of what is asked for; the things that it is related to keep their own. viewpoint: from where "left
+    of", "right of", "behind", "in front of", "leftmost" and "rightmost" are said, and "nearest" and
+    "farthest" where they are of nothing else.
 
-    Raises InputError as `grammar.parse` does and where a viewpoint is needed, EncoderError as `QueryEngine.run`.
+    Raises InputError as `grammar.parse` does and where a viewpoint is needed, EncoderError as
+    `QueryEngine.run`.
     """
     tree = parse(text)
     if not isinstance(tree, Atom):
@@ -85,7 +77,7 @@ def run_phrase(
             tree = Atom(tidy(text))
         else:
             answer = replace(found, phrase=tidy(text))
-            return ComposedResult(_placed(engine.surface, answer), tree, tuple(asking.asked.values()))
+            return ComposedResult(placed(engine.surface, answer), tree, tuple(asking.asked.values()))
     answer = engine.run(tree.text, level, progress)
     return ComposedResult(answer, tree, (answer,))
 
@@ -119,11 +111,11 @@ class _Asking:
             case Atom(text):
                 return self._thing(text, level)
             case Both(items):
-                return _joined([self.answer(item, level) for item in items], all_needed=True)
+                return joined([self.answer(item, level) for item in items], all_needed=True)
             case Union(items):
-                return _joined([self.answer(item, level) for item in items], all_needed=False)
+                return joined([self.answer(item, level) for item in items], all_needed=False)
             case Without(what, unwanted):
-                return _without(self.answer(what, level), self.answer(unwanted), isinstance(unwanted, Atom))
+                return without(self.answer(what, level), self.answer(unwanted), isinstance(unwanted, Atom))
             case Inside(part, whole):
                 return self._inside(part, whole, level)
             case Relation() | Superlative():
@@ -147,7 +139,7 @@ class _Asking:
         there = grown(self.surface, thing.members)
         if not isinstance(part, Atom):
             found = self.answer(part, level)
-            return _restricted(found, found.members & there, thing)
+            return restricted(found, found.members & there, thing)
         asked = [self._ask(part.text, level)]
         if isinstance(whole, Atom):
             asked += self._if_known(f"{whole.text} {part.text}", level)
@@ -177,124 +169,10 @@ class _Asking:
                     if np.isin(mine, theirs).mean() < SAME
                 )
             }
-        labels = nearest_thing(self.surface, what.members, [numbers for numbers, _ in things])
-        return _restricted(what, np.isin(labels, list(right)), anchor or what)
+        labels = owners(self.surface, len(what.members), [numbers for numbers, _ in things])
+        return restricted(what, np.isin(labels, list(right)), anchor or what)
 
     def _extents(self, answer: QueryResult) -> list[tuple[Array, Extent]]:
         """Every single thing of an answer, as surface numbers and as the place it takes."""
         parts = separate(self.surface, answer.members[self.surface.rows])
         return [(numbers, extent(self.surface.positions[numbers], self._frame)) for numbers in parts]
-
-
-def grown(surface: Surface, members: Array) -> Array:
-    """(N,) bool, and what is next to it on the surface."""
-    inside = members[surface.rows].astype(np.float32)
-    result = members.copy()
-    result[surface.rows[surface.links.astype(np.float32) @ inside > 0]] = True
-    return result
-
-
-def nearest_thing(surface: Surface, members: Array, things: list[Array]) -> Array:
-    """(N,) number of the thing (of `things`, as surface numbers) that is nearest to each member; -1 for what
-    is no member, and for all where there is no thing."""
-    labels = np.full(len(members), -1)
-    if things:
-        numbers = np.concatenate(things)
-        owner = np.repeat(np.arange(len(things)), [len(thing) for thing in things])
-        labels[surface.rows[numbers]] = owner
-    return labels
-
-
-def cut_inside(
-    engine: QueryEngine, asked: list[QueryResult], thing: QueryResult, there: Array, level: LevelChoice
-) -> QueryResult:
-    """What `asked` says of a part, cut anew among the Gaussians of its thing. there: (N,) bool."""
-    surface, known = engine.surface, engine.field.known
-    relevancy = np.mean([result.relevancy for result in asked], axis=0, dtype=np.float32)
-    relevancy = np.where(there, relevancy, 0)
-    numbers = np.flatnonzero(there[surface.rows])
-    peaks = [peak_among(surface, values, numbers) for values in relevancy]
-    own = int(np.argmax(peaks[:WHOLE])) if max(peaks[:WHOLE]) > 0 else WHOLE
-    chosen = own if level == "auto" else LEVELS.index(level)
-    peak, inside = peaks[chosen], there & known[chosen]
-    own_surface = thing.members & known[chosen]  # without what it touches, which may be anything
-    low = float(np.quantile(relevancy[chosen][own_surface], LEAST)) if own_surface.any() else peak
-    members = inside & (relevancy[chosen] > low + SHARE * max(peak - low, SPAN))
-    fits = peak_among(surface, asked[0].relevancy[chosen], numbers) >= engine.field.reading.found
-    return replace(
-        asked[0],
-        level=chosen,
-        scores=(peaks[0], peaks[1], peaks[2]),
-        relevancy=relevancy,
-        peak=peak,
-        found=bool(members.any() and thing.found and fits),
-        members=members,
-    )
-
-
-def peak_among(surface: Surface, values: Array, numbers: Array) -> float:
-    """The highest of the means over neighbourhoods of some of the surface, see `Surface.smooth`; 0 for none."""
-    if len(numbers) == 0:
-        return 0.0
-    near = surface.neighbours[numbers]
-    weights = surface.weights[near]
-    return float(((weights * values[surface.rows[near]]).sum(1) / weights.sum(1)).max())
-
-
-def picture_cut(answer: QueryResult) -> float:
-    """The relevancy at `answer.level` above which a picture shows the answer: half way between its members and
-    what is none, so that at an edge more than half of a pixel is of members."""
-    values = answer.relevancy[answer.level]
-    if not answer.members.any():
-        return 1.0
-    least = float(values[answer.members].min())
-    below = values[~answer.members & (values < least)]
-    return (least + float(below.max(initial=0))) / 2
-
-
-def _joined(answers: list[QueryResult], all_needed: bool) -> QueryResult:
-    """The union of answers, found if all are, or any is; what is not found of alternatives does not count."""
-    counting = answers if all_needed else [answer for answer in answers if answer.found] or answers
-    score = min if all_needed else max
-    values = np.max([np.where(a.members, a.relevancy[a.level], 0) for a in counting], axis=0)
-    peak = score(answer.peak for answer in counting)
-    return replace(
-        counting[0],
-        scores=(peak, peak, peak),
-        relevancy=np.tile(values.astype(np.float32), (len(LEVELS), 1)),
-        peak=peak,
-        found=(all if all_needed else any)(answer.found for answer in answers),
-        members=np.any([answer.members for answer in counting], axis=0),
-    )
-
-
-def _without(what: QueryResult, unwanted: QueryResult, rivals: bool) -> QueryResult:
-    """`what` but for `unwanted`, if that is there. rivals: two names of whole things, of which the better one
-    counts: a green mug resembles "red mug", and "mug" more."""
-    if not unwanted.found:
-        return what
-    taken = unwanted.members
-    if rivals and what.level == unwanted.level:
-        taken = taken & (unwanted.relevancy[unwanted.level] >= what.relevancy[what.level])
-    return _restricted(what, ~taken, what)
-
-
-def _restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryResult:
-    """`answer` where `keep` (N,) holds alone; nothing is found without `needed`."""
-    members = answer.members & keep
-    return replace(
-        answer,
-        relevancy=np.where(members, answer.relevancy, 0),
-        peak=answer.peak if members.any() else 0.0,
-        found=bool(members.any() and answer.found and needed.found),
-        members=members,
-    )
-
-
-def _placed(surface: Surface, answer: QueryResult) -> QueryResult:
-    """`answer` with the place of its strongest connected members."""
-    values = np.where(answer.members, answer.relevancy[answer.level], 0)
-    smoothed = surface.smooth(np.tile(values.astype(np.float32), (len(LEVELS), 1)))[0]
-    place = locate(surface, smoothed, HALF * float(smoothed.max(initial=0)))
-    found = (None, None) if place is None else (place.position, place.box)
-    return replace(answer, place=found[0], box=found[1])

@@ -11,10 +11,10 @@
     thing       = owner "'s" thing | words part-word | words
 
 "X of Y", "Y's X" and "Y X" with X a known part word are X inside Y; not "cup of tea" (X holds or measures
-Y), not "children's book" (Y owns X), not "red handle" (Y only describes). "Y without X", X a part word, leaves
-out the X inside Y. Words that only describe are no thing, so that "red and blue ball" stays whole. Wherever a
-side of a construction would name nothing, the grammar finds nothing there, and the words are asked as one
-phrase. Word lists are in `query.vocabulary`.
+Y), not "children's book" (Y owns X), not "red handle" (Y only describes). "Y without X", X a part word,
+leaves out the X inside Y. Words that only describe are no thing, so that "red and blue ball" stays whole.
+Wherever a side of a construction would name nothing, the grammar finds nothing there, and the words are asked
+as one phrase. Word lists are in `query.vocabulary`.
 """
 
 import re

@@ -153,8 +153,9 @@ def _beside(kind: Side, what: Extent, anchor: Extent, seen_by: Viewer) -> bool:
 
 
 def most(kind: Extreme, things: list[Extent], anchors: list[Extent], seen_by: Viewer | None) -> int:
-    """Number of the one of `things` (at least one) that is most so. "nearest" and "farthest" are measured from
-    any of `anchors`, and without one, as "leftmost" and "rightmost" are, from the viewer, who is then not None."""
+    """Number of the one of `things` (at least one) that is most so. "nearest" and "farthest" are measured
+    from any of `anchors`, and without one from the viewer, as "leftmost" and "rightmost" are; who is then not
+    None."""
     sign = -1 if kind in ("smallest", "nearest", "lowest", "leftmost") else 1
     return int(np.nanargmax([sign * _measure(kind, thing, anchors, seen_by) for thing in things]))
 

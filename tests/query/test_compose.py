@@ -5,7 +5,8 @@ import pytest
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.query.compose import peak_among, picture_cut, run_phrase
+from langsplat_core.query.combine import peak_among, picture_cut
+from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from tests.support.laid_table import PlainEncoder, front_camera, laid_table, meaning
 

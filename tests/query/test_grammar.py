@@ -109,8 +109,38 @@ def test_readings_show_the_structure():
 
 
 WORDS = st.sampled_from(
-    "mug red handle of the and or not without but , ' 's on in left to biggest nearest from a orange, & on;"
-    " mug's dogs' near as well top".split()
+    [
+        "mug",
+        "red",
+        "handle",
+        "of",
+        "the",
+        "and",
+        "or",
+        "not",
+        "without",
+        "but",
+        ",",
+        "'",
+        "'s",
+        "on",
+        "in",
+        "left",
+        "to",
+        "biggest",
+        "nearest",
+        "from",
+        "a",
+        "orange,",
+        "&",
+        "on;",
+        "mug's",
+        "dogs'",
+        "near",
+        "as",
+        "well",
+        "top",
+    ]
 )
 
 
@@ -121,7 +151,6 @@ def test_every_text_is_read_or_refused(text):
     for query in [text, *split_queries(text)]:
         try:
             tree = parse(query)
-        except InputError as refused:
-            assert str(refused)
+        except InputError:
             continue
         assert all(atom.text.strip() and atom.text in reading(tree) for atom in atoms(tree))

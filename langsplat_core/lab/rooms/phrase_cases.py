@@ -1,9 +1,9 @@
 """Phrases with structure that are true of a procedural room, from its geometry and its names."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 
@@ -113,7 +113,7 @@ def _parts(truth: Truth, labels: Mapping[str, Mapping[str, str]]) -> Iterator[Ca
 
 def _sets(things: Things, rng: np.random.Generator) -> Iterator[Case]:
     words = [str(word) for word in rng.permutation(sorted(set(things.words.values()) - set(SHELL)))]
-    for one, other in zip(words, words[1:], strict=False):
+    for one, other in pairwise(words):
         ids = (*things.called(one), *things.called(other))
         yield Case("A and B", f"{one} and {other}", f"{one} and {other}", ids)
     for kind in _kinds(things):
@@ -154,8 +154,3 @@ def _extremes(things: Things, seen_by: Viewer) -> Iterator[Case]:
             one = numbers[most(kind, [things.extents[number] for number in numbers], [], seen_by)]
             text = f"the {kind} {word}"
             yield Case(kind, text, f"{kind} {word}", (one,))
-
-
-def by_construction(rows: Sequence[Case]) -> dict[str, list[Case]]:
-    """In the order of CONSTRUCTIONS."""
-    return {name: [row for row in rows if row.construction == name] for name in CONSTRUCTIONS}

@@ -1,4 +1,4 @@
-"""Phrases with structure, composed and asked whole, in rooms whose truth is known (`langsplat bench phrases`)."""
+"""Phrases with structure, composed and asked whole, in rooms with truth (`langsplat bench phrases`)."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -26,7 +26,8 @@ from langsplat_core.lab.rooms.scoring import (
 from langsplat_core.lab.rooms.variants import variants
 from langsplat_core.lab.world.photographs import photographed_room
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.compose import picture_cut, run_phrase
+from langsplat_core.query.combine import picture_cut
+from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.cut import CutRule, cut_level
 from langsplat_core.query.engine import QueryEngine, QueryResult
 from langsplat_core.query.grammar import parse
