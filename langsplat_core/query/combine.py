@@ -24,9 +24,9 @@ HALF = 0.5  # of the peak: what is less is no longer the place
 
 def grown(surface: Surface, members: Array) -> Array:
     """(N,) bool, and what is next to it on the surface."""
-    inside = members[surface.rows].astype(np.float32)
+    inside = np.flatnonzero(members[surface.rows])
     result = members.copy()
-    result[surface.rows[surface.links.astype(np.float32) @ inside > 0]] = True
+    result[surface.rows[surface.links[inside].indices]] = True
     return result
 
 
@@ -47,18 +47,18 @@ def cut_inside(
     relevancy = np.mean([result.relevancy for result in asked], axis=0, dtype=np.float32)
     relevancy = np.where(there, relevancy, 0)
     numbers = np.flatnonzero(there[surface.rows])
-    peaks = [peak_among(surface, values, numbers) for values in relevancy]
+    peaks = peaks_among(surface, relevancy, numbers)
     own = int(np.argmax(peaks[:WHOLE])) if max(peaks[:WHOLE]) > 0 else WHOLE
     chosen = own if level == "auto" else LEVELS.index(level)
     peak, inside = peaks[chosen], there & known[chosen]
     own_surface = thing.members & known[chosen]  # without what it touches, which may be anything
     low = float(np.quantile(relevancy[chosen][own_surface], LEAST)) if own_surface.any() else peak
     members = inside & (relevancy[chosen] > low + SHARE * max(peak - low, SPAN))
-    fits = peak_among(surface, asked[0].relevancy[chosen], numbers) >= engine.field.reading.found
+    fits = peaks_among(surface, asked[0].relevancy, numbers)[chosen] >= engine.field.reading.found
     return replace(
         asked[0],
         level=chosen,
-        scores=(peaks[0], peaks[1], peaks[2]),
+        scores=peaks,
         relevancy=relevancy,
         peak=peak,
         found=bool(members.any() and thing.found and fits),
@@ -66,13 +66,12 @@ def cut_inside(
     )
 
 
-def peak_among(surface: Surface, values: Array, numbers: Array) -> float:
-    """The highest of the means around some `numbers` of the surface, see `Surface.smooth`; 0 for none."""
+def peaks_among(surface: Surface, relevancy: Array, numbers: Array) -> tuple[float, float, float]:
+    """The highest smoothed relevancy of (3, N) at some `numbers` of the surface, per level; 0 for none."""
     if len(numbers) == 0:
-        return 0.0
-    near = surface.neighbours[numbers]
-    weights = surface.weights[near]
-    return float(((weights * values[surface.rows[near]]).sum(1) / weights.sum(1)).max())
+        return 0.0, 0.0, 0.0
+    subpart, part, whole = surface.smooth(relevancy)[:, numbers].max(1)
+    return float(subpart), float(part), float(whole)
 
 
 def picture_cut(answer: QueryResult) -> float:

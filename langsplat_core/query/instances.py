@@ -4,6 +4,7 @@ Lengths are compared with the things' own sizes, so that a scene needs no scale.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -22,6 +23,7 @@ TOUCH = 0.1  # of the smaller thing's size: the widest gap that is still touchin
 FOOT = 0.4  # of a thing's height: what it stands on touches it below
 FLAT = 0.5  # of a thing's points: what touches so many, it lies or hangs on
 HELD = 0.6  # of a thing's points: what holds so many, it is in
+SUNK = 0.25  # of a thing's height: what is in another has so much of it below the rim
 ASIDE = 0.25  # of the mean size: what is closer than this sideways or in depth is level with the other
 
 
@@ -42,6 +44,16 @@ class Extent:
     def size(self) -> float:
         """Diagonal of its box, world units."""
         return float(np.linalg.norm(self.high - self.low))
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of its points."""
+        return cKDTree(self.points)
+
+    @cached_property
+    def spacing(self) -> float:
+        """Median distance of a point to the nearest other, world units."""
+        return float(np.median(self.tree.query(self.points, k=2)[0][:, 1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +103,7 @@ def separate(surface: Surface, inside: Array) -> list[Array]:
 
 def gap(one: Extent, other: Extent) -> float:
     """Least distance between points of two things, world units."""
-    return float(cKDTree(other.points).query(one.points)[0].min())
+    return float(other.tree.query(one.points)[0].min())
 
 
 def stands(kind: Side, what: Extent, anchor: Extent, seen_by: Viewer | None) -> bool:
@@ -114,9 +126,8 @@ def stands(kind: Side, what: Extent, anchor: Extent, seen_by: Viewer | None) -> 
 
 
 def _on(what: Extent, anchor: Extent) -> bool:
-    distance = cKDTree(anchor.points).query(what.points)[0]
-    spacing = float(np.median(cKDTree(anchor.points).query(anchor.points, k=2)[0][:, 1]))
-    touching = distance <= TOUCH * min(what.size, anchor.size) + spacing
+    reach = TOUCH * min(what.size, anchor.size) + anchor.spacing
+    touching = anchor.tree.query(what.points, distance_upper_bound=reach)[0] < np.inf
     if not touching.any() or what.size > anchor.size:
         return False
     above = what.centre[2] > anchor.low[2] and _over(what, anchor)
@@ -130,9 +141,11 @@ def _over(what: Extent, anchor: Extent) -> bool:
 
 
 def _in(what: Extent, anchor: Extent) -> bool:
-    head = np.array([0, 0, 0.5 * (what.high[2] - what.low[2])])  # it may look out of an open vessel
+    height = what.high[2] - what.low[2]
+    head = np.array([0, 0, 0.5 * height])  # it may look out of an open vessel
+    sunk = what.low[2] <= anchor.high[2] - SUNK * height  # and does not merely stand on a flat top
     held = ((what.points >= anchor.low) & (what.points <= anchor.high + head)).all(1)
-    return bool(what.size < anchor.size and _over(what, anchor) and held.mean() >= HELD)
+    return bool(what.size < anchor.size and sunk and _over(what, anchor) and held.mean() >= HELD)
 
 
 def _above(what: Extent, anchor: Extent) -> bool:

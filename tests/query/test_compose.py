@@ -5,7 +5,7 @@ import pytest
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.query.combine import peak_among, picture_cut
+from langsplat_core.query.combine import grown, peaks_among, picture_cut
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from tests.support.laid_table import PlainEncoder, front_camera, laid_table, meaning
@@ -114,10 +114,22 @@ def test_a_part_is_cut_inside_at_the_level_that_is_asked_for(table):
     assert run_phrase(engine, "handle of the red mug", "whole").answer.level == 2
 
 
-def test_a_peak_among_some_is_that_of_the_smoothed_surface(table):
+def test_growing_adds_what_is_linked(table):
+    engine, blocks = table
+    surface, book = engine.surface, blocks["book"]
+    inside = book[surface.rows]
+    want = book.copy()
+    want[surface.rows[inside | (surface.links.astype(float) @ inside > 0)]] = True
+    np.testing.assert_array_equal(grown(surface, book), want)
+    assert want.sum() > book.sum()
+
+
+def test_peaks_among_some_are_those_of_the_smoothed_surface(table):
     engine, _ = table
-    result = engine.run("mug")
-    smoothed = engine.surface.smooth(result.relevancy)[2]
-    numbers = np.arange(0, len(smoothed), 7)
-    got = peak_among(engine.surface, result.relevancy[2], numbers)
-    assert got == pytest.approx(smoothed[numbers].max(), abs=1e-6)
+    relevancy = engine.run("mug").relevancy
+    numbers = np.arange(0, len(engine.surface.rows), 7)
+    near = engine.surface.neighbours[numbers]
+    weights = engine.surface.weights[near].astype(np.float64)
+    means = (relevancy[:, engine.surface.rows[near]] * weights).sum(2) / weights.sum(1)
+    np.testing.assert_allclose(peaks_among(engine.surface, relevancy, numbers), means.max(1), atol=1e-6)
+    assert peaks_among(engine.surface, relevancy, np.zeros(0, int)) == (0, 0, 0)

@@ -26,6 +26,7 @@ TABLE = box((0, 0, -0.05), (1, 1, 0.05))
 BOWL = box((0.5, 0, 0.2), (0.3, 0.3, 0.2), hollow=True)
 CUP = box((-0.5, 0, 0.1), (0.1, 0.1, 0.1))
 FRUIT = box((0.5, 0, 0.2), (0.1, 0.1, 0.1))
+DOME = extent(CUP.points @ FRAME * (1, 1, 0.3), FRAME)  # flat, on the table
 LAMP = box((-0.5, 0, 2.0), (0.35, 0.35, 0.2))
 WALL = box((0, 2.05, 1), (3, 0.05, 2))
 PICTURE = box((0, 1.98, 1.5), (0.4, 0.02, 0.3))
@@ -42,7 +43,7 @@ TRUE = {
 }
 FALSE = {
     "on": [(TABLE, CUP), (LAMP, TABLE), (CUP, BOWL), (CUP, WALL)],
-    "in": [(CUP, BOWL), (BOWL, FRUIT), (CUP, TABLE)],
+    "in": [(CUP, BOWL), (BOWL, FRUIT), (CUP, TABLE), (DOME, TABLE)],
     "near": [(CUP, BOWL), (LAMP, CUP)],
     "above": [(TABLE, LAMP), (LAMP, BOWL)],
     "below": [(LAMP, TABLE)],
