@@ -9,6 +9,7 @@ from langsplat_core.cli.bench_gains import BenchGains
 from langsplat_core.cli.bench_lift import BenchLift
 from langsplat_core.cli.bench_load import BenchLoad
 from langsplat_core.cli.bench_memory import BenchMemory
+from langsplat_core.cli.bench_phrases import BenchPhrases
 from langsplat_core.cli.bench_steps import BenchSteps
 from langsplat_core.cli.bench_words import BenchWords
 from langsplat_core.cli.compact import Compact
@@ -43,6 +44,7 @@ def parse(args: list[str]) -> Command:
     bench.command(name="lift")(BenchLift)
     bench.command(name="load")(BenchLoad)
     bench.command(name="memory")(BenchMemory)
+    bench.command(name="phrases")(BenchPhrases)
     bench.command(name="steps")(BenchSteps)
     bench.command(name="words")(BenchWords)
     app = SubcommandApp()

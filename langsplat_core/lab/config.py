@@ -97,6 +97,15 @@ class WordBenchConfig:
 
 
 @dataclass(frozen=True)
+class PhraseBenchConfig:
+    """Rooms in which phrases with structure are asked whole and composed (`langsplat bench phrases`)."""
+
+    tier: Tier = "clutter"
+    seeds: tuple[int, ...] = (203,)
+    """Of the rooms; never that of the bundled scene, nor 201 and 202, on which composing was tuned."""
+
+
+@dataclass(frozen=True)
 class RasterBenchConfig:
     """What the rasterizer benchmark draws (`langsplat bench raster`)."""
 

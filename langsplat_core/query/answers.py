@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from langsplat_core.arrays import Array, sigmoid
+from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.cut import cut_level
 from langsplat_core.query.extent import find_extent, to_margin
@@ -54,21 +54,19 @@ def by_regions(
 ) -> QueryResult:
     """Whole regions, cut at a share of the best one's margin (`extent`)."""
     extent = find_extent(relevancy, surface, regions, reading.temperature, level)
-    scores = [float(sigmoid(np.array(reading.temperature * margin))) for margin in extent.margins]
-    spread = np.append(extent.inside, False)[surface.anchors]
-    even = np.where(surface.anchors >= 0, np.append(extent.even, 0)[surface.anchors], relevancy[extent.level])
+    even = surface.spread(extent.even, relevancy[extent.level])
     lowest = float(extent.even[extent.inside].min(initial=1.0))
     place = locate(surface, extent.even, np.nextafter(np.float32(lowest), np.float32(0)))
     return QueryResult(
         phrase=phrase,
         level=extent.level,
-        scores=(scores[0], scores[1], scores[2]),
+        scores=extent.peaks,
         relevancy=relevancy,
-        even=even.astype(np.float32),
-        peak=scores[extent.level],
+        even=even,
+        peak=extent.peaks[extent.level],
         probability=_probability(extent.margin, reading),
         found=_found(extent.margin, reading),
-        members=spread,
+        members=surface.spread(extent.inside, np.zeros(relevancy.shape[1], bool)),
         place=None if place is None else place.position,
         box=None if place is None else place.box,
     )

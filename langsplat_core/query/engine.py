@@ -195,6 +195,12 @@ class QueryEngine:
             return by_peak(tidy(phrase), relevancy, self.surface, reading, level)
         return by_regions(tidy(phrase), relevancy, self.surface, self.regions, reading, level)
 
+    def evened(self, relevancy: Array) -> Array:
+        """(3, N) relevancy -> the same, of every region its mean; of what is off the surface its own."""
+        means = self.regions.means(relevancy, self.surface)
+        rows = [values[of] for values, of in zip(means, self.regions.of, strict=True)]
+        return np.stack([self.surface.spread(*pair) for pair in zip(rows, relevancy, strict=True)])
+
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
         """The things among the members of an answer, best first, or only so many of them."""
         relevancy = result.relevancy[result.level]

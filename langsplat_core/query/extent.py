@@ -27,7 +27,7 @@ class Extent:
 
     level: int  # index into LEVELS
     margin: float  # of the best region at any level: cosine with the phrase minus nearest canonical one
-    margins: tuple[float, float, float]  # of the best region of each level
+    peaks: tuple[float, float, float]  # relevancy of the best region of each level
     even: Array  # (M,) float32 relevancy at the level, the same all over a region
     inside: Array  # (M,) bool
 
@@ -37,15 +37,15 @@ def find_extent(
 ) -> Extent:
     """From the (3, N) relevancy of a phrase. level: "auto", or the one that is wanted."""
     means = regions.means(relevancy, surface)
-    margins = [to_margin(values, temperature) for values in means]
-    best = [_best(values, sizes) for values, sizes in zip(margins, regions.sizes, strict=True)]
+    peaks = [_best(values, sizes) for values, sizes in zip(means, regions.sizes, strict=True)]
+    best = to_margin(np.array(peaks), temperature)
     chosen = _level(best) if level == "auto" else LEVELS.index(level)
-    inside = margins[chosen] > cut(best[chosen], SHARES[chosen])
+    inside = to_margin(means[chosen], temperature) > cut(float(best[chosen]), SHARES[chosen])
     of = regions.of[chosen]
     return Extent(
         level=chosen,
-        margin=max(best),
-        margins=(best[0], best[1], best[2]),
+        margin=float(best.max()),
+        peaks=(peaks[0], peaks[1], peaks[2]),
         even=means[chosen].astype(np.float32)[of],
         inside=inside[of],
     )
@@ -62,14 +62,12 @@ def cut(best: float, share: float) -> float:
     return share * best if best > FAINT else best - (1 - share) * FAINT
 
 
-def _best(margins: Array, sizes: Array) -> float:
-    """The best region's margin; crumbs that no neighbour took do not count where there are others."""
-    if len(margins) == 0:
-        return float(to_margin(np.zeros(1), 1.0)[0])
-    solid = margins[sizes >= SMALLEST]
-    return float((solid if len(solid) else margins).max())
+def _best(means: Array, sizes: Array) -> float:
+    """The best region's relevancy; crumbs that no neighbour took do not count where there are others."""
+    solid = means[sizes >= SMALLEST]
+    return float((solid if len(solid) else means).max(initial=0))
 
 
-def _level(best: list[float]) -> int:
+def _level(best: Array) -> int:
     """The coarsest that is nearly as good as the best."""
-    return max(level for level in range(len(LEVELS)) if best[level] >= max(best) - COARSER)
+    return int(np.flatnonzero(best >= best.max() - COARSER)[-1])

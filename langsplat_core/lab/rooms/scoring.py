@@ -235,14 +235,8 @@ def _judged(
     engine: QueryEngine, view: View, answers: Sequence[Answer], reading: Reading
 ) -> Iterator[tuple[Array, tuple[int, int]]]:
     """The mask (H, W) of each answer, and the row and column of its peak."""
-    gate = PictureConfig().alpha_gate
     if reading.cut == "regions" and not reading.paper_order:
-        for start in range(0, len(answers), CHANNELS // 2):
-            some = answers[start : start + CHANNELS // 2]
-            columns = [*(answer.even for answer in some), *(answer.members for answer in some)]
-            maps = np.moveaxis(splatted_relevancy(view, np.stack(columns, 1), gate), 2, 0)
-            for relevancy, share in zip(maps[: len(some)], maps[len(some) :], strict=True):
-                yield _smoothed_mask(share > HALF), _peak(relevancy)
+        yield from masks_and_peaks(view, [(answer.even, answer.members) for answer in answers])
         return
     rule: CutRule = "floor" if reading.cut == "regions" else reading.cut
     for answer, relevancy in zip(
@@ -250,6 +244,20 @@ def _judged(
     ):
         cut = cut_level(rule, relevancy, answer.peak, answer.median)
         yield _smoothed_mask(relevancy > cut), _peak(relevancy)
+
+
+def masks_and_peaks(
+    view: View, answers: Sequence[tuple[Array, Array]]
+) -> Iterator[tuple[Array, tuple[int, int]]]:
+    """(N,) relevancy and (N,) bool members of each answer -> its mask (H, W): where members are more than
+    half of what a pixel shows; and the row and column of the peak."""
+    for start in range(0, len(answers), CHANNELS // 2):
+        some = answers[start : start + CHANNELS // 2]
+        columns = [*(values for values, _ in some), *(members for _, members in some)]
+        maps = splatted_relevancy(view, np.stack(columns, 1), PictureConfig().alpha_gate)
+        maps = np.moveaxis(maps, 2, 0)
+        for relevancy, share in zip(maps[: len(some)], maps[len(some) :], strict=True):
+            yield _smoothed_mask(share > HALF), _peak(relevancy)
 
 
 def _smoothed_mask(mask: Array) -> Array:

@@ -1,0 +1,97 @@
+"""How boxes of points stand to each other, and which things there are."""
+
+import numpy as np
+import pytest
+
+from langsplat_core.arrays import Array
+from langsplat_core.query.standing import Body, body, gap, most, separate, stands, upright, viewer
+from langsplat_core.query.surface import build_surface
+from langsplat_core.scene import look_at
+from tests.support.laid_table import UP, laid_table
+
+FRAME = upright(UP)
+EYE = viewer(look_at(np.array([0.0, -8, 1]), np.zeros(3), UP, (160, 120)), FRAME)
+
+
+def box(centre: tuple[float, float, float], half: tuple[float, float, float], hollow: bool = False) -> Body:
+    """2000 points in a box, or of an open vessel: its floor and sides."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (2000, 3))
+    if hollow:
+        points = points[(np.abs(points[:, :2]).max(1) > 0.9) | (points[:, 2] < -0.9)]
+    return body(points * half + np.array(centre), FRAME)
+
+
+TABLE = box((0, 0, -0.05), (1, 1, 0.05))
+BOWL = box((0.5, 0, 0.2), (0.3, 0.3, 0.2), hollow=True)
+CUP = box((-0.5, 0, 0.1), (0.1, 0.1, 0.1))
+FRUIT = box((0.5, 0, 0.2), (0.1, 0.1, 0.1))
+DOME = body(CUP.points @ FRAME * (1, 1, 0.3), FRAME)  # flat, on the table
+LAMP = box((-0.5, 0, 2.0), (0.35, 0.35, 0.2))
+WALL = box((0, 2.05, 1), (3, 0.05, 2))
+PICTURE = box((0, 1.98, 1.5), (0.4, 0.02, 0.3))
+TRUE = {
+    "on": [(CUP, TABLE), (BOWL, TABLE), (PICTURE, WALL)],
+    "in": [(FRUIT, BOWL)],
+    "near": [(FRUIT, BOWL), (CUP, TABLE)],
+    "above": [(LAMP, TABLE), (LAMP, CUP)],
+    "below": [(TABLE, LAMP), (CUP, LAMP)],
+    "left of": [(CUP, BOWL)],
+    "right of": [(BOWL, CUP)],
+    "behind": [(PICTURE, TABLE)],
+    "in front of": [(TABLE, PICTURE)],
+}
+FALSE = {
+    "on": [(TABLE, CUP), (LAMP, TABLE), (CUP, BOWL), (CUP, WALL)],
+    "in": [(CUP, BOWL), (BOWL, FRUIT), (CUP, TABLE), (DOME, TABLE)],
+    "near": [(CUP, BOWL), (LAMP, CUP)],
+    "above": [(TABLE, LAMP), (LAMP, BOWL)],
+    "below": [(LAMP, TABLE)],
+    "left of": [(BOWL, CUP), (FRUIT, BOWL)],
+    "right of": [(CUP, BOWL)],
+    "behind": [(TABLE, PICTURE), (CUP, BOWL)],
+    "in front of": [(PICTURE, TABLE)],
+}
+
+
+@pytest.mark.parametrize("kind", TRUE)
+def test_how_things_stand(kind):
+    assert all(stands(kind, what, anchor, EYE) for what, anchor in TRUE[kind])
+    assert not any(stands(kind, what, anchor, EYE) for what, anchor in FALSE[kind])
+
+
+@pytest.mark.parametrize("turn", [0, 90, 211])
+def test_what_is_upright_does_not_depend_on_the_world(turn):
+    """The same things under another up direction stand the same."""
+    angle = np.radians(turn)
+    rotation = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+
+    def turned(one: Body) -> Body:
+        return body((one.points @ FRAME) @ rotation.T, upright(rotation @ UP))
+
+    for kind in ("on", "in", "near", "above", "below"):
+        assert all(stands(kind, turned(what), turned(anchor), None) for what, anchor in TRUE[kind])
+        assert not any(stands(kind, turned(what), turned(anchor), None) for what, anchor in FALSE[kind])
+
+
+def test_the_most_extreme_thing():
+    things = [CUP, BOWL, LAMP]
+    want = {"biggest": 2, "smallest": 0, "highest": 2, "lowest": 0, "rightmost": 1, "farthest": 2}
+    assert {kind: most(kind, things, [], EYE) for kind in want} == want
+    assert most("nearest", things, [FRUIT], None) == 1
+
+
+def test_a_gap_is_the_least_distance():
+    distances = np.linalg.norm(CUP.points[:, None] - BOWL.points, axis=-1)
+    assert gap(CUP, BOWL) == pytest.approx(distances.min())
+
+
+def test_single_things_are_connected_and_no_specks():
+    scene, blocks = laid_table()
+    surface = build_surface(scene.gaussians)
+    inside: Array = (blocks["far mug"] | blocks["book"])[surface.rows]
+    speck = np.flatnonzero(blocks["table"][surface.rows])[:3]
+    inside[speck] = True
+    parts = separate(surface, inside)
+    assert [len(part) for part in parts] == [blocks["far mug"].sum()]  # the book has less than a tenth of it
+    assert separate(surface, np.zeros(len(surface.rows), bool)) == []
