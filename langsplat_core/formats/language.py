@@ -29,8 +29,7 @@ executed). Version 2, for N Gaussians, CLIP vectors of D numbers and P phrases:
     phrases          JSON list of the P phrases
     temperature      of the softmax that reads this encoder's cosines, decimal
     found            relevancy from which a phrase counts as present, decimal
-    calibration      JSON list: constant, slope, and probability from which a phrase counts as found, see
-                     `scene.language.Calibration`; absent where the encoder has none
+    calibration      JSON list: the numbers of `scene.language.Calibration`; absent where the encoder has none
 
 "float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
 like the one in memory. With a codebook as `langsplat train` makes it that is 22 bytes per Gaussian, 6 of

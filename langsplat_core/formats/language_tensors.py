@@ -127,8 +127,8 @@ def _calibration(metadata: dict[str, str], path: Path) -> Calibration | None:
     if "calibration" not in metadata:
         return None
     numbers = parse_json(metadata["calibration"].encode(), path)
-    if not isinstance(numbers, list) or len(numbers) != 3 or not all(isinstance(n, float) for n in numbers):
-        raise FormatError(f"{path}: the header's 'calibration' is not a list of three numbers")
+    if not isinstance(numbers, list) or len(numbers) != 4 or not all(isinstance(n, float) for n in numbers):
+        raise FormatError(f"{path}: the header's 'calibration' is not a list of four numbers")
     return Calibration(*numbers)
 
 

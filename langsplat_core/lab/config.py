@@ -88,6 +88,18 @@ class GainBenchConfig:
 
 
 @dataclass(frozen=True)
+class VerdictBenchConfig:
+    """Rooms in which present and absent things are asked for (`langsplat bench verdict`)."""
+
+    tiers: tuple[Tier, ...] = ("clutter",)
+    seeds: tuple[int, ...] = (301, 302, 303, 304, 305)
+    """Of the rooms; never that of the bundled scene, nor 201, 202 and 203, which calibrate the demo encoder."""
+    masks: MaskOrigin = "truth"
+    """Exact outlines, the same with 15 % wrong vectors, the weight-free segmenter's."""
+    codec: CodecConfig = CodecConfig()  # noqa: RUF009 (frozen)
+
+
+@dataclass(frozen=True)
 class WordBenchConfig:
     """Rooms whose things are named (`langsplat bench words`)."""
 

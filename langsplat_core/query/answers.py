@@ -17,6 +17,7 @@ from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN
 
 AnswerRule = Literal["regions", "peak"]
 Verdict = Literal["found", "weak match", "not here"]
+Margins = tuple[float, float, float]  # of each level
 WEAK = 0.5  # probability from which what is not found is at least a weak match
 
 
@@ -30,6 +31,7 @@ class QueryResult:
     relevancy: Array  # (3, N) float32 in [0, 1] per level and Gaussian
     even: Array  # (N,) float32 relevancy at the level, the same all over a region
     peak: float  # score of the chosen level
+    margins: Margins  # of the best: cosine with the phrase minus that with the nearest canonical phrase
     probability: float | None  # that the thing is there at all; None where the encoder is not calibrated
     found: bool
     members: Array  # (N,) bool: the Gaussians that answer, wherever they are
@@ -64,8 +66,9 @@ def by_regions(
         relevancy=relevancy,
         even=even,
         peak=extent.peaks[extent.level],
-        probability=_probability(extent.margin, reading),
-        found=_found(extent.margin, reading),
+        margins=extent.margins,
+        probability=_probability(extent.margins, reading),
+        found=_found(extent.margins, reading),
         members=surface.spread(extent.inside, np.zeros(relevancy.shape[1], bool)),
         place=None if place is None else place.position,
         box=None if place is None else place.box,
@@ -79,7 +82,8 @@ def by_peak(
     smoothed = surface.smooth(relevancy)
     scores = [float(values.max()) if len(values) else 0.0 for values in smoothed]
     chosen = int(np.argmax(scores)) if level == "auto" else LEVELS.index(level)
-    peak, margin = scores[chosen], float(to_margin(np.array(max(scores)), reading.temperature))
+    peak, best = scores[chosen], to_margin(np.array(scores), reading.temperature)
+    margins = (float(best[0]), float(best[1]), float(best[2]))
     place = locate(surface, smoothed[chosen], max(FLOOR + 0.5 * (peak - FLOOR), FLOOR))
     return QueryResult(
         phrase=phrase,
@@ -88,19 +92,20 @@ def by_peak(
         relevancy=relevancy,
         even=relevancy[chosen],
         peak=peak,
-        probability=_probability(margin, reading),
-        found=_found(margin, reading),
+        margins=margins,
+        probability=_probability(margins, reading),
+        found=_found(margins, reading),
         members=relevancy[chosen] > cut_level("floor", relevancy[chosen], peak, FLOOR),
         place=None if place is None else place.position,
         box=None if place is None else place.box,
     )
 
 
-def _probability(margin: float, reading: Reading) -> float | None:
-    return None if reading.calibration is None else reading.calibration.probability(margin)
+def _probability(margins: Margins, reading: Reading) -> float | None:
+    return None if reading.calibration is None else reading.calibration.probability(margins)
 
 
-def _found(margin: float, reading: Reading) -> bool:
+def _found(margins: Margins, reading: Reading) -> bool:
     if reading.calibration is not None:
-        return reading.calibration.probability(margin) >= reading.calibration.found
-    return margin >= float(to_margin(np.array(reading.found), reading.temperature))
+        return reading.calibration.probability(margins) >= reading.calibration.found
+    return max(margins) >= float(to_margin(np.array(reading.found), reading.temperature))

@@ -26,7 +26,7 @@ class Extent:
     """What of a surface answers a phrase."""
 
     level: int  # index into LEVELS
-    margin: float  # of the best region at any level: cosine with the phrase minus nearest canonical one
+    margins: tuple[float, float, float]  # of the best region of each level
     peaks: tuple[float, float, float]  # relevancy of the best region of each level
     even: Array  # (M,) float32 relevancy at the level, the same all over a region
     inside: Array  # (M,) bool
@@ -44,7 +44,7 @@ def find_extent(
     of = regions.of[chosen]
     return Extent(
         level=chosen,
-        margin=float(best.max()),
+        margins=(float(best[0]), float(best[1]), float(best[2])),
         peaks=(peaks[0], peaks[1], peaks[2]),
         even=means[chosen].astype(np.float32)[of],
         inside=inside[of],

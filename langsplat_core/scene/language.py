@@ -16,20 +16,26 @@ NO_THING = 65_535  # in `LanguageField.things`: of no thing in particular
 
 @dataclass(frozen=True)
 class Calibration:
-    """What an answer's best cosine margin says about whether the thing is there at all (Platt 1999):
-    ``probability = sigmoid(constant + slope * margin)``, present and absent being as likely beforehand."""
+    """What the best cosine margins of an answer say about whether the thing is there at all (Platt 1999):
+    ``probability = sigmoid(constant + whole * margin of whole things + finer * the better one of the finer
+    levels)``, present and absent being as likely beforehand."""
 
     constant: float
-    slope: float
+    whole: float
+    finer: float
     found: float = 0.75  # probability from which a phrase counts as found; 0.5 up to here is a weak match
 
     def __post_init__(self) -> None:
-        if not (np.isfinite([self.constant, self.slope]).all() and self.slope > 0 and 0.5 <= self.found <= 1):
-            raise ValueError(f"calibration: {self}; expected a positive slope, and found in [0.5, 1]")
+        slopes = (self.whole, self.finer)
+        if not (np.isfinite([self.constant, *slopes]).all() and sum(slopes) > 0 and 0.5 <= self.found <= 1):
+            raise ValueError(f"{self}: expected finite numbers, rising with margins, and found in [0.5, 1]")
 
-    def probability(self, margin: float) -> float:
-        """That what is asked for is there, in (0, 1)."""
-        return float(sigmoid(np.array(self.constant + self.slope * margin)))
+    def probability(self, margins: tuple[float, float, float]) -> float:
+        """That what is asked for is there, in (0, 1). margins: the best of each level, cosine with the phrase
+        minus that with the nearest canonical phrase."""
+        subpart, part, whole = margins
+        logit = self.constant + self.whole * whole + self.finer * max(subpart, part)
+        return float(sigmoid(np.array(logit)))
 
 
 @dataclass(frozen=True)

@@ -234,7 +234,7 @@ def _reading(weights: Weights, temperature: float) -> Reading:
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise EncoderError(
             f'{weights.id}: {READING} is not {{"found": 0 to 1, "calibration": {{"constant": number, '
-            f'"slope": number, "found": 0.5 to 1}}}} ({error!r})'
+            f'"whole": number, "finer": number, "found": 0.5 to 1}}}} ({error!r})'
         ) from None
 
 

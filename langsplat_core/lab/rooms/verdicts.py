@@ -1,0 +1,174 @@
+"""How far "found" and "not here" can be trusted (`langsplat bench verdict`), and the calibration of an encoder.
+
+In rooms whose truth is known every thing that is there is asked for, and every thing of the catalogue that is
+not. A calibration is fitted to the margins of both (Platt 1999, with Platt's smoothed targets); it is fair
+only to rooms that it was not fitted to.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import InputError
+from langsplat_core.files import atomic_path
+from langsplat_core.lab.config import BenchmarkConfig, VerdictBenchConfig
+from langsplat_core.lab.rooms.benchmark import Room, weights_digest
+from langsplat_core.lab.rooms.report import separation
+from langsplat_core.lab.rooms.variants import Variant
+from langsplat_core.lab.world.objects.catalogue import EVERYTHING
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.answers import WEAK
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.scene import Calibration, Scene
+from langsplat_core.semantics.encoders import load_encoder
+
+REJECTED = 0.95  # of what is absent, in the rooms that a calibration is fitted to
+BINS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)  # of probability
+SHARES = (0.9, 0.95, 0.98)  # of absent things rejected, at which acceptance is reported
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One phrase in one room."""
+
+    tier: str
+    seed: int
+    text: str
+    kind: str  # "object", "colour+object" or "absent"
+    margins: tuple[float, float, float]  # of the best region of each level
+    probability: float | None
+    found: bool
+
+
+def measure_verdicts(config: VerdictBenchConfig, work: Path, progress: Progress = silent) -> list[Verdict]:
+    """Every room, every thing. Rooms that are not in `work` are made. Raises InputError without a room."""
+    if not config.seeds or not config.tiers:
+        raise InputError("bench verdict: name at least one of --tiers and one of --seeds")
+    encoder, weights = load_encoder("demo"), weights_digest("demo")
+    settings = BenchmarkConfig()
+    variant = Variant("the method", config.masks, codec=config.codec)
+    rows: list[Verdict] = []
+    for tier in config.tiers:
+        for seed in config.seeds:
+            room = Room(settings, tier, seed, work, (encoder, weights), progress)
+            field, _, _ = room.field(variant)
+            rows += _of_room(room, QueryEngine(Scene(room.gaussians, field), lambda _: encoder))
+            progress(f"{tier} {seed}", 1.0)
+    return rows
+
+
+def _of_room(room: Room, engine: QueryEngine) -> list[Verdict]:
+    asked = [(p.text, p.kind) for p in room.truth.phrases if p.kind in ("object", "colour+object")]
+    asked += [(text, "absent") for text in room.truth.absent(EVERYTHING)]
+    rows = []
+    for text, kind in asked:
+        if not engine.unknown_words(text):
+            answer = engine.run(text)
+            judged = answer.margins, answer.probability, answer.found
+            rows.append(Verdict(room.tier, room.seed, text, kind, *judged))
+    return rows
+
+
+def fit_calibration(present: Array, absent: Array) -> Calibration:
+    """Of margins (P, 3) of things that are there and (A, 3) of things that are not, which weigh the same.
+
+    Raises InputError where there are fewer than ten of either, or the margins do not tell them apart.
+    """
+    if min(len(present), len(absent)) < 10:
+        raise InputError(
+            "a calibration needs ten things that are there and ten that are not; take more rooms"
+        )
+    margins = np.concatenate([present, absent])
+    features = np.stack([margins[:, 2], margins[:, :2].max(axis=1)], axis=1)
+    targets = np.repeat(
+        [(len(present) + 1) / (len(present) + 2), 1 / (len(absent) + 2)], [len(present), len(absent)]
+    )
+    weights = np.repeat([1 / len(present), 1 / len(absent)], [len(present), len(absent)])
+
+    def loss(parameters: Array) -> float:
+        logits = parameters[0] + features @ parameters[1:]
+        return float((weights * (np.logaddexp(0, logits) - targets * logits)).sum())
+
+    constant, whole, finer = minimize(loss, np.array([0.0, 10.0, 0.0]), method="BFGS").x.round(3)
+    if whole + finer <= 0:
+        raise InputError("what is there has no larger margins than what is not: nothing to calibrate")
+    plain = Calibration(float(constant), float(whole), float(finer))
+    said = [plain.probability((m[0], m[1], m[2])) for m in absent.tolist()]
+    highest = float(np.quantile(said, REJECTED, method="higher"))
+    return replace(plain, found=float(np.ceil(1000 * max(highest, WEAK)) / 1000))
+
+
+def write_calibration(path: Path, calibration: Calibration) -> None:
+    """Into a `reading.json`, whose other fields stay."""
+    stated = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    stated["calibration"] = asdict(calibration)
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(stated, indent=1) + "\n", encoding="utf-8")
+
+
+def margins_of(rows: Sequence[Verdict], kind: str) -> Array:
+    """(n, 3) margins of one kind of phrase."""
+    return np.array([row.margins for row in rows if row.kind == kind])
+
+
+def verdict_table(rows: Sequence[Verdict]) -> str:
+    """Markdown: what is accepted and rejected, and the area under the curve, per tier; means over rooms with
+    their standard deviation."""
+    at = (f"accepted at {100 * share:.0f} % rejected" for share in SHARES)
+    head = ("tier", "accepted %", "of colour + thing %", "absent rejected %", "ROC area %", *at)
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for tier in dict.fromkeys(row.tier for row in rows):
+        here = [row for row in rows if row.tier == tier]
+        rooms = [[row for row in here if row.seed == seed] for seed in dict.fromkeys(r.seed for r in here)]
+        lines.append("| " + " | ".join((tier, *_spreads([_shares(room) for room in rooms]))) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _shares(rows: Sequence[Verdict]) -> tuple[float, ...]:
+    present, absent = (
+        np.array([_score(row) for row in rows if row.kind == kind]) for kind in ("object", "absent")
+    )
+    rates = [np.mean([row.found for row in rows if row.kind == kind]) for kind in ("object", "colour+object")]
+    rejected = np.mean([not row.found for row in rows if row.kind == "absent"])
+    at = [np.mean(present > np.quantile(absent, share, method="higher")) for share in SHARES]
+    return tuple(float(x) for x in (*rates, rejected, separation(present, absent), *at))
+
+
+def _score(row: Verdict) -> float:
+    """What a threshold would be put on."""
+    return max(row.margins) if row.probability is None else row.probability
+
+
+def _spreads(rooms: Sequence[tuple[float, ...]]) -> list[str]:
+    columns = 100 * np.array(rooms)
+    spread = columns.std(axis=0, ddof=1) if len(rooms) > 1 else np.zeros(columns.shape[1])
+    return [f"{m:.1f} +/- {s:.1f}" for m, s in zip(columns.mean(axis=0), spread, strict=True)]
+
+
+def curve_table(rows: Sequence[Verdict]) -> str:
+    """Markdown: of everything said with a probability between two limits, how much was there, present and
+    absent things weighing the same in all."""
+    judged = [row for row in rows if row.probability is not None and row.kind in ("object", "absent")]
+    said = np.array([row.probability for row in judged])
+    there = np.array([row.kind == "object" for row in judged], dtype=bool)
+    weights = np.where(there, 1 / max(there.sum(), 1), 1 / max((~there).sum(), 1))
+    lines = ["| probability said | phrases | mean said % | there % |", "|---|---|---|---|"]
+    for low, high in pairwise(BINS):
+        inside = (said >= low) & (said < high) if high < 1 else said >= low
+        if inside.any():
+            share = weights[inside] / weights[inside].sum()
+            cells = f"{100 * share @ said[inside]:.0f} | {100 * share @ there[inside]:.0f}"
+            lines.append(f"| {low:g} to {high:g} | {inside.sum()} | {cells} |")
+    return "\n".join(lines) + "\n"
+
+
+def figures(config: VerdictBenchConfig, rows: Sequence[Verdict]) -> dict[str, Any]:
+    """All figures."""
+    return {"settings": asdict(config), "rows": [asdict(row) for row in rows]}
