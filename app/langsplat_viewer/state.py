@@ -28,6 +28,7 @@ class Query:
     phrase: str
     slot: int | None = None  # index of its colour while shown, None while hidden
     result: QueryResult | None = None
+    reading: str = ""  # how the phrase was understood, where it has structure
     problem: str = ""  # why it has no result, one line
     pending: bool = True
 

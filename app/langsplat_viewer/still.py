@@ -14,6 +14,7 @@ from langsplat_core.display.latent_colours import latent_colours
 from langsplat_core.errors import BackendError, InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.compose import run_phrase
 from langsplat_core.scene import LEVELS, Camera, Reading, Scene
 from langsplat_viewer.frame import Backend
 from langsplat_viewer.headless import render_picture
@@ -69,7 +70,9 @@ def still_camera(scene: Scene, choice: str, size: tuple[int, int] | None) -> Cam
 def describe(result: QueryResult) -> str:
     """One line for people and for scripts."""
     place = "none" if result.place is None else "({})".format(", ".join(f"{v:.3f}" for v in result.place))
-    verdict = "found" if result.found else "not here"
+    verdict: str = result.verdict
+    if result.probability is not None:
+        verdict += f" ({100 * result.probability:.0f} %)"
     level = LEVELS[result.level]
     return f"'{result.phrase}': {verdict}, score {result.peak:.3f}, level {level}, place {place}"
 
@@ -81,7 +84,9 @@ def draw_still(request: StillRequest, services: Services, progress: Progress = s
     check_display(scene, request.display, request.queries)
     camera = still_camera(scene, request.camera, request.size)
     engine = services.engine(scene)
-    results = [engine.run(phrase, request.level, progress) for phrase in request.queries]
+    results = [
+        run_phrase(engine, phrase, request.level, camera, progress).answer for phrase in request.queries
+    ]
     shown = results[-SLOTS:]  # as in the window, where a fourth query takes the oldest one's colour
 
     progress("drawing", 0.8)

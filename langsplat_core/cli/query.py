@@ -14,7 +14,9 @@ from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.errors import InputError
 from langsplat_core.formats import load_scene
 from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import NO_FIELD, QueryEngine
+from langsplat_core.query.phrase_tree import Atom
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.places import peak_pixel
 from langsplat_core.raster import load_rasterizer
@@ -33,7 +35,9 @@ class QueryScene:
     texts: tyro.conf.Positional[tuple[str, ...]]
     """Phrases, each in quotes if it has several words."""
     level: LevelChoice = "auto"
-    """Semantic level; auto takes the one with the highest score."""
+    """Semantic level; auto takes the coarsest of those that answer nearly best."""
+    whole: bool = False
+    """Ask every phrase whole, without looking for structure such as "handle of the red mug"."""
     mode: Literal["splat", "paper"] = "splat"
     """splat: relevancy per Gaussian, then blended. paper: latents blended, every pixel decoded."""
     camera: Annotated[int, tyro.conf.arg(metavar="INDEX")] = 0
@@ -58,8 +62,8 @@ class QueryScene:
         unit = unit_of(scene, self.scale)
         answers, tables = [], []
         for text in self.texts:
-            result = engine.run(text, self.level)
-            answer = _answer(result, scene, engine, camera, self.mode)
+            result, understood = self._ask(engine, text, camera)
+            answer = _answer(result, scene, engine, camera, self.mode) | {"reading": understood}
             things = engine.instances(result, max(self.instances, 0)) if result.found else ()
             answer["metres_per_unit"] = unit.length if unit.name == "m" else None
             answer["instances"] = [instance_json(thing, number) for number, thing in enumerate(things, 1)]
@@ -70,14 +74,24 @@ class QueryScene:
             print()
             return
         for answer, lines in zip(answers, tables, strict=True):
-            verdict = "found" if answer["found"] else "not here"
+            verdict, reading = answer["verdict"], answer["reading"]
+            if answer["probability"] is not None:
+                verdict += f" ({100 * answer['probability']:.0f} %)"
             place = "-" if answer["place"] is None else f"{unit.format(answer['place'])} {unit.name}"
             print(
                 f"{answer['phrase']}: {verdict}, score {answer['score']:.3f} at level {answer['level']}, "
                 f"place {place}, pixel {answer['pixel']}",
+                *([] if reading is None else [f"  read as: {reading}"]),
                 *lines,
                 sep="\n",
             )
+
+    def _ask(self, engine: QueryEngine, text: str, camera: Camera | None) -> tuple[QueryResult, str | None]:
+        """The answer, and how the phrase was read where it has structure."""
+        if self.whole or self.mode == "paper":
+            return engine.run(text, self.level), None
+        composed = run_phrase(engine, text, self.level, camera)
+        return composed.answer, None if isinstance(composed.tree, Atom) else composed.reading
 
 
 def _camera(scene: Scene, index: int) -> Camera | None:
@@ -95,6 +109,8 @@ def _answer(
     answer: dict[str, Any] = {
         "phrase": result.phrase,
         "found": result.found,
+        "verdict": result.verdict,
+        "probability": result.probability,
         "score": result.peak,
         "level": LEVELS[result.level],
         "scores": dict(zip(LEVELS, result.scores, strict=True)),
@@ -111,7 +127,7 @@ def _answer(
             phrase = engine.text_vector(result.phrase)[None]
             relevancy = decoded_relevancy(view, engine.field, result.level, phrase, gate)
         else:
-            relevancy = splatted_relevancy(view, result.relevancy[result.level][:, None], gate)
+            relevancy = splatted_relevancy(view, result.even[:, None], gate)
         column, row, score = peak_pixel(np.asarray(relevancy[..., 0]), PAPER_FILTER)
         answer |= {"pixel": [column, row], "pixel_score": score}
     return answer

@@ -24,6 +24,7 @@ from langsplat_core.formats.shapes import (
     write_points,
 )
 from langsplat_core.query.combined import Combination, Combined, combine
+from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import NO_FIELD, QueryEngine
 from langsplat_core.query.hulls import hulls
 from langsplat_core.query.instances import Instance, find_instances
@@ -73,7 +74,7 @@ class Select:
             raise InputError(f"{self.scene}: {NO_FIELD}")
         unit = unit_of(scene, self.scale)
         engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
-        answer = combine([engine.run(text, self.level) for text in self.texts], self.combine)
+        answer = combine([run_phrase(engine, text, self.level).answer for text in self.texts], self.combine)
         found = find_instances(engine.surface, scene.gaussians, answer.members, answer.relevancy)
         taken = chosen(found, self.instance)
         selected = self._reshaped(

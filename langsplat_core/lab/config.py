@@ -93,7 +93,7 @@ class VerdictBenchConfig:
 
     tiers: tuple[Tier, ...] = ("clutter",)
     seeds: tuple[int, ...] = (301, 302, 303, 304, 305)
-    """Of the rooms; never that of the bundled scene, nor 201, 202 and 203, which calibrate the demo encoder."""
+    """Of the rooms; never that of the bundled scene, nor 201 to 203, which calibrate the demo encoder."""
     masks: MaskOrigin = "truth"
     """Exact outlines, the same with 15 % wrong vectors, the weight-free segmenter's."""
     codec: CodecConfig = CodecConfig()  # noqa: RUF009 (frozen)

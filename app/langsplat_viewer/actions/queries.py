@@ -2,8 +2,9 @@
 
 from langsplat_core.config import LevelChoice
 from langsplat_core.display.displays import DISPLAYS
-from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.compose import ComposedResult, run_phrase
 from langsplat_core.query.engine import NO_FIELD
+from langsplat_core.query.phrase_tree import Atom
 from langsplat_core.scene.phrases import phrase_key, tidy
 from langsplat_viewer.actions.settings import set_display, show_panel
 from langsplat_viewer.state import SLOTS, Query
@@ -64,9 +65,12 @@ def _answer(viewer: Viewer, query: Query) -> None:
     engine, level = viewer.engine, viewer.state.level
     if engine is None:
         return
+    view = viewer.state.view
+    viewpoint = None if view is None else view.camera(*viewer.state.size)
 
-    def done(result: QueryResult) -> None:
-        query.result, query.problem, query.pending = result, "", False
+    def done(composed: ComposedResult) -> None:
+        query.result, query.problem, query.pending = composed.answer, "", False
+        query.reading = "" if isinstance(composed.tree, Atom) else composed.reading
 
     def failed(reason: str) -> None:
         query.problem, query.pending = reason, False
@@ -75,7 +79,7 @@ def _answer(viewer: Viewer, query: Query) -> None:
     query.pending = True
     viewer.worker.submit(
         f"searching '{query.phrase}'",
-        lambda progress: engine.run(query.phrase, level, progress),
+        lambda progress: run_phrase(engine, query.phrase, level, viewpoint, progress),
         done,
         failed,
     )

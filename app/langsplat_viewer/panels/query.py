@@ -99,14 +99,18 @@ def _verdict(query: Query) -> None:
     if query.pending:
         imgui.text_colored(MUTED, "...")
     elif query.result is not None:
-        found = query.result.found
-        imgui.text_colored(GOOD if found else MUTED, "found" if found else "not here")
+        imgui.text_colored(GOOD if query.result.found else MUTED, query.result.verdict)
+        probability = query.result.probability
+        if imgui.is_item_hovered() and probability is not None:
+            imgui.set_tooltip(f"{100 * probability:.0f} % likely to be there")
 
 
 def _answer(viewer: Viewer, query: Query) -> None:
     result = query.result
     assert result is not None
     imgui.indent(imgui.get_frame_height())
+    if query.reading:
+        small_wrapped(f"read as: {query.reading}", MUTED)
     for index, (name, score) in enumerate(zip(LEVELS, result.scores, strict=True)):
         if index:
             imgui.same_line()

@@ -1,4 +1,4 @@
-"""How far "found" and "not here" can be trusted (`langsplat bench verdict`), and the calibration of an encoder.
+"""How far "found" and "not here" can be trusted (`langsplat bench verdict`), and how they are calibrated.
 
 In rooms whose truth is known every thing that is there is asked for, and every thing of the catalogue that is
 not. A calibration is fitted to the margins of both (Platt 1999, with Platt's smoothed targets); it is fair
