@@ -7,6 +7,7 @@ the work. The viewer's program ends the same way and uses this module too.
 import contextlib
 import io
 import logging
+import os
 import re
 import sys
 import warnings
@@ -55,6 +56,9 @@ def main(program: str, parser: Callable[[], Command]) -> int:
         command.run()
     except LangSplatError as error:
         return _fail(program, " ".join(str(error).split()))
+    except BrokenPipeError:  # whoever reads has enough, as `| head` has
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more at exit either
+        return 0
     except KeyboardInterrupt:
         print(f"{program}: interrupted; the same command continues where it stopped", file=sys.stderr)
         return 130

@@ -9,10 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.extent import to_margin
 from langsplat_core.query.places import locate
 from langsplat_core.query.surface import Surface
 from langsplat_core.scene import LEVELS
@@ -20,6 +21,9 @@ from langsplat_core.scene import LEVELS
 WHOLE = LEVELS.index("whole")
 SHARE = 0.6  # of the way from what is typical of a thing's least fitting surface to the part's peak on it
 LEAST = 0.05  # quantile of a part's relevancy on its thing that stands for "not this part"
+# Constant and slope of the probability that a thing has a part, by the part's best margin on it: of 186 parts
+# that things of the rooms 201 and 202 have and 275 that they have not, 70 % are accepted and 87 % rejected.
+PART = (0.87, 11.0)
 SPAN = 0.02  # of relevancy: the least distance that is divided
 HALF = 0.5  # of the peak: what is less is no longer the place
 
@@ -57,6 +61,12 @@ def cut_inside(
     own_surface = thing.members & known[chosen]  # without what it touches, which may be anything
     low = float(np.quantile(even[chosen][own_surface], LEAST)) if own_surface.any() else peak
     members = inside & (even[chosen] > low + SHARE * max(peak - low, SPAN))
+    reading = engine.field.reading
+    probability, fits = thing.probability, True
+    if reading.calibration is not None and probability is not None:
+        margin = to_margin(np.array(peak), reading.temperature)
+        probability = min(probability, float(sigmoid(PART[0] + PART[1] * margin)))
+        fits = probability >= reading.calibration.found
     return replace(
         asked[0],
         level=chosen,
@@ -64,8 +74,8 @@ def cut_inside(
         relevancy=relevancy,
         even=even[chosen],
         peak=peak,
-        probability=thing.probability if members.any() else 0.0,
-        found=bool(members.any() and thing.found),
+        probability=probability if members.any() else 0.0,
+        found=bool(members.any() and thing.found and fits),
         members=members,
     )
 
