@@ -21,6 +21,7 @@ SCALE = 5.0  # of the criterion, in 1 - cosine times Gaussians: larger prefers l
 SMALLEST = 10  # Gaussians; smaller patches join the neighbour that means the most similar
 BORDER = 0.3  # added to the step between two things, in 1 - cosine
 UNKNOWN = 2.0  # step between a Gaussian with a meaning and one without: as much as between opposites
+CHUNK = 65_536  # links whose ends are compared at a time
 STEPS = 65_535 / (UNKNOWN + BORDER)  # of 1 - cosine that are told apart: 16 bits sort in linear time
 
 
@@ -70,7 +71,10 @@ def _steps(field: LanguageField, level: int, rows: Array, ends: tuple[Array, Arr
         steps = apart[codes[a], codes[b]]
     else:
         directions = unit(latents.astype(np.float32))
-        steps = 1 - np.einsum("ed,ed->e", directions[a], directions[b])
+        steps = np.empty(len(a), np.float32)
+        for start in range(0, len(a), CHUNK):  # latents may be as long as the encoder's vectors
+            part = slice(start, start + CHUNK)
+            steps[part] = 1 - np.einsum("ed,ed->e", directions[a[part]], directions[b[part]])
     both, neither = known[a] & known[b], ~known[a] & ~known[b]
     return np.asarray(np.where(both, steps, np.where(neither, 0.0, UNKNOWN)).clip(0, UNKNOWN))
 
