@@ -1,6 +1,7 @@
 """Lifting by gradient descent against automatic differentiation, torch's Adam and the one-pass mean."""
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -116,3 +117,17 @@ def test_it_is_deterministic_and_can_be_interrupted():
 
     with pytest.raises(Cancelled):
         lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, SHORT, progress=stop)
+
+
+@pytest.mark.slow
+def test_zeros_as_published_take_ten_to_twenty_thousand_steps_more():
+    """The first gradients are 1e9 times too large, and Adam's second moment forgets by 0.999 a step."""
+    pairs, cpu = views(8), load_lifting_rasterizer("cpu")
+
+    def loss(steps: int, start: Literal["one-pass", "zeros-as-published"]) -> float:
+        config = LiftConfig(mode="gradient", steps=steps, start=start)
+        return l1(lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, config)[0], pairs)
+
+    reached = loss(1_000, "one-pass")
+    assert loss(10_000, "zeros-as-published") > 1.03 * reached
+    assert loss(20_000, "zeros-as-published") < 1.01 * reached
