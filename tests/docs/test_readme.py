@@ -119,7 +119,7 @@ def test_inspect(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_query(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(["langsplat", "query"])
     answers = json.loads(capsys.readouterr().out)
-    assert [answer["phrase"] for answer in answers] == ["red mug", "handle"]
+    assert [answer["phrase"] for answer in answers] == ["handle of the red mug"]
     assert all(len(answer["pixel"]) == 2 for answer in answers)
 
 
