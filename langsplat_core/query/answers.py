@@ -48,6 +48,10 @@ class QueryResult:
     @property
     def heat_range(self) -> tuple[float, float]:
         """The relevancies at which a heat map of this answer is coldest and hottest."""
+        if (
+            self.found and self.peak < FLOOR + MIN_HEAT_SPAN
+        ):  # the best of its thing, though not of all phrases
+            return self.peak - MIN_HEAT_SPAN, self.peak
         return FLOOR, max(self.peak, FLOOR + MIN_HEAT_SPAN)
 
 
