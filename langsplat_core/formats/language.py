@@ -97,7 +97,7 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
         "found": repr(field.reading.found),
     }
     if field.reading.calibration is not None:
-        metadata["calibration"] = json.dumps(astuple(field.reading.calibration))
+        metadata["calibration"] = json.dumps([float(n) for n in astuple(field.reading.calibration)])
     with atomic_path(path) as temporary:
         save_file({name: np.ascontiguousarray(t) for name, t in tensors.items()}, temporary, metadata)
 

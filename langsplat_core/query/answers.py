@@ -61,18 +61,20 @@ def by_regions(
     """Whole regions, cut at a share of the best one's margin (`extent`)."""
     extent = find_extent(relevancy, surface, regions, reading.temperature, level)
     even = surface.spread(extent.even, relevancy[extent.level])
+    peak = extent.peaks[extent.level]
     lowest = float(extent.even[extent.inside].min(initial=1.0))
-    place = locate(surface, extent.even, np.nextafter(np.float32(lowest), np.float32(0)))
+    solid = np.where(extent.even > np.float32(peak), 0, extent.even)  # what is above the best is a crumb
+    place = locate(surface, solid, np.nextafter(np.float32(lowest), np.float32(0)))
     return QueryResult(
         phrase=phrase,
         level=extent.level,
         scores=extent.peaks,
         relevancy=relevancy,
         even=even,
-        peak=extent.peaks[extent.level],
+        peak=peak,
         margins=extent.margins,
         probability=_probability(extent.margins, reading),
-        found=_found(extent.margins, reading),
+        found=_found(extent.margins, reading, level),
         members=surface.spread(extent.inside, np.zeros(relevancy.shape[1], bool)),
         place=None if place is None else place.position,
         box=None if place is None else place.box,
@@ -98,7 +100,7 @@ def by_peak(
         peak=peak,
         margins=margins,
         probability=_probability(margins, reading),
-        found=_found(margins, reading),
+        found=_found(margins, reading, level),
         members=relevancy[chosen] > cut_level("floor", relevancy[chosen], peak, FLOOR),
         place=None if place is None else place.position,
         box=None if place is None else place.box,
@@ -109,7 +111,9 @@ def _probability(margins: Margins, reading: Reading) -> float | None:
     return None if reading.calibration is None else reading.calibration.probability(margins)
 
 
-def _found(margins: Margins, reading: Reading) -> bool:
+def _found(margins: Margins, reading: Reading, level: LevelChoice) -> bool:
+    if level != "auto" and margins[LEVELS.index(level)] < 0:
+        return False  # it may be there, but what the wanted level shows is nearer to a canonical phrase
     if reading.calibration is not None:
         return reading.calibration.probability(margins) >= reading.calibration.found
     return max(margins) >= float(to_margin(np.array(reading.found), reading.temperature))

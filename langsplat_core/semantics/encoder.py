@@ -231,7 +231,7 @@ def _reading(weights: Weights, temperature: float) -> Reading:
         stated = json.loads(path.read_text(encoding="utf-8"))
         calibration = Calibration(**stated["calibration"]) if "calibration" in stated else None
         return Reading(temperature, float(stated.get("found", Reading.found)), calibration)
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, OverflowError) as error:
         raise EncoderError(
             f'{weights.id}: {READING} is not {{"found": 0 to 1, "calibration": {{"constant": number, '
             f'"whole": number, "finer": number, "found": 0.5 to 1}}}} ({error!r})'

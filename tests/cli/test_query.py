@@ -21,7 +21,7 @@ from langsplat_core.formats import (
 from langsplat_core.lab.rooms.scoring import ask, evaluate
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.scene import Scene
+from langsplat_core.scene import Calibration, Reading, Scene
 from tests.support.fakes import FakeEncoder, axis, blobs
 from tests.support.fakes import cameras as fake_cameras
 from tests.support.fakes import language as fake_language
@@ -118,3 +118,51 @@ def test_the_things_of_an_answer_are_listed(tmp_path, capsys):
     assert abs(float(capsys.readouterr().out.splitlines()[2].split()[5])) == pytest.approx(1.2, abs=0.1)
     with pytest.raises(InputError, match="--scale -1"):
         QueryScene(tmp_path / "a.ply", ("pair",), scale=-1.0).run()
+
+
+def asked(capsys, path, *texts: str, **options) -> tuple[list[str], list[dict]]:
+    """Lines for people, and what JSON says."""
+    QueryScene(path, texts, **options).run()
+    lines = capsys.readouterr().out.splitlines()
+    QueryScene(path, texts, json=True, **options).run()
+    return lines, json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(
+    ("constant", "verdict", "probability"),
+    [(1.0, "found", 1.0), (-7.0, "weak match", 0.73), (-11.0, "not here", 0.05)],
+)
+def test_a_verdict_comes_with_its_probability(tmp_path, capsys, constant, verdict, probability):
+    reading = Reading(calibration=Calibration(constant, whole=8.0, finer=0.01))
+    field = replace(fake_language(phrasebook=True), reading=reading)
+    save_scene(tmp_path / "a.ply", Scene(blobs(), field))
+    lines, (answer,) = asked(capsys, tmp_path / "a.ply", "book")
+    assert answer["probability"] == pytest.approx(probability, abs=0.01)
+    percent = f"{100 * answer['probability']:.0f}"
+    assert lines[0].startswith(f"book: {verdict} ({percent} %), score ")
+    assert (answer["verdict"], answer["found"]) == (verdict, verdict == "found")
+    assert (answer["instances"] == []) == (verdict != "found")
+
+
+def test_without_a_calibration_there_is_no_probability(tmp_path, capsys):
+    save_scene(tmp_path / "a.ply", Scene(blobs(), fake_language(phrasebook=True)))
+    lines, (answer,) = asked(capsys, tmp_path / "a.ply", "book")
+    assert lines[0].startswith("book: found, score ")
+    assert answer["probability"] is None
+
+
+def test_structure_is_read_unless_the_phrase_is_asked_whole(tmp_path, capsys):
+    field = replace(
+        fake_language(), phrasebook={"mug": axis(0), "plant": axis(2), "mug near the plant": axis(1)}
+    )
+    save_scene(tmp_path / "a.ply", Scene(blobs(), field, fake_cameras(1)))
+    lines, (answer,) = asked(capsys, tmp_path / "a.ply", "mug or plant")
+    assert lines[0].startswith("mug or plant: found")
+    assert lines[1] == f"  read as: {answer['reading']}" == "  read as: mug  or  plant"
+    assert len(answer["instances"]) == 2
+    lines, (answer,) = asked(capsys, tmp_path / "a.ply", "mug near the plant", whole=True)
+    assert answer["reading"] is None
+    assert not any("read as" in line for line in lines)
+    assert answer["place"][0] == pytest.approx(0, abs=0.2)  # what the phrasebook says of the whole phrase
+    _, (plain,) = asked(capsys, tmp_path / "a.ply", "plant")
+    assert plain["reading"] is None

@@ -51,7 +51,9 @@ def scene() -> Scene:
     gaussians.opacity_logits[::2] = -5.0
     gaussians.sh[:, 1:] *= 0.05
     extras = {"age": np.arange(N, dtype=np.float32)}
-    return Scene(gaussians, random_field(N, phrases=("red mug", "door")), cameras(), extras=extras)
+    things = np.arange(N, dtype=np.uint16) // 9
+    field = replace(random_field(N, phrases=("red mug", "door")), things=things)
+    return Scene(gaussians, field, cameras(), extras=extras)
 
 
 @pytest.fixture
@@ -132,6 +134,7 @@ def test_budget_companions_and_order_survive_the_file(scene, source, tmp_path):
     count = small.gaussians.sh.shape[1]
     np.testing.assert_array_equal(small.gaussians.sh, scene.gaussians.sh[rows, :count])
     np.testing.assert_array_equal(small.language.latents, scene.language.latents[:, rows])
+    np.testing.assert_array_equal(small.language.things, scene.language.things[rows])
     assert len(small.cameras) == len(scene.cameras)
     held = choose_views(scene, None, CONFIG, silent).measuring
     losses = psnr_losses(

@@ -62,6 +62,7 @@ STAGES = (
     "memberships-*/groups.npz",
     "codec-*.npz",
     "latents-*.npz",
+    "things-*.npy",
 )
 
 
@@ -88,6 +89,7 @@ def test_the_same_command_again_changes_nothing_and_repeats_no_stage(room, tmp_p
         (language, "lift_sample"),
         (language, "lift_block"),
         (language, "fit_codec"),
+        (language, "find_things"),
         (store, "embed_regions"),
     ):
         monkeypatch.setattr(module, name, forbidden)
@@ -98,6 +100,24 @@ def test_the_same_command_again_changes_nothing_and_repeats_no_stage(room, tmp_p
         np.testing.assert_array_equal(tensor, tensors.pop(name))
     assert not tensors
     assert replace(again, seconds={}) == replace(first, seconds={})
+    (path,) = (tmp_path / "scene.work").glob("things-*.npy")
+    things = load_scene(out).language.things
+    np.testing.assert_array_equal(things, np.load(path))
+    assert 0 in things  # numbered from the largest
+
+
+def test_lost_things_are_found_again_without_lifting_again(room, tmp_path, monkeypatch):
+    out = tmp_path / "scene.ply"
+    train_scene(room, out, tiny_settings(room))
+    first = load_scene(out).language.things
+    (lost,) = (tmp_path / "scene.work").glob("things-*.npy")
+    lost.unlink()
+    kept = kept_results(tmp_path / "scene.work")
+    train_scene(room, out, tiny_settings(room))
+    now = kept_results(tmp_path / "scene.work")
+    assert set(now) - set(kept) == {str(lost)}
+    assert kept.items() <= now.items()
+    np.testing.assert_array_equal(load_scene(out).language.things, first)
 
 
 def test_a_setting_repeats_only_what_depends_on_it(room, tmp_path):
@@ -124,14 +144,16 @@ def test_more_steps_of_lifting_do_not_fit_the_codec_again(room, tmp_path):
     assert (len(list(work.glob("codec-*.npz"))), len(list(work.glob("latents-*.npz")))) == (1, 2)
 
 
-@pytest.mark.parametrize("name", ["memberships-*/*.npy", "memberships-*/*.npz", "codec-*", "latents-*"])
+@pytest.mark.parametrize(
+    "name", ["memberships-*/*.npy", "memberships-*/*.npz", "codec-*", "latents-*", "things-*"]
+)
 def test_a_damaged_result_is_one_line(room, tmp_path, name):
     out, work = tmp_path / "scene.ply", tmp_path / "scene.work"
     train_scene(room, out, tiny_settings(room))
     damaged = sorted(work.glob(name))
     for path in damaged:
         path.write_bytes(path.read_bytes()[:100])
-    for path in {*work.glob("*.npz"), *work.glob("memberships-*/*")} - set(damaged):
+    for path in {*work.glob("*.np[yz]"), *work.glob("memberships-*/*")} - set(damaged):
         path.unlink()
     with pytest.raises(FormatError, match="delete it and run again"):
         train_scene(room, out, tiny_settings(room))
@@ -149,9 +171,12 @@ def test_other_liftings(room, tmp_path, mode):
     assert field is not None
     assert field.codec.kind == "linear"
     assert np.isfinite(field.latents).all()
+    assert (field.things is None) == (mode != "mean")  # averaging latents needs no memberships
 
 
-@pytest.mark.parametrize("stage", ["reading", "Training", "masks", "lifting", "codebook", "averaging"])
+@pytest.mark.parametrize(
+    "stage", ["reading", "Training", "masks", "lifting", "codebook", "averaging", "finding"]
+)
 def test_an_interrupted_run_leaves_no_scene_and_resumes(room, tmp_path, stage):
     def stop(label: str, fraction: float) -> None:
         if label.startswith(stage):

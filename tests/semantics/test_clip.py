@@ -1,5 +1,6 @@
 """CLIP through the real loading path, with a tiny model made here."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 from transformers import CLIPModel, CLIPTokenizer
 
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.scene import Reading
+from langsplat_core.scene import Calibration, Reading
 from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
 from langsplat_core.semantics.families.clip import CLIP_MEAN, CLIP_STD
 from tests.support.tiny_clip import SIDE, WORDS, tiny_clip
@@ -161,7 +162,50 @@ def test_how_an_encoder_is_read_lies_beside_its_weights(tmp_path):
     assert load_text_encoder(str(tmp_path)).reading == Reading(10.0, 0.6)
     (tmp_path / "reading.json").write_text('{"found": 0.7}')
     assert load_encoder(str(tmp_path), "cpu").reading == Reading(10.0, 0.7)
-    for broken in ("{}", '{"found": 2}', '{"found": "much"}', "[", '{"found": null}'):
-        (tmp_path / "reading.json").write_text(broken)
-        with pytest.raises(EncoderError, match=r"reading\.json is not"):
-            load_text_encoder(str(tmp_path))
+    (tmp_path / "reading.json").write_text("{}")
+    assert load_text_encoder(str(tmp_path)).reading == Reading(10.0, 0.6)
+
+
+def test_a_calibration_lies_there_too(tmp_path):
+    tiny_clip(tmp_path)
+    stated = {"constant": -1, "whole": 18.5, "finer": 2.5, "found": 0.7}
+    (tmp_path / "reading.json").write_text(json.dumps({"calibration": stated}))
+    want = Reading(10.0, 0.6, Calibration(-1, 18.5, 2.5, 0.7))
+    assert load_text_encoder(str(tmp_path)).reading == want
+    assert load_encoder(str(tmp_path), "cpu").reading == want
+    stated.pop("found")
+    (tmp_path / "reading.json").write_text(json.dumps({"found": 0.8, "calibration": stated}))
+    reading = load_text_encoder(str(tmp_path)).reading
+    assert reading == Reading(10.0, 0.8, Calibration(-1, 18.5, 2.5))
+
+
+BROKEN_READINGS = (
+    '{"found": 2}',
+    '{"found": "much"}',
+    '{"found": null}',
+    '{"found": 1' + "0" * 400 + "}",
+    "[",
+    "[]",
+    "3",
+    "",
+    '"found"',
+    '{"calibration": null}',
+    '{"calibration": [0, 1, 2]}',
+    '{"calibration": {"constant": 0, "whole": 1}}',
+    '{"calibration": {"constant": 0, "whole": 1, "finer": 0, "part": 2}}',
+    '{"calibration": {"constant": 0, "whole": NaN, "finer": 0}}',
+    '{"calibration": {"constant": 0, "whole": "1", "finer": 0}}',
+    '{"calibration": {"constant": 0, "whole": -1, "finer": 0.5}}',
+    '{"calibration": {"constant": 0, "whole": 1, "finer": 0, "found": 0.4}}',
+    '{"calibration": {"constant": 0, "whole": 1, "finer": 0, "found": "0.7"}}',
+    '{"calibration": {"constant": 0, "whole": 1' + "0" * 400 + ', "finer": 0}}',
+)
+
+
+@pytest.mark.parametrize("broken", BROKEN_READINGS)
+def test_a_broken_reading_is_one_line(tmp_path, broken):
+    tiny_clip(tmp_path)
+    (tmp_path / "reading.json").write_text(broken)
+    with pytest.raises(EncoderError, match=r"reading\.json is not") as caught:
+        load_text_encoder(str(tmp_path))
+    assert "\n" not in str(caught.value)

@@ -26,7 +26,12 @@ def assert_same_field(got: LanguageField, want: LanguageField) -> None:
     """Bit for bit: a saved scene must answer exactly like the one in memory."""
     for name in ("latents", "confidence", "canonical"):
         np.testing.assert_array_equal(getattr(got, name), getattr(want, name), name)
+    assert (got.things is None) == (want.things is None)
+    if want.things is not None:
+        np.testing.assert_array_equal(got.things, want.things)
+        assert got.things.dtype == np.uint16
     assert got.encoder_id == want.encoder_id
+    assert got.reading == want.reading
     assert got.codec.kind == want.codec.kind
     assert got.codec.tensors().keys() == want.codec.tensors().keys()
     for name, tensor in want.codec.tensors().items():

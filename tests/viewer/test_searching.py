@@ -1,11 +1,17 @@
 """Queries, their colours and levels, without a window."""
 
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
 from numpy.testing import assert_allclose
 
+from langsplat_core.scene import Calibration, Reading
 from langsplat_viewer import actions
 from langsplat_viewer.state import NO_HEAT
-from tests.support.fakes import CENTRES
-from tests.support.windowless import errors, settle
+from langsplat_viewer.still import describe
+from tests.support.fakes import CENTRES, blob_scene, language
+from tests.support.windowless import SCENES, errors, settle
 
 
 def test_a_query_is_answered_and_shown(opened):
@@ -110,3 +116,28 @@ def test_the_box_is_emptied_by_a_search_and_by_nothing_else(opened):
     actions.focus_search(opened)
     assert opened.state.show_panel
     assert actions.take_search_focus(opened)
+
+
+def test_a_phrase_with_structure_says_how_it_was_read(opened):
+    actions.ask(opened, "mug or book")
+    actions.ask(opened, "mug")
+    settle(opened)
+    composed, plain = opened.state.queries
+    assert (composed.reading, plain.reading) == ("mug  or  book", "")
+    assert composed.result.found
+    assert composed.result.members[:240].mean() > 0.9 > 0.1 > composed.result.members[240:].mean()
+
+
+@pytest.mark.parametrize(("constant", "verdict"), [(1.0, "found"), (-7.0, "weak match"), (-11.0, "not here")])
+def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch, constant, verdict):
+    reading = Reading(calibration=Calibration(constant, whole=8.0, finer=0.01))
+    scene = replace(blob_scene(), language=replace(language(), reading=reading))
+    monkeypatch.setitem(SCENES, "sure.ply", scene)
+    actions.open_scene(viewer, Path("sure.ply"))
+    settle(viewer)
+    actions.ask(viewer, "mug")
+    settle(viewer)
+    result = viewer.state.queries[0].result
+    assert (result.verdict, result.found) == (verdict, verdict == "found")
+    said = f"'mug': {verdict} ({100 * result.probability:.0f} %), score "
+    assert describe(result).startswith(said)

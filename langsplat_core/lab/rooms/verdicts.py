@@ -135,10 +135,18 @@ def _shares(rows: Sequence[Verdict]) -> tuple[float, ...]:
     present, absent = (
         np.array([_score(row) for row in rows if row.kind == kind]) for kind in ("object", "absent")
     )
-    rates = [np.mean([row.found for row in rows if row.kind == kind]) for kind in ("object", "colour+object")]
-    rejected = np.mean([not row.found for row in rows if row.kind == "absent"])
-    at = [np.mean(present > np.quantile(absent, share, method="higher")) for share in SHARES]
-    return tuple(float(x) for x in (*rates, rejected, separation(present, absent), *at))
+    kinds = ("object", "colour+object", "absent")
+    found, coloured, wrong = (_mean([row.found for row in rows if row.kind == kind]) for kind in kinds)
+    compared = [float("nan")] * (1 + len(SHARES))  # nothing to compare where one of both was not asked for
+    if len(present) and len(absent):
+        at = (np.mean(present > np.quantile(absent, share, method="higher")) for share in SHARES)
+        compared = [separation(present, absent), *map(float, at)]
+    return found, coloured, 1 - wrong, *compared
+
+
+def _mean(values: Sequence[bool]) -> float:
+    """NaN of nothing."""
+    return float(np.mean(values)) if values else float("nan")
 
 
 def _score(row: Verdict) -> float:
@@ -147,9 +155,13 @@ def _score(row: Verdict) -> float:
 
 
 def _spreads(rooms: Sequence[tuple[float, ...]]) -> list[str]:
-    columns = 100 * np.array(rooms)
-    spread = columns.std(axis=0, ddof=1) if len(rooms) > 1 else np.zeros(columns.shape[1])
-    return [f"{m:.1f} +/- {s:.1f}" for m, s in zip(columns.mean(axis=0), spread, strict=True)]
+    return [_spread(column[np.isfinite(column)]) for column in 100 * np.array(rooms).T]
+
+
+def _spread(values: Array) -> str:
+    if len(values) == 0:
+        return "-"
+    return f"{values.mean():.1f} +/- {values.std(ddof=1) if len(values) > 1 else 0:.1f}"
 
 
 def curve_table(rows: Sequence[Verdict]) -> str:

@@ -81,14 +81,15 @@ def _claims(members: Memberships, firsts: Array, level: int) -> tuple[sparse.csr
 def _overlapping(claims: sparse.csr_matrix, views: Array) -> sparse.csr_matrix:
     """(M, M) links between masks of different views whose overlap over union, where both see, is large."""
     both = (claims.T @ claims).tocoo()
-    of_view = sparse.csr_matrix((np.ones(len(views), np.float32), (np.arange(len(views)), views)))
+    shape = len(views), int(views.max(initial=-1)) + 1
+    of_view = sparse.csr_matrix((np.ones(len(views), np.float32), (np.arange(len(views)), views)), shape)
     seen = claims @ of_view  # (n, V): is the Gaussian claimed in the view at all
     visible = (claims.T @ seen).tocsr()  # (M, V): Gaussians of the mask that the view sees
     a, b = both.row, both.col
     union = _at(visible, a, views[b]) + _at(visible, b, views[a]) - both.data
     same = (views[a] != views[b]) & (both.data > SAME * union)
-    shape = (claims.shape[1],) * 2
-    return sparse.csr_matrix((np.ones(int(same.sum()), bool), (a[same], b[same])), shape)
+    square = (len(views), len(views))
+    return sparse.csr_matrix((np.ones(int(same.sum()), bool), (a[same], b[same])), square)
 
 
 def _at(matrix: sparse.csr_matrix, rows: Array, columns: Array) -> Array:

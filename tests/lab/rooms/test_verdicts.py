@@ -1,0 +1,208 @@
+"""Verdicts and their calibration, on margins whose truth is known."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from langsplat_core.arrays import Array, sigmoid
+from langsplat_core.cli.app import parse
+from langsplat_core.cli.bench_verdict import BenchVerdict
+from langsplat_core.cli.run import main
+from langsplat_core.errors import InputError
+from langsplat_core.lab.config import VerdictBenchConfig
+from langsplat_core.lab.rooms import verdicts as module
+from langsplat_core.lab.rooms.verdicts import (
+    REJECTED,
+    Verdict,
+    curve_table,
+    figures,
+    fit_calibration,
+    margins_of,
+    measure_verdicts,
+    verdict_table,
+    write_calibration,
+)
+from langsplat_core.scene import Calibration
+
+TRUE = Calibration(-1.0, 18.0, 6.0)
+
+
+def logistic(count: int, seed: int = 0) -> tuple[Array, Array]:
+    """Margins of things that are there and that are not, by `TRUE`: about as many of both."""
+    rng = np.random.default_rng(seed)
+    margins = rng.uniform([-0.3, -0.3, -0.25], [0.3, 0.1, 0.3], (count, 3))
+    likely = np.array([TRUE.probability(tuple(row)) for row in margins.tolist()])
+    there = rng.uniform(size=count) < likely
+    return margins[there], margins[~there]
+
+
+def test_a_fit_recovers_what_made_the_data():
+    present, absent = logistic(20_000)
+    fitted = fit_calibration(present, absent)
+    assert fitted.whole == pytest.approx(TRUE.whole, rel=0.06)
+    assert fitted.finer == pytest.approx(TRUE.finer, rel=0.12)
+    # Both weigh the same in the fit: the constant moves by the logarithm of how many there are of each.
+    want = TRUE.constant - np.log(len(present) / len(absent))
+    assert fitted.constant == pytest.approx(want, abs=0.12)
+
+
+def test_how_many_there_are_of_each_changes_nothing():
+    present, absent = logistic(4_000)
+    once, often = fit_calibration(present, absent), fit_calibration(present, np.tile(absent, (9, 1)))
+    for name in ("constant", "whole", "finer", "found"):
+        assert getattr(often, name) == pytest.approx(getattr(once, name), rel=0.02, abs=0.02)
+
+
+def test_found_rejects_as_much_of_what_is_absent_as_is_asked():
+    present, absent = logistic(3_000)
+    fitted = fit_calibration(present, absent)
+    said = np.array([fitted.probability(tuple(row)) for row in absent.tolist()])
+    assert REJECTED <= (said < fitted.found).mean() < REJECTED + 0.01
+    apart = fit_calibration(np.full((20, 3), 0.5), np.full((20, 3), -0.5))
+    assert apart.found == 0.5  # never less than even
+    assert np.isfinite([apart.constant, apart.whole, apart.finer]).all()  # Platt's targets keep it so
+
+
+def test_the_order_of_the_margins_changes_nothing():
+    present, absent = logistic(500)
+    got = fit_calibration(present[::-1], absent[::-1])
+    want = fit_calibration(present, absent)
+    assert (got.whole, got.finer) == pytest.approx((want.whole, want.finer), abs=0.02)
+
+
+@pytest.mark.parametrize(("present", "absent"), [(9, 100), (100, 9), (0, 0)])
+def test_too_little_to_fit(present, absent):
+    with pytest.raises(InputError, match="ten things that are there"):
+        fit_calibration(np.zeros((present, 3)), np.zeros((absent, 3)))
+    with pytest.raises(InputError, match="ten things"):
+        fit_calibration(margins_of([], "object"), margins_of([], "absent"))
+
+
+def test_margins_that_say_the_opposite():
+    present, absent = logistic(500)
+    with pytest.raises(InputError, match="nothing to calibrate"):
+        fit_calibration(absent, present)
+
+
+def test_writing_keeps_what_else_stands_there(tmp_path):
+    path = tmp_path / "reading.json"
+    write_calibration(path, TRUE)
+    assert json.loads(path.read_text()) == {
+        "calibration": {"constant": -1.0, "whole": 18.0, "finer": 6.0, "found": 0.75}
+    }
+    path.write_text('{"found": 0.73, "calibration": {"constant": 9}}')
+    write_calibration(path, TRUE)
+    stated = json.loads(path.read_text())
+    assert (stated["found"], Calibration(**stated["calibration"])) == (0.73, TRUE)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def row(kind: str, probability: float | None, *, found: bool | None = None, seed: int = 1, tier="clutter"):
+    margin = 0.1 if probability is None else probability
+    said = (probability or 0) >= 0.75 if found is None else found
+    return Verdict(tier, seed, "a thing", kind, (margin, -0.1, margin), probability, said)
+
+
+ROOM = [row("object", p) for p in (0.2, 0.8, 0.9, 0.95)] + [row("colour+object", p) for p in (0.7, 0.99)]
+ROOM += [row("absent", p) for p in (0.01, 0.02, 0.5, 0.76)]
+
+
+def cells(table: str, line: int) -> list[str]:
+    return [cell.strip() for cell in table.splitlines()[line].strip("|").split("|")]
+
+
+def test_the_table_of_one_room():
+    tier, accepted, coloured, rejected, area, *at = cells(verdict_table(ROOM), 2)
+    assert tier == "clutter"
+    assert (accepted, coloured, rejected) == ("75.0 +/- 0.0", "50.0 +/- 0.0", "75.0 +/- 0.0")
+    pairs = [a > b for a in (0.2, 0.8, 0.9, 0.95) for b in (0.01, 0.02, 0.5, 0.76)]
+    assert area == f"{100 * np.mean(pairs):.1f} +/- 0.0"
+    assert at == ["75.0 +/- 0.0"] * 3  # of four absent things none but the best is the limit
+
+
+def test_rooms_are_averaged_in_their_tier():
+    other = [replace(r, seed=2, found=True) for r in ROOM]
+    third = [replace(r, tier="separate", probability=None) for r in ROOM]
+    table = verdict_table(ROOM + other + third)
+    assert cells(table, 2)[1] == f"87.5 +/- {100 * np.std([0.75, 1], ddof=1):.1f}"
+    assert [cells(table, 2)[0], cells(table, 3)[0]] == ["clutter", "separate"]
+    assert cells(table, 3)[1:] == cells(verdict_table(ROOM), 2)[1:]  # the best margin takes its place
+    assert table.count("\n") == 4
+
+
+def test_a_room_without_one_kind_of_phrase_is_no_error():
+    table = verdict_table([r for r in ROOM if r.kind != "colour+object"])
+    assert cells(table, 2)[1:4] == ["75.0 +/- 0.0", "-", "75.0 +/- 0.0"]
+    half = [r for r in ROOM if r.kind != "colour+object"] + [replace(r, seed=2) for r in ROOM]
+    assert cells(verdict_table(half), 2)[2] == "50.0 +/- 0.0"  # of the rooms that have such things
+    assert cells(verdict_table([row("object", 0.9)]), 2)[1:] == ["100.0 +/- 0.0", *["-"] * 6]
+    assert cells(verdict_table([row("absent", 0.1)]), 2)[3] == "100.0 +/- 0.0"
+
+
+def test_the_curve_weighs_present_and_absent_alike():
+    many = ROOM + [row("absent", p) for p in (0.01, 0.02, 0.5, 0.76)] * 9
+    assert [cells(curve_table(many), n)[2:] for n in range(2, 7)] == [
+        cells(curve_table(ROOM), n)[2:] for n in range(2, 7)
+    ]
+    lines = [cells(curve_table(ROOM), n) for n in range(2, 7)]
+    assert [line[0] for line in lines] == [
+        "0 to 0.1",
+        "0.1 to 0.25",
+        "0.5 to 0.75",
+        "0.75 to 0.9",
+        "0.9 to 1",
+    ]
+    assert [line[1] for line in lines] == ["2", "1", "1", "2", "2"]  # coloured things are not counted
+    assert [line[3] for line in lines] == ["0", "100", "0", "50", "100"]
+    certain = curve_table([row("object", 1.0), row("absent", 0.0)])
+    assert (cells(certain, 2)[3], cells(certain, 3)[3]) == ("0", "100")
+    assert curve_table([row("object", None)]).count("\n") == 2
+
+
+@pytest.mark.parametrize("changes", [{"seeds": ()}, {"tiers": ()}])
+def test_no_room(tmp_path, changes):
+    with pytest.raises(InputError, match="--tiers and one of --seeds"):
+        measure_verdicts(replace(VerdictBenchConfig(), **changes), tmp_path)
+
+
+def calibration_data(*_: object) -> list[Verdict]:
+    present, absent = logistic(300)
+    rows = [("object", margins) for margins in present] + [("absent", margins) for margins in absent]
+    rows += [("colour+object", margins) for margins in present]
+    return [
+        Verdict("clutter", 301, "x", kind, tuple(m.tolist()), float(sigmoid(20 * m[2])), bool(m[2] > 0.1))
+        for kind, m in rows
+    ]
+
+
+def test_the_command_writes_tables_and_a_calibration(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(module, "measure_verdicts", calibration_data)
+    command = parse(["bench", "verdict", "--seeds", "301", "--out", str(tmp_path / "out")])
+    assert isinstance(command, BenchVerdict)
+    command.run()
+    assert not (tmp_path / "reading.json").exists()
+    printed = capsys.readouterr().out
+    stored = json.loads((tmp_path / "out" / "verdict.json").read_text())
+    assert stored["settings"]["seeds"] == [301]
+    assert len(stored["rows"]) == len(calibration_data())
+    assert "absent rejected %" in printed
+    assert verdict_table(calibration_data()) in (tmp_path / "out" / "verdict.md").read_text()
+    replace(command, fit=tmp_path / "reading.json").run()
+    stated = json.loads((tmp_path / "reading.json").read_text())["calibration"]
+    assert 10 < Calibration(**stated).whole < 30
+    assert "reading.json: Calibration(" in capsys.readouterr().out
+
+
+def test_mistakes_end_with_one_line(tmp_path, capsys):
+    empty = BenchVerdict(VerdictBenchConfig(seeds=()), work=tmp_path / "work", out=tmp_path / "out")
+    assert main("langsplat", lambda: empty) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_figures_hold_every_answer():
+    made = figures(VerdictBenchConfig(), ROOM)
+    assert len(made["rows"]) == len(ROOM)
+    assert json.loads(json.dumps(made))["rows"][0]["kind"] == "object"

@@ -1,0 +1,195 @@
+"""Answers by regions and by the peak, and what is said about them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from langsplat_core.arrays import sigmoid
+from langsplat_core.query.answers import QueryResult, by_peak, by_regions
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.regions import SMALLEST, build_regions
+from langsplat_core.query.surface import Surface, build_surface
+from langsplat_core.scene import LEVELS, Calibration, Gaussians, LanguageField, Reading, Scene
+from langsplat_core.semantics.relevancy import FLOOR
+from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, blob_scene, blobs, language
+from tests.support.file_samples import random_field
+from tests.support.scenes import random_gaussians
+
+RULES = ("regions", "peak")
+SURE = Calibration(constant=0.0, whole=20.0, finer=2.0, found=0.8)
+
+
+def calibrated(calibration: Calibration | None) -> QueryEngine:
+    scene = blob_scene()
+    field = replace(language(), reading=Reading(calibration=calibration))
+    return QueryEngine(replace(scene, language=field), lambda _: FakeEncoder())
+
+
+def asked(relevancy, surface: Surface, field: LanguageField, rule: str, level="auto") -> QueryResult:
+    if rule == "peak":
+        return by_peak("x", relevancy, surface, field.reading, level)
+    return by_regions("x", relevancy, surface, build_regions(surface, field), field.reading, level)
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
+@pytest.mark.parametrize("level", ["auto", *LEVELS])
+def test_whatever_is_asked_the_answer_is_sound(kind, rule, level):
+    gaussians, field = random_gaussians(300), random_field(300, kind)
+    engine = QueryEngine(Scene(gaussians, field), rule=rule)
+    result = engine.run("red mug", level)
+    again = QueryEngine(Scene(gaussians, field), rule=rule).run("red mug", level)
+    for name in ("relevancy", "even", "members", "place", "box"):
+        np.testing.assert_array_equal(getattr(result, name), getattr(again, name))
+        assert np.isfinite(getattr(result, name)).all()
+    assert (result.relevancy.shape, result.even.shape, result.members.shape) == ((3, 300), (300,), (300,))
+    assert (result.even.dtype, result.members.dtype) == (np.float32, bool)
+    assert result.members.any()
+    assert level in ("auto", LEVELS[result.level])
+    assert np.isfinite([*result.scores, *result.margins]).all()
+    assert result.peak == result.scores[result.level]
+    assert result.probability is None
+    np.testing.assert_allclose(sigmoid(10 * np.array(result.margins)), result.scores, atol=1e-5)
+
+
+def test_an_answer_by_regions_has_their_borders():
+    gaussians, field = random_gaussians(400), random_field(400, "linear")
+    engine = QueryEngine(Scene(gaussians, field))
+    result = engine.run("red mug")
+    of = engine.regions.of[result.level]
+    members, even = result.members[engine.surface.rows], result.even[engine.surface.rows]
+    for number in range(of.max() + 1):
+        assert len({*members[of == number].tolist()}) == 1
+        assert len({*even[of == number].tolist()}) == 1
+    assert even[members].min() > even[~members].max()
+    assert even.max() == pytest.approx(result.peak, abs=1e-6)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_the_answer_is_the_thing(rule):
+    engine = QueryEngine(blob_scene(), lambda _: FakeEncoder(), rule=rule)
+    result = engine.run("book")
+    assert (result.level, result.found, result.verdict) == (2, True, "found")
+    np.testing.assert_array_equal(np.flatnonzero(result.members), np.arange(PER_BLOB, 2 * PER_BLOB))
+    np.testing.assert_allclose(result.place, CENTRES[1], atol=0.2)
+    low, high = result.box
+    assert ((low > CENTRES[1] - 0.7) & (high < CENTRES[1] + 0.7)).all()
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_level_at_which_the_thing_is_not_has_not_found_it(rule):
+    """As a whole a mug is there; among the parts nothing is more of a mug than of an object."""
+    engine = QueryEngine(blob_scene(), lambda _: FakeEncoder(), rule=rule)
+    assert engine.run("mug", "whole").found
+    result = engine.run("mug", "part")
+    assert result.margins[1] < 0 < 0.5 < result.margins[2]
+    assert not result.found
+
+
+def test_a_crumb_is_no_place():
+    """A few stray Gaussians far off mean it more than the thing does, and are no thing."""
+    far = np.arange(SMALLEST - 1)
+    gaussians = blobs()
+    means = gaussians.means.copy()
+    means[far] += np.array([60, 0, 0], np.float32)
+    gaussians = Gaussians(
+        means, gaussians.log_scales, gaussians.quats_wxyz, gaussians.opacity_logits, gaussians.sh
+    )
+    surface, field = build_surface(gaussians), language()
+    relevancy = np.full((3, len(means)), 0.3, np.float32)
+    relevancy[2, PER_BLOB : 2 * PER_BLOB] = 0.8
+    relevancy[2, far] = 0.95
+    result = asked(relevancy, surface, field, "regions")
+    assert result.peak == pytest.approx(0.8, abs=1e-6)
+    np.testing.assert_allclose(result.place, CENTRES[1], atol=0.3)
+    assert result.box[1][0] < 30
+
+
+@pytest.mark.parametrize(
+    ("constant", "verdict"), [(0.0, "found"), (-7.0, "weak match"), (-10.0, "not here"), (99.0, "found")]
+)
+def test_a_calibrated_verdict(constant, verdict):
+    """The book's margins: 1 as a whole, -0.8 as a part, and as a subpart nothing was seen."""
+    calibration = Calibration(constant, whole=8.0, finer=0.01, found=0.75)
+    result = calibrated(calibration).run("book")
+    subpart, part, whole = result.margins
+    assert (part, whole) == (pytest.approx(-0.8, abs=1e-3), pytest.approx(1.0, abs=0.05))
+    want = 1 / (1 + np.exp(-(constant + 8 * whole + 0.01 * max(subpart, part))))
+    assert result.probability == pytest.approx(want)
+    assert (result.found, result.verdict) == (verdict == "found", verdict)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_probability_is_of_being_there_at_all(rule):
+    """It knows no level: what is asked for at another one is there all the same."""
+    engine = QueryEngine(calibrated(SURE).scene, lambda _: FakeEncoder(), rule=rule)
+    said = {engine.run("mug", level).probability for level in ("auto", *LEVELS)}
+    assert len(said) == 1
+    assert min(said) > 0.99
+    assert calibrated(None).run("mug").probability is None
+
+
+def test_without_a_calibration_the_best_margin_decides():
+    scene = blob_scene()
+    for found, says in ((0.6, True), (0.9999, True), (1.0, False)):
+        field = replace(language(), reading=Reading(found=found))
+        result = QueryEngine(replace(scene, language=field), lambda _: FakeEncoder()).run("mug")
+        assert (result.found, result.verdict) == (says, "found" if says else "not here")
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_negative_margins_everywhere(rule):
+    gaussians, field = random_gaussians(200), random_field(200, "codebook")
+    relevancy = np.random.default_rng(0).uniform(0.05, 0.2, (3, 200)).astype(np.float32)
+    for level in ("auto", *LEVELS):
+        result = asked(relevancy, build_surface(gaussians), field, rule, level)
+        assert (result.found, result.verdict) == (False, "not here")
+        assert max(result.margins) < 0
+        assert result.heat_range == (FLOOR, pytest.approx(FLOOR + 0.1))
+        assert np.isfinite([*result.place, *result.box.ravel()]).all()
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("calibration", [None, SURE])
+@pytest.mark.parametrize("count", [0, 1])
+def test_almost_no_gaussians(rule, calibration, count):
+    field = replace(random_field(count), reading=Reading(calibration=calibration))
+    result = QueryEngine(Scene(random_gaussians(count), field), rule=rule).run("red mug")
+    assert not result.found
+    assert result.members.shape == (count,)
+    assert np.isfinite([*result.scores, *result.margins]).all()
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_no_meaning_anywhere(rule):
+    field = random_field(150, "linear")
+    field = replace(
+        field,
+        latents=np.zeros_like(field.latents),
+        confidence=np.zeros_like(field.confidence),
+        reading=Reading(calibration=SURE),
+    )
+    result = QueryEngine(Scene(random_gaussians(150), field), rule=rule).run("red mug")
+    assert (result.verdict, result.place, result.scores) == ("not here", None, (0, 0, 0))
+    assert result.probability < 1e-3
+
+
+def test_evened_relevancy_is_that_of_its_region():
+    gaussians, field = random_gaussians(300), random_field(300, "autoencoder")
+    gaussians.opacity_logits[:20] = -9  # faint: what is next to them, or if nothing is near, their own
+    gaussians.means[:5] += 500
+    engine = QueryEngine(Scene(gaussians, field))
+    relevancy = engine.relevancy(engine.text_vector("red mug"))
+    evened = engine.evened(relevancy)
+    assert evened.shape == (3, 300)
+    np.testing.assert_array_equal(evened[:, :5], relevancy[:, :5])
+    surface, regions = engine.surface, engine.regions
+    means = regions.means(relevancy, surface)
+    for level in range(3):
+        want = means[level][regions.of[level]]
+        np.testing.assert_array_equal(evened[level, surface.rows], want)
+        near = np.flatnonzero(surface.anchors >= 0)
+        np.testing.assert_array_equal(evened[level, near], want[surface.anchors[near]])
+        result = engine.run("red mug", LEVELS[level])
+        np.testing.assert_allclose(result.even, evened[level], atol=1e-6)

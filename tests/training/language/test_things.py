@@ -1,0 +1,216 @@
+"""Things from masks, against the rule written out with sets."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from langsplat_core.arrays import Array
+from langsplat_core.scene import LEVELS, NO_THING
+from langsplat_core.training.language import memberships as blocks
+from langsplat_core.training.language import things as module
+from langsplat_core.training.language.memberships import PAIR, Memberships
+from langsplat_core.training.language.things import SAME, find_things, masks_of_things
+
+WHOLE = len(LEVELS) - 1
+UNSEEN = -1
+
+
+def view(of_row, level: int = WHOLE, weights: Array | None = None) -> Array:
+    """Pairs of a view in which row i is all in mask `of_row[i]`, or unseen."""
+    of_row = np.asarray(of_row)
+    seen = np.flatnonzero(of_row != UNSEEN)
+    pairs = np.zeros(len(seen), PAIR)
+    pairs["row"], pairs["mask"], pairs["level"] = seen, of_row[seen], level
+    pairs["weight"] = 1 if weights is None else weights[seen]
+    return pairs
+
+
+def joined(*parts: Array) -> Array:
+    """What several maps say of one view, by rising row."""
+    pairs = np.concatenate(parts)
+    return pairs[np.argsort(pairs["row"], kind="stable")]
+
+
+def counts_of(views: Sequence[Array]) -> list[int]:
+    return [int(pairs["mask"].max()) + 1 if len(pairs) else 0 for pairs in views]
+
+
+def found(views: Sequence[Array], count: int) -> Array:
+    return find_things(Memberships(list(views), count), counts_of(views))
+
+
+def random_views(seed: int, count: int = 240, views: int = 8) -> list[Array]:
+    """Six things, each view with numbers of its own, holes, strays, and now and then two things in one."""
+    rng = np.random.default_rng(seed)
+    truth = np.sort(rng.integers(6, size=count))
+    made = []
+    for _ in range(views):
+        said = np.where(rng.uniform(size=count) < 0.03, rng.integers(6, size=count), truth)
+        if rng.uniform() < 0.3:
+            said = np.where(said == rng.integers(6), rng.integers(6), said)
+        said = rng.permutation(6)[said]
+        said[(truth == rng.integers(6)) | (rng.uniform(size=count) < 0.2)] = UNSEEN
+        rest = np.where(rng.uniform(size=count) < 0.1, rng.integers(6, size=count), UNSEEN)
+        parts = np.where(rng.uniform(size=count) < 0.5, 6 + rng.integers(3, size=count), UNSEEN)
+        weights = rng.uniform(0.1, 9, size=(3, count)).astype(np.float32)
+        rest[rest == said] = UNSEEN  # a row and a mask are a pair once
+        made.append(
+            joined(view(said, weights=weights[0]), view(rest, weights=weights[1]), view(parts, 1, weights[2]))
+        )
+    return made
+
+
+def plain_masks_of_things(views: Sequence[Array], level: int) -> list[int]:
+    """Sets of what masks claim, and links that are walked; masks of no thing are -1."""
+    claims: list[set[int]] = []
+    of_view: list[int] = []
+    for number, pairs in enumerate(views):
+        here = [pair for pair in pairs.tolist() if pair[2] == level]
+        total: dict[int, float] = {}
+        for row, _, _, weight in here:
+            total[row] = total.get(row, 0) + weight
+        for mask in range(counts_of(views)[number]):
+            claims.append({row for row, m, _, weight in here if m == mask and weight > total[row] / 2})
+            of_view.append(number)
+    seen = [
+        set().union(*(claim for claim, v in zip(claims, of_view, strict=True) if v == number))
+        for number in range(len(views))
+    ]
+    names = list(range(len(claims)))
+    for a, mine in enumerate(claims):
+        for b, other in enumerate(claims):
+            both = len(mine & other)
+            union = len(mine & seen[of_view[b]]) + len(other & seen[of_view[a]]) - both
+            if of_view[a] != of_view[b] and both > SAME * union:
+                old, new = names[a], names[b]
+                names = [new if name == old else name for name in names]
+    kept = sorted({name for name, claim in zip(names, claims, strict=True) if claim})
+    return [kept.index(n) if claim else -1 for n, claim in zip(names, claims, strict=True)]
+
+
+@pytest.mark.parametrize("level", [1, 2])
+@pytest.mark.parametrize("seed", range(4))
+def test_masks_go_together_by_the_plain_rule(seed, level):
+    views = random_views(seed)
+    got = masks_of_things(Memberships(views, 240), counts_of(views), level)
+    want = np.array(plain_masks_of_things(views, level))
+    assert ((got == -1) == (want == -1)).all()
+    pairs = len({*zip(got.tolist(), want.tolist(), strict=True)})
+    assert pairs == len({*got.tolist()}) == len({*want.tolist()})
+    assert sorted({*got.tolist()} - {-1}) == list(range(got.max() + 1))
+    if level == WHOLE:
+        assert 6 <= got.max() + 1 < sum(counts_of(views)) / 2  # many were merged, not all
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_gaussian_belongs_to_the_thing_that_it_paints_most(seed):
+    views = random_views(seed)
+    counts = counts_of(views)
+    things = found(views, 240)
+    numbers = np.array(plain_masks_of_things(views, WHOLE))
+    firsts = np.cumsum([0, *counts])
+    weights = np.zeros((240, numbers.max() + 1))
+    for first, pairs in zip(firsts, views, strict=False):
+        for row, mask, level, weight in pairs.tolist():
+            if level == WHOLE and numbers[first + mask] >= 0:
+                weights[row, numbers[first + mask]] += weight
+    want = np.where(weights.any(1), weights.argmax(1), -1)
+    assert ((things == NO_THING) == (want == -1)).all()
+    assert len({*zip(things.tolist(), want.tolist(), strict=True)}) == len({*want.tolist()})
+    sizes = np.bincount(things[things != NO_THING])
+    assert (np.diff(sizes) <= 0).all()  # from the largest
+    assert sizes.min() > 0
+    np.testing.assert_array_equal(found(views, 240), things)
+
+
+def test_masks_seen_in_several_views_are_one_thing_numbered_from_the_largest():
+    truth = np.repeat([0, 1, 2], [10, 30, 20])
+    views = [view(np.array(order)[truth]) for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0])]
+    things = found(views, 60)
+    assert things.dtype == np.uint16
+    assert things.tolist() == np.array([2, 0, 1])[truth].tolist()
+
+
+def test_views_that_never_meet_say_nothing_about_each_other():
+    rows = np.arange(40)
+    apart = [view(np.where(rows < 20, 0, UNSEEN)), view(np.where(rows >= 20, 0, UNSEEN))]
+    assert found(apart, 40).tolist() == [0] * 20 + [1] * 20
+    between = view(np.where((rows >= 10) & (rows < 30), 0, UNSEEN))
+    assert found([*apart, between], 40).tolist() == [0] * 40  # a view of both joins them
+
+
+def test_half_a_thing_in_the_corner_of_a_picture_is_that_thing():
+    """What the other view does not see counts on neither side."""
+    rows = np.arange(40)
+    cropped = view(np.where(rows < 6, 0, UNSEEN))
+    assert found([view(np.zeros(40, int)), cropped], 40).tolist() == [0] * 40
+
+
+@pytest.mark.parametrize("spilled", [2, 5])
+def test_touching_masks_do_not_merge_where_one_spills_over(spilled):
+    rows = np.arange(40)
+    exact, wide = view(rows // 20), view((rows >= 20 + spilled).astype(int))
+    things = found([exact, exact.copy(), wide], 40)
+    assert len(np.unique(things)) == 2
+    np.testing.assert_array_equal(things == things[0], rows < 20)
+
+
+def test_a_mask_over_two_things_merges_neither():
+    rows = np.arange(40)
+    both = view(np.zeros(40, int))
+    things = found([view(rows // 20), view(1 - rows // 20), both], 40)
+    np.testing.assert_array_equal(things == things[0], rows < 20)
+    assert NO_THING not in things
+
+
+def test_masks_of_other_levels_show_no_thing():
+    rows = np.arange(20)
+    views = [joined(view(np.where(rows < 10, 0, UNSEEN)), view(np.full(20, 1), level=1))] * 2
+    assert masks_of_things(Memberships(views, 20), [2, 2], WHOLE).tolist() == [0, -1, 0, -1]
+    assert masks_of_things(Memberships(views, 20), [2, 2], 1).tolist() == [-1, 0, -1, 0]
+    assert masks_of_things(Memberships(views, 20), [2, 2], 0).tolist() == [-1] * 4
+    assert found(views, 20).tolist() == [0] * 10 + [NO_THING] * 10
+
+
+def test_a_gaussian_that_two_masks_share_evenly_is_claimed_by_neither():
+    even = joined(view([0, 0, 0]), view([1, UNSEEN, UNSEEN]))
+    assert plain_masks_of_things([even], WHOLE) == [0, -1]
+    assert masks_of_things(Memberships([even], 3), [2], WHOLE).tolist() == [0, -1]
+    assert found([even], 3).tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("sample", [60, 200])
+def test_a_sample_is_enough_to_tell_things_apart(monkeypatch, sample):
+    truth = np.repeat([0, 1, 2], [300, 100, 200])
+    views = [view(np.array(order)[truth]) for order in ([0, 1, 2], [2, 0, 1])]
+    whole = found(views, 600)
+    monkeypatch.setattr(module, "SAMPLE", sample)
+    np.testing.assert_array_equal(found(views, 600), whole)
+    np.testing.assert_array_equal(found(views, 600), found(views, 600))
+
+
+def test_a_mask_that_the_sample_misses_shows_no_thing(monkeypatch):
+    of_row = np.zeros(200, int)
+    of_row[7] = 1
+    assert found([view(of_row)], 200)[7] == 1
+    missed = [s for s in range(1, 200) if 7 not in np.random.default_rng(0).permutation(200)[:s]]
+    monkeypatch.setattr(module, "SAMPLE", missed[-1])
+    assert found([view(of_row)], 200)[7] == NO_THING
+
+
+def test_blocks_change_nothing(monkeypatch):
+    views = random_views(5)
+    whole = found(views, 240)
+    monkeypatch.setattr(blocks, "BLOCK", 37)
+    np.testing.assert_array_equal(found(views, 240), whole)
+
+
+def test_views_without_masks():
+    empty = np.zeros(0, PAIR)
+    full = view(np.zeros(12, int))
+    assert found([empty, full, empty, full, empty], 12).tolist() == [0] * 12
+    for views in ([empty], [empty, empty]):
+        assert found(views, 5).tolist() == [NO_THING] * 5
+    assert find_things(Memberships([empty], 5), [3]).tolist() == [NO_THING] * 5  # masks that hide behind
+    assert found([empty], 0).shape == (0,)

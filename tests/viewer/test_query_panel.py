@@ -1,0 +1,87 @@
+"""What the search panel says of an answer, written down instead of drawn."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from langsplat_core.scene import Calibration, Reading
+from langsplat_viewer import actions
+from langsplat_viewer.panels import query as panel
+from langsplat_viewer.viewer import Viewer
+from tests.support.fakes import blob_scene, language
+from tests.support.windowless import SCENES, settle
+
+
+class Paper:
+    """Takes the place of imgui: notes every text; nothing is clicked, and the mouse is everywhere."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+        spacing = SimpleNamespace(x=4.0, y=4.0)
+        self.values = {
+            "calc_text_size": spacing,
+            "get_content_region_avail": spacing,
+            "get_style": SimpleNamespace(frame_padding=spacing, item_spacing=spacing),
+            "get_frame_height": 10.0,
+            "get_cursor_pos_x": 0.0,
+            "input_text_with_hint": (False, ""),
+            "is_item_hovered": True,
+        }
+
+    def __getattr__(self, name: str):
+        if name.endswith("_"):  # a set of flags
+            return SimpleNamespace(enter_returns_true=0, no_tooltip=0)
+
+        def call(*args: object) -> object:
+            if name in ("text", "text_colored", "set_tooltip"):
+                self.said.append(str(args[-1]))
+            return self.values.get(name, False)
+
+        return call
+
+
+@pytest.fixture
+def paper(monkeypatch) -> Iterator[Paper]:
+    made = Paper()
+    monkeypatch.setattr(panel, "imgui", made)
+    monkeypatch.setattr(panel, "hello_imgui", made)
+    monkeypatch.setattr(panel, "small_wrapped", lambda text, colour: made.said.append(text))
+    return made
+
+
+def searched(viewer: Viewer, phrase: str, calibration: Calibration | None = None) -> Viewer:
+    field = replace(language(), reading=Reading(calibration=calibration))
+    SCENES["asked.ply"] = replace(blob_scene(), language=field)
+    try:
+        actions.open_scene(viewer, Path("asked.ply"))
+        settle(viewer)
+    finally:
+        del SCENES["asked.ply"]
+    actions.ask(viewer, phrase)
+    settle(viewer)
+    return viewer
+
+
+@pytest.mark.parametrize(
+    ("constant", "verdict", "percent"),
+    [(1.0, "found", "100 %"), (-7.0, "weak match", "73 %"), (-11.0, "not here", "5 %")],
+)
+def test_the_verdict_and_how_likely_it_is(viewer, paper, constant, verdict, percent):
+    panel.draw(searched(viewer, "mug", Calibration(constant, whole=8.0, finer=0.01)))
+    assert [text for text in paper.said if text in ("found", "weak match", "not here")] == [verdict]
+    assert f"{percent} likely to be there" in paper.said
+
+
+def test_without_a_calibration_nothing_is_said_to_be_likely(viewer, paper):
+    panel.draw(searched(viewer, "mug"))
+    assert "found" in paper.said
+    assert not any("likely" in text for text in paper.said)
+    assert not any("read as" in text for text in paper.said)
+
+
+def test_structure_is_said_as_it_was_read(viewer, paper):
+    panel.draw(searched(viewer, "mug or book"))
+    assert "read as: mug  or  book" in paper.said
