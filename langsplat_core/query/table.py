@@ -5,11 +5,13 @@ once per scene at the nodes of an octahedral grid; after that a phrase costs one
 and every Gaussian looks its value up by bilinear interpolation at a place computed once.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.compiled import kernel, plain, shared_workers
 from langsplat_core.scene import Codec, Reading
 from langsplat_core.scene.codec import meaningful
 from langsplat_core.semantics.relevancy import from_cosines
@@ -41,19 +43,20 @@ class SphereTable:
 
     vectors: Array  # (R * R, D) float32 decoded unit vectors
     nearest_canonical: Array  # (R * R,) largest cosine with a canonical phrase
-    corner: Array  # (M,) int64 index of the lower left node; -1 for a latent without meaning
+    corner: Array  # (M,) int32 index of the lower left node; -1 for a latent without meaning
     fraction: Array  # (M, 2) float32 position inside the cell, in [0, 1]
     resolution: int
     temperature: float
 
-    def relevancy(self, phrase: Array) -> Array:
-        """(D,) unit phrase vector -> (M,) float32 relevancy; 0 where the latent has no meaning."""
-        nodes = from_cosines(self.vectors @ phrase, self.nearest_canonical, self.temperature)
-        corner = np.maximum(self.corner, 0)
-        u, v = self.fraction.T
-        low = nodes[corner] * (1 - u) + nodes[corner + 1] * u
-        high = nodes[corner + self.resolution] * (1 - u) + nodes[corner + self.resolution + 1] * u
-        return np.where(self.corner >= 0, low * (1 - v) + high * v, 0).astype(np.float32)
+    def relevancies(self, phrases: Array) -> Iterator[Array]:
+        """(Q, D) unit phrase vectors -> of each in turn (M,) float32 relevancy; 0 where the latent has no
+        meaning."""
+        nodes = from_cosines(self.vectors @ phrases.T, self.nearest_canonical[:, None], self.temperature).T
+        for row in nodes:
+            found = np.empty(len(self.corner), np.float32)
+            arguments = plain(row), self.corner, self.fraction, self.resolution, found
+            shared_workers().run(_interpolate, len(found), *arguments)
+            yield found
 
 
 def suits_table(codec: Codec) -> bool:
@@ -82,8 +85,24 @@ def build_table(
     return SphereTable(
         vectors=vectors,
         nearest_canonical=(vectors @ canonical.T).max(1),
-        corner=np.where(known, cell[:, 1] * resolution + cell[:, 0], -1),
+        corner=np.where(known, cell[:, 1] * resolution + cell[:, 0], -1).astype(np.int32),
         fraction=(position - cell).astype(np.float32),
         resolution=resolution,
         temperature=temperature,
     )
+
+
+@kernel
+def _interpolate(
+    first: int, last: int, nodes: Array, corner: Array, fraction: Array, resolution: int, found: Array
+) -> None:
+    """Rows [first, last) of `found` (M,), bilinear."""
+    one = np.float32(1)
+    for i in range(first, last):
+        node, u, v = corner[i], fraction[i, 0], fraction[i, 1]
+        if node < 0:
+            found[i] = 0
+            continue
+        low = nodes[node] * (one - u) + nodes[node + 1] * u
+        high = nodes[node + resolution] * (one - u) + nodes[node + resolution + 1] * u
+        found[i] = low * (one - v) + high * v

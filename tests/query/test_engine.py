@@ -75,7 +75,7 @@ def test_table_agrees_with_exact_decoding_and_improves_with_resolution():
     errors = {}
     for resolution in (48, 192):
         table = build_table(codec, latents, canonical, resolution=resolution)
-        got = np.stack([table.relevancy(phrase) for phrase in phrases], 1)
+        got = np.stack(list(table.relevancies(phrases)), 1)
         errors[resolution] = np.abs(got - exact)
     assert errors[192].mean() < 3e-4
     assert errors[192].max() < 0.02  # at creases of the ReLU decoder
