@@ -82,6 +82,21 @@ def test_table_agrees_with_exact_decoding_and_improves_with_resolution():
     assert errors[192].mean() < errors[48].mean() / 6  # bilinear: second order where smooth
 
 
+def test_a_table_decodes_only_what_latents_lie_between():
+    rng = np.random.default_rng(8)
+    codec, canonical = random_codec(rng), unit(rng.normal(size=(4, D)))
+    latents = np.repeat(unit(rng.normal(size=(5, 3))), 40, axis=0).astype(np.float32)
+    latents[:40] = 0  # no meaning
+    table = build_table(codec, latents, canonical, resolution=64)
+    assert len(table.used) == len(table.vectors) <= 4 * 4
+    phrases = unit(rng.normal(size=(2, D)))
+    got = np.stack(list(table.relevancies(phrases)), 1)
+    np.testing.assert_allclose(got, latent_relevancy(codec, latents, phrases, canonical), atol=0.02)
+    assert (got[:40] == 0).all()
+    nothing = build_table(codec, np.zeros((7, 3), np.float32), canonical)
+    assert (next(nothing.relevancies(phrases)) == 0).all()
+
+
 def test_a_table_needs_a_sphere():
     rng = np.random.default_rng(7)
     canonical = unit(rng.normal(size=(4, D))).astype(np.float32)
