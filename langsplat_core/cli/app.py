@@ -10,6 +10,7 @@ from langsplat_core.cli.bench_lift import BenchLift
 from langsplat_core.cli.bench_load import BenchLoad
 from langsplat_core.cli.bench_memory import BenchMemory
 from langsplat_core.cli.bench_phrases import BenchPhrases
+from langsplat_core.cli.bench_query import BenchQuery
 from langsplat_core.cli.bench_steps import BenchSteps
 from langsplat_core.cli.bench_verdict import BenchVerdict
 from langsplat_core.cli.bench_words import BenchWords
@@ -46,6 +47,7 @@ def parse(args: list[str]) -> Command:
     bench.command(name="load")(BenchLoad)
     bench.command(name="memory")(BenchMemory)
     bench.command(name="phrases")(BenchPhrases)
+    bench.command(name="query")(BenchQuery)
     bench.command(name="steps")(BenchSteps)
     bench.command(name="verdict")(BenchVerdict)
     bench.command(name="words")(BenchWords)

@@ -52,7 +52,7 @@ def language_change(
         return None
     load = None if load_encoder is None else cache(load_encoder)  # once for both
     engines = [QueryEngine(scene, load) for scene in scenes]
-    results = [tuple(engine.run(phrase) for phrase in phrases) for engine in engines]
+    results = [tuple(engine.run_many(phrases)) for engine in engines]
     channels = [
         _channels(scene.language, found)
         for scene, found in zip((before, after), results, strict=True)

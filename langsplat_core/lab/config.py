@@ -149,3 +149,21 @@ class KernelStepsConfig:
     """Width and height of the picture, pixels."""
     channels: int = 12
     """Values per Gaussian."""
+
+
+@dataclass(frozen=True)
+class QueryBenchConfig:
+    """How phrases are asked of one scene, every way (`langsplat bench query`)."""
+
+    size: tuple[int, int] = (1440, 1080)
+    """Width and height of the picture, pixels; that of the paper's figures."""
+    count: int = 0
+    """Gaussians; the scene's are repeated, each beside itself, until there are so many. 0: as they are."""
+    phrases: int = 8
+    """That errors are averaged and times taken over; the paper's order is timed with one."""
+    together: int = 100
+    """Phrases that are asked at once, and one by one."""
+    repeats: int = 5
+    """Of every timing of a view and a picture, of which the median is taken."""
+    codec_steps: int = 3_000
+    """Of the training of the autoencoder that stands beside the codebook."""

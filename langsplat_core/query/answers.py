@@ -59,12 +59,14 @@ def by_regions(
     phrase: str, relevancy: Array, surface: Surface, regions: Regions, reading: Reading, level: LevelChoice
 ) -> QueryResult:
     """Whole regions, cut at a share of the best one's margin (`extent`)."""
-    extent = find_extent(relevancy, surface, regions, reading.temperature, level)
-    even = surface.spread(extent.even, relevancy[extent.level])
-    peak = extent.peaks[extent.level]
+    extent = find_extent(relevancy, regions, reading.temperature, level)
+    even, peak = (
+        regions.spread(extent.level, extent.even, relevancy[extent.level]),
+        extent.peaks[extent.level],
+    )
     lowest = float(extent.even[extent.inside].min(initial=1.0))
     solid = np.where(extent.even > np.float32(peak), 0, extent.even)  # what is above the best is a crumb
-    place = locate(surface, solid, np.nextafter(np.float32(lowest), np.float32(0)))
+    place = locate(surface, solid[regions.of[extent.level]], np.nextafter(np.float32(lowest), np.float32(0)))
     return QueryResult(
         phrase=phrase,
         level=extent.level,
@@ -75,7 +77,7 @@ def by_regions(
         margins=extent.margins,
         probability=_probability(extent.margins, reading),
         found=_found(extent.margins, reading, level),
-        members=surface.spread(extent.inside, np.zeros(relevancy.shape[1], bool)),
+        members=regions.spread(extent.level, extent.inside, np.zeros(relevancy.shape[1], bool)),
         place=None if place is None else place.position,
         box=None if place is None else place.box,
     )

@@ -1,12 +1,13 @@
 """Answering phrases on a scene: encode, look up, read (`answers`)."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.compiled import plain
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
@@ -18,7 +19,7 @@ from langsplat_core.query.surface import Surface, build_surface
 from langsplat_core.scene import CANONICAL_PHRASES, LanguageField, Scene
 from langsplat_core.scene.phrases import phrase_key, tidy
 
-BATCH = 256  # phrases of a vocabulary that are encoded at a time
+BATCH = 256  # phrases that are encoded, and compared with codewords, at a time
 SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them
 NO_FIELD = "this scene has no language field: it can be looked at, not searched; `langsplat train` makes one"
 
@@ -114,19 +115,23 @@ class QueryEngine:
         Raises InputError for an empty phrase, and EncoderError for unknown words, an encoder that is not the
         scene's, or one that cannot be loaded.
         """
-        key = phrase_key(phrase)
-        if not key:
+        found: Array = self.text_vectors([phrase], progress)[0]
+        return found
+
+    def text_vectors(self, phrases: Sequence[str], progress: Progress = silent) -> Array:
+        """(Q, D) unit vectors of phrases, encoded together. Raises as `text_vector`."""
+        book, keys = self.field.phrasebook, [phrase_key(phrase) for phrase in phrases]
+        if not all(keys):
             raise InputError("the query is empty; type a word such as 'cup'")
-        if key in self.field.phrasebook:
-            return self.field.phrasebook[key]
-        encoder = self.load_encoder(progress)
-        unknown = encoder.unknown_words(key)
-        if unknown:
-            raise EncoderError(
-                f"the encoder does not know {', '.join(repr(word) for word in unknown)}; "
-                "use other words, or a scene made with OpenCLIP weights"
-            )
-        return self._encode(encoder, [key])[0]
+        fresh = [key for key in dict.fromkeys(keys) if key not in book]
+        known = dict(book)
+        if fresh:
+            encoder = self.load_encoder(progress)
+            _check_words(encoder, fresh)
+            for start in range(0, len(fresh), BATCH):
+                batch = fresh[start : start + BATCH]
+                known.update(zip(batch, self._encode(encoder, batch), strict=True))
+        return np.stack([known[key] for key in keys])
 
     def known_vectors(
         self, phrases: Iterable[str], progress: Progress = silent
@@ -175,7 +180,11 @@ class QueryEngine:
 
     def relevancy(self, vector: Array) -> Array:
         """(D,) unit text vector -> (3, N) float32 relevancy per level and Gaussian."""
-        return self._lookup.relevancy(vector).reshape(self.field.confidence.shape)
+        return next(self._relevancies(vector[None]))
+
+    def _relevancies(self, vectors: Array) -> Iterator[Array]:
+        for values in self._lookup.relevancies(vectors):
+            yield values.reshape(self.field.confidence.shape)
 
     def run(
         self,
@@ -190,18 +199,44 @@ class QueryEngine:
         if vector is None:
             vector = self.text_vector(phrase, progress)
         progress(f"searching '{tidy(phrase)}'", 0.5)
-        relevancy, reading = self.relevancy(vector), self.field.reading
+        return self._answer(tidy(phrase), self.relevancy(vector), level)
+
+    def run_many(
+        self, phrases: Sequence[str], level: LevelChoice = "auto", progress: Progress = silent
+    ) -> list[QueryResult]:
+        """What `run` answers to each of `phrases`, which are encoded and compared with the scene's meanings
+        together. An answer keeps 17 bytes per Gaussian. Raises as `text_vector` does, before any is asked."""
+        results: list[QueryResult] = []
+        vectors = self.text_vectors(phrases, progress) if phrases else np.zeros((0, 0))
+        for start in range(0, len(phrases), BATCH):
+            part = slice(start, start + BATCH)
+            for phrase, relevancy in zip(phrases[part], self._relevancies(vectors[part]), strict=True):
+                progress(f"searching '{tidy(phrase)}'", len(results) / len(phrases))
+                results.append(self._answer(tidy(phrase), relevancy, level))
+        return results
+
+    def _answer(self, phrase: str, relevancy: Array, level: LevelChoice) -> QueryResult:
+        reading = self.field.reading
         if self.rule == "peak":
-            return by_peak(tidy(phrase), relevancy, self.surface, reading, level)
-        return by_regions(tidy(phrase), relevancy, self.surface, self.regions, reading, level)
+            return by_peak(phrase, relevancy, self.surface, reading, level)
+        return by_regions(phrase, relevancy, self.surface, self.regions, reading, level)
 
     def evened(self, relevancy: Array) -> Array:
         """(3, N) relevancy -> the same, of every region its mean; of what is off the surface its own."""
-        means = self.regions.means(relevancy, self.surface)
-        rows = [values[of] for values, of in zip(means, self.regions.of, strict=True)]
-        return np.stack([self.surface.spread(*pair) for pair in zip(rows, relevancy, strict=True)])
+        regions, own = self.regions, plain(relevancy)
+        means = [values.astype(np.float32) for values in regions.means(own)]
+        return np.stack([regions.spread(level, row, own[level]) for level, row in enumerate(means)])
 
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
         """The things among the members of an answer, best first, or only so many of them."""
         relevancy = result.relevancy[result.level]
         return find_instances(self.surface, self.scene.gaussians, result.members, relevancy, at_most)
+
+
+def _check_words(encoder: TextEncoder, keys: Iterable[str]) -> None:
+    unknown = [word for key in keys for word in encoder.unknown_words(key)]
+    if unknown:
+        raise EncoderError(
+            f"the encoder does not know {', '.join(repr(word) for word in dict.fromkeys(unknown))}; "
+            "use other words, or a scene made with OpenCLIP weights"
+        )

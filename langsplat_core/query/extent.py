@@ -12,7 +12,6 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.regions import SMALLEST, Regions
-from langsplat_core.query.surface import Surface
 from langsplat_core.scene import LEVELS
 
 COARSER = 0.06  # of margin that a coarser level may be worse by and still be taken: things are asked for most
@@ -23,31 +22,29 @@ NARROWEST = 1e-6  # distance of a relevancy from 0 and 1, so that its margin is 
 
 @dataclass(frozen=True, eq=False)
 class Extent:
-    """What of a surface answers a phrase."""
+    """What of a surface answers a phrase: some of the R regions of a level."""
 
     level: int  # index into LEVELS
     margins: tuple[float, float, float]  # of the best region of each level
     peaks: tuple[float, float, float]  # relevancy of the best region of each level
-    even: Array  # (M,) float32 relevancy at the level, the same all over a region
-    inside: Array  # (M,) bool
+    even: Array  # (R,) float32 relevancy, the same all over a region
+    inside: Array  # (R,) bool
 
 
 def find_extent(
-    relevancy: Array, surface: Surface, regions: Regions, temperature: float, level: LevelChoice = "auto"
+    relevancy: Array, regions: Regions, temperature: float, level: LevelChoice = "auto"
 ) -> Extent:
     """From the (3, N) relevancy of a phrase. level: "auto", or the one that is wanted."""
-    means = regions.means(relevancy, surface)
+    means = regions.means(relevancy)
     peaks = [_best(values, sizes) for values, sizes in zip(means, regions.sizes, strict=True)]
     best = to_margin(np.array(peaks), temperature)
     chosen = _level(best) if level == "auto" else LEVELS.index(level)
-    inside = to_margin(means[chosen], temperature) > cut(float(best[chosen]), SHARES[chosen])
-    of = regions.of[chosen]
     return Extent(
         level=chosen,
         margins=(float(best[0]), float(best[1]), float(best[2])),
         peaks=(peaks[0], peaks[1], peaks[2]),
-        even=means[chosen].astype(np.float32)[of],
-        inside=inside[of],
+        even=means[chosen].astype(np.float32),
+        inside=to_margin(means[chosen], temperature) > cut(float(best[chosen]), SHARES[chosen]),
     )
 
 

@@ -4,6 +4,7 @@ A codebook gives an exact answer for a fetch; a sphere of three numbers has a ta
 compared latent by latent.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -11,16 +12,20 @@ from typing import Protocol
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.compiled import kernel, plain, shared_workers
 from langsplat_core.query.table import build_table, suits_table
 from langsplat_core.scene import LanguageField
 from langsplat_core.semantics.relevancy import CHUNK, from_cosines, latent_relevancy
+
+TOGETHER = 16  # phrases compared with every latent at a time: 12 bytes each per Gaussian
 
 
 class Lookup(Protocol):
     """Everything about a language field that does not depend on the phrase."""
 
-    def relevancy(self, phrase: Array) -> Array:
-        """(D,) unit phrase vector -> (3 N,) float32 relevancy; 0 where a Gaussian has no meaning."""
+    def relevancies(self, phrases: Array) -> Iterator[Array]:
+        """(Q, D) unit phrase vectors -> of each in turn (3 N,) float32 relevancy; 0 where a Gaussian has no
+        meaning. What can be computed for all phrases together is."""
 
 
 def build_lookup(field: LanguageField, exact: bool = False) -> Lookup:
@@ -50,11 +55,13 @@ class CodeLookup:
         self._nearest = (self._vectors @ field.canonical.T).max(1)
         self._codes = np.where(field.known, field.latents[..., 0], count).astype(np.uint16).reshape(-1)
 
-    def relevancy(self, phrase: Array) -> Array:
+    def relevancies(self, phrases: Array) -> Iterator[Array]:
         """See `Lookup`."""
-        values = from_cosines(self._vectors @ phrase, self._nearest, self._temperature)
-        found: Array = np.append(values, 0).astype(np.float32)[self._codes]
-        return found
+        values = from_cosines(self._vectors @ phrases.T, self._nearest[:, None], self._temperature)
+        for row in values.T:
+            found = np.empty(len(self._codes), np.float32)
+            shared_workers().run(_fetch, len(found), plain(np.append(row, 0)), self._codes, found)
+            yield found
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +70,14 @@ class LatentLookup:
 
     field: LanguageField
 
-    def relevancy(self, phrase: Array) -> Array:
+    def relevancies(self, phrases: Array) -> Iterator[Array]:
         """See `Lookup`."""
         field = self.field
         latents, temperature = known_latents(field), field.reading.temperature
-        return latent_relevancy(field.codec, latents, phrase[None], field.canonical, temperature)[:, 0]
+        for start in range(0, len(phrases), TOGETHER):
+            some = phrases[start : start + TOGETHER]
+            values = latent_relevancy(field.codec, latents, some, field.canonical, temperature)
+            yield from np.ascontiguousarray(values.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +101,17 @@ class DecodedLookup:
             nearest[part] = (vectors[part] @ field.canonical.T).max(1)
         return rows, vectors, nearest
 
-    def relevancy(self, phrase: Array) -> Array:
+    def relevancies(self, phrases: Array) -> Iterator[Array]:
         """See `Lookup`."""
         rows, vectors, nearest = self._decoded
-        values = np.zeros(self.field.confidence.size, np.float32)
-        values[rows] = from_cosines(vectors @ phrase, nearest, self.field.reading.temperature)
-        return values
+        for phrase in phrases:
+            values = np.zeros(self.field.confidence.size, np.float32)
+            values[rows] = from_cosines(vectors @ phrase, nearest, self.field.reading.temperature)
+            yield values
+
+
+@kernel
+def _fetch(first: int, last: int, values: Array, codes: Array, found: Array) -> None:
+    """Rows [first, last) of `found` (3 N,)."""
+    for i in range(first, last):
+        found[i] = values[codes[i]]

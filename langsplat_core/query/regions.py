@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.compiled import kernel
+from langsplat_core.compiled import kernel, plain, shared_workers
 from langsplat_core.query.surface import Surface
 from langsplat_core.scene import LEVELS, NO_THING, LanguageField
 
@@ -22,23 +22,39 @@ SMALLEST = 10  # Gaussians; smaller patches join the neighbour that means the mo
 BORDER = 0.3  # added to the step between two things, in 1 - cosine
 UNKNOWN = 2.0  # step between a Gaussian with a meaning and one without: as much as between opposites
 CHUNK = 65_536  # links whose ends are compared at a time
+PIECES = 4  # that a level is summed in, so that more than three cores have work
 STEPS = 65_535 / (UNKNOWN + BORDER)  # of 1 - cosine that are told apart: 16 bits sort in linear time
 
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Regions of the M Gaussians of a surface."""
+    """Regions of the M Gaussians of a surface, and of the N of its scene."""
 
     of: Array  # (3, M) int32 number of the region at each level, from 0
     sizes: tuple[Array, Array, Array]  # (R,) Gaussians in each region of a level
+    everywhere: Array  # (3, N) int32 the same of all Gaussians, faint ones with the nearest; -1: none is near
+    weights: Array  # (N,) float32 opacity of the surface's Gaussians, 0 for all others
+    totals: tuple[Array, Array, Array]  # (R,) float64 sums of these weights
 
-    def means(self, values: Array, surface: Surface) -> tuple[Array, Array, Array]:
-        """(3, N) values of all Gaussians -> of every level the (R,) float64 opacity-weighted means."""
-        made = []
-        for of, row, size in zip(self.of, values, self.sizes, strict=True):
-            total = np.bincount(of, surface.weights, len(size))
-            made.append(np.bincount(of, surface.weights * row[surface.rows], len(size)) / total)
+    def means(self, values: Array) -> tuple[Array, Array, Array]:
+        """(3, N) values of all Gaussians -> of every level the (R,) float64 opacity-weighted means.
+
+        In the order of the Gaussians and not of the surface: memory is read from front to back.
+        """
+        longest = max(len(total) for total in self.totals)
+        sums = np.zeros((len(LEVELS) * PIECES, longest))
+        workers = shared_workers()
+        workers.run(_sum_pieces, len(sums), plain(values), self.everywhere, self.weights, sums)
+        levels = sums.reshape(len(LEVELS), PIECES, longest).sum(1)
+        made = [row[: len(total)] / total for row, total in zip(levels, self.totals, strict=True)]
         return made[0], made[1], made[2]
+
+    def spread(self, level: int, values: Array, others: Array) -> Array:
+        """(R,) values of a level's regions -> (N,) of all Gaussians: of a faint one what is next to it, and
+        where nothing is, its own of `others` (N,) of the same type."""
+        spread = np.empty_like(others)
+        shared_workers().run(_spread, len(others), self.everywhere[level], values, others, spread)
+        return spread
 
 
 def build_regions(surface: Surface, field: LanguageField) -> Regions:
@@ -46,7 +62,7 @@ def build_regions(surface: Surface, field: LanguageField) -> Regions:
     links = surface.links.tocoo()
     once = links.row < links.col
     ends = links.row[once].astype(np.int32), links.col[once].astype(np.int32)
-    of, sizes = [], []
+    of = []
     for level in range(len(LEVELS)):
         steps = _steps(field, level, surface.rows, ends)
         if level == len(LEVELS) - 1 and field.things is not None:
@@ -54,10 +70,20 @@ def build_regions(surface: Surface, field: LanguageField) -> Regions:
         ranks = np.round(steps * STEPS).astype(np.uint16)
         order = np.argsort(ranks, kind="stable").astype(np.int32)
         roots = _merge(len(surface.rows), *ends, steps.astype(np.float32), order, SCALE, SMALLEST)
-        _, numbers, count = np.unique(roots, return_inverse=True, return_counts=True)
-        of.append(numbers.astype(np.int32).reshape(-1))
-        sizes.append(count)
-    return Regions(np.stack(of), (sizes[0], sizes[1], sizes[2]))
+        of.append(np.unique(roots, return_inverse=True)[1].astype(np.int32).reshape(-1))
+    return regions_from(surface, np.stack(of))
+
+
+def regions_from(surface: Surface, of: Array) -> Regions:
+    """From the (3, M) int32 number of each Gaussian's region at each level, counted from 0."""
+    everywhere = np.full((len(LEVELS), len(surface.anchors)), -1, np.int32)
+    near = surface.anchors >= 0
+    everywhere[:, near] = of[:, surface.anchors[near]]
+    weights = np.zeros(len(surface.anchors), np.float32)
+    weights[surface.rows] = surface.weights
+    sizes = [np.bincount(row) for row in of]
+    totals = [np.bincount(row, surface.weights) for row in of]
+    return Regions(of, (sizes[0], sizes[1], sizes[2]), everywhere, weights, (totals[0], totals[1], totals[2]))
 
 
 def _steps(field: LanguageField, level: int, rows: Array, ends: tuple[Array, Array]) -> Array:
@@ -119,3 +145,22 @@ def _merge(
             root = parent[root]
         parent[item] = root
     return parent
+
+
+@kernel
+def _sum_pieces(first: int, last: int, values: Array, everywhere: Array, weights: Array, sums: Array) -> None:
+    """Rows [first, last) of `sums` (3 P, R): of a level's P pieces the weighted sums over its regions."""
+    count, pieces = len(weights), len(sums) // len(values)
+    for row in range(first, last):
+        level, piece = row // pieces, row % pieces
+        for i in range(count * piece // pieces, count * (piece + 1) // pieces):
+            if weights[i] > 0:
+                sums[row, everywhere[level, i]] += np.float64(weights[i]) * values[level, i]
+
+
+@kernel
+def _spread(first: int, last: int, of: Array, values: Array, others: Array, spread: Array) -> None:
+    """Rows [first, last) of `spread` (N,)."""
+    for i in range(first, last):
+        region = of[i]
+        spread[i] = values[region] if region >= 0 else others[i]

@@ -40,14 +40,6 @@ class Surface:
         workers.run(_smooth, count, packed, self.neighbours, smoothed)
         return smoothed
 
-    def spread(self, values: Array, others: Array) -> Array:
-        """(M,) values of the surface -> (N,) of all Gaussians: of a faint one what is next to it, and where
-        nothing is, its own of `others` (N,)."""
-        near = self.anchors >= 0
-        spread = others.astype(values.dtype)
-        spread[near] = values[self.anchors[near]]
-        return spread
-
     def connected(self, inside: Array, seed: int) -> Array:
         """(M,) bool, and a member of it -> numbers of all that are linked to that member through members."""
         reached = np.empty(int(inside.sum()), np.int32)

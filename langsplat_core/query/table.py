@@ -1,20 +1,23 @@
 """A phrase as a small table: relevancy over the sphere of latents.
 
 With d = 3 and unit latents, the relevancy of one phrase is a function on the sphere. The decoder is run
-once per scene at the nodes of an octahedral grid; after that a phrase costs one matrix-vector product,
-and every Gaussian looks its value up by bilinear interpolation at a place computed once.
+once per scene at the nodes of an octahedral grid that its latents lie between; after that a phrase costs one
+matrix-vector product, and every Gaussian looks its value up by bilinear interpolation at a place computed
+once.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.compiled import kernel, shared_workers
 from langsplat_core.scene import Codec, Reading
 from langsplat_core.scene.codec import meaningful
 from langsplat_core.semantics.relevancy import from_cosines
 
-RESOLUTION = 192  # nodes per side; error against exact decoding falls with its square
+RESOLUTION = 256  # nodes per side; error against exact decoding falls with its square
 
 
 def octahedral_to_sphere(uv: Array) -> Array:
@@ -37,23 +40,27 @@ def sphere_to_octahedral(vectors: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SphereTable:
-    """Decoded vectors at the nodes, and where each of M latents lies between them."""
+    """Decoded vectors at the U nodes of R x R that are needed, and where M latents lie between them."""
 
-    vectors: Array  # (R * R, D) float32 decoded unit vectors
-    nearest_canonical: Array  # (R * R,) largest cosine with a canonical phrase
-    corner: Array  # (M,) int64 index of the lower left node; -1 for a latent without meaning
+    used: Array  # (U,) int64 index of each node in the grid, row-major
+    vectors: Array  # (U, D) float32 decoded unit vectors
+    nearest_canonical: Array  # (U,) largest cosine with a canonical phrase
+    corner: Array  # (M,) int32 index of the lower left node; -1 for a latent without meaning
     fraction: Array  # (M, 2) float32 position inside the cell, in [0, 1]
     resolution: int
     temperature: float
 
-    def relevancy(self, phrase: Array) -> Array:
-        """(D,) unit phrase vector -> (M,) float32 relevancy; 0 where the latent has no meaning."""
-        nodes = from_cosines(self.vectors @ phrase, self.nearest_canonical, self.temperature)
-        corner = np.maximum(self.corner, 0)
-        u, v = self.fraction.T
-        low = nodes[corner] * (1 - u) + nodes[corner + 1] * u
-        high = nodes[corner + self.resolution] * (1 - u) + nodes[corner + self.resolution + 1] * u
-        return np.where(self.corner >= 0, low * (1 - v) + high * v, 0).astype(np.float32)
+    def relevancies(self, phrases: Array) -> Iterator[Array]:
+        """(Q, D) unit phrase vectors -> of each in turn (M,) float32 relevancy; 0 where the latent has no
+        meaning."""
+        values = from_cosines(self.vectors @ phrases.T, self.nearest_canonical[:, None], self.temperature)
+        nodes = np.zeros(self.resolution**2, np.float32)
+        for row in values.T:
+            nodes[self.used] = row
+            found = np.empty(len(self.corner), np.float32)
+            arguments = nodes, self.corner, self.fraction, self.resolution, found
+            shared_workers().run(_interpolate, len(found), *arguments)
+            yield found
 
 
 def suits_table(codec: Codec) -> bool:
@@ -71,19 +78,39 @@ def build_table(
     """Tabulate `codec` for (M, 3) latents; those of no length have no meaning."""
     if not suits_table(codec):
         raise ValueError(f"a sphere table needs unit latents of 3 numbers; {codec.kind} has others")
-    axis = np.linspace(0, 1, resolution)
-    grid = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)  # row-major: first coordinate fastest
-    vectors = codec.decode(octahedral_to_sphere(grid).astype(np.float32))
-
     known = meaningful(codec, latents)
     safe = np.where(known[:, None], latents, (0.0, 0.0, 1.0)).astype(np.float64)
     position = sphere_to_octahedral(safe) * (resolution - 1)
     cell = np.clip(np.floor(position), 0, resolution - 2).astype(np.int64)
+    corner = cell[:, 1] * resolution + cell[:, 0]  # row-major: first coordinate fastest
+    needed = np.zeros(resolution**2, bool)
+    for step in (0, 1, resolution, resolution + 1):
+        needed[corner[known] + step] = True
+    used = np.flatnonzero(needed)
+    grid = np.stack([used % resolution, used // resolution], 1) / (resolution - 1)
+    vectors = codec.decode(octahedral_to_sphere(grid).astype(np.float32))
     return SphereTable(
+        used=used,
         vectors=vectors,
         nearest_canonical=(vectors @ canonical.T).max(1),
-        corner=np.where(known, cell[:, 1] * resolution + cell[:, 0], -1),
+        corner=np.where(known, corner, -1).astype(np.int32),
         fraction=(position - cell).astype(np.float32),
         resolution=resolution,
         temperature=temperature,
     )
+
+
+@kernel
+def _interpolate(
+    first: int, last: int, nodes: Array, corner: Array, fraction: Array, resolution: int, found: Array
+) -> None:
+    """Rows [first, last) of `found` (M,), bilinear."""
+    one = np.float32(1)
+    for i in range(first, last):
+        node, u, v = corner[i], fraction[i, 0], fraction[i, 1]
+        if node < 0:
+            found[i] = 0
+            continue
+        low = nodes[node] * (one - u) + nodes[node + 1] * u
+        high = nodes[node + resolution] * (one - u) + nodes[node + resolution + 1] * u
+        found[i] = low * (one - v) + high * v

@@ -185,9 +185,9 @@ def test_evened_relevancy_is_that_of_its_region():
     assert evened.shape == (3, 300)
     np.testing.assert_array_equal(evened[:, :5], relevancy[:, :5])
     surface, regions = engine.surface, engine.regions
-    means = regions.means(relevancy, surface)
+    means = regions.means(relevancy)
     for level in range(3):
-        want = means[level][regions.of[level]]
+        want = means[level].astype(np.float32)[regions.of[level]]
         np.testing.assert_array_equal(evened[level, surface.rows], want)
         near = np.flatnonzero(surface.anchors >= 0)
         np.testing.assert_array_equal(evened[level, near], want[surface.anchors[near]])

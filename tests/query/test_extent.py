@@ -7,7 +7,7 @@ import pytest
 
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.query.extent import COARSER, FAINT, NARROWEST, SHARES, cut, find_extent, to_margin
-from langsplat_core.query.regions import SMALLEST, Regions
+from langsplat_core.query.regions import SMALLEST, Regions, regions_from
 from langsplat_core.query.surface import Surface, build_surface
 from langsplat_core.scene import LEVELS
 from tests.support.scenes import random_gaussians
@@ -21,10 +21,10 @@ def surface() -> Surface:
     return build_surface(random_gaussians(N), min_opacity=0.0)
 
 
-def regions_of(sizes: tuple[int, ...]) -> Regions:
+def regions_of(surface: Surface, sizes: tuple[int, ...]) -> Regions:
     """Of one partition at all levels; `sizes` add up to the Gaussians of the surface."""
     of = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
-    return Regions(np.stack([of] * 3), (np.array(sizes),) * 3)
+    return regions_from(surface, np.stack([of] * 3))
 
 
 def spread_out(surface: Surface, regions: Regions, margins) -> Array:
@@ -56,15 +56,15 @@ def test_the_extent_is_that_of_the_plain_rule(surface, level, middle):
         sizes = (*rng.integers(3, 30, 9).tolist(),)
         sizes = (*sizes, count - sum(sizes))
         margins = middle + 0.1 * rng.normal(size=(3, len(sizes)))
-        regions = regions_of(sizes)
-        got = find_extent(spread_out(surface, regions, margins), surface, regions, T, level)
+        regions = regions_of(surface, sizes)
+        got = find_extent(spread_out(surface, regions, margins), regions, T, level)
         chosen, answering = plain_extent(margins, sizes, level)
         assert got.level == chosen
-        np.testing.assert_array_equal(got.inside, np.repeat(answering, sizes))
+        np.testing.assert_array_equal(got.inside, answering)
         solid = np.array(sizes) >= SMALLEST
         np.testing.assert_allclose(got.margins, margins[:, solid].max(1), atol=1e-5)
         np.testing.assert_allclose(got.peaks, sigmoid(T * margins[:, solid].max(1)), atol=1e-6)
-        np.testing.assert_allclose(got.even, np.repeat(sigmoid(T * margins[chosen]), sizes), atol=1e-6)
+        np.testing.assert_allclose(got.even, sigmoid(T * margins[chosen]), atol=1e-6)
         assert got.even.dtype == np.float32
         assert got.inside.any()
 
@@ -81,28 +81,28 @@ def test_the_extent_is_that_of_the_plain_rule(surface, level, middle):
     ],
 )
 def test_the_coarsest_of_the_levels_that_answer_nearly_best(surface, best, level):
-    regions = regions_of((100, len(surface.rows) - 100))
+    regions = regions_of(surface, (100, len(surface.rows) - 100))
     margins = [(value, value - 0.4) for value in best]
-    assert find_extent(spread_out(surface, regions, margins), surface, regions, T).level == level
+    assert find_extent(spread_out(surface, regions, margins), regions, T).level == level
 
 
 def test_crumbs_set_no_scale_unless_there_is_nothing_else(surface):
     count = len(surface.rows)
-    regions = regions_of((SMALLEST - 1, 50, count - 50 - SMALLEST + 1))
+    regions = regions_of(surface, (SMALLEST - 1, 50, count - 50 - SMALLEST + 1))
     margins = [(0.9, 0.2, -0.4)] * 3
-    got = find_extent(spread_out(surface, regions, margins), surface, regions, T)
+    got = find_extent(spread_out(surface, regions, margins), regions, T)
     assert got.margins == pytest.approx((0.2,) * 3, abs=1e-5)
     small = build_surface(random_gaussians(4), min_opacity=0.0)
-    crumbs = regions_of((1, len(small.rows) - 1))
-    got = find_extent(spread_out(small, crumbs, [(0.9, 0.2)] * 3), small, crumbs, T)
+    crumbs = regions_of(small, (1, len(small.rows) - 1))
+    got = find_extent(spread_out(small, crumbs, [(0.9, 0.2)] * 3), crumbs, T)
     assert got.margins == pytest.approx((0.9,) * 3, abs=1e-4)
 
 
 def test_where_everything_is_as_bad_all_of_it_answers_and_nothing_is_not_a_number(surface):
-    regions = regions_of((100, len(surface.rows) - 100))
+    regions = regions_of(surface, (100, len(surface.rows) - 100))
     for value in (0.0, 0.5, 1.0):
         relevancy = np.full((3, N), value, np.float32)
-        got = find_extent(relevancy, surface, regions, T)
+        got = find_extent(relevancy, regions, T)
         assert (got.level, got.inside.all()) == (2, True)
         assert np.isfinite([*got.margins, *got.peaks]).all()
         assert (got.even == np.float32(value)).all()
@@ -110,8 +110,8 @@ def test_where_everything_is_as_bad_all_of_it_answers_and_nothing_is_not_a_numbe
 
 def test_a_surface_of_nothing():
     surface = build_surface(random_gaussians(0))
-    nothing = Regions(np.zeros((3, 0), np.int32), (np.zeros(0, int),) * 3)
-    got = find_extent(np.zeros((3, 0), np.float32), surface, nothing, T, "part")
+    nothing = regions_from(surface, np.zeros((3, 0), np.int32))
+    got = find_extent(np.zeros((3, 0), np.float32), nothing, T, "part")
     assert (got.level, got.peaks) == (1, (0, 0, 0))
     assert (got.even.shape, got.inside.shape) == ((0,), (0,))
     assert np.isfinite(got.margins).all()

@@ -29,7 +29,7 @@ def test_every_lookup_finds_the_relevancy_of_what_latents_stand_for(kind, temper
     field = replace(random_field(300, kind), reading=Reading(temperature))
     field.confidence[1, 5:20] = 0
     phrase = unit(np.random.default_rng(3).normal(size=field.codec.vector_dim)).astype(np.float32)
-    got = build_lookup(field, exact).relevancy(phrase)
+    got = next(build_lookup(field, exact).relevancies(phrase[None]))
     error = np.abs(got - wanted(field, phrase))
     assert error.max() < (1e-5 if exact else TOLERANCE[kind])
     assert (got.reshape(3, 300)[1, 5:20] == 0).all()
@@ -40,6 +40,6 @@ def test_codeword_zero_is_a_meaning_like_any_other():
     field.latents[:] = 0
     field.confidence[:] = 1
     field.confidence[2, 4] = 0
-    values = build_lookup(field).relevancy(field.codec.vectors[0]).reshape(3, 10)
+    values = next(build_lookup(field).relevancies(field.codec.vectors[:1])).reshape(3, 10)
     assert values[2, 4] == 0
     assert (np.delete(values[2], 4) > 0.5).all()

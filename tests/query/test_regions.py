@@ -170,7 +170,7 @@ def test_almost_no_gaussians(kind, count):
     surface = build_surface(line(count))
     regions = build_regions(surface, field)
     assert regions.of.tolist() == [[0] * count] * 3
-    means = regions.means(np.full((3, count), 0.25, np.float32), surface)
+    means = regions.means(np.full((3, count), 0.25, np.float32))
     assert [mean.tolist() for mean in means] == [[0.25] * min(count, 1)] * 3
 
 
@@ -233,7 +233,7 @@ def test_means_are_weighted_by_opacity():
     surface = build_surface(gaussians)
     regions = build_regions(surface, field)
     values = np.random.default_rng(1).uniform(size=(3, N)).astype(np.float32)
-    for level, means in enumerate(regions.means(values, surface)):
+    for level, means in enumerate(regions.means(values)):
         assert means.dtype == np.float64
         for number, mean in enumerate(means):
             members = np.flatnonzero(regions.of[level] == number)
@@ -250,5 +250,5 @@ def test_values_without_meaning_elsewhere_harm_no_mean():
     surface = build_surface(gaussians)
     values = np.full((3, N), 0.5, np.float32)
     values[:, ::3] = np.nan
-    for means in build_regions(surface, field).means(values, surface):
+    for means in build_regions(surface, field).means(values):
         assert means == pytest.approx(0.5)

@@ -74,7 +74,7 @@ class SceneSource:
         view = self.rasterizer.view(scene.gaussians, camera, scene.raster_settings())
         if isinstance(rule, MapRule) and self.paper_order:
             return [read_maps(maps, rule) for maps in self._decoded(view, phrases)]
-        results = [self.engine.run(phrase) for phrase in phrases]
+        results = self.engine.run_many(phrases)
         if isinstance(rule, OwnRule):
             return [own_prediction(view, result, rule) for result in results]
         if isinstance(rule, SilhouetteRule):

@@ -67,12 +67,11 @@ def measure_verdicts(config: VerdictBenchConfig, work: Path, progress: Progress 
 def _of_room(room: Room, engine: QueryEngine) -> list[Verdict]:
     asked = [(p.text, p.kind) for p in room.truth.phrases if p.kind in ("object", "colour+object")]
     asked += [(text, "absent") for text in room.truth.absent(EVERYTHING)]
+    asked = [(text, kind) for text, kind in asked if not engine.unknown_words(text)]
     rows = []
-    for text, kind in asked:
-        if not engine.unknown_words(text):
-            answer = engine.run(text)
-            judged = answer.margins, answer.probability, answer.found
-            rows.append(Verdict(room.tier, room.seed, text, kind, *judged))
+    for (text, kind), answer in zip(asked, engine.run_many([text for text, _ in asked]), strict=True):
+        judged = answer.margins, answer.probability, answer.found
+        rows.append(Verdict(room.tier, room.seed, text, kind, *judged))
     return rows
 
 
