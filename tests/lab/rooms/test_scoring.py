@@ -28,27 +28,37 @@ from tests.support.scenes import random_camera, random_gaussians
 from tests.support.two_blobs import random_codec, two_blob_scene
 
 
-def answer(values, peak=1.0, level=2, vector=None, found=True) -> Answer:
+def answer(values, peak=1.0, level=2, vector=None, members=None) -> Answer:
     values = np.asarray(values, np.float32)
     return Answer(
-        np.zeros(4) if vector is None else vector, level, values, peak, float(np.median(values)), found
+        vector=np.zeros(4) if vector is None else vector,
+        level=level,
+        values=values,
+        members=values > 0.5 if members is None else members,
+        even=values,
+        peak=peak,
+        median=float(np.median(values)),
+        found=True,
     )
 
 
-def test_direct_overlap_has_its_closed_form():
+@pytest.mark.parametrize("rule", ["regions", "floor"])
+def test_direct_overlap_has_its_closed_form(rule):
+    """What answers is cut from the values, or what the answer itself says."""
     labels = np.full((3, 200), -1)
     labels[2, :180] = np.repeat([0, 1, 2], 60)  # the last 20 are shown nowhere
-    values = np.zeros(200)
-    values[30:100] = 0.9  # 30 of thing 0, 40 of thing 1
-    values[180:] = 0.9
+    inside = np.zeros(200, bool)
+    inside[30:100] = True  # 30 of thing 0, 40 of thing 1
+    inside[180:] = True
     phrases = (
         Phrase("mug", "object", (0,)),
         Phrase("mug or bowl", "object", (0, 1)),
         Phrase("rare", "part", (5,)),
     )
-    answers = {phrase.text: answer(values) for phrase in phrases}
+    made = answer(0.9 * inside) if rule == "floor" else answer(np.full(200, 0.9), members=inside)
     truth = Truth(None, phrases, frozenset())
-    (score,) = evaluate_direct(Asked(None, answers, (), 0.0), labels, truth)
+    asked = Asked(None, {phrase.text: made for phrase in phrases}, (), 0.0)
+    (score,) = evaluate_direct(asked, labels, truth, rule)
     assert (score.kind, score.phrases) == ("object", 2)
     assert score.mean_iou == pytest.approx((30 / 100 + 70 / 120) / 2)
 
