@@ -21,13 +21,13 @@ class BenchLift:
     work: Path = Path("eval_out")
     """Folder for the room, as of `langsplat eval synthetic`."""
     out: Path = Path("bench_out")
-    """Folder for lift.md, lift.json and lift.png."""
+    """Folder for lift.md, lift.json and lift.png, and for rows as they are made: the same command goes on."""
 
     def run(self) -> None:
         from langsplat_core.lab.rooms.lifting import measure_liftings, plot
 
         with TerminalProgress() as progress:
-            report = measure_liftings(self.config, self.work, progress)
+            report = measure_liftings(self.config, self.work, progress, kept=self.out / "lift.rows.jsonl")
         save_figures(self.out, "lift", report.text, report.figures)
         with atomic_path(self.out / "lift.png") as path:
             plot(report.rows, path)

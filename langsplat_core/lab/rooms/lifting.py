@@ -8,6 +8,7 @@ from typing import Any
 from langsplat_core.errors import InputError
 from langsplat_core.lab.config import BenchmarkConfig, LiftBenchConfig
 from langsplat_core.lab.rooms.benchmark import Room, weights_digest
+from langsplat_core.lab.rooms.kept_rows import KeptRows
 from langsplat_core.lab.rooms.report import Measured, loss_cells, of_kind
 from langsplat_core.lab.rooms.variants import Variant, liftings
 from langsplat_core.progress import Progress, silent
@@ -48,12 +49,17 @@ class LiftReport:
 
 
 def measure_liftings(
-    config: LiftBenchConfig, work: Path, progress: Progress = silent, rooms: BenchmarkConfig | None = None
+    config: LiftBenchConfig,
+    work: Path,
+    progress: Progress = silent,
+    rooms: BenchmarkConfig | None = None,
+    kept: Path | None = None,
 ) -> LiftReport:
     """In one room, whose photographs and Gaussians are made in `work` first where they are not there.
 
     Seconds are from masks with vectors to latents, everything in them, in a folder of their own that is
     emptied first: nothing is taken from an earlier run. `rooms`: how the room is photographed and trained.
+    `kept`: a file that takes every row when it is made, and gives those that an earlier run has made.
     Raises InputError for settings without a row.
     """
     if not config.masks:
@@ -62,9 +68,18 @@ def measure_liftings(
     chosen = {masks: _chosen(liftings(config, masks, encoder.dim), config.only) for masks in config.masks}
     settings = rooms or BenchmarkConfig()
     room = Room(settings, config.tier, config.seed, work, (encoder, weights_digest("demo")), progress)
-    rows = []
+    matters = asdict(replace(config, masks=(), only=())) | {
+        "rooms": asdict(settings),
+        "encoder": room.weights,
+    }
+    rows, earlier = [], None if kept is None else KeptRows(kept, matters)
     for variant in (variant for ways in chosen.values() for variant in ways):
-        rows.append(replace(room.measure(variant, fresh=True), name=variant.name))
+        row = None if earlier is None else earlier.get(variant.masks, variant.name)
+        if row is None:
+            row = replace(room.measure(variant, fresh=True), name=variant.name)
+            if earlier is not None:
+                earlier.add(row)
+        rows.append(row)
     return LiftReport(config, len(room.gaussians), tuple(rows))
 
 

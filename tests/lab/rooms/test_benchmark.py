@@ -12,7 +12,7 @@ from langsplat_core.cli.evaluate import EvalSynthetic
 from langsplat_core.cli.run import main
 from langsplat_core.config import CodecConfig, DatasetConfig
 from langsplat_core.datasets import load_capture
-from langsplat_core.errors import InputError
+from langsplat_core.errors import FormatError, InputError
 from langsplat_core.formats import save_scene
 from langsplat_core.lab.config import BenchmarkConfig, GainBenchConfig, LiftBenchConfig
 from langsplat_core.lab.demo import SEED
@@ -175,7 +175,13 @@ def test_ways_of_lifting_are_compared_in_one_room(run, tmp_path):
     config = LiftBenchConfig(
         "separate", 101, ("truth", "wrong"), (3,), (8,), (32,), codec_steps=40, gradient_steps=20
     )
-    report = measure_liftings(config, run.work, rooms=TINY)
+    kept = tmp_path / "rows.jsonl"
+    report = measure_liftings(config, run.work, rooms=TINY, kept=kept)
+    again = measure_liftings(config, run.work, rooms=TINY, kept=kept)
+    assert again.rows == report.rows  # seconds too: nothing was made again
+    kept.write_text(kept.read_text()[:-20])
+    with pytest.raises(FormatError, match="delete it"):
+        measure_liftings(config, run.work, rooms=TINY, kept=kept)
     names = [variant.name for variant in liftings(config, "truth", 512)]
     assert [(row.masks, row.name) for row in report.rows] == [
         (masks, name) for masks in ("truth", "wrong") for name in names
