@@ -91,18 +91,23 @@ def _steps(field: LanguageField, level: int, rows: Array, ends: tuple[Array, Arr
     known, latents = field.known[level][rows], field.latents[level][rows]
     a, b = ends
     if field.codec.space == "index":
-        codewords = field.codec.decode(np.arange(field.codec.index_size, dtype=np.uint16)[:, None])
-        apart = 1 - codewords @ codewords.T
-        codes = latents[:, 0]
-        steps = apart[codes[a], codes[b]]
+        directions = field.codec.decode(np.arange(field.codec.index_size, dtype=np.uint16)[:, None])
+        steps = _apart(directions, latents[a, 0], latents[b, 0])
     else:
-        directions = unit(latents.astype(np.float32))
-        steps = np.empty(len(a), np.float32)
-        for start in range(0, len(a), CHUNK):  # latents may be as long as the encoder's vectors
-            part = slice(start, start + CHUNK)
-            steps[part] = 1 - np.einsum("ed,ed->e", directions[a[part]], directions[b[part]])
+        steps = _apart(unit(latents.astype(np.float32)), a, b)
     both, neither = known[a] & known[b], ~known[a] & ~known[b]
     return np.asarray(np.where(both, steps, np.where(neither, 0.0, UNKNOWN)).clip(0, UNKNOWN))
+
+
+def _apart(directions: Array, first: Array, second: Array) -> Array:
+    """(E,) 1 - cosine of pairs among (K, D) unit vectors, from a table of all where that is smaller."""
+    if len(directions) ** 2 <= len(first):
+        return np.asarray((1 - directions @ directions.T)[first, second])
+    steps = np.empty(len(first), np.float32)
+    for start in range(0, len(first), CHUNK):  # the vectors may be as long as the encoder's
+        part = slice(start, start + CHUNK)
+        steps[part] = 1 - np.einsum("ed,ed->e", directions[first[part]], directions[second[part]])
+    return steps
 
 
 def _along_things(steps: Array, things: Array, ends: tuple[Array, Array]) -> Array:
