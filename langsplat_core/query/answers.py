@@ -48,9 +48,7 @@ class QueryResult:
     @property
     def heat_range(self) -> tuple[float, float]:
         """The relevancies at which a heat map of this answer is coldest and hottest."""
-        if (
-            self.found and self.peak < FLOOR + MIN_HEAT_SPAN
-        ):  # the best of its thing, though not of all phrases
+        if self.found and self.peak < FLOOR + MIN_HEAT_SPAN:  # best on its thing, not against all phrases
             return self.peak - MIN_HEAT_SPAN, self.peak
         return FLOOR, max(self.peak, FLOOR + MIN_HEAT_SPAN)
 
@@ -60,10 +58,8 @@ def by_regions(
 ) -> QueryResult:
     """Whole regions, cut at a share of the best one's margin (`extent`)."""
     extent = find_extent(relevancy, regions, reading.temperature, level)
-    even, peak = (
-        regions.spread(extent.level, extent.even, relevancy[extent.level]),
-        extent.peaks[extent.level],
-    )
+    even = regions.spread(extent.level, extent.even, relevancy[extent.level])
+    peak = extent.peaks[extent.level]
     lowest = float(extent.even[extent.inside].min(initial=1.0))
     solid = np.where(extent.even > np.float32(peak), 0, extent.even)  # what is above the best is a crumb
     place = locate(surface, solid[regions.of[extent.level]], np.nextafter(np.float32(lowest), np.float32(0)))

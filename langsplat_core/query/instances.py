@@ -64,6 +64,10 @@ class Parts:
     starts: Array  # (C,) int32 where each part begins in `order`
     labels: Array  # (M,) int32 part of every Gaussian of the surface; -1 for those that are no members
 
+    def each(self) -> list[Array]:
+        """The numbers of every part, ascending."""
+        return [np.sort(part) for part in np.split(self.order, self.starts[1:])] if len(self.starts) else []
+
 
 def find_instances(
     surface: Surface, gaussians: Gaussians, members: Array, relevancy: Array, at_most: int | None = None

@@ -9,13 +9,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.surface import Surface
+from langsplat_core.query.instances import connected_parts
 from langsplat_core.query.words import Word, WordScores, certain
 from langsplat_core.scene import LEVELS, LanguageField
 from langsplat_core.semantics.relevancy import FLOOR
@@ -199,20 +198,13 @@ def _spots(
 ) -> tuple[Spot, ...]:
     """The connected places of Gaussians `rows` (M,), the largest first, without splinters."""
     total = float(areas.sum())
-    parts = sorted(connected_parts(engine.surface, rows), key=lambda part: -areas[part].sum())
+    surface = engine.surface
+    numbers = np.flatnonzero(np.isin(surface.rows, rows))
+    found = [surface.rows[part] for part in connected_parts(surface, numbers).each()]
+    parts = sorted(found, key=lambda part: -areas[part].sum())
     least = LEAST_SPOT * areas[parts[0]].sum() if parts else 0.0
     kept = [part for part in parts if len(part) >= LEAST_COUNT and areas[part].sum() >= least]
     return tuple(_spot(engine, attributes, areas, level, part, total) for part in kept)
-
-
-def connected_parts(surface: Surface, rows: Array) -> list[Array]:
-    """(M,) numbers of Gaussians -> those that are on `surface`, as (P,) int64 parts that it connects."""
-    numbers = np.flatnonzero(np.isin(surface.rows, rows))
-    if len(numbers) == 0:
-        return []
-    _, part = connected_components(surface.links[numbers][:, numbers], directed=False)
-    order = np.argsort(part, kind="stable")
-    return np.split(surface.rows[numbers[order]], np.flatnonzero(np.diff(part[order])) + 1)
 
 
 def _spot(

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array
+from langsplat_core.query.instances import connected_parts
 from langsplat_core.query.phrase_tree import Extreme, Side
 from langsplat_core.query.surface import Surface
 from langsplat_core.scene import Camera
@@ -91,14 +91,8 @@ def body(positions: Array, frame: Array) -> Body:
 
 def separate(surface: Surface, inside: Array) -> list[Array]:
     """(M,) bool -> surface numbers of each connected thing in it, the largest first, without specks."""
-    numbers = np.flatnonzero(inside)
-    if len(numbers) == 0:
-        return []
-    _, label = connected_components(surface.links[numbers][:, numbers], directed=False)
-    counts = np.bincount(label)
-    least = max(FEWEST, SPECK * counts.max())
-    order = np.argsort(-counts, kind="stable")
-    return [numbers[label == number] for number in order if counts[number] >= least]
+    parts = sorted(connected_parts(surface, np.flatnonzero(inside)).each(), key=len, reverse=True)
+    return [part for part in parts if len(part) >= max(FEWEST, SPECK * len(parts[0]))]
 
 
 def gap(one: Body, other: Body) -> float:

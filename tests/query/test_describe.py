@@ -9,7 +9,8 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.query import describe
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.inventory import connected_parts, field_meanings, same_things
+from langsplat_core.query.instances import connected_parts
+from langsplat_core.query.inventory import field_meanings, same_things
 from langsplat_core.query.surface import surface_areas
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Gaussians, Scene
@@ -192,7 +193,9 @@ def test_meanings_of_fields_without_codewords_are_the_gaussians_own():
 
 def test_parts_of_nothing_and_of_two_blobs():
     surface = QueryEngine(named_scene()).surface
-    assert connected_parts(surface, np.zeros(0, int)) == []
+    assert connected_parts(surface, np.zeros(0, int)).each() == []
     rows = np.concatenate([np.arange(PER_BLOB), np.arange(2 * PER_BLOB, 3 * PER_BLOB)])  # two that are apart
-    parts = [part for part in connected_parts(surface, rows) if len(part) > 1]
+    numbers = np.flatnonzero(np.isin(surface.rows, rows))
+    found = connected_parts(surface, numbers).each()
+    parts = [surface.rows[part] for part in found if len(part) > 1]
     assert {frozenset((part // PER_BLOB).tolist()) for part in parts} == {frozenset({0}), frozenset({2})}
