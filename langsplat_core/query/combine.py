@@ -22,8 +22,8 @@ WHOLE = LEVELS.index("whole")
 SHARE = 0.6  # of the way from what is typical of a thing's least fitting surface to the part's peak on it
 LEAST = 0.05  # quantile of a part's relevancy on its thing that stands for "not this part"
 # Constant and slope of the probability that a thing has a part, by the part's best margin on it, from the
-# spread of 186 parts that things of the rooms 201 and 202 have and 275 that they have not: a margin of -0.02 accepts
-# 66 % and rejects 91 %, one of -0.05 75 % and 84 %. Chosen by eye, not fitted.
+# spread of 186 parts that things of the rooms 201 and 202 have and 275 that they have not: a margin of -0.02
+# accepts 66 % and rejects 91 %, one of -0.05 75 % and 84 %. Chosen by eye, not fitted.
 PART = (0.87, 11.0)
 SPAN = 0.02  # of relevancy: the least distance that is divided
 HALF = 0.5  # of the peak: what is less is no longer the place
