@@ -26,10 +26,10 @@ class BenchVerdict:
 
     def run(self) -> None:
         from langsplat_core.lab.rooms.verdicts import (
+            PAIRS,
             curve_table,
             figures,
             fit_calibration,
-            margins_of,
             measure_verdicts,
             verdict_table,
             write_calibration,
@@ -38,9 +38,9 @@ class BenchVerdict:
         with TerminalProgress() as progress:
             rows = measure_verdicts(self.config, self.work, progress)
         if self.fit is not None:
-            calibration = fit_calibration(margins_of(rows, "object"), margins_of(rows, "absent"))
+            calibration = fit_calibration(rows)
             write_calibration(self.fit, calibration)
             print(f"{self.fit}: {calibration}")
-        tables = f"{verdict_table(rows)}\n{curve_table(rows)}"
+        tables = "\n".join([verdict_table(rows), *(curve_table(rows, asked) for asked in PAIRS)])
         save_figures(self.out, "verdict", tables, figures(self.config, rows))
         print(tables)

@@ -29,7 +29,8 @@ executed). Version 2, for N Gaussians, CLIP vectors of D numbers and P phrases:
     phrases          JSON list of the P phrases
     temperature      of the softmax that reads this encoder's cosines, decimal
     found            relevancy from which a phrase counts as present, decimal
-    calibration      JSON list: the numbers of `scene.language.Calibration`; absent where the encoder has none
+    calibration      JSON: a list of numbers for each of the three `Odds` of `scene.Calibration`; absent where
+                     the encoder has none
 
 "float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
 like the one in memory. With a codebook as `langsplat train` makes it that is 22 bytes per Gaussian, 6 of
@@ -97,7 +98,8 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
         "found": repr(field.reading.found),
     }
     if field.reading.calibration is not None:
-        metadata["calibration"] = json.dumps([float(n) for n in astuple(field.reading.calibration)])
+        odds = astuple(field.reading.calibration)
+        metadata["calibration"] = json.dumps([[float(n) for n in numbers] for numbers in odds])
     with atomic_path(path) as temporary:
         save_file({name: np.ascontiguousarray(t) for name, t in tensors.items()}, temporary, metadata)
 

@@ -1,6 +1,6 @@
 """The tensors of a language sidecar, read and checked; the layout stands in `language`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +10,12 @@ from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import FormatError
 from langsplat_core.formats.opening import open_for_reading, parse_json
 from langsplat_core.formats.packed_positions import step, unpack_positions
-from langsplat_core.scene import LEVELS, Calibration, LanguageField, Reading, codec_from_tensors
+from langsplat_core.scene import LEVELS, Calibration, LanguageField, Odds, Reading, codec_from_tensors
 from langsplat_core.scene.codec import KINDS
 
 FORMAT, VERSION = "langsplat", "2"
 CODEC = "codec."
+WAYS = len(fields(Calibration))  # to look for something, each with odds of its own
 _KEYS = {
     "1": ("encoder", "levels", "codec", "d", "gaussians", "means_blake2b", "phrases"),
     "2": (
@@ -126,10 +127,15 @@ def _field(
 def _calibration(metadata: dict[str, str], path: Path) -> Calibration | None:
     if "calibration" not in metadata:
         return None
-    numbers = parse_json(metadata["calibration"].encode(), path)
-    if not isinstance(numbers, list) or len(numbers) != 4 or not all(isinstance(n, float) for n in numbers):
-        raise FormatError(f"{path}: the header's 'calibration' is not a list of four numbers")
-    return Calibration(*numbers)
+    stated = parse_json(metadata["calibration"].encode(), path)
+    odds = [stated] * WAYS if _four(stated) else stated  # files of before parts had odds of their own
+    if not isinstance(odds, list) or len(odds) != WAYS or not all(map(_four, odds)):
+        raise FormatError(f"{path}: the header's 'calibration' is not {WAYS} lists of four numbers")
+    return Calibration(*(Odds(*numbers) for numbers in odds))
+
+
+def _four(numbers: object) -> bool:
+    return isinstance(numbers, list) and len(numbers) == 4 and all(isinstance(n, float) for n in numbers)
 
 
 def _means(tensors: dict[str, Array], count: int) -> tuple[Array, float]:

@@ -17,7 +17,7 @@ from langsplat_core.config import (
 )
 from langsplat_core.lab.config import MaskOrigin, Tier
 from langsplat_core.lab.rooms.oracles import TruthMasks
-from langsplat_core.lab.rooms.scoring import read_truth
+from langsplat_core.lab.rooms.truth import read_truth
 from langsplat_core.lab.world.photographs import write_dataset
 from langsplat_core.pipeline.train import train_scene
 from langsplat_core.progress import Progress, silent

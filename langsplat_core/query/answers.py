@@ -12,12 +12,12 @@ from langsplat_core.query.extent import find_extent, to_margin
 from langsplat_core.query.places import locate
 from langsplat_core.query.regions import Regions
 from langsplat_core.query.surface import Surface
-from langsplat_core.scene import LEVELS, Reading
+from langsplat_core.query.vocabulary import names_part
+from langsplat_core.scene import LEVELS, Margins, Odds, Reading
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN
 
 AnswerRule = Literal["regions", "peak"]
 Verdict = Literal["found", "weak match", "not here"]
-Margins = tuple[float, float, float]  # of each level
 WEAK = 0.5  # probability from which what is not found is at least a weak match
 
 
@@ -31,7 +31,7 @@ class QueryResult:
     relevancy: Array  # (3, N) float32 in [0, 1] per level and Gaussian
     even: Array  # (N,) float32 relevancy at the level, the same all over a region
     peak: float  # score of the chosen level
-    margins: Margins  # of the best: cosine with the phrase minus that with the nearest canonical phrase
+    margins: Margins  # of the best region, or neighbourhood, of each level
     probability: float | None  # that the thing is there at all; None where the encoder is not calibrated
     found: bool
     members: Array  # (N,) bool: the Gaussians that answer, wherever they are
@@ -61,6 +61,7 @@ def by_regions(
     even = regions.spread(extent.level, extent.even, relevancy[extent.level])
     peak = extent.peaks[extent.level]
     lowest = float(extent.even[extent.inside].min(initial=1.0))
+    probability, found = _judged(phrase, extent.margins, reading, level)
     solid = np.where(extent.even > np.float32(peak), 0, extent.even)  # what is above the best is a crumb
     place = locate(surface, solid[regions.of[extent.level]], np.nextafter(np.float32(lowest), np.float32(0)))
     return QueryResult(
@@ -71,8 +72,8 @@ def by_regions(
         even=even,
         peak=peak,
         margins=extent.margins,
-        probability=_probability(extent.margins, reading),
-        found=_found(extent.margins, reading, level),
+        probability=probability,
+        found=found,
         members=regions.spread(extent.level, extent.inside, np.zeros(relevancy.shape[1], bool)),
         place=None if place is None else place.position,
         box=None if place is None else place.box,
@@ -88,6 +89,7 @@ def by_peak(
     chosen = int(np.argmax(scores)) if level == "auto" else LEVELS.index(level)
     peak, best = scores[chosen], to_margin(np.array(scores), reading.temperature)
     margins = (float(best[0]), float(best[1]), float(best[2]))
+    probability, found = _judged(phrase, margins, reading, level)
     place = locate(surface, smoothed[chosen], max(FLOOR + 0.5 * (peak - FLOOR), FLOOR))
     return QueryResult(
         phrase=phrase,
@@ -97,21 +99,27 @@ def by_peak(
         even=relevancy[chosen],
         peak=peak,
         margins=margins,
-        probability=_probability(margins, reading),
-        found=_found(margins, reading, level),
+        probability=probability,
+        found=found,
         members=relevancy[chosen] > cut_level("floor", relevancy[chosen], peak, FLOOR),
         place=None if place is None else place.position,
         box=None if place is None else place.box,
     )
 
 
-def _probability(margins: Margins, reading: Reading) -> float | None:
-    return None if reading.calibration is None else reading.calibration.probability(margins)
+def _odds(phrase: str, reading: Reading) -> Odds | None:
+    """A part asked for alone answers at the finer levels, where its margins are others than a thing's."""
+    if reading.calibration is None:
+        return None
+    return reading.calibration.part if names_part(phrase) else reading.calibration.thing
 
 
-def _found(margins: Margins, reading: Reading, level: LevelChoice) -> bool:
-    if level != "auto" and margins[LEVELS.index(level)] < 0:
-        return False  # it may be there, but what the wanted level shows is nearer to a canonical phrase
-    if reading.calibration is not None:
-        return reading.calibration.probability(margins) >= reading.calibration.found
-    return max(margins) >= float(to_margin(np.array(reading.found), reading.temperature))
+def _judged(phrase: str, margins: Margins, reading: Reading, level: LevelChoice) -> tuple[float | None, bool]:
+    """Probability and found."""
+    odds = _odds(phrase, reading)
+    # It may be there, but what the wanted level shows is nearer to a canonical phrase.
+    fits = level == "auto" or margins[LEVELS.index(level)] >= 0
+    if odds is None:
+        return None, fits and max(margins) >= float(to_margin(np.array(reading.found), reading.temperature))
+    probability = odds.probability(margins)
+    return probability, fits and probability >= odds.found

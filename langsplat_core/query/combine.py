@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from langsplat_core.arrays import Array, sigmoid
+from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
@@ -21,10 +21,6 @@ from langsplat_core.scene import LEVELS
 WHOLE = LEVELS.index("whole")
 SHARE = 0.6  # of the way from what is typical of a thing's least fitting surface to the part's peak on it
 LEAST = 0.05  # quantile of a part's relevancy on its thing that stands for "not this part"
-# Constant and slope of the probability that a thing has a part, by the part's best margin on it, from the
-# spread of 186 parts that things of the rooms 201 and 202 have and 275 that they have not: a margin of -0.02
-# accepts 66 % and rejects 91 %, one of -0.05 75 % and 84 %. Chosen by eye, not fitted.
-PART = (0.87, 11.0)
 SPAN = 0.02  # of relevancy: the least distance that is divided
 HALF = 0.5  # of the peak: what is less is no longer the place
 
@@ -64,10 +60,12 @@ def cut_inside(
     members = inside & (even[chosen] > low + SHARE * max(peak - low, SPAN))
     reading = engine.field.reading
     probability, fits = thing.probability, True
+    subpart, part, whole = to_margin(np.array(peaks), reading.temperature).tolist()
+    margins = (subpart, part, whole)
     if reading.calibration is not None and probability is not None:
-        margin = to_margin(np.array(peak), reading.temperature)
-        probability = min(probability, float(sigmoid(PART[0] + PART[1] * margin)))
-        fits = probability >= reading.calibration.found
+        odds = reading.calibration.inside
+        fits = odds.probability(margins) >= odds.found
+        probability = min(probability, odds.probability(margins))
     return replace(
         asked[0],
         level=chosen,
@@ -75,6 +73,7 @@ def cut_inside(
         relevancy=relevancy,
         even=even[chosen],
         peak=peak,
+        margins=margins,
         probability=probability if members.any() else 0.0,
         found=bool(members.any() and thing.found and fits),
         members=members,

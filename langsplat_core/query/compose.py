@@ -26,7 +26,7 @@ from langsplat_core.query.phrase_tree import (
     reading,
 )
 from langsplat_core.query.standing import Body, body, most, separate, stands, upright, viewer
-from langsplat_core.query.vocabulary import is_part
+from langsplat_core.query.vocabulary import names_part
 from langsplat_core.scene import Camera
 from langsplat_core.scene.phrases import phrase_key, tidy
 from langsplat_core.semantics.relevancy import FLOOR
@@ -130,7 +130,7 @@ class _Asking:
 
     def _thing(self, text: str, level: LevelChoice) -> QueryResult:
         """A thing is looked for among wholes, unless it is a part, or fits none of them."""
-        if level != "auto" or is_part(text.split()[-1]):
+        if level != "auto" or names_part(text):
             return self._ask(text, level)
         whole = self._ask(text, "whole")
         return whole if whole.peak >= FLOOR else self._ask(text, "auto")

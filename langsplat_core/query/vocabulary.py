@@ -55,7 +55,7 @@ OWNERS = _words(
 )
 
 
-def _forms(word: str) -> tuple[str, ...]:
+def forms(word: str) -> tuple[str, ...]:
     """A word in lower case and what it may be the plural of."""
     low = word.lower()
     return (low, low.removesuffix("s"), low.removesuffix("es"))
@@ -63,12 +63,18 @@ def _forms(word: str) -> tuple[str, ...]:
 
 def is_part(word: str) -> bool:
     """Whether a noun, in either number, is a part of things."""
-    return any(form in PARTS for form in _forms(word))
+    return any(form in PARTS for form in forms(word))
+
+
+def names_part(phrase: str) -> bool:
+    """Whether what a phrase without structure names is a part of things: "red handle", "the keyboard"."""
+    words = phrase.split()
+    return bool(words) and is_part(words[-1])
 
 
 def is_measure(word: str) -> bool:
     """Whether a noun, in either number, holds or counts what follows "of"."""
-    return any(form in MEASURES for form in _forms(word))
+    return any(form in MEASURES for form in forms(word))
 
 
 def only(words: frozenset[str], tokens: list[str]) -> bool:

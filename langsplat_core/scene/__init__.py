@@ -14,10 +14,9 @@ from langsplat_core.scene.language import (
     CANONICAL_PHRASES,
     LEVELS,
     NO_THING,
-    Calibration,
     LanguageField,
-    Reading,
 )
+from langsplat_core.scene.reading import Calibration, Margins, Odds, Reading
 from langsplat_core.scene.scene import Scene
 
 __all__ = [
@@ -34,6 +33,8 @@ __all__ = [
     "Intrinsics",
     "LanguageField",
     "LinearCodec",
+    "Margins",
+    "Odds",
     "Reading",
     "Scene",
     "codec_from_tensors",

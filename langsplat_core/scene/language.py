@@ -5,53 +5,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from langsplat_core.arrays import Array, check_array, sigmoid
+from langsplat_core.arrays import Array, check_array
 from langsplat_core.scene.codec import Codec, latent_dtype, meaningful
 from langsplat_core.scene.phrases import phrase_key
+from langsplat_core.scene.reading import Reading
 
 LEVELS = ("subpart", "part", "whole")  # index 0, 1, 2 wherever a level axis appears
 CANONICAL_PHRASES = ("object", "things", "stuff", "texture")  # LERF's negatives, used by LangSplat
 NO_THING = 65_535  # in `LanguageField.things`: of no thing in particular
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """What the best cosine margins of an answer say about whether the thing is there at all (Platt 1999):
-    ``probability = sigmoid(constant + whole * margin of whole things + finer * the better one of the finer
-    levels)``, present and absent being as likely beforehand."""
-
-    constant: float
-    whole: float
-    finer: float
-    found: float = 0.75  # probability from which a phrase counts as found; 0.5 up to here is a weak match
-
-    def __post_init__(self) -> None:
-        slopes = (self.whole, self.finer)
-        if not (np.isfinite([self.constant, *slopes]).all() and sum(slopes) > 0 and 0.5 <= self.found <= 1):
-            raise ValueError(f"{self}: expected finite numbers, rising with margins, and found in [0.5, 1]")
-
-    def probability(self, margins: tuple[float, float, float]) -> float:
-        """That what is asked for is there, in (0, 1). margins: the best of each level, cosine with the phrase
-        minus that with the nearest canonical phrase."""
-        subpart, part, whole = margins
-        logit = self.constant + self.whole * whole + self.finer * max(subpart, part)
-        return float(sigmoid(np.array(logit)))
-
-
-@dataclass(frozen=True)
-class Reading:
-    """How cosines of one text encoder are read: other encoders have another scale."""
-
-    temperature: float = 10.0  # of the softmax; 10 in the public code of LERF and LangSplat, for CLIP
-    found: float = 0.6  # peak relevancy from which a phrase counts as present, without a calibration
-    calibration: Calibration | None = None
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.temperature) and self.temperature > 0 and 0 <= self.found <= 1):
-            raise ValueError(
-                f"reading: temperature {self.temperature} and found {self.found}; expected a positive number "
-                "and one in [0, 1]"
-            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.scene import Calibration, Reading
+from langsplat_core.scene import Calibration, Odds, Reading
 from langsplat_core.semantics.weights import Weights
 
 OPEN_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
@@ -229,12 +229,16 @@ def _reading(weights: Weights, temperature: float) -> Reading:
         return Reading(temperature)
     try:
         stated = json.loads(path.read_text(encoding="utf-8"))
-        calibration = Calibration(**stated["calibration"]) if "calibration" in stated else None
+        if unknown := set(stated) - {"found", "calibration"}:
+            raise ValueError(f"unknown: {', '.join(sorted(unknown))}")
+        odds = {name: Odds(**numbers) for name, numbers in stated.get("calibration", {}).items()}
+        calibration = Calibration(**odds) if "calibration" in stated else None
         return Reading(temperature, float(stated.get("found", Reading.found)), calibration)
     except (OSError, ValueError, TypeError, AttributeError, OverflowError) as error:
         raise EncoderError(
-            f'{weights.id}: {READING} is not {{"found": 0 to 1, "calibration": {{"constant": number, '
-            f'"whole": number, "finer": number, "found": 0.5 to 1}}}} ({error!r})'
+            f'{weights.id}: {READING} is not {{"found": 0 to 1, "calibration": {{"thing": ODDS, '
+            '"part": ODDS, "inside": ODDS}} with ODDS as {"constant": number, "whole": number, '
+            f'"finer": number, "found": 0.5 to 1}} ({error!r})'
         ) from None
 
 

@@ -13,13 +13,13 @@ from safetensors.numpy import load_file, save_file
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError
 from langsplat_core.formats import read_language, rematch_language, write_language
-from langsplat_core.scene import NO_THING, Calibration, LanguageField, Reading
+from langsplat_core.scene import NO_THING, Calibration, LanguageField, Odds, Reading
 from tests.support.file_samples import random_field
 from tests.support.same import assert_same_field
 from tests.support.scenes import random_gaussians
 
 N = 60
-CALIBRATION = Calibration(-0.25, 18.548, 2.7, 0.62)
+CALIBRATION = Calibration(Odds(-0.25, 18.548, 2.7, 0.62), Odds(0.5, 2.25, 15.5), Odds(0.75, -0.5, 9.25, 0.5))
 Change = Callable[[dict[str, Array], dict[str, str]], None]
 
 
@@ -52,7 +52,7 @@ def change(path: Path, how: Change) -> None:
 
 @pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
 @pytest.mark.parametrize("things", [False, True])
-@pytest.mark.parametrize("calibration", [None, CALIBRATION, Calibration(0, 1, 0, 1)])
+@pytest.mark.parametrize("calibration", [None, CALIBRATION, Calibration(*[Odds(0, 1, 0, 1)] * 3)])
 def test_what_is_written_is_read_back(tmp_path, means, kind, things, calibration):
     want = replace(full_field(kind), reading=Reading(11.7, 0.73, calibration))
     if not things:
@@ -66,7 +66,11 @@ def test_the_layout_is_the_documented_one(sidecar, tmp_path, means):
     with safe_open(sidecar, framework="numpy") as file:
         stored, metadata = file.get_slice("things"), file.metadata()
         assert (stored.get_dtype(), stored.get_shape()) == ("U16", [N])
-    assert json.loads(metadata["calibration"]) == [-0.25, 18.548, 2.7, 0.62]
+    assert json.loads(metadata["calibration"]) == [
+        [-0.25, 18.548, 2.7, 0.62],
+        [0.5, 2.25, 15.5, 0.75],
+        [0.75, -0.5, 9.25, 0.5],
+    ]
     write_language(tmp_path / "a.safetensors", random_field(N), means)
     with safe_open(tmp_path / "a.safetensors", framework="numpy") as file:
         assert "things" not in file.keys()  # noqa: SIM118 (not a dictionary)
@@ -82,6 +86,13 @@ def test_a_field_without_either_is_what_files_held_before(sidecar, means):
     assert (field.things, field.reading) == (None, Reading(11.7, 0.73))
 
 
+def test_four_numbers_are_the_odds_of_everything(sidecar, means):
+    """As files had it before parts had odds of their own."""
+    change(sidecar, stating("[-0.25, 18.5, 2.75, 0.625]"))
+    calibration = Calibration(*[Odds(-0.25, 18.5, 2.75, 0.625)] * 3)
+    assert read_language(sidecar, means).reading == Reading(11.7, 0.73, calibration)
+
+
 def stating(text: str) -> Change:
     return lambda tensors, metadata: metadata.update(calibration=text)
 
@@ -92,15 +103,21 @@ def holding(things: Array) -> Change:
 
 DAMAGED = {
     "no JSON": (stating("[0.0, 1.0,"), "not readable as JSON"),
-    "no list": (stating('{"constant": 1.0}'), "not a list of four numbers"),
-    "a number": (stating("1.0"), "not a list of four numbers"),
-    "nothing": (stating("null"), "not a list of four numbers"),
-    "too short": (stating("[0.0, 1.0, 2.0]"), "not a list of four numbers"),
-    "too long": (stating("[0.0, 1.0, 2.0, 0.7, 0.7]"), "not a list of four numbers"),
-    "texts": (stating('["0.0", "1.0", "2.0", "0.7"]'), "not a list of four numbers"),
-    "truths": (stating("[true, true, true, true]"), "not a list of four numbers"),
-    "lists": (stating("[[0.0], [1.0], [2.0], [0.7]]"), "not a list of four numbers"),
-    "an endless number": (stating("[1" + "0" * 500 + ", 1.0, 2.0, 0.7]"), "not a list of four numbers"),
+    "no list": (stating('{"constant": 1.0}'), "not 3 lists of four numbers"),
+    "a number": (stating("1.0"), "not 3 lists of four numbers"),
+    "nothing": (stating("null"), "not 3 lists of four numbers"),
+    "too short": (stating("[0.0, 1.0, 2.0]"), "not 3 lists of four numbers"),
+    "too long": (stating("[0.0, 1.0, 2.0, 0.7, 0.7]"), "not 3 lists of four numbers"),
+    "texts": (stating('["0.0", "1.0", "2.0", "0.7"]'), "not 3 lists of four numbers"),
+    "truths": (stating("[true, true, true, true]"), "not 3 lists of four numbers"),
+    "two lists": (stating("[[0.0, 1.0, 2.0, 0.7], [0.0, 1.0, 2.0, 0.7]]"), "not 3 lists of four numbers"),
+    "lists of four": (stating("[[0.0, 1.0, 2.0, 0.7], [0.0, 1.0, 2.0, 0.7], [0.0]]"), "not 3 lists"),
+    "a falling one": (
+        stating("[[0.0, 1.0, 2.0, 0.7], [0.0, 1.0, 2.0, 0.7], [0.0, -3.0, 2.0, 0.7]]"),
+        "rising with margins",
+    ),
+    "lists": (stating("[[0.0], [1.0], [2.0], [0.7]]"), "not 3 lists of four numbers"),
+    "an endless number": (stating("[1" + "0" * 500 + ", 1.0, 2.0, 0.7]"), "not 3 lists of four numbers"),
     "nested without end": (stating("[" * 100_000), "not readable as JSON"),
     "NaN": (stating("[NaN, 1.0, 2.0, 0.7]"), "expected finite numbers"),
     "infinite": (stating("[0.0, Infinity, 2.0, 0.7]"), "expected finite numbers"),

@@ -10,14 +10,14 @@ from langsplat_core.query.answers import QueryResult, by_peak, by_regions
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.regions import SMALLEST, build_regions
 from langsplat_core.query.surface import Surface, build_surface
-from langsplat_core.scene import LEVELS, Calibration, Gaussians, LanguageField, Reading, Scene
+from langsplat_core.scene import LEVELS, Calibration, Gaussians, LanguageField, Odds, Reading, Scene
 from langsplat_core.semantics.relevancy import FLOOR
 from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, blob_scene, blobs, language
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_gaussians
 
 RULES = ("regions", "peak")
-SURE = Calibration(constant=0.0, whole=20.0, finer=2.0, found=0.8)
+SURE = Calibration(*[Odds(constant=0.0, whole=20.0, finer=2.0, found=0.8)] * 3)
 
 
 def calibrated(calibration: Calibration | None) -> QueryEngine:
@@ -26,10 +26,12 @@ def calibrated(calibration: Calibration | None) -> QueryEngine:
     return QueryEngine(replace(scene, language=field), lambda _: FakeEncoder())
 
 
-def asked(relevancy, surface: Surface, field: LanguageField, rule: str, level="auto") -> QueryResult:
+def asked(
+    relevancy, surface: Surface, field: LanguageField, rule: str, level="auto", phrase="x"
+) -> QueryResult:
     if rule == "peak":
-        return by_peak("x", relevancy, surface, field.reading, level)
-    return by_regions("x", relevancy, surface, build_regions(surface, field), field.reading, level)
+        return by_peak(phrase, relevancy, surface, field.reading, level)
+    return by_regions(phrase, relevancy, surface, build_regions(surface, field), field.reading, level)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -111,13 +113,30 @@ def test_a_crumb_is_no_place():
 )
 def test_a_calibrated_verdict(constant, verdict):
     """The book's margins: 1 as a whole, -0.8 as a part, and as a subpart nothing was seen."""
-    calibration = Calibration(constant, whole=8.0, finer=0.01, found=0.75)
-    result = calibrated(calibration).run("book")
+    odds = Odds(constant, whole=8.0, finer=0.01, found=0.75)
+    never = Odds(-99.0, whole=8.0, finer=0.01)
+    result = calibrated(Calibration(odds, never, never)).run("book")
     subpart, part, whole = result.margins
     assert (part, whole) == (pytest.approx(-0.8, abs=1e-3), pytest.approx(1.0, abs=0.05))
     want = 1 / (1 + np.exp(-(constant + 8 * whole + 0.01 * max(subpart, part))))
     assert result.probability == pytest.approx(want)
     assert (result.found, result.verdict) == (verdict == "found", verdict)
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("phrase", ["handle", "the handle", "red handle", "Handles"])
+def test_a_part_that_is_asked_for_alone_has_odds_of_its_own(rule, phrase):
+    gaussians, field = random_gaussians(300), random_field(300, "codebook")
+    relevancy = np.full((3, 300), 0.4, np.float32)
+    relevancy[1, :100] = 0.7  # among the parts it is there, among wholes it is not
+    calibration = Calibration(Odds(0, 20, 0), Odds(0, 0, 20), Odds(-99, 1, 1))
+    field = replace(field, reading=Reading(calibration=calibration))
+    surface = build_surface(gaussians)
+    part, thing = (asked(relevancy, surface, field, rule, phrase=text) for text in (phrase, "mug"))
+    assert part.margins == thing.margins
+    assert part.probability == pytest.approx(sigmoid(np.array(20 * max(part.margins[:2]))))
+    assert part.probability > 0.5 > thing.probability
+    assert (thing.found, thing.probability) == (False, pytest.approx(sigmoid(np.array(20 * part.margins[2]))))
 
 
 @pytest.mark.parametrize("rule", RULES)

@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from langsplat_core.scene import NO_THING, Calibration, Reading
+from langsplat_core.scene import NO_THING, Calibration, Odds, Reading
 from tests.support.file_samples import random_field
 
 N = 20
 
 
 def test_a_probability_is_the_logistic_of_whole_and_the_better_finer_margin():
-    calibration = Calibration(-1.0, 18.0, 3.0)
+    odds = Odds(-1.0, 18.0, 3.0)
     for margins in ((0.1, -0.2, 0.3), (-0.2, 0.1, 0.3), (-5.0, -4.0, -9.0)):
         logit = -1 + 18 * margins[2] + 3 * max(margins[:2])
-        assert calibration.probability(margins) == pytest.approx(1 / (1 + np.exp(-logit)))
-    far = calibration.probability((-999.0, -999.0, -999.0)), calibration.probability((999.0, 999.0, 999.0))
+        assert odds.probability(margins) == pytest.approx(1 / (1 + np.exp(-logit)))
+    far = odds.probability((-999.0, -999.0, -999.0)), odds.probability((999.0, 999.0, 999.0))
     assert 0 <= far[0] < 1e-9 < 1 - 1e-9 < far[1] <= 1
     assert type(far[0]) is float
 
@@ -35,14 +35,15 @@ def test_a_probability_is_the_logistic_of_whole_and_the_better_finer_margin():
         (0, 1, 1, np.nan),
     ],
 )
-def test_a_calibration_rises_with_margins(numbers):
+def test_odds_rise_with_margins(numbers):
     with pytest.raises(ValueError, match="expected finite numbers, rising with margins"):
-        Calibration(*numbers)
+        Odds(*numbers)
 
 
 def test_a_reading_holds_a_calibration_or_none():
     assert Reading().calibration is None
-    assert replace(Reading(), calibration=Calibration(0, 1, 0)).calibration == Calibration(0, 1, 0, 0.75)
+    calibration = Calibration(thing=Odds(0, 1, 0), part=Odds(0, 0, 1), inside=Odds(1, 0, 1))
+    assert replace(Reading(), calibration=calibration).calibration.part == Odds(0, 0, 1, 0.75)
 
 
 @pytest.mark.parametrize(

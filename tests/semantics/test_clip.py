@@ -9,7 +9,7 @@ import torch
 from transformers import CLIPModel, CLIPTokenizer
 
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.scene import Calibration, Reading
+from langsplat_core.scene import Calibration, Odds, Reading
 from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
 from langsplat_core.semantics.families.clip import CLIP_MEAN, CLIP_STD
 from tests.support.tiny_clip import SIDE, WORDS, tiny_clip
@@ -168,17 +168,19 @@ def test_how_an_encoder_is_read_lies_beside_its_weights(tmp_path):
 
 def test_a_calibration_lies_there_too(tmp_path):
     tiny_clip(tmp_path)
-    stated = {"constant": -1, "whole": 18.5, "finer": 2.5, "found": 0.7}
+    odds = {"constant": -1, "whole": 18.5, "finer": 2.5, "found": 0.7}
+    stated = {"thing": odds, "part": {"constant": 0, "whole": 0, "finer": 9}, "inside": odds}
     (tmp_path / "reading.json").write_text(json.dumps({"calibration": stated}))
-    want = Reading(10.0, 0.6, Calibration(-1, 18.5, 2.5, 0.7))
+    want = Reading(10.0, 0.6, Calibration(Odds(-1, 18.5, 2.5, 0.7), Odds(0, 0, 9), Odds(-1, 18.5, 2.5, 0.7)))
     assert load_text_encoder(str(tmp_path)).reading == want
     assert load_encoder(str(tmp_path), "cpu").reading == want
-    stated.pop("found")
+    odds.pop("found")
     (tmp_path / "reading.json").write_text(json.dumps({"found": 0.8, "calibration": stated}))
     reading = load_text_encoder(str(tmp_path)).reading
-    assert reading == Reading(10.0, 0.8, Calibration(-1, 18.5, 2.5))
+    assert reading == Reading(10.0, 0.8, Calibration(Odds(-1, 18.5, 2.5), Odds(0, 0, 9), Odds(-1, 18.5, 2.5)))
 
 
+ODDS = '{"constant": 0, "whole": 1, "finer": 0}'
 BROKEN_READINGS = (
     '{"found": 2}',
     '{"found": "much"}',
@@ -191,14 +193,25 @@ BROKEN_READINGS = (
     '"found"',
     '{"calibration": null}',
     '{"calibration": [0, 1, 2]}',
-    '{"calibration": {"constant": 0, "whole": 1}}',
-    '{"calibration": {"constant": 0, "whole": 1, "finer": 0, "part": 2}}',
-    '{"calibration": {"constant": 0, "whole": NaN, "finer": 0}}',
-    '{"calibration": {"constant": 0, "whole": "1", "finer": 0}}',
-    '{"calibration": {"constant": 0, "whole": -1, "finer": 0.5}}',
-    '{"calibration": {"constant": 0, "whole": 1, "finer": 0, "found": 0.4}}',
-    '{"calibration": {"constant": 0, "whole": 1, "finer": 0, "found": "0.7"}}',
-    '{"calibration": {"constant": 0, "whole": 1' + "0" * 400 + ', "finer": 0}}',
+    '{"calibration": {}}',
+    '{"verdict": {}}',
+    '{"calibration": {"constant": 0, "whole": 1, "finer": 0}}',  # as it was once
+    f'{{"calibration": {{"thing": {ODDS}, "part": {ODDS}}}}}',
+    f'{{"calibration": {{"thing": {ODDS}, "part": {ODDS}, "inside": {ODDS}, "other": {ODDS}}}}}',
+    f'{{"calibration": {{"thing": {ODDS}, "part": {ODDS}, "inside": null}}}}',
+    *(
+        f'{{"calibration": {{"thing": {ODDS}, "part": {broken}, "inside": {ODDS}}}}}'
+        for broken in (
+            '{"constant": 0, "whole": 1}',
+            '{"constant": 0, "whole": 1, "finer": 0, "part": 2}',
+            '{"constant": 0, "whole": NaN, "finer": 0}',
+            '{"constant": 0, "whole": "1", "finer": 0}',
+            '{"constant": 0, "whole": -1, "finer": 0.5}',
+            '{"constant": 0, "whole": 1, "finer": 0, "found": 0.4}',
+            '{"constant": 0, "whole": 1, "finer": 0, "found": "0.7"}',
+            '{"constant": 0, "whole": 1' + "0" * 400 + ', "finer": 0}',
+        )
+    ),
 )
 
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from langsplat_core.scene import Calibration, Reading
+from langsplat_core.scene import Calibration, Odds, Reading
 from langsplat_viewer import actions
 from langsplat_viewer.panels import query as panel
 from langsplat_viewer.viewer import Viewer
@@ -70,7 +70,7 @@ def searched(viewer: Viewer, phrase: str, calibration: Calibration | None = None
     [(1.0, "found", "100 %"), (-7.0, "weak match", "73 %"), (-11.0, "not here", "5 %")],
 )
 def test_the_verdict_and_how_likely_it_is(viewer, paper, constant, verdict, percent):
-    panel.draw(searched(viewer, "mug", Calibration(constant, whole=8.0, finer=0.01)))
+    panel.draw(searched(viewer, "mug", Calibration(*[Odds(constant, whole=8.0, finer=0.01)] * 3)))
     assert [text for text in paper.said if text in ("found", "weak match", "not here")] == [verdict]
     assert f"{percent} likely to be there" in paper.said
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from numpy.testing import assert_allclose
 
-from langsplat_core.scene import Calibration, Reading
+from langsplat_core.scene import Calibration, Odds, Reading
 from langsplat_viewer import actions
 from langsplat_viewer.state import NO_HEAT
 from langsplat_viewer.still import describe
@@ -130,7 +130,7 @@ def test_a_phrase_with_structure_says_how_it_was_read(opened):
 
 @pytest.mark.parametrize(("constant", "verdict"), [(1.0, "found"), (-7.0, "weak match"), (-11.0, "not here")])
 def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch, constant, verdict):
-    reading = Reading(calibration=Calibration(constant, whole=8.0, finer=0.01))
+    reading = Reading(calibration=Calibration(*[Odds(constant, whole=8.0, finer=0.01)] * 3))
     scene = replace(blob_scene(), language=replace(language(), reading=reading))
     monkeypatch.setitem(SCENES, "sure.ply", scene)
     actions.open_scene(viewer, Path("sure.ply"))

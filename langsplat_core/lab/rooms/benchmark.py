@@ -39,12 +39,11 @@ from langsplat_core.lab.rooms.report import Measured, RoomReport, codec_name, me
 from langsplat_core.lab.rooms.scoring import (
     Asked,
     Reading,
-    Truth,
     ask,
     evaluate,
     evaluate_direct,
-    read_truth,
 )
+from langsplat_core.lab.rooms.truth import Truth, read_truth
 from langsplat_core.lab.rooms.variants import Variant, variants
 from langsplat_core.lab.world.objects.catalogue import EVERYTHING
 from langsplat_core.lab.world.photographs import write_dataset

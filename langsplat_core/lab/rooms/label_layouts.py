@@ -14,7 +14,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.files import atomic_path
 from langsplat_core.lab.config import LabelLayout, Tier
 from langsplat_core.lab.rooms.outlines import outlines
-from langsplat_core.lab.rooms.scoring import MIN_PIXELS, Phrase, Truth, read_truth
+from langsplat_core.lab.rooms.scoring import MIN_PIXELS
+from langsplat_core.lab.rooms.truth import Phrase, Truth, read_truth
 from langsplat_core.lab.world.photographs import PLAIN, Naming, write_dataset
 from langsplat_core.progress import Progress
 

@@ -10,7 +10,7 @@ import numpy as np
 from langsplat_core.arrays import Array, unit
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
-from langsplat_core.lab.rooms.scoring import Truth
+from langsplat_core.lab.rooms.truth import Truth
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import TextEncoder
 from langsplat_core.raster.protocol import LiftingRasterizer
@@ -96,9 +96,10 @@ def moved_to_pictures(told: Sequence[ImageFeatures], seen: Sequence[ImageFeature
 def phrase_vectors(truth: Truth, encoder: TextEncoder) -> dict[int, Array]:
     """The text vector of every id's own phrase, such as "handle of the red mug"; ids without one,
     or with words that the encoder was never taught, are left out."""
-    texts = sorted({text for text in truth.names.values() if text and not encoder.unknown_words(text)})
+    names = {number: region.phrase for number, region in truth.regions.items()}
+    texts = sorted({text for text in names.values() if text and not encoder.unknown_words(text)})
     known = dict(zip(texts, encoder.encode_texts(texts), strict=True))
-    return {number: known[text] for number, text in truth.names.items() if text in known}
+    return {number: known[text] for number, text in names.items() if text in known}
 
 
 def true_labels(

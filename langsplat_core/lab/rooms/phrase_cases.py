@@ -1,6 +1,5 @@
 """Phrases with structure that are true of a procedural room, from its geometry and its names."""
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise, product
@@ -8,7 +7,7 @@ from itertools import pairwise, product
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.lab.rooms.scoring import Truth
+from langsplat_core.lab.rooms.truth import Truth
 from langsplat_core.lab.world.assembly import World
 from langsplat_core.lab.world.captions import KINDS
 from langsplat_core.query.phrase_tree import EXTREMES, SIDES
@@ -72,10 +71,9 @@ def things_in(world: World, frame: Array, seed: int = 0) -> Things:
 def cases(truth: Truth, things: Things, seen_by: Viewer, seed: int) -> list[Case]:
     """At most `MOST_CASES` of every construction but of parts, of which there are all."""
     rng = np.random.default_rng((seed, 7))
-    labels = json.loads((truth.folder / "labels.json").read_text(encoding="utf-8"))
     found: dict[str, list[Case]] = {name: [] for name in CONSTRUCTIONS}
     every = [
-        *_parts(truth, labels),
+        *_parts(truth),
         *_sets(things, rng),
         *_relations(things, seen_by),
         *_extremes(things, seen_by),
@@ -94,8 +92,8 @@ def cases(truth: Truth, things: Things, seen_by: Viewer, seed: int) -> list[Case
     return drawn
 
 
-def _parts(truth: Truth, labels: Mapping[str, Mapping[str, str]]) -> Iterator[Case]:
-    names = {f"{item['thing']} {item['word']}": (item["thing"], item["word"]) for item in labels.values()}
+def _parts(truth: Truth) -> Iterator[Case]:
+    names = {f"{item.thing} {item.word}": (item.thing, item.word) for item in truth.regions.values()}
     for phrase in truth.phrases:
         if phrase.kind in ("part", "subpart"):
             thing, part = names[phrase.text]
@@ -103,9 +101,7 @@ def _parts(truth: Truth, labels: Mapping[str, Mapping[str, str]]) -> Iterator[Ca
             yield Case(f"{phrase.kind} of thing", text, phrase.text, phrase.ids)
             yield Case(f"thing {phrase.kind}", phrase.text, phrase.text, phrase.ids)
             wholes = tuple(
-                int(key)
-                for key, item in labels.items()
-                if item["level"] == "whole" and item["thing"] == thing
+                key for key, item in truth.regions.items() if item.level == "whole" and item.thing == thing
             )
             text = f"{thing} without its {part}"
             yield Case("thing without part", text, f"{thing} without {part}", wholes, phrase.ids)

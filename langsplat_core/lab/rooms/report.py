@@ -9,7 +9,8 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.files import atomic_path
-from langsplat_core.lab.rooms.scoring import KINDS, Asked, DirectScore, Score, Truth, found_rate
+from langsplat_core.lab.rooms.scoring import Asked, DirectScore, Score, found_rate
+from langsplat_core.lab.rooms.truth import KINDS, Truth
 from langsplat_core.scene import Codec
 from langsplat_core.training.language.relevancy_error import CodecReport
 

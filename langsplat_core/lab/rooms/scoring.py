@@ -5,20 +5,17 @@ thing?) and segmentation (intersection over union), per view and phrase, average
 overlap directly among the Gaussians; and rejection: how many absent objects are answered with "not here".
 """
 
-import json
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
-from langsplat_core.errors import InputError
 from langsplat_core.evaluation.metrics import intersection_over_union, majority
-from langsplat_core.lab.world.captions import object_words
+from langsplat_core.lab.rooms.truth import KINDS, Phrase, Truth
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.cut import CutRule, cut_level
 from langsplat_core.query.engine import QueryEngine
@@ -34,35 +31,6 @@ MIN_GAUSSIANS = 20  # nor one with fewer Gaussians directly
 FILTER, VOTE, PAPER_ROWS = 20, 7, 731
 CHANNELS = 32  # phrases that are splatted at a time
 HALF = 0.5  # of what a pixel shows: from there it belongs to an answer's Gaussians
-KINDS = ("object", "colour+object", "part", "subpart")  # of phrases, in the order of tables
-
-
-@dataclass(frozen=True)
-class Phrase:
-    """A phrase and what it is true for."""
-
-    text: str
-    kind: str  # one of KINDS
-    ids: tuple[int, ...]  # truth ids, of any level
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """What `langsplat demo dataset` knows about its photographs."""
-
-    folder: Path
-    phrases: tuple[Phrase, ...]
-    words: frozenset[str]  # every phrase that is right for anything in the room
-    names: Mapping[int, str] = field(default_factory=dict)  # id -> the phrase that says most about it
-
-    def labels(self, name: str) -> Array:
-        """(3, H, W) ids of the photograph with this stem, -1 where nothing is."""
-        with np.load(self.folder / f"{name}.npz", allow_pickle=False) as stored:
-            return np.asarray(stored["ids"]).astype(np.int64)
-
-    def absent(self, things: Iterable[str]) -> list[str]:
-        """Those of `things` that nothing in the room may be called by, nor by a synonym of theirs."""
-        return sorted(thing for thing in things if self.words.isdisjoint(object_words(thing)))
 
 
 @dataclass(frozen=True)
@@ -115,34 +83,6 @@ class DirectScore:
     kind: str
     phrases: int
     mean_iou: float
-
-
-def read_truth(dataset: Path) -> Truth:
-    """The truth beside the photographs; InputError where there is none."""
-    folder = dataset / "truth"
-    if not (folder / "labels.json").is_file():
-        raise InputError(f"{dataset}: no truth/labels.json; make one with `langsplat demo dataset --out DIR`")
-    labels = json.loads((folder / "labels.json").read_text(encoding="utf-8"))
-    phrases: dict[str, Phrase] = {}
-    for item in labels.values():
-        for text, kind in _asked(item):
-            ids = tuple(int(key) for key, other in labels.items() if text in other["words"])
-            # A part without finer regions is its own subpart: the coarsest level gives a phrase its kind.
-            if text not in phrases or KINDS.index(kind) < KINDS.index(phrases[text].kind):
-                phrases[text] = Phrase(text, kind, ids)
-    words = frozenset(word for item in labels.values() for word in item["words"])
-    names = {int(key): item.get("phrase", "") for key, item in labels.items()}
-    return Truth(folder, tuple(phrases.values()), words, names)
-
-
-def _asked(item: dict[str, str]) -> Iterator[tuple[str, str]]:
-    """The phrases that are asked about one region: (text, kind)."""
-    if item["level"] == "whole" and item["thing"]:
-        yield item["thing"], "object"
-        if item["colour"]:
-            yield f"{item['colour']} {item['thing']}", "colour+object"
-    elif item["level"] in ("part", "subpart") and item["word"] not in ("", item["thing"], "body"):
-        yield f"{item['thing']} {item['word']}", item["level"]
 
 
 def ask(engine: QueryEngine, texts: Iterable[str]) -> Asked:

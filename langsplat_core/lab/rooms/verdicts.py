@@ -1,12 +1,14 @@
 """How far "found" and "not here" can be trusted (`langsplat bench verdict`), and how they are calibrated.
 
 In rooms whose truth is known every thing that is there is asked for, and every thing of the catalogue that is
-not. A calibration is fitted to the margins of both (Platt 1999, with Platt's smoothed targets); it is fair
-only to rooms that it was not fitted to.
+not; every part alone, and part words that nothing in the room is called by; every part of a thing, and as
+many that the thing has not. A calibration is fitted to the margins of each (Platt 1999, with Platt's smoothed
+targets); it is fair only to rooms that it was not fitted to.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -21,17 +23,27 @@ from langsplat_core.files import atomic_path
 from langsplat_core.lab.config import BenchmarkConfig, VerdictBenchConfig
 from langsplat_core.lab.rooms.benchmark import Room, weights_digest
 from langsplat_core.lab.rooms.report import separation
+from langsplat_core.lab.rooms.scoring import MIN_GAUSSIANS
+from langsplat_core.lab.rooms.truth import Region
 from langsplat_core.lab.rooms.variants import Variant
+from langsplat_core.lab.world.captions import part_words
 from langsplat_core.lab.world.objects.catalogue import EVERYTHING
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import WEAK
+from langsplat_core.query.answers import WEAK, QueryResult
+from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.scene import Calibration, Scene
+from langsplat_core.query.vocabulary import PARTS, forms, is_part
+from langsplat_core.scene import Calibration, Margins, Odds, Scene
 from langsplat_core.semantics.encoders import load_encoder
 
 REJECTED = 0.95  # of what is absent, in the rooms that a calibration is fitted to
 BINS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)  # of probability
 SHARES = (0.9, 0.95, 0.98)  # of absent things rejected, at which acceptance is reported
+PAIRS = {  # what is looked for -> the kinds of phrases that are there and that are not
+    "thing": ("object", "absent"),
+    "part": ("part", "absent part"),
+    "inside": ("part of thing", "absent part of thing"),
+}
 
 
 @dataclass(frozen=True)
@@ -41,8 +53,8 @@ class Verdict:
     tier: str
     seed: int
     text: str
-    kind: str  # "object", "colour+object" or "absent"
-    margins: tuple[float, float, float]  # of the best region of each level
+    kind: str  # one of those in `PAIRS`, or "colour+object"
+    margins: Margins  # of the best region of each level
     probability: float | None
     found: bool
 
@@ -65,17 +77,69 @@ def measure_verdicts(config: VerdictBenchConfig, work: Path, progress: Progress 
 
 
 def _of_room(room: Room, engine: QueryEngine) -> list[Verdict]:
+    parts, absent_parts = _part_words(room)
     asked = [(p.text, p.kind) for p in room.truth.phrases if p.kind in ("object", "colour+object")]
     asked += [(text, "absent") for text in room.truth.absent(EVERYTHING)]
+    asked += [(word, "part") for word in parts]
+    asked += [(word, "absent part") for word in absent_parts]
     asked = [(text, kind) for text, kind in asked if not engine.unknown_words(text)]
-    rows = []
-    for (text, kind), answer in zip(asked, engine.run_many([text for text, _ in asked]), strict=True):
-        judged = answer.margins, answer.probability, answer.found
-        rows.append(Verdict(room.tier, room.seed, text, kind, *judged))
+    answers = engine.run_many([text for text, _ in asked])
+    rows = [_verdict(room, text, kind, answer) for (text, kind), answer in zip(asked, answers, strict=True)]
+    for text, kind in _inside(room, engine):
+        rows.append(_verdict(room, text, kind, run_phrase(engine, text).answer))
     return rows
 
 
-def fit_calibration(present: Array, absent: Array) -> Calibration:
+def _verdict(room: Room, text: str, kind: str, answer: QueryResult) -> Verdict:
+    return Verdict(room.tier, room.seed, text, kind, answer.margins, answer.probability, answer.found)
+
+
+def _part_words(room: Room) -> tuple[list[str], list[str]]:
+    """Words of parts that Gaussians of the room show, and such words that nothing in it is called by."""
+    seen, counts = np.unique(room.labels, return_counts=True)
+    shown = {int(number) for number, count in zip(seen, counts, strict=True) if count >= MIN_GAUSSIANS}
+    parts = {
+        region.word for number, region in room.truth.regions.items() if number in shown and _part(region)
+    }
+    return sorted(parts), sorted(_uncalled(PARTS, room.truth.words))
+
+
+def _inside(room: Room, engine: QueryEngine) -> Iterator[tuple[str, str]]:
+    """(phrase, kind): every part of every thing of the room, and as many that it has not."""
+    rng = np.random.default_rng((room.seed, 11))
+    regions = list(room.truth.regions.values())
+    words = sorted({region.word for region in regions if _part(region)})
+    words = [word for word in words if not engine.unknown_words(word)]
+    for thing in sorted({region.thing for region in regions}):
+        own = [region for region in regions if region.thing == thing]
+        has = sorted({region.word for region in own if _part(region)} & set(words))
+        lacks = _uncalled(words, {word for region in own for word in region.words})
+        drawn = rng.permutation(lacks)[: len(has)].tolist()
+        if has and not engine.unknown_words(thing):
+            yield from ((f"{word} of the {thing}", "part of thing") for word in has)
+            yield from ((f"{word} of the {thing}", "absent part of thing") for word in drawn)
+
+
+def _part(region: Region) -> bool:
+    return region.is_part and is_part(region.word)
+
+
+def _uncalled(words: Iterable[str], called: AbstractSet[str]) -> list[str]:
+    """Those of `words` that neither in this number nor in the other one are among `called`."""
+    return sorted(word for word in words if called.isdisjoint({*forms(word), f"{word}s", *part_words(word)}))
+
+
+def fit_calibration(rows: Sequence[Verdict]) -> Calibration:
+    """To all kinds of phrases. Raises as `fit_odds` does."""
+    return Calibration(
+        **{
+            name: fit_odds(margins_of(rows, there), margins_of(rows, not_))
+            for name, (there, not_) in PAIRS.items()
+        }
+    )
+
+
+def fit_odds(present: Array, absent: Array) -> Odds:
     """Of margins (P, 3) of things that are there and (A, 3) of things that are not, which weigh the same.
 
     Raises InputError where there are fewer than ten of either, or the margins do not tell them apart.
@@ -98,7 +162,7 @@ def fit_calibration(present: Array, absent: Array) -> Calibration:
     constant, whole, finer = minimize(loss, np.array([0.0, 10.0, 0.0]), method="BFGS").x.round(3)
     if whole + finer <= 0:
         raise InputError("what is there has no larger margins than what is not: nothing to calibrate")
-    plain = Calibration(float(constant), float(whole), float(finer))
+    plain = Odds(float(constant), float(whole), float(finer))
     said = [plain.probability((m[0], m[1], m[2])) for m in absent.tolist()]
     highest = float(np.quantile(said, REJECTED, method="higher"))
     return replace(plain, found=float(np.ceil(1000 * max(highest, WEAK)) / 1000))
@@ -121,26 +185,29 @@ def verdict_table(rows: Sequence[Verdict]) -> str:
     """Markdown: what is accepted and rejected, and the area under the curve, per tier; means over rooms with
     their standard deviation."""
     at = (f"accepted at {100 * share:.0f} % rejected" for share in SHARES)
-    head = ("tier", "accepted %", "of colour + thing %", "absent rejected %", "ROC area %", *at)
+    head = ("tier", "asked for", "phrases", "accepted %", "absent rejected %", "ROC area %", *at)
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    asked = {"thing": PAIRS["thing"], "colour + thing": ("colour+object", "absent"), **PAIRS}
     for tier in dict.fromkeys(row.tier for row in rows):
-        here = [row for row in rows if row.tier == tier]
-        rooms = [[row for row in here if row.seed == seed] for seed in dict.fromkeys(r.seed for r in here)]
-        lines.append("| " + " | ".join((tier, *_spreads([_shares(room) for room in rooms]))) + " |")
+        for name, pair in asked.items():
+            here = [row for row in rows if row.tier == tier and row.kind in pair]
+            rooms = [
+                [row for row in here if row.seed == seed] for seed in dict.fromkeys(r.seed for r in here)
+            ]
+            if any(row.kind == pair[0] for row in here):
+                cells = (tier, name, str(len(here)), *_spreads([_shares(room, pair) for room in rooms]))
+                lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
-def _shares(rows: Sequence[Verdict]) -> tuple[float, ...]:
-    present, absent = (
-        np.array([_score(row) for row in rows if row.kind == kind]) for kind in ("object", "absent")
-    )
-    kinds = ("object", "colour+object", "absent")
-    found, coloured, wrong = (_mean([row.found for row in rows if row.kind == kind]) for kind in kinds)
+def _shares(rows: Sequence[Verdict], pair: tuple[str, str]) -> tuple[float, ...]:
+    present, absent = (np.array([_score(row) for row in rows if row.kind == kind]) for kind in pair)
+    found, wrong = (_mean([row.found for row in rows if row.kind == kind]) for kind in pair)
     compared = [float("nan")] * (1 + len(SHARES))  # nothing to compare where one of both was not asked for
     if len(present) and len(absent):
         at = (np.mean(present > np.quantile(absent, share, method="higher")) for share in SHARES)
         compared = [separation(present, absent), *map(float, at)]
-    return found, coloured, 1 - wrong, *compared
+    return found, 1 - wrong, *compared
 
 
 def _mean(values: Sequence[bool]) -> float:
@@ -163,14 +230,15 @@ def _spread(values: Array) -> str:
     return f"{values.mean():.1f} +/- {values.std(ddof=1) if len(values) > 1 else 0:.1f}"
 
 
-def curve_table(rows: Sequence[Verdict]) -> str:
+def curve_table(rows: Sequence[Verdict], asked: str = "thing") -> str:
     """Markdown: of everything said with a probability between two limits, how much was there, present and
-    absent things weighing the same in all."""
-    judged = [row for row in rows if row.probability is not None and row.kind in ("object", "absent")]
+    absent ones weighing the same in all. asked: a key of `PAIRS`."""
+    pair = PAIRS[asked]
+    judged = [row for row in rows if row.probability is not None and row.kind in pair]
     said = np.array([row.probability for row in judged])
-    there = np.array([row.kind == "object" for row in judged], dtype=bool)
+    there = np.array([row.kind == pair[0] for row in judged], dtype=bool)
     weights = np.where(there, 1 / max(there.sum(), 1), 1 / max((~there).sum(), 1))
-    lines = ["| probability said | phrases | mean said % | there % |", "|---|---|---|---|"]
+    lines = [f"| probability of a {asked} said | phrases | mean said % | there % |", "|---|---|---|---|"]
     for low, high in pairwise(BINS):
         inside = (said >= low) & (said < high) if high < 1 else said >= low
         if inside.any():

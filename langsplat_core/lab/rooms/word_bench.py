@@ -1,6 +1,5 @@
 """How well a vocabulary names what is in rooms whose truth is known (`langsplat bench words`)."""
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -14,6 +13,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.lab.config import BenchmarkConfig, WordBenchConfig
 from langsplat_core.lab.rooms.benchmark import Room, weights_digest
 from langsplat_core.lab.rooms.scoring import MIN_GAUSSIANS
+from langsplat_core.lab.rooms.truth import Region
 from langsplat_core.lab.rooms.variants import Variant
 from langsplat_core.lab.world.captions import colour_words, object_words
 from langsplat_core.progress import Progress, silent
@@ -25,7 +25,7 @@ from langsplat_core.scene import LEVELS, Scene
 from langsplat_core.semantics.encoders import load_encoder
 
 TOP = 5
-Labels = Mapping[int, Mapping[str, Any]]  # truth id -> what labels.json says about it
+Truth = Mapping[int, Region]  # by truth id
 
 
 @dataclass(frozen=True)
@@ -74,13 +74,11 @@ def measure_words(
         room = Room(settings, config.tier, seed, work, (encoder, weights_digest("demo")), progress)
         field, _, _ = room.field(Variant("the method", settings.masks, codec=settings.codec))
         describer = Describer(QueryEngine(Scene(room.gaussians, field), lambda _: encoder))
-        text = (room.photographs / "truth" / "labels.json").read_text(encoding="utf-8")
-        truth = {int(key): item for key, item in json.loads(text).items()}
-        found.append(_room(seed, describer, room.labels, truth))
+        found.append(_room(seed, describer, room.labels, room.truth.regions))
     return found
 
 
-def _room(seed: int, describer: Describer, labels: Array, truth: Labels) -> RoomWords:
+def _room(seed: int, describer: Describer, labels: Array, truth: Truth) -> RoomWords:
     names = []
     for how, words in _ways(describer).items():
         for level in reversed(range(len(LEVELS))):
@@ -105,11 +103,11 @@ def _regions(labels: Array) -> dict[int, Array]:
 
 
 def _names(
-    how: str, words: WordScores, describer: Describer, level: int, regions: Mapping[int, Array], truth: Labels
+    how: str, words: WordScores, describer: Describer, level: int, regions: Mapping[int, Array], truth: Truth
 ) -> LevelNames:
     field, known, rows = describer.engine.field, describer.engine.field.known[level], []
     for key, members in regions.items():
-        right = np.isin(words.phrases, truth[key]["words"])
+        right = np.isin(words.phrases, truth[key].words)
         members = members[known[members]]
         if not right.any() or len(members) == 0:
             continue
@@ -121,10 +119,10 @@ def _names(
     return LevelNames(how, LEVELS[level], len(rows), *(float(value) for value in mean))
 
 
-def _colours(describer: Describer, regions: Mapping[int, Array], truth: Labels) -> float:
+def _colours(describer: Describer, regions: Mapping[int, Array], truth: Truth) -> float:
     hits = []
     for key, members in regions.items():
-        colour = truth[key]["colour"]
+        colour = truth[key].colour
         if colour:
             said = describer.at_gaussians(members)[2].colour
             hits.append(said is not None and said.phrase in colour_words(colour))
@@ -132,7 +130,7 @@ def _colours(describer: Describer, regions: Mapping[int, Array], truth: Labels) 
 
 
 def score_inventory(
-    entries: Sequence[Entry], labels: Array, truth: Labels, areas: Array, phrases: Sequence[str]
+    entries: Sequence[Entry], labels: Array, truth: Truth, areas: Array, phrases: Sequence[str]
 ) -> InventoryScore:
     """Entries of whole things against (3, N) truth ids; seconds are left 0."""
     wholes, named = [entry for entry in entries if entry.level == 2], set()
@@ -140,11 +138,11 @@ def score_inventory(
     for entry in wholes:
         rows = np.concatenate([spot.rows for spot in entry.spots])
         ids = labels[2, rows]
-        fits = {key for key in np.unique(ids[ids >= 0]) if entry.phrase in truth[int(key)]["words"]}
+        fits = {key for key in np.unique(ids[ids >= 0]) if entry.phrase in truth[int(key)].words}
         if areas[rows[np.isin(ids, list(fits))]].sum() * 2 > areas[rows].sum():
             correct += 1
-            named |= {truth[int(key)]["thing"] for key in fits}
-    things = {truth[key]["thing"] for key in _regions(labels[2])} - {""}
+            named |= {truth[int(key)].thing for key in fits}
+    things = {truth[key].thing for key in _regions(labels[2])} - {""}
     things = {thing for thing in things if not set(object_words(thing)).isdisjoint(phrases)}
     return InventoryScore(
         entries=len(wholes),

@@ -25,9 +25,7 @@ from langsplat_core.lab.rooms.oracles import (
     MIN_REGION,
     TruthMasks,
 )
-from langsplat_core.lab.rooms.scoring import (
-    read_truth,
-)
+from langsplat_core.lab.rooms.truth import read_truth
 from langsplat_core.lab.rooms.variants import liftings, variants
 from langsplat_core.lab.world import photographs as dataset
 from langsplat_core.progress import silent

@@ -12,7 +12,8 @@ from langsplat_core.evaluation.protocols.lerf_ovs import read_lerf_ovs
 from langsplat_core.evaluation.protocols.ovs3d import read_3d_ovs
 from langsplat_core.lab.rooms.label_layouts import write_labelled
 from langsplat_core.lab.rooms.outlines import outlines
-from langsplat_core.lab.rooms.scoring import MIN_PIXELS, read_truth
+from langsplat_core.lab.rooms.scoring import MIN_PIXELS
+from langsplat_core.lab.rooms.truth import read_truth
 from langsplat_core.lab.world import photographs
 from langsplat_core.progress import silent
 

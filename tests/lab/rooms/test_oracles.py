@@ -11,9 +11,7 @@ from langsplat_core.lab.rooms.oracles import (
     phrase_vectors,
     true_labels,
 )
-from langsplat_core.lab.rooms.scoring import (
-    Truth,
-)
+from langsplat_core.lab.rooms.truth import Region, Truth
 from langsplat_core.lab.world.assembly import build_room
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.semantics.store import ImageFeatures
@@ -39,7 +37,8 @@ class Speller:
 def test_perfect_embeddings_are_text_vectors_of_the_true_words():
     names = {0: "red mug", 1: "handle of the red mug", 2: "blue cactus", 3: ""}
     encoder = Speller()
-    vectors = phrase_vectors(Truth(None, (), frozenset(), names), encoder)
+    regions = {key: Region("whole", "", "", phrase=phrase) for key, phrase in names.items()}
+    vectors = phrase_vectors(Truth(None, (), regions), encoder)
     assert set(vectors) == {0, 1}
     ids = np.full((3, 4, 5), 0)
     ids[1, :, :3], ids[1, :, 3:] = 1, 2

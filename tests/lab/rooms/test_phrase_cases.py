@@ -7,7 +7,7 @@ import pytest
 
 from langsplat_core.lab.rooms.phrase_cases import CONSTRUCTIONS, Case, cases, things_in
 from langsplat_core.lab.rooms.phrases import PhraseScore, phrase_table
-from langsplat_core.lab.rooms.scoring import Truth, read_truth
+from langsplat_core.lab.rooms.truth import Truth, read_truth
 from langsplat_core.lab.world.assembly import World, build_room
 from langsplat_core.query.grammar import parse
 from langsplat_core.query.phrase_tree import Atom
@@ -66,7 +66,7 @@ def test_every_case_has_structure_and_a_truth_that_says_so(room, found):
     assert {"part of thing", "A and B", "kind, not thing", "near", "highest"} <= {
         c.construction for c in found
     }
-    known = {int(key) for key in json.loads((truth.folder / "labels.json").read_text())}
+    known = set(truth.regions)
     for case in found:
         assert set(case.ids) | set(case.without) <= known
         # "picture of a cat" is a picture, and a part that is in no list is asked whole

@@ -11,13 +11,12 @@ from langsplat_core.lab.rooms.report import separation
 from langsplat_core.lab.rooms.scoring import (
     Answer,
     Asked,
-    Phrase,
-    Truth,
     ask,
     evaluate_direct,
     found_rate,
     relevancy_maps,
 )
+from langsplat_core.lab.rooms.truth import Phrase, Region, Truth
 from langsplat_core.query.cut import CUT_RULES, cut_level
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
@@ -56,7 +55,7 @@ def test_direct_overlap_has_its_closed_form(rule):
         Phrase("rare", "part", (5,)),
     )
     made = answer(0.9 * inside) if rule == "floor" else answer(np.full(200, 0.9), members=inside)
-    truth = Truth(None, phrases, frozenset())
+    truth = Truth(None, phrases)
     asked = Asked(None, {phrase.text: made for phrase in phrases}, (), 0.0)
     (score,) = evaluate_direct(asked, labels, truth, rule)
     assert (score.kind, score.phrases) == ("object", 2)
@@ -87,7 +86,7 @@ def test_separation_is_the_chance_of_the_right_order():
 
 
 def test_absent_things_have_no_other_name_in_the_room():
-    truth = Truth(None, (), frozenset({"mug", "cup", "orange", "couch"}))
+    truth = Truth(None, (), {0: Region("whole", "", "", words=("mug", "cup", "orange", "couch"))})
     assert truth.absent(["mug", "orange", "sofa", "lamp", "apple"]) == ["apple", "lamp"]
 
 

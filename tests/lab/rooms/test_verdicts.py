@@ -14,19 +14,20 @@ from langsplat_core.errors import InputError
 from langsplat_core.lab.config import VerdictBenchConfig
 from langsplat_core.lab.rooms import verdicts as module
 from langsplat_core.lab.rooms.verdicts import (
+    PAIRS,
     REJECTED,
     Verdict,
     curve_table,
     figures,
     fit_calibration,
-    margins_of,
+    fit_odds,
     measure_verdicts,
     verdict_table,
     write_calibration,
 )
-from langsplat_core.scene import Calibration
+from langsplat_core.scene import Calibration, Odds
 
-TRUE = Calibration(-1.0, 18.0, 6.0)
+TRUE = Odds(-1.0, 18.0, 6.0)
 
 
 def logistic(count: int, seed: int = 0) -> tuple[Array, Array]:
@@ -40,7 +41,7 @@ def logistic(count: int, seed: int = 0) -> tuple[Array, Array]:
 
 def test_a_fit_recovers_what_made_the_data():
     present, absent = logistic(20_000)
-    fitted = fit_calibration(present, absent)
+    fitted = fit_odds(present, absent)
     assert fitted.whole == pytest.approx(TRUE.whole, rel=0.06)
     assert fitted.finer == pytest.approx(TRUE.finer, rel=0.12)
     # Both weigh the same in the fit: the constant moves by the logarithm of how many there are of each.
@@ -50,52 +51,67 @@ def test_a_fit_recovers_what_made_the_data():
 
 def test_how_many_there_are_of_each_changes_nothing():
     present, absent = logistic(4_000)
-    once, often = fit_calibration(present, absent), fit_calibration(present, np.tile(absent, (9, 1)))
+    once, often = fit_odds(present, absent), fit_odds(present, np.tile(absent, (9, 1)))
     for name in ("constant", "whole", "finer", "found"):
         assert getattr(often, name) == pytest.approx(getattr(once, name), rel=0.02, abs=0.02)
 
 
 def test_found_rejects_as_much_of_what_is_absent_as_is_asked():
     present, absent = logistic(3_000)
-    fitted = fit_calibration(present, absent)
+    fitted = fit_odds(present, absent)
     said = np.array([fitted.probability(tuple(row)) for row in absent.tolist()])
     assert REJECTED <= (said < fitted.found).mean() < REJECTED + 0.01
-    apart = fit_calibration(np.full((20, 3), 0.5), np.full((20, 3), -0.5))
+    apart = fit_odds(np.full((20, 3), 0.5), np.full((20, 3), -0.5))
     assert apart.found == 0.5  # never less than even
     assert np.isfinite([apart.constant, apart.whole, apart.finer]).all()  # Platt's targets keep it so
 
 
 def test_the_order_of_the_margins_changes_nothing():
     present, absent = logistic(500)
-    got = fit_calibration(present[::-1], absent[::-1])
-    want = fit_calibration(present, absent)
+    got = fit_odds(present[::-1], absent[::-1])
+    want = fit_odds(present, absent)
     assert (got.whole, got.finer) == pytest.approx((want.whole, want.finer), abs=0.02)
 
 
 @pytest.mark.parametrize(("present", "absent"), [(9, 100), (100, 9), (0, 0)])
 def test_too_little_to_fit(present, absent):
     with pytest.raises(InputError, match="ten things that are there"):
-        fit_calibration(np.zeros((present, 3)), np.zeros((absent, 3)))
+        fit_odds(np.zeros((present, 3)), np.zeros((absent, 3)))
     with pytest.raises(InputError, match="ten things"):
-        fit_calibration(margins_of([], "object"), margins_of([], "absent"))
+        fit_calibration([])
 
 
 def test_margins_that_say_the_opposite():
     present, absent = logistic(500)
     with pytest.raises(InputError, match="nothing to calibrate"):
-        fit_calibration(absent, present)
+        fit_odds(absent, present)
+
+
+def test_every_way_of_looking_has_its_own_odds():
+    spread = {"thing": 1.0, "part": 0.5, "inside": 0.25}
+    rows = []
+    for name, factor in spread.items():
+        for kind, margins in zip(PAIRS[name], logistic(4_000), strict=True):
+            rows += [
+                Verdict("clutter", 1, "x", kind, tuple(m), None, False) for m in (factor * margins).tolist()
+            ]
+    fitted = fit_calibration(rows)
+    assert fitted.part.whole == pytest.approx(2 * fitted.thing.whole, rel=0.02)
+    assert fitted.inside.finer == pytest.approx(4 * fitted.thing.finer, rel=0.02)
 
 
 def test_writing_keeps_what_else_stands_there(tmp_path):
     path = tmp_path / "reading.json"
-    write_calibration(path, TRUE)
-    assert json.loads(path.read_text()) == {
-        "calibration": {"constant": -1.0, "whole": 18.0, "finer": 6.0, "found": 0.75}
-    }
+    calibration = Calibration(TRUE, Odds(0, 0, 1), replace(TRUE, found=0.8))
+    write_calibration(path, calibration)
+    assert json.loads(path.read_text())["calibration"]["part"] == {
+        "constant": 0, "whole": 0, "finer": 1, "found": 0.75
+    }  # fmt: skip
     path.write_text('{"found": 0.73, "calibration": {"constant": 9}}')
-    write_calibration(path, TRUE)
+    write_calibration(path, calibration)
     stated = json.loads(path.read_text())
-    assert (stated["found"], Calibration(**stated["calibration"])) == (0.73, TRUE)
+    odds = {name: Odds(**numbers) for name, numbers in stated["calibration"].items()}
+    assert (stated["found"], Calibration(**odds)) == (0.73, calibration)
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -114,31 +130,43 @@ def cells(table: str, line: int) -> list[str]:
 
 
 def test_the_table_of_one_room():
-    tier, accepted, coloured, rejected, area, *at = cells(verdict_table(ROOM), 2)
-    assert tier == "clutter"
-    assert (accepted, coloured, rejected) == ("75.0 +/- 0.0", "50.0 +/- 0.0", "75.0 +/- 0.0")
+    tier, asked, phrases, accepted, rejected, area, *at = cells(verdict_table(ROOM), 2)
+    assert (tier, asked, phrases) == ("clutter", "thing", "8")
+    assert (accepted, rejected) == ("75.0 +/- 0.0", "75.0 +/- 0.0")
     pairs = [a > b for a in (0.2, 0.8, 0.9, 0.95) for b in (0.01, 0.02, 0.5, 0.76)]
     assert area == f"{100 * np.mean(pairs):.1f} +/- 0.0"
     assert at == ["75.0 +/- 0.0"] * 3  # of four absent things none but the best is the limit
+    assert cells(verdict_table(ROOM), 3)[1:4] == ["colour + thing", "6", "50.0 +/- 0.0"]
+
+
+def test_parts_have_lines_of_their_own():
+    parts = [row("part", 0.9), row("part", 0.3), row("absent part", 0.1)]
+    inside = [row("part of thing", 0.9), row("absent part of thing", 0.8)]
+    table = verdict_table(ROOM + parts + inside)
+    assert [cells(table, n)[1] for n in range(2, 6)] == ["thing", "colour + thing", "part", "inside"]
+    assert cells(table, 4)[2:5] == ["3", "50.0 +/- 0.0", "100.0 +/- 0.0"]
+    assert cells(table, 5)[2:5] == ["2", "100.0 +/- 0.0", "0.0 +/- 0.0"]
+    assert cells(table, 2) == cells(verdict_table(ROOM), 2)
+    assert cells(curve_table(ROOM + parts, "part"), 3)[:2] == ["0.25 to 0.5", "1"]
 
 
 def test_rooms_are_averaged_in_their_tier():
     other = [replace(r, seed=2, found=True) for r in ROOM]
     third = [replace(r, tier="separate", probability=None) for r in ROOM]
     table = verdict_table(ROOM + other + third)
-    assert cells(table, 2)[1] == f"87.5 +/- {100 * np.std([0.75, 1], ddof=1):.1f}"
-    assert [cells(table, 2)[0], cells(table, 3)[0]] == ["clutter", "separate"]
-    assert cells(table, 3)[1:] == cells(verdict_table(ROOM), 2)[1:]  # the best margin takes its place
-    assert table.count("\n") == 4
+    assert cells(table, 2)[3] == f"87.5 +/- {100 * np.std([0.75, 1], ddof=1):.1f}"
+    assert [cells(table, n)[0] for n in range(2, 6)] == ["clutter", "clutter", "separate", "separate"]
+    assert cells(table, 4)[1:] == cells(verdict_table(ROOM), 2)[1:]  # the best margin takes its place
+    assert table.count("\n") == 6
 
 
 def test_a_room_without_one_kind_of_phrase_is_no_error():
     table = verdict_table([r for r in ROOM if r.kind != "colour+object"])
-    assert cells(table, 2)[1:4] == ["75.0 +/- 0.0", "-", "75.0 +/- 0.0"]
+    assert (table.count("\n"), cells(table, 2)[3:5]) == (3, ["75.0 +/- 0.0", "75.0 +/- 0.0"])
     half = [r for r in ROOM if r.kind != "colour+object"] + [replace(r, seed=2) for r in ROOM]
-    assert cells(verdict_table(half), 2)[2] == "50.0 +/- 0.0"  # of the rooms that have such things
-    assert cells(verdict_table([row("object", 0.9)]), 2)[1:] == ["100.0 +/- 0.0", *["-"] * 6]
-    assert cells(verdict_table([row("absent", 0.1)]), 2)[3] == "100.0 +/- 0.0"
+    assert cells(verdict_table(half), 3)[3] == "50.0 +/- 0.0"  # of the rooms that have such things
+    assert cells(verdict_table([row("object", 0.9)]), 2)[3:] == ["100.0 +/- 0.0", *["-"] * 5]
+    assert verdict_table([row("absent", 0.1)]).count("\n") == 2
 
 
 def test_the_curve_weighs_present_and_absent_alike():
@@ -169,7 +197,8 @@ def test_no_room(tmp_path, changes):
 
 def calibration_data(*_: object) -> list[Verdict]:
     present, absent = logistic(300)
-    rows = [("object", margins) for margins in present] + [("absent", margins) for margins in absent]
+    rows = [(there, margins) for there, _ in PAIRS.values() for margins in present]
+    rows += [(missing, margins) for _, missing in PAIRS.values() for margins in absent]
     rows += [("colour+object", margins) for margins in present]
     return [
         Verdict("clutter", 301, "x", kind, tuple(m.tolist()), float(sigmoid(20 * m[2])), bool(m[2] > 0.1))
@@ -191,7 +220,7 @@ def test_the_command_writes_tables_and_a_calibration(tmp_path, monkeypatch, caps
     assert verdict_table(calibration_data()) in (tmp_path / "out" / "verdict.md").read_text()
     replace(command, fit=tmp_path / "reading.json").run()
     stated = json.loads((tmp_path / "reading.json").read_text())["calibration"]
-    assert 10 < Calibration(**stated).whole < 30
+    assert all(10 < Odds(**stated[name]).whole < 30 for name in PAIRS)
     assert "reading.json: Calibration(" in capsys.readouterr().out
 
 

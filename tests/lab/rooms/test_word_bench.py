@@ -5,6 +5,7 @@ import pytest
 
 from langsplat_core.errors import InputError
 from langsplat_core.lab.config import WordBenchConfig
+from langsplat_core.lab.rooms.truth import Region
 from langsplat_core.lab.rooms.word_bench import (
     InventoryScore,
     LevelNames,
@@ -16,9 +17,9 @@ from langsplat_core.lab.rooms.word_bench import (
 from langsplat_core.query.inventory import Entry, Spot
 
 TRUTH = {
-    0: {"words": ["mug", "cup", "red mug"], "thing": "mug"},
-    1: {"words": ["table"], "thing": "table"},
-    2: {"words": ["duck"], "thing": "duck"},
+    0: Region("whole", "mug", "mug", words=("mug", "cup", "red mug")),
+    1: Region("whole", "table", "table", words=("table",)),
+    2: Region("whole", "duck", "duck", words=("duck",)),
 }
 LABELS = np.stack([np.repeat([-1, -1, -1, -1], 30), np.repeat([-1] * 4, 30), np.repeat([0, 1, 2, -1], 30)])
 
