@@ -9,6 +9,7 @@ from langsplat_core.cli.bench_gains import BenchGains
 from langsplat_core.cli.bench_lift import BenchLift
 from langsplat_core.cli.bench_load import BenchLoad
 from langsplat_core.cli.bench_memory import BenchMemory
+from langsplat_core.cli.bench_paper import BenchPaper
 from langsplat_core.cli.bench_phrases import BenchPhrases
 from langsplat_core.cli.bench_query import BenchQuery
 from langsplat_core.cli.bench_steps import BenchSteps
@@ -44,6 +45,7 @@ def parse(args: list[str]) -> Command:
     bench.command(name="raster")(BenchRaster)
     bench.command(name="gains")(BenchGains)
     bench.command(name="lift")(BenchLift)
+    bench.command(name="paper")(BenchPaper)
     bench.command(name="load")(BenchLoad)
     bench.command(name="memory")(BenchMemory)
     bench.command(name="phrases")(BenchPhrases)

@@ -1,71 +1,15 @@
 """The benchmark on procedural rooms: freshly rendered, trained by the ordinary pipeline, compared with the
 truth; and an error budget, which swaps one stage at a time for one that makes no mistake."""
 
-import hashlib
-import statistics
-import time
-from collections.abc import Sequence
-from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-import numpy as np
-
-from langsplat_core.arrays import Array
-from langsplat_core.config import (
-    ClipConfig,
-    DatasetConfig,
-    MaskConfig,
-    RadianceConfig,
-    TrainConfig,
-)
-from langsplat_core.datasets import load_capture
-from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
-from langsplat_core.files import atomic_path
-from langsplat_core.formats.language import means_checksum
-from langsplat_core.lab.config import BenchmarkConfig, Tier
+from langsplat_core.lab.config import BenchmarkConfig
 from langsplat_core.lab.demo import SEED
-from langsplat_core.lab.rooms.oracles import (
-    TruthMasks,
-    moved_to_pictures,
-    oracle_vectors,
-    phrase_vectors,
-    true_labels,
-    with_wrong_vectors,
-)
-from langsplat_core.lab.rooms.report import Measured, RoomReport, codec_name, measured
-from langsplat_core.lab.rooms.scoring import (
-    Asked,
-    Reading,
-    ask,
-    evaluate,
-    evaluate_direct,
-)
-from langsplat_core.lab.rooms.truth import Truth, read_truth
-from langsplat_core.lab.rooms.variants import Variant, variants
-from langsplat_core.lab.world.objects.catalogue import EVERYTHING
-from langsplat_core.lab.world.photographs import write_dataset
-from langsplat_core.pipeline.language import Views, language_field
-from langsplat_core.pipeline.stages import stage_key
-from langsplat_core.pipeline.train import trained_gaussians
+from langsplat_core.lab.rooms.report import RoomReport
+from langsplat_core.lab.rooms.room import HOLD_OUT, Room, labelled, weights_digest
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import AnswerRule
-from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.pixels import splatted_relevancy
-from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.scene import Gaussians, LanguageField, Scene
-from langsplat_core.semantics.encoder import Encoder
-from langsplat_core.semantics.encoders import load_encoder, model_folder
-from langsplat_core.semantics.masks import MaskSource
-from langsplat_core.semantics.sources import load_mask_source
-from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture
-from langsplat_core.training.language.relevancy_error import CodecReport
-from langsplat_core.training.radiance.train import evaluate_views
-
-HOLD_OUT = 8  # every so many views, one is not trained on
-FRAMES = 5  # timed pictures of one phrase
+from langsplat_core.semantics.encoders import load_encoder
 
 
 def run_benchmark(config: BenchmarkConfig, work: Path, progress: Progress = silent) -> list[RoomReport]:
@@ -78,13 +22,9 @@ def run_benchmark(config: BenchmarkConfig, work: Path, progress: Progress = sile
     for tier in config.tiers:
         for seed in config.seeds:
             label = f"{tier} {seed}, "
-            room = Room(config, tier, seed, work, (encoder, weights), _labelled(progress, label))
+            room = Room(config, tier, seed, work, (encoder, weights), labelled(progress, label))
             reports.append(room.report())
     return reports
-
-
-def _labelled(progress: Progress, prefix: str) -> Progress:
-    return lambda label, fraction: progress(prefix + label, fraction)
 
 
 def _check(config: BenchmarkConfig) -> None:
@@ -98,190 +38,3 @@ def _check(config: BenchmarkConfig) -> None:
         raise InputError("--seeds must be 0 or more")
     if config.views < HOLD_OUT or min(config.steps, config.max_gaussians) < 1:
         raise InputError(f"eval synthetic: it needs at least {HOLD_OUT} --views, and 1 step and Gaussian")
-
-
-def weights_digest(model: str) -> str:
-    """Of an encoder's weights: a folder may be filled with others under the same name."""
-    folder, digest = model_folder(model, "--encoder"), hashlib.sha256()
-    for path in sorted([*folder.glob("*.safetensors"), *folder.glob("*.bin")]):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]
-
-
-def train_config(config: BenchmarkConfig) -> TrainConfig:
-    """The settings with which every room is trained."""
-    return TrainConfig(
-        dataset=DatasetConfig(max_side=max(config.size), test_every=HOLD_OUT),
-        radiance=RadianceConfig(steps=config.steps, sh_degree=1, max_gaussians=config.max_gaussians),
-        clip=ClipConfig(model=config.encoder),
-    )
-
-
-class Room:
-    """One room and everything that is derived from it, each made once, when it is first needed."""
-
-    def __init__(
-        self,
-        config: BenchmarkConfig,
-        tier: Tier,
-        seed: int,
-        work: Path,
-        encoder: tuple[Encoder, str],
-        progress: Progress,
-    ) -> None:
-        width, height = config.size
-        self.config, self.tier, self.seed, self.progress = config, tier, seed, progress
-        self.encoder, self.weights = encoder
-        self.folder = work / f"{tier}-{seed}-{config.views}x{width}x{height}"
-        self.settings = train_config(config)
-        self.seconds: dict[str, float] = {}
-
-    @cached_property
-    def photographs(self) -> Path:
-        """Their folder, rendered if need be, with the truth in it."""
-        folder, start = self.folder / "photographs", time.perf_counter()
-        if not (folder / "transforms.json").exists():
-            write_dataset(folder, self.seed, self.config.views, self.config.size, self.progress, self.tier)
-            self._lap("photographs", start)
-        return folder
-
-    @cached_property
-    def capture(self) -> Capture:
-        """The photographs."""
-        start = time.perf_counter()
-        capture = load_capture(self.photographs, self.settings.dataset, self.folder, self.progress)
-        self._lap("photographs", start)
-        return capture
-
-    @cached_property
-    def truth(self) -> Truth:
-        """What is in them."""
-        return read_truth(self.photographs)
-
-    @cached_property
-    def gaussians(self) -> Gaussians:
-        """Trained without the held-out views."""
-        train, _ = self.capture.split(HOLD_OUT)
-        start = time.perf_counter()
-        gaussians = trained_gaussians(self.capture, train, self.settings, self.folder, self.progress)
-        self._lap("radiance", start)
-        return gaussians
-
-    @cached_property
-    def labels(self) -> Array:
-        """(3, N) what every Gaussian truly is."""
-        path = self.folder / f"{stage_key('labels', 1, means_checksum(self.gaussians.means))}.npy"
-        if not path.exists():
-            start = time.perf_counter()
-            views = [(camera, self.truth.labels(camera.name)) for camera in self.capture.cameras]
-            labels = true_labels(CpuRasterizer(), self.gaussians, views, self.progress)
-            with atomic_path(path) as temporary:
-                np.save(temporary, labels, allow_pickle=False)
-            self._lap("labels of the Gaussians", start)
-        stored: Array = np.load(path, allow_pickle=False)
-        return stored
-
-    def views(self, variant: Variant) -> Views:
-        """The training views with masks and vectors."""
-        source: MaskSource = load_mask_source(MaskConfig(source="graph"))
-        outlines = "graph" if variant.masks == "graph" else "truth"
-        if outlines == "truth":
-            source = TruthMasks(self.capture, self.truth)
-        train, _ = self.capture.split(HOLD_OUT)
-        cameras = [self.capture.cameras[i] for i in train]
-        start = time.perf_counter()
-        features: Sequence[ImageFeatures] = describe_capture(
-            [self.capture.images[i] for i in train],
-            [camera.name for camera in cameras],
-            source,
-            self.encoder,
-            FeatureStore(self.folder / f"features-{outlines}-{self.weights}"),
-            self.progress,
-        )
-        self._lap(f"masks ({variant.masks}) and vectors", start)
-        if variant.masks == "wrong":
-            features = [with_wrong_vectors(item, seed) for seed, item in enumerate(features)]
-        if variant.vectors == "text":
-            words = phrase_vectors(self.truth, self.encoder)
-            told = [
-                oracle_vectors(item, self.truth.labels(camera.name), words)
-                for item, camera in zip(features, cameras, strict=True)
-            ]
-            features = moved_to_pictures(told, features)
-        return list(zip(cameras, features, strict=True))
-
-    def field(self, variant: Variant, fresh: bool = False) -> tuple[LanguageField, CodecReport, float]:
-        """What the Gaussians mean, what the codec loses, and seconds; `fresh` takes nothing that was kept."""
-        views, start = self.views(variant), time.perf_counter()
-        settings = replace(self.settings, codec=variant.codec, lift=variant.lift)
-        with TemporaryDirectory(dir=self.folder) as empty:
-            work = Path(empty) if fresh else self.folder
-            made = language_field(self.gaussians, views, self.encoder, settings, work, self.progress)
-        self._lap(f"language field ({variant.name})", start)
-        return *made, round(time.perf_counter() - start, 1)
-
-    def measure(self, variant: Variant, fresh: bool = False) -> Measured:
-        """Ask everything; the method's own order of work but for what `variant` says. fresh: see `field`."""
-        field, loss, seconds = self.field(variant, fresh)
-        return replace(self.measure_field(field, variant), codec_loss=loss, fit_seconds=seconds)
-
-    def rule(self, variant: Variant) -> AnswerRule:
-        """How answers are read; the paper's own ones by their peak."""
-        return "regions" if self.config.cut == "regions" and variant.query != "paper" else "peak"
-
-    def measure_field(self, field: LanguageField, variant: Variant) -> Measured:
-        """Ask everything of what the Gaussians are said to mean."""
-        start = time.perf_counter()
-        # What is no codec has its numbers at hand; going through a codec's interface takes seconds a phrase.
-        whole = field.codec.latent_dim == field.codec.vector_dim
-        engine = QueryEngine(
-            Scene(self.gaussians, field), lambda _: self.encoder, exact=whole, rule=self.rule(variant)
-        )
-        absent = self.truth.absent(EVERYTHING)
-        asked = ask(engine, [*(phrase.text for phrase in self.truth.phrases), *absent])
-        reading = Reading(variant.query == "paper", self.config.cut)
-        held_out = [self.capture.cameras[i] for i in self.capture.split(HOLD_OUT)[1]]
-        progress = _labelled(self.progress, f"{variant.name}: ")
-        scores = evaluate(asked, CpuRasterizer(), held_out, self.truth, reading, progress)
-        direct = evaluate_direct(asked, self.labels, self.truth, self.config.cut)
-        result = measured(asked, self.truth, absent, scores, direct)
-        self._lap(f"queries ({variant.name})", start)
-        return replace(
-            result,
-            **{key: getattr(variant, key) for key in ("name", "masks", "vectors", "query")},
-            codec=codec_name(field.codec),
-            bytes_per_gaussian=field.latents.nbytes / max(len(field), 1),
-            frame_ms=1000 * self._frame_seconds(asked),
-        )
-
-    def _frame_seconds(self, asked: Asked) -> float:
-        """Median of projecting one held-out view and splatting one phrase into it."""
-        camera = self.capture.cameras[self.capture.split(HOLD_OUT)[1][0]]
-        values = np.stack([answer.values for answer in asked.answers.values()][:1], 1)
-        times = []
-        for _ in range(FRAMES):
-            start = time.perf_counter()
-            splatted_relevancy(CpuRasterizer().view(self.gaussians, camera), values, 0.3)
-            times.append(time.perf_counter() - start)
-        return statistics.median(times)
-
-    def report(self) -> RoomReport:
-        """Measure what the settings ask for."""
-        _, held_out = self.capture.split(HOLD_OUT)
-        rows = [self.measure(variant) for variant in variants(self.config, self.encoder.dim)]
-        views = evaluate_views(self.gaussians, self.capture, held_out)
-        return RoomReport(
-            tier=self.tier,
-            seed=self.seed,
-            views=len(self.capture) - len(held_out),
-            held_out=len(held_out),
-            gaussians=len(self.gaussians),
-            psnr=float(np.mean([view.psnr for view in views])),
-            encoder=self.encoder.id,
-            cut=self.config.cut,
-            measured=tuple(rows),
-            seconds=self.seconds,
-        )
-
-    def _lap(self, name: str, start: float) -> None:
-        self.seconds[name] = round(self.seconds.get(name, 0.0) + time.perf_counter() - start, 1)

@@ -10,9 +10,9 @@ import numpy as np
 from langsplat_core.config import CodecConfig
 from langsplat_core.errors import InputError
 from langsplat_core.lab.config import BenchmarkConfig, GainBenchConfig, MaskOrigin
-from langsplat_core.lab.rooms.benchmark import Room, weights_digest
 from langsplat_core.lab.rooms.gains import GAINS, Material
 from langsplat_core.lab.rooms.report import Measured, of_kind
+from langsplat_core.lab.rooms.room import Room, weights_digest
 from langsplat_core.lab.rooms.variants import Variant
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import load_lifting_rasterizer

@@ -7,9 +7,9 @@ from typing import Any
 
 from langsplat_core.errors import InputError
 from langsplat_core.lab.config import BenchmarkConfig, LiftBenchConfig
-from langsplat_core.lab.rooms.benchmark import Room, weights_digest
 from langsplat_core.lab.rooms.kept_rows import KeptRows
 from langsplat_core.lab.rooms.report import Measured, loss_cells, of_kind
+from langsplat_core.lab.rooms.room import Room, weights_digest
 from langsplat_core.lab.rooms.variants import Variant, liftings
 from langsplat_core.progress import Progress, silent
 from langsplat_core.semantics.encoders import load_encoder

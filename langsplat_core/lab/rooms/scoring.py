@@ -6,23 +6,25 @@ overlap directly among the Gaussians; and rejection: how many absent objects are
 """
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import PictureConfig
+from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.evaluation.metrics import intersection_over_union, majority
 from langsplat_core.lab.rooms.truth import KINDS, Phrase, Truth
 from langsplat_core.progress import Progress, silent
+from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.cut import CutRule, cut_level
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.places import peak_pixel
 from langsplat_core.raster.protocol import Rasterizer, View
 from langsplat_core.scene import Camera
+from langsplat_core.semantics.relevancy import FLOOR
 
 MIN_PIXELS = 150  # a thing with fewer visible pixels in a view is not asked for there
 MIN_GAUSSIANS = 20  # nor one with fewer Gaussians directly
@@ -30,6 +32,8 @@ MIN_GAUSSIANS = 20  # nor one with fewer Gaussians directly
 # 731 rows; smaller pictures get smaller windows, or a part would be lost in one
 FILTER, VOTE, PAPER_ROWS = 20, 7, 731
 CHANNELS = 32  # phrases that are splatted at a time
+TOGETHER = 64  # phrases that are asked at a time
+TIMED = 15  # phrases that are asked alone
 HALF = 0.5  # of what a pixel shows: from there it belongs to an answer's Gaussians
 
 
@@ -54,6 +58,10 @@ class Answer:
     median: float  # of the values of Gaussians with a meaning
     found: bool
     probability: float | None = None
+
+
+Judge = Callable[[View, Sequence[Answer]], Iterable[tuple[Array, tuple[int, int]]]]
+"""The mask (H, W) of each answer in a view, and the row and column of its peak."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,35 +93,36 @@ class DirectScore:
     mean_iou: float
 
 
-def ask(engine: QueryEngine, texts: Iterable[str]) -> Asked:
-    """Ask every phrase once; the engine has answered before, so that no time goes into preparation."""
+def ask(engine: QueryEngine, texts: Iterable[str], level: LevelChoice = "auto") -> Asked:
+    """Ask every phrase once, at a level, and some of them alone, for the time that one takes."""
+    texts = list(dict.fromkeys(texts))
+    unknown = [text for text in texts if engine.unknown_words(text)]
+    known = [text for text in texts if text not in unknown]
     answers: dict[str, Answer] = {}
-    unknown, seconds = [], []
-    for text in dict.fromkeys(texts):
-        if engine.unknown_words(text):
-            unknown.append(text)
-            continue
-        if not answers:
-            engine.run(text)
+    for start in range(0, len(known), TOGETHER):
+        some = known[start : start + TOGETHER]
+        vectors = engine.text_vectors(some)
+        for text, vector, result in zip(some, vectors, engine.run_many(some, level), strict=True):
+            answers[text] = _answer(engine, vector, result)
+    return Asked(engine, answers, tuple(unknown), _seconds(engine, known[:TIMED], level))
+
+
+def _answer(engine: QueryEngine, vector: Array, result: QueryResult) -> Answer:
+    values = result.relevancy[result.level]
+    known = engine.field.confidence[result.level] > 0
+    median = float(np.median(values[known])) if known.any() else 0.0
+    said = {name: getattr(result, name) for name in ("members", "even", "peak", "found", "probability")}
+    return Answer(vector=vector, level=result.level, values=values, median=median, **said)
+
+
+def _seconds(engine: QueryEngine, texts: Sequence[str], level: LevelChoice) -> float:
+    """Median of asking one; the engine has answered before, so that no time goes into preparation."""
+    seconds = []
+    for text in texts:
         start = time.perf_counter()
-        result = engine.run(text)
+        engine.run(text, level)
         seconds.append(time.perf_counter() - start)
-        values = result.relevancy[result.level]
-        known = engine.field.confidence[result.level] > 0
-        median = float(np.median(values[known])) if known.any() else 0.0
-        vector = engine.text_vector(text)
-        answers[text] = Answer(
-            vector=vector,
-            level=result.level,
-            values=values,
-            members=result.members,
-            even=result.even,
-            peak=result.peak,
-            median=median,
-            found=result.found,
-            probability=result.probability,
-        )
-    return Asked(engine, answers, tuple(unknown), float(np.median(seconds)) if seconds else 0.0)
+    return float(np.median(seconds)) if seconds else 0.0
 
 
 def evaluate(
@@ -123,10 +132,11 @@ def evaluate(
     truth: Truth,
     reading: Reading | None = None,
     progress: Progress = silent,
+    judge: Judge | None = None,
 ) -> list[Score]:
-    """Every phrase that was asked, in every view where its thing is visible."""
-    reading = reading or Reading()
-    scene = asked.engine.scene
+    """Every phrase that was asked, in every view where its thing is visible. judge: in place of `reading`."""
+    settled, scene = reading or Reading(), asked.engine.scene
+    judge = judge or (lambda view, answers: _judged(asked.engine, view, answers, settled))
     results: dict[str, list[tuple[float, bool]]] = {}
     for done, camera in enumerate(cameras):
         labels = truth.labels(camera.name)
@@ -134,7 +144,7 @@ def evaluate(
         masks = {p: _mask(labels, p) for p in truth.phrases if p.text in asked.answers}
         visible = [phrase for phrase, mask in masks.items() if mask.sum() >= MIN_PIXELS]
         answers = [asked.answers[phrase.text] for phrase in visible]
-        for phrase, result in zip(visible, _judged(asked.engine, view, answers, reading), strict=True):
+        for phrase, result in zip(visible, judge(view, answers), strict=True):
             found, peak = result
             truth_mask = masks[phrase]
             score = intersection_over_union(found, truth_mask), bool(truth_mask[peak])
@@ -198,6 +208,13 @@ def masks_and_peaks(
         maps = np.moveaxis(maps, 2, 0)
         for relevancy, share in zip(maps[: len(some)], maps[len(some) :], strict=True):
             yield _smoothed_mask(share > HALF), _peak(relevancy)
+
+
+def masks_of_maps(maps: Iterable[Array]) -> Iterator[tuple[Array, tuple[int, int]]]:
+    """(H, W) relevancy -> the mask of what is above half way between the floor and its maximum; its peak."""
+    for relevancy in maps:
+        cut = cut_level("floor", relevancy, float(relevancy.max()), FLOOR)
+        yield _smoothed_mask(relevancy > cut), _peak(relevancy)
 
 
 def _smoothed_mask(mask: Array) -> Array:

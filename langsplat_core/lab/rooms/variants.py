@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from langsplat_core.config import CodecConfig, LiftConfig
+from langsplat_core.config import CodecConfig, LevelChoice, LiftConfig
 from langsplat_core.lab.config import BenchmarkConfig, LiftBenchConfig, MaskOrigin
 
 
@@ -17,6 +17,7 @@ class Variant:
     codec: CodecConfig = CodecConfig()  # noqa: RUF009 (frozen)
     lift: LiftConfig = LiftConfig()  # noqa: RUF009
     query: Literal["blend answers", "paper"] = "blend answers"  # paper: blend latents, then decode
+    level: LevelChoice = "auto"  # that is asked
 
 
 def autoencoder(d: int = 3, steps: int = CodecConfig.steps) -> CodecConfig:

@@ -21,8 +21,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
 from langsplat_core.lab.config import BenchmarkConfig, VerdictBenchConfig
-from langsplat_core.lab.rooms.benchmark import Room, weights_digest
 from langsplat_core.lab.rooms.report import separation
+from langsplat_core.lab.rooms.room import Room, weights_digest
 from langsplat_core.lab.rooms.scoring import MIN_GAUSSIANS
 from langsplat_core.lab.rooms.truth import Region
 from langsplat_core.lab.rooms.variants import Variant

@@ -11,7 +11,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.lab.config import BenchmarkConfig, WordBenchConfig
-from langsplat_core.lab.rooms.benchmark import Room, weights_digest
+from langsplat_core.lab.rooms.room import Room, weights_digest
 from langsplat_core.lab.rooms.scoring import MIN_GAUSSIANS
 from langsplat_core.lab.rooms.truth import Region
 from langsplat_core.lab.rooms.variants import Variant

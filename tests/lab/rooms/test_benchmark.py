@@ -17,7 +17,7 @@ from langsplat_core.formats import save_scene
 from langsplat_core.lab.config import BenchmarkConfig, GainBenchConfig, LiftBenchConfig
 from langsplat_core.lab.demo import SEED
 from langsplat_core.lab.rooms import scoring as synthetic
-from langsplat_core.lab.rooms.benchmark import HOLD_OUT, Room, run_benchmark, weights_digest
+from langsplat_core.lab.rooms.benchmark import run_benchmark
 from langsplat_core.lab.rooms.gain_bench import gain_table, measure_gains
 from langsplat_core.lab.rooms.gains import GAINS
 from langsplat_core.lab.rooms.lifting import measure_liftings, plot
@@ -25,6 +25,7 @@ from langsplat_core.lab.rooms.oracles import (
     MIN_REGION,
     TruthMasks,
 )
+from langsplat_core.lab.rooms.room import HOLD_OUT, Room, weights_digest
 from langsplat_core.lab.rooms.truth import read_truth
 from langsplat_core.lab.rooms.variants import liftings, variants
 from langsplat_core.lab.world import photographs as dataset

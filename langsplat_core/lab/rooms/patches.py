@@ -1,0 +1,139 @@
+"""LERF's way to an answer, without masks: CLIP vectors of square patches at several scales, and a search of
+the scale that fits the phrase best (Kerr et al. 2023, sections 3.1 and 3.3).
+
+LERF trains a field of vectors over position and scale; here the same vectors are averaged onto Gaussians that
+are already there, `W^T y / W^T 1` at every scale, so that it is compared with masks and not with another
+renderer. Scales are shares of the picture's height, as there.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from langsplat_core.arrays import Array, unit
+from langsplat_core.config import PictureConfig
+from langsplat_core.lab.rooms.scoring import Answer, masks_of_maps
+from langsplat_core.progress import Progress, silent
+from langsplat_core.raster.protocol import LiftingRasterizer, View
+from langsplat_core.scene import Camera, Gaussians
+from langsplat_core.semantics.crops import masked_crop
+from langsplat_core.semantics.embed import ImageEncoder
+from langsplat_core.semantics.relevancy import relevancy
+
+SCALES = tuple(float(scale) for scale in np.linspace(0.05, 0.5, 7))  # LERF's; it interpolates between them
+OVERLAP = 0.5  # of neighbouring patches
+CHANNELS = 32  # of a picture of vectors that are splatted or gathered at a time
+
+
+@dataclass(frozen=True, eq=False)
+class PatchField:
+    """What Gaussians mean at every scale."""
+
+    vectors: Array  # (S, N, D) float32 unit; zero where never seen
+    canonical: Array  # (C, D) float32 unit
+    temperature: float
+
+
+def patch_vectors(image: Array, encoder: ImageEncoder, scale: float) -> Array:
+    """(H, W, D) float32 vectors of an image (H, W, 3) uint8: of square patches `scale` high, interpolated
+    between their centres."""
+    height, width = image.shape[:2]
+    side = min(max(round(scale * height), 2), height, width)
+    rows, columns = _starts(height, side), _starts(width, side)
+    whole, size = np.ones((side, side), bool), encoder.image_size
+    crops = [masked_crop(image[y : y + side, x : x + side], whole, size) for y in rows for x in columns]
+    vectors = encoder.encode_images(np.stack(crops)).reshape(len(rows), len(columns), -1)
+    at_y = np.interp(np.arange(height), rows + (side - 1) / 2, np.arange(len(rows)))
+    at_x = np.interp(np.arange(width), columns + (side - 1) / 2, np.arange(len(columns)))
+    grid = np.meshgrid(at_y, at_x, indexing="ij")
+    planes = [map_coordinates(plane, grid, order=1) for plane in np.moveaxis(vectors, 2, 0)]
+    return np.stack(planes, 2)
+
+
+def _starts(length: int, side: int) -> Array:
+    """Where patches of `side` pixels begin, so that they cover `length` and overlap by `OVERLAP`."""
+    count = int(np.ceil((length - side) / (side * (1 - OVERLAP)))) + 1
+    return np.linspace(0, length - side, count).round().astype(int)
+
+
+def lift_patches(
+    rasterizer: LiftingRasterizer,
+    gaussians: Gaussians,
+    views: Sequence[tuple[Camera, Array]],
+    encoder: ImageEncoder,
+    progress: Progress = silent,
+) -> Array:
+    """(S, N, D) unit vectors of Gaussians from views (camera, image (H, W, 3) uint8)."""
+    total: Array | None = None
+    for done, (camera, image) in enumerate(views):
+        view = rasterizer.view(gaussians, camera)
+        for row, scale in enumerate(SCALES):
+            vectors = patch_vectors(image, encoder, scale)
+            if total is None:
+                total = np.zeros((len(SCALES), len(gaussians), vectors.shape[2]), np.float32)
+            for part in _parts(vectors.shape[2]):
+                total[row, :, part] += view.gather(np.ascontiguousarray(vectors[..., part]))
+        progress("patches of the photographs", (done + 1) / len(views))
+    if total is None:
+        raise ValueError("views: expected at least one")
+    return np.stack([unit(sums).astype(np.float32) for sums in total])
+
+
+def _parts(count: int) -> Iterator[slice]:
+    return (slice(start, min(start + CHANNELS, count)) for start in range(0, count, CHANNELS))
+
+
+def pictures(field: PatchField, view: View, phrases: Array) -> Array:
+    """(Q, D) unit phrase vectors -> (Q, H, W) relevancy in a view, each at its best scale: the one with the
+    highest relevancy in the picture."""
+    best: Array | None = None
+    gate = PictureConfig().alpha_gate
+    for vectors in field.vectors:
+        blended = [view.splat(np.ascontiguousarray(vectors[:, part])) for part in _parts(vectors.shape[1])]
+        shown, alpha = np.concatenate([values for values, _ in blended], 2), blended[0][1]
+        flat = unit(shown.reshape(-1, shown.shape[2]))
+        values = relevancy(flat, phrases, field.canonical, field.temperature).astype(np.float32)
+        maps = np.where(alpha > gate, np.moveaxis(values.reshape(*alpha.shape, -1), 2, 0), 0)
+        best = maps if best is None else np.where(_peaks(maps) > _peaks(best), maps, best)
+    assert best is not None  # there are scales
+    return best
+
+
+def _peaks(maps: Array) -> Array:
+    return np.asarray(maps.max(axis=(1, 2), keepdims=True))
+
+
+def among_gaussians(field: PatchField, phrase: Array) -> Array:
+    """(D,) unit phrase vector -> (N,) relevancy at the best scale."""
+    values = [
+        relevancy(vectors, phrase[None], field.canonical, field.temperature)[:, 0]
+        for vectors in field.vectors
+    ]
+    for level, vectors in zip(values, field.vectors, strict=True):
+        level[~vectors.any(axis=1)] = 0
+    return np.asarray(max(values, key=lambda level: level.max()), np.float32)
+
+
+def reread(answer: Answer, field: PatchField) -> Answer:
+    """The answer to the same phrase by patches."""
+    values = among_gaussians(field, answer.vector)
+    seen = values[values > 0]
+    return replace(
+        answer,
+        values=values,
+        even=values,
+        peak=float(values.max()),
+        median=float(np.median(seen)) if len(seen) else 0.0,
+    )
+
+
+def judged(
+    field: PatchField, view: View, answers: Sequence[Answer]
+) -> Iterator[tuple[Array, tuple[int, int]]]:
+    """The mask (H, W) of each answer in a view, cut half way between the floor and its peak, and the row and
+    column of the peak."""
+    if answers:
+        maps = pictures(field, view, np.stack([answer.vector for answer in answers]))
+        yield from masks_of_maps(maps)
