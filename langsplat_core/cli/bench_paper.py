@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from langsplat_core.cli.bench_files import save_figures
+from langsplat_core.files import atomic_path
 from langsplat_core.lab.config import PaperBenchConfig
 from langsplat_core.progress import TerminalProgress
 
@@ -20,12 +21,14 @@ class BenchPaper:
     work: Path = Path("eval_out")
     """Folder for the rooms, as of `langsplat eval synthetic`."""
     out: Path = Path("bench_out")
-    """Folder for paper.md and paper.json, and for rows as they are made: the same command goes on."""
+    """Folder for paper.md, .json and .png, and for rows as they are made: the same command goes on."""
 
     def run(self) -> None:
-        from langsplat_core.lab.rooms.paper_tables import figures, measure_paper, paper_table
+        from langsplat_core.lab.rooms.paper_tables import figures, measure_paper, paper_table, plot
 
         with TerminalProgress() as progress:
             rows = measure_paper(self.config, self.work, progress, kept=self.out / "paper.rows.jsonl")
         save_figures(self.out, "paper", paper_table(rows), figures(self.config, rows))
+        with atomic_path(self.out / "paper.png") as path:
+            plot(rows, path)
         print(paper_table(rows))

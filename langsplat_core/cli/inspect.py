@@ -80,6 +80,8 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
         ("text encoder", f"{field.encoder}, {field.vector_dim} numbers"),
         ("phrasebook", f"{field.phrases} phrases"),
         ("observed", observed),
+        ("things", "none" if field.things is None else f"{field.things}"),
+        ("verdicts", "calibrated" if field.calibrated else "uncalibrated: no probabilities"),
     ]
 
 

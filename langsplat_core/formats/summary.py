@@ -11,7 +11,7 @@ from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.config import INRIA
 from langsplat_core.formats import cameras_json, companion_path, language
 from langsplat_core.formats.sog import META_NAME
-from langsplat_core.scene import LEVELS, SH_COUNTS, Gaussians, LanguageField, Scene
+from langsplat_core.scene import LEVELS, NO_THING, SH_COUNTS, Gaussians, LanguageField, Scene
 
 NEEDLE = 1e3  # longest over shortest axis from which a Gaussian counts as extremely stretched
 OPACITY_EDGES = (0.0, INRIA.alpha_min, 0.1, 0.5, 0.9, 1.0)
@@ -27,7 +27,9 @@ class LanguageSummary:
     vector_dim: int
     phrases: int
     observed: Mapping[str, float]  # level -> share of the Gaussians with a meaning
-    bytes: int  # latents and confidences
+    things: int | None  # that the Gaussians are told to belong to; None: no such numbers
+    calibrated: bool  # whether answers come with a probability
+    bytes: int  # latents, confidences and things
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ def memory_bytes(scene: Scene) -> int:
     arrays = [getattr(scene.gaussians, field.name) for field in fields(scene.gaussians)]
     arrays += list(scene.extras.values())
     if scene.language is not None:
-        arrays += [scene.language.latents, scene.language.confidence]
+        arrays += _arrays(scene.language)
     return sum(array.nbytes for array in arrays)
 
 
@@ -135,6 +137,11 @@ def _sh_energy(gaussians: Gaussians) -> tuple[float, ...]:
     return tuple(float(per_coefficient[a:b].sum() / total) for a, b in pairwise(edges))
 
 
+def _arrays(field: LanguageField) -> list[Array]:
+    """Those with a row for each Gaussian."""
+    return [array for array in (field.latents, field.confidence, field.things) if array is not None]
+
+
 def _language(field: LanguageField) -> LanguageSummary:
     observed = {
         name: float((confidence > 0).mean()) if len(field) else 0.0
@@ -147,5 +154,7 @@ def _language(field: LanguageField) -> LanguageSummary:
         vector_dim=field.codec.vector_dim,
         phrases=len(field.phrasebook),
         observed=observed,
-        bytes=field.latents.nbytes + field.confidence.nbytes,
+        things=None if field.things is None else len(np.setdiff1d(field.things, [NO_THING])),
+        calibrated=field.reading.calibration is not None,
+        bytes=sum(array.nbytes for array in _arrays(field)),
     )

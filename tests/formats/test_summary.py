@@ -9,7 +9,7 @@ import pytest
 from langsplat_core.cli.inspect import Inspect
 from langsplat_core.formats import save_scene
 from langsplat_core.formats.summary import disk_bytes, duplicates, summarise
-from langsplat_core.scene import Gaussians, Scene
+from langsplat_core.scene import NO_THING, Calibration, Gaussians, Odds, Reading, Scene
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_camera, random_gaussians
 
@@ -91,3 +91,18 @@ def test_size_of_a_folder_counts_its_files(real_data):
     folder = real_data / "gaussians" / "playbot_8k_sog"
     expected = sum(file.stat().st_size for file in folder.iterdir())
     assert disk_bytes(folder) == disk_bytes(folder / "meta.json") == expected
+
+
+def test_things_are_counted():
+    field = random_field(40)
+    things = np.array([3, 3, 9, NO_THING] * 10, np.uint16)
+    plain, named = (
+        summarise(Scene(random_gaussians(40), made)) for made in (field, replace(field, things=things))
+    )
+    assert (plain.language.things, named.language.things) == (None, 2)
+    assert named.language.bytes - plain.language.bytes == things.nbytes
+    assert named.memory_bytes - plain.memory_bytes == things.nbytes
+    odds = Odds(0, 1, 0)
+    sure = replace(field, reading=Reading(calibration=Calibration(odds, odds, odds)))
+    assert not plain.language.calibrated
+    assert summarise(Scene(random_gaussians(40), sure)).language.calibrated

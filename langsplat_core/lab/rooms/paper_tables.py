@@ -156,6 +156,32 @@ def _cell(shares: Array) -> str:
     return mean if len(shares) < 2 else f"{mean} +/- {100 * shares[:, 0].std(ddof=1):.1f}"
 
 
+def plot(rows: Sequence[PaperRow], path: Path) -> None:
+    """Accuracy in pictures and among Gaussians against the time from a phrase to a picture; means over rooms,
+    with bars of one standard deviation."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, panels = pyplot.subplots(1, 2, figsize=(12, 4.6), layout="constrained", sharex=True)
+    for panel, (title, column) in zip(panels, (("mIoU in pictures %", 1), ("IoU in 3D %", 3)), strict=True):
+        for number, name in enumerate(dict.fromkeys(row.measured.name for row in rows)):
+            same = [row for row in rows if row.measured.name == name]
+            shares = np.array([100 * of_kind(row.measured, "all")[column] for row in same])
+            at = float(np.mean([row.picture_ms for row in same])), float(shares.mean())
+            colour = "#0072b2" if name.startswith(OURS) else "#d55e00"
+            panel.errorbar(*at, yerr=shares.std(), fmt="o", color=colour, capsize=2)
+            above = 4 if number % 2 == 0 else -9
+            panel.annotate(name, at, fontsize=7, xytext=(5, above), textcoords="offset points")
+        panel.set_xscale("log")
+        panel.set_xlabel("milliseconds from a phrase to its picture")
+        panel.set_ylabel(title)
+        panel.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
 def figures(config: PaperBenchConfig, rooms: Sequence[PaperRow]) -> dict[str, Any]:
     """All figures."""
     return {"settings": asdict(config), "rows": [asdict(row) for row in rooms]}

@@ -14,7 +14,7 @@ from langsplat_core.config import CodecConfig, DatasetConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.formats import save_scene
-from langsplat_core.lab.config import BenchmarkConfig, GainBenchConfig, LiftBenchConfig
+from langsplat_core.lab.config import BenchmarkConfig, GainBenchConfig, LiftBenchConfig, PaperBenchConfig
 from langsplat_core.lab.demo import SEED
 from langsplat_core.lab.rooms import scoring as synthetic
 from langsplat_core.lab.rooms.benchmark import run_benchmark
@@ -25,6 +25,7 @@ from langsplat_core.lab.rooms.oracles import (
     MIN_REGION,
     TruthMasks,
 )
+from langsplat_core.lab.rooms.paper_tables import measure_paper
 from langsplat_core.lab.rooms.room import HOLD_OUT, Room, weights_digest
 from langsplat_core.lab.rooms.truth import read_truth
 from langsplat_core.lab.rooms.variants import liftings, variants
@@ -205,3 +206,14 @@ def test_changes_of_the_lifting_are_compared_with_none(run):
     assert "1 of 1" in table or "0 of 1" in table
     with pytest.raises(InputError, match="--seeds"):
         measure_gains(replace(config, seeds=()), run.work)
+
+
+def test_the_papers_ways_are_compared_with_lerfs(run):
+    chosen = ("LERF", "in one pass", "subpart alone", "squares")
+    config = PaperBenchConfig("separate", (101,), dims=(1,), codec_steps=40, only=chosen)
+    lerf, paper, subpart, squares = (row.measured for row in measure_paper(config, run.work, rooms=TINY))
+    assert (lerf.query, paper.query, squares.masks) == ("blend answers", "paper", "tiles")
+    assert lerf.bytes_per_gaussian == 7 * 512 * 4
+    assert min(len(row.scores) for row in (lerf, paper, subpart, squares)) > 0
+    assert min(row.frame_ms for row in (lerf, paper, subpart, squares)) > 0
+    assert len({row.scores for row in (lerf, paper, subpart, squares)}) == 4

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from langsplat_core.arrays import unit
 from langsplat_core.errors import InputError
@@ -117,6 +118,14 @@ def test_the_table_has_means_and_spreads():
     assert lines[2][4].startswith("43.8 / 60.0")  # (10 * 0.7 + 30 * 0.35) / 40
     assert [line[5] for line in lines[2:]] == ["42", "12"]  # the paper's picture is its answer
     assert row(PATCHES, 1, 0.5).picture_ms == 12
+
+
+def test_the_picture_is_drawn(tmp_path):
+    rows = [row(OURS, 1, 0.8), row(OURS, 2, 0.6), row(PATCHES, 1, 0.4)]
+    module.plot(rows, tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as drawn:
+        assert drawn.width > 900
+        assert np.asarray(drawn.convert("L")).std() > 5
 
 
 def test_every_way_has_its_own_name_and_settings():
