@@ -56,6 +56,8 @@ class Train:
             f"(99 % below {report.relevancy_error_p99:.3f}); "
             f"{sum(report.seconds.values()):.0f} s"
         )
+        for doubt in report.doubts:
+            print(f"warning: {doubt}")
 
 
 def train_command(args: Sequence[str]) -> type[Train]:

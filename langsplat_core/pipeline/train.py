@@ -20,6 +20,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
 from langsplat_core.formats import load_scene, read_ply, save_scene, write_ply
 from langsplat_core.pipeline.crew import Crew
+from langsplat_core.pipeline.doubts import doubts
 from langsplat_core.pipeline.language import language_field
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.views import StoredViews
@@ -53,6 +54,7 @@ class TrainReport:
     relevancy_error: float  # mean absolute, of what the codec makes of it, over everyday phrases
     relevancy_error_p99: float
     observed: float  # fraction of Gaussians with a meaning at the whole level
+    doubts: tuple[str, ...]  # what speaks against the scene, with the remedy
     seconds: dict[str, float]  # per stage, of this run: a stage that was already done takes almost none
 
 
@@ -110,13 +112,13 @@ def train_scene(
 
     if crew.leads:
         save_scene(out, Scene(gaussians, language, cameras, metres_per_unit=metres))
-        psnr = _mean_psnr(gaussians, capture, held_out)
+        scores = evaluate_views(gaussians, capture, held_out) if held_out else []
         clock.lap("saving and held-out views")
         report = TrainReport(
             views=len(train),
             held_out=len(held_out),
             gaussians=len(gaussians),
-            psnr=psnr,
+            psnr=float(np.mean([score.psnr for score in scores])) if scores else None,
             masks=mask_source.name,
             encoder=encoder.id,
             mask_count=sum(len(item.vectors) for item in features),
@@ -126,18 +128,14 @@ def train_scene(
             relevancy_error=loss.error_mean,
             relevancy_error_p99=loss.error_p99,
             observed=float((language.confidence[2] > 0).mean()) if len(gaussians) else 0.0,
+            doubts=doubts(scores, cameras),
             seconds=clock.laps,
         )
         with atomic_path(work / REPORT) as temporary:
             temporary.write_text(json.dumps(asdict(report), indent=1))
     crew.meet()
-    return TrainReport(**json.loads((work / REPORT).read_text()))
-
-
-def _mean_psnr(gaussians: Gaussians, capture: Capture, held_out: list[int]) -> float | None:
-    if not held_out:
-        return None
-    return float(np.mean([view.psnr for view in evaluate_views(gaussians, capture, held_out)]))
+    stated = json.loads((work / REPORT).read_text())
+    return TrainReport(**stated | {"doubts": tuple(stated["doubts"])})
 
 
 def trained_gaussians(

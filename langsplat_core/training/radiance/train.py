@@ -45,6 +45,7 @@ class ViewScore:
     name: str
     psnr: float  # dB
     ssim: float
+    covered: float  # share of its pixels that the Gaussians cover by half and more
 
 
 class _Pictures:
@@ -143,9 +144,10 @@ def evaluate_views(
     with torch.no_grad():
         for index in range(len(pictures)):
             camera, target = pictures.at(index, coarse=False)
-            image = renderer.render(state.values, camera, gaussians.sh_degree).image.clamp(0, 1)
+            drawn = renderer.render(state.values, camera, gaussians.sh_degree)
+            image, covered = drawn.image.clamp(0, 1), float((drawn.alpha >= 0.5).float().mean())
             decibels = psnr(image.cpu().numpy(), target.cpu().numpy())
-            scores.append(ViewScore(camera.name, decibels, float(ssim(image, target))))
+            scores.append(ViewScore(camera.name, decibels, float(ssim(image, target)), covered))
     return scores
 
 

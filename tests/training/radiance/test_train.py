@@ -121,6 +121,7 @@ def test_training_learns_the_scene() -> None:
     assert np.mean([s.psnr for s in after[:5]]) > np.mean([s.psnr for s in before[:5]]) + 10
     assert after[5].psnr > before[5].psnr + 5  # the view that was not trained on
     assert after[5].ssim > before[5].ssim
+    assert all(0 < score.covered <= 1 for score in [*before, *after])
     assert trained.valid().all()
     assert trained.opacity_logits.min() > -5.6  # none below alpha 1/255
 
