@@ -105,8 +105,11 @@ def _reason(error: Exception) -> str:
 
 
 class _Quiet:
-    """No Python warnings while any thread is inside. `warnings.catch_warnings` alone is not safe where threads
-    overlap: the one that leaves last would restore what another had set."""
+    """No Python warnings while any thread is inside.
+
+    `warnings.catch_warnings` alone is not safe where threads overlap: the one that leaves last would restore
+    what another had set.
+    """
 
     def __init__(self) -> None:
         self._lock, self._inside = threading.Lock(), 0
