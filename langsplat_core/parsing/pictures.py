@@ -25,8 +25,8 @@ from langsplat_core.parsing.opening import open_for_reading
 KINDS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # always; AVIF and HEIF where Pillow has a codec
 MOST_PIXELS = 178_000_000  # of any picture: 0.7 GB once decoded. The largest cameras make 151 million
 # Declared pixels beyond these need a file of a fitting size: photographs keep 2 to 100 pixels a byte, what is
-# made to exhaust memory a million.
-FREE_PIXELS, PIXELS_PER_BYTE = 16_000_000, 128
+# made to exhaust memory a million. The decoders of WebP and AVIF hold two more copies of the picture.
+FREE_PIXELS, FREE_PIXELS_COPIED, PIXELS_PER_BYTE = 16_000_000, 8_000_000, 128
 
 
 class PictureError(FormatError):
@@ -56,7 +56,7 @@ def opened(
         try:
             # Image.open looks at the first bytes only to choose the kind; the name's ending plays no part
             with Image.open(file, formats=kinds or readable_kinds()) as picture:
-                _check_size(name, picture.size, size)
+                _check_size(name, picture, size)
                 yield picture
         except LangSplatError:
             raise
@@ -85,12 +85,13 @@ def _file(source: Path | bytes) -> tuple[BinaryIO, int]:
     return open_for_reading(source)
 
 
-def _check_size(name: str, size: tuple[int, int], file_size: int) -> None:
-    most = min(MOST_PIXELS, FREE_PIXELS + PIXELS_PER_BYTE * file_size)
-    if size[0] * size[1] > most:
+def _check_size(name: str, picture: Image.Image, file_size: int) -> None:
+    free = FREE_PIXELS_COPIED if picture.format in ("WEBP", "AVIF", "HEIF") else FREE_PIXELS
+    most = min(MOST_PIXELS, free + PIXELS_PER_BYTE * file_size)
+    if picture.width * picture.height > most:
         raise PictureError(
             name,
-            f"declares {size[0]}x{size[1]} pixels; at most {most // 10**6} million are read from "
+            f"declares {picture.width}x{picture.height} pixels; at most {most // 10**6} million are read from "
             f"a file of {file_size} bytes",
         )
 
