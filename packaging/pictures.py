@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from imgui_bundle.immapp import testing  # isort: skip  (before glfw)
-from PIL import Image
 
+from langsplat_core.parsing.pictures import opened
 from langsplat_viewer.frame import FrameRenderer
 from langsplat_viewer.options import scene_path, services
 from langsplat_viewer.window import Window, WindowRequest
@@ -43,7 +43,9 @@ def window_picture(path: Path, queries: tuple[str, ...]) -> None:
         testing.capture(ctx, str(path))
 
     testing.run(test_function=wait_and_capture, runner_params=window.params())
-    Image.open(path).convert("RGB").save(path, optimize=True)
+    with opened(path) as picture:
+        rgb = picture.convert("RGB")
+    rgb.save(path, optimize=True)
 
 
 def main() -> None:

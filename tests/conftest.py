@@ -21,6 +21,7 @@ own_kernel_cache()
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--slow", action="store_true", help="run the slow tier too")
+    parser.addoption("--seed", type=int, help="of the damaged files of the slow tier, in place of its own")
     parser.addoption("--measured", action="store_true", help="print the errors that accuracy tests measured")
 
 

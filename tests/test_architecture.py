@@ -26,7 +26,7 @@ LAYERS = [
         "langsplat_core.datasets",
         "langsplat_core.formats",
     ],
-    ["langsplat_core.scene"],
+    ["langsplat_core.scene", "langsplat_core.parsing"],
     ["langsplat_core.config", "langsplat_core.progress", "langsplat_core.files", "langsplat_core.compiled"],
     ["langsplat_core.arrays"],
     ["langsplat_core.errors"],

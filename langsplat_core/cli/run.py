@@ -14,9 +14,17 @@ import warnings
 from collections.abc import Callable
 from typing import Protocol
 
-from langsplat_core.errors import LangSplatError
+from langsplat_core.errors import LangSplatError, printable_line
 
+_LOG_LIMIT = 2000  # characters of a warning
 _FRAME = re.compile(r"[│╭╮╰╯]|─+")
+
+
+class _OneLine(logging.Formatter):
+    """What a warning quotes from a file is shown as an error's message is."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable_line(record.getMessage(), _LOG_LIMIT)
 
 
 class Command(Protocol):
@@ -49,13 +57,15 @@ def main(program: str, parser: Callable[[], Command]) -> int:
         if stop.code in (0, None):
             return 0
         return _fail(program, one_line(complaint.getvalue()))
-    logging.basicConfig(format="%(message)s", stream=sys.stderr)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_OneLine())
+    logging.basicConfig(handlers=[handler])
     logging.getLogger("langsplat").setLevel(logging.INFO)
     warnings.filterwarnings("ignore", module=r"(torch|transformers|huggingface_hub|numba)(\.|$)")
     try:
         command.run()
     except LangSplatError as error:
-        return _fail(program, " ".join(str(error).split()))
+        return _fail(program, str(error))
     except BrokenPipeError:  # whoever reads has enough, as `| head` has
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more at exit either
         return 0

@@ -17,7 +17,7 @@ __all__ = ["Capture", "load_capture"]
 
 ACCEPTED = (
     "a folder with transforms.json (nerfstudio) or that file, a folder with sparse/0 and images (COLMAP), "
-    "or a folder of at least three photographs (jpg, png, webp, tif)"
+    "or a folder of at least three photographs (jpg, png, webp, tif, bmp, avif)"
 )
 
 

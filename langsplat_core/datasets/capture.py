@@ -1,6 +1,7 @@
 """A capture: photographs with known cameras, as every loader returns them."""
 
 import hashlib
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,6 +9,20 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.scene import Camera
+
+log = logging.getLogger("langsplat")
+
+
+def tell_of_lost_points(good: Array, source: str) -> None:
+    """A warning where most of the points of `source` had to be left out; `good`: (M,) bool, those that were
+    not."""
+    if 2 * good.sum() < len(good):
+        log.warning(
+            "%d of the %d points of %s are damaged or badly located and are left out; was it written whole?",
+            len(good) - good.sum(),
+            len(good),
+            source,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.capture import Capture, tell_of_lost_points
 from langsplat_core.datasets.colmap_model import ModelCamera, SparseModel, has_model, read_model
 from langsplat_core.datasets.images import Photo, develop, shortened
 from langsplat_core.datasets.intrinsics import (
@@ -17,7 +17,7 @@ from langsplat_core.datasets.intrinsics import (
     FisheyeDistortion,
     PhotoIntrinsics,
 )
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.errors import FormatError, InputError, printable_line
 from langsplat_core.progress import Progress
 
 log = logging.getLogger("langsplat")
@@ -58,7 +58,7 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
     if missing and len(missing) == len(photos):
         raise InputError(
             f"none of the {len(photos)} photographs named by {model_folder} exists "
-            f"(first: {photos[0].path}); put them into {folder / 'images'}"
+            f"(first: {printable_line(photos[0].path, 120)}); put them into {folder / 'images'}"
         )
     if missing:
         log.warning(
@@ -98,4 +98,5 @@ def good_points(model: SparseModel) -> tuple[Array, Array]:
     good = np.isfinite(model.points).all(1)
     good &= ~(model.errors > MAX_POINT_ERROR)
     good &= model.track_lengths != 1
+    tell_of_lost_points(good, "the COLMAP model")
     return model.points[good], model.colours[good]

@@ -14,7 +14,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from langsplat_core.arrays import Array, rotation_matrices
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.errors import FormatError, InputError, printable_line
+from langsplat_core.scene import FARTHEST
 
 Result = TypeVar("Result")
 
@@ -114,12 +115,14 @@ def _guarded(read: Callable[[bytes], Result], path: Path) -> Result:
     try:
         return read(path.read_bytes())
     except (struct.error, ValueError, IndexError, OverflowError) as error:
-        raise FormatError(f"{path} is no readable COLMAP file ({error}); export the model again") from None
+        raise FormatError(
+            f"{path} is no readable COLMAP file ({printable_line(error, 120)}); export the model again"
+        ) from None
 
 
 def _image(name: str, camera_id: int, quaternion_wxyz: Array, translation: Array) -> ModelImage:
     largest = np.abs(quaternion_wxyz).max()
-    if not (np.isfinite(translation).all() and 1e-9 < largest < 1e9):
+    if not ((np.abs(translation) <= FARTHEST).all() and 1e-9 < largest < 1e9):
         raise ValueError(f"image {name} has an impossible pose")
     matrix = np.eye(4)
     matrix[:3, :3] = rotation_matrices(quaternion_wxyz[None])[0]

@@ -1,7 +1,6 @@
 """Photographs: finding them, reading them whatever their kind, and making pinhole pictures of them."""
 
 import logging
-import struct
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -15,17 +14,20 @@ from langsplat_core.arrays import Array
 from langsplat_core.datasets.album import Album
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.datasets.undistort import pinhole_for, resample, source_positions
-from langsplat_core.errors import InputError
+from langsplat_core.errors import InputError, printable_line
+from langsplat_core.parsing.pictures import PictureError, opened
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
 
 log = logging.getLogger("langsplat")
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
+# HEIF is named where it cannot be read, too: the message then says why such photographs are left out
+PHOTO_SUFFIXES = (
+    *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif"),
+    *(".heic", ".heif"),
+)
 ASPECT_TOLERANCE = 0.02  # shrunk copies round their sizes
 WORKERS = 2  # decoding and resampling release the interpreter; more would only hold more pixels
-# What Pillow raises for files that are not, or no longer, pictures.
-UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +50,11 @@ def find_photos(folder: Path) -> list[Path]:
 
 
 def shortened(names: Iterable[str], limit: int = 5) -> str:
-    """``a, b, c and 4 more``."""
+    """``a, b, c and 4 more``; long names lose their middle."""
     listed = sorted(names)
     rest = len(listed) - limit
-    return ", ".join(listed[:limit]) + (f" and {rest} more" if rest > 0 else "")
+    shown = printable_line(", ".join(printable_line(name, 80) for name in listed[:limit]), 200)
+    return shown + (f" and {rest} more" if rest > 0 else "")
 
 
 def unique_names(labels: Sequence[str]) -> list[str]:
@@ -68,15 +71,16 @@ def unique_names(labels: Sequence[str]) -> list[str]:
 def read_photo(path: Path, upright: bool) -> Image.Image:
     """An RGB picture; transparent pixels are laid over black, 16 bits become 8.
 
-    With `upright` it is turned as its EXIF data ask. Raises one of `UNREADABLE`.
+    With `upright` it is turned as its EXIF data ask. Raises PictureError.
     """
-    with Image.open(path) as opened:
-        picture = upright_copy(opened) if upright else opened
+    with opened(path) as stored:
+        picture = upright_copy(stored) if upright else stored
         if picture.mode.startswith("I") or picture.mode == "F":  # Pillow's own conversion would clip
-            values = np.asarray(picture, np.float64)
-            if picture.mode == "F" or values.max(initial=0) > 65535:
-                raise ValueError("more than 16 bits per channel")
-            return Image.fromarray((values / 257 + 0.5).astype(np.uint8)).convert("RGB")
+            values = np.asarray(picture)
+            if picture.mode == "F" or not 0 <= values.min(initial=0) <= values.max(initial=0) <= 65535:
+                raise PictureError(path, "more than 16 bits per channel")
+            # the nearest of 256 shades: v / 257 rounded, in whole numbers
+            return Image.fromarray(((values.astype(np.uint32) + 128) // 257).astype(np.uint8)).convert("RGB")
         if picture.has_transparency_data:
             black = Image.new("RGBA", picture.size, (0, 0, 0, 255))
             return Image.alpha_composite(black, picture.convert("RGBA")).convert("RGB")
@@ -85,9 +89,10 @@ def read_photo(path: Path, upright: bool) -> Image.Image:
 
 def upright_copy(picture: Image.Image) -> Image.Image:
     """Turned as the EXIF data ask; unreadable EXIF data count as none."""
+    picture.load()  # so that nothing but the EXIF data can fail below
     try:
         return ImageOps.exif_transpose(picture)
-    except (SyntaxError, ValueError, KeyError, TypeError, struct.error):
+    except Exception:  # noqa: BLE001  Pillow's parser lets through what damaged tags cause
         return picture.copy()
 
 
@@ -139,8 +144,8 @@ def develop(
         photo = photos[index]
         try:
             picture, intrinsics = _read_for(photo)
-        except UNREADABLE as error:
-            return f"{photo.label} ({error})"
+        except PictureError as error:
+            return f"{photo.label} ({error.reason})"
         camera, positions = plan(intrinsics)
         pose = replace(camera, world_to_camera=photo.world_to_camera, name=names[index])
         return pose, resample(picture, intrinsics, camera, positions)

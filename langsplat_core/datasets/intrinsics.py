@@ -15,6 +15,11 @@ import pycolmap
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Intrinsics
 
+# What no photograph exceeds; numbers of damaged files would overflow in what is computed from them.
+MOST_SIDE = 1 << 20  # pixels
+FOCAL_RANGE = (1e-3, 1e5)  # in lengths of the longer side; a telescope of 100 m on a 36 mm sensor has 3000
+MOST_SHIFT = 1e3  # of the principal point, in lengths of the longer side
+
 
 class Distortion(Protocol):
     """Maps (N, 2) normalised to (N, 2) distorted coordinates, float64. Hashable, so that photographs
@@ -96,6 +101,18 @@ class PhotoIntrinsics(Intrinsics):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        side = max(self.width, self.height)
+        least, most = FOCAL_RANGE
+        if side > MOST_SIDE:
+            raise ValueError(f"a photograph of more than {MOST_SIDE} pixels a side")
+        if not least * side <= min(self.fx, self.fy) <= max(self.fx, self.fy) <= most * side:
+            raise ValueError(
+                f"focal lengths {self.fx:g} and {self.fy:g} for {side} pixels; none has such a lens"
+            )
+        if max(abs(self.cx), abs(self.cy)) > MOST_SHIFT * side:
+            raise ValueError(
+                f"the principal point ({self.cx:g}, {self.cy:g}) is far outside of the photograph"
+            )
         if self.distortion == BrownDistortion():  # all zero, as many files write a pinhole
             object.__setattr__(self, "distortion", None)
 

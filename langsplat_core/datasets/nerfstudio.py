@@ -5,7 +5,6 @@ been applied to both poses and points, so the world is taken as it stands.
 Layout: https://docs.nerf.studio/quickstart/data_conventions.html
 """
 
-import json
 import logging
 import math
 import os
@@ -14,20 +13,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
-from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.capture import Capture
-from langsplat_core.datasets.images import PHOTO_SUFFIXES, UNREADABLE, Photo, develop, shortened
+from langsplat_core.datasets.capture import Capture, tell_of_lost_points
+from langsplat_core.datasets.images import PHOTO_SUFFIXES, Photo, develop, shortened
 from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, FisheyeDistortion, PhotoIntrinsics
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.errors import FormatError, InputError, printable_line
+from langsplat_core.parsing.cloud import read_cloud
+from langsplat_core.parsing.opening import read_json_file
+from langsplat_core.parsing.pictures import PictureError, picture_size
 from langsplat_core.progress import Progress
+from langsplat_core.scene import FARTHEST
 
 log = logging.getLogger("langsplat")
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+JSON_LIMIT = 256 * 1024 * 1024  # bytes; a frame takes about 700
 Json = dict[str, Any]
 
 
@@ -52,7 +54,7 @@ def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
         try:
             photos[label] = Photo(path, label, _lens({**top, **frame}, size), _pose(frame))
         except ValueError as error:
-            raise FormatError(f"{where} ({label}): {error}") from None
+            raise FormatError(f"{where} ({printable_line(label, 60)}): {error}") from None
     _report_missing(file, missing, len(frames))
     cameras, images = develop(list(photos.values()), max_side, progress)
     return Capture(cameras, images, *_points(file, top.get("ply_file_path")), _metres_per_unit(file, top))
@@ -74,7 +76,8 @@ def _metres_per_unit(file: Path, top: Json) -> float | None:
 def _report_missing(file: Path, missing: list[str], total: int) -> None:
     if len(missing) == total:
         raise InputError(
-            f"none of the {total} photographs listed in {file} can be opened (first: {missing[0]}); "
+            f"none of the {total} photographs listed in {file} can be opened "
+            f"(first: {printable_line(missing[0], 80)}); "
             "paths in it are relative to its folder"
         )
     if missing:
@@ -88,10 +91,7 @@ def _report_missing(file: Path, missing: list[str], total: int) -> None:
 
 
 def _read_json(file: Path) -> Json:
-    try:
-        top = json.loads(file.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{file} is not valid JSON ({error})") from None
+    top = read_json_file(file, JSON_LIMIT)
     if not isinstance(top, dict):
         raise FormatError(f"{file} is not a nerfstudio dataset: expected an object at the top")
     return top
@@ -115,9 +115,8 @@ def _number(values: Json, key: str, default: float | None = None) -> float:
 def _stored_size(path: Path) -> tuple[int, int] | None:
     """Width and height in the file's header; None if it is no picture."""
     try:
-        with Image.open(path) as picture:
-            return picture.size
-    except UNREADABLE:
+        return picture_size(path)
+    except PictureError:
         return None
 
 
@@ -166,10 +165,10 @@ def _pose(frame: Json) -> Array:
     """(4, 4) world-to-camera in OpenCV's frame."""
     try:
         matrix = np.array(frame.get("transform_matrix"), np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):  # whole numbers have no limit in JSON
         matrix = np.empty(0)
-    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
-        raise ValueError('"transform_matrix" must be 4x4 finite numbers')
+    if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) <= FARTHEST).all():
+        raise ValueError(f'"transform_matrix" must be 4x4 numbers, none beyond {FARTHEST:g}')
     camera_to_world = np.eye(4)
     camera_to_world[:3] = matrix[:3]
     # Rotations lose their last digits in text; anything further off is no rotation.
@@ -190,15 +189,9 @@ def _points(file: Path, name: object) -> tuple[Array, Array]:
         log.warning("%s names the points %s, which do not exist", file.name, name)
         return none
     try:
-        vertex = PlyData.read(path)["vertex"]
-        points = np.stack([vertex[axis] for axis in "xyz"], -1).astype(np.float64)
-    except (PlyHeaderParseError, PlyElementParseError, KeyError, ValueError, OSError, MemoryError) as error:
-        raise FormatError(f"{path} is no readable point cloud ({error}); remove ply_file_path") from None
-    try:
-        colours = np.stack([vertex[channel] for channel in ("red", "green", "blue")], -1)
-    except ValueError:
-        colours = np.full(points.shape, 128, np.uint8)
-    if colours.dtype.kind == "f":
-        colours = np.clip(np.rint(colours * 255), 0, 255)
-    finite = np.isfinite(points).all(1)
-    return points[finite], colours.astype(np.uint8)[finite]
+        points, colours = read_cloud(path)
+    except FormatError as error:
+        raise FormatError(f"{error}; mend it or remove ply_file_path from {file.name}") from None
+    finite = np.asarray(np.isfinite(points).all(1))
+    tell_of_lost_points(finite, path.name)
+    return points[finite], colours[finite]

@@ -10,9 +10,10 @@ from langsplat_core.datasets import sfm
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.colmap import good_points, located_photos
 from langsplat_core.datasets.colmap_model import SparseModel, has_model, read_model
-from langsplat_core.datasets.images import UNREADABLE, Photo, develop, find_photos, read_photo, shortened
+from langsplat_core.datasets.images import Photo, develop, find_photos, read_photo, shortened
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
+from langsplat_core.parsing.pictures import PictureError, opened
 from langsplat_core.progress import Progress
 
 log = logging.getLogger("langsplat")
@@ -96,10 +97,10 @@ def _small_copies(folder: Path, numbered: dict[str, Path], progress: Progress) -
         try:
             if not (folder / name).is_file():
                 _write_copy(path, folder / name)
-            with Image.open(folder / name) as copy:
+            with opened(folder / name) as copy:
                 copies.append(_Copy(name, copy.size, str(_tags(copy.getexif()))))
-        except UNREADABLE as error:
-            broken.append(f"{path.name} ({error})")
+        except PictureError as error:
+            broken.append(f"{path.name} ({error.reason})")
     progress("preparing photographs", 1.0)
     if broken:
         log.warning("%d photographs cannot be read: %s", len(broken), shortened(broken))
@@ -119,13 +120,13 @@ def _optics(path: Path) -> Image.Exif:
     """Only what tells the focal length: other tags, orientation first of all, would be wrong for a copy."""
     kept = Image.Exif()
     try:
-        with Image.open(path) as picture:
+        with opened(path) as picture:
             source = picture.getexif()
             kept.update({tag: source[tag] for tag in _MAIN_TAGS if tag in source})
             inner = source.get_ifd(_EXIF_IFD)
             kept.get_ifd(_EXIF_IFD).update({tag: inner[tag] for tag in _EXIF_TAGS if tag in inner})
-        kept.tobytes()
-    except UNREADABLE:
+            kept.tobytes()
+    except PictureError:
         return Image.Exif()
     return kept
 

@@ -7,10 +7,13 @@ of `scene.spz`, `.splat` and `.ksplat` keep its suffix, `scene.spz.langsplat.saf
 the rounded positions of that file, so that it could not serve a `scene.ply` in the same folder.
 """
 
+import logging
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
@@ -20,11 +23,11 @@ from langsplat_core.formats.ksplat import read_ksplat
 from langsplat_core.formats.langsplat_features import read_features, write_features
 from langsplat_core.formats.language import read_language, rematch_language, write_language
 from langsplat_core.formats.metres import metres_comment, write_metres
-from langsplat_core.formats.opening import exists
 from langsplat_core.formats.ply import read_ply, read_ply_scene, write_ply
 from langsplat_core.formats.sog import META_NAME, read_sog, read_sog_scene
 from langsplat_core.formats.splat import read_splat, write_splat
 from langsplat_core.formats.spz import read_spz_scene, write_spz
+from langsplat_core.parsing.opening import exists
 from langsplat_core.scene import Gaussians, Scene
 
 __all__ = [
@@ -55,6 +58,9 @@ __all__ = [
     "write_spz",
 ]
 
+log = logging.getLogger("langsplat")
+
+LOOKED_AT = 4096  # rows of a large scene, evenly taken, that tell whether most can be drawn
 SUPPORTED = ".ply, .compressed.ply, .spz, .splat, .ksplat, .sog, or a SOG folder or its meta.json"
 
 
@@ -89,7 +95,19 @@ def load_without_language(path: Path | str) -> Scene:
 
 
 def _read_scene(path: Path) -> Scene:
-    """What the scene's own file holds."""
+    """What the scene's own file holds; a warning where most of it cannot be drawn."""
+    scene = _read_by_kind(path)
+    count = len(scene.gaussians)
+    looked_at = scene.gaussians.take(np.arange(0, count, max(1, count // LOOKED_AT)))
+    if 2 * looked_at.valid().sum() < len(looked_at):
+        reasons = looked_at.invalid_rows()
+        share = sum(reasons.values()) / len(looked_at)
+        told = f"{share:.0%} of the {count} Gaussians cannot be drawn ({', '.join(reasons)})"
+        log.warning("%s: %s; is the file damaged?", path, told)
+    return scene
+
+
+def _read_by_kind(path: Path) -> Scene:
     if not exists(path):
         raise InputError(f"{path}: no such file; check the spelling and the folder")
     read = _READERS.get(path.suffix.lower())

@@ -22,8 +22,8 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError
 from langsplat_core.files import atomic_path
-from langsplat_core.formats.opening import read_json_file
-from langsplat_core.scene import Camera
+from langsplat_core.parsing.opening import read_json_file
+from langsplat_core.scene import FARTHEST, Camera
 
 SUFFIX = ".cameras.json"
 SIZE_LIMIT = 64 * 1024 * 1024  # bytes; a camera takes about 500
@@ -69,8 +69,12 @@ def _camera(entry: Any, what: str) -> Camera:
         raise FormatError(f"{what}: expected an object with width, height, position, rotation, fx, fy")
     width, height = (_pixels(entry, key, what) for key in ("width", "height"))
     position = _numbers(entry, "position", (3,), what)
+    if np.abs(position).max() > FARTHEST:
+        raise FormatError(
+            f"{what}: 'position' is more than {FARTHEST:g} units from the origin; move the world"
+        )
     rotation = _numbers(entry, "rotation", (3, 3), what)
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+    if not _is_rotation(rotation):
         raise FormatError(f"{what}: 'rotation' is not a rotation matrix")
     matrix = np.eye(4)
     matrix[:3, :3] = rotation.T
@@ -91,6 +95,13 @@ def _camera(entry: Any, what: str) -> Camera:
         )
     except ValueError as error:  # what the camera itself refuses: fx of 0, for one
         raise FormatError(f"{what}: {error}") from None
+
+
+def _is_rotation(matrix: Array) -> bool:
+    if np.abs(matrix).max() > 2:  # products of larger ones could overflow
+        return False
+    unlike = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    return bool(unlike <= ROTATION_TOLERANCE and np.linalg.det(matrix) > 0)
 
 
 def _without_image_suffix(name: str) -> str:

@@ -23,8 +23,8 @@ import numpy as np
 from langsplat_core.arrays import Array, logit
 from langsplat_core.errors import FormatError
 from langsplat_core.formats.inria_layout import REST_COUNTS, SH_C0, sh_from_channel_major
-from langsplat_core.formats.ply_body import iterate_rows
-from langsplat_core.formats.ply_header import PlyElement, PlyHeader
+from langsplat_core.parsing.ply_body import iterate_rows
+from langsplat_core.parsing.ply_header import PlyElement, PlyHeader
 from langsplat_core.scene import Gaussians
 
 CHUNK_SIZE = 256

@@ -6,7 +6,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError
-from langsplat_core.formats.ply_header import PlyElement
+from langsplat_core.parsing.ply_header import PlyElement
 from langsplat_core.scene import SH_COUNTS
 
 POSITION = ("x", "y", "z")

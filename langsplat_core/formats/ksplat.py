@@ -20,8 +20,8 @@ import numpy as np
 
 from langsplat_core.arrays import Array, logit
 from langsplat_core.errors import FormatError
-from langsplat_core.formats.opening import open_for_reading
 from langsplat_core.formats.splat import base_of_colours, log_of_scales
+from langsplat_core.parsing.opening import open_for_reading
 from langsplat_core.scene import SH_COUNTS, Gaussians
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import FormatError
 from langsplat_core.files import atomic_path
-from langsplat_core.formats.npy import read_npy
+from langsplat_core.parsing.npy import read_npy
 
 MAP_COUNT = 4
 NO_MASK = -1

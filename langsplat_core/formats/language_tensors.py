@@ -7,9 +7,9 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from langsplat_core.arrays import Array, check_array
-from langsplat_core.errors import FormatError
-from langsplat_core.formats.opening import open_for_reading, parse_json
+from langsplat_core.errors import FormatError, printable_line
 from langsplat_core.formats.packed_positions import step, unpack_positions
+from langsplat_core.parsing.opening import open_for_reading, parse_json
 from langsplat_core.scene import LEVELS, Calibration, LanguageField, Odds, Reading, codec_from_tensors
 from langsplat_core.scene.codec import KINDS
 
@@ -54,7 +54,7 @@ def read_stored(path: Path) -> Stored:
                 tensor = file.get_tensor(name)
                 tensors[name] = tensor if name in _WHOLE else tensor.astype(np.float32)
     except SafetensorError as error:
-        raise FormatError(f"{path}: not a whole safetensors file ({error})") from None
+        raise FormatError(f"{path}: not a whole safetensors file ({printable_line(error, 80)})") from None
     return _assemble(tensors, metadata, path)
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
-from langsplat_core.formats.opening import open_for_reading
-from langsplat_core.formats.ply_header import read_ply_header
+from langsplat_core.parsing.opening import open_for_reading
+from langsplat_core.parsing.ply_header import read_ply_header
 
 KEY = "metres_per_unit"
 

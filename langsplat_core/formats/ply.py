@@ -32,9 +32,9 @@ from langsplat_core.formats.inria_layout import (
     sh_to_channel_major,
 )
 from langsplat_core.formats.metres import metres_by_comments
-from langsplat_core.formats.opening import open_for_reading
-from langsplat_core.formats.ply_body import CHUNK_ROWS, fill_columns, iterate_rows
-from langsplat_core.formats.ply_header import TYPE_NAMES, PlyElement, PlyHeader, is_name, read_ply_header
+from langsplat_core.parsing.opening import open_for_reading
+from langsplat_core.parsing.ply_body import CHUNK_ROWS, fill_columns, iterate_rows
+from langsplat_core.parsing.ply_header import TYPE_NAMES, PlyElement, PlyHeader, is_name, read_ply_header
 from langsplat_core.scene import Gaussians, Scene
 
 LAYOUT = "the layout"  # NumPy field of all its columns together; no PLY property has a name with a blank

@@ -17,20 +17,18 @@ Opacities of 0 and 1 become logits of -infinity and +infinity. `model: "antialia
 PlayCanvas' public specification.
 """
 
-import io
-import zipfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from langsplat_core.arrays import Array, logit
 from langsplat_core.errors import FormatError
 from langsplat_core.formats.compressed_ply import smallest_three
-from langsplat_core.formats.opening import open_for_reading, parse_json
+from langsplat_core.parsing.archives import Archive, opened_archive
+from langsplat_core.parsing.opening import open_for_reading, parse_json
+from langsplat_core.parsing.pictures import opened
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
 
 META_NAME = "meta.json"
@@ -60,14 +58,8 @@ def read_sog_scene(path: Path | str) -> Scene:
         return _decode(_folder_reader(path), path / META_NAME)
     if path.suffix.lower() == ".json":
         return _decode(_folder_reader(path.parent), path)
-    file, size = open_for_reading(path)
-    with file:
-        try:
-            with zipfile.ZipFile(file) as archive:
-                return _decode(_archive_reader(archive, size, path), path / META_NAME)
-        # zipfile lets whatever goes wrong inside through; NotImplementedError is a RuntimeError
-        except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, OSError, ValueError) as error:
-            raise FormatError(f"{path}: not a readable SOG archive ({str(error)[:80]})") from None
+    with opened_archive(path, "SOG archive") as archive:
+        return _decode(_archive_reader(archive), path / META_NAME)
 
 
 def _folder_reader(folder: Path) -> Fetch:
@@ -81,21 +73,9 @@ def _folder_reader(folder: Path) -> Fetch:
     return fetch
 
 
-def _archive_reader(archive: zipfile.ZipFile, archive_size: int, path: Path) -> Fetch:
-    def fetch(name: str, limit: int) -> bytes:
-        try:
-            member = archive.open(name)
-        except KeyError:
-            raise FormatError(f"{path}: has no {name!r} inside; is it a SOG file?") from None
-        # The images are compressed already, so a member far larger than its archive is a trap.
-        most = min(limit, 16 * archive_size + META_LIMIT)
-        with member:
-            content = member.read(most + 1)
-        if len(content) > most:
-            raise FormatError(f"{path}: {name!r} inside has more than {most} bytes")
-        return content
-
-    return fetch
+def _archive_reader(archive: Archive) -> Fetch:
+    # The images are compressed already, so a member far larger than its archive is a trap.
+    return lambda name, limit: archive.read(name, min(limit, 16 * archive.size + META_LIMIT))
 
 
 def _decode(fetch: Fetch, meta_path: Path) -> Scene:
@@ -170,17 +150,14 @@ class _Planes:
         data = self._fetch(name, IMAGE_LIMIT)
         if key == "means" and self.count > PIXELS_PER_BYTE * len(data) + SLACK_PIXELS:
             raise FormatError(f"{what} has {len(data)} bytes, too few for {self.count} Gaussians")
-        try:
-            with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
-                if not suits(*image.size):
-                    raise FormatError(
-                        f"{what} has {image.width}x{image.height} pixels, which does not suit "
-                        f"{self.count} Gaussians"
-                    )
-                # A lossless image of full opacity is stored without alpha: convert makes it 255 again.
-                return np.asarray(image.convert("RGBA"))
-        except (OSError, EOFError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-            raise FormatError(f"{what} cannot be read ({str(error)[:80]})") from None
+        with opened(data, what, ("WEBP", "PNG")) as image:
+            if not suits(*image.size):
+                raise FormatError(
+                    f"{what} has {image.width}x{image.height} pixels, which does not suit "
+                    f"{self.count} Gaussians"
+                )
+            # A lossless image of full opacity is stored without alpha: convert makes it 255 again.
+            return np.asarray(image.convert("RGBA"))
 
 
 class _Meta:

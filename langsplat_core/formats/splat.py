@@ -18,7 +18,7 @@ from langsplat_core.arrays import Array, logit, sigmoid, unit
 from langsplat_core.errors import FormatError
 from langsplat_core.files import atomic_path
 from langsplat_core.formats.inria_layout import SH_C0
-from langsplat_core.formats.opening import open_for_reading
+from langsplat_core.parsing.opening import open_for_reading
 from langsplat_core.scene import Gaussians
 
 HUGE = 1e12  # world units that no Gaussian of a real scene has

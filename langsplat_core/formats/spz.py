@@ -54,8 +54,10 @@ def read_spz_scene(path: Path | str) -> Scene:
     rest = blocks["sh"].reshape(count, blocks["sh"].shape[1] // 3, 3)[:, : SH_COUNTS[degree] - 1]
     rest = (rest.astype(np.float32) - 128) / 128 * _coefficient_signs(signs, rest.shape[1])[:, None]
     base = (blocks["colours"] / 255 - 0.5) / COLOUR_SCALE
+    with np.errstate(invalid="ignore"):  # signalling NaN in half floats become ordinary ones
+        means = _positions(packed) * signs
     gaussians = Gaussians(
-        means=_positions(packed) * signs,
+        means=means,
         log_scales=blocks["scales"].astype(np.float32) / 16 - 10,
         quats_wxyz=_rotations(packed) * _quaternion_signs(signs),
         opacity_logits=logit(blocks["alphas"][:, 0] / 255),

@@ -23,7 +23,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError
 from langsplat_core.files import atomic_path
-from langsplat_core.formats.opening import open_for_reading
+from langsplat_core.parsing.opening import open_for_reading
 
 MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
 HEADER_SIZE, HEADER_SIZE_4 = 16, 32

@@ -1,6 +1,6 @@
 """The nouns of the project: plain typed data, no behaviour that needs a device or a file."""
 
-from langsplat_core.scene.camera import Camera, look_at
+from langsplat_core.scene.camera import FARTHEST, Camera, look_at
 from langsplat_core.scene.codec import (
     AutoencoderCodec,
     CodebookCodec,
@@ -21,6 +21,7 @@ from langsplat_core.scene.scene import Scene
 
 __all__ = [
     "CANONICAL_PHRASES",
+    "FARTHEST",
     "LEVELS",
     "NO_THING",
     "SH_COUNTS",

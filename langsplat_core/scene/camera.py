@@ -7,6 +7,8 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.scene.intrinsics import Intrinsics
 
+FARTHEST = 1e9  # world units along an axis, of cameras in files: there, float32 positions are 64 units apart
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:

@@ -65,7 +65,8 @@ class Scene:
             return np.zeros(3), 1.0
         centre = np.median(means, axis=0)
         radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.7))
-        return centre, max(radius, 1e-3)
+        # far from the origin float32 positions are coarse, and a camera needs a distance that it can tell
+        return centre, max(radius, 1e-3, 1e-6 * float(np.abs(centre).max()))
 
     def framing_camera(self, size: tuple[int, int]) -> Camera:
         """A camera of `size` (width, height) that frames the bounds, a little from above."""

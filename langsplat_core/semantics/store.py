@@ -2,8 +2,7 @@
 
 import hashlib
 import json
-import zipfile
-import zlib
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +12,19 @@ from urllib.parse import quote
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array, unit
-from langsplat_core.errors import FormatError
+from langsplat_core.errors import FormatError, InputError
 from langsplat_core.files import atomic_path
+from langsplat_core.parsing.npy import read_npz
+from langsplat_core.parsing.opening import exists
 from langsplat_core.progress import Progress, silent
 from langsplat_core.semantics.embed import ImageEncoder, embed_regions
 from langsplat_core.semantics.masks import MaskSource, label_maps
 
 VERSION = 1
 SUFFIX = ".features.npz"
+_PARTS = {"key": "U", "labels": "i", "vectors": "f"}  # of a file, with the kind of its type
+
+log = logging.getLogger("langsplat")
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,18 +49,27 @@ class FeatureStore:
 
     def __init__(self, folder: Path | str) -> None:
         self.folder = Path(folder)
+        self._reported: set[str] = set()  # names whose damaged files were told of
 
     def path(self, name: str) -> Path:
         """Where the photograph called `name` is kept."""
         return self.folder / (quote(name, safe=" ") + SUFFIX)
 
     def has(self, name: str, key: str | None = None) -> bool:
-        """Whether a readable file for `name` exists; with `key`, only if it was saved with that key."""
+        """Whether a whole file for `name` exists; with `key`, only if it was saved with that key.
+
+        A damaged one counts as absent, and is told of once: what it held is then made again.
+        """
         try:
-            with np.load(self.path(name), allow_pickle=False) as file:
-                return key is None or str(file["key"]) == key
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            if not exists(self.path(name)):
+                return False
+            stored_key = self._read(name)[1]
+        except InputError as error:
+            if name not in self._reported:
+                self._reported.add(name)
+                log.warning("%s; made again", error)
             return False
+        return key is None or stored_key == key
 
     def save(self, name: str, features: ImageFeatures, key: str = "") -> None:
         """Keep the features of one photograph; `key` names all that they depend on."""
@@ -72,15 +85,27 @@ class FeatureStore:
 
     def load(self, name: str) -> ImageFeatures:
         """The features of one photograph. Raises FormatError for an absent or damaged file."""
-        path = self.path(name)
         try:
-            with np.load(path, allow_pickle=False) as file:
-                labels, vectors = file["labels"].astype(np.int32), file["vectors"].astype(np.float32)
-            return ImageFeatures(labels, unit(vectors))
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise FormatError(
-                f"{path}: no readable image features ({error}); delete it and run again"
-            ) from error
+            return self._read(name)[0]
+        except InputError as error:
+            raise FormatError(f"{error}; delete it and run again") from None
+
+    def _read(self, name: str) -> tuple[ImageFeatures, str]:
+        """The features and the key they were saved with. Raises InputError and FormatError."""
+        path = self.path(name)
+        arrays = read_npz(path)
+        for part, kind in _PARTS.items():
+            if part not in arrays or arrays[part].dtype.kind != kind:
+                raise FormatError(
+                    f"{path}: no readable image features ({part!r} is missing or of another type)"
+                )
+        if arrays["key"].ndim or not np.isfinite(arrays["vectors"]).all():
+            raise FormatError(f"{path}: no readable image features (numbers that are not finite)")
+        labels, vectors = arrays["labels"].astype(np.int32), arrays["vectors"].astype(np.float32)
+        try:
+            return ImageFeatures(labels, unit(vectors)), str(arrays["key"])
+        except (ValueError, TypeError) as error:
+            raise FormatError(f"{path}: no readable image features ({error})") from None
 
 
 def feature_key(image: Array, mask_source: MaskSource, encoder: str) -> str:

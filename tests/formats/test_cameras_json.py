@@ -102,6 +102,8 @@ BROKEN = {
     "a width of truth": ([entry(width=True)], "'width' is not a number"),
     "two numbers for a place": ([entry(position=[1, 2])], "'position' is not 3 numbers"),
     "an infinite place": ("[" + json.dumps(entry()).replace("3.0]", "Infinity]") + "]", "'position' is not"),
+    "a place beyond sense": ([entry(position=[0, 2e9, 0])], "more than 1e[+]09 units from the origin"),
+    "a rotation that overflows": ([entry(rotation=[[1e200] * 3] * 3)], "'rotation' is not a rotation"),
     "ragged rotation": ([entry(rotation=[[1, 0, 0], [0, 1], [0, 0, 1]])], "'rotation' is not 3 rows"),
     "a scaled rotation": (
         [entry(rotation=[[2 * x for x in row] for row in TURNED])],

@@ -69,7 +69,7 @@ BROKEN = {
     "three maps": ({"maps": MAPS[:3]}, r"\(3, 6, 8\); expected numbers of shape \(4, H, W\)"),
     "one map": ({"maps": MAPS[0]}, "expected numbers of shape"),
     "maps without pixels": ({"maps": MAPS[:, :0]}, "expected numbers of shape"),
-    "maps of text": ({"maps": MAPS.astype("U2")}, "not a .npy file of plain numbers"),
+    "maps of text": ({"maps": MAPS.astype("U2")}, "expected numbers of shape"),
     "flat vectors": ({"vectors": VECTORS[0]}, r"expected floats of shape \(M, D\)"),
     "whole vectors": ({"vectors": VECTORS.astype(np.int32)}, "expected floats of shape"),
     "vectors that are none": ({"vectors": VECTORS * np.float32(np.nan)}, "not finite"),

@@ -171,3 +171,17 @@ def test_an_unusable_companion_is_an_error(tmp_path):
     (tmp_path / "scene.cameras.json").write_text("[")
     with pytest.raises(FormatError, match=r"scene\.cameras\.json: not readable as JSON"):
         load_scene(tmp_path / "scene.ply")
+
+
+def test_a_scene_of_which_most_cannot_be_drawn_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    gaussians = random_gaussians(N)
+    for broken, told in ((N // 2, False), (N // 2 + 1, True)):
+        means = gaussians.means.copy()
+        means[:broken] = np.nan
+        write_ply(tmp_path / "a.ply", replace(gaussians, means=means))
+        caplog.clear()
+        assert len(load_scene(tmp_path / "a.ply").gaussians) == N
+        assert bool(caplog.messages) == told
+    assert f"52% of the {N} Gaussians cannot be drawn (position not finite)" in caplog.messages[0]

@@ -104,7 +104,10 @@ BROKEN = {
     "too few entries": (lambda: broken_meta(lambda m: m["shN"].update(count=20)), "a label of 'shN' is 39"),
     "a narrow palette": (lambda: broken_meta(lambda m: m["shN"].update(bands=2)), "does not suit"),
     "quaternions without a tag": (lambda: swapped("quats.webp", "sh0.webp"), "alpha below 252"),
-    "an image of words": (lambda: swapped("sh0.webp", b"RIFF words"), "'sh0.webp' of 'sh0' cannot be read"),
+    "an image of words": (
+        lambda: swapped("sh0.webp", b"RIFF words"),
+        "'sh0.webp' of 'sh0': not a readable picture",
+    ),
     "not JSON": (lambda: swapped("meta.json", b"{"), "not readable as JSON"),
     "nested JSON": (lambda: swapped("meta.json", b"[" * 100_000), "not readable as JSON"),
     "a list": (lambda: swapped("meta.json", b"[]"), "expected a JSON object"),

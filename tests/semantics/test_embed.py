@@ -1,5 +1,6 @@
 """Vectors of regions, and the store that lets a run continue."""
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +128,45 @@ def test_a_damaged_file_is_named(tmp_path: Path, keep: int) -> None:
     assert not store.has("a", "k")
     with pytest.raises(FormatError, match="delete it and run again"):
         store.load("a")
+
+
+def with_header(path: Path, old: bytes, new: bytes) -> None:
+    """Change the text in front of the arrays; the archive's checksums are right."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name).replace(old, new) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"'shape'", b"'shap'+"),  # tokenizer errors from NumPy's own reader
+        (b"'<f2'", b"'|S2'"),  # bytes, which have no astype to floats
+        (b"(7, 512)", b"(7777777777777777, 512)"),  # MemoryError
+        (b"'<U1'", b"'<U9'"),
+        (b"labels", b"label\x1b"),
+    ],
+)
+def test_a_damaged_header_counts_as_absent_and_is_told_of_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, old: bytes, new: bytes
+) -> None:
+    store = FeatureStore(tmp_path)
+    store.save("a", random_features(), "k")
+    if old == b"labels":
+        path = store.path("a")
+        path.write_bytes(path.read_bytes().replace(old, new))
+    else:
+        with_header(store.path("a"), old, new)
+    assert not store.has("a", "k")
+    assert not store.has("a", "k")
+    assert len(caplog.messages) == 1
+    assert "a.features.npz" in caplog.messages[0]
+    with pytest.raises(FormatError, match="delete it and run again"):
+        store.load("a")
+    store.save("a", random_features(), "k")
+    assert store.has("a", "k")
 
 
 def test_an_absent_file_is_named(tmp_path: Path) -> None:

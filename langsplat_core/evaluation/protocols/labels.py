@@ -9,8 +9,9 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.images import PHOTO_SUFFIXES, UNREADABLE
-from langsplat_core.errors import FormatError, InputError
+from langsplat_core.datasets.images import PHOTO_SUFFIXES
+from langsplat_core.errors import InputError
+from langsplat_core.parsing.pictures import opened
 
 Size = tuple[int, int]  # width and height, pixels
 SAME_SHAPE = 0.02  # relative difference of aspect up to which two sizes may be of one picture
@@ -92,20 +93,8 @@ class Benchmark:
 
 def read_grey(path: Path) -> Array:
     """(H, W) uint8 brightness of a picture file; FormatError where it cannot be read."""
-    try:
-        with Image.open(path) as picture:
-            return np.asarray(picture.convert("L"))
-    except UNREADABLE as error:
-        raise FormatError(f"{path}: not a readable picture ({str(error)[:80]})") from None
-
-
-def picture_size(path: Path) -> Size:
-    """Of a picture file, from its header; FormatError where it cannot be read."""
-    try:
-        with Image.open(path) as picture:
-            return picture.size
-    except UNREADABLE as error:
-        raise FormatError(f"{path}: not a readable picture ({str(error)[:80]})") from None
+    with opened(path) as picture:
+        return np.asarray(picture.convert("L"))
 
 
 def resized(mask: Array, size: Size) -> Array:

@@ -24,7 +24,7 @@ from langsplat_core.evaluation.protocols.labels import (
     Size,
     photograph_of,
 )
-from langsplat_core.formats.opening import read_json_file
+from langsplat_core.parsing.opening import read_json_file
 
 LIMIT = 2**26  # bytes of a label file; real ones have some hundred kilobytes
 MAX_SIDE = 20_000  # px of a label's grid

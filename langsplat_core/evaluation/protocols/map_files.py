@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.images import UNREADABLE
 from langsplat_core.errors import FormatError
-from langsplat_core.formats.npy import read_npy
+from langsplat_core.parsing.npy import read_npy
+from langsplat_core.parsing.pictures import opened
 from langsplat_core.scene import LEVELS
 
 
@@ -73,10 +72,7 @@ def _read(path: Path) -> Array:
 
 def _picture(path: Path) -> Array:
     """(H, W) in [0, 1]."""
-    try:
-        with Image.open(path) as picture:
-            if picture.mode.startswith("I"):
-                return np.asarray(picture, np.float64) / 65535
-            return np.asarray(picture.convert("L"), np.float64) / 255
-    except UNREADABLE as error:
-        raise FormatError(f"{path}: not a readable picture ({str(error)[:80]})") from None
+    with opened(path) as picture:
+        if picture.mode.startswith("I"):
+            return np.asarray(picture, np.float64) / 65535
+        return np.asarray(picture.convert("L"), np.float64) / 255

@@ -15,8 +15,8 @@ from langsplat_core.evaluation.protocols.labels import (
     LabelledScene,
     MaskFile,
     photograph_of,
-    picture_size,
 )
+from langsplat_core.parsing.pictures import picture_size
 
 WANTED = "expected segmentations/classes.txt in it, or in folders of it, one per scene"
 

@@ -16,10 +16,10 @@ from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.formats.npy import read_npy
-from langsplat_core.formats.opening import open_for_reading
-from langsplat_core.formats.ply_body import fill_columns, iterate_rows
-from langsplat_core.formats.ply_header import read_ply_header
+from langsplat_core.parsing.npy import read_npy
+from langsplat_core.parsing.opening import open_for_reading
+from langsplat_core.parsing.ply_body import fill_columns, iterate_rows
+from langsplat_core.parsing.ply_header import read_ply_header
 from langsplat_core.query.engine import QueryEngine
 
 ENDING = "_vh_clean_2.labels.ply"

@@ -29,7 +29,7 @@ from langsplat_core.formats.checkpoints.parts import (
     Part,
     read_part,
 )
-from langsplat_core.formats.opening import exists
+from langsplat_core.parsing.opening import exists
 from langsplat_core.scene import LEVELS, AutoencoderCodec, Scene
 
 WIDEST_LATENT = 16  # numbers per Gaussian up to which they are an autoencoder's; 1, 2, 3 and 8 were published

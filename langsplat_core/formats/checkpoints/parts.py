@@ -20,10 +20,10 @@ from langsplat_core.formats.checkpoints.gaussian_tuple import GEOMETRY, gaussian
 from langsplat_core.formats.checkpoints.meanings import Leaves, SparseCodes, Vectors
 from langsplat_core.formats.checkpoints.quantisers import checked_centroids, is_centroids, read_faiss
 from langsplat_core.formats.checkpoints.unpickling import load_torch, plain_array
-from langsplat_core.formats.npy import MAGIC as NPY
-from langsplat_core.formats.npy import read_npy, read_npz
-from langsplat_core.formats.opening import open_for_reading
 from langsplat_core.formats.ply import read_ply_scene
+from langsplat_core.parsing.npy import MAGIC as NPY
+from langsplat_core.parsing.npy import read_npy, read_npz
+from langsplat_core.parsing.opening import open_for_reading
 from langsplat_core.scene import AutoencoderCodec, Gaussians
 
 PLAIN, UNNAMED = "3D Gaussian Splatting", "LangSplat or Occam's LGS"

@@ -19,7 +19,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError
-from langsplat_core.formats.opening import open_for_reading
+from langsplat_core.parsing.opening import open_for_reading
 
 MAGIC = b"IxPq"
 CENTROIDS = 256  # of a part: what a byte can name

@@ -10,7 +10,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError
-from langsplat_core.formats.opening import open_for_reading
+from langsplat_core.parsing.opening import open_for_reading
 
 _FOREIGN_CLASS = re.compile(r"(?:GLOBAL |but got <class ')([A-Za-z_][\w.]*)")  # as torch's messages name it
 _PLAIN_TYPES = "?bBhHiIlLqQefdUS"  # NumPy's numbers and texts; no objects

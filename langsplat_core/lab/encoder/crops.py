@@ -24,6 +24,7 @@ from langsplat_core.lab.world.appearance.render import Light, Picture, Renderer
 from langsplat_core.lab.world.appearance.textures import noise
 from langsplat_core.lab.world.assembly import World, build_room
 from langsplat_core.lab.world.captions import Label
+from langsplat_core.parsing.pictures import opened
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera, look_at
 from langsplat_core.semantics.crops import masked_crop
@@ -127,7 +128,8 @@ def _photograph(image: Array, rng: np.random.Generator) -> Array:
     if rng.random() < 0.4:
         buffer = io.BytesIO()
         result.save(buffer, "JPEG", quality=int(rng.integers(35, 92)))
-        result = Image.open(buffer)
+        with opened(buffer.getvalue()) as compressed:
+            result = compressed.convert("RGB")
     grain = rng.normal(0, rng.uniform(0, 7), image.shape)
     return np.clip(np.asarray(result) + grain, 0, 255).astype(np.uint8)
 

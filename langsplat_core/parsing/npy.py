@@ -1,10 +1,9 @@
-"""Files of plain NumPy arrays, .npy and .npz, read without pickles and without belief in their headers."""
+"""Files of plain NumPy arrays of numbers or texts, .npy and .npz, read without pickles and without belief in
+their headers."""
 
 import io
 import math
 import re
-import zipfile
-import zlib
 from pathlib import Path
 from typing import BinaryIO
 
@@ -12,7 +11,8 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError
-from langsplat_core.formats.opening import open_for_reading
+from langsplat_core.parsing.archives import opened_archive
+from langsplat_core.parsing.opening import open_for_reading
 
 MAGIC = b"\x93NUMPY"
 HEADER_LIMIT = 10_000  # bytes; NumPy writes 118
@@ -20,7 +20,8 @@ MEMBER_LIMIT = 2**31  # bytes of one array in an .npz: packed ones may be a thou
 # What NumPy writes, to the letter. Its own reader evaluates the text as a Python literal, and on damaged
 # headers raises tokenizer errors and warnings.
 _HEADER = re.compile(
-    rb"\{'descr': '(?P<dtype>[<>|](?:[iu][1248]|f[248]))', 'fortran_order': (?P<order>True|False), "
+    rb"\{'descr': '(?P<dtype>[<>|](?:[iu][1248]|f[248]|U[1-9]\d{0,3}))', "
+    rb"'fortran_order': (?P<order>True|False), "
     rb"'shape': \((?P<shape>(?:\d{1,18}(?:, ?)?){0,8})\), ?\} *\n?$"
 )
 
@@ -33,21 +34,13 @@ def read_npy(path: Path) -> Array:
 
 
 def read_npz(path: Path) -> dict[str, Array]:
-    """The arrays of numbers in an .npz file, by their names without .npy. Raises as `read_npy` does."""
-    file, _ = open_for_reading(path)
+    """The arrays in an .npz file, by their names without .npy. Raises as `read_npy` does."""
     arrays = {}
-    try:
-        with file, zipfile.ZipFile(file) as archive:
-            for member in archive.infolist():
-                if member.file_size > MEMBER_LIMIT:
-                    raise FormatError(f"{path}: {member.filename[:60]!r} claims {member.file_size} bytes")
-                data = archive.read(member)
-                name = member.filename.removesuffix(".npy")
-                arrays[name] = _parse(io.BytesIO(data), len(data), f"{path}: {name[:60]!r}")
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError) as error:
-        raise FormatError(f"{path}: not a whole .npz file ({str(error)[:80]})") from None
-    except (NotImplementedError, RuntimeError) as error:  # another compression; a password
-        raise FormatError(f"{path}: an .npz file of another kind ({str(error)[:80]})") from None
+    with opened_archive(path, ".npz file") as archive:
+        for member in archive.names:
+            data = archive.read(member, MEMBER_LIMIT)
+            name = member.removesuffix(".npy")
+            arrays[name] = _parse(io.BytesIO(data), len(data), f"{path}: {name[:60]!r}")
     return arrays
 
 
@@ -69,4 +62,12 @@ def _parse(file: BinaryIO, size: int, name: str) -> Array:
             f"the file has {size - file.tell()}"
         )
     data = np.frombuffer(file.read(), dtype)
+    if dtype.kind == "U" and data.size and not _is_text(data):
+        raise FormatError(f"{name}: holds a text that is not Unicode")
     return data.reshape(shape, order="F" if header["order"] == b"True" else "C")
+
+
+def _is_text(data: Array) -> bool:
+    """Whether every code point of a text array exists; NumPy raises SystemError over one that does not."""
+    codes = data.view(data.dtype.byteorder.replace("|", "=") + "u4")
+    return bool(((codes < 0xD800) | (codes > 0xDFFF) & (codes <= 0x10FFFF)).all())

@@ -16,7 +16,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError
-from langsplat_core.formats.ply_header import PlyElement, PlyHeader
+from langsplat_core.parsing.ply_header import PlyElement, PlyHeader
 
 CHUNK_ROWS = 2048  # about 0.5 MB of a degree-3 scene: the columns are then picked out of the cache
 THREADS = 2  # which NumPy lets run at once; one core does not use the whole bandwidth of the memory
