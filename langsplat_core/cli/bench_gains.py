@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from langsplat_core.cli.bench_files import save_figures
+from langsplat_core.cli.checks import OutFolder
 from langsplat_core.lab.config import GainBenchConfig
 from langsplat_core.progress import TerminalProgress
 
@@ -17,9 +18,9 @@ class BenchGains:
     masks."""
 
     config: Annotated[GainBenchConfig, tyro.conf.arg(name="")] = field(default_factory=GainBenchConfig)
-    work: Path = Path("eval_out")
+    work: OutFolder = Path("eval_out")
     """Folder for the rooms, as of `langsplat eval synthetic`."""
-    out: Path = Path("bench_out")
+    out: OutFolder = Path("bench_out")
     """Folder for gains.md and gains.json."""
 
     def run(self) -> None:

@@ -1,6 +1,5 @@
 """Photographs with cameras, whatever they came with."""
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.datasets.photos import load_photos, photo_folder
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
+from langsplat_core.ranges import check_settings
 
 __all__ = ["Capture", "load_capture"]
 
@@ -31,15 +31,12 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
     warning of the logger "langsplat". Raises InputError where nothing usable remains.
     """
     path = Path(path)
-    if config.max_side < 16:
-        raise InputError(f"max_side is {config.max_side}; photographs need at least 16 pixels")
-    metres = config.metres_per_unit
-    if metres is not None and not 0 < metres < math.inf:
-        raise InputError(f"metres_per_unit is {metres:g}; must be above 0 and finite")
+    check_settings(config, "--dataset.")
     if not path.exists():
         raise InputError(f"{path} does not exist; expected {ACCEPTED}")
     capture = _load(path, config.max_side, work, progress)
-    capture = capture if metres is None else replace(capture, metres_per_unit=metres)
+    if config.metres_per_unit is not None:
+        capture = replace(capture, metres_per_unit=config.metres_per_unit)
     return capture if len(capture.points) else add_points(capture, work, progress)
 
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
+from langsplat_core.datasets.colmap_library import pycolmap
 from langsplat_core.files import atomic_path
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from langsplat_core.errors import InputError
-from langsplat_core.files import atomic_path
+from langsplat_core.files import atomic_path, check_output_file
 from langsplat_core.formats import antialiasing, cameras_json, language
 from langsplat_core.formats.cameras_json import read_cameras, write_cameras
 from langsplat_core.formats.ksplat import read_ksplat
@@ -105,9 +105,11 @@ def _read_scene(path: Path) -> Scene:
 
 
 def check_writable(path: Path | str) -> None:
-    """InputError unless `save_scene` can write a file of this name's ending."""
+    """InputError unless `save_scene` can write a scene of this name, and its companions, where it lies."""
     if Path(path).suffix.lower() not in _WRITERS:
         raise InputError(f"{path}: scenes are written as {', '.join(_WRITERS)}; choose such a name")
+    for file in (path, companion_path(path, language.SUFFIX), companion_path(path, cameras_json.SUFFIX)):
+        check_output_file(file)
 
 
 def save_scene(path: Path | str, scene: Scene) -> None:

@@ -2,13 +2,14 @@
 
 import hashlib
 import json
+import os
 import zipfile
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from langsplat_core.semantics.masks import MaskSource, label_maps
 
 VERSION = 1
 SUFFIX = ".features.npz"
+LONGEST_NAME = 200  # bytes before the suffix; file systems take 255, the suffix and a temporary name more
+SHORTENED = "%~"  # percent-encoding never writes this
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +50,24 @@ class FeatureStore:
         self.folder = Path(folder)
 
     def path(self, name: str) -> Path:
-        """Where the photograph called `name` is kept."""
-        return self.folder / (quote(name, safe=" ") + SUFFIX)
+        """Where the photograph called `name` is kept: by its name, percent-encoded, or, where that is longer
+        than files' names may be, by the beginning of it and a digest. The file itself holds the whole."""
+        quoted = quote(name, safe=" ", errors="surrogateescape")
+        if len(quoted) > LONGEST_NAME:
+            digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
+            quoted = f"{quoted[: LONGEST_NAME // 2]}{SHORTENED}{digest}"
+        return self.folder / (quoted + SUFFIX)
+
+    def names(self) -> list[str]:
+        """Names of the photographs in the store, sorted."""
+        return sorted(self._name(path) for path in self.folder.glob(f"*{SUFFIX}"))
+
+    def _name(self, path: Path) -> str:
+        stem = path.name.removesuffix(SUFFIX)
+        if SHORTENED not in stem:
+            return unquote(stem, errors="surrogateescape")
+        with np.load(path, allow_pickle=False) as file:
+            return bytes(file["name"]).decode(errors="surrogateescape")
 
     def has(self, name: str, key: str | None = None) -> bool:
         """Whether a readable file for `name` exists; with `key`, only if it was saved with that key."""
@@ -66,6 +85,7 @@ class FeatureStore:
                 temporary,
                 allow_pickle=False,
                 key=np.array(key),
+                name=np.frombuffer(os.fsencode(name), np.uint8),
                 labels=features.labels.astype(rows),
                 vectors=features.vectors.astype(np.float16),
             )

@@ -54,6 +54,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import AnswerRule
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.pixels import splatted_relevancy
+from langsplat_core.ranges import check_settings
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import Gaussians, LanguageField, Scene
 from langsplat_core.semantics.encoder import Encoder
@@ -88,16 +89,13 @@ def _labelled(progress: Progress, prefix: str) -> Progress:
 
 
 def _check(config: BenchmarkConfig) -> None:
-    if not config.tiers or not config.seeds:
-        raise InputError("eval synthetic: name at least one of --tiers and one of --seeds")
+    check_settings(config)
+    if not config.tiers:
+        raise InputError("eval synthetic: name at least one of --tiers")
     if SEED in config.seeds:
         raise InputError(
             f"--seeds {SEED} is the bundled scene's room, on which things were tuned; take another seed"
         )
-    if min(config.seeds) < 0:
-        raise InputError("--seeds must be 0 or more")
-    if config.views < HOLD_OUT or min(config.steps, config.max_gaussians) < 1:
-        raise InputError(f"eval synthetic: it needs at least {HOLD_OUT} --views, and 1 step and Gaussian")
 
 
 def weights_digest(model: str) -> str:
