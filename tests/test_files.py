@@ -1,4 +1,4 @@
-"""Names and places that cannot be written to are told of beforehand; temporary names fit wherever theirs do."""
+"""Names and places that cannot be written to are told of beforehand; temporary names always fit."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Whatever happens to a command, it ends with one line: names, texts, standard output, signals, permissions."""
+"""Whatever happens to a command, it ends with one line."""
 
 import os
 import signal
