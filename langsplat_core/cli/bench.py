@@ -25,6 +25,7 @@ class BenchRaster:
         from langsplat_core.lab.speed.raster import quick_plan, run_plan
 
         with TerminalProgress() as progress:
-            report = run_plan(quick_plan(self.config) if self.quick else self.config, progress)
+            plan = quick_plan(self.config) if self.quick else self.config
+            report = run_plan(plan, progress, keep=lambda unfinished: unfinished.save(self.out))
         report.save(self.out)
         print(report.text)

@@ -21,13 +21,13 @@ class BenchGains:
     work: OutFolder = Path("eval_out")
     """Folder for the rooms, as of `langsplat eval synthetic`."""
     out: OutFolder = Path("bench_out")
-    """Folder for gains.md and gains.json."""
+    """Folder for gains.md and gains.json, and for rows as they are made: the same command goes on."""
 
     def run(self) -> None:
         from langsplat_core.lab.rooms.gain_bench import figures, gain_table, measure_gains
 
         with TerminalProgress() as progress:
-            rows = measure_gains(self.config, self.work, progress)
+            rows = measure_gains(self.config, self.work, progress, kept=self.out / "gains.rows.jsonl")
         table = gain_table(rows)
         save_figures(self.out, "gains", table, figures(self.config, rows))
         print(table)

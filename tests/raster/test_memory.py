@@ -20,7 +20,7 @@ def test_a_camera_file_of_65536_x_65536(tmp_path: Path, monkeypatch: pytest.Monk
     write_cameras(tmp_path / "view.json", (replace(random_camera(2), width=65_536, height=65_536),))
     (camera,) = read_cameras(tmp_path / "view.json")
     tracemalloc.start()
-    with pytest.raises(InputError, match="65536x65536 pixels needs 172 GB .* has 64; choose a smaller size"):
+    with pytest.raises(InputError, match=r"65536x65536 pixels needs 172 GB .* has 64; choose a smaller size"):
         render(Scene(G), camera)
     assert tracemalloc.get_traced_memory()[1] < 1e6
     tracemalloc.stop()

@@ -61,6 +61,6 @@ def test_bytes_that_are_no_weights(content: bytes, name: str, tmp_path: Path) ->
     tiny_clip(tmp_path)
     (tmp_path / WEIGHTS).unlink()
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(EncoderError, match="not .* weights") as caught:
+    with pytest.raises(EncoderError, match=r"not .* weights") as caught:
         load_text_encoder(str(tmp_path))
     assert "\n" not in str(caught.value)
