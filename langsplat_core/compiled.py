@@ -10,13 +10,16 @@ helpers and constants of other files too: so every kernel's folder is named by a
 files of this package that it imports, directly or not.
 """
 
+import atexit
 import hashlib
+import logging
 import os
 import re
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -25,6 +28,8 @@ import numba
 import numpy as np
 
 from langsplat_core.arrays import Array
+
+log = logging.getLogger("langsplat")
 
 _PIECES_PER_THREAD = 4
 _PACKAGE = Path(__file__).resolve().parent
@@ -41,23 +46,61 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
 
     options: further ones of `numba.njit`, such as `fastmath`.
     """
-    with _cache_folder(kernel_folder(Path(function.__code__.co_filename))):
-        return numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+    folder = kernel_folder(Path(function.__code__.co_filename))
+    with _cache_folder(folder) if folder else nullcontext():
+        return numba.njit(cache=folder is not None, nogil=True, error_model="numpy", **options)(function)
 
 
-def kernel_folder(source: Path) -> Path:
+def kernel_folder(source: Path) -> Path | None:
     """Where the machine code of the kernels in `source` is kept: below `$NUMBA_CACHE_DIR` where that is set,
-    else beside the package, else, where that cannot be written, in the user's cache folder."""
-    if numba.config.CACHE_DIR:
-        root = Path(numba.config.CACHE_DIR)
-    elif os.access(_PACKAGE, os.W_OK):
-        root = _PACKAGE / "__pycache__" / "kernels"
-    else:
-        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "langsplat" / "kernels"
+    else beside the package, else in the user's cache folder: the first of these that can be written to. Where
+    none can, in a folder of this process alone, which is said once; None where there is not even that."""
+    root = _cache_root(numba.config.CACHE_DIR)
+    if root is None:
+        return None
     source = source.resolve()
     inside = source.is_relative_to(_PACKAGE)
     name = ".".join(source.relative_to(_PACKAGE).with_suffix("").parts) if inside else source.stem
     return root / name / digest_of_sources(source)
+
+
+@cache
+def _cache_root(given: str) -> Path | None:
+    """The first folder that can be written to; `given`: as the user asked for, or empty."""
+    places = [Path(given)] if given else [_PACKAGE / "__pycache__" / "kernels", *_user_cache()]
+    found = next(filter(_is_writable, places), None)
+    if found is not None:
+        return found
+    log.warning(
+        "kernels are compiled for this run only, which takes some seconds: %s cannot be written to; set "
+        "NUMBA_CACHE_DIR to a folder that can",
+        " and ".join(map(str, places)),
+    )
+    try:
+        private = Path(tempfile.mkdtemp(prefix="langsplat-kernels-"))
+    except OSError:
+        return None
+    atexit.register(shutil.rmtree, private, ignore_errors=True)
+    return private
+
+
+def _user_cache() -> list[Path]:
+    """The user's cache folder; none for users without a home."""
+    try:
+        cache_home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError:
+        return []
+    return [Path(cache_home) / "langsplat" / "kernels"]
+
+
+def _is_writable(folder: Path) -> bool:
+    """Whether files can be made in `folder`, which is made if it is missing."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
 
 
 @cache

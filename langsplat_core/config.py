@@ -1,9 +1,26 @@
-"""Every setting a user can change, as frozen dataclasses; the command line is derived from them."""
+"""Every setting a user can change, as frozen dataclasses; the command line is derived from them.
+
+A number's range is part of its field's type; `ranges.check_settings` refuses what lies outside.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Literal
+from typing import Annotated, Literal
+
+from langsplat_core.ranges import Range
+
+# What a number may be: every field with numbers names one of these, or a range of its own.
+Count = Annotated[int, Range(1, 1_000_000_000)]
+SeveralCount = Annotated[int, Range(2, 1_000_000_000)]
+CountOrZero = Annotated[int, Range(0, 1_000_000_000)]
+Seed = Annotated[int, Range(0, 2**32 - 1)]
+Side = Annotated[int, Range(16, 65_536)]  # pixels of a picture's longer side
+Share = Annotated[float, Range(0.0, 1.0)]
+Rate = Annotated[float, Range(0.0, 10.0, above=True)]  # a learning rate
+NotNegative = Annotated[float, Range(0.0, 1e9)]
+Decibels = Annotated[float, Range(0.0, 200.0)]
+Positive = Annotated[float, Range(0.0, 1e9, above=True)]
 
 
 @dataclass(frozen=True)
@@ -13,12 +30,12 @@ class RasterSettings:
     Sources: graphdeco-inria/diff-gaussian-rasterization and gsplat.
     """
 
-    near: float = 0.2  # Gaussians with camera z <= near are not drawn, world units
-    fov_clamp: float = 1.3  # Jacobian taken at most at this multiple of the half field of view
-    dilation: float = 0.3  # added to both diagonal entries of the 2D covariance, px^2
-    alpha_max: float = 0.99  # cap of one Gaussian's alpha
-    alpha_min: float = 1 / 255  # smaller alphas are skipped
-    transmittance_min: float = 1e-4  # stop when the next transmittance would be <= this, without adding
+    near: Positive = 0.2  # Gaussians with camera z <= near are not drawn, world units
+    fov_clamp: Positive = 1.3  # Jacobian taken at most at this multiple of the half field of view
+    dilation: NotNegative = 0.3  # added to both diagonal entries of the 2D covariance, px^2
+    alpha_max: Share = 0.99  # cap of one Gaussian's alpha
+    alpha_min: Share = 1 / 255  # smaller alphas are skipped
+    transmittance_min: Share = 1e-4  # stop when the next transmittance would be <= this, without adding
     antialiased: bool = False  # Mip-Splatting: opacity times sqrt(det before / det after dilation)
 
 
@@ -31,9 +48,11 @@ RASTER_PROFILES = {"inria": INRIA, "gsplat": GSPLAT}
 class DatasetConfig:
     """How photographs are read."""
 
-    max_side: int = 800  # photographs are shrunk until their longer side has at most this many pixels
-    test_every: int = 8  # every n-th view, in name order, is held out from training; 0 holds out none
-    metres_per_unit: float | None = None  # of the dataset's world; None: as transforms.json says, if it does
+    max_side: Side = 800  # photographs are shrunk until their longer side has at most this many pixels
+    test_every: CountOrZero = 8  # every n-th view, in name order, is held out from training; 0 holds out none
+    metres_per_unit: Positive | None = (
+        None  # of the dataset's world; None: as transforms.json says, if it does
+    )
 
 
 @dataclass(frozen=True)
@@ -44,29 +63,29 @@ class RadianceConfig:
     geometry learn faster (see `training.radiance.schedule`).
     """
 
-    steps: int = 30_000
-    reference_steps: int = 30_000
+    steps: Count = 30_000
+    reference_steps: Count = 30_000
     backend: Literal["auto", "cpu", "cuda"] = "auto"
-    sh_degree: int = 3
-    sh_degree_every: int = 1_000
-    max_gaussians: int = 1_000_000
-    lambda_dssim: float = 0.2
-    position_lr_init: float = 1.6e-4  # times the cameras' extent
-    position_lr_final: float = 1.6e-6
-    feature_lr: float = 2.5e-3  # higher SH coefficients: a twentieth
-    opacity_lr: float = 0.05
-    scale_lr: float = 5e-3
-    rotation_lr: float = 1e-3
-    densify_from: int = 500
-    densify_until: int = 15_000
-    densify_every: int = 100
-    densify_grad: float = 2e-4  # mean norm of the gradient by the 2D mean, in NDC
-    percent_dense: float = 0.01  # of the extent: larger Gaussians split, smaller ones are cloned
-    opacity_reset_every: int = 3_000
-    prune_opacity: float = 5e-3
-    coarse_fraction: float = 1 / 3  # of the steps, at the start, on pictures of half the size; INRIA: 0
-    checkpoint_every: int = 2_000  # steps of this run
-    seed: int = 0
+    sh_degree: Annotated[int, Range(0, 3)] = 3
+    sh_degree_every: Count = 1_000
+    max_gaussians: Count = 1_000_000
+    lambda_dssim: Share = 0.2
+    position_lr_init: Rate = 1.6e-4  # times the cameras' extent
+    position_lr_final: Rate = 1.6e-6
+    feature_lr: Rate = 2.5e-3  # higher SH coefficients: a twentieth
+    opacity_lr: Rate = 0.05
+    scale_lr: Rate = 5e-3
+    rotation_lr: Rate = 1e-3
+    densify_from: CountOrZero = 500
+    densify_until: CountOrZero = 15_000
+    densify_every: Count = 100
+    densify_grad: NotNegative = 2e-4  # mean norm of the gradient by the 2D mean, in NDC
+    percent_dense: Share = 0.01  # of the extent: larger Gaussians split, smaller ones are cloned
+    opacity_reset_every: Count = 3_000
+    prune_opacity: Share = 5e-3
+    coarse_fraction: Share = 1 / 3  # of the steps, at the start, on pictures of half the size; INRIA: 0
+    checkpoint_every: Count = 2_000  # steps of this run
+    seed: Seed = 0
 
 
 @dataclass(frozen=True)
@@ -78,17 +97,17 @@ class MaskConfig:
     sam: str = ""
     # layers of crops that SAM sees beside the whole picture, 2 x 2 in the first: 0 as the paper's text,
     # 1 as its code, which takes five times as long
-    crop_layers: int = 0
-    points_per_side: int = 32
-    points_per_batch: int = 64
-    predicted_iou: float = 0.7
-    stability: float = 0.85
-    stability_offset: float = 1.0
-    box_nms: float = 0.7
-    min_region: int = 100  # px
-    nms_iou: float = 0.8
-    nms_score: float = 0.7
-    nms_inner: float = 0.5
+    crop_layers: Annotated[int, Range(0, 4)] = 0
+    points_per_side: Annotated[int, Range(1, 1_024)] = 32
+    points_per_batch: Count = 64
+    predicted_iou: Share = 0.7
+    stability: Share = 0.85
+    stability_offset: NotNegative = 1.0
+    box_nms: Share = 0.7
+    min_region: CountOrZero = 100  # px
+    nms_iou: Share = 0.8
+    nms_score: Share = 0.7
+    nms_inner: Share = 0.5
 
 
 @dataclass(frozen=True)
@@ -96,7 +115,7 @@ class ClipConfig:
     """The vision-language encoder: CLIP, SigLIP, SigLIP 2 or TIPS v2."""
 
     model: str = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"  # hub id, folder, or "demo" for the bundled one
-    batch: int = 32
+    batch: Count = 32
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
 
@@ -105,13 +124,14 @@ class CodecConfig:
     """How a Gaussian keeps a CLIP vector: by the number of a codeword, or as latents (paper section 3.2)."""
 
     kind: Literal["codebook", "autoencoder", "linear"] = "codebook"
-    size: int = 0  # codewords of a codebook; 0: as many as `max_relevancy_error` asks for
-    max_relevancy_error: float = 0.005  # mean over the scene's vectors and a few hundred phrases
-    latent_dim: int = 3  # numbers that the other kinds keep
-    steps: int = 4_000  # of the autoencoder's training, as are the following
-    batch: int = 256
-    lr: float = 3e-3  # 7e-4 in the public code: with as many steps a quarter more error
-    seed: int = 0
+    # codewords of a codebook; 0: as many as `max_relevancy_error` asks for
+    size: Annotated[int, Range(0, 65_535)] = 0
+    max_relevancy_error: Share = 0.005  # mean over the scene's vectors and a few hundred phrases
+    latent_dim: Annotated[int, Range(1, 4_096)] = 3  # numbers that the other kinds keep
+    steps: Count = 4_000  # of the autoencoder's training, as are the following
+    batch: SeveralCount = 256
+    lr: Rate = 3e-3  # 7e-4 in the public code: with as many steps a quarter more error
+    seed: Seed = 0
 
 
 @dataclass(frozen=True)
@@ -121,12 +141,12 @@ class LiftConfig:
     # median, mean: of the CLIP vectors of the masks a Gaussian belongs to, then encoded;
     # one-pass: the paper's latents, averaged as W^T H / W^T 1; gradient: trained by Adam, as in the paper
     mode: Literal["median", "mean", "one-pass", "gradient"] = "median"
-    chunk: int = 32  # mask channels per gather pass, where a backend cannot lift label maps at once
+    chunk: Count = 32  # mask channels per gather pass, where a backend cannot lift label maps at once
     backend: Literal["auto", "cpu", "cuda"] = "auto"
-    steps: int = 30_000  # of mode gradient, as are the following
-    lr: float = 2.5e-3
+    steps: Count = 30_000  # of mode gradient, as are the following
+    lr: Rate = 2.5e-3
     start: Literal["one-pass", "zeros-as-published"] = "one-pass"
-    seed: int = 0
+    seed: Seed = 0
 
 
 @dataclass(frozen=True)
@@ -160,11 +180,13 @@ TRAIN_PROFILES: Mapping[TrainProfile, TrainConfig] = MappingProxyType(
 class CompactConfig:
     """How small a scene may be made (`langsplat compact`)."""
 
-    max_psnr_loss: float = 0.1  # dB, mean over the measuring views; nothing that loses more is written
-    views: int = 96  # at most, of the scene's cameras or photographs; a sixth of them measures the loss
-    max_side: int = 800  # pictures are drawn with at most this many pixels on their longer side
+    max_psnr_loss: Decibels = 0.1  # dB, mean over the measuring views; nothing that loses more is written
+    views: SeveralCount = (
+        96  # at most, of the scene's cameras or photographs; a sixth of them measures the loss
+    )
+    max_side: Side = 800  # pictures are drawn with at most this many pixels on their longer side
     # dB that the scene is assumed to have where no photographs are given: higher is more cautious
-    assumed_psnr: float = 35.0
+    assumed_psnr: Decibels = 35.0
     phrases: tuple[str, ...] = ()  # asked before and after, beside those in the scene's phrasebook
 
 
@@ -177,8 +199,8 @@ class PictureConfig:
     """How channels become a picture; the window's shader and the NumPy twin follow the same list."""
 
     display: Display = "rgb"
-    heat_opacity: float = 0.85  # of the heat map over the colours where relevancy is high
-    dim: float = 0.45  # colours are multiplied by this where a query finds nothing
-    threshold: float = 0.6  # relevancy above which a pixel belongs to a segmentation, in [0, 1]
-    alpha_gate: float = 0.3  # pixels with less alpha carry no relevancy
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # display values in [0, 1]
+    heat_opacity: Share = 0.85  # of the heat map over the colours where relevancy is high
+    dim: Share = 0.45  # colours are multiplied by this where a query finds nothing
+    threshold: Share = 0.6  # relevancy above which a pixel belongs to a segmentation, in [0, 1]
+    alpha_gate: Share = 0.3  # pixels with less alpha carry no relevancy
+    background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)  # display values in [0, 1]

@@ -1,4 +1,4 @@
-"""Writing files so that a reader never sees half of one."""
+"""Writing files so that a reader never sees half of one, and saying beforehand where none can be written."""
 
 import os
 import tempfile
@@ -6,16 +6,28 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from langsplat_core.errors import InputError
+
+NAME_MAX, PATH_MAX = 255, 4_096  # bytes, where the system does not say
+RANDOM = 8  # characters that `tempfile` puts into a name
+LONGEST_SUFFIX = 64  # bytes of a suffix that a temporary name keeps
+# Where files are none: what is written there is read by the system or by nobody, and is gone afterwards.
+_SYSTEM, _MEMORY = ("/proc", "/sys", "/dev"), "/dev/shm"
+
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
     """Yield a temporary name beside `path`; on a clean exit it is renamed to `path`, else removed.
 
-    The temporary name keeps the suffix, because some writers choose the format by it.
+    The temporary name keeps the suffix, because some writers choose the format by it; it is no longer than
+    `path` may be.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{target.stem}.", suffix=target.suffix, dir=target.parent)
+    suffix = target.suffix if len(os.fsencode(target.suffix)) <= LONGEST_SUFFIX else ""
+    room = name_max(target.parent) - RANDOM - 2 - len(os.fsencode(suffix))
+    stem = os.fsencode(target.stem)[:room].decode(errors="ignore")
+    handle, name = tempfile.mkstemp(prefix=f".{stem}.", suffix=suffix, dir=target.parent)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -26,3 +38,87 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def name_max(folder: Path) -> int:
+    """Bytes that the file system of an existing `folder` takes for one name."""
+    return _limit(folder, "PC_NAME_MAX", NAME_MAX)
+
+
+def check_output_file(path: Path | str) -> None:
+    """InputError, in one line, where no file can be written at `path`: a name that the file system does not
+    take, a folder, a place under a file, in the system's own folders, or where one may not write.
+
+    Folders that are missing will be made; nothing is left behind by the check.
+    """
+    target = Path(path)
+    folder = _existing_folder(target)
+    if os.path.isdir(target):
+        raise InputError(f"{shown(path)}: is a folder; name a file in it")
+    if os.path.exists(target) and not os.path.isfile(target):
+        raise InputError(f"{shown(path)}: is no ordinary file; choose another name")
+    _try_writing(target, folder)
+
+
+def check_output_folder(path: Path | str) -> None:
+    """InputError, in one line, where files cannot be written into a folder `path`, which may be missing yet;
+    see `check_output_file`."""
+    target = Path(path)
+    folder = _existing_folder(target)
+    if os.path.lexists(target) and not os.path.isdir(target):
+        raise InputError(f"{shown(path)}: is a file; name a folder")
+    _try_writing(target, folder)
+
+
+def shown(path: Path | str) -> str:
+    """A path for a message: printable, and without its middle where it is long."""
+    text = str(path).encode("utf-8", "backslashreplace").decode()
+    return text if len(text) <= 100 else f"{text[:50]}...{text[-47:]}"
+
+
+def _existing_folder(target: Path) -> Path:
+    """The nearest folder above `target` that exists. InputError for names that it cannot hold."""
+    try:
+        size = len(str(target).encode())
+    except UnicodeEncodeError:
+        raise InputError(f"{shown(target)}: the name is not UTF-8; choose another") from None
+    if "\0" in str(target):
+        raise InputError(f"{shown(target)!r}: no name can hold a zero byte; choose another")
+    whole = Path(os.path.abspath(target))
+    if size > PATH_MAX // 2:  # companions and temporary files need room too
+        raise InputError(f"{shown(target)}: a path of {size} bytes; choose a shorter one")
+    folder = next((above for above in whole.parents if os.path.lexists(above)), Path(whole.anchor))
+    if not os.path.isdir(folder):
+        raise InputError(f"{shown(target)}: {shown(folder)} is a file, not a folder; choose another name")
+    longest = max(whole.relative_to(folder).parts, key=lambda part: len(part.encode()), default="")
+    if len(longest.encode()) > name_max(folder):
+        raise InputError(
+            f"{shown(target)}: a name of {len(longest.encode())} bytes; this file system takes "
+            f"{name_max(folder)}, choose a shorter one"
+        )
+    return folder
+
+
+def _try_writing(target: Path, folder: Path) -> None:
+    real = os.path.realpath(target)
+    if any(_below(real, place) for place in _SYSTEM) and not _below(real, _MEMORY):
+        raise InputError(f"{shown(target)}: lies in a folder of the system's own; choose another")
+    try:
+        with tempfile.TemporaryFile(dir=target if os.path.isdir(target) else folder):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"{shown(target)}: nothing can be written into {shown(folder)} ({error.strerror}); "
+            "choose another folder"
+        ) from None
+
+
+def _below(path: str, folder: str) -> bool:
+    return path == folder or path.startswith(folder + os.sep)
+
+
+def _limit(folder: Path, name: str, default: int) -> int:
+    try:
+        return os.pathconf(folder, name)
+    except (AttributeError, OSError, ValueError):  # Windows has none; not every file system answers
+        return default

@@ -20,6 +20,10 @@ class Cancelled(Exception):
     """Raised by a `Progress` to stop the work; what was stored so far stays valid."""
 
 
+class Terminated(KeyboardInterrupt):
+    """The system asked the process to end (SIGTERM); what was stored so far stays valid."""
+
+
 class TerminalProgress:
     """A `Progress` that draws one bar per label on stderr; use as a context manager."""
 

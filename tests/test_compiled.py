@@ -12,6 +12,7 @@ import pytest
 from langsplat_core import compiled
 from langsplat_core.compiled import Workers, digest_of_sources, kernel_folder
 from langsplat_core.raster.cpu import blend, planes, tiles
+from tests.support.another_user import bound_by_permissions
 
 PACKAGE = Path(compiled.__file__).parent
 KERNEL = """
@@ -67,7 +68,40 @@ def test_the_key_follows_imports_and_nothing_else(tmp_path: Path) -> None:
     assert digest_of_sources(lonely) != before
     sources = [Path(module.__file__ or "") for module in (blend, planes, tiles)]
     assert len({digest_of_sources(source) for source in sources}) == 3
-    assert kernel_folder(sources[0]).parent.name == "raster.cpu.blend"
+    folder = kernel_folder(sources[0])
+    assert folder is not None
+    assert folder.parent.name == "raster.cpu.blend"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("home", ["/proc", "closed"])
+def test_without_a_place_to_keep_them_kernels_are_compiled_for_the_run(home: str, tmp_path: Path) -> None:
+    """With neither the package's folder nor a home to write to."""
+    package, closed = tmp_path / "langsplat_core", tmp_path / "closed"
+    package.mkdir()
+    closed.mkdir()
+    (package / "__init__.py").touch()
+    for name in ("arrays.py", "compiled.py", "errors.py"):
+        shutil.copy(PACKAGE / name, package / name)
+    (package / "running.py").write_text(KERNEL)
+    (package / "adding.py").write_text(HELPER.format(step=2))
+    for folder in (package, closed):
+        folder.chmod(0o555)
+    environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", CALL],
+        env=environment | {"HOME": str(tmp_path / home)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=bound_by_permissions(),
+    )
+    for folder in (package, closed):
+        folder.chmod(0o755)
+    assert done.stdout.strip() == "[2. 3. 4.]", done.stderr
+    (line,) = done.stderr.splitlines()
+    assert "kernels are compiled for this run only" in line
 
 
 def test_pieces_cover_a_range_once() -> None:

@@ -14,6 +14,7 @@ import pytest
 
 from langsplat_core import config
 from langsplat_core.lab import config as lab_config
+from langsplat_core.ranges import Range
 
 ROOT = Path(__file__).parent.parent
 SOURCES = [*ROOT.glob("langsplat_core/**/*.py"), *ROOT.glob("app/**/*.py")]
@@ -21,7 +22,7 @@ CONFIGS = {
     name: value
     for module in (config, lab_config)
     for name, value in vars(module).items()
-    if dataclasses.is_dataclass(value) and isinstance(value, type)
+    if dataclasses.is_dataclass(value) and isinstance(value, type) and value is not Range
 }
 FIELDS = {
     name: {key: getattr(kind, "__name__", "") for key, kind in typing.get_type_hints(cls).items()}

@@ -1,6 +1,5 @@
 """One picture without a window: `langsplat-viewer --headless --out picture.png`."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from langsplat_core.config import Display, LevelChoice, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.display.latent_colours import latent_colours
 from langsplat_core.errors import BackendError, InputError
+from langsplat_core.files import check_output_file
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
@@ -46,14 +46,7 @@ def check_out(out: Path | None) -> Path:
         raise InputError("--headless needs somewhere to draw to; add --out picture.png")
     if out.suffix.lower() != ".png":
         raise InputError(f"--out {out}: only PNG is written; end the name in .png")
-    try:
-        if out.is_dir():
-            raise InputError(f"--out {out}: is a folder; name a file in it")
-        folder = next(parent for parent in out.absolute().parents if parent.exists())
-    except OSError as error:
-        raise InputError(f"--out {str(out)[:80]}: cannot be written ({error.strerror})") from None
-    if not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise InputError(f"--out {out}: {folder} cannot be written to; choose another folder")
+    check_output_file(out)
     return out
 
 

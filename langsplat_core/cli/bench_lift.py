@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from langsplat_core.cli.bench_files import save_figures
+from langsplat_core.cli.checks import OutFolder
 from langsplat_core.files import atomic_path
 from langsplat_core.lab.config import LiftBenchConfig
 from langsplat_core.progress import TerminalProgress
@@ -18,9 +19,9 @@ class BenchLift:
     known truth: relevancy error, accuracy, seconds and bytes. Half an hour and more."""
 
     config: Annotated[LiftBenchConfig, tyro.conf.arg(name="")] = field(default_factory=LiftBenchConfig)
-    work: Path = Path("eval_out")
+    work: OutFolder = Path("eval_out")
     """Folder for the room, as of `langsplat eval synthetic`."""
-    out: Path = Path("bench_out")
+    out: OutFolder = Path("bench_out")
     """Folder for lift.md, lift.json and lift.png, and for rows as they are made: the same command goes on."""
 
     def run(self) -> None:

@@ -4,7 +4,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from langsplat_core.cli.bench_files import save_figures
-from langsplat_core.errors import InputError
+from langsplat_core.cli.checks import OutFolder
+from langsplat_core.config import Count
 from langsplat_core.lab.speed.load import as_table, measure_loading
 from langsplat_core.progress import TerminalProgress
 
@@ -13,16 +14,14 @@ from langsplat_core.progress import TerminalProgress
 class BenchLoad:
     """Read a large PLY with this program and with plyfile, each in a fresh interpreter."""
 
-    count: int = 2_500_000
+    count: Count = 2_500_000
     """Gaussians in the file, which takes 248 bytes each in the temporary folder while it runs."""
-    repeats: int = 3
+    repeats: Count = 3
     """Readings with each; the fastest counts."""
-    out: Path = Path("bench_out")
+    out: OutFolder = Path("bench_out")
     """Folder for load.md and load.json."""
 
     def run(self) -> None:
-        if self.count < 1 or self.repeats < 1:
-            raise InputError("--count and --repeats must be 1 or more")
         with TerminalProgress() as progress:
             loadings = measure_loading(self.count, self.repeats, progress)
         table = as_table(loadings)

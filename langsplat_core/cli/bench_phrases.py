@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from langsplat_core.cli.bench_files import save_figures
+from langsplat_core.cli.checks import OutFolder
 from langsplat_core.lab.config import PhraseBenchConfig
 from langsplat_core.progress import TerminalProgress
 
@@ -17,9 +18,9 @@ class BenchPhrases:
     room."""
 
     config: Annotated[PhraseBenchConfig, tyro.conf.arg(name="")] = field(default_factory=PhraseBenchConfig)
-    work: Path = Path("eval_out")
+    work: OutFolder = Path("eval_out")
     """Folder for the rooms, as of `langsplat eval synthetic`."""
-    out: Path = Path("bench_out")
+    out: OutFolder = Path("bench_out")
     """Folder for phrases.md and phrases.json."""
 
     def run(self) -> None:

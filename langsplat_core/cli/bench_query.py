@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from langsplat_core.cli.bench_files import save_figures
+from langsplat_core.cli.checks import OutFolder
 from langsplat_core.errors import InputError
 from langsplat_core.formats import load_scene
 from langsplat_core.lab.config import QueryBenchConfig
@@ -23,13 +24,11 @@ class BenchQuery:
     scene: tyro.conf.Positional[Path]
     """A scene with a codebook, and its cameras beside it."""
     config: Annotated[QueryBenchConfig, tyro.conf.arg(name="")] = field(default_factory=QueryBenchConfig)
-    out: Path = Path("bench_out")
+    out: OutFolder = Path("bench_out")
     """Folder for query.md and query.json."""
 
     def run(self) -> None:
         c = self.config
-        if min(*c.size, c.phrases, c.together, c.repeats, c.codec_steps) < 1 or c.count < 0:
-            raise InputError("--size, --phrases, --together, --repeats and --codec-steps must be 1 or more")
         scene = load_scene(self.scene)
         if scene.language is None:
             raise InputError(f"{self.scene}: {NO_FIELD}")

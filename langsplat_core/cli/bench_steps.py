@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from langsplat_core.errors import InputError
+from langsplat_core.cli.checks import OutFolder
 from langsplat_core.files import atomic_path
 from langsplat_core.lab.config import KernelStepsConfig
 from langsplat_core.progress import TerminalProgress
@@ -17,12 +17,10 @@ class BenchSteps:
     """Time the CPU kernels whole and with one step taken out at a time; takes some minutes."""
 
     config: Annotated[KernelStepsConfig, tyro.conf.arg(name="")] = field(default_factory=KernelStepsConfig)
-    out: Path = Path("bench_out")
+    out: OutFolder = Path("bench_out")
     """Folder for steps.md."""
 
     def run(self) -> None:
-        if min(self.config.count, self.config.channels, *self.config.size) < 1:
-            raise InputError("--count, --channels and --size must be 1 or more")
         from langsplat_core.lab.speed.kernel_steps import measure_steps, steps_table
 
         with TerminalProgress() as progress:

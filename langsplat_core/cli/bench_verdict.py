@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from langsplat_core.cli.bench_files import save_figures
+from langsplat_core.cli.checks import OutFile, OutFolder
 from langsplat_core.lab.config import VerdictBenchConfig
 from langsplat_core.progress import TerminalProgress
 
@@ -17,11 +18,11 @@ class BenchVerdict:
     the ROC curve's area, and what the probabilities are worth."""
 
     config: Annotated[VerdictBenchConfig, tyro.conf.arg(name="")] = field(default_factory=VerdictBenchConfig)
-    work: Path = Path("eval_out")
+    work: OutFolder = Path("eval_out")
     """Folder for the rooms, as of `langsplat eval synthetic`."""
-    out: Path = Path("bench_out")
+    out: OutFolder = Path("bench_out")
     """Folder for verdict.md and verdict.json."""
-    fit: Path | None = None
+    fit: OutFile | None = None
     """Fit the encoder's calibration to these rooms and write it into this reading.json; measure elsewhere."""
 
     def run(self) -> None:

@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from langsplat_core.cli.bench_files import save_figures
+from langsplat_core.cli.checks import OutFolder
 from langsplat_core.lab.config import WordBenchConfig
 from langsplat_core.progress import TerminalProgress
 
@@ -16,9 +17,9 @@ class BenchWords:
     """Words for every region of rooms whose truth is known, and their inventories: seconds a room."""
 
     config: Annotated[WordBenchConfig, tyro.conf.arg(name="")] = field(default_factory=WordBenchConfig)
-    work: Path = Path("eval_out")
+    work: OutFolder = Path("eval_out")
     """Folder for the rooms, as of `langsplat eval synthetic`."""
-    out: Path = Path("bench_out")
+    out: OutFolder = Path("bench_out")
     """Folder for words.md and words.json."""
 
     def run(self) -> None:

@@ -9,6 +9,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from langsplat_core.cli.checks import OutFile
 from langsplat_core.config import CompactConfig
 from langsplat_core.progress import TerminalProgress
 
@@ -23,7 +24,7 @@ class Compact:
 
     scene: tyro.conf.Positional[Path]
     """Any readable scene."""
-    out: Path | None = None
+    out: OutFile | None = None
     """The scene to write (default: SCENE with .compact.ply for its ending)."""
     photos: Path | None = None
     """Dataset the scene was trained on: the loss is then measured against its photographs."""

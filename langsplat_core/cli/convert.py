@@ -8,6 +8,7 @@ import tyro
 
 from langsplat_core.config import CodecConfig
 from langsplat_core.errors import InputError
+from langsplat_core.files import check_output_folder
 from langsplat_core.formats import (
     check_writable,
     load_scene,
@@ -119,6 +120,8 @@ class Convert:
     def _export(self) -> None:
         from langsplat_core.pipeline.exporting import export_langsplat, export_occam
 
+        check_output_folder(self.out)
+
         scene = self._read()
         scene = replace(scene, path=self.source)
         with TerminalProgress() as progress:
@@ -140,6 +143,7 @@ class Convert:
         folder = self.source
         if len(self.sources) > 1 or not folder.is_dir():
             raise InputError(f"{folder}: --to features reads one folder of masks and vectors of photographs")
+        check_output_folder(self.out)
         with TerminalProgress() as progress:
             if langsplat_stems(folder):
                 count = features_from_langsplat(folder, FeatureStore(self.out), progress)

@@ -9,8 +9,10 @@ from typing import Annotated
 
 import tyro
 
+from langsplat_core.cli.checks import OutFile, OutFolder
+from langsplat_core.config import Count, Seed
 from langsplat_core.files import atomic_path
-from langsplat_core.lab.config import DemoEncoderConfig, LabelLayout, MaskOrigin, Tier
+from langsplat_core.lab.config import DemoEncoderConfig, LabelLayout, MaskOrigin, Pixels, Size, Tier
 from langsplat_core.progress import TerminalProgress
 
 
@@ -18,13 +20,13 @@ from langsplat_core.progress import TerminalProgress
 class DemoDataset:
     """Render a procedural room: photographs, cameras, points, and the truth at three levels."""
 
-    out: Path
+    out: OutFolder
     """Folder to write."""
-    seed: int = 0
+    seed: Seed = 0
     """Another seed is another room."""
-    views: int = 72
+    views: Count = 72
     """Number of photographs."""
-    size: tuple[int, int] = (640, 480)
+    size: Size = (640, 480)
     """Width and height, pixels."""
     tier: Tier = "clutter"
     """How hard the room is: objects apart, cluttered, or packed with look-alikes."""
@@ -45,7 +47,7 @@ class DemoDataset:
 class DemoEncoder:
     """Train the small demo CLIP on procedural crops. Resumes when interrupted."""
 
-    out: Path
+    out: OutFolder
     """Folder to write: model, tokenizer, vocabulary."""
     config: Annotated[DemoEncoderConfig, tyro.conf.arg(name="")] = field(default_factory=DemoEncoderConfig)
 
@@ -61,15 +63,15 @@ class DemoEncoder:
 class DemoBuild:
     """Make the demo scene: render its photographs, train it with the ordinary pipeline, compact it."""
 
-    out: Path
+    out: OutFile
     """The scene to write, *.ply."""
-    seed: int = 2
+    seed: Seed = 2
     """Another seed is another room."""
     tier: Tier = "clutter"
     """How hard the room is: objects apart, cluttered, or packed with look-alikes."""
     masks: MaskOrigin = "truth"
     """Outlines as a perfect segmenter would find them, or those of the weight-free segmenter."""
-    steps: int = 6_000
+    steps: Count = 6_000
     """Steps of radiance training."""
     gaussians: Path | None = None
     """Keep the Gaussians of this scene of the same room, and make only their language field again."""
@@ -88,13 +90,13 @@ class DemoBuild:
 class DemoSheet:
     """Draw every class of object that the generator knows, so that one sees what its words mean."""
 
-    out: Path
+    out: OutFile
     """The picture to write, *.png."""
-    seed: int = 0
+    seed: Seed = 0
     """Another seed draws other examples."""
-    side: int = 128
+    side: Pixels = 128
     """Pixels per example."""
-    instances: int = 3
+    instances: Count = 3
     """Examples of every class."""
 
     def run(self) -> None:

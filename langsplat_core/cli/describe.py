@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from langsplat_core.config import Count, CountOrZero
 from langsplat_core.errors import InputError
 from langsplat_core.formats import load_scene
 from langsplat_core.progress import Progress, TerminalProgress
@@ -33,15 +34,15 @@ class Describe:
 
     scene: tyro.conf.Positional[Path]
     """A trained scene, *.ply with its language field beside it."""
-    camera: Annotated[int, tyro.conf.arg(metavar="INDEX")] = 0
+    camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX")] = 0
     """Training view in which --pixel is meant."""
-    pixel: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="X Y")] = None
+    pixel: Annotated[tuple[CountOrZero, CountOrZero] | None, tyro.conf.arg(metavar="X Y")] = None
     """Column and row, counted from the top left pixel, 0 0."""
-    gaussian: Annotated[int | None, tyro.conf.arg(metavar="NUMBER")] = None
+    gaussian: Annotated[CountOrZero | None, tyro.conf.arg(metavar="NUMBER")] = None
     """One Gaussian, by its row in the file, from 0."""
     level: Level | None = None
     """This semantic level alone."""
-    top: int = 5
+    top: Count = 5
     """Words per level."""
     vocabulary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Your own list, one phrase per line, in place of the bundled everyday things and parts."""
@@ -81,8 +82,6 @@ class Describe:
         """InputError for arguments that do not go with the scene or each other, before anything is loaded."""
         if scene.language is None:
             raise InputError(f"{self.scene}: {NO_FIELD}")
-        if self.top < 1:
-            raise InputError(f"--top {self.top}: at least one word")
         if self.pixel is not None and self.gaussian is not None:
             raise InputError("--pixel and --gaussian are two questions; ask one of them")
         count = len(scene.gaussians)

@@ -6,7 +6,9 @@ from typing import Annotated
 
 import tyro
 
+from langsplat_core.cli.checks import OutFile
 from langsplat_core.errors import InputError
+from langsplat_core.files import check_output_folder
 from langsplat_core.lab.config import BenchmarkConfig
 from langsplat_core.progress import TerminalProgress
 
@@ -21,7 +23,7 @@ class EvalSynthetic:
     config: Annotated[BenchmarkConfig, tyro.conf.arg(name="")] = field(default_factory=BenchmarkConfig)
     work: Path = Path("eval_out")
     """Folder for the rooms and all intermediate results."""
-    json: Path | None = None
+    json: OutFile | None = None
     """Also write all figures to this file."""
     scene: Path | None = None
     """Measure this scene, trained on --dataset, instead of fresh rooms; of the settings, --cut applies."""
@@ -43,6 +45,7 @@ class EvalSynthetic:
         self._run_rooms()
 
     def _run_rooms(self) -> None:
+        check_output_folder(self.work)
         from langsplat_core.lab.rooms.benchmark import run_benchmark
         from langsplat_core.lab.rooms.report import (
             budget_table,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from langsplat_core.cli.checks import OutFile, OutFolder
 from langsplat_core.errors import InputError
 from langsplat_core.evaluation.protocols.profiles import (
     LERF_PROFILES,
@@ -31,7 +32,7 @@ class _Eval:
     """Score these maps of another system, files named VIEW/PHRASE.npy or .png, instead of a scene."""
     only: tuple[str, ...] = ()
     """Names of the benchmark's scenes to score; all of them if empty."""
-    json: Path | None = None
+    json: OutFile | None = None
     """Also write all figures to this file."""
     encoder: str = ""
     """Text encoder folder or hub id, in place of the one the scene names."""
@@ -50,7 +51,7 @@ class _Eval:
 
 @dataclass(frozen=True)
 class _EvalLabels(_Eval):
-    pictures: Path | None = None
+    pictures: OutFolder | None = None
     """Also write one picture per query into this folder."""
     paper_order: bool = False
     """Blend latents and decode every pixel, as the paper does, not the relevancies; no codebook can."""

@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from langsplat_core.cli.instances import instance_json, table, unit_of
-from langsplat_core.config import LevelChoice, PictureConfig
+from langsplat_core.config import CountOrZero, LevelChoice, PictureConfig, Positive
 from langsplat_core.errors import InputError
 from langsplat_core.formats import load_scene
 from langsplat_core.query.answers import QueryResult
@@ -40,13 +40,13 @@ class QueryScene:
     """Ask every phrase whole, without looking for structure such as "handle of the red mug"."""
     mode: Literal["splat", "paper"] = "splat"
     """splat: relevancy per Gaussian, then blended. paper: latents blended, every pixel decoded."""
-    camera: Annotated[int, tyro.conf.arg(metavar="INDEX")] = 0
+    camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX")] = 0
     """Training view in which the pixel is reported."""
     encoder: str = ""
     """Text encoder folder or hub id, in place of the one the scene names."""
-    instances: int = 5
+    instances: CountOrZero = 5
     """How many of a phrase's things are listed, the best first."""
-    scale: float | None = None
+    scale: Positive | None = None
     """Metres per world unit, in place of what the scene says."""
     json: bool = False
     """Print JSON, lengths in world units."""
@@ -64,7 +64,7 @@ class QueryScene:
         for text in self.texts:
             result, understood = self._ask(engine, text, camera)
             answer = _answer(result, scene, engine, camera, self.mode) | {"reading": understood}
-            things = engine.instances(result, max(self.instances, 0)) if result.found else ()
+            things = engine.instances(result, self.instances) if result.found else ()
             answer["metres_per_unit"] = unit.length if unit.name == "m" else None
             answer["instances"] = [instance_json(thing, number) for number, thing in enumerate(things, 1)]
             answers.append(answer)

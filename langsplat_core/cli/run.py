@@ -1,22 +1,31 @@
-"""How every command ends: 0, or 2 with one line on stderr, or 130 when interrupted.
+"""How every command ends: 0, or 2 with one line on stderr, or 130 (143) when interrupted (terminated).
 
 A command is a dataclass whose fields are its arguments (tyro derives the parser) and whose `run` does
 the work. The viewer's program ends the same way and uses this module too.
 """
 
 import contextlib
+import errno
 import io
 import logging
 import os
 import re
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import Protocol
 
+from langsplat_core.cli.checks import check_arguments
 from langsplat_core.errors import LangSplatError, printable_line
+from langsplat_core.files import shown
+from langsplat_core.progress import Terminated
 
 _LOG_LIMIT = 2000  # characters of a warning
+# What writing to an open file or standard output ends in where there is no room or no file.
+_UNWRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF)
 _FRAME = re.compile(r"[│╭╮╰╯]|─+")
 
 
@@ -49,6 +58,7 @@ def one_line(box: str) -> str:
 
 def main(program: str, parser: Callable[[], Command]) -> int:
     """Parse and run; returns the exit code."""
+    _prepare_standard_output()
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
@@ -63,16 +73,76 @@ def main(program: str, parser: Callable[[], Command]) -> int:
     logging.getLogger("langsplat").setLevel(logging.INFO)
     warnings.filterwarnings("ignore", module=r"(torch|transformers|huggingface_hub|numba)(\.|$)")
     try:
-        command.run()
-    except LangSplatError as error:
-        return _fail(program, str(error))
-    except BrokenPipeError:  # whoever reads has enough, as `| head` has
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing more at exit either
-        return 0
-    except KeyboardInterrupt:
-        print(f"{program}: interrupted; the same command continues where it stopped", file=sys.stderr)
-        return 130
+        with _sigterm_raises():
+            check_arguments(command)
+            command.run()
+            sys.stdout.flush()  # now, while what goes wrong can still be said in a line
+    except (LangSplatError, OSError, MemoryError, KeyboardInterrupt) as error:
+        return _ended(program, error)
     return 0
+
+
+def _ended(program: str, error: BaseException) -> int:
+    """Say in a line why a command did not come to its end; returns the exit code."""
+    if isinstance(error, BrokenPipeError):  # whoever reads has enough, as `| head` has
+        _drop_standard_output()
+        return 0
+    if isinstance(error, KeyboardInterrupt):
+        how, code = ("terminated", 143) if isinstance(error, Terminated) else ("interrupted", 130)
+        print(f"{program}: {how}; the same command continues where it stopped", file=sys.stderr)
+        return code
+    if isinstance(error, OSError):
+        return _fail(program, _system_complaint(error))
+    if isinstance(error, MemoryError):
+        return _fail(program, "too little memory on this machine; ask for less, or for smaller pictures")
+    return _fail(program, str(error))
+
+
+@contextlib.contextmanager
+def _sigterm_raises() -> Iterator[None]:
+    """Have SIGTERM end a command as Ctrl-C does: with what is finished kept, and a line."""
+
+    def terminate(number: int, frame: FrameType | None) -> None:
+        raise Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before if before is not None else signal.SIG_DFL)
+
+
+def _prepare_standard_output() -> None:
+    """Names that cannot be encoded are printed with escapes. A closed standard output fails when it is
+    written to, and no file that is opened later takes its place."""
+    if sys.stdout is None:
+        nowhere = os.open(os.devnull, os.O_RDONLY)
+        if nowhere != 1:
+            os.dup2(nowhere, 1)
+            os.close(nowhere)
+        sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115  as long as the process
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def _drop_standard_output() -> None:
+    """Nothing more is written, also not what is buffered when the process ends."""
+    with contextlib.suppress(OSError):  # a standard output that is no file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _system_complaint(error: OSError) -> str:
+    """What the system said of a file, or of standard output."""
+    reason = error.strerror or str(error) or type(error).__name__
+    if isinstance(error.filename, str | bytes):
+        return f"{shown(os.fsdecode(error.filename))}: {reason}"
+    if error.errno in _UNWRITTEN:
+        _drop_standard_output()  # perhaps the culprit, which would complain again at exit
+        return f"a file or standard output cannot be written ({reason}); what was finished is kept"
+    return reason
 
 
 def _fail(program: str, message: str) -> int:

@@ -3,13 +3,17 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
+from langsplat_core.config import Positive
 from langsplat_core.errors import InputError
 from langsplat_core.formats import load_without_language, write_metres
+from langsplat_core.ranges import Range
 
-Span = tuple[float, float, float, float, float, float]
+Coordinate = Annotated[float, Range(-1e12, 1e12)]
+Span = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
 
 
 @dataclass(frozen=True)
@@ -19,11 +23,11 @@ class Scale:
 
     scene: tyro.conf.Positional[Path]
     """The scene, *.ply."""
-    metres: float | None = None
+    metres: Positive | None = None
     """A known length, between the two points of --between."""
     between: Span | None = None
     """Two points that are --metres apart, x y z x y z in world units."""
-    metres_per_unit: float | None = None
+    metres_per_unit: Positive | None = None
     """How long a unit is."""
 
     def run(self) -> None:

@@ -11,8 +11,9 @@ import numpy as np
 import tyro
 
 from langsplat_core.arrays import Array
+from langsplat_core.cli.checks import OutFile
 from langsplat_core.cli.instances import Unit, instance_json, table, unit_of
-from langsplat_core.config import LevelChoice
+from langsplat_core.config import Count, LevelChoice, NotNegative, Positive
 from langsplat_core.errors import InputError
 from langsplat_core.formats import check_writable, load_scene, save_scene
 from langsplat_core.formats.shapes import (
@@ -44,7 +45,7 @@ class Select:
     """A trained scene, *.ply with its language field beside it."""
     texts: tyro.conf.Positional[tuple[str, ...]]
     """Phrases, each in quotes if it has several words."""
-    out: Path
+    out: OutFile
     """File to write: .ply, .spz or .splat for a scene, .ply for points, .ply or .obj for hulls."""
     remove: bool = False
     """Write everything else instead."""
@@ -52,15 +53,15 @@ class Select:
     """What several phrases make: what any of them names, what all name, or the first without the others."""
     level: LevelChoice = "auto"
     """Semantic level; auto takes for each phrase the one with the highest score."""
-    instance: tuple[int, ...] = ()
+    instance: tuple[Count, ...] = ()
     """Numbers of the things to take, as printed, the best is 1; all if none is given."""
-    grow: float = 0.0
+    grow: NotNegative = 0.0
     """Take also what is so near along the surface: metres if the scene has a scale, else world units."""
-    shrink: float = 0.0
+    shrink: NotNegative = 0.0
     """Leave out what is so near to the rest along the surface, in the same unit; after growing."""
     shape: Annotated[Shape, tyro.conf.arg(name="as")] = "scene"
     """scene: Gaussians. points: their centres, with colour and relevancy. hull: a closed mesh around each."""
-    scale: float | None = None
+    scale: Positive | None = None
     """Metres per world unit, in place of what the scene says."""
     encoder: str = ""
     """Text encoder folder or hub id, in place of the one the scene names."""
@@ -97,9 +98,6 @@ class Select:
             raise InputError(
                 "--as hull is the shape of things; what is left after --remove is written as points"
             )
-        for name, value in (("--grow", self.grow), ("--shrink", self.shrink)):
-            if not 0 <= value < float("inf"):
-                raise InputError(f"{name} {value:g}: a distance must be 0 or more")
         if self.out.resolve() == self.scene.resolve():
             raise InputError(f"{self.out}: would replace the original scene; choose another --out")
         folder = self.out.parent

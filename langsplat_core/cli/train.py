@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from langsplat_core.cli.checks import OutFile, OutFolder
 from langsplat_core.config import TRAIN_PROFILES, TrainConfig, TrainProfile
 from langsplat_core.progress import TerminalProgress, silent
 
@@ -20,9 +21,9 @@ class Train:
 
     dataset: tyro.conf.Positional[Path]
     """Folder of photographs, COLMAP project folder, or transforms.json."""
-    out: Path
+    out: OutFile
     """The scene to write, *.ply; its language field and cameras are written beside it."""
-    work: Path | None = None
+    work: OutFolder | None = None
     """Folder for intermediate results (default: <out>.work)."""
     profile: TrainProfile = "default"
     """"paper" starts from the published method's settings; options beside it still count."""

@@ -9,7 +9,6 @@ views is kept after all. Everything is measured as the target format stores it, 
 read back and measured before it takes its name.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,6 +31,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.formats import check_writable, load_scene, save_scene
 from langsplat_core.formats.summary import disk_bytes
 from langsplat_core.progress import Progress, silent
+from langsplat_core.ranges import check_settings
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.raster.protocol import Rasterizer
 from langsplat_core.scene import Scene
@@ -106,12 +106,7 @@ def compact_scene(
 
 def _check(source: Path, out: Path, config: CompactConfig) -> None:
     check_writable(out)
-    if not 0 <= config.max_psnr_loss < math.inf:
-        raise InputError(f"--max-psnr-loss {config.max_psnr_loss}: must be 0 dB or more")
-    if not 0 < config.assumed_psnr < math.inf:
-        raise InputError(f"--assumed-psnr {config.assumed_psnr}: must be above 0 dB, for example 35")
-    if config.max_side < 16:
-        raise InputError(f"--max-side {config.max_side}: pictures need at least 16 pixels")
+    check_settings(config)
     if out.resolve() == source.resolve():
         raise InputError(f"{out}: would replace the original scene; choose another --out")
 

@@ -46,8 +46,6 @@ def choose_views(scene: Scene, photos: Path | None, config: CompactConfig, progr
     `HOLD_OUT`-th view does. Raises InputError where fewer than two views are left or the photographs belong
     to another world than the scene.
     """
-    if config.views < 2:
-        raise InputError(f"--views {config.views}: at least 2, one to rank and one to measure")
     if photos is not None:
         return _photographed(scene, photos, config, progress)
     if len(scene.cameras) >= 2:

@@ -1,6 +1,6 @@
 """Photographs with cameras, whatever they came with."""
 
-import math
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +11,9 @@ from langsplat_core.datasets.known_poses import add_points
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.datasets.photos import load_photos, photo_folder
 from langsplat_core.errors import InputError
+from langsplat_core.files import shown
 from langsplat_core.progress import Progress, silent
+from langsplat_core.ranges import check_settings
 
 __all__ = ["Capture", "load_capture"]
 
@@ -26,20 +28,20 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
 
     Recognises, in this order, a nerfstudio ``transforms.json``, a COLMAP model, and plain photographs,
     whose cameras are then found by structure from motion. A dataset with cameras but without points gets
-    triangulated ones. Whatever had to be computed is kept in ``work/sfm`` and not computed again for the
+    triangulated ones. Whatever had to be computed is kept in ``work/sfm-*`` and not computed again for the
     same photographs. The world is the dataset's own. What had to be left out is reported once, by a
     warning of the logger "langsplat". Raises InputError where nothing usable remains.
     """
     path = Path(path)
-    if config.max_side < 16:
-        raise InputError(f"max_side is {config.max_side}; photographs need at least 16 pixels")
-    metres = config.metres_per_unit
-    if metres is not None and not 0 < metres < math.inf:
-        raise InputError(f"metres_per_unit is {metres:g}; must be above 0 and finite")
-    if not path.exists():
-        raise InputError(f"{path} does not exist; expected {ACCEPTED}")
-    capture = _load(path, config.max_side, work, progress)
-    capture = capture if metres is None else replace(capture, metres_per_unit=metres)
+    check_settings(config, "--dataset.")
+    if not os.path.exists(path):  # unlike Path.exists, also no for names that no file system could hold
+        raise InputError(f"{shown(path)} does not exist; expected {ACCEPTED}")
+    try:
+        capture = _load(path, config.max_side, work, progress)
+    except PermissionError as error:
+        raise InputError(f"{error.filename}: may not be read ({error.strerror}); see to its rights") from None
+    if config.metres_per_unit is not None:
+        capture = replace(capture, metres_per_unit=config.metres_per_unit)
     return capture if len(capture.points) else add_points(capture, work, progress)
 
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import pycolmap
 
 from langsplat_core.arrays import Array
+from langsplat_core.datasets.colmap_library import pycolmap
 from langsplat_core.scene import Intrinsics
 
 # What no photograph exceeds; numbers of damaged files would overflow in what is computed from them.

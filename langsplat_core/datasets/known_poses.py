@@ -26,7 +26,7 @@ MAX_ANGLE = 75.0  # degrees between the axes of views that are matched
 
 
 def add_points(capture: Capture, work: Path, progress: Progress) -> Capture:
-    """The capture with points in its own world: triangulated ones (kept in ``work/sfm``), or random ones
+    """The capture with points in its own world: triangulated ones (kept in ``work/sfm-*``), or random ones
     in front of the cameras when fewer than `MIN_POINTS` can be triangulated."""
     points, colours = _triangulated(capture, work, progress)
     if len(points) < MIN_POINTS:
@@ -40,11 +40,7 @@ def add_points(capture: Capture, work: Path, progress: Progress) -> Capture:
 
 def _triangulated(capture: Capture, work: Path, progress: Progress) -> tuple[Array, Array]:
     names = [f"{index:05d}.png" for index in range(len(capture))]
-    facts = [
-        (c.name, _params(c), c.width, c.height, c.world_to_camera.tolist(), int(image.sum()))
-        for c, image in zip(capture.cameras, capture.images, strict=True)
-    ]
-    workspace = sfm.open_workspace(work, ["known poses", 1, facts])
+    workspace = sfm.open_workspace(work, ["known poses", 2, capture.digest(range(len(capture)))])
     try:
         if not has_model(workspace / "sparse"):
             for name, image in zip(names, capture.images, strict=True):

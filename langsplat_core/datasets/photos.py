@@ -1,5 +1,6 @@
 """A plain folder of photographs: cameras by structure from motion."""
 
+import hashlib
 import logging
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ log = logging.getLogger("langsplat")
 
 SFM_SIDE = 1600  # px, longer side of the copies that features are sought in
 MIN_PHOTOS = 3
+UNREAD = "cannot be read"
 # EXIF tags from which COLMAP guesses the focal length: maker, model; focal length, same for 35 mm film.
 _MAIN_TAGS, _EXIF_IFD, _EXIF_TAGS = (0x010F, 0x0110), 0x8769, (0x920A, 0xA405)
 _ADVICE = "take more photographs, each sharing at least two thirds of its view with the next"
@@ -41,19 +43,19 @@ def photo_folder(folder: Path) -> Path | None:
 
 
 def load_photos(folder: Path, max_side: int, work: Path, progress: Progress) -> Capture:
-    """Locate the photographs in `folder` (kept in ``work/sfm``) and load them; see `load_capture`."""
+    """Locate the photographs in `folder` (kept in ``work/sfm-*``) and load them; see `load_capture`."""
     paths = find_photos(folder)
     if len(paths) < MIN_PHOTOS:
         raise InputError(
             f"{folder} has {len(paths)} photographs; at least {MIN_PHOTOS} are needed: {_ADVICE}"
         )
-    stamps = [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in paths]
-    workspace = sfm.open_workspace(work, ["photographs", 1, str(folder.resolve()), SFM_SIDE, stamps])
+    contents = [(path.name, _content(path)) for path in paths]
+    workspace = sfm.open_workspace(work, ["photographs", 2, SFM_SIDE, contents])
     numbered = {f"{index:05d}.jpg": path for index, path in enumerate(paths)}
     if not has_model(workspace / "sparse"):
-        _reconstruct(workspace, numbered, progress)
+        _reconstruct(workspace, numbered, _twins(numbered, dict(contents)), progress)
     model = read_model(workspace / "sparse")
-    _report_left_out(model, numbered)
+    _report_left_out(model, numbered, sfm.left_out(workspace))
     located = located_photos(model, workspace / "images", workspace / "sparse")
     photos = [
         Photo(numbered[p.label], numbered[p.label].name, p.intrinsics, p.world_to_camera, upright=True)
@@ -63,29 +65,66 @@ def load_photos(folder: Path, max_side: int, work: Path, progress: Progress) -> 
     return Capture(cameras, images, *good_points(model))
 
 
-def _reconstruct(workspace: Path, numbered: dict[str, Path], progress: Progress) -> None:
+def _content(path: Path) -> str:
+    """A digest of a file: photographs that were copied, moved or touched are the same. Empty for one that may
+    not be read, which is reported where it is opened."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return ""
+
+
+def _twins(numbered: dict[str, Path], contents: dict[str, str]) -> dict[str, str]:
+    """For photographs that are the same as an earlier one, which: names in the workspace -> file names."""
+    first: dict[str, str] = {}
+    return {
+        name: earlier
+        for name, path in numbered.items()
+        if (earlier := first.setdefault(contents[path.name], path.name)) != path.name
+    }
+
+
+def _why(reasons: dict[str, str], numbered: dict[str, Path], twins: dict[str, str]) -> str:
+    """Reasons and their photographs: ``no features: a.jpg, b.jpg; no matches with any other: c.jpg``."""
+    groups: dict[str, list[str]] = {}
+    for name, path in numbered.items():
+        if name in twins:
+            groups.setdefault(f"the same picture as {twins[name]}", []).append(path.name)
+        elif name in reasons:
+            groups.setdefault(reasons[name], []).append(path.name)
+    return "; ".join(f"{reason}: {shortened(names)}" for reason, names in groups.items())
+
+
+def _reconstruct(
+    workspace: Path, numbered: dict[str, Path], twins: dict[str, str], progress: Progress
+) -> None:
     copies = _small_copies(workspace / "images", numbered, progress)
     try:
         sfm.extract_features(workspace, _groups(copies), progress)
         sfm.match_features(workspace, sfm.pairs_by_name([copy.name for copy in copies]), progress)
         found = sfm.map_cameras(workspace, len(copies), progress)
     except sfm.FAILURES as error:
+        reason = str(error).partition("\n")[0]
         raise InputError(
-            f"structure from motion failed ({str(error).splitlines()[0]}); remove {workspace} and try again"
+            f"structure from motion failed ({reason}); remove {workspace} and try again"
         ) from None
     if found < MIN_PHOTOS:
-        raise InputError(f"only {found} of {len(copies)} photographs could be located together: {_ADVICE}")
+        why = _why(sfm.left_out(workspace), numbered, twins)
+        raise InputError(
+            f"only {found} of {len(copies)} photographs could be located together ({why}); {_ADVICE}"
+        )
 
 
-def _report_left_out(model: SparseModel, numbered: dict[str, Path]) -> None:
+def _report_left_out(model: SparseModel, numbered: dict[str, Path], reasons: dict[str, str]) -> None:
     located = {image.name for image in model.images}
-    lost = [path.name for name, path in numbered.items() if name not in located]
+    lost = {name: path for name, path in numbered.items() if name not in located}
     if lost:
         log.warning(
-            "%d of %d photographs could not be located and are left out: %s",
+            "%d of %d photographs could not be located and are left out (%s)",
             len(lost),
             len(numbered),
-            shortened(lost),
+            _why(dict.fromkeys(lost, UNREAD) | reasons, lost, {}),
         )
 
 

@@ -1,18 +1,21 @@
 """pycolmap, wrapped: features, matches, mapping and triangulation, in steps that report and resume.
 
 A *workspace* is a folder with small copies of the photographs (``images``), COLMAP's ``database.db`` and,
-in the end, the model (``sparse``). The database keeps what was computed, so an interrupted run goes on.
+in the end, the model (``sparse``). It is named by a digest of all that it is made from; the database keeps
+what was computed, so an interrupted run goes on, and ends with the same cameras, byte for byte: photographs
+are numbered in the order of their names, every random choice has its seed, and the mapper runs on one thread.
 """
 
+import hashlib
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
+from langsplat_core.datasets.colmap_library import pycolmap
 from langsplat_core.files import atomic_path
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
@@ -23,6 +26,9 @@ FEATURES = 8192  # per photograph
 SMALL_SIDE = 1000  # px; smaller photographs are doubled before features are sought, as SIFT proposes
 EXTRACT_BATCH = 8  # photographs per step: a step is the unit of progress and of resuming
 MATCH_BATCH = 64  # pairs per step
+FEWEST_MATCHES = 15  # that COLMAP's mapper works with
+FEWEST_FEATURES = 50  # fewer rarely give that many matches
+LEFT_OUT = "left_out.json"  # in the workspace: which photographs have no camera, and why
 FAILURES = (RuntimeError, ValueError, IndexError, OSError)  # what pycolmap raises
 
 Pair = tuple[str, str]
@@ -39,14 +45,11 @@ class Group:
 
 
 def open_workspace(work: Path, inputs: object) -> Path:
-    """``work/sfm``, emptied first unless it was made for the same `inputs` (anything JSON can hold)."""
-    folder = work / "sfm"
-    stamp, text = folder / "inputs.json", json.dumps(inputs, sort_keys=True)
-    if not (stamp.is_file() and stamp.read_text() == text):
-        shutil.rmtree(folder, ignore_errors=True)
-        (folder / "images").mkdir(parents=True)
-        with atomic_path(stamp) as temporary:
-            temporary.write_text(text)
+    """``work/sfm-<digest>`` of `inputs`, anything that JSON can hold; those of others are left alone."""
+    digest = hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:12]
+    folder = work / f"sfm-{digest}"
+    if not (folder / "sparse").is_dir():
+        (folder / "images").mkdir(parents=True, exist_ok=True)
     pycolmap.logging.minloglevel = 3  # its log lines would tear the progress bars apart
     return folder
 
@@ -56,6 +59,8 @@ def extract_features(folder: Path, groups: Sequence[Group], progress: Progress) 
     database = folder / "database.db"
     total, done = sum(len(group.names) for group in groups), 0
     for group in groups:
+        _register(database, folder / "images", group)
+    for group in groups:
         for start in range(0, len(group.names), EXTRACT_BATCH):
             progress("finding features", done / total)
             names = group.names[start : start + EXTRACT_BATCH]
@@ -64,28 +69,46 @@ def extract_features(folder: Path, groups: Sequence[Group], progress: Progress) 
     progress("finding features", 1.0)
 
 
+def _register(database: Path, images: Path, group: Group) -> None:
+    """Rows for the photographs of a group, in their order: extraction on several threads would number them
+    as it happens, and what follows depends on the numbers."""
+    with pycolmap.Database.open(database) as opened:
+        known = {image.name: image.camera_id for image in opened.read_all_images()}
+    lacking = [name for name in group.names if name not in known]
+    if lacking:
+        pycolmap.import_images(
+            database_path=database,
+            image_path=images,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            image_names=lacking,
+            options=_reader(group, known.get(group.names[0], -1)),
+        )
+
+
+def _reader(group: Group, camera_id: int) -> "pycolmap.ImageReaderOptions":
+    """How photographs of a group are taken in; with -1 COLMAP makes a new camera for them."""
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = group.model
+    reader.camera_params = group.params
+    reader.existing_camera_id = camera_id
+    return reader
+
+
 def _extract(database: Path, images: Path, group: Group, names: Sequence[str]) -> None:
-    camera_id = -1  # COLMAP makes a new camera for the first photographs of a group
     with pycolmap.Database.open(database) as opened:
         known = {image.name: image for image in opened.read_all_images()}
         lacking = [n for n in names if n not in known or not opened.exists_keypoints(known[n].image_id)]
-        if group.names[0] in known:
-            camera_id = known[group.names[0]].camera_id
     if not lacking:
         return
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = FEATURES
     options.sift.first_octave = -1 if group.side <= SMALL_SIDE else 0
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = group.model
-    reader.camera_params = group.params
-    reader.existing_camera_id = camera_id
     pycolmap.extract_features(
         database_path=database,
         image_path=images,
         image_names=lacking,
         camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=reader,
+        reader_options=_reader(group, known[group.names[0]].camera_id),
         extraction_options=options,
         device=pycolmap.Device.cpu,
     )
@@ -137,6 +160,7 @@ def map_cameras(folder: Path, count: int, progress: Progress) -> int:
     options.max_num_models = 5
     options.random_seed = 0
     options.triangulation.random_seed = 0
+    options.num_threads = 1  # sums of several threads differ from run to run
     registered = 0
 
     def advance() -> None:
@@ -157,10 +181,48 @@ def map_cameras(folder: Path, count: int, progress: Progress) -> int:
     best = max(
         models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None
     )
+    located = set() if best is None else {image.name for image in best.images.values() if image.has_pose}
+    _write_left_out(folder, located)
     if best is not None:
         _store(best, folder)
     progress("locating cameras", 1.0)
     return 0 if best is None else int(best.num_reg_images())
+
+
+def left_out(folder: Path) -> dict[str, str]:
+    """Why photographs have no camera, by their names in the workspace, after `map_cameras`."""
+    why: dict[str, str] = json.loads((folder / LEFT_OUT).read_text())
+    return why
+
+
+def _write_left_out(folder: Path, located: Collection[str]) -> None:
+    with pycolmap.Database.open(folder / "database.db") as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        features = {number: database.num_keypoints_for_image(number) for number in names}
+        pairs, inliers = database.read_two_view_geometry_num_inliers()
+    friends: dict[int, int] = dict.fromkeys(names, 0)
+    for pair, count in zip(pairs, inliers, strict=True):
+        if count >= FEWEST_MATCHES:
+            for number in pycolmap.pair_id_to_image_pair(pair):
+                friends[number] += 1
+    why = {
+        name: _reason(features[number], friends[number])
+        for number, name in names.items()
+        if name not in located
+    }
+    with atomic_path(folder / LEFT_OUT) as temporary:
+        temporary.write_text(json.dumps(why, sort_keys=True))
+
+
+def _reason(features: int, friends: int) -> str:
+    """In words, from the number of features and of photographs that share enough of them."""
+    if features == 0:
+        return "no features (nothing but plain areas, or blurred)"
+    if features < FEWEST_FEATURES:
+        return "too few features (plain, dark, blurred or tiny)"
+    if friends == 0:
+        return "no matches with any other"
+    return "matched, but from one and the same place, or without enough overlap"
 
 
 def triangulate(folder: Path, names: Sequence[str], cameras: Sequence[Camera]) -> None:
@@ -177,6 +239,7 @@ def triangulate(folder: Path, names: Sequence[str], cameras: Sequence[Camera]) -
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
     options.triangulation.random_seed = 0
+    options.num_threads = 1
     attempts = folder / "attempts"
     attempts.mkdir(exist_ok=True)
     result = pycolmap.triangulate_points(

@@ -8,6 +8,7 @@ the rounded positions of that file, so that it could not serve a `scene.ply` in 
 """
 
 import logging
+import os
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -16,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.errors import InputError
-from langsplat_core.files import atomic_path
+from langsplat_core.files import atomic_path, check_output_file
 from langsplat_core.formats import antialiasing, cameras_json, language
 from langsplat_core.formats.cameras_json import read_cameras, write_cameras
 from langsplat_core.formats.ksplat import read_ksplat
@@ -123,9 +124,11 @@ def _read_by_kind(path: Path) -> Scene:
 
 
 def check_writable(path: Path | str) -> None:
-    """InputError unless `save_scene` can write a file of this name's ending."""
+    """InputError unless `save_scene` can write a scene of this name, and its companions, where it lies."""
     if Path(path).suffix.lower() not in _WRITERS:
         raise InputError(f"{path}: scenes are written as {', '.join(_WRITERS)}; choose such a name")
+    for file in (path, companion_path(path, language.SUFFIX), companion_path(path, cameras_json.SUFFIX)):
+        check_output_file(file)
 
 
 def save_scene(path: Path | str, scene: Scene) -> None:
@@ -183,9 +186,9 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
     scene = Path(scene)
     if scene.name == META_NAME:
         scene = scene.parent
-    if scene.suffix.lower() in (".ply", ".sog") and not scene.is_dir():
+    if scene.suffix.lower() in (".ply", ".sog") and not os.path.isdir(scene):  # which a name too long is not
         return scene.with_name(scene.stem + suffix)
-    if scene.suffix.lower() in _READERS and not scene.is_dir():
+    if scene.suffix.lower() in _READERS and not os.path.isdir(scene):  # which a name too long is not
         return scene.with_name(scene.name + suffix)
     whole = scene.resolve()  # "." has no name of its own
     return whole.with_name(whole.name + suffix)

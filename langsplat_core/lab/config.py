@@ -2,16 +2,24 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
-from langsplat_core.config import CodecConfig, LiftConfig
+from langsplat_core.config import CodecConfig, Count, CountOrZero, LiftConfig, Positive, Rate, Seed
 from langsplat_core.query.cut import CutRule
+from langsplat_core.ranges import Range
 
+Pixels = Annotated[int, Range(1, 65_536)]
 Tier = Literal["separate", "clutter", "occlusion"]  # objects apart, cluttered, packed with look-alikes
 TIERS: tuple[Tier, ...] = get_args(Tier)
 # The outlines a perfect segmenter would find; the same, but 15 % of the vectors are another region's; the
 # weight-free segmenter's; squares in place of masks.
 MaskOrigin = Literal["truth", "wrong", "graph", "tiles"]
+Latents = Annotated[int, Range(1, 512)]  # numbers per Gaussian
+Codewords = Annotated[int, Range(1, 65_535)]
+Channels = Annotated[int, Range(1, 4_096)]  # values per Gaussian
+Views = Annotated[int, Range(8, 100_000)]  # photographs of a room, of which every eighth is held out
+Size = tuple[Pixels, Pixels]  # width and height of a picture
+Seeds = Annotated[tuple[Seed, ...], Range(0, 2**32 - 1, some=True)]
 LabelLayout = Literal["plain", "lerf-ovs", "3d-ovs"]  # how a rendered room's truth is written
 
 
@@ -20,14 +28,14 @@ class DemoEncoderConfig:
     """Training of the small CLIP that comes with the program (`langsplat demo encoder`)."""
 
     start: Path | None = None  # folder of an earlier demo encoder to begin from; None: random weights
-    rooms: int = 400  # random rooms that crops are rendered from
-    views: int = 3  # photographs of each room
-    plain_crops: int = 8_000  # crops of nothing but a colour or a texture
-    steps: int = 8_000
-    batch: int = 128  # crops per step
-    phrases: int = 192  # phrases per step
-    lr: float = 1e-3
-    seed: int = 0
+    rooms: Count = 400  # random rooms that crops are rendered from
+    views: Count = 3  # photographs of each room
+    plain_crops: CountOrZero = 8_000  # crops of nothing but a colour or a texture
+    steps: Count = 8_000
+    batch: Count = 128  # crops per step
+    phrases: Count = 192  # phrases per step
+    lr: Rate = 1e-3
+    seed: Seed = 0
 
 
 @dataclass(frozen=True)
@@ -35,11 +43,11 @@ class BenchmarkConfig:
     """Fresh rooms, and the method that is measured in them (`langsplat eval synthetic`)."""
 
     tiers: tuple[Tier, ...] = TIERS
-    seeds: tuple[int, ...] = (101,)  # one room of every tier each; never that of the bundled scene
-    views: int = 48  # photographs of each room; every eighth is held out
-    size: tuple[int, int] = (400, 300)  # width and height, pixels
-    steps: int = 1_500  # of radiance training
-    max_gaussians: int = 50_000
+    seeds: Seeds = (101,)  # one room of every tier each; never that of the bundled scene
+    views: Views = 48  # photographs of each room; every eighth is held out
+    size: Size = (400, 300)  # width and height, pixels
+    steps: Count = 1_500  # of radiance training
+    max_gaussians: Count = 50_000
     masks: MaskOrigin = "truth"
     encoder: str = "demo"  # "demo" for the bundled one, a folder, or a hub id
     codec: CodecConfig = field(default_factory=CodecConfig)
@@ -55,19 +63,19 @@ class LiftBenchConfig:
     """Ways from masks to meanings, compared in one room (`langsplat bench lift`)."""
 
     tier: Tier = "clutter"
-    seed: int = 101
+    seed: Seed = 101
     """Of the room; never that of the bundled scene."""
     masks: tuple[MaskOrigin, ...] = ("truth", "wrong", "graph")
     """Exact outlines, the same with every seventh vector another region's, the weight-free segmenter's."""
-    dims: tuple[int, ...] = (1, 2, 3, 8)
+    dims: tuple[Latents, ...] = (1, 2, 3, 8)
     """Numbers per latent of the autoencoders."""
-    ranks: tuple[int, ...] = (8, 64)
+    ranks: tuple[Latents, ...] = (8, 64)
     """Numbers per latent of the linear codecs."""
-    sizes: tuple[int, ...] = (256, 1_024, 4_096)
+    sizes: tuple[Codewords, ...] = (256, 1_024, 4_096)
     """Codewords of the codebooks."""
-    codec_steps: int = 4_000
+    codec_steps: Count = 4_000
     """Of the autoencoders' training."""
-    gradient_steps: int = 3_000
+    gradient_steps: Count = 3_000
     """Of the paper's training; it takes 30 000."""
     only: tuple[str, ...] = ()
     """Rows whose name holds one of these texts; all of them if empty."""
@@ -78,13 +86,13 @@ class PaperBenchConfig:
     """The paper's comparisons, on rooms with known truth (`langsplat bench paper`)."""
 
     tier: Tier = "clutter"
-    seeds: tuple[int, ...] = (301, 302, 303, 304, 305)
+    seeds: Seeds = (301, 302, 303, 304, 305)
     """Of the rooms; never that of the bundled scene, nor 201 to 203, on which the readings were tuned."""
-    dims: tuple[int, ...] = (1, 2, 3, 8)
+    dims: tuple[Latents, ...] = (1, 2, 3, 8)
     """Numbers per latent of the autoencoders."""
-    codec_steps: int = 4_000
+    codec_steps: Count = 4_000
     """Of the autoencoders' training."""
-    gradient_steps: int = 3_000
+    gradient_steps: Count = 3_000
     """Of the paper's training, from one-pass latents; from zeros it takes 30 000."""
     only: tuple[str, ...] = ()
     """Rows whose name holds one of these texts; all of them if empty."""
@@ -95,11 +103,11 @@ class GainBenchConfig:
     """Changes of the lifting, and the rooms they are tried in (`langsplat bench gains`)."""
 
     tier: Tier = "clutter"
-    seeds: tuple[int, ...] = (201, 202)
+    seeds: Seeds = (201, 202)
     """Of the rooms; never that of the bundled scene."""
     masks: tuple[MaskOrigin, ...] = ("truth", "wrong")
     """Exact outlines, the same with 15 % wrong vectors, the weight-free segmenter's."""
-    size: int = 1_024
+    size: Codewords = 1_024
     """Codewords, the same for all changes."""
 
 
@@ -108,7 +116,7 @@ class VerdictBenchConfig:
     """Rooms in which present and absent things are asked for (`langsplat bench verdict`)."""
 
     tiers: tuple[Tier, ...] = ("clutter",)
-    seeds: tuple[int, ...] = (301, 302, 303, 304, 305)
+    seeds: Seeds = (301, 302, 303, 304, 305)
     """Of the rooms; never that of the bundled scene, nor 201 to 203, which calibrate the demo encoder."""
     masks: MaskOrigin = "truth"
     """Exact outlines, the same with 15 % wrong vectors, the weight-free segmenter's."""
@@ -120,7 +128,7 @@ class WordBenchConfig:
     """Rooms whose things are named (`langsplat bench words`)."""
 
     tier: Tier = "clutter"
-    seeds: tuple[int, ...] = (203,)
+    seeds: Seeds = (203,)
     """Of the rooms; never that of the bundled scene."""
 
 
@@ -129,7 +137,7 @@ class PhraseBenchConfig:
     """Rooms in which phrases with structure are asked whole and composed (`langsplat bench phrases`)."""
 
     tier: Tier = "clutter"
-    seeds: tuple[int, ...] = (203,)
+    seeds: Seeds = (203,)
     """Of the rooms; never that of the bundled scene, nor 201 and 202, on which composing was tuned."""
 
 
@@ -137,17 +145,17 @@ class PhraseBenchConfig:
 class RasterBenchConfig:
     """What the rasterizer benchmark draws (`langsplat bench raster`)."""
 
-    counts: tuple[int, ...] = (10_000, 31_000, 100_000, 200_000, 1_000_000)
+    counts: tuple[Count, ...] = (10_000, 31_000, 100_000, 200_000, 1_000_000)
     """Sizes of the random scenes, drawn at the middle one of --sizes."""
-    sizes: tuple[tuple[int, int], ...] = ((320, 240), (640, 480), (960, 720))
+    sizes: Annotated[tuple[Size, ...], Range(1, 65_536, some=True)] = ((320, 240), (640, 480), (960, 720))
     """Widths and heights of the picture, pixels; all are drawn with --pivot Gaussians."""
-    pivot: int = 200_000
+    pivot: Count = 200_000
     """Gaussians of the random scene that is drawn at every size."""
-    channels: tuple[int, ...] = (3, 12)
+    channels: Annotated[tuple[Channels, ...], Range(1, 4_096, some=True)] = (3, 12)
     """Values per Gaussian."""
     scenes: tuple[Path, ...] = ()
     """Real scenes to measure beside the random ones, from their first camera, else one that frames them."""
-    limit: float = 60.0
+    limit: Positive = 60.0
     """Seconds that a single call may be expected to take; what would take longer is named and left out."""
     cold: bool = False
     """Also measure the first call in fresh processes, without and with compiled kernels."""
@@ -159,11 +167,11 @@ class KernelStepsConfig:
 
     scene: Path | None = None
     """A scene to measure on; without one a random one."""
-    count: int = 200_000
+    count: Count = 200_000
     """Gaussians of the random scene."""
-    size: tuple[int, int] = (640, 480)
+    size: Size = (640, 480)
     """Width and height of the picture, pixels."""
-    channels: int = 12
+    channels: Channels = 12
     """Values per Gaussian."""
 
 
@@ -171,15 +179,15 @@ class KernelStepsConfig:
 class QueryBenchConfig:
     """How phrases are asked of one scene, every way (`langsplat bench query`)."""
 
-    size: tuple[int, int] = (1440, 1080)
+    size: Size = (1440, 1080)
     """Width and height of the picture, pixels; that of the paper's figures."""
-    count: int = 0
+    count: CountOrZero = 0
     """Gaussians; the scene's are repeated, each beside itself, until there are so many. 0: as they are."""
-    phrases: int = 8
+    phrases: Count = 8
     """That errors are averaged and times taken over; the paper's order is timed with one."""
-    together: int = 100
+    together: Count = 100
     """Phrases that are asked at once, and one by one."""
-    repeats: int = 5
+    repeats: Count = 5
     """Of every timing of a view and a picture, of which the median is taken."""
-    codec_steps: int = 3_000
+    codec_steps: Count = 3_000
     """Of the training of the autoencoder that stands beside the codebook."""

@@ -91,7 +91,7 @@ def _check_size(name: str, picture: Image.Image, file_size: int) -> None:
     if picture.width * picture.height > most:
         raise PictureError(
             name,
-            f"declares {picture.width}x{picture.height} pixels; at most {most // 10**6} million are read from "
+            f"declares {picture.width}x{picture.height} pixels; at most {most // 10**6} million are read of "
             f"a file of {file_size} bytes",
         )
 

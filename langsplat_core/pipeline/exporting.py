@@ -1,7 +1,6 @@
 """Scenes and features as other methods' tools read them."""
 
 from pathlib import Path
-from urllib.parse import unquote
 
 import numpy as np
 
@@ -76,7 +75,7 @@ def features_to_langsplat(store: FeatureStore, folder: Path, progress: Progress 
     LangSplat cuts a photograph's name at its first dot. Its map of default masks is left empty: no level
     is trained from it. Raises InputError where there are none, or two would have one name.
     """
-    names = stored_names(store)
+    names = store.names()
     stems = {name.split(".")[0]: name for name in names}
     if not names or len(stems) < len(names):
         problem = "two photographs have one name up to its first dot" if names else f"holds no *{SUFFIX}"
@@ -87,11 +86,6 @@ def features_to_langsplat(store: FeatureStore, folder: Path, progress: Progress 
         write_features(folder, stem, features.vectors, np.concatenate([default, features.labels]))
         progress("writing features", (done + 1) / len(stems))
     return len(stems)
-
-
-def stored_names(store: FeatureStore) -> list[str]:
-    """Names of the photographs in `store`, sorted."""
-    return sorted(unquote(path.name.removesuffix(SUFFIX)) for path in store.folder.glob(f"*{SUFFIX}"))
 
 
 def features_from_langsplat(folder: Path, store: FeatureStore, progress: Progress = silent) -> int:

@@ -16,6 +16,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.formats.checkpoints import ForeignScene, Leaves
 from langsplat_core.pipeline.language import encoded_phrases
 from langsplat_core.progress import Progress, silent
+from langsplat_core.ranges import check_settings
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     LEVELS,
@@ -67,6 +68,8 @@ def import_scene(
     Raises EncoderError where the encoder cannot be loaded, InputError where its vectors have another length
     or no Gaussian has a meaning, FormatError for features that are not finite.
     """
+    config = config or CodecConfig()
+    check_settings(config, "--codec.")
     if foreign.dim == 0:
         return foreign.scene, ImportReport(foreign.method, "", 0, (0.0, 0.0, 0.0), None, foreign.notes)
     encoder = load_text_encoder(encoder_id or OPEN_MODEL)
@@ -75,7 +78,6 @@ def import_scene(
             f"{_first_path(foreign)}: vectors of {foreign.dim} numbers, those of the encoder {encoder.id} "
             f"have {encoder.dim}; name the encoder they were made with by --encoder"
         )
-    config = config or CodecConfig()
     vocabulary = everyday_vocabulary(encoder, phrases)
     codec, loss = _codec(foreign, config, vocabulary, progress)
     latents, confidence = _latents(foreign, codec, progress)

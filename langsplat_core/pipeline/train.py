@@ -8,6 +8,7 @@ import json
 import logging
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -17,14 +18,16 @@ from langsplat_core.config import TrainConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
-from langsplat_core.files import atomic_path
-from langsplat_core.formats import load_scene, read_ply, save_scene, write_ply
+from langsplat_core.files import atomic_path, check_output_folder
+from langsplat_core.formats import check_writable, load_scene, read_ply, save_scene, write_ply
 from langsplat_core.pipeline.crew import Crew
 from langsplat_core.pipeline.doubts import doubts
 from langsplat_core.pipeline.language import language_field
+from langsplat_core.pipeline.lock import sole_use
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.views import StoredViews
 from langsplat_core.progress import Progress, silent
+from langsplat_core.ranges import check_settings
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.semantics.encoders import load_encoder
 from langsplat_core.semantics.masks import MaskSource
@@ -74,13 +77,32 @@ def train_scene(
     the processes that share the work; all call this with the same arguments, and one writes the scene.
     `gaussians_from`: a scene in the photographs' world whose Gaussians are taken instead of training some.
     """
+    check_settings(config)
     if out.suffix.lower() != ".ply":
         raise InputError(f"{out}: the scene must be named *.ply, for example --out {out.with_suffix('.ply')}")
     work = work or out.with_name(out.stem + ".work")
-    clock, crew = _Clock(), crew or Crew()
-
-    # First: absent weights, or a scene that cannot be read, should not cost an hour.
+    check_writable(out)
+    check_output_folder(work)
+    # First: a scene that cannot be read should not cost an hour.
     given = None if gaussians_from is None else load_scene(gaussians_from)
+    crew = crew or Crew()
+    with sole_use(work) if crew.leads else nullcontext():
+        return _train(dataset, out, config, work, progress, masks_of, crew, given)
+
+
+def _train(
+    dataset: Path,
+    out: Path,
+    config: TrainConfig,
+    work: Path,
+    progress: Progress,
+    masks_of: Callable[[Capture], MaskSource] | None,
+    crew: Crew,
+    given: Scene | None,
+) -> TrainReport:
+    """`train_scene` in a folder that is its own; `given`: the scene whose Gaussians are taken."""
+    clock = _Clock()
+    # First: absent weights should not cost an hour.
     encoder = load_encoder(config.clip.model, config.clip.device, config.clip.batch)
     named = None if masks_of else load_mask_source(config.masks, config.clip.device)
     # One process solves for cameras, the others find them in the work folder.

@@ -3,11 +3,12 @@
 import hashlib
 import json
 import logging
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
 import numpy as np
 
@@ -23,6 +24,8 @@ from langsplat_core.semantics.masks import MaskSource, label_maps
 VERSION = 1
 SUFFIX = ".features.npz"
 _PARTS = {"key": "U", "labels": "i", "vectors": "f"}  # of a file, with the kind of its type
+LONGEST_NAME = 200  # bytes before the suffix; file systems take 255, the suffix and a temporary name more
+SHORTENED = "%~"  # percent-encoding never writes this
 
 log = logging.getLogger("langsplat")
 
@@ -52,8 +55,26 @@ class FeatureStore:
         self._reported: set[str] = set()  # names whose damaged files were told of
 
     def path(self, name: str) -> Path:
-        """Where the photograph called `name` is kept."""
-        return self.folder / (quote(name, safe=" ") + SUFFIX)
+        """Where the photograph called `name` is kept: by its name, percent-encoded, or, where that is longer
+        than files' names may be, by the beginning of it and a digest. The file itself holds the whole."""
+        quoted = quote(name, safe=" ", errors="surrogateescape")
+        if len(quoted) > LONGEST_NAME:
+            digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
+            quoted = f"{quoted[: LONGEST_NAME // 2]}{SHORTENED}{digest}"
+        return self.folder / (quoted + SUFFIX)
+
+    def names(self) -> list[str]:
+        """Names of the photographs in the store, sorted. Raises FormatError for a damaged file."""
+        return sorted(self._name(path) for path in self.folder.glob(f"*{SUFFIX}"))
+
+    def _name(self, path: Path) -> str:
+        stem = path.name.removesuffix(SUFFIX)
+        if SHORTENED not in stem:
+            return unquote(stem, errors="surrogateescape")
+        stored = read_npz(path).get("name")
+        if stored is None or stored.dtype != np.uint8:
+            raise FormatError(f"{path}: does not say which photograph it is of; delete it and run again")
+        return os.fsdecode(stored.tobytes())
 
     def has(self, name: str, key: str | None = None) -> bool:
         """Whether a whole file for `name` exists; with `key`, only if it was saved with that key.
@@ -79,6 +100,7 @@ class FeatureStore:
                 temporary,
                 allow_pickle=False,
                 key=np.array(key),
+                name=np.frombuffer(os.fsencode(name), np.uint8),
                 labels=features.labels.astype(rows),
                 vectors=features.vectors.astype(np.float16),
             )

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import warnings
 import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -15,7 +16,11 @@ CONFIG = "config.json"
 SMALL_FILES = ["*.json", "*.txt"]
 SAFE = ["model.safetensors", "model-*.safetensors"]
 PICKLED = ["pytorch_model.bin", "pytorch_model-*.bin"]  # transformers reads these with weights_only
-UNREADABLE = (OSError, ValueError, TypeError, KeyError, RuntimeError, EOFError, pickle.PickleError)
+# What transformers, safetensors and torch raise for files that are no weights.
+UNREADABLE = (
+    *(OSError, ValueError, TypeError, LookupError, AttributeError, AssertionError, ImportError),
+    *(RuntimeError, EOFError, pickle.PickleError, zipfile.BadZipFile, ArithmeticError),
+)
 
 
 @dataclass(frozen=True)
@@ -146,10 +151,15 @@ def loading_errors(id: str, kind: str) -> Iterator[None]:
     logging.set_verbosity(logging.CRITICAL)
     logging.disable_progress_bar()
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
     except (*UNREADABLE, SafetensorError) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise EncoderError(f"{id}: not {kind} weights that transformers can load ({lines[0]})") from error
+        # torch's own words advise to run the file.
+        pickled = isinstance(error, pickle.UnpicklingError) or "weights_only" in str(error)
+        reason = "a pickle that holds more than tensors, which is not run" if pickled else lines[0][:200]
+        raise EncoderError(f"{id}: not {kind} weights that transformers can load ({reason})") from error
     finally:
         logging.set_verbosity(level)
         if bars:

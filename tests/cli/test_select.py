@@ -134,7 +134,7 @@ def test_points_and_hulls(folder, capsys):
         (("mug", "book", "--combine", "intersection"), "the intersection of 'mug', 'book' is empty"),
         (("mug", "--instance", "2"), "--instance 2: there are 1, numbered from 1"),
         (("mug", "--instance", "0"), "--instance 0"),
-        (("mug", "--grow", "-1"), "--grow -1: a distance must be 0 or more"),
+        (("mug", "--grow", "-1"), "--grow -1: must be 0 to 1e+09"),
         (("mug", "--shrink", "nan"), "--shrink nan"),
         (("pair", "--shrink", "9"), "nothing is left; shrink by less"),
         (("mug", "book", "plant", "--grow", "99", "--remove"), "the whole scene"),

@@ -1,6 +1,8 @@
 """Structure from motion and triangulation, on a small textured room whose shape is known."""
 
 import logging
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -102,7 +104,9 @@ def test_cameras_are_found_where_they_were(located) -> None:  # type: ignore[no-
 def test_what_was_left_out_is_reported(located) -> None:  # type: ignore[no-untyped-def]
     _, _, _, messages = located
     assert any("aa_broken.jpg" in message and "cannot be read" in message for message in messages)
-    assert any("zz_noise.JPG" in message and "could not be located" in message for message in messages)
+    (lost,) = [message for message in messages if "could not be located" in message]
+    assert "no matches with any other: zz_noise.JPG" in lost
+    assert "cannot be read: aa_broken.jpg" in lost
 
 
 def test_a_second_run_computes_nothing(
@@ -116,7 +120,24 @@ def test_a_second_run_computes_nothing(
     again = load_capture(photos, CONFIG, work)
     np.testing.assert_array_equal(again.points, capture.points)
     np.testing.assert_array_equal(again.cameras[3].world_to_camera, capture.cameras[3].world_to_camera)
-    assert sorted(path.name for path in (work / "sfm").iterdir()) == ["inputs.json", "sparse"]
+    (stage,) = work.glob("sfm-*")
+    assert sorted(path.name for path in stage.iterdir()) == ["left_out.json", "sparse"]
+
+
+def test_cameras_are_the_same_byte_for_byte(
+    photos: Path,
+    located,  # type: ignore[no-untyped-def]
+    tmp_path: Path,
+) -> None:
+    """Solved at once, from copies with other dates in another place, as by the run that was interrupted."""
+    shutil.copytree(photos, tmp_path / "moved")
+    for photo in (tmp_path / "moved" / "images").iterdir():
+        os.utime(photo, (0, 0))
+    load_capture(tmp_path / "moved", CONFIG, tmp_path / "work")
+    (ours,), (theirs,) = located[1].glob("sfm-*"), (tmp_path / "work").glob("sfm-*")
+    assert ours.name == theirs.name
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (ours / "sparse" / name).read_bytes() == (theirs / "sparse" / name).read_bytes()
 
 
 def test_changed_photographs_are_computed_again(
@@ -210,11 +231,12 @@ def test_copies_are_upright_and_keep_the_focal_length(tmp_path: Path) -> None:
 
     with pytest.raises(Cancelled):
         load_capture(tmp_path, CONFIG, tmp_path / "work", cancel)
-    camera = pycolmap.infer_camera_from_image(tmp_path / "work/sfm/images/00000.jpg")
+    (stage,) = (tmp_path / "work").glob("sfm-*")
+    camera = pycolmap.infer_camera_from_image(stage / "images/00000.jpg")
     assert (camera.width, camera.height) == (60, 90)
     assert camera.has_prior_focal_length
     assert camera.focal_length == pytest.approx(35 / np.hypot(36, 24) * np.hypot(60, 90), rel=0.01)
-    with Image.open(tmp_path / "work/sfm/images/00002.jpg") as copy:
+    with Image.open(stage / "images/00002.jpg") as copy:
         assert copy.getexif().get(0x0112, 1) == 1
 
 
@@ -230,4 +252,21 @@ def test_photographs_that_do_not_overlap_say_so(tmp_path: Path) -> None:
         Image.fromarray(rng.integers(0, 256, (120, 160, 3), dtype=np.uint8)).save(tmp_path / f"{index}.png")
     with pytest.raises(InputError, match="of 3 photographs could be located") as caught:
         load_capture(tmp_path, CONFIG, tmp_path / "work")
+    assert "(no matches with any other: 0.png, 1.png, 2.png)" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_each_photograph_that_has_no_camera_is_told_why(tmp_path: Path) -> None:
+    """Black, tiny, alone, and one view taken three times."""
+    (name,) = write_photos(tmp_path, LENS, poses(1))
+    for copy in ("b.png", "c.png"):
+        shutil.copy(tmp_path / name, tmp_path / copy)
+    (tmp_path / name).rename(tmp_path / "a.png")
+    Image.new("RGB", (400, 300)).save(tmp_path / "black.png")
+    Image.new("RGB", (2, 2), (255, 0, 0)).save(tmp_path / "tiny.png")
+    with pytest.raises(InputError, match="0 of 5 photographs could be located") as caught:
+        load_capture(tmp_path, CONFIG, tmp_path / "work")
+    message = str(caught.value)
+    assert "from one and the same place, or without enough overlap: a.png" in message
+    assert "the same picture as a.png: b.png, c.png" in message
+    assert "no features (nothing but plain areas, or blurred): black.png, tiny.png" in message

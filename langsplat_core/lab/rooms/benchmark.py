@@ -7,8 +7,9 @@ from langsplat_core.errors import InputError
 from langsplat_core.lab.config import BenchmarkConfig
 from langsplat_core.lab.demo import SEED
 from langsplat_core.lab.rooms.report import RoomReport
-from langsplat_core.lab.rooms.room import HOLD_OUT, Room, labelled, weights_digest
+from langsplat_core.lab.rooms.room import Room, labelled, weights_digest
 from langsplat_core.progress import Progress, silent
+from langsplat_core.ranges import check_settings
 from langsplat_core.semantics.encoders import load_encoder
 
 
@@ -28,13 +29,10 @@ def run_benchmark(config: BenchmarkConfig, work: Path, progress: Progress = sile
 
 
 def _check(config: BenchmarkConfig) -> None:
-    if not config.tiers or not config.seeds:
-        raise InputError("eval synthetic: name at least one of --tiers and one of --seeds")
+    check_settings(config)
+    if not config.tiers:
+        raise InputError("eval synthetic: name at least one of --tiers")
     if SEED in config.seeds:
         raise InputError(
             f"--seeds {SEED} is the bundled scene's room, on which things were tuned; take another seed"
         )
-    if min(config.seeds) < 0:
-        raise InputError("--seeds must be 0 or more")
-    if config.views < HOLD_OUT or min(config.steps, config.max_gaussians) < 1:
-        raise InputError(f"eval synthetic: it needs at least {HOLD_OUT} --views, and 1 step and Gaussian")

@@ -1,7 +1,8 @@
 """What small changes of the lifting gain, room by room (`langsplat bench gains`)."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from langsplat_core.config import CodecConfig
 from langsplat_core.errors import InputError
 from langsplat_core.lab.config import BenchmarkConfig, GainBenchConfig, MaskOrigin
 from langsplat_core.lab.rooms.gains import GAINS, Material
+from langsplat_core.lab.rooms.kept_rows import KeptRows
 from langsplat_core.lab.rooms.report import Measured, of_kind
 from langsplat_core.lab.rooms.room import Room, weights_digest
 from langsplat_core.lab.rooms.variants import Variant
@@ -43,10 +45,15 @@ class Gain:
 
 
 def measure_gains(
-    config: GainBenchConfig, work: Path, progress: Progress = silent, rooms: BenchmarkConfig | None = None
+    config: GainBenchConfig,
+    work: Path,
+    progress: Progress = silent,
+    rooms: BenchmarkConfig | None = None,
+    kept: Path | None = None,
 ) -> list[Gain]:
-    """Every change in every room; `rooms`: how they are photographed and trained. Raises InputError for
-    settings without a room."""
+    """Every change in every room; `rooms`: how they are photographed and trained; `kept`: a file that takes
+    every row when it is made, and gives those that an earlier run has made. Raises InputError for settings
+    without a room."""
     if not config.seeds or not config.masks:
         raise InputError("bench gains: name at least one of --seeds and one of --masks")
     encoder, rows = load_encoder("demo"), []
@@ -54,12 +61,21 @@ def measure_gains(
     settings = rooms or BenchmarkConfig()
     for seed in config.seeds:
         room = Room(settings, config.tier, seed, work, (encoder, weights_digest("demo")), progress)
+        matters = asdict(replace(config, seeds=(seed,), masks=())) | {
+            "rooms": asdict(settings),
+            "encoder": room.weights,
+        }
+        earlier = None if kept is None else KeptRows(kept, matters)
         for masks in config.masks:
-            material = _material(room, Variant("", masks))
+            material = cache(partial(_material, room, Variant("", masks)))  # not for rows that are there
             for change, lift in GAINS.items():
-                variant = Variant(change, masks)
-                field = _field(lift(material), encoder, vocabulary, config.size)
-                rows.append(Gain(masks, seed, change, room.measure_field(field, variant)))
+                measured = None if earlier is None else earlier.get(masks, change)
+                if measured is None:
+                    field = _field(lift(material()), encoder, vocabulary, config.size)
+                    measured = room.measure_field(field, Variant(change, masks))
+                    if earlier is not None:
+                        earlier.add(measured)
+                rows.append(Gain(masks, seed, change, measured))
     return rows
 
 

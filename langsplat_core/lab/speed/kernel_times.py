@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from langsplat_core.formats import load_scene
+from langsplat_core.lab.config import KernelStepsConfig
 from langsplat_core.lab.speed.cases import default_camera, random_scene
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import Camera, Gaussians
@@ -30,13 +31,12 @@ def median_ms(call: Callable[[], object]) -> float:
     return float(np.median(spent))
 
 
-def main(settings: dict[str, object]) -> None:
+def main(config: KernelStepsConfig) -> None:
     """Measure and print."""
-    gaussians, camera = _scene(settings)
-    channels = int(str(settings["channels"]))
+    gaussians, camera = _scene(config)
     generator = np.random.default_rng(0)
-    x = generator.uniform(size=(len(gaussians), channels)).astype(np.float32)
-    y = generator.uniform(size=(camera.height, camera.width, channels)).astype(np.float32)
+    x = generator.uniform(size=(len(gaussians), config.channels)).astype(np.float32)
+    y = generator.uniform(size=(camera.height, camera.width, config.channels)).astype(np.float32)
     raster = CpuRasterizer(1)
     view = raster.view(gaussians, camera)
     calls = {
@@ -50,14 +50,14 @@ def main(settings: dict[str, object]) -> None:
     print(json.dumps(times))
 
 
-def _scene(settings: dict[str, object]) -> tuple[Gaussians, Camera]:
-    width, height = np.asarray(settings["size"], int).tolist()
-    if settings["scene"] is None:
-        return random_scene(int(str(settings["count"]))), default_camera(width, height)
-    opened = load_scene(str(settings["scene"]))
+def _scene(config: KernelStepsConfig) -> tuple[Gaussians, Camera]:
+    width, height = config.size
+    if config.scene is None:
+        return random_scene(config.count), default_camera(width, height)
+    opened = load_scene(config.scene)
     camera = opened.cameras[0] if opened.cameras else opened.framing_camera((width, height))
     return opened.gaussians, camera.resized(width, height)
 
 
 if __name__ == "__main__":
-    main(json.loads(sys.argv[1]))
+    main(KernelStepsConfig(**json.loads(sys.argv[1])))

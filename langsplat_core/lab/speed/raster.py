@@ -3,7 +3,7 @@
 import json
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -102,8 +102,11 @@ _NOTES = """- ms: median of the calls after the first.
 """
 
 
-def run_plan(plan: RasterBenchConfig, progress: Progress = silent) -> Report:
-    """Measure; a few minutes for the default plan."""
+def run_plan(
+    plan: RasterBenchConfig, progress: Progress = silent, keep: Callable[[Report], None] = lambda _: None
+) -> Report:
+    """Measure; a few minutes for the default plan. `keep` is given what there is after every scene and size,
+    so that an interrupted run leaves that."""
     machine = describe_machine()
     baseline: Any = TorchRasterizer()  # a `Rasterizer` whose views have no depth
     backends: list[Rasterizer] = [*_backends(machine), baseline]
@@ -125,6 +128,8 @@ def run_plan(plan: RasterBenchConfig, progress: Progress = silent) -> Report:
         for step, (channels, backend) in enumerate(steps):
             progress(f"{name}, {backend.name}", (n + step / len(steps)) / total)
             rows += measure(backend, case, channels, truth, foresight)
+        unfinished = {"unfinished": f"{n + 1} of {total} scenes and sizes"}
+        keep(Report(machine | unfinished, list(rows), peak, dict(needs), []))
     progress("bench: fresh processes" if plan.cold else "bench: done", 1.0)
     return Report(machine, rows, peak, needs, measure_starts() if plan.cold else [])
 

@@ -20,6 +20,7 @@ from langsplat_core.raster.cpu.labels import gather_labels
 from langsplat_core.raster.cpu.operator import TileOperator, in_fours
 from langsplat_core.raster.cpu.tiles import bin_tiles, depth_order
 from langsplat_core.raster.cpu.walk import make_cutoffs
+from langsplat_core.raster.memory import check_picture
 from langsplat_core.scene import Camera, Gaussians
 
 
@@ -169,5 +170,6 @@ class CpuRasterizer:
         self.workers = shared_workers(threads)
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> CpuView:
-        """See `Rasterizer.view`."""
+        """See `Rasterizer.view`. InputError for a picture that this machine's memory cannot hold."""
+        check_picture(camera)
         return CpuView(gaussians, camera, settings, self.workers)

@@ -8,6 +8,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import CodecConfig
 from langsplat_core.progress import Progress, silent
+from langsplat_core.ranges import check_settings
 from langsplat_core.scene import AutoencoderCodec, CodebookCodec, Codec, LinearCodec
 from langsplat_core.training.language.autoencoder_fit import train_autoencoder
 from langsplat_core.training.language.codebook_fit import fit_codebook
@@ -18,7 +19,8 @@ def fit_codec(
     vectors: Array, config: CodecConfig, vocabulary: Vocabulary, progress: Progress = silent
 ) -> Codec:
     """(M, D) float32 unit CLIP vectors -> a codec for them; what phrases of the `vocabulary` find is what it
-    may not change. Deterministic for a given seed on one machine."""
+    may not change. Deterministic for a given seed on one machine. InputError for settings out of range."""
+    check_settings(config, "--codec.")
     return FITTERS[config.kind](vectors, config, vocabulary, progress)
 
 

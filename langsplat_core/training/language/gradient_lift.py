@@ -22,6 +22,7 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.compiled import kernel, plain, shared_workers
 from langsplat_core.config import INRIA, LiftConfig, RasterSettings
 from langsplat_core.progress import Progress, silent
+from langsplat_core.ranges import check_settings
 from langsplat_core.raster.protocol import FreezableView, LiftingRasterizer, LiftingView
 from langsplat_core.scene import Camera, Codec, Gaussians
 from langsplat_core.semantics.store import ImageFeatures
@@ -77,6 +78,7 @@ def lift_by_gradient(
     `config` says for how many steps, how fast, from where. Deterministic for a given seed on the CPU.
     """
     start, confidence = lift_latents(rasterizer, gaussians, views, codec, settings, progress)
+    check_settings(config, "--lift.")
     published = config.start == "zeros-as-published"
     adam = AdamState.begin(np.zeros_like(start) if published else start)
     targets = [_target(camera, features, codec) for camera, features in views]

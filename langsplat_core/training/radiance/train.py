@@ -21,7 +21,8 @@ from langsplat_core.arrays import Array, psnr, sigmoid
 from langsplat_core.config import INRIA, RadianceConfig
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
-from langsplat_core.progress import Cancelled, Progress, silent
+from langsplat_core.progress import Cancelled, Progress, Terminated, silent
+from langsplat_core.ranges import check_settings
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.training.radiance.checkpoint import fingerprint, load_checkpoint, save_checkpoint
 from langsplat_core.training.radiance.densify import accumulate, densify, reset_opacities
@@ -97,9 +98,10 @@ def train_radiance(
 
     With a `checkpoint` path the run continues from that file if it exists, and writes it every
     `config.checkpoint_every` steps, at the end, and when it is interrupted (Ctrl-C, or `Cancelled` from
-    `progress` or `on_step`). Raises InputError when there is nothing to train on or the checkpoint
-    belongs to another run, BackendError when the chosen backend does not work.
+    `progress` or `on_step`). Raises InputError when a setting is out of its range, there is nothing to train
+    on or the checkpoint belongs to another run, BackendError when the chosen backend does not work.
     """
+    check_settings(config, "--radiance.")
     if not train_indices:
         raise InputError("no photographs to train on; give a capture with at least one training view")
     renderer = renderer_for(config.backend)
@@ -199,22 +201,27 @@ def _one_torch_thread() -> Iterator[None]:
 
 @contextmanager
 def _interrupts_between_steps() -> Iterator[Callable[[], None]]:
-    """Hold Ctrl-C back while a step runs, because half a step is no state to resume from.
+    """Hold Ctrl-C and SIGTERM back while a step runs, because half a step is no state to resume from.
 
-    Yields a function that raises the KeyboardInterrupt that came meanwhile. Other threads than the main
-    one never receive it and need no care.
+    Yields a function that raises the KeyboardInterrupt or Terminated that came meanwhile. Other threads than
+    the main one never receive them and need no care. SIGTERM is left to whoever wants it otherwise: it is
+    held back only where it would raise.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None
         return
     pending: list[int] = []
-    previous = signal.signal(signal.SIGINT, lambda number, _: pending.append(number))
+    held = [signal.SIGINT, *([signal.SIGTERM] if callable(signal.getsignal(signal.SIGTERM)) else [])]
+    previous = {number: signal.getsignal(number) for number in held}
+    for number in held:
+        signal.signal(number, lambda number, _: pending.append(number))
 
     def raise_if_interrupted() -> None:
         if pending:
-            raise KeyboardInterrupt
+            raise Terminated if signal.SIGTERM in pending else KeyboardInterrupt
 
     try:
         yield raise_if_interrupted
     finally:
-        signal.signal(signal.SIGINT, previous if previous is not None else signal.SIG_DFL)
+        for number, handler in previous.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)

@@ -186,7 +186,11 @@ class TestReport:
 
 def test_a_tiny_run_writes_three_sane_files(tmp_path):
     plan = RasterBenchConfig((60, 120, 200), ((40, 30),), 120, (1, 3))
-    run_plan(plan).save(tmp_path)
+    unfinished = []
+    run_plan(plan, keep=unfinished.append).save(tmp_path)
+    assert [report.machine["unfinished"][0] for report in unfinished] == ["1", "2", "3"]
+    unfinished[0].save(tmp_path / "interrupted")
+    assert {row.gaussians for row in unfinished[0].rows} == {60}
     record = json.loads((tmp_path / "raster.json").read_text())
     rows = record["measurements"]
     cpu = {r["operation"] for r in rows if r["backend"] == "cpu"}

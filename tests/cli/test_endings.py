@@ -1,0 +1,164 @@
+"""Whatever happens to a command, it ends with one line."""
+
+import os
+import signal
+import subprocess
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from langsplat_core.cli.app import parse
+from langsplat_core.cli.checks import Written
+from langsplat_core.cli.run import main
+from langsplat_core.ranges import annotations, named_values
+from tests.support.another_user import bound_by_permissions
+
+DEMO = str(files("langsplat_assets") / "demo" / "scene.ply")
+RUN = [sys.executable, "-m", "langsplat_core"]
+WRITING = [
+    "train d --out {}.ply",
+    "train d --out s.ply --work {}",
+    "select s.ply cup --out {}.ply",
+    "convert s.ply {}.ply",
+    "convert s.ply {} --to langsplat",
+    "compact s.ply --out {}.ply",
+    "demo build --out {}.ply",
+    "demo dataset --out {}",
+    "demo encoder --out {}",
+    "demo sheet --out {}.png",
+    "eval synthetic --work {}",
+    "eval synthetic --json {}.json",
+    "eval lerf-ovs s.ply d --json {}.json",
+    "eval 3d-ovs s.ply d --pictures {}",
+    "eval scannet s.ply d --json {}.json",
+    *(
+        f"bench {name} --out {{}}"
+        for name in ("raster", "gains", "lift", "load", "memory", "paper", "phrases")
+    ),
+    *(f"bench {name} --out {{}}" for name in ("query s.ply", "steps", "verdict", "words")),
+    *(f"bench {name} --work {{}}" for name in ("gains", "lift", "paper", "phrases", "verdict", "words")),
+    "bench verdict --fit {}.json",
+]
+NOT_MARKED = {"convert s.ply {}.ply", "convert s.ply {} --to langsplat", "eval synthetic --work {}"}
+
+
+@pytest.mark.parametrize("line", WRITING)
+@pytest.mark.parametrize("place", ["/proc/x", "{here}/file/x", "{here}/" + "n" * 300])
+def test_every_command_that_writes_tries_the_place_first(
+    line: str, place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    (tmp_path / "s.ply").symlink_to(DEMO)
+    words = line.format(place.format(here=tmp_path)).split()
+    assert main("langsplat", lambda: parse(words)) == 2
+    (message,) = capsys.readouterr().err.splitlines()
+    assert any(word in message for word in ("system's own", "is a file", "file system takes")), message
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "s.ply"]
+
+
+@pytest.mark.parametrize("line", [line for line in WRITING if line not in NOT_MARKED])
+def test_what_is_written_is_marked(line: str) -> None:
+    command = parse(line.format("out").split())
+    for option, _, hint in named_values(command):
+        if option in ("--out", "--work", "--fit", "--pictures") or (
+            option == "--json" and "Path" in str(hint)
+        ):
+            assert any(isinstance(part, Written) for part in annotations(hint)), option
+
+
+@pytest.mark.parametrize(
+    "words", [["query", DEMO, "caf\udce9"], ["query", DEMO, "cup", "--encoder", "\udcff"]]
+)
+def test_texts_that_are_not_utf_8(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main("langsplat", lambda: parse(words)) == 2
+    (message,) = capsys.readouterr().err.splitlines()
+    assert "is not UTF-8" in message
+
+
+def test_a_name_that_is_not_utf_8_can_be_read_and_is_printed_with_escapes(tmp_path: Path) -> None:
+    scene = tmp_path / os.fsdecode(b"caf\xe9.ply")
+    scene.symlink_to(DEMO)
+    done = subprocess.run([*RUN, "scale", str(scene)], capture_output=True, text=True, check=True)
+    assert "caf\\udce9.ply: " in done.stdout
+
+
+@pytest.mark.parametrize("name", ["x" * 300 + ".ply", "file/x.ply", "/proc/self/mem"])
+def test_names_that_cannot_be_read(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    for words in (["inspect", name], ["train", name, "--out", "s.ply", "--clip.model", "demo"]):
+        assert main("langsplat", lambda words=words: parse(words)) == 2  # type: ignore[misc]
+        assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def shell(command: str) -> tuple[int, list[str]]:
+    """Exit code and lines on standard error of a shell command in which "langsplat" is ours."""
+    function = f'langsplat() {{ "{sys.executable}" -m langsplat_core "$@"; }}; '
+    done = subprocess.run(
+        ["bash", "-c", f"set -o pipefail; {function}{command}"], capture_output=True, text=True, check=False
+    )
+    return done.returncode, done.stderr.splitlines()
+
+
+@pytest.mark.parametrize("where", ["> /dev/full", ">&-"])
+def test_standard_output_that_takes_nothing(where: str) -> None:
+    for command in ("inspect", "scale"):
+        code, (line,) = shell(f"langsplat {command} {DEMO} {where}")
+        assert code == 2
+        assert "standard output" in line
+
+
+def test_a_reader_that_has_enough() -> None:
+    assert shell(f"langsplat inspect {DEMO} --json | head -c 1 >/dev/null") == (0, [])
+    assert shell(f"langsplat inspect {DEMO} | true") == (0, [])
+
+
+@pytest.mark.parametrize(("number", "said"), [(signal.SIGTERM, "terminated"), (signal.SIGINT, "interrupted")])
+def test_a_signal_ends_a_command_in_a_line(number: int, said: str, tmp_path: Path) -> None:
+    """With pycolmap imported, whose library would print a stack trace."""
+    code = (
+        "import sys, time\nfrom langsplat_core.cli.run import main\n"
+        "from dataclasses import dataclass\n"
+        "@dataclass\nclass Waits:\n    def run(self):\n"
+        "        from langsplat_core.datasets import load_capture\n"
+        "        print('ready', flush=True)\n        time.sleep(60)\n"
+        "sys.exit(main('langsplat', Waits))\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=30)
+    assert process.returncode == 128 + number
+    (line,) = errors.splitlines()
+    assert line == f"langsplat: {said}; the same command continues where it stopped"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("closed", [".", "images", "sparse/0/cameras.bin", "transforms.json"])
+def test_datasets_that_may_not_be_read(closed: str, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    if closed == "transforms.json":
+        data.mkdir()
+        (data / closed).write_text("{}")
+    else:
+        (data / "images").mkdir(parents=True)
+        (data / "sparse" / "0").mkdir(parents=True)
+        for name in ("cameras.bin", "images.bin", "points3D.bin"):
+            (data / "sparse" / "0" / name).write_bytes(bytes(8))
+    (data / closed).chmod(0)
+    words = ["train", str(data), "--out", str(tmp_path / "s.ply"), "--clip.model", "demo"]
+    done = subprocess.run(
+        [*RUN, *words], capture_output=True, text=True, check=False, preexec_fn=bound_by_permissions()
+    )
+    (data / closed).chmod(0o755)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("langsplat: ")
