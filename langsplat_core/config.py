@@ -186,7 +186,7 @@ class CompactConfig:
     )
     max_side: Side = 800  # pictures are drawn with at most this many pixels on their longer side
     # dB that the scene is assumed to have where no photographs are given: higher is more cautious
-    assumed_psnr: Decibels = 35.0
+    assumed_psnr: Annotated[float, Range(0.0, 200.0, above=True)] = 35.0
     phrases: tuple[str, ...] = ()  # asked before and after, beside those in the scene's phrasebook
 
 

@@ -14,6 +14,7 @@ from langsplat_core.config import CompactConfig, DatasetConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress
+from langsplat_core.ranges import check_settings
 from langsplat_core.scene import Camera, Scene, look_at
 
 log = logging.getLogger("langsplat")
@@ -46,6 +47,7 @@ def choose_views(scene: Scene, photos: Path | None, config: CompactConfig, progr
     `HOLD_OUT`-th view does. Raises InputError where fewer than two views are left or the photographs belong
     to another world than the scene.
     """
+    check_settings(config)
     if photos is not None:
         return _photographed(scene, photos, config, progress)
     if len(scene.cameras) >= 2:

@@ -127,8 +127,9 @@ def check_writable(path: Path | str) -> None:
     """InputError unless `save_scene` can write a scene of this name, and its companions, where it lies."""
     if Path(path).suffix.lower() not in _WRITERS:
         raise InputError(f"{path}: scenes are written as {', '.join(_WRITERS)}; choose such a name")
-    for file in (path, companion_path(path, language.SUFFIX), companion_path(path, cameras_json.SUFFIX)):
-        check_output_file(file)
+    check_output_file(path)
+    for suffix in (language.SUFFIX, cameras_json.SUFFIX):
+        check_output_file(companion_path(path, suffix))
 
 
 def save_scene(path: Path | str, scene: Scene) -> None:

@@ -37,7 +37,7 @@ WRITING = [
         f"bench {name} --out {{}}"
         for name in ("raster", "gains", "lift", "load", "memory", "paper", "phrases")
     ),
-    *(f"bench {name} --out {{}}" for name in ("query s.ply", "steps", "verdict", "words")),
+    *(f"bench {name} --out {{}}" for name in ("paper", "query s.ply", "steps", "verdict", "words")),
     *(f"bench {name} --work {{}}" for name in ("gains", "lift", "paper", "phrases", "verdict", "words")),
     "bench verdict --fit {}.json",
 ]

@@ -120,7 +120,7 @@ def test_views_that_measure_do_not_rank(scene):
     assert not set(map(id, views.ranking)) & set(map(id, views.measuring))
     thinned = choose_views(scene, None, replace(CONFIG, views=4), silent)
     assert (len(thinned.ranking), len(thinned.measuring)) == (2, 2)
-    with pytest.raises(InputError, match="at least 2"):
+    with pytest.raises(InputError, match="--views 1: must be 2 to"):
         choose_views(scene, None, replace(CONFIG, views=1), silent)
 
 

@@ -42,7 +42,7 @@ def test_half_a_colmap_model_is_no_model(tmp_path: Path) -> None:
 @pytest.mark.parametrize("side", [0, -5, 3])
 def test_a_useless_size_is_refused(tmp_path: Path, side: int) -> None:
     write_colmap(tmp_path)
-    with pytest.raises(InputError, match="max_side"):
+    with pytest.raises(InputError, match=r"--dataset\.max-side"):
         load_capture(tmp_path, DatasetConfig(max_side=side), tmp_path / "work")
 
 

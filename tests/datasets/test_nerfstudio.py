@@ -235,5 +235,5 @@ def test_a_dataset_may_say_how_long_its_unit_is(tmp_path: Path) -> None:
         rewrite(tmp_path, {**data, "metres_per_unit": wrong})
         with pytest.raises(FormatError, match="metres_per_unit"):
             load(tmp_path)
-    with pytest.raises(InputError, match="metres_per_unit is 0; must be above 0"):
+    with pytest.raises(InputError, match=r"--dataset\.metres-per-unit 0: must be above 0"):
         load_capture(tmp_path, DatasetConfig(metres_per_unit=0.0), tmp_path / "work")

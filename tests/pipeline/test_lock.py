@@ -29,12 +29,14 @@ def test_a_second_one_is_told_who_is_there_and_a_dead_one_holds_nothing(tmp_path
         other.wait()
         assert (work / LOCK).exists()
         with sole_use(work):
-            assert f"process {os.getpid()} " in (work / LOCK).read_text()
+            assert (work / LOCK).read_text().startswith(f"process {os.getpid()} ")
 
 
 def test_one_after_the_other_and_never_two_in_one_process(tmp_path: Path) -> None:
+    work = tmp_path / "c"
     for _ in range(2):
-        with sole_use(tmp_path), pytest.raises(InputError, match="--work"), sole_use(tmp_path):
+        with sole_use(work), pytest.raises(InputError, match="--work"), sole_use(work):
             pass
     with sole_use(tmp_path / "a"), sole_use(tmp_path / "b"):
-        pass
+        (tmp_path / "a" / "result").touch()
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a", LOCK, "result"]  # b held nothing

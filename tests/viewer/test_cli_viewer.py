@@ -177,8 +177,8 @@ def test_what_cannot_work_is_one_line(viewer, folder, arguments, reason):
         (["--headless"], "add --out"),
         (["--headless", "--out", "a.jpg"], "end the name in .png"),
         (["--headless", "--out", "folder.png"], "is a folder"),
-        (["--headless", "--out", "blobs.ply/a.png"], "cannot be written"),
-        (["--headless", "--out", "x" * 5000 + ".png"], "cannot be written"),
+        (["--headless", "--out", "blobs.ply/a.png"], "is a file, not a folder"),
+        (["--headless", "--out", "x" * 5000 + ".png"], "choose a shorter one"),
         (["--out", "a.png"], "add --headless"),
     ],
 )

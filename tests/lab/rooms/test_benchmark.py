@@ -143,7 +143,7 @@ def test_truth_masks_refuse_a_strange_photograph(run, capture):
     [
         (EvalSynthetic(replace(TINY, seeds=(101, SEED))), "bundled scene's room"),
         (EvalSynthetic(replace(TINY, seeds=())), "at least one"),
-        (EvalSynthetic(replace(TINY, views=5)), "at least 8"),
+        (EvalSynthetic(replace(TINY, views=5)), "--views 5: must be 8 to"),
         (EvalSynthetic(scene="a.ply"), "belong together"),
         (EvalSynthetic(TINY, paper_order=True), "needs --scene"),
     ],
