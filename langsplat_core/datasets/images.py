@@ -111,7 +111,10 @@ def _read_for(photo: Photo) -> tuple[Image.Image, PhotoIntrinsics]:
             f"{photo.path} is {picture.width}x{picture.height} pixels but its camera is "
             f"{intrinsics.width}x{intrinsics.height}; use the photographs that the cameras were computed from"
         )
-    return picture, photo.intrinsics.regridded(*picture.size)
+    try:
+        return picture, photo.intrinsics.regridded(*picture.size)
+    except ValueError as error:  # a camera of one or two pixels, at the edge of what a lens may be
+        raise InputError(f"{photo.path}: {error}; export the cameras again") from None
 
 
 def _fits(size: tuple[int, int], intrinsics: PhotoIntrinsics) -> bool:

@@ -91,8 +91,8 @@ def _check_size(name: str, picture: Image.Image, file_size: int) -> None:
     if picture.width * picture.height > most:
         raise PictureError(
             name,
-            f"declares {picture.width}x{picture.height} pixels; at most {most // 10**6} million are read of "
-            f"a file of {file_size} bytes",
+            f"declares {picture.width}x{picture.height} pixels; at most {most // 10**6} million are read "
+            f"from a file of {file_size} bytes",
         )
 
 

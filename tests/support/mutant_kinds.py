@@ -1,12 +1,8 @@
 """Every kind of input file that is damaged in tests: good samples, how to damage them, and how they are
 read."""
 
-import gzip
 import io
-import struct
-import zipfile
-import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,14 +26,14 @@ from tests.support.file_samples import (
     sog_files,
     zipped,
 )
-from tests.support.mutants import mutant
+from tests.support.mutants import Wound, mutant
 from tests.support.scenes import random_camera, random_gaussians
 from tests.support.small_datasets import write_colmap, write_nerfstudio
 from tests.support.splat_samples import ksplat_bytes, splat_bytes, spz_bytes
+from tests.support.wrapped_mutants import in_gzip, in_png, in_zip
 
 SCENE = random_gaussians(20, sh_degree=1)
 PLAIN = random_gaussians(300, seed=1)
-Damage = Callable[[bytes, Sequence[bytes], np.random.Generator], bytes]
 
 
 @dataclass(frozen=True)
@@ -47,7 +43,7 @@ class MutantKind:
     file: str  # where the mutants are written, below the folder of the test
     samples: Callable[[Path], list[bytes]]  # also writes what has to lie beside them into the folder
     read: Callable[[Path], float]  # the share of sound content
-    damage: Damage = mutant
+    damage: Wound = mutant
 
 
 def scene_share(path: Path) -> float:
@@ -67,90 +63,6 @@ def _whole(read: Callable[[Path], object]) -> Callable[[Path], float]:
         return 1.0
 
     return share
-
-
-# -- damage below a wrapping that would notice it ------------------------------------------------------------
-
-
-def _half(inner: Damage) -> Damage:
-    return lambda data, others, rng: (inner if rng.random() < 0.6 else mutant)(data, others, rng)
-
-
-@_half
-def in_zip(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> bytes:
-    """One member is damaged, missing, or packed by another method; the checksums are right."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    name = str(rng.choice(list(members)))
-    same = [member for member in members.values() if len(member) > 100]
-    buffer = io.BytesIO()
-    methods = [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]
-    method = methods[int(rng.choice([0, 0, 1, 1, 1, 1, 1, 2, 3]))]
-    with zipfile.ZipFile(buffer, "w", method) as archive:
-        for other, content in members.items():
-            if other == name:
-                content = (
-                    in_png(content, same, rng) if content[:4] == b"\x89PNG" else mutant(content, same, rng)
-                )
-            archive.writestr(other, content)
-    packed = buffer.getvalue()
-    return mutant(packed, others, rng) if rng.random() < 0.2 else packed
-
-
-@_half
-def in_gzip(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> bytes:
-    if data[:2] != b"\x1f\x8b":
-        return mutant(data, others, rng)
-    plain = [gzip.decompress(other) for other in others if other[:2] == b"\x1f\x8b"]
-    return gzip.compress(mutant(gzip.decompress(data), plain, rng), 1)
-
-
-def _unfolded(content: bytes) -> bytes:
-    try:
-        return zlib.decompress(content)
-    except zlib.error:  # damaged already
-        return content
-
-
-@_half
-def in_png(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> bytes:
-    """Chunks whose content, order or number is damaged, with right lengths and checksums."""
-    chunks, place = [], 8
-    while place + 8 <= len(data):
-        (length,) = struct.unpack(">I", data[place : place + 4])
-        chunks.append((data[place + 4 : place + 8], data[place + 8 : place + 8 + length]))
-        place += 12 + length
-    for _ in range(int(rng.integers(1, 3))):
-        index = int(rng.integers(len(chunks)))
-        name, content = chunks[index]
-        match int(rng.integers(6)):
-            case 0:
-                chunks.insert(int(rng.integers(len(chunks) + 1)), chunks[index])
-            case 1 if len(chunks) > 1:
-                del chunks[index]
-            case 2:
-                names = [
-                    b"IHDR",
-                    b"PLTE",
-                    b"tRNS",
-                    b"iCCP",
-                    b"tEXt",
-                    b"zTXt",
-                    b"iTXt",
-                    b"eXIf",
-                    b"acTL",
-                    b"fcTL",
-                ]
-                chunks[index] = (names[int(rng.integers(len(names)))], content)
-            case 3 if name == b"IDAT":
-                chunks[index] = (name, zlib.compress(mutant(_unfolded(content), [], rng)))
-            case _:
-                chunks[index] = (name, mutant(content, [], rng))
-    body = b"".join(
-        struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
-        for name, content in chunks
-    )
-    return data[:8] + body
 
 
 # -- samples -------------------------------------------------------------------------------------------------
@@ -316,11 +228,11 @@ def photograph(path: Path) -> float:
     return 1.0
 
 
-def _photographs(kind: str, damage: Damage = mutant) -> MutantKind:
+def _photographs(kind: str, damage: Wound = mutant) -> MutantKind:
     return MutantKind("a.png", pictures(kind), photograph, damage)  # the name's ending plays no part
 
 
-def _scenes(file: str, *samples: bytes, damage: Damage = mutant) -> MutantKind:
+def _scenes(file: str, *samples: bytes, damage: Wound = mutant) -> MutantKind:
     return MutantKind(file, lambda _: [*samples], scene_share, damage)
 
 
