@@ -34,8 +34,8 @@ class QueryScene:
     scene: tyro.conf.Positional[Path]
     """A trained scene, *.ply with its language field beside it."""
     texts: tyro.conf.Positional[tuple[str, ...]]
-    """Phrases, each in quotes if it has several words; "," and ";" separate them too. One that cannot be asked
-    is named on stderr, and the others are answered; with none left the exit code is 2."""
+    """Phrases, each in quotes if it has several words; "," and ";" separate them too. What cannot be asked
+    is named on stderr, and the rest is answered; with nothing left the exit code is 2."""
     level: LevelChoice = "auto"
     """Semantic level; auto takes the coarsest of those that answer nearly best."""
     whole: bool = False

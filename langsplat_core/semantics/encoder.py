@@ -63,8 +63,9 @@ class TextTower(Protocol):
     def logits(self) -> Logits | None:
         """As the weights state it; None where a family does not need it."""
 
-    def encode(self, texts: list[str]) -> Any:
-        """(B, D) float tensor, of any length, of B phrases."""
+    def encode(self, texts: list[str]) -> Array:
+        """(B, D) float32 vectors, of any length, of B > 0 phrases. Raises InputError and EncoderError as
+        `tokens.check_whole`: no part of a phrase is left out in silence."""
 
 
 class PictureTower(Protocol):
@@ -147,7 +148,8 @@ class PhraseEncoder:
         for text in texts:
             self._check(text)
         said = [self._said(text) for text in texts]
-        parts = [self._encode(said[i : i + TEXT_BATCH]) for i in range(0, len(texts), TEXT_BATCH)]
+        starts = range(0, len(texts), TEXT_BATCH)
+        parts = [unit(self._tower.encode(said[i : i + TEXT_BATCH])) for i in starts]
         return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
 
     def _check(self, text: str) -> None:
@@ -167,12 +169,6 @@ class PhraseEncoder:
         if self._words is None:
             return text
         return " ".join(self._taught(word) or "" for word in WORD.findall(text.lower()))
-
-    def _encode(self, texts: list[str]) -> Array:
-        import torch
-
-        with torch.inference_mode():
-            return unit(self._tower.encode(texts).float().cpu().numpy())
 
 
 class Encoder:
@@ -241,9 +237,17 @@ class Encoder:
 
         mean, std = self._pictures.statistics
         pixels = (crops.astype(np.float32) / 255 - mean) / std
-        with torch.inference_mode():
-            inputs = torch.from_numpy(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))).to(self._device)
-            return unit(self._pictures.encode(inputs).float().cpu().numpy())
+        inputs = torch.from_numpy(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))).to(self._device)
+        return unit(inferred(lambda: self._pictures.encode(inputs)))
+
+
+def inferred(forward: Callable[[], Any]) -> Array:
+    """The float32 array of a torch tensor that `forward` computes, without gradients."""
+    import torch
+
+    with torch.inference_mode():
+        values: Array = forward().float().cpu().numpy()
+    return values
 
 
 def _reading(weights: Weights, temperature: float) -> Reading:
