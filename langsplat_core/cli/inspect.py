@@ -29,14 +29,18 @@ class Inspect:
     """Print JSON."""
 
     def run(self) -> None:
-        summary = summarise(load_scene(self.scene))
+        scene = load_scene(self.scene)
+        summary = summarise(scene)
         size = disk_bytes(self.scene)
         if self.json:
-            print(json.dumps({"scene": str(self.scene), "disk_bytes": size, **asdict(summary)}, indent=1))
+            said = {"scene": str(self.scene), "disk_bytes": size, "unread": scene.unread, **asdict(summary)}
+            print(json.dumps(said, indent=1))
             return
         table = Table.grid(padding=(0, 2))
         for name, value in [("on disk", f"{size / 1e6:.2f} MB, companions included"), *_lines(summary)]:
             table.add_row(name, Text(value))
+        for reason in scene.unread:
+            table.add_row("not read", Text(reason))
         Console().print(table)
 
 

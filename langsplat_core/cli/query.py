@@ -15,7 +15,7 @@ from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.formats import load_scene
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import check_phrase, run_phrase
-from langsplat_core.query.engine import NO_FIELD, LoadEncoder, QueryEngine, TextEncoder
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, no_field
 from langsplat_core.query.phrase_tree import Atom
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.places import peak_pixel
@@ -56,7 +56,7 @@ class QueryScene:
     def run(self) -> None:
         scene = load_scene(self.scene)
         if scene.language is None:
-            raise InputError(f"{self.scene}: {NO_FIELD}")
+            raise InputError(f"{self.scene}: {no_field(scene)}")
         if not self.texts:
             raise InputError("no phrase given; for example: langsplat query scene.ply 'red cup'")
         camera = _camera(scene, self.camera)

@@ -10,6 +10,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.compiled import plain
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
+from langsplat_core.formats.language import SUFFIX
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import AnswerRule, QueryResult, by_peak, by_regions
 from langsplat_core.query.instances import Instance, find_instances
@@ -23,6 +24,12 @@ from langsplat_core.scene.phrases import phrase_key, tidy
 BATCH = 256  # phrases that are encoded, and compared with codewords, at a time
 SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them
 NO_FIELD = "this scene has no language field: it can be looked at, not searched; `langsplat train` makes one"
+
+
+def no_field(scene: Scene) -> str:
+    """Why a scene without a language field has none."""
+    unread = [reason for reason in scene.unread if SUFFIX in reason]
+    return f"it can be looked at, not searched: {unread[0]}" if unread else NO_FIELD
 
 
 class TextEncoder(Protocol):
@@ -70,7 +77,7 @@ class QueryEngine:
     def field(self) -> LanguageField:
         """The scene's language field; InputError where it has none."""
         if self.scene.language is None:
-            raise InputError(NO_FIELD)
+            raise InputError(no_field(self.scene))
         return self.scene.language
 
     @property

@@ -117,7 +117,8 @@ def test_a_vocabulary_makes_words_unknown(tmp_path: Path) -> None:
     assert encoder.unknown_words("Red, APPLE handl") == ("handl",)
     assert encoder.encode_texts(["Red  mug"]).shape == (1, 24)
     with pytest.raises(
-        EncoderError, match=r"'handl' \(did you mean 'handle'\?\); .* 7 words, such as apple, .*--clip\.model laion/"
+        EncoderError,
+        match=r"'handl' \(did you mean 'handle'\?\); .* 7 words, such as apple, .*--clip\.model laion/",
     ) as error:
         encoder.encode_texts(["handl"])
     assert "\n" not in str(error.value)
