@@ -44,29 +44,29 @@ class RadianceConfig:
     geometry learn faster (see `training.radiance.schedule`).
     """
 
-    steps: int = 30_000
-    reference_steps: int = 30_000
-    backend: Literal["auto", "cpu", "cuda"] = "auto"
-    sh_degree: int = 3
-    sh_degree_every: int = 1_000
-    max_gaussians: int = 1_000_000
-    lambda_dssim: float = 0.2
+    steps: int = 30_000  # of training
+    reference_steps: int = 30_000  # of the schedules that follow
+    backend: Literal["auto", "cpu", "cuda"] = "auto"  # what rasterizes
+    sh_degree: int = 3  # highest degree of the spherical harmonics, 0 to 3
+    sh_degree_every: int = 1_000  # steps after which the degree grows by one
+    max_gaussians: int = 1_000_000  # never more than so many
+    lambda_dssim: float = 0.2  # share of 1 - SSIM in the loss; the rest is L1
     position_lr_init: float = 1.6e-4  # times the cameras' extent
-    position_lr_final: float = 1.6e-6
+    position_lr_final: float = 1.6e-6  # at the last step, times the cameras' extent
     feature_lr: float = 2.5e-3  # higher SH coefficients: a twentieth
-    opacity_lr: float = 0.05
-    scale_lr: float = 5e-3
-    rotation_lr: float = 1e-3
-    densify_from: int = 500
-    densify_until: int = 15_000
-    densify_every: int = 100
+    opacity_lr: float = 0.05  # of opacity logits
+    scale_lr: float = 5e-3  # of logarithms of scales
+    rotation_lr: float = 1e-3  # of quaternions
+    densify_from: int = 500  # first step at which Gaussians are split, cloned and pruned
+    densify_until: int = 15_000  # last step of that
+    densify_every: int = 100  # steps between two of them
     densify_grad: float = 2e-4  # mean norm of the gradient by the 2D mean, in NDC
     percent_dense: float = 0.01  # of the extent: larger Gaussians split, smaller ones are cloned
-    opacity_reset_every: int = 3_000
-    prune_opacity: float = 5e-3
+    opacity_reset_every: int = 3_000  # steps between two resets of all opacities to at most 0.01
+    prune_opacity: float = 5e-3  # fainter Gaussians are removed
     coarse_fraction: float = 1 / 3  # of the steps, at the start, on pictures of half the size; INRIA: 0
     checkpoint_every: int = 2_000  # steps of this run
-    seed: int = 0
+    seed: int = 0  # of random numbers
 
 
 @dataclass(frozen=True)
@@ -79,16 +79,16 @@ class MaskConfig:
     # layers of crops that SAM sees beside the whole picture, 2 x 2 in the first: 0 as the paper's text,
     # 1 as its code, which takes five times as long
     crop_layers: int = 0
-    points_per_side: int = 32
-    points_per_batch: int = 64
-    predicted_iou: float = 0.7
-    stability: float = 0.85
-    stability_offset: float = 1.0
-    box_nms: float = 0.7
-    min_region: int = 100  # px
-    nms_iou: float = 0.8
-    nms_score: float = 0.7
-    nms_inner: float = 0.5
+    points_per_side: int = 32  # of the grid that SAM is asked at
+    points_per_batch: int = 64  # asked at a time
+    predicted_iou: float = 0.7  # least quality that SAM says of a mask it keeps
+    stability: float = 0.85  # least stability of a mask that is kept
+    stability_offset: float = 1.0  # of the two cuts whose overlap is the stability, in logits
+    box_nms: float = 0.7  # overlap of boxes from which the worse mask goes
+    min_region: int = 100  # px; smaller regions and holes are removed
+    nms_iou: float = 0.8  # overlap of masks of a level from which the worse one goes
+    nms_score: float = 0.7  # least score of a mask behind that
+    nms_inner: float = 0.5  # how far inside another a mask may lie
 
 
 @dataclass(frozen=True)
@@ -96,22 +96,22 @@ class ClipConfig:
     """The vision-language encoder: CLIP, SigLIP, SigLIP 2 or TIPS v2."""
 
     model: str = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"  # hub id, folder, or "demo" for the bundled one
-    batch: int = 32
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    batch: int = 32  # pictures per forward pass
+    device: Literal["auto", "cpu", "cuda"] = "auto"  # where it runs
 
 
 @dataclass(frozen=True)
 class CodecConfig:
     """How a Gaussian keeps a CLIP vector: by the number of a codeword, or as latents (paper section 3.2)."""
 
-    kind: Literal["codebook", "autoencoder", "linear"] = "codebook"
+    kind: Literal["codebook", "autoencoder", "linear"] = "codebook"  # how vectors are kept
     size: int = 0  # codewords of a codebook; 0: as many as `max_relevancy_error` asks for
     max_relevancy_error: float = 0.005  # mean over the scene's vectors and a few hundred phrases
     latent_dim: int = 3  # numbers that the other kinds keep
     steps: int = 4_000  # of the autoencoder's training, as are the following
-    batch: int = 256
+    batch: int = 256  # vectors per step
     lr: float = 3e-3  # 7e-4 in the public code: with as many steps a quarter more error
-    seed: int = 0
+    seed: int = 0  # of random numbers
 
 
 @dataclass(frozen=True)
@@ -122,11 +122,11 @@ class LiftConfig:
     # one-pass: the paper's latents, averaged as W^T H / W^T 1; gradient: trained by Adam, as in the paper
     mode: Literal["median", "mean", "one-pass", "gradient"] = "median"
     chunk: int = 32  # mask channels per gather pass, where a backend cannot lift label maps at once
-    backend: Literal["auto", "cpu", "cuda"] = "auto"
+    backend: Literal["auto", "cpu", "cuda"] = "auto"  # what lifts
     steps: int = 30_000  # of mode gradient, as are the following
-    lr: float = 2.5e-3
-    start: Literal["one-pass", "zeros-as-published"] = "one-pass"
-    seed: int = 0
+    lr: float = 2.5e-3  # learning rate
+    start: Literal["one-pass", "zeros-as-published"] = "one-pass"  # what mode gradient starts from
+    seed: int = 0  # of random numbers
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable
 from typing import Protocol
 
+from langsplat_core import __version__
 from langsplat_core.errors import LangSplatError
 
 _FRAME = re.compile(r"[│╭╮╰╯]|─+")
@@ -39,12 +40,17 @@ def one_line(box: str) -> str:
     return f"{words or heading or 'unusable arguments'} (see --help)"
 
 
-def main(program: str, parser: Callable[[], Command]) -> int:
+def main(program: str, parser: Callable[[], Command]) -> int:  # noqa: PLR0911  one end a row
     """Parse and run; returns the exit code."""
+    if sys.argv[1:] == ["--version"]:
+        print(f"{program} {__version__}")
+        return 0
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
             command = parser()
+    except LangSplatError as error:
+        return _fail(program, str(error))
     except SystemExit as stop:
         if stop.code in (0, None):
             return 0

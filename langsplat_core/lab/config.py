@@ -24,23 +24,23 @@ class DemoEncoderConfig:
     rooms: int = 400  # random rooms that crops are rendered from
     views: int = 3  # photographs of each room
     plain_crops: int = 8_000  # crops of nothing but a colour or a texture
-    steps: int = 8_000
+    steps: int = 8_000  # of training
     batch: int = 128  # crops per step
     phrases: int = 192  # phrases per step
-    lr: float = 1e-3
-    seed: int = 0
+    lr: float = 1e-3  # largest learning rate
+    seed: int = 0  # of random numbers
 
 
 @dataclass(frozen=True)
 class BenchmarkConfig:
     """Fresh rooms, and the method that is measured in them (`langsplat eval synthetic`)."""
 
-    tiers: tuple[Tier, ...] = TIERS
+    tiers: tuple[Tier, ...] = TIERS  # how crowded the rooms are
     seeds: tuple[int, ...] = (101,)  # one room of every tier each; never that of the bundled scene
     views: int = 48  # photographs of each room; every eighth is held out
     size: tuple[int, int] = (400, 300)  # width and height, pixels
     steps: int = 1_500  # of radiance training
-    max_gaussians: int = 50_000
+    max_gaussians: int = 50_000  # of a room
     masks: MaskOrigin = "truth"
     encoder: str = "demo"  # "demo" for the bundled one, a folder, or a hub id
     codec: CodecConfig = field(default_factory=CodecConfig)
@@ -55,7 +55,7 @@ class BenchmarkConfig:
 class LiftBenchConfig:
     """Ways from masks to meanings, compared in one room (`langsplat bench lift`)."""
 
-    tier: Tier = "clutter"
+    tier: Tier = "clutter"  # how crowded the rooms are
     seed: int = 101
     """Of the room; never that of the bundled scene."""
     masks: tuple[MaskOrigin, ...] = MASK_ORIGINS
@@ -78,7 +78,7 @@ class LiftBenchConfig:
 class GainBenchConfig:
     """Changes of the lifting, and the rooms they are tried in (`langsplat bench gains`)."""
 
-    tier: Tier = "clutter"
+    tier: Tier = "clutter"  # how crowded the rooms are
     seeds: tuple[int, ...] = (201, 202)
     """Of the rooms; never that of the bundled scene."""
     masks: tuple[MaskOrigin, ...] = ("truth", "wrong")
@@ -91,7 +91,7 @@ class GainBenchConfig:
 class VerdictBenchConfig:
     """Rooms in which present and absent things are asked for (`langsplat bench verdict`)."""
 
-    tiers: tuple[Tier, ...] = ("clutter",)
+    tiers: tuple[Tier, ...] = ("clutter",)  # how crowded the rooms are
     seeds: tuple[int, ...] = (301, 302, 303, 304, 305)
     """Of the rooms; never that of the bundled scene, nor 201 to 203, which calibrate the demo encoder."""
     masks: MaskOrigin = "truth"
@@ -103,7 +103,7 @@ class VerdictBenchConfig:
 class WordBenchConfig:
     """Rooms whose things are named (`langsplat bench words`)."""
 
-    tier: Tier = "clutter"
+    tier: Tier = "clutter"  # how crowded the rooms are
     seeds: tuple[int, ...] = (203,)
     """Of the rooms; never that of the bundled scene."""
 
@@ -112,7 +112,7 @@ class WordBenchConfig:
 class PhraseBenchConfig:
     """Rooms in which phrases with structure are asked whole and composed (`langsplat bench phrases`)."""
 
-    tier: Tier = "clutter"
+    tier: Tier = "clutter"  # how crowded the rooms are
     seeds: tuple[int, ...] = (203,)
     """Of the rooms; never that of the bundled scene, nor 201 and 202, on which composing was tuned."""
 
