@@ -63,29 +63,29 @@ class RadianceConfig:
     geometry learn faster (see `training.radiance.schedule`).
     """
 
-    steps: Count = 30_000
-    reference_steps: Count = 30_000
-    backend: Literal["auto", "cpu", "cuda"] = "auto"
-    sh_degree: Annotated[int, Range(0, 3)] = 3
-    sh_degree_every: Count = 1_000
-    max_gaussians: Count = 1_000_000
-    lambda_dssim: Share = 0.2
+    steps: Count = 30_000  # of training
+    reference_steps: Count = 30_000  # of the schedules that follow
+    backend: Literal["auto", "cpu", "cuda"] = "auto"  # what rasterizes
+    sh_degree: Annotated[int, Range(0, 3)] = 3  # highest degree of the spherical harmonics, 0 to 3
+    sh_degree_every: Count = 1_000  # steps after which the degree grows by one
+    max_gaussians: Count = 1_000_000  # never more than so many
+    lambda_dssim: Share = 0.2  # share of 1 - SSIM in the loss; the rest is L1
     position_lr_init: Rate = 1.6e-4  # times the cameras' extent
-    position_lr_final: Rate = 1.6e-6
+    position_lr_final: Rate = 1.6e-6  # at the last step, times the cameras' extent
     feature_lr: Rate = 2.5e-3  # higher SH coefficients: a twentieth
-    opacity_lr: Rate = 0.05
-    scale_lr: Rate = 5e-3
-    rotation_lr: Rate = 1e-3
-    densify_from: CountOrZero = 500
-    densify_until: CountOrZero = 15_000
-    densify_every: Count = 100
+    opacity_lr: Rate = 0.05  # of opacity logits
+    scale_lr: Rate = 5e-3  # of logarithms of scales
+    rotation_lr: Rate = 1e-3  # of quaternions
+    densify_from: CountOrZero = 500  # first step at which Gaussians are split, cloned and pruned
+    densify_until: CountOrZero = 15_000  # last step of that
+    densify_every: Count = 100  # steps between two of them
     densify_grad: NotNegative = 2e-4  # mean norm of the gradient by the 2D mean, in NDC
     percent_dense: Share = 0.01  # of the extent: larger Gaussians split, smaller ones are cloned
-    opacity_reset_every: Count = 3_000
-    prune_opacity: Share = 5e-3
+    opacity_reset_every: Count = 3_000  # steps between two resets of all opacities to at most 0.01
+    prune_opacity: Share = 5e-3  # fainter Gaussians are removed
     coarse_fraction: Share = 1 / 3  # of the steps, at the start, on pictures of half the size; INRIA: 0
     checkpoint_every: Count = 2_000  # steps of this run
-    seed: Seed = 0
+    seed: Seed = 0  # of random numbers
 
 
 @dataclass(frozen=True)
@@ -98,16 +98,16 @@ class MaskConfig:
     # layers of crops that SAM sees beside the whole picture, 2 x 2 in the first: 0 as the paper's text,
     # 1 as its code, which takes five times as long
     crop_layers: Annotated[int, Range(0, 4)] = 0
-    points_per_side: Annotated[int, Range(1, 1_024)] = 32
-    points_per_batch: Count = 64
-    predicted_iou: Share = 0.7
-    stability: Share = 0.85
-    stability_offset: NotNegative = 1.0
-    box_nms: Share = 0.7
+    points_per_side: Annotated[int, Range(1, 1_024)] = 32  # of the grid that SAM is asked at
+    points_per_batch: Count = 64  # asked at a time
+    predicted_iou: Share = 0.7  # least quality that SAM says of a mask it keeps
+    stability: Share = 0.85  # least stability of a mask that is kept
+    stability_offset: NotNegative = 1.0  # of the two cuts whose overlap is the stability, in logits
+    box_nms: Share = 0.7  # overlap of boxes from which the worse mask goes
     min_region: CountOrZero = 100  # px
-    nms_iou: Share = 0.8
-    nms_score: Share = 0.7
-    nms_inner: Share = 0.5
+    nms_iou: Share = 0.8  # overlap of masks of a level from which the worse one goes
+    nms_score: Share = 0.7  # least score of a mask behind that
+    nms_inner: Share = 0.5  # how far inside another a mask may lie
 
 
 @dataclass(frozen=True)
@@ -115,23 +115,23 @@ class ClipConfig:
     """The vision-language encoder: CLIP, SigLIP, SigLIP 2 or TIPS v2."""
 
     model: str = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"  # hub id, folder, or "demo" for the bundled one
-    batch: Count = 32
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    batch: Count = 32  # pictures per forward pass
+    device: Literal["auto", "cpu", "cuda"] = "auto"  # where it runs
 
 
 @dataclass(frozen=True)
 class CodecConfig:
     """How a Gaussian keeps a CLIP vector: by the number of a codeword, or as latents (paper section 3.2)."""
 
-    kind: Literal["codebook", "autoencoder", "linear"] = "codebook"
+    kind: Literal["codebook", "autoencoder", "linear"] = "codebook"  # how vectors are kept
     # codewords of a codebook; 0: as many as `max_relevancy_error` asks for
     size: Annotated[int, Range(0, 65_535)] = 0
     max_relevancy_error: Share = 0.005  # mean over the scene's vectors and a few hundred phrases
     latent_dim: Annotated[int, Range(1, 4_096)] = 3  # numbers that the other kinds keep
     steps: Count = 4_000  # of the autoencoder's training, as are the following
-    batch: SeveralCount = 256
+    batch: SeveralCount = 256  # vectors per step
     lr: Rate = 3e-3  # 7e-4 in the public code: with as many steps a quarter more error
-    seed: Seed = 0
+    seed: Seed = 0  # of random numbers
 
 
 @dataclass(frozen=True)
@@ -142,11 +142,11 @@ class LiftConfig:
     # one-pass: the paper's latents, averaged as W^T H / W^T 1; gradient: trained by Adam, as in the paper
     mode: Literal["median", "mean", "one-pass", "gradient"] = "median"
     chunk: Count = 32  # mask channels per gather pass, where a backend cannot lift label maps at once
-    backend: Literal["auto", "cpu", "cuda"] = "auto"
+    backend: Literal["auto", "cpu", "cuda"] = "auto"  # what lifts
     steps: Count = 30_000  # of mode gradient, as are the following
-    lr: Rate = 2.5e-3
-    start: Literal["one-pass", "zeros-as-published"] = "one-pass"
-    seed: Seed = 0
+    lr: Rate = 2.5e-3  # learning rate
+    start: Literal["one-pass", "zeros-as-published"] = "one-pass"  # what mode gradient starts from
+    seed: Seed = 0  # of random numbers
 
 
 @dataclass(frozen=True)

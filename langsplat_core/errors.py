@@ -1,5 +1,7 @@
 """Errors a user can cause. Each message is one line: what is wrong, and how to mend it."""
 
+from collections.abc import Mapping, Sequence
+
 LINE_LIMIT = 1000  # characters of a message: room for two long paths, not for a file's content
 
 
@@ -43,3 +45,16 @@ class BackendError(LangSplatError):
 
 class EncoderError(LangSplatError):
     """A text or image encoder whose weights are absent or that does not know what was asked."""
+
+
+class UnknownWordError(EncoderError):
+    """Words that a text encoder was never taught."""
+
+    def __init__(self, near: Mapping[str, Sequence[str]], remedy: str) -> None:
+        """near: each unknown word and the known ones written like it, the nearest first."""
+        self.near = {word: tuple(close) for word, close in near.items()}
+        super().__init__(f"the encoder does not know {', '.join(map(self._said, self.near))}; {remedy}")
+
+    def _said(self, word: str) -> str:
+        close = " or ".join(map(repr, self.near[word]))
+        return f"{word!r} (did you mean {close}?)" if close else repr(word)

@@ -11,7 +11,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.formats import load_scene
 from langsplat_core.formats.cameras_json import read_cameras
 from langsplat_core.formats.sog import META_NAME
-from langsplat_core.query.engine import NO_FIELD
+from langsplat_core.query.engine import no_field
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_viewer.viewer import Services
@@ -83,7 +83,7 @@ def chosen_display(choice: DisplayChoice, queries: tuple[str, ...]) -> Display:
 def check_display(scene: Scene, display: Display, queries: tuple[str, ...]) -> None:
     """InputError for a display or query that this scene cannot answer."""
     if scene.language is None and (queries or DISPLAYS[display].needs_field):
-        raise InputError(f"{scene.path}: {NO_FIELD}")
+        raise InputError(f"{scene.path}: {no_field(scene)}")
     if DISPLAYS[display].needs_query and not queries:
         raise InputError(f"--display {display} shows a search; add --query TEXT")
 

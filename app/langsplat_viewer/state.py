@@ -11,6 +11,7 @@ from langsplat_core.display.colour_maps import MAX_QUERIES
 from langsplat_core.display.compose import HeatRanges
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.suggestions import Suggestions
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.relevancy import FLOOR
 from langsplat_viewer.controls import Extent, OrbitCamera
@@ -30,6 +31,7 @@ class Query:
     result: QueryResult | None = None
     reading: str = ""  # how the phrase was understood, where it has structure
     problem: str = ""  # why it has no result, one line
+    meant: str = ""  # the phrase with its unknown words replaced by known ones, where there are such
     pending: bool = True
 
 
@@ -80,6 +82,10 @@ class ViewerState:
     level: LevelChoice = "auto"
     queries: list[Query] = field(default_factory=list)
     typed: str = ""
+    asked: list[str] = field(default_factory=list)  # what was searched for, the oldest first
+    recalled: int = 0  # index into `asked` of the phrase last recalled; its length: none
+    suggestions: Suggestions = field(default_factory=Suggestions)
+    suggestions_of: Scene | None = None  # the scene for which they were looked for
     focus_input: bool = False  # the query box takes the keyboard at the next frame
 
     path_typed: str = ""

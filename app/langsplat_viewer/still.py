@@ -1,5 +1,6 @@
 """One picture without a window: `langsplat-viewer --headless --out picture.png`."""
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +13,12 @@ from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.display.latent_colours import latent_colours
 from langsplat_core.errors import BackendError, InputError
 from langsplat_core.files import check_output_file
+from langsplat_core.formats.language import SUFFIX
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.compose import run_phrase
+from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.scene import LEVELS, Camera, Reading, Scene
+from langsplat_core.scene.phrases import split_phrases
 from langsplat_viewer.frame import Backend
 from langsplat_viewer.headless import render_picture
 from langsplat_viewer.options import check_display, chosen_camera, latent_level
@@ -24,6 +27,7 @@ from langsplat_viewer.state import SLOTS
 from langsplat_viewer.viewer import Services
 
 DEFAULT_SIZE = (1280, 720)
+log = logging.getLogger("langsplat")
 
 
 @dataclass(frozen=True)
@@ -77,9 +81,10 @@ def draw_still(request: StillRequest, services: Services, progress: Progress = s
     check_display(scene, request.display, request.queries)
     camera = still_camera(scene, request.camera, request.size)
     engine = services.engine(scene)
-    results = [
-        run_phrase(engine, phrase, request.level, camera, progress).answer for phrase in request.queries
-    ]
+    phrases = [phrase for text in request.queries for phrase in split_phrases(text) or [text]]
+    for phrase in phrases:  # before anything slow is done
+        check_phrase(engine, phrase, camera, progress)
+    results = [run_phrase(engine, phrase, request.level, camera, progress).answer for phrase in phrases]
     shown = results[-SLOTS:]  # as in the window, where a fourth query takes the oldest one's colour
 
     progress("drawing", 0.8)
@@ -101,6 +106,9 @@ def draw_still(request: StillRequest, services: Services, progress: Progress = s
         raise BackendError(f"OpenGL cannot draw {size} here ({error}); try --backend cpu") from None
     except OSError as error:
         raise InputError(f"--out {request.out}: cannot be written ({error.strerror or error})") from None
+    for reason in scene.unread:
+        if SUFFIX in reason:  # of the cameras it was said when they were read
+            log.warning("opened without its language field: %s", reason)
     return [f"{request.out}: {size}, {request.display}", *(describe(result) for result in results)]
 
 

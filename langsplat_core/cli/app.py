@@ -1,6 +1,9 @@
 """`langsplat ...`: thin commands, each a dataclass of arguments and one call into the layers below."""
 
 import sys
+from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
+from types import MappingProxyType
 
 from tyro.extras import SubcommandApp
 
@@ -27,52 +30,97 @@ from langsplat_core.cli.run import Command, main
 from langsplat_core.cli.scale import Scale
 from langsplat_core.cli.select import Select
 from langsplat_core.cli.train import train_command
+from langsplat_core.errors import InputError
 
 # Options that are asked for often enough to have a short name.
 ALIASES = {"--max-relevancy-error": "--codec.max-relevancy-error"}
 
 
+COMMANDS: Mapping[str, type[Command]] = MappingProxyType(
+    {
+        "query": QueryScene,
+        "describe": Describe,
+        "select": Select,
+        "scale": Scale,
+        "convert": Convert,
+        "compact": Compact,
+        "inspect": Inspect,
+        "doctor": Doctor,
+    }
+)
+# Name -> what it is about, and its commands.
+GROUPS: Mapping[str, tuple[str, Mapping[str, type[Command]]]] = MappingProxyType(
+    {
+        "demo": (
+            "Make the bundled scene, its photographs and its encoder.",
+            {"build": DemoBuild, "dataset": DemoDataset, "encoder": DemoEncoder, "sheet": DemoSheet},
+        ),
+        "eval": (
+            "Measure a scene against ground truth.",
+            {
+                "synthetic": EvalSynthetic,
+                "lerf-ovs": EvalLerfOvs,
+                "3d-ovs": EvalOvs3d,
+                "scannet": EvalScanNet,
+            },
+        ),
+        "bench": (
+            "Speed against error, measured in one run.",
+            {
+                "raster": BenchRaster,
+                "gains": BenchGains,
+                "lift": BenchLift,
+                "paper": BenchPaper,
+                "load": BenchLoad,
+                "memory": BenchMemory,
+                "phrases": BenchPhrases,
+                "query": BenchQuery,
+                "steps": BenchSteps,
+                "verdict": BenchVerdict,
+                "words": BenchWords,
+            },
+        ),
+    }
+)
+
+
 def parse(args: list[str]) -> Command:
-    demo, evaluate, bench = SubcommandApp(), SubcommandApp(), SubcommandApp()
-    demo.command(name="build")(DemoBuild)
-    demo.command(name="dataset")(DemoDataset)
-    demo.command(name="encoder")(DemoEncoder)
-    demo.command(name="sheet")(DemoSheet)
-    evaluate.command(name="synthetic")(EvalSynthetic)
-    evaluate.command(name="lerf-ovs")(EvalLerfOvs)
-    evaluate.command(name="3d-ovs")(EvalOvs3d)
-    evaluate.command(name="scannet")(EvalScanNet)
-    bench.command(name="raster")(BenchRaster)
-    bench.command(name="gains")(BenchGains)
-    bench.command(name="lift")(BenchLift)
-    bench.command(name="paper")(BenchPaper)
-    bench.command(name="load")(BenchLoad)
-    bench.command(name="memory")(BenchMemory)
-    bench.command(name="phrases")(BenchPhrases)
-    bench.command(name="query")(BenchQuery)
-    bench.command(name="steps")(BenchSteps)
-    bench.command(name="verdict")(BenchVerdict)
-    bench.command(name="words")(BenchWords)
+    """The command that the words of a command line name; SystemExit as tyro raises it, with its message on
+    stderr. Raises InputError for a command that does not exist."""
+    check_commands(args)
     app = SubcommandApp()
     app.command(name="train")(train_command(args))
-    app.command(name="query")(QueryScene)
-    app.command(name="describe")(Describe)
-    app.command(name="select")(Select)
-    app.command(name="scale")(Scale)
-    app.command(name="convert")(Convert)
-    app.command(name="compact")(Compact)
-    app.command(name="inspect")(Inspect)
-    app.command(name="doctor")(Doctor)
-    app.command(demo, name="demo", help="Make the bundled scene, its photographs and its encoder.")
-    app.command(evaluate, name="eval", help="Measure a scene against ground truth.")
-    app.command(bench, name="bench", help="Speed against error, measured in one run.")
+    for name, command in COMMANDS.items():
+        app.command(name=name)(command)
+    for name, (about, commands) in GROUPS.items():
+        group = SubcommandApp()
+        for member, command in commands.items():
+            group.command(name=member)(command)
+        app.command(group, name=name, help=about)
     args = [ALIASES.get(word, word) for word in args]
-    command: Command = app.cli(
+    found: Command = app.cli(
         prog="langsplat",
         description="Train, query, convert and measure 3D Gaussian scenes with a language field.",
         args=args,
     )
-    return command
+    return found
+
+
+def check_commands(args: Sequence[str]) -> None:
+    """InputError that names a command which does not exist, and those that are written like it."""
+    known: Iterable[str] = ("train", *COMMANDS, *GROUPS)
+    for place, word in enumerate(args[:2]):
+        if word.startswith("-"):
+            return
+        if word not in known:
+            near = get_close_matches(word, known, n=2)
+            hint = (
+                f"did you mean {' or '.join(map(repr, near))}?" if near else f"there are {', '.join(known)}"
+            )
+            raise InputError(f"no command {' '.join(args[: place + 1])!r}; {hint}")
+        if word not in GROUPS:
+            return
+        known = tuple(GROUPS[word][1])
 
 
 def entry() -> None:

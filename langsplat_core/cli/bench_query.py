@@ -12,7 +12,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.formats import load_scene
 from langsplat_core.lab.config import QueryBenchConfig
 from langsplat_core.progress import TerminalProgress
-from langsplat_core.query.engine import NO_FIELD
+from langsplat_core.query.engine import no_field
 from langsplat_core.semantics.encoders import load_text_encoder
 
 
@@ -31,7 +31,7 @@ class BenchQuery:
         c = self.config
         scene = load_scene(self.scene)
         if scene.language is None:
-            raise InputError(f"{self.scene}: {NO_FIELD}")
+            raise InputError(f"{self.scene}: {no_field(scene)}")
         from langsplat_core.lab.speed.queries import figures, measure_queries, query_table
 
         encoder = load_text_encoder(scene.language.encoder_id)

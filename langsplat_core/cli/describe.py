@@ -16,7 +16,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.formats import load_scene
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.describe import Describer, Levels, Words
-from langsplat_core.query.engine import NO_FIELD, QueryEngine
+from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.query.inventory import Entry, Spot
 from langsplat_core.query.words import Word
 from langsplat_core.raster import load_lifting_rasterizer
@@ -81,7 +81,7 @@ class Describe:
     def _check(self, scene: Scene) -> None:
         """InputError for arguments that do not go with the scene or each other, before anything is loaded."""
         if scene.language is None:
-            raise InputError(f"{self.scene}: {NO_FIELD}")
+            raise InputError(f"{self.scene}: {no_field(scene)}")
         if self.pixel is not None and self.gaussian is not None:
             raise InputError("--pixel and --gaussian are two questions; ask one of them")
         count = len(scene.gaussians)

@@ -15,8 +15,19 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from langsplat_core import __version__
+from langsplat_core.errors import BackendError, LangSplatError
 from langsplat_core.formats import load_scene
 from langsplat_core.formats.summary import NEEDLE, OPACITY_EDGES, SceneSummary, disk_bytes, summarise
+from langsplat_core.semantics.encoder import OPEN_MODEL
+from langsplat_core.semantics.encoders import load_text_encoder
+
+LIBRARIES = {
+    "EGL": "libegl1",
+    "GL": "libgl1",
+    "X11": "libx11-6",
+    "usb-1.0": "libusb-1.0-0",
+}  # Debian's packages
 
 
 @dataclass(frozen=True)
@@ -29,14 +40,18 @@ class Inspect:
     """Print JSON."""
 
     def run(self) -> None:
-        summary = summarise(load_scene(self.scene))
+        scene = load_scene(self.scene)
+        summary = summarise(scene)
         size = disk_bytes(self.scene)
         if self.json:
-            print(json.dumps({"scene": str(self.scene), "disk_bytes": size, **asdict(summary)}, indent=1))
+            said = {"scene": str(self.scene), "disk_bytes": size, "unread": scene.unread, **asdict(summary)}
+            print(json.dumps(said, indent=1))
             return
         table = Table.grid(padding=(0, 2))
         for name, value in [("on disk", f"{size / 1e6:.2f} MB, companions included"), *_lines(summary)]:
             table.add_row(name, Text(value))
+        for reason in scene.unread:
+            table.add_row("not read", Text(reason))
         Console().print(table)
 
 
@@ -94,16 +109,45 @@ class Doctor:
     """Print what this machine has, for a report of trouble."""
 
     def run(self) -> None:
+        print(f"langsplat        {__version__}")
         print(
             f"python           {platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores"
         )
         for package in ("numpy", "numba", "torch", "transformers", "moderngl", "imgui-bundle", "open3d"):
             print(f"{package:<16} {_version(package)}")
-        for library in ("EGL", "GL", "X11", "usb-1.0"):
-            print(f"lib{library:<13} {ctypes.util.find_library(library) or 'missing'}")
+        for library, package in LIBRARIES.items():
+            found = ctypes.util.find_library(library)
+            print(f"lib{library:<13} {found or f'missing: apt install {package}'}")
         print(f"DISPLAY          {os.environ.get('DISPLAY') or 'not set: use --headless'}")
+        print(f"OpenGL           {_opengl()}")
+        print(f"text encoder     {_encoder()}")
         has_gsplat = importlib.util.find_spec("gsplat") is not None
         print(f"CUDA backend     {'gsplat is installed' if has_gsplat else 'gsplat is not installed'}")
+
+
+def _opengl() -> str:
+    """What draws without a window, or why it cannot and what to do."""
+    from langsplat_core.raster.opengl.context import create_egl_context
+
+    try:
+        context = create_egl_context()
+    except BackendError as error:
+        return str(error)
+    try:
+        about = context.info
+        return f"{about['GL_VERSION']} on {about['GL_RENDERER']}"
+    finally:
+        context.release()
+
+
+def _encoder() -> str:
+    """Whether the bundled encoder works, and what real photographs want."""
+    try:
+        encoder = load_text_encoder("demo")
+        encoder.encode_texts(["red mug"])
+    except LangSplatError as error:
+        return str(error)
+    return f"demo: works; for real photographs `hf download {OPEN_MODEL}`, see docs/encoders.md"
 
 
 def _version(package: str) -> str:

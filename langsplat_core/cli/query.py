@@ -11,16 +11,17 @@ import tyro
 
 from langsplat_core.cli.instances import instance_json, table, unit_of
 from langsplat_core.config import CountOrZero, LevelChoice, PictureConfig, Positive
-from langsplat_core.errors import InputError
+from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.formats import load_scene
 from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.compose import run_phrase
-from langsplat_core.query.engine import NO_FIELD, QueryEngine
+from langsplat_core.query.compose import check_phrase, run_phrase
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, no_field
 from langsplat_core.query.phrase_tree import Atom
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.places import peak_pixel
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import LEVELS, Camera, Scene
+from langsplat_core.scene.phrases import split_phrases
 from langsplat_core.semantics.encoders import load_text_encoder
 
 PAPER_FILTER = 20  # px, mean filter before the peak is taken (paper, implementation details)
@@ -33,7 +34,8 @@ class QueryScene:
     scene: tyro.conf.Positional[Path]
     """A trained scene, *.ply with its language field beside it."""
     texts: tyro.conf.Positional[tuple[str, ...]]
-    """Phrases, each in quotes if it has several words."""
+    """Phrases, each in quotes if it has several words; "," and ";" separate them too. What cannot be asked
+    is named on stderr, and the rest is answered; with nothing left the exit code is 2."""
     level: LevelChoice = "auto"
     """Semantic level; auto takes the coarsest of those that answer nearly best."""
     whole: bool = False
@@ -54,14 +56,14 @@ class QueryScene:
     def run(self) -> None:
         scene = load_scene(self.scene)
         if scene.language is None:
-            raise InputError(f"{self.scene}: {NO_FIELD}")
+            raise InputError(f"{self.scene}: {no_field(scene)}")
         if not self.texts:
             raise InputError("no phrase given; for example: langsplat query scene.ply 'red cup'")
         camera = _camera(scene, self.camera)
-        engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
+        engine = QueryEngine(scene, _once(load_text_encoder), encoder_id=self.encoder)
         unit = unit_of(scene, self.scale)
         answers, tables = [], []
-        for text in self.texts:
+        for text in self._askable(engine, camera):
             result, understood = self._ask(engine, text, camera)
             answer = _answer(result, scene, engine, camera, self.mode) | {"reading": understood}
             things = engine.instances(result, self.instances) if result.found else ()
@@ -86,12 +88,55 @@ class QueryScene:
                 sep="\n",
             )
 
+    def _askable(self, engine: QueryEngine, camera: Camera | None) -> list[str]:
+        """The phrases that can be asked; of the others it is said why on stderr, before anything is searched.
+        Raises that reason where none is left."""
+        phrases = [phrase for text in self.texts for phrase in split_phrases(text) or [text]]
+        problems: dict[str, LangSplatError] = {}
+        for phrase in phrases:
+            try:
+                if self._plainly:
+                    engine.text_vector(phrase)
+                else:
+                    check_phrase(engine, phrase, camera)
+            except LangSplatError as error:
+                problems[phrase] = error
+        reasons = {
+            str(error): [p for p, e in problems.items() if str(e) == str(error)]
+            for error in problems.values()
+        }
+        if len(problems) == len(dict.fromkeys(phrases)):
+            raise InputError("; ".join(reasons))
+        for reason, unasked in reasons.items():
+            print(f"langsplat: not asked: {', '.join(map(repr, unasked))}: {reason}", file=sys.stderr)
+        return [phrase for phrase in phrases if phrase not in problems]
+
+    @property
+    def _plainly(self) -> bool:
+        return self.whole or self.mode == "paper"
+
     def _ask(self, engine: QueryEngine, text: str, camera: Camera | None) -> tuple[QueryResult, str | None]:
         """The answer, and how the phrase was read where it has structure."""
-        if self.whole or self.mode == "paper":
+        if self._plainly:
             return engine.run(text, self.level), None
         composed = run_phrase(engine, text, self.level, camera)
         return composed.answer, None if isinstance(composed.tree, Atom) else composed.reading
+
+
+def _once(load: LoadEncoder) -> LoadEncoder:
+    """Fails as it first did: a hub out of reach is not asked again by every phrase."""
+    failed: list[EncoderError] = []
+
+    def load_once(model: str) -> TextEncoder:
+        if failed:
+            raise failed[0]
+        try:
+            return load(model)
+        except EncoderError as error:
+            failed.append(error)
+            raise
+
+    return load_once
 
 
 def _camera(scene: Scene, index: int) -> Camera | None:

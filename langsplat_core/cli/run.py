@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Protocol
 
+from langsplat_core import __version__
 from langsplat_core.cli.checks import check_arguments
 from langsplat_core.errors import LangSplatError, printable_line
 from langsplat_core.files import shown
@@ -59,10 +60,15 @@ def one_line(box: str) -> str:
 def main(program: str, parser: Callable[[], Command]) -> int:
     """Parse and run; returns the exit code."""
     _prepare_standard_output()
+    if sys.argv[1:] == ["--version"]:
+        print(f"{program} {__version__}")
+        return 0
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
             command = parser()
+    except LangSplatError as error:
+        return _fail(program, str(error))
     except SystemExit as stop:
         if stop.code in (0, None):
             return 0

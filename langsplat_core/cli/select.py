@@ -26,7 +26,7 @@ from langsplat_core.formats.shapes import (
 )
 from langsplat_core.query.combined import Combination, Combined, combine
 from langsplat_core.query.compose import run_phrase
-from langsplat_core.query.engine import NO_FIELD, QueryEngine
+from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.query.hulls import hulls
 from langsplat_core.query.instances import Instance, find_instances
 from langsplat_core.query.selection import grow, of_rows, shrink, union
@@ -72,7 +72,7 @@ class Select:
         self._check()
         scene = load_scene(self.scene)
         if scene.language is None:
-            raise InputError(f"{self.scene}: {NO_FIELD}")
+            raise InputError(f"{self.scene}: {no_field(scene)}")
         unit = unit_of(scene, self.scale)
         engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
         answer = combine([run_phrase(engine, text, self.level).answer for text in self.texts], self.combine)

@@ -78,21 +78,31 @@ def load_scene(path: Path | str) -> Scene:
     """A scene with its language field and cameras, where they lie beside it.
 
     Cameras are `<scene>.cameras.json`, or for a PLY in the folder structure of the INRIA code
-    (`model/point_cloud/iteration_N/point_cloud.ply`) `model/cameras.json`. Raises InputError and
-    FormatError as `load_gaussians` does, also when a companion is unusable or made for other Gaussians.
+    (`model/point_cloud/iteration_N/point_cloud.ply`) `model/cameras.json`. A companion that is unusable or
+    made for other Gaussians is left out, with the reason in `Scene.unread`. Raises InputError and FormatError
+    as `load_gaussians` does.
     """
     scene = load_without_language(path)
     sidecar = companion_path(path, language.SUFFIX)
     if not exists(sidecar):
         return scene
-    return replace(scene, language=read_language(sidecar, scene.gaussians.means))
+    try:
+        return replace(scene, language=read_language(sidecar, scene.gaussians.means))
+    except InputError as error:
+        return replace(scene, unread=(*scene.unread, str(error)))
 
 
 def load_without_language(path: Path | str) -> Scene:
     """As `load_scene`, but without the language field, which is not even looked at."""
     path = Path(path)
-    scene, cameras = _read_scene(path), _cameras_path(path)
-    return replace(scene, cameras=read_cameras(cameras) if exists(cameras) else (), path=path)
+    scene, cameras = replace(_read_scene(path), path=path), _cameras_path(path)
+    if not exists(cameras):
+        return scene
+    try:
+        return replace(scene, cameras=read_cameras(cameras))
+    except InputError as error:
+        log.warning("opened without its cameras: %s", error)
+        return replace(scene, unread=(str(error),))
 
 
 def _read_scene(path: Path) -> Scene:
@@ -139,9 +149,14 @@ def save_scene(path: Path | str, scene: Scene) -> None:
     dependence nor the mark of antialiasing. All keep the rows' order. All files are first written whole under
     temporary names. Then the old companions are removed, the scene's file renamed into place, and last the
     new companions. Interrupted anywhere, there is the old scene or the new one, perhaps without companions,
-    but never a scene beside companions of another.
+    but never a scene beside companions of another. A scene with companions that could not be read is not
+    written: that would remove them. Raises InputError then, and as `check_writable`.
     """
     path = Path(path)
+    if scene.unread:
+        raise InputError(
+            f"not written without what lies beside it; mend or remove it first: {scene.unread[0]}"
+        )
     check_writable(path)
     write = _WRITERS[path.suffix.lower()]
     sidecar, cameras = companion_path(path, language.SUFFIX), companion_path(path, cameras_json.SUFFIX)

@@ -31,23 +31,23 @@ class DemoEncoderConfig:
     rooms: Count = 400  # random rooms that crops are rendered from
     views: Count = 3  # photographs of each room
     plain_crops: CountOrZero = 8_000  # crops of nothing but a colour or a texture
-    steps: Count = 8_000
+    steps: Count = 8_000  # of training
     batch: Count = 128  # crops per step
     phrases: Count = 192  # phrases per step
-    lr: Rate = 1e-3
-    seed: Seed = 0
+    lr: Rate = 1e-3  # largest learning rate
+    seed: Seed = 0  # of random numbers
 
 
 @dataclass(frozen=True)
 class BenchmarkConfig:
     """Fresh rooms, and the method that is measured in them (`langsplat eval synthetic`)."""
 
-    tiers: tuple[Tier, ...] = TIERS
+    tiers: tuple[Tier, ...] = TIERS  # how crowded the rooms are
     seeds: Seeds = (101,)  # one room of every tier each; never that of the bundled scene
     views: Views = 48  # photographs of each room; every eighth is held out
     size: Size = (400, 300)  # width and height, pixels
     steps: Count = 1_500  # of radiance training
-    max_gaussians: Count = 50_000
+    max_gaussians: Count = 50_000  # of a room
     masks: MaskOrigin = "truth"
     encoder: str = "demo"  # "demo" for the bundled one, a folder, or a hub id
     codec: CodecConfig = field(default_factory=CodecConfig)
@@ -62,7 +62,7 @@ class BenchmarkConfig:
 class LiftBenchConfig:
     """Ways from masks to meanings, compared in one room (`langsplat bench lift`)."""
 
-    tier: Tier = "clutter"
+    tier: Tier = "clutter"  # how crowded the rooms are
     seed: Seed = 101
     """Of the room; never that of the bundled scene."""
     masks: tuple[MaskOrigin, ...] = ("truth", "wrong", "graph")
@@ -102,7 +102,7 @@ class PaperBenchConfig:
 class GainBenchConfig:
     """Changes of the lifting, and the rooms they are tried in (`langsplat bench gains`)."""
 
-    tier: Tier = "clutter"
+    tier: Tier = "clutter"  # how crowded the rooms are
     seeds: Seeds = (201, 202)
     """Of the rooms; never that of the bundled scene."""
     masks: tuple[MaskOrigin, ...] = ("truth", "wrong")
@@ -115,7 +115,7 @@ class GainBenchConfig:
 class VerdictBenchConfig:
     """Rooms in which present and absent things are asked for (`langsplat bench verdict`)."""
 
-    tiers: tuple[Tier, ...] = ("clutter",)
+    tiers: tuple[Tier, ...] = ("clutter",)  # how crowded the rooms are
     seeds: Seeds = (301, 302, 303, 304, 305)
     """Of the rooms; never that of the bundled scene, nor 201 to 203, which calibrate the demo encoder."""
     masks: MaskOrigin = "truth"
@@ -127,7 +127,7 @@ class VerdictBenchConfig:
 class WordBenchConfig:
     """Rooms whose things are named (`langsplat bench words`)."""
 
-    tier: Tier = "clutter"
+    tier: Tier = "clutter"  # how crowded the rooms are
     seeds: Seeds = (203,)
     """Of the rooms; never that of the bundled scene."""
 
@@ -136,7 +136,7 @@ class WordBenchConfig:
 class PhraseBenchConfig:
     """Rooms in which phrases with structure are asked whole and composed (`langsplat bench phrases`)."""
 
-    tier: Tier = "clutter"
+    tier: Tier = "clutter"  # how crowded the rooms are
     seeds: Seeds = (203,)
     """Of the rooms; never that of the bundled scene, nor 201 and 202, on which composing was tuned."""
 

@@ -22,6 +22,7 @@ from langsplat_core.query.phrase_tree import (
     Tree,
     Union,
     Without,
+    atoms,
     children,
     reading,
 )
@@ -81,6 +82,21 @@ def run_phrase(
             return ComposedResult(placed(engine.surface, answer), tree, tuple(asking.asked.values()))
     answer = engine.run(tree.text, level, progress)
     return ComposedResult(answer, tree, (answer,))
+
+
+def check_phrase(
+    engine: QueryEngine, text: str, viewpoint: Camera | None = None, progress: Progress = silent
+) -> None:
+    """Raise what `run_phrase` would, without searching: for a phrase that names nothing, unknown words, an
+    encoder that cannot be loaded, a viewpoint that is needed. What was encoded for it is kept."""
+    tree = parse(text)
+    if not isinstance(tree, Atom):
+        _check_viewpoint(tree, viewpoint)
+    try:
+        engine.text_vectors([atom.text for atom in atoms(tree)], progress)
+    except EncoderError:
+        if phrase_key(text) not in engine.field.phrasebook:
+            raise
 
 
 def _check_viewpoint(tree: Tree, viewpoint: Camera | None) -> None:

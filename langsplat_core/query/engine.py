@@ -9,19 +9,27 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import plain
 from langsplat_core.config import LevelChoice
-from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.errors import EncoderError, InputError, UnknownWordError
+from langsplat_core.formats.language import SUFFIX
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import AnswerRule, QueryResult, by_peak, by_regions
 from langsplat_core.query.instances import Instance, find_instances
 from langsplat_core.query.lookup import Lookup, build_lookup
 from langsplat_core.query.regions import Regions, build_regions
 from langsplat_core.query.surface import Surface, build_surface
+from langsplat_core.query.vocabulary import STOP_WORDS, check_names, only
 from langsplat_core.scene import CANONICAL_PHRASES, LanguageField, Scene
 from langsplat_core.scene.phrases import phrase_key, tidy
 
 BATCH = 256  # phrases that are encoded, and compared with codewords, at a time
 SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them
 NO_FIELD = "this scene has no language field: it can be looked at, not searched; `langsplat train` makes one"
+
+
+def no_field(scene: Scene) -> str:
+    """Why a scene without a language field has none."""
+    unread = [reason for reason in scene.unread if SUFFIX in reason]
+    return f"it can be looked at, not searched: {unread[0]}" if unread else NO_FIELD
 
 
 class TextEncoder(Protocol):
@@ -32,6 +40,9 @@ class TextEncoder(Protocol):
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
         """Words of `text` that the encoder was never taught; empty if it cannot tell."""
+
+    def near_words(self, word: str) -> tuple[str, ...]:
+        """Words it was taught that are written like an unknown one, the nearest first."""
 
 
 LoadEncoder = Callable[[str], TextEncoder]  # from a hub id, a folder or "demo"; may raise EncoderError
@@ -59,13 +70,14 @@ class QueryEngine:
         self._load_encoder = load_encoder
         self._encoder_id = encoder_id
         self._encoder: TextEncoder | None = None
+        self._encoded: dict[str, Array] = {}  # phrases asked so far, 2 KB each at D = 512
         self._encoder_checked = False
 
     @property
     def field(self) -> LanguageField:
         """The scene's language field; InputError where it has none."""
         if self.scene.language is None:
-            raise InputError(NO_FIELD)
+            raise InputError(no_field(self.scene))
         return self.scene.language
 
     @property
@@ -112,8 +124,8 @@ class QueryEngine:
     def text_vector(self, phrase: str, progress: Progress = silent) -> Array:
         """(D,) unit vector of a phrase: from the scene's phrasebook, else from the encoder.
 
-        Raises InputError for an empty phrase, and EncoderError for unknown words, an encoder that is not the
-        scene's, or one that cannot be loaded.
+        Raises InputError for an empty phrase and one of stop words alone, UnknownWordError for words that the
+        encoder was never taught, and EncoderError for one that is not the scene's or cannot be loaded.
         """
         found: Array = self.text_vectors([phrase], progress)[0]
         return found
@@ -121,17 +133,16 @@ class QueryEngine:
     def text_vectors(self, phrases: Sequence[str], progress: Progress = silent) -> Array:
         """(Q, D) unit vectors of phrases, encoded together. Raises as `text_vector`."""
         book, keys = self.field.phrasebook, [phrase_key(phrase) for phrase in phrases]
-        if not all(keys):
-            raise InputError("the query is empty; type a word such as 'cup'")
-        fresh = [key for key in dict.fromkeys(keys) if key not in book]
-        known = dict(book)
+        fresh = [key for key in dict.fromkeys(keys) if key not in book and key not in self._encoded]
+        for key in fresh:
+            check_names(key.split())
         if fresh:
             encoder = self.load_encoder(progress)
             _check_words(encoder, fresh)
             for start in range(0, len(fresh), BATCH):
                 batch = fresh[start : start + BATCH]
-                known.update(zip(batch, self._encode(encoder, batch), strict=True))
-        return np.stack([known[key] for key in keys])
+                self._encoded.update(zip(batch, self._encode(encoder, batch), strict=True))
+        return np.stack([book[key] if key in book else self._encoded[key] for key in keys])
 
     def known_vectors(
         self, phrases: Iterable[str], progress: Progress = silent
@@ -140,7 +151,7 @@ class QueryEngine:
         (V, D) unit vectors: from the phrasebook, else encoded together. Raises EncoderError for an encoder
         that is not the scene's, or one that cannot be loaded."""
         book, keys = self.field.phrasebook, tuple(dict.fromkeys(map(phrase_key, phrases)))
-        fresh = [key for key in keys if key not in book]
+        fresh = [key for key in keys if key not in book and not only(STOP_WORDS, key.split())]
         known = dict(book)
         if fresh:
             encoder = self.load_encoder(progress)
@@ -234,9 +245,7 @@ class QueryEngine:
 
 
 def _check_words(encoder: TextEncoder, keys: Iterable[str]) -> None:
-    unknown = [word for key in keys for word in encoder.unknown_words(key)]
+    unknown = dict.fromkeys(word for key in keys for word in encoder.unknown_words(key))
     if unknown:
-        raise EncoderError(
-            f"the encoder does not know {', '.join(repr(word) for word in dict.fromkeys(unknown))}; "
-            "use other words, or a scene made with OpenCLIP weights"
-        )
+        near = {word: encoder.near_words(word) for word in unknown}
+        raise UnknownWordError(near, "use other words, or a scene made with OpenCLIP weights")

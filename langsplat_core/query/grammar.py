@@ -2,7 +2,7 @@
 
     query       = alternatives { exclusion alternatives }
     exclusion   = ", not" | "but not" | "and not" | "not" | "without" | "except" | "other than"
-    alternatives = all { "or" all }
+    alternatives = all { ("or" | ",") all }
     all         = clause { ("and" | "&" | "as well as") clause }
     clause      = [ superlative ] related [ "on the left" | "on the right" ]
     superlative = "biggest" | "smallest" | "nearest" | "farthest" | "highest" | "lowest" | "leftmost" | ...
@@ -14,11 +14,11 @@
 Y), not "children's book" (Y owns X), not "red handle" (Y only describes). "Y without X", X a part word,
 leaves out the X inside Y. Words that only describe are no thing, so that "red and blue ball" stays whole.
 Wherever a side of a construction would name nothing, the grammar finds nothing there, and the words are asked
-as one phrase. Word lists are in `query.vocabulary`.
+as one phrase. A line of several queries is separated by `scene.phrases.split_phrases`. Word lists are in
+`query.vocabulary`.
 """
 
 import re
-import unicodedata
 from typing import Literal
 
 from langsplat_core.errors import InputError
@@ -42,11 +42,12 @@ from langsplat_core.query.vocabulary import (
     ARTICLES,
     OWNERS,
     STOP_WORDS,
+    check_names,
     is_measure,
     is_part,
     only,
 )
-from langsplat_core.scene.phrases import tidy
+from langsplat_core.scene.phrases import tokens as tokens_of
 
 MAX_CHARACTERS = 400
 MAX_ATOMS = 12  # each is asked for itself
@@ -85,13 +86,6 @@ _EXCLUSIONS = tuple(
         *("but not", "and not", "other than", "not", "without", "except"),
     )
 )
-_SEPARATE = re.compile(r"[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)", re.IGNORECASE)
-_APOSTROPHES = str.maketrans(dict.fromkeys("’‘ʼ′＇´`", "'"))
-
-
-def split_queries(text: str) -> list[str]:
-    """The queries in a line, separated by ";" or ","; "mug, not red" is one. Empty ones are left out."""
-    return [part for part in (tidy(part) for part in _SEPARATE.split(text)) if part]
 
 
 def parse(text: str) -> Tree:
@@ -102,53 +96,19 @@ def parse(text: str) -> Tree:
     """
     if len(text) > MAX_CHARACTERS:
         raise InputError(f"a query of {len(text)} characters; use at most {MAX_CHARACTERS}")
-    tokens = _tokens(text)
+    tokens = tokens_of(text)
     words = [token for token in tokens if token != ","]
-    if not words:
-        raise InputError("the query is empty; type a word such as 'cup'")
-    if _exclusion_at(tokens, 0):
+    if words and _exclusion_at(tokens, 0):
         raise InputError(
             f"'{' '.join(words)[:60]}' only says what not to look for; "
             "begin with what to look for: 'mug, not red mug'"
         )
-    if only(STOP_WORDS, words):
-        raise InputError(
-            f"'{' '.join(words)[:60]}' names nothing to look for; type a thing such as 'red mug'"
-        )
+    check_names(words)
     tree = _query(tokens)
     count = len(atoms(tree))
     if count > MAX_ATOMS:
         raise InputError(f"a query of {count} phrases; ask at most {MAX_ATOMS} at a time")
     return tree
-
-
-def _tokens(text: str) -> list[str]:
-    """Words without quotes and outer punctuation, and commas."""
-    text = "".join(
-        " " if unicodedata.category(mark) in ("Cc", "Cs") else mark for mark in text.translate(_APOSTROPHES)
-    )
-    text = re.sub(r"(?<=\w)\s+'s\b", "'s", text)
-    found = []
-    for piece in re.findall(r",|[^\s,;]+", text):
-        word = "," if piece == "," else _bare(piece)
-        if word:
-            found.append(word)
-    while found and found[-1] == ",":
-        found.pop()
-    return found
-
-
-def _bare(word: str) -> str:
-    """`word` without punctuation around it; a possessive's apostrophe stays. "" where it is nothing else."""
-    if word == "&":
-        return word
-    marks = [unicodedata.category(mark)[0] in "PZ" or mark == "'" for mark in word]
-    if all(marks) or all(unicodedata.category(mark) in ("Cf", "Po", "Mn") for mark in word):
-        return ""
-    first, last = marks.index(False), len(marks) - marks[::-1].index(False)
-    return word[first:last] + (
-        "'" if word[last : last + 1] == "'" and first == 0 and word[last - 1] == "s" else ""
-    )
 
 
 def _query(tokens: list[str]) -> Tree:
@@ -185,8 +145,10 @@ def _exclusion_at(tokens: list[str], at: int) -> int:
 
 
 def _alternatives(tokens: list[str]) -> Tree:
-    words = [token for token in tokens if token != ","]
-    items = [_all(part) for part in _split(words, ("or",))]
+    ahead = [*(token.lower() for token in tokens[1:]), ""]
+    tokens = [token for token, then in zip(tokens, ahead, strict=True) if (token, then) != (",", "or")]
+    sides = _split(tokens, ("or", ","))
+    items = [_all([token for token in side if token != ","]) for side in sides]
     return items[0] if len(items) == 1 else Union(tuple(items))
 
 

@@ -1,5 +1,9 @@
 """The plain word lists by which the grammar of phrases tells a part from a thing; see `query.grammar`."""
 
+from collections.abc import Sequence
+
+from langsplat_core.errors import InputError
+
 
 def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
@@ -77,6 +81,16 @@ def is_measure(word: str) -> bool:
     return any(form in MEASURES for form in forms(word))
 
 
-def only(words: frozenset[str], tokens: list[str]) -> bool:
+def only(words: frozenset[str], tokens: Sequence[str]) -> bool:
     """Whether all `tokens` are among `words`, whatever their case; true of none."""
     return all(token.lower() in words for token in tokens)
+
+
+def check_names(words: Sequence[str]) -> None:
+    """InputError for no word, and for stop words alone, whose vectors are near anything."""
+    if not words:
+        raise InputError("the query is empty; type a word such as 'cup'")
+    if only(STOP_WORDS, words):
+        raise InputError(
+            f"'{' '.join(words)[:60]}' names nothing to look for; type a thing such as 'red mug'"
+        )

@@ -24,6 +24,7 @@ class Scene:
     antialiased: bool = False  # trained with Mip-Splatting's compensation, as its file says
     extras: Mapping[str, Array] = field(default_factory=dict)  # (N,) properties not read here
     metres_per_unit: float | None = None  # > 0; None: nobody said how long a world unit is
+    unread: tuple[str, ...] = ()  # why files that lie beside it could not be read, a line each
 
     def __post_init__(self) -> None:
         if self.metres_per_unit is not None and not 0 < self.metres_per_unit < np.inf:

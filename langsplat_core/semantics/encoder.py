@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.scene import Calibration, Odds, Reading
 from langsplat_core.semantics.weights import Weights
 
@@ -23,6 +23,7 @@ VOCABULARY = "vocabulary.txt"  # beside the weights: the only words the encoder 
 READING = "reading.json"  # beside the weights, optional: fields of `scene.Reading`, but for the temperature
 WORD = re.compile(r"[^\W_]+(?:'[^\W_]+)?")
 EXAMPLES = 12  # known words to name where a phrase has an unknown one
+SUGGESTIONS = 2  # known words offered for an unknown one
 TEXT_BATCH = 64  # phrases per forward pass
 Triple = tuple[float, float, float]
 SHARE_OF_SCALE = 0.1  # of a model's logit scale: the temperature of relevancy, see `Logits.temperature`
@@ -62,8 +63,9 @@ class TextTower(Protocol):
     def logits(self) -> Logits | None:
         """As the weights state it; None where a family does not need it."""
 
-    def encode(self, texts: list[str]) -> Any:
-        """(B, D) float tensor, of any length, of B phrases."""
+    def encode(self, texts: list[str]) -> Array:
+        """(B, D) float32 vectors, of any length, of B > 0 phrases. Raises InputError and EncoderError as
+        `tokens.check_whole`: no part of a phrase is left out in silence."""
 
 
 class PictureTower(Protocol):
@@ -123,16 +125,31 @@ class PhraseEncoder:
         """Words of `text` that the encoder was never taught; empty when it was taught open vocabulary."""
         if self._words is None:
             return ()
-        return tuple(word for word in WORD.findall(text.lower()) if word not in self._words)
+        return tuple(word for word in WORD.findall(text.lower()) if self._taught(word) is None)
+
+    def near_words(self, word: str) -> tuple[str, ...]:
+        """Words it was taught that are written like an unknown one, the nearest first."""
+        return tuple(get_close_matches(word.lower(), sorted(self._words or ()), n=SUGGESTIONS))
+
+    def _taught(self, word: str) -> str | None:
+        """The word in which the encoder was taught `word`: itself, or of a possessive its owner."""
+        assert self._words is not None
+        owner = word.partition("'")[0]
+        return next((form for form in (word, owner) if form in self._words), None)
 
     def encode_texts(self, texts: Sequence[str]) -> Array:
         """(M, D) float32 unit vectors of M phrases, raw: no prompt template, as in LangSplat.
 
-        Raises InputError for a phrase without a letter or digit, EncoderError for unknown words.
+        An encoder of a closed vocabulary is given its words and nothing else: any mark that its tokenizer
+        lacks might end the phrase. Raises InputError for a phrase without a letter or digit or with more
+        tokens than the model reads, UnknownWordError for words it was not taught, EncoderError for other
+        marks that it cannot read.
         """
         for text in texts:
             self._check(text)
-        parts = [self._encode(list(texts[i : i + TEXT_BATCH])) for i in range(0, len(texts), TEXT_BATCH)]
+        said = [self._said(text) for text in texts]
+        starts = range(0, len(texts), TEXT_BATCH)
+        parts = [unit(self._tower.encode(said[i : i + TEXT_BATCH])) for i in starts]
         return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
 
     def _check(self, text: str) -> None:
@@ -141,19 +158,17 @@ class PhraseEncoder:
         unknown = self.unknown_words(text)
         if unknown:
             words = sorted(self._words or ())
-            near = [match for word in unknown for match in get_close_matches(word, words, n=2)]
-            known = ", ".join(near or words[:: len(words) // EXAMPLES + 1])
-            raise EncoderError(
-                f"{', '.join(map(repr, unknown))}: not taught to the encoder '{self.id}', which knows "
-                f"{len(words)} words, such as {known}; a scene trained with `--clip.model {OPEN_MODEL}` "
-                "can be asked anything"
+            examples = ", ".join(words[:: len(words) // EXAMPLES + 1])
+            raise UnknownWordError(
+                {word: self.near_words(word) for word in unknown},
+                f"'{self.id}' was taught {len(words)} words, such as {examples}; a scene trained with "
+                f"`--clip.model {OPEN_MODEL}` can be asked anything",
             )
 
-    def _encode(self, texts: list[str]) -> Array:
-        import torch
-
-        with torch.inference_mode():
-            return unit(self._tower.encode(texts).float().cpu().numpy())
+    def _said(self, text: str) -> str:
+        if self._words is None:
+            return text
+        return " ".join(self._taught(word) or "" for word in WORD.findall(text.lower()))
 
 
 class Encoder:
@@ -199,6 +214,10 @@ class Encoder:
         """As `PhraseEncoder.unknown_words`."""
         return self._text.unknown_words(text)
 
+    def near_words(self, word: str) -> tuple[str, ...]:
+        """As `PhraseEncoder.near_words`."""
+        return self._text.near_words(word)
+
     def encode_texts(self, texts: Sequence[str]) -> Array:
         """As `PhraseEncoder.encode_texts`."""
         return self._text.encode_texts(texts)
@@ -218,9 +237,17 @@ class Encoder:
 
         mean, std = self._pictures.statistics
         pixels = (crops.astype(np.float32) / 255 - mean) / std
-        with torch.inference_mode():
-            inputs = torch.from_numpy(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))).to(self._device)
-            return unit(self._pictures.encode(inputs).float().cpu().numpy())
+        inputs = torch.from_numpy(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))).to(self._device)
+        return unit(inferred(lambda: self._pictures.encode(inputs)))
+
+
+def inferred(forward: Callable[[], Any]) -> Array:
+    """The float32 array of a torch tensor that `forward` computes, without gradients."""
+    import torch
+
+    with torch.inference_mode():
+        values: Array = forward().float().cpu().numpy()
+    return values
 
 
 def _reading(weights: Weights, temperature: float) -> Reading:

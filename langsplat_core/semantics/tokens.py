@@ -5,10 +5,11 @@ side is padded, whether an end token is there) differs between its versions, and
 """
 
 import json
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from langsplat_core.errors import EncoderError
+from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.semantics.weights import Weights
 
 FILE = "tokenizer.json"
@@ -23,7 +24,7 @@ class Tokens:
     tokenizer: Any  # tokenizers.Tokenizer
     length: int  # tokens per phrase
     pad: int
-    end: int | None  # put behind every phrase, also behind one that was cut; None: nothing
+    end: int | None  # put behind every phrase; None: nothing
 
     @property
     def is_unigram(self) -> bool:
@@ -31,14 +32,16 @@ class Tokens:
         return type(self.tokenizer.model).__name__ == "Unigram"
 
     def rows(self, texts: list[str]) -> tuple[Any, Any]:
-        """(B, length) int64 tensor of token numbers, and one of 1 where a token is no padding."""
+        """(B, length) int64 tensor of token numbers, and one of 1 where a token is no padding. Raises as
+        `check_whole`."""
         import torch
 
         ids = torch.full((len(texts), self.length), self.pad)
         used = torch.zeros_like(ids)
         tail = [] if self.end is None else [self.end]
         for row, found in enumerate(self.tokenizer.encode_batch(texts, add_special_tokens=False)):
-            tokens = found.ids[: self.length - len(tail)] + tail
+            check_whole(texts[row], found.ids, self.length - len(tail), set(tail))
+            tokens = found.ids + tail
             ids[row, : len(tokens)] = torch.tensor(tokens)
             used[row, : len(tokens)] = 1
         return ids, used
@@ -52,18 +55,35 @@ def load_tokens(weights: Weights, length: int, ends: bool) -> Tokens:
     path = weights.folder / FILE
     if not path.is_file():
         raise EncoderError(f"{weights.id}: no {FILE} in this folder, which its phrases are read with")
-    tokenizer = _read(weights, str(path))
-    tokenizer.no_truncation()
-    tokenizer.no_padding()
+    tokenizer = read_tokenizer(weights)
     pad = _number(weights, tokenizer, "pad_token")
     return Tokens(tokenizer, length, pad, _number(weights, tokenizer, "eos_token") if ends else None)
 
 
-def _read(weights: Weights, path: str) -> Any:
+def check_whole(text: str, ids: Sequence[int], room: int, ends: Collection[int]) -> None:
+    """Refuse a phrase of which a model would not see all.
+
+    ids: its tokens without those that begin and end a phrase; room: how many the model reads; ends: tokens
+    that end a phrase, which some tokenizers give for every mark that they cannot read. Raises InputError for
+    a phrase that is too long, EncoderError for one that would end early.
+    """
+    if len(ids) > room:
+        raise InputError(
+            f"'{text[:40]} ...' is too long: {len(ids)} tokens; this encoder reads {room}, so use fewer words"
+        )
+    if not set(ends).isdisjoint(ids):
+        raise EncoderError(f"{text[:80]!r} holds marks that this encoder cannot read; use plain words")
+
+
+def read_tokenizer(weights: Weights) -> Any:
+    """The folder's `tokenizers.Tokenizer`, which neither cuts nor pads. EncoderError for a damaged file."""
     from tokenizers import Tokenizer
 
     try:
-        return Tokenizer.from_file(path)
+        tokenizer = Tokenizer.from_file(str(weights.folder / FILE))
+        tokenizer.no_truncation()
+        tokenizer.no_padding()
+        return tokenizer
     except Exception as error:  # the library raises no narrower class for a damaged file
         reason = (str(error).splitlines() or ["unreadable"])[0]
         raise EncoderError(f"{weights.id}: {FILE} is no tokenizer ({reason})") from error

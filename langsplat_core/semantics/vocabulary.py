@@ -44,15 +44,16 @@ def read_vocabulary(path: Path) -> tuple[str, ...]:
 def _phrase(line: bytes, where: str) -> str:
     """The phrase of a line, "" where it has none; InputError that begins with `where` for a bad line."""
     try:
-        phrase = phrase_key(line.decode("utf-8"))
+        text = line.decode("utf-8").strip()
     except UnicodeDecodeError:
         raise InputError(f"{where}: is not UTF-8 text; save the list as plain text in UTF-8") from None
-    if not phrase or phrase.startswith(COMMENT):
+    if not text or text.startswith(COMMENT):
         return ""
-    if not phrase.isprintable():
+    if not " ".join(text.split()).isprintable():
         raise InputError(f"{where}: holds control characters; a vocabulary is plain text, a phrase per line")
+    phrase = phrase_key(text)
     if not any(character.isalnum() for character in phrase):
-        raise InputError(f"{where}: {phrase[:20]!r} has no letter or digit; write a phrase, or begin with #")
+        raise InputError(f"{where}: {text[:20]!r} has no letter or digit; write a phrase, or begin with #")
     if len(phrase) > LONGEST:
         raise InputError(
             f"{where}: {len(phrase)} characters, a phrase has at most {LONGEST}; write one phrase per line"

@@ -168,6 +168,8 @@ def loading_errors(id: str, kind: str) -> Iterator[None]:
 
 def torch_device(device: str) -> str:
     """What "auto" means here: cuda where PyTorch sees one, else cpu. EncoderError for an absent device."""
+    if device == "cpu":
+        return device  # without importing torch, which a small text encoder does without
     import torch
 
     if device == "auto":

@@ -13,7 +13,7 @@ import pytest
 from langsplat_core.cli import query
 from langsplat_core.cli.query import QueryScene
 from langsplat_core.config import INRIA
-from langsplat_core.errors import InputError
+from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.formats import (
     load_scene,
     save_scene,
@@ -89,6 +89,55 @@ def test_another_phrase_is_answered_by_the_encoder_named(tmp_path, monkeypatch, 
     QueryScene(tmp_path / "a.ply", ("mug",)).run()
     assert loaded == ["mine", "fake"]
     assert "Mug: found" in capsys.readouterr().out
+
+
+def test_an_unknown_word_is_said_first_and_the_rest_is_answered(tmp_path, monkeypatch, capsys):
+    save_scene(tmp_path / "a.ply", Scene(blobs(), fake_language()))
+    monkeypatch.setattr(query, "load_text_encoder", lambda name: FakeEncoder())
+    QueryScene(tmp_path / "a.ply", ("mug", "plamt", "the", "book or sofa", '"book"'), json=True).run()
+    out, err = capsys.readouterr()
+    assert [answer["phrase"] for answer in json.loads(out)] == ["mug", "book"]
+    plamt, the, sofa = err.splitlines()
+    assert plamt.startswith(
+        "langsplat: not asked: 'plamt': the encoder does not know 'plamt' (did you mean 'plant'?)"
+    )
+    assert "'the' names nothing" in the
+    assert "'book or sofa': the encoder does not know 'sofa';" in sofa
+
+
+def test_nothing_is_searched_before_all_is_checked(tmp_path, monkeypatch, capsys):
+    save_scene(tmp_path / "a.ply", Scene(blobs(), fake_language()))
+    monkeypatch.setattr(query, "load_text_encoder", lambda name: FakeEncoder())
+    monkeypatch.setattr(QueryEngine, "relevancy", lambda *_: pytest.fail("searched"))
+    for texts in (("sofa",), ("sofa", "the"), ("sofa; ?",)):
+        with pytest.raises(LangSplatError, match="does not know 'sofa'"):
+            QueryScene(tmp_path / "a.ply", texts).run()
+    assert capsys.readouterr() == ("", "")
+
+
+def test_an_encoder_that_cannot_be_loaded_is_tried_once(tmp_path, monkeypatch, capsys):
+    save_scene(tmp_path / "a.ply", Scene(blobs(), fake_language(phrasebook=True)))
+    tried = []
+
+    def absent(name):
+        tried.append(name)
+        raise EncoderError("no weights here")
+
+    monkeypatch.setattr(query, "load_text_encoder", absent)
+    QueryScene(tmp_path / "a.ply", ("mug", "book", "plant")).run()
+    out, err = capsys.readouterr()
+    assert out.startswith("book: found")
+    assert err == "langsplat: not asked: 'mug', 'plant': no weights here\n"
+    assert len(tried) == 1
+
+
+def test_commas_separate_phrases_and_exclusions_stay_one(tmp_path, monkeypatch, capsys):
+    save_scene(tmp_path / "a.ply", Scene(blobs(), fake_language()))
+    monkeypatch.setattr(query, "load_text_encoder", lambda name: FakeEncoder())
+    QueryScene(tmp_path / "a.ply", ("mug, plant; mug or book, not book",), json=True).run()
+    answers = json.loads(capsys.readouterr().out)
+    assert [answer["phrase"] for answer in answers] == ["mug", "plant", "mug or book, not book"]
+    assert answers[2]["reading"] == "(mug  or  book)  without  book"
 
 
 def test_the_things_of_an_answer_are_listed(tmp_path, capsys):

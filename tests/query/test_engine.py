@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import unit
-from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.errors import EncoderError, InputError, UnknownWordError
+from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.places import locate, peak_pixel
@@ -13,7 +14,7 @@ from langsplat_core.query.table import build_table, octahedral_to_sphere, sphere
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import LanguageField, LinearCodec, Scene
 from langsplat_core.semantics.relevancy import FLOOR, latent_relevancy, relevancy
-from tests.support.fakes import FakeEncoder, blob_scene
+from tests.support.fakes import WORDS, FakeEncoder, blob_scene
 from tests.support.two_blobs import D, random_codec, two_blob_scene
 
 
@@ -150,7 +151,10 @@ def test_engine_errors_say_what_to_do():
         def unknown_words(self, text):
             return tuple(word for word in text.split() if word == "flurb")
 
-    with pytest.raises(EncoderError, match="'flurb'"):
+        def near_words(self, word):
+            return ("blurb",)
+
+    with pytest.raises(UnknownWordError, match=r"'flurb' \(did you mean 'blurb'\?\); use other words"):
         QueryEngine(scene, lambda _: Small()).run("red flurb")
     with pytest.raises(EncoderError, match="3 numbers"):
         QueryEngine(scene, lambda _: Small()).run("red")
@@ -161,6 +165,58 @@ def test_engine_errors_say_what_to_do():
 
     with pytest.raises(EncoderError, match="other weights"):
         QueryEngine(scene, lambda _: Stranger()).run("red")
+
+
+@pytest.mark.parametrize("phrase", ["the", "A", "of", "'the'!", "of the"])
+def test_stop_words_alone_are_refused(phrase):
+    """An encoder has a vector for them too, and something is always near it."""
+    engine = QueryEngine(blob_scene(), lambda _: FakeEncoder())
+    for ask in (
+        engine.run,
+        lambda text: engine.run_many(["mug", text]),
+        lambda text: run_phrase(engine, text),
+    ):
+        with pytest.raises(InputError, match="names nothing to look for") as refused:
+            ask(phrase)
+        assert "\n" not in str(refused.value)
+    assert engine.known_vectors([phrase, "mug"])[0] == ("mug",)
+
+
+@pytest.mark.parametrize("phrase", ['"mug"', "mug.", "(Mug)", "mug;"])
+def test_marks_around_a_phrase_change_nothing(phrase):
+    engine = QueryEngine(blob_scene(), lambda _: FakeEncoder())
+    assert engine.run(phrase).peak == engine.run("mug").peak
+    assert engine.run(phrase).phrase.lower() == "mug"
+
+
+def test_a_phrase_is_encoded_once():
+    encoded = []
+
+    class Counting(FakeEncoder):
+        def encode_texts(self, texts):
+            encoded.extend(texts)
+            return super().encode_texts(texts)
+
+    engine = QueryEngine(blob_scene(), lambda _: Counting())
+    check_phrase(engine, "mug or book")
+    run_phrase(engine, "book or mug")
+    engine.run("Mug", "part")
+    assert sorted(word for word in encoded if word in WORDS) == ["book", "mug"]
+
+
+def test_a_check_raises_what_asking_would():
+    engine = QueryEngine(blob_scene(phrasebook=True))
+    check_phrase(engine, "Book")
+    with pytest.raises(EncoderError, match="phrasebook"):
+        check_phrase(engine, "book or mug")
+    engine = QueryEngine(blob_scene(), lambda _: FakeEncoder())
+    with pytest.raises(UnknownWordError, match="did you mean 'plant'") as unknown:
+        check_phrase(engine, "mug near the plamt")
+    assert unknown.value.near == {"plamt": ("plant",)}
+    with pytest.raises(InputError, match="where one looks from"):
+        check_phrase(engine, "mug behind the plant")
+    with pytest.raises(InputError, match="empty"):
+        check_phrase(engine, "?")
 
 
 @pytest.mark.parametrize(("encoder_id", "asked_for"), [("", "fake"), ("mine", "mine")])

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from langsplat_core.errors import InputError
-from langsplat_core.query.grammar import MAX_ATOMS, MAX_CHARACTERS, parse, split_queries
+from langsplat_core.query.grammar import MAX_ATOMS, MAX_CHARACTERS, parse
 from langsplat_core.query.phrase_tree import (
     Atom,
     Both,
@@ -17,6 +17,7 @@ from langsplat_core.query.phrase_tree import (
     atoms,
     reading,
 )
+from langsplat_core.scene.phrases import split_phrases
 
 MUG, BOOK, TABLE = Atom("mug"), Atom("book"), Atom("table")
 HANDLE = Atom("handle")
@@ -39,6 +40,8 @@ READ = {
     "mug and the book": Both((MUG, BOOK)),
     "mug as well as book & table": Both((MUG, BOOK, TABLE)),
     "mug or book and table": Union((MUG, Both((BOOK, TABLE)))),
+    "mug, book or table": Union((MUG, BOOK, TABLE)),  # where nobody has separated them
+    "mug, book, or table": Union((MUG, BOOK, TABLE)),
     "mug and glass": Both((MUG, Atom("glass"))),
     "mug, not red mug": Without(MUG, Atom("red mug")),
     "mug but not the book": Without(MUG, BOOK),
@@ -95,12 +98,6 @@ def test_a_text_without_end_is_refused():
         parse(" and ".join(["mug"] * (MAX_ATOMS + 1)))
 
 
-def test_queries_in_a_line_are_separated():
-    line = "mug, red book; plate, not red plate,, the cup, but not my cup"
-    assert split_queries(line) == ["mug", "red book", "plate, not red plate", "the cup, but not my cup"]
-    assert split_queries(" ,; ") == []
-
-
 def test_readings_show_the_structure():
     assert reading(parse("red mug handle")) == "handle  inside  red mug"
     assert reading(parse("biggest mug on the table")) == "biggest  (mug  on  table)"
@@ -148,7 +145,7 @@ WORDS = st.sampled_from(
 @given(st.one_of(st.text(max_size=60), st.lists(WORDS, max_size=14).map(" ".join)))
 def test_every_text_is_read_or_refused(text):
     """Nothing but InputError is raised, every phrase of a tree says something, and a reading shows it."""
-    for query in [text, *split_queries(text)]:
+    for query in [text, *split_phrases(text)]:
         try:
             tree = parse(query)
         except InputError:

@@ -44,7 +44,7 @@ def test_images_agree_with_the_whole_model(folder: Path) -> None:
 
 
 def test_texts_agree_with_the_whole_model_one_at_a_time(folder: Path) -> None:
-    phrases = ["red mug", "handle", "green apple things"]
+    phrases = ["red mug", "handle", "green mug"]
     got = load_text_encoder(str(folder)).encode_texts(phrases)
     np.testing.assert_array_equal(got, load_encoder(str(folder), "cpu").encode_texts(phrases))
     model = CLIPModel.from_pretrained(folder).eval()
@@ -117,7 +117,8 @@ def test_a_vocabulary_makes_words_unknown(tmp_path: Path) -> None:
     assert encoder.unknown_words("Red, APPLE handl") == ("handl",)
     assert encoder.encode_texts(["Red  mug"]).shape == (1, 24)
     with pytest.raises(
-        EncoderError, match=r"'handl': not taught .* such as handle; .*--clip\.model laion/"
+        EncoderError,
+        match=r"'handl' \(did you mean 'handle'\?\); .* 7 words, such as apple, .*--clip\.model laion/",
     ) as error:
         encoder.encode_texts(["handl"])
     assert "\n" not in str(error.value)

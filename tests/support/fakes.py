@@ -1,5 +1,6 @@
 """A scene of three blobs with known meanings, and a text encoder that knows their names."""
 
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -85,3 +86,6 @@ class FakeEncoder:
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
         return tuple(word for word in text.split() if word not in WORDS)
+
+    def near_words(self, word: str) -> tuple[str, ...]:
+        return tuple(get_close_matches(word, WORDS))

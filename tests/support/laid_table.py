@@ -1,6 +1,7 @@
 """A table with mugs, their handles and a book, of Gaussians whose meanings are known at every level."""
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 
 import numpy as np
 
@@ -69,6 +70,9 @@ class PlainEncoder:
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
         return tuple(word for word in text.split() if word not in AXES)
+
+    def near_words(self, word: str) -> tuple[str, ...]:
+        return tuple(get_close_matches(word, AXES))
 
 
 def laid_table(phrasebook: dict[str, Array] | None = None) -> tuple[Scene, dict[str, Array]]:

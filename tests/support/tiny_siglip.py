@@ -9,7 +9,7 @@ from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, processor
 from transformers import Siglip2Config, Siglip2Model, Siglip2Tokenizer, SiglipConfig, SiglipModel
 
 SIDE = 32
-LENGTH = 10  # tokens that every phrase is padded to
+LENGTH = 40  # tokens that every phrase is padded to
 SCALE, BIAS = 110.0, -12.5
 TOWER = {"hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2}
 LETTERS = "abcdefghijklmnopqrstuvwxyz"

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from langsplat_core.formats import load_scene, save_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer import actions
 from tests.support.fakes import blob_scene
@@ -109,3 +110,18 @@ def test_a_path_can_be_typed(viewer):
     assert actions.open_typed(viewer)
     settle(viewer)
     assert viewer.state.scene is SCENES["blobs.ply"]
+
+
+def test_a_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
+    path = tmp_path / "a.ply"
+    save_scene(path, replace(blob_scene(), path=None))
+    names = ("a.cameras.json", "a.langsplat.safetensors")
+    for name in names:
+        (tmp_path / name).write_bytes(b"{")
+    viewer.services = replace(viewer.services, load_scene=load_scene)
+    actions.open_scene(viewer, path)
+    settle(viewer)
+    assert viewer.state.scene.language is None
+    said = errors(viewer)
+    assert len(said) == 2
+    assert all(name in reason for name, reason in zip(names, said, strict=True))

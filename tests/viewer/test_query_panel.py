@@ -10,6 +10,7 @@ import pytest
 from langsplat_core.scene import Calibration, Odds, Reading
 from langsplat_viewer import actions
 from langsplat_viewer.panels import query as panel
+from langsplat_viewer.panels import query_box
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene, language
 from tests.support.windowless import SCENES, settle
@@ -31,9 +32,11 @@ class Paper:
             "is_item_hovered": True,
         }
 
+    InputTextCallbackData = object
+
     def __getattr__(self, name: str):
         if name.endswith("_"):  # a set of flags
-            return SimpleNamespace(enter_returns_true=0, no_tooltip=0)
+            return SimpleNamespace(enter_returns_true=0, callback_history=0, no_tooltip=0)
 
         def call(*args: object) -> object:
             if name in ("text", "text_colored", "set_tooltip"):
@@ -47,6 +50,7 @@ class Paper:
 def paper(monkeypatch) -> Iterator[Paper]:
     made = Paper()
     monkeypatch.setattr(panel, "imgui", made)
+    monkeypatch.setattr(query_box, "imgui", made)
     monkeypatch.setattr(panel, "hello_imgui", made)
     monkeypatch.setattr(panel, "small_wrapped", lambda text, colour: made.said.append(text))
     return made

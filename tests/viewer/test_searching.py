@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 
 from langsplat_core.scene import Calibration, Odds, Reading
 from langsplat_viewer import actions
+from langsplat_viewer.panels.query_box import hint
 from langsplat_viewer.state import NO_HEAT
 from langsplat_viewer.still import describe
 from tests.support.fakes import CENTRES, blob_scene, language
@@ -47,6 +48,72 @@ def test_an_unknown_word_is_one_line(opened):
     assert opened.state.shown() == []
 
 
+def test_an_unknown_word_takes_no_colour_and_says_what_may_be_meant(opened):
+    for text in ("mug", "book", "plant", "plamt pot", "plamt"):
+        actions.ask(opened, text)
+    settle(opened)
+    assert [query.slot for query in opened.state.queries] == [0, 1, 2, None, None]
+    typo = opened.state.queries[4]
+    assert (typo.phrase, typo.meant) == ("plamt", "plant")
+    assert "did you mean 'plant'?" in typo.problem
+    assert opened.state.queries[3].meant == ""  # "pot" is like no word
+
+
+def test_a_correction_is_offered_and_takes_the_place_of_the_typo(opened):
+    actions.ask(opened, "red plamt")
+    settle(opened)
+    assert actions.offers(opened) == ("did you mean", ())  # "red" is like no word either
+    actions.ask(opened, "plamt")
+    settle(opened)
+    assert actions.offers(opened) == ("did you mean", ("plant",))
+    actions.ask_offered(opened, "plant")
+    settle(opened)
+    assert [query.phrase for query in opened.state.queries] == ["red plamt", "plant"]
+    assert opened.state.queries[1].result.found
+    assert opened.state.queries[1].slot == 0
+
+
+def test_commas_separate_searches_and_quotes_are_no_part_of_them(opened):
+    actions.ask(opened, '"mug", plant; book, not mug')
+    settle(opened)
+    assert [query.phrase for query in opened.state.queries] == ["mug", "plant", "book, not mug"]
+    actions.ask(opened, "?!")
+    assert "no word to look for" in errors(opened)[-1]
+    actions.ask(opened, "the")
+    settle(opened)
+    assert "names nothing" in opened.state.queries[-1].problem or "names nothing" in errors(opened)[-1]
+
+
+def test_earlier_phrases_come_back_by_the_arrows(opened):
+    assert actions.recall(opened, -1) == ""
+    for text in ("mug", "book", "Mug"):
+        actions.ask(opened, text)
+    assert [actions.recall(opened, step) for step in (-1, -1, -1, 1, 1)] == ["Mug", "book", "book", "Mug", ""]
+
+
+def test_examples_are_offered_until_the_first_search_and_each_is_found(viewer):
+    actions.open_scene(viewer, Path("book.ply"))
+    settle(viewer)
+    assert actions.offers(viewer) == ("try", ())
+    actions.prepare_suggestions(viewer)
+    assert viewer.worker.current == ("finding examples", 0.0) or viewer.state.suggestions.examples
+    settle(viewer)
+    assert actions.offers(viewer) == ("try", ("book",))
+    assert hint(viewer) == "book, ..."
+    actions.prepare_suggestions(viewer)
+    assert viewer.worker.current is None  # once per scene
+    actions.type_phrase(viewer, "bo")
+    assert actions.offers(viewer) == ("", ("book",))
+    actions.type_phrase(viewer, "")
+    actions.ask_offered(viewer, "book")
+    settle(viewer)
+    assert viewer.state.queries[0].result.found
+    actions.open_scene(viewer, Path("plain.ply"))
+    settle(viewer)
+    actions.prepare_suggestions(viewer)
+    assert actions.offers(viewer) == ("try", ())
+
+
 def test_empty_and_repeated_phrases(opened):
     actions.ask(opened, "   ")
     assert opened.state.queries == []
@@ -61,10 +128,10 @@ def test_a_fourth_query_takes_the_oldest_ones_colour(opened):
         actions.ask(opened, word)
     settle(opened)
     assert [query.slot for query in opened.state.queries] == [0, 1, 2]
-    actions.ask(opened, "mug book")
+    actions.ask(opened, "mug or book")
     settle(opened)
     slots = {query.phrase: query.slot for query in opened.state.queries}
-    assert slots == {"mug": None, "book": 1, "plant": 2, "mug book": 0}
+    assert slots == {"mug": None, "book": 1, "plant": 2, "mug or book": 0}
 
 
 def test_hiding_keeps_the_colours_of_the_others(opened):

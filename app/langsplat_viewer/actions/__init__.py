@@ -16,6 +16,7 @@ from langsplat_viewer.actions.camera import (
     step_camera,
     tick,
 )
+from langsplat_viewer.actions.offers import ask_offered, offers, prepare_suggestions, recall
 from langsplat_viewer.actions.opening import cancel, open_scene, open_typed, type_path
 from langsplat_viewer.actions.queries import (
     ask,
@@ -41,6 +42,7 @@ from langsplat_viewer.actions.settings import (
 
 __all__ = [
     "ask",
+    "ask_offered",
     "ask_typed",
     "cancel",
     "focus_pixel",
@@ -50,8 +52,11 @@ __all__ = [
     "go_to_camera",
     "hide",
     "move",
+    "offers",
     "open_scene",
     "open_typed",
+    "prepare_suggestions",
+    "recall",
     "remove",
     "reset_view",
     "resize",

@@ -8,7 +8,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.display.latent_colours import latent_colours
 from langsplat_core.progress import Progress
-from langsplat_core.query.engine import NO_FIELD
+from langsplat_core.query.engine import no_field
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions.settings import set_display
@@ -91,8 +91,10 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     reasons = ", ".join(f"{count:,} with {reason}" for reason, count in opened.unusable.items())
     not_drawn = f"; not drawn: {reasons}" if reasons else ""
     state.say(f"{path.name}: {len(scene.gaussians):,} Gaussians{not_drawn}")
+    for reason in scene.unread:
+        state.say(f"opened without what lies beside it: {reason}", is_error=True)
     if scene.language is None:
-        state.say(NO_FIELD)
+        state.say(no_field(scene))
     else:
         state.picture = replace(state.picture, threshold=scene.language.reading.found)
         _warm_up_encoder(viewer, viewer.services.encoder_id or scene.language.encoder_id)

@@ -2,36 +2,43 @@
 
 from langsplat_core.config import LevelChoice
 from langsplat_core.display.displays import DISPLAYS
+from langsplat_core.errors import UnknownWordError
+from langsplat_core.progress import Progress
 from langsplat_core.query.compose import ComposedResult, run_phrase
-from langsplat_core.query.engine import NO_FIELD
+from langsplat_core.query.engine import no_field
 from langsplat_core.query.phrase_tree import Atom
-from langsplat_core.scene.phrases import phrase_key, tidy
+from langsplat_core.query.suggestions import corrected
+from langsplat_core.scene.phrases import phrase_key, split_phrases
 from langsplat_viewer.actions.settings import set_display, show_panel
 from langsplat_viewer.state import SLOTS, Query
 from langsplat_viewer.viewer import Viewer
 
 
-def ask(viewer: Viewer, phrase: str) -> None:
-    """Search the scene for a phrase and show where it is true."""
+def ask(viewer: Viewer, text: str) -> None:
+    """Search the scene for a phrase, or for several between commas, and show where each is true."""
+    phrases = split_phrases(text)
+    for phrase in phrases:
+        _ask(viewer, phrase)
+    if text.strip() and not phrases:
+        viewer.state.say(f"'{text.strip()[:40]}' has no word to look for", is_error=True)
+
+
+def _ask(viewer: Viewer, phrase: str) -> None:
     state = viewer.state
-    phrase = tidy(phrase)
-    if not phrase:
-        return
     if state.scene is None or viewer.engine is None:
         state.say("open a scene first, then search it", is_error=True)
         return
     if state.scene.language is None:
-        state.say(NO_FIELD, is_error=True)
+        state.say(no_field(state.scene), is_error=True)
         return
     key = phrase_key(phrase)
     query = next((q for q in state.queries if phrase_key(q.phrase) == key), None)
     if query is None:
         query = Query(phrase)
         state.queries.append(query)
-    show(viewer, query)
-    if not DISPLAYS[state.picture.display].needs_query:
-        set_display(viewer, "relevancy")
-    _answer(viewer, query)
+    state.asked = [*(earlier for earlier in state.asked if phrase_key(earlier) != key), phrase]
+    state.recalled = len(state.asked)
+    _answer(viewer, query, then_show=True)
 
 
 def type_phrase(viewer: Viewer, text: str) -> None:
@@ -41,7 +48,7 @@ def type_phrase(viewer: Viewer, text: str) -> None:
 
 def ask_typed(viewer: Viewer, again: bool) -> None:
     """Search for what stands in the box and empty it; `again`: the next phrase can be typed at once."""
-    if not tidy(viewer.state.typed):
+    if not viewer.state.typed.strip():
         return
     ask(viewer, viewer.state.typed)
     viewer.state.typed = ""
@@ -60,26 +67,43 @@ def take_search_focus(viewer: Viewer) -> bool:
     return wanted
 
 
-def _answer(viewer: Viewer, query: Query) -> None:
-    """Have the worker answer `query` at the current level choice."""
+def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
+    """Have the worker answer `query` at the current level choice. Only what is answered takes a colour."""
     engine, level = viewer.engine, viewer.state.level
     if engine is None:
         return
     view = viewer.state.view
     viewpoint = None if view is None else view.camera(*viewer.state.size)
 
-    def done(composed: ComposedResult) -> None:
-        query.result, query.problem, query.pending = composed.answer, "", False
+    def work(progress: Progress) -> ComposedResult | UnknownWordError:
+        try:
+            return run_phrase(engine, query.phrase, level, viewpoint, progress)
+        except UnknownWordError as error:
+            return error
+
+    def done(composed: ComposedResult | UnknownWordError) -> None:
+        if isinstance(composed, UnknownWordError):
+            query.meant = corrected(query.phrase, composed.near) or ""
+            failed(str(composed))
+            return
+        query.result, query.problem, query.meant, query.pending = composed.answer, "", "", False
         query.reading = "" if isinstance(composed.tree, Atom) else composed.reading
+        if then_show and query in viewer.state.queries:
+            show(viewer, query)
+            if not DISPLAYS[viewer.state.picture.display].needs_query:
+                set_display(viewer, "relevancy")
 
     def failed(reason: str) -> None:
         query.problem, query.pending = reason, False
+        if query in viewer.state.queries:  # the list stays in the order of asking
+            viewer.state.queries.remove(query)
+            viewer.state.queries.append(query)
         viewer.state.say(reason, is_error=True)
 
     query.pending = True
     viewer.worker.submit(
         f"searching '{query.phrase}'",
-        lambda progress: run_phrase(engine, query.phrase, level, viewpoint, progress),
+        work,
         done,
         failed,
     )

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from langsplat_core.config import Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
-from langsplat_core.query.engine import NO_FIELD
+from langsplat_core.query.engine import no_field
 from langsplat_viewer.viewer import Viewer
 
 
@@ -12,7 +12,7 @@ def set_display(viewer: Viewer, display: Display, latent_level: int | None = Non
     """Choose what is shown; `latent_level` is an index into `scene.LEVELS`."""
     state = viewer.state
     if DISPLAYS[display].needs_field and state.scene is not None and state.scene.language is None:
-        state.say(NO_FIELD, is_error=True)
+        state.say(no_field(state.scene), is_error=True)
         return
     state.picture = replace(state.picture, display=display)
     if latent_level is not None:

@@ -6,9 +6,10 @@ from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
 from langsplat_core.config import LevelChoice
 from langsplat_core.display.colour_maps import QUERY_COLOURS
-from langsplat_core.query.engine import NO_FIELD
+from langsplat_core.query.engine import no_field
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions
+from langsplat_viewer.panels import query_box
 from langsplat_viewer.panels.style import BAD, GOOD, MUTED, small_wrapped
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
@@ -21,31 +22,16 @@ def draw(viewer: Viewer) -> None:
     imgui.separator_text("Search")
     scene = viewer.state.scene
     if scene is not None and scene.language is None:
-        small_wrapped(NO_FIELD, MUTED)
+        small_wrapped(no_field(scene), MUTED)
         return
     imgui.begin_disabled(scene is None)
-    _box(viewer)
+    query_box.draw(viewer)
     _level(viewer)
     imgui.end_disabled()
     for index, query in enumerate(list(viewer.state.queries)):
         imgui.push_id(f"query {index}")
         _entry(viewer, query)
         imgui.pop_id()
-
-
-def _box(viewer: Viewer) -> None:
-    button = imgui.calc_text_size("Search").x + 2 * imgui.get_style().frame_padding.x
-    imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
-    if actions.take_search_focus(viewer):
-        imgui.set_keyboard_focus_here()
-    flags = imgui.InputTextFlags_.enter_returns_true
-    hint = "red mug, handle, ..."
-    entered, typed = imgui.input_text_with_hint("##phrase", hint, viewer.state.typed, flags)
-    actions.type_phrase(viewer, typed)
-    imgui.same_line()
-    clicked = imgui.button("Search")
-    if entered or clicked:
-        actions.ask_typed(viewer, again=entered)
 
 
 def _level(viewer: Viewer) -> None:

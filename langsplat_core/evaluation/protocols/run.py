@@ -16,7 +16,7 @@ from langsplat_core.evaluation.protocols.scoring import score_scene
 from langsplat_core.evaluation.protocols.sources import MapSource, SceneSource, Source
 from langsplat_core.formats import load_scene
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.engine import NO_FIELD, LoadEncoder, QueryEngine
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, no_field
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Camera
 
@@ -95,7 +95,7 @@ def _source(
         )
     scene = load_scene(path)
     if scene.language is None:
-        raise InputError(f"{path}: {NO_FIELD}")
+        raise InputError(f"{path}: {no_field(scene)}")
     own = {without_suffix(camera.name): camera for camera in scene.cameras}
     others = _other_cameras(own, labelled, path, progress)
     # With no name in common the scene's views are named by another rule: nothing is known of training.

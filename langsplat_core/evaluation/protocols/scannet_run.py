@@ -19,7 +19,7 @@ from langsplat_core.evaluation.protocols.scannet import (
 )
 from langsplat_core.formats import load_scene
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.engine import NO_FIELD, LoadEncoder, QueryEngine
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, no_field
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def run_scannet(
             path = subject.scene / f"{name}.ply" if subject.scene.is_dir() else subject.scene
             scene = load_scene(path)
             if scene.language is None:
-                raise InputError(f"{path}: {NO_FIELD}")
+                raise InputError(f"{path}: {no_field(scene)}")
             engine = QueryEngine(scene, load_encoder, encoder_id=subject.encoder)
             found, unknown = scene_classes(engine, points, profile)
             scores += score_points(points, found, profile, unknown)

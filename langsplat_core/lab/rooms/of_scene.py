@@ -10,7 +10,7 @@ from langsplat_core.lab.rooms.scoring import Reading, ask, evaluate, found_rate
 from langsplat_core.lab.rooms.truth import read_truth
 from langsplat_core.lab.world.objects.catalogue import EVERYTHING
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.engine import NO_FIELD, QueryEngine
+from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.semantics.encoders import load_text_encoder
 
@@ -25,7 +25,7 @@ def measure_scene(scene_path: Path, dataset: Path, reading: Reading, progress: P
     """
     scene = load_scene(scene_path)
     if scene.language is None:
-        raise InputError(f"{scene_path}: {NO_FIELD}")
+        raise InputError(f"{scene_path}: {no_field(scene)}")
     truth = read_truth(dataset)
     trained = {camera.name for camera in scene.cameras}
     capture = load_capture(dataset, WHOLE, dataset, progress)

@@ -4,16 +4,17 @@ from typing import Any
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError
-from langsplat_core.semantics.encoder import Family, Logits, pixel_statistics
+from langsplat_core.semantics.encoder import Family, Logits, TextTower, inferred, pixel_statistics
+from langsplat_core.semantics.families.clip_plain import TEMPERATURE, plain_text_tower
+from langsplat_core.semantics.tokens import check_whole
 from langsplat_core.semantics.weights import Weights, load_model, loading_errors
 
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)  # of OpenAI's CLIP, kept by OpenCLIP
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
-TEMPERATURE = 10.0  # of LERF and LangSplat, whatever scale a checkpoint ended its training with
 
 
 class ClipText:
-    """A `TextTower`."""
+    """A `TextTower`, by torch."""
 
     def __init__(self, weights: Weights) -> None:
         from transformers import CLIPTextModelWithProjection, CLIPTokenizerFast
@@ -29,14 +30,15 @@ class ClipText:
         """See `TextTower`."""
         return int(self._model.config.projection_dim)
 
-    def encode(self, texts: list[str]) -> Any:
+    def encode(self, texts: list[str]) -> Array:
         """See `TextTower`."""
-        limit = int(self._model.config.max_position_embeddings)
+        limit = int(self._model.config.max_position_embeddings) - 2  # one begins a phrase, one ends it
+        ends = {int(self._tokenizer.eos_token_id)}
+        for text, row in zip(texts, self._tokenizer(texts, verbose=False).input_ids, strict=True):
+            check_whole(text, row[1:-1], limit, ends)
         # Padding follows the end token, which attends to earlier tokens only: no attention mask is needed.
-        tokens = self._tokenizer(
-            texts, padding=True, truncation=True, max_length=limit, return_tensors="pt"
-        ).input_ids.to(self._device)
-        return self._model(input_ids=tokens).text_embeds
+        tokens = self._tokenizer(texts, padding=True, return_tensors="pt").input_ids.to(self._device)
+        return inferred(lambda: self._model(input_ids=tokens).text_embeds)
 
 
 class ClipPictures:
@@ -58,7 +60,12 @@ class ClipPictures:
         return self._model(pixel_values=pixels).image_embeds
 
 
-CLIP = Family("CLIP", ClipText, ClipPictures)
+def clip_text(weights: Weights) -> TextTower:
+    """In NumPy where the model is small, else by torch."""
+    return plain_text_tower(weights) or ClipText(weights)
+
+
+CLIP = Family("CLIP", clip_text, ClipPictures)
 
 
 def _load(kind: Any, tower: str, weights: Weights) -> Any:

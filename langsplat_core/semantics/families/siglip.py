@@ -15,7 +15,7 @@ from typing import Any
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError
-from langsplat_core.semantics.encoder import Family, Logits, pixel_statistics
+from langsplat_core.semantics.encoder import Family, Logits, inferred, pixel_statistics
 from langsplat_core.semantics.tokens import load_tokens
 from langsplat_core.semantics.weights import (
     Weights,
@@ -44,10 +44,10 @@ class SiglipText:
         """See `TextTower`."""
         return int(self._model.config.projection_size)
 
-    def encode(self, texts: list[str]) -> Any:
+    def encode(self, texts: list[str]) -> Array:
         """See `TextTower`."""
         ids, _ = self._tokens.rows([self.canonical(text) for text in texts])
-        return self._model(input_ids=ids.to(self._device)).pooler_output
+        return inferred(lambda: self._model(input_ids=ids.to(self._device)).pooler_output)
 
     def canonical(self, text: str) -> str:
         """As the captions of its training: lower case; SigLIP 1 had no punctuation either."""

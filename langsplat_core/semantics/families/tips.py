@@ -6,7 +6,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError
-from langsplat_core.semantics.encoder import Family, Logits
+from langsplat_core.semantics.encoder import Family, Logits, inferred
 from langsplat_core.semantics.tokens import load_tokens
 from langsplat_core.semantics.weights import Weights, load_model, loading_errors, read_scalars
 
@@ -33,10 +33,11 @@ class TipsText:
         """See `TextTower`."""
         return int(self._model.config.hidden_size)
 
-    def encode(self, texts: list[str]) -> Any:
+    def encode(self, texts: list[str]) -> Array:
         """See `TextTower`."""
         ids, used = self._tokens.rows([text.lower() for text in texts])
-        return self._model(input_ids=ids.to(self._device), attention_mask=used.to(self._device)).pooler_output
+        given = {"input_ids": ids.to(self._device), "attention_mask": used.to(self._device)}
+        return inferred(lambda: self._model(**given).pooler_output)
 
 
 class TipsPictures:

@@ -1,0 +1,230 @@
+"""The text half of a small CLIP in NumPy, from the file of its weights: neither torch nor transformers is
+imported for it, which takes seconds and hundreds of megabytes.
+
+The network is that of Radford et al. 2021: token and position vectors, layers of causal self-attention and a
+two-layer perceptron, each behind a layer norm and added to what came in, a last norm, and the vector at the
+end token projected. It is equal to `transformers.CLIPTextModelWithProjection` but for rounding.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import EncoderError
+from langsplat_core.semantics.encoder import Logits
+from langsplat_core.semantics.tokens import FILE, check_whole, read_tokenizer
+from langsplat_core.semantics.weights import CONFIG, SAFE, Weights
+
+MOST_WEIGHTS = (
+    20_000_000  # of the text half; above it torch's threads are worth their import, docs/encoders.md
+)
+TEMPERATURE = 10.0  # of LERF and LangSplat, whatever scale a checkpoint ended its training with
+READABLE = ("F16", "F32", "F64")  # types of safetensors that NumPy has too
+LEGACY_END = 2  # of configurations whose end token is the one with the highest number
+PREFIX = "text_model."
+TOKENS, POSITIONS = (f"{PREFIX}embeddings.{name}_embedding.weight" for name in ("token", "position"))
+PROJECTION = "text_projection.weight"
+
+Tensors = Mapping[str, Array]  # name -> float32
+
+
+@dataclass(frozen=True)
+class TextConfig:
+    """What the weights alone do not say; defaults as of `transformers.CLIPTextConfig`."""
+
+    vocab_size: int = 49_408
+    hidden_size: int = 512
+    intermediate_size: int = 2_048
+    num_hidden_layers: int = 12
+    num_attention_heads: int = 8
+    max_position_embeddings: int = 77
+    hidden_act: str = "quick_gelu"
+    layer_norm_eps: float = 1e-5
+    eos_token_id: int = 49_407
+    projection_dim: int = 512
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Every tensor of the text half and its shape."""
+        wide, inner = self.hidden_size, self.intermediate_size
+        found: dict[str, tuple[int, ...]] = {
+            TOKENS: (self.vocab_size, wide),
+            POSITIONS: (self.max_position_embeddings, wide),
+            PROJECTION: (self.projection_dim, wide),
+        }
+        matrices = {f"self_attn.{name}_proj": (wide, wide) for name in ("q", "k", "v", "out")}
+        matrices |= {"mlp.fc1": (inner, wide), "mlp.fc2": (wide, inner)}
+        norms = [f"{PREFIX}final_layer_norm"]
+        for number in range(self.num_hidden_layers):
+            layer = _layer(number)
+            norms += [f"{layer}layer_norm1", f"{layer}layer_norm2"]
+            for name, shape in matrices.items():
+                found |= {f"{layer}{name}.weight": shape, f"{layer}{name}.bias": shape[:1]}
+        return found | {f"{name}.{part}": (wide,) for name in norms for part in ("weight", "bias")}
+
+
+class PlainClipText:
+    """A `TextTower`."""
+
+    def __init__(self, id: str, config: TextConfig, tensors: Tensors, tokenizer: Any, end: int) -> None:
+        self.id = id
+        self.temperature = TEMPERATURE
+        self.logits: Logits | None = None
+        self._config, self._tensors = config, tensors
+        self._tokenizer, self._end = tokenizer, end
+
+    @property
+    def dim(self) -> int:
+        """See `TextTower`."""
+        return self._config.projection_dim
+
+    def encode(self, texts: list[str]) -> Array:
+        """See `TextTower`."""
+        rows = [found.ids for found in self._tokenizer.encode_batch(texts)]
+        for text, row in zip(texts, rows, strict=True):
+            check_whole(text, row[1:-1], self._config.max_position_embeddings - 2, {self._end})
+        longest = max(map(len, rows))
+        # What follows the end token is not seen by it.
+        ids = np.array([row + [self._end] * (longest - len(row)) for row in rows])
+        return text_vectors(self._tensors, self._config, ids, np.array([len(row) - 1 for row in rows]))
+
+
+def plain_text_tower(weights: Weights, most: int = MOST_WEIGHTS) -> PlainClipText | None:
+    """The text half in `weights`, if it is small, whole and of a kind that is computed here; else None, and
+    torch reads the folder, or says what is wrong with it.
+
+    most: how many weights the half may have.
+    """
+    if weights.device != "cpu":
+        return None
+    config = _text_config(weights)
+    if (
+        config is None
+        or config.hidden_act not in _ACTIVATIONS
+        or config.hidden_size % config.num_attention_heads
+    ):
+        return None
+    shapes = config.shapes()
+    if sum(int(np.prod(shape)) for shape in shapes.values()) > most:
+        return None
+    tokenizer = _tokenizer(weights)
+    tensors = None if tokenizer is None else _tensors(weights.folder, shapes)
+    if tensors is None:
+        return None
+    row = tokenizer.encode("").ids  # the tokens that begin and end every phrase
+    highest = max(tokenizer.get_vocab(with_added_tokens=True).values())
+    ends = (config.eos_token_id,) if config.eos_token_id != LEGACY_END else (highest,)
+    if len(row) != 2 or row[1] not in ends or highest >= config.vocab_size:
+        return None
+    return PlainClipText(weights.id, config, tensors, tokenizer, row[1])
+
+
+def text_vectors(tensors: Tensors, config: TextConfig, ids: Array, ends: Array) -> Array:
+    """(B, L) token numbers, and (B,) where the end token of each row is -> (B, D) float32, of any length."""
+    eps, activate = config.layer_norm_eps, _ACTIVATIONS[config.hidden_act]
+    length = ids.shape[1]
+    later = np.triu(np.full((length, length), -np.inf, np.float32), 1)
+    x = tensors[TOKENS][ids] + tensors[POSITIONS][:length]
+    for number in range(config.num_hidden_layers):
+        layer = _layer(number)
+        before = _norm(tensors, f"{layer}layer_norm1", x, eps)
+        x = x + _attention(tensors, f"{layer}self_attn.", before, later, config.num_attention_heads)
+        inner = _linear(tensors, f"{layer}mlp.fc1", _norm(tensors, f"{layer}layer_norm2", x, eps))
+        x = x + _linear(tensors, f"{layer}mlp.fc2", activate(inner))
+    last = _norm(tensors, f"{PREFIX}final_layer_norm", x[np.arange(len(ids)), ends], eps)
+    found: Array = last @ tensors[PROJECTION].T
+    return found
+
+
+def _layer(number: int) -> str:
+    return f"{PREFIX}encoder.layers.{number}."
+
+
+def _linear(tensors: Tensors, name: str, x: Array) -> Array:
+    weight = tensors[f"{name}.weight"]
+    # As one product of matrices: NumPy would take (B, L, W) in B small ones, ten times slower.
+    product = x.reshape(-1, x.shape[-1]) @ weight.T + tensors[f"{name}.bias"]
+    return product.reshape(*x.shape[:-1], len(weight))
+
+
+def _norm(tensors: Tensors, name: str, x: Array, eps: float) -> Array:
+    centred = x - x.mean(-1, keepdims=True)
+    spread = np.sqrt((centred**2).mean(-1, keepdims=True) + np.float32(eps))
+    scaled: Array = centred / spread * tensors[f"{name}.weight"] + tensors[f"{name}.bias"]
+    return scaled
+
+
+def _attention(tensors: Tensors, name: str, x: Array, later: Array, heads: int) -> Array:
+    """x: (B, L, W); later: (L, L), -infinity where a token comes after another one."""
+    batch, length, wide = x.shape
+    query, key, value = (
+        _linear(tensors, f"{name}{part}_proj", x).reshape(batch, length, heads, -1).transpose(0, 2, 1, 3)
+        for part in "qkv"
+    )
+    scores = query @ key.transpose(0, 1, 3, 2) * np.float32((wide // heads) ** -0.5) + later
+    shares = np.exp(scores - scores.max(-1, keepdims=True))
+    shares /= shares.sum(-1, keepdims=True)
+    return _linear(tensors, f"{name}out_proj", (shares @ value).transpose(0, 2, 1, 3).reshape(x.shape))
+
+
+def _quick_gelu(x: Array) -> Array:
+    with np.errstate(over="ignore"):  # of a large negative number: 0
+        gelu: Array = x / (1 + np.exp(np.float32(-1.702) * x))
+    return gelu
+
+
+def _gelu(x: Array) -> Array:
+    from scipy.special import erf
+
+    gelu: Array = np.float32(0.5) * x * (1 + erf(x * np.float32(0.5**0.5)))
+    return gelu
+
+
+_ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {"quick_gelu": _quick_gelu, "gelu": _gelu}
+
+
+def _text_config(weights: Weights) -> TextConfig | None:
+    """What config.json says of the text half; None where it says what cannot be understood."""
+    try:
+        whole = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8"))
+        stated = {**(whole.get("text_config") or {}), **(whole.get("text_config_dict") or {})}
+        stated["projection_dim"] = whole.get("projection_dim", TextConfig.projection_dim)
+        kinds = {name: type(getattr(TextConfig, name)) for name in TextConfig.__dataclass_fields__}
+        config = TextConfig(**{name: kind(stated[name]) for name, kind in kinds.items() if name in stated})
+    except (OSError, ValueError, TypeError, AttributeError):
+        return None
+    return (
+        config if min(config.num_attention_heads, config.num_hidden_layers, config.hidden_size) > 0 else None
+    )
+
+
+def _tokenizer(weights: Weights) -> Any:
+    if not (weights.folder / FILE).is_file():
+        return None
+    try:
+        return read_tokenizer(weights)
+    except EncoderError:
+        return None
+
+
+def _tensors(folder: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array] | None:
+    """The tensors of these names as float32, from all safetensors of a folder; None where one is absent, has
+    another shape, or is of a type that NumPy lacks."""
+    from safetensors import SafetensorError, safe_open
+
+    found: dict[str, Array] = {}
+    try:
+        for path in sorted(path for pattern in SAFE for path in folder.glob(pattern)):
+            with safe_open(path, framework="np") as file:
+                for name in shapes.keys() & set(file.keys()):
+                    tensor = file.get_slice(name)
+                    if tuple(tensor.get_shape()) != shapes[name] or tensor.get_dtype() not in READABLE:
+                        return None
+                    found[name] = file.get_tensor(name).astype(np.float32)
+    except (OSError, ValueError, SafetensorError):
+        return None
+    return found if len(found) == len(shapes) else None

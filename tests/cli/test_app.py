@@ -1,0 +1,90 @@
+"""The command line as a whole: its commands, their options, and what it says of those that do not exist."""
+
+import dataclasses
+import subprocess
+import sys
+
+import pytest
+from tyro.extras import get_parser
+
+from langsplat_core import __version__
+from langsplat_core.cli.app import COMMANDS, GROUPS, entry, parse
+from langsplat_core.cli.inspect import Doctor
+from langsplat_core.cli.train import Train
+from langsplat_core.errors import InputError
+from langsplat_viewer.__main__ import ViewerCommand
+from langsplat_viewer.__main__ import entry as viewer_entry
+
+EVERY = {
+    "viewer": ViewerCommand,
+    "train": Train,
+    **COMMANDS,
+    **{f"{group} {name}": made for group, (_, members) in GROUPS.items() for name, made in members.items()},
+}
+
+
+@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_every_option_is_described(name):
+    actions = get_parser(EVERY[name])._actions  # noqa: SLF001  argparse has no public list of them
+    assert len(actions) > len(dataclasses.fields(EVERY[name])) // 2
+    bare = [
+        action.dest
+        for action in actions
+        if len((action.help or "").partition("(default")[0].replace("(required)", "").strip()) < 3
+    ]
+    assert bare == []
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["qurey", "a.ply"], "no command 'qurey'; did you mean 'query'?"),
+        (["bench", "quary"], "no command 'bench quary'; did you mean 'query'?"),
+        (["xyz"], "no command 'xyz'; there are train, query"),
+    ],
+)
+def test_a_command_that_does_not_exist_is_named(words, said):
+    with pytest.raises(InputError) as error:
+        parse(words)
+    assert str(error.value).startswith(said)
+
+
+@pytest.mark.parametrize(("program", "run"), [("langsplat", entry), ("langsplat-viewer", viewer_entry)])
+def test_versions(program, run, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [program, "--version"])
+    with pytest.raises(SystemExit) as stop:
+        run()
+    assert not stop.value.code
+    assert capsys.readouterr().out == f"{program} {__version__}\n"
+
+
+def test_doctor_says_what_draws_and_what_encodes(capsys):
+    Doctor().run()
+    said = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert said["langsplat"] == __version__
+    assert said["OpenGL"]
+    assert "demo: works" in said["text"]
+
+
+QUERY = """
+import sys
+from langsplat_core.cli.app import entry
+sys.argv = ["langsplat", "query", {scene!r}, "teddy", "red mug"]
+try:
+    entry()
+except SystemExit as stop:
+    assert not stop.code, stop.code
+print([name for name in ("torch", "transformers", "open3d") if name in sys.modules])
+"""
+
+
+@pytest.mark.long
+def test_asking_the_bundled_scene_imports_no_torch():
+    from importlib.resources import files
+
+    scene = str(files("langsplat_assets") / "demo" / "scene.ply")
+    code = QUERY.format(scene=scene)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("teddy: found")
+    assert done.stdout.splitlines()[-1] == "[]"
