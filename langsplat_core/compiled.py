@@ -60,6 +60,11 @@ def kernel_folder(source: Path) -> Path:
     return root / name / digest_of_sources(source)
 
 
+def is_compiled(source: Path) -> bool:
+    """Whether an earlier process has left machine code of the kernels in `source` as they are now."""
+    return any(kernel_folder(source).rglob("*.nbc"))
+
+
 @cache
 def digest_of_sources(source: Path) -> str:
     """Of a file and all files of this package that it imports, as they are now."""

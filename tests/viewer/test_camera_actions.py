@@ -7,7 +7,16 @@ from numpy.testing import assert_allclose
 
 from langsplat_viewer import actions
 from langsplat_viewer.state import GLIDE_SECONDS
+from langsplat_viewer.viewer import Viewer
 from tests.support.windowless import arrive, errors, settle
+
+
+def share_in_picture(viewer: Viewer, size: tuple[int, int]) -> float:
+    """Of the weight of the scene, as seen now in a window of that size."""
+    sample = viewer.state.extent.sample
+    pixels, depth = viewer.state.view.camera(*size).project(sample.points)
+    inside = (depth > 0) & (pixels >= 0).all(1) & (pixels <= size).all(1)
+    return float(sample.weights[inside].sum() / sample.weights.sum())
 
 
 def test_focus_brings_the_latest_result_found_to_the_centre(opened):
@@ -31,10 +40,11 @@ def test_focus_on_one_of_several_results(opened):
     assert_allclose(opened.state.view.target, opened.state.queries[0].result.place)
 
 
-def test_focus_without_a_result_is_the_scenes_middle(opened):
+def test_focus_without_a_result_is_the_whole_scene(opened):
+    actions.resize(opened, 160, 120)
     actions.focus_result(opened)
     arrive(opened)
-    assert_allclose(opened.state.view.target, opened.state.extent.centre)
+    assert share_in_picture(opened, (160, 120)) >= 0.99
 
 
 def test_training_cameras_wrap_round(opened):

@@ -64,7 +64,7 @@ def folder(tmp_path: Path) -> Path:
 )
 def test_window(scenario: str, display: str, folder: Path):
     environment = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}
-    environment |= {"DISPLAY": display, "PYTHONPATH": str(ROOT)}
+    environment |= {"DISPLAY": display, "PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "app")))}
     run = subprocess.run(
         [sys.executable, "-m", "tests.viewer.window_driver", scenario, str(folder)],
         cwd=folder,
@@ -104,6 +104,9 @@ class FakeRenderer:
     def read(self, camera, picture, heat_ranges=()):
         return np.zeros((camera.height, camera.width, 3), np.uint8)
 
+    def shows_nothing(self) -> bool:
+        return False
+
     def depth_at(self, x_px, y_px):
         return 2.0 if x_px > 100 else None
 
@@ -112,7 +115,9 @@ class FakeRenderer:
 def state() -> ViewerState:
     scene = blob_scene()
     extent = extent_of(scene)
-    return ViewerState(scene=scene, extent=extent, view=default_view(scene, extent), size=(200, 120))
+    return ViewerState(
+        scene=scene, extent=extent, view=default_view(scene, extent, (200, 120)), size=(200, 120)
+    )
 
 
 def drawn(renderer: FakeRenderer) -> list[object]:

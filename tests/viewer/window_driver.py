@@ -52,6 +52,7 @@ class Session:
         self.window = Window(
             WindowRequest(folder / scene, size=(860, 620), **request), services, self._make_renderer
         )
+        self.window.idles = False
         self.state = self.window.viewer.state
 
     def _make_renderer(self, ctx) -> CountingRenderer:
