@@ -1,10 +1,8 @@
 """The window itself, on a virtual display, driven like a person would; and the canvas behind it."""
 
 import os
-import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +11,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.formats import save_scene
+from langsplat_core.scene import Scene
 from langsplat_viewer.canvas import REST_SECONDS, Canvas
 from langsplat_viewer.controls import default_view, extent_of, orbit
 from langsplat_viewer.state import ViewerState
@@ -21,31 +20,13 @@ from tests.support.fakes import blob_scene
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture(scope="module")
-def display() -> Iterator[str]:
-    """The name of a display: a virtual one of our own where Xvfb is installed, else the session's."""
-    if shutil.which("Xvfb") is None:
-        if not os.environ.get("DISPLAY"):
-            pytest.skip("neither Xvfb nor a display")
-        yield os.environ["DISPLAY"]
-        return
-    reading, writing = os.pipe()
-    command = ["Xvfb", "-displayfd", str(writing), "-screen", "0", "1280x900x24", "-nolisten", "tcp"]
-    server = subprocess.Popen(command, pass_fds=[writing], stderr=subprocess.DEVNULL)
-    os.close(writing)
-    with os.fdopen(reading) as pipe:
-        number = pipe.readline().strip()
-    assert number, "Xvfb did not start"
-    yield f":{number}"
-    server.terminate()
-    server.wait(10)
-
-
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Scenes with and without a language field, and one cut short."""
+    """Scenes with and without a language field, one cut short, and one of which nothing can be drawn."""
     for name, field in (("blobs", True), ("plain", False)):
         save_scene(tmp_path / f"{name}.ply", replace(blob_scene(field=field), path=None))
+    gaussians = replace(blob_scene().gaussians, opacity_logits=np.full(360, np.nan))
+    save_scene(tmp_path / "nothing.ply", Scene(gaussians))
     whole = (tmp_path / "plain.ply").read_bytes()
     (tmp_path / "truncated.ply").write_bytes(whole[: len(whole) // 2])
     return tmp_path
@@ -59,6 +40,10 @@ def folder(tmp_path: Path) -> Path:
         "without_field",
         "from_the_command_line",
         "broken_renderer",
+        "use_shortcuts",
+        "many_queries",
+        "type_while_opening",
+        "look_at_nothing",
         "close_while_opening",
     ],
 )

@@ -71,7 +71,7 @@ def _bar(result: QueryResult, colours: Array) -> None:
     imgui.text_unformatted(elided(result.phrase, width, lambda text: imgui.calc_text_size(text).x))
     start, paint = imgui.get_cursor_screen_pos(), imgui.get_window_draw_list()
     for step, colour in enumerate(colours):
-        left, right = (start.x + width * edge / STEPS for edge in (step, step + 1))
+        left, right = (round(start.x + width * edge / STEPS) for edge in (step, step + 1))  # no seams
         paint.add_rect_filled(ImVec2(left, start.y), ImVec2(right, start.y + height), _packed(colour))
     imgui.dummy(ImVec2(width, height))
     low, high = result.heat_range
