@@ -56,7 +56,7 @@ def test_window(scenario: str, display: str, folder: Path):
         env=environment,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
     )
     assert run.returncode == 0, (run.stdout + run.stderr)[-4000:]
     assert run.stdout.rstrip().endswith("PASSED"), (run.stdout + run.stderr)[-4000:]
