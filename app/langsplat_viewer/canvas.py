@@ -16,7 +16,7 @@ from langsplat_core.config import PictureConfig
 from langsplat_core.display.compose import HeatRanges
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.controls import OrbitCamera
-from langsplat_viewer.looking import why_nothing
+from langsplat_viewer.looking import why_nothing, why_undrawable
 from langsplat_viewer.state import FrameStats, ViewerState
 
 SCALES = (1.0, 0.5, 0.25)
@@ -100,7 +100,9 @@ class Canvas:
         if self._unsure and not moving and self._camera is not None:
             self._unsure = False  # asked at rest only: it reads the picture back
             if self._renderer.shows_nothing():
-                state.nothing = why_nothing(state.scene.gaussians, self._camera)
+                reason = why_nothing(state.scene.gaussians, self._camera)
+                elsewhere = not why_undrawable(state.scene.gaussians)  # another view would show something
+                state.nothing = f"{reason}: press R for the opening view" if elsewhere else reason
         return moving
 
     def _scale(self) -> float:

@@ -52,4 +52,4 @@ def _said(viewer: Viewer) -> str:
     state = viewer.state
     if state.scene is None:
         return f"opening {state.opening.name} ..." if state.opening else "Drop a scene here, or use Open ..."
-    return f"{state.nothing}: press R for the opening view" if state.nothing else ""
+    return state.nothing
