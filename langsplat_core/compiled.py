@@ -64,6 +64,12 @@ def kernel_folder(source: Path) -> Path | None:
     return root / name / digest_of_sources(source)
 
 
+def is_compiled(source: Path) -> bool:
+    """Whether an earlier process has left machine code of the kernels in `source` as they are now."""
+    folder = kernel_folder(source)
+    return folder is not None and any(folder.rglob("*.nbc"))
+
+
 @cache
 def _cache_root(given: str) -> Path | None:
     """The first folder that can be written to; `given`: as the user asked for, or empty."""

@@ -201,6 +201,7 @@ class PictureConfig:
     display: Display = "rgb"
     heat_opacity: Share = 0.85  # of the heat map over the colours where relevancy is high
     dim: Share = 0.45  # colours are multiplied by this where a query finds nothing
-    threshold: Share = 0.6  # relevancy above which a pixel belongs to a segmentation, in [0, 1]
+    own_colours: bool = False  # heat in the colour of each query instead of the colour map
+    threshold: Share = 0.5  # of a pixel's light from an answer's Gaussians from which it is segmented
     alpha_gate: Share = 0.3  # pixels with less alpha carry no relevancy
     background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)  # display values in [0, 1]

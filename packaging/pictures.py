@@ -31,6 +31,7 @@ def window_picture(path: Path, queries: tuple[str, ...]) -> None:
         scene_path(None), queries=queries, display="relevancy", size=(1280, 800), camera=CAMERA
     )
     window = Window(request, services(""), FrameRenderer)
+    window.idles = False
 
     def wait_and_capture(ctx: Any) -> None:  # imgui's test context has no public type
         state = window.viewer.state

@@ -16,6 +16,7 @@ from langsplat_core.config import PictureConfig
 from langsplat_core.display.compose import HeatRanges
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.controls import OrbitCamera
+from langsplat_viewer.looking import why_nothing, why_undrawable
 from langsplat_viewer.state import FrameStats, ViewerState
 
 SCALES = (1.0, 0.5, 0.25)
@@ -46,6 +47,9 @@ class Renderer(Protocol):
     def read(self, camera: Camera, picture: PictureConfig, heat_ranges: HeatRanges = ()) -> Array:
         """(H, W, 3) uint8 picture."""
 
+    def shows_nothing(self) -> bool:
+        """Whether the last picture holds nothing of the scene."""
+
     def depth_at(self, x_px: float, y_px: float) -> float | None:
         """Camera z of the surface at a pixel of the last picture, world units."""
 
@@ -69,6 +73,7 @@ class Canvas:
         self._moved = -1e9  # when the view last changed, seconds
         self._fine_ms = 0.0
         self._camera: Camera | None = None
+        self._unsure = False  # whether the picture shows anything is not known yet
         self.texture: moderngl.Texture | None = None  # RGBA8, first row at the bottom, as GL has it
 
     def update(self, state: ViewerState, now: float) -> bool:
@@ -86,10 +91,18 @@ class Canvas:
         moving = now - self._moved < REST_SECONDS
         scale = self._scale() if moving and state.coarse_while_moving else 1.0
         size = (max(1, round(state.size[0] * scale)), max(1, round(state.size[1] * scale)))
-        key = (state.layers_key(), state.picture, state.view, state.size, scale, state.heat_ranges())
+        picture = state.shown_picture()
+        key = (state.layers_key(), picture, state.view, state.size, scale, state.heat_ranges())
         if key != self._drawn:
             self._drawn = key
             self._draw(state, size, scale)
+            state.nothing, self._unsure = "", True
+        if self._unsure and not moving and self._camera is not None:
+            self._unsure = False  # asked at rest only: it reads the picture back
+            if self._renderer.shows_nothing():
+                reason = why_nothing(state.scene.gaussians, self._camera)
+                elsewhere = not why_undrawable(state.scene.gaussians)  # another view would show something
+                state.nothing = f"{reason}: press R for the opening view" if elsewhere else reason
         return moving
 
     def _scale(self) -> float:
@@ -114,7 +127,7 @@ class Canvas:
         target = self._target(size)
         camera = state.view.camera(*size)
         began = self._clock()
-        self._renderer.draw(target, camera, state.picture, state.heat_ranges())
+        self._renderer.draw(target, camera, state.shown_picture(), state.heat_ranges())
         self._ctx.finish()
         milliseconds = 1e3 * (self._clock() - began)
         if scale == 1:
@@ -150,4 +163,4 @@ class Canvas:
         assert state.view is not None
         self._sync(state)
         self._camera = state.view.camera(*state.size)
-        return np.asarray(self._renderer.read(self._camera, state.picture, state.heat_ranges()))
+        return np.asarray(self._renderer.read(self._camera, state.shown_picture(), state.heat_ranges()))

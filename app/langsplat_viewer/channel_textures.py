@@ -11,6 +11,7 @@ from langsplat_core.raster import Rasterizer
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer, GlView, Source
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.channels import ArrayChannels, Layers
+from langsplat_viewer.looking import looking_settings
 
 Textures = tuple[moderngl.Texture, ...]  # colours with alpha and, if asked for, one further channel
 
@@ -53,7 +54,7 @@ class GlSource:
         self._layers = layers
 
     def _view(self, camera: Camera) -> GlView:
-        return self._rasterizer.view(self._scene.gaussians, camera, self._scene.raster_settings())
+        return self._rasterizer.view(self._scene.gaussians, camera, looking_settings(self._scene, camera))
 
     def render(self, camera: Camera, extra: Extra) -> Textures:
         sources: list[Source] = ["colour"]

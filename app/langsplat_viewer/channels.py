@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array
-from langsplat_core.config import INRIA, PictureConfig
+from langsplat_core.config import PictureConfig
 from langsplat_core.display.colour_maps import MAX_QUERIES
 from langsplat_core.display.compose import Channels
 from langsplat_core.display.displays import DISPLAYS, Extra
@@ -13,6 +13,7 @@ from langsplat_core.raster import Rasterizer, View
 from langsplat_core.raster.protocol import MedianDepth
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_viewer.looking import looking_settings
 
 _DEPTH_SAMPLE = 20_000  # Gaussians looked at for the depth range; quantiles need no more
 
@@ -52,9 +53,7 @@ def depth_range(gaussians: Gaussians, camera: Camera) -> tuple[float, float]:
     means = gaussians.means[:: max(len(gaussians) // _DEPTH_SAMPLE, 1)].astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
         pixels, depths = camera.project(means)
-        inside = (
-            (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1) & (depths > INRIA.near)
-        )
+        inside = (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1) & (depths > 0)
     if not inside.any():
         return 0.0, 1.0
     near, far = np.quantile(depths[inside], [0.02, 0.98])
@@ -83,7 +82,7 @@ class ArrayChannels:
 
     def view(self, scene: Scene, camera: Camera) -> View:
         """The Gaussians of `scene` projected into `camera`."""
-        gaussians, settings = scene.gaussians, scene.raster_settings()
+        gaussians, settings = scene.gaussians, looking_settings(scene, camera)
         key = (settings, *camera_key(camera))
         if (
             self._view is None

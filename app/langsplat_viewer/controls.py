@@ -12,10 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera, Intrinsics, Scene, look_at
+from langsplat_viewer.framing import Sample, framing_eye, median_depth, reach, sample_of
 
 MAX_ELEVATION = math.radians(88)  # nearer to the pole a small drag would spin the picture
 DEFAULT_FOV = 50.0  # degrees, of the picture's shorter side
 FOV_RANGE = (10.0, 120.0)  # degrees
+FARTHEST = 12.0  # of the distance from the middle that holds the scene: it is still a spot that can be seen
+SURROUNDINGS = 1.8  # how much more than a thing itself a view of it shows
 
 
 def symmetric_intrinsics(fov_degrees: float = DEFAULT_FOV) -> Intrinsics:
@@ -94,10 +97,13 @@ def pan(view: OrbitCamera, dx: float, dy: float, size: tuple[int, int]) -> Orbit
     return replace(view, target=view.target - view.distance * (dx / inner.fx * right + dy / inner.fy * down))
 
 
-def zoom(view: OrbitCamera, factor: float, min_distance: float) -> OrbitCamera:
-    """Multiply the distance by `factor`; at `min_distance` the target is pushed on, so it never sticks."""
+def zoom(
+    view: OrbitCamera, factor: float, min_distance: float, max_distance: float = math.inf
+) -> OrbitCamera:
+    """Multiply the distance by `factor`; at `min_distance` the target is pushed on, so it never sticks, and
+    at `max_distance` the way back ends (a view from farther away stays where it is)."""
     wanted = view.distance * factor
-    distance = max(wanted, min_distance)
+    distance = min(max(wanted, min_distance), max(max_distance, view.distance))
     push = distance - wanted if factor < 1 else 0.0
     return replace(view, distance=distance, target=view.target + push * view.rotation[2])
 
@@ -154,13 +160,18 @@ class Extent:
     centre: Array  # (3,) robust middle, world units
     radius: float  # robust, world units, > 0
     up: Array  # (3,) unit
-    home: Camera  # frames the whole scene
+    rotation: Array  # (3, 3) world to camera, of a view from a little above
+    sample: Sample  # what a view of everything is fitted to
+    farthest: float  # how far the camera may go back from what it turns around, world units
 
 
 def extent_of(scene: Scene) -> Extent:
     """Measure a scene."""
     centre, radius = scene.bounds()
-    return Extent(centre, radius, scene.up(), scene.framing_camera((1000, 1000)))
+    rotation = scene.framing_camera((1000, 1000)).rotation
+    sample = sample_of(scene.gaussians)
+    farthest = FARTHEST * max(reach(sample, centre), radius)
+    return Extent(centre, radius, scene.up(), rotation, sample, farthest)
 
 
 def from_camera(camera: Camera, extent: Extent) -> OrbitCamera:
@@ -171,6 +182,26 @@ def from_camera(camera: Camera, extent: Extent) -> OrbitCamera:
     return OrbitCamera(camera.rotation, target, distance, extent.up, camera.intrinsics)
 
 
-def default_view(scene: Scene, extent: Extent) -> OrbitCamera:
-    """The first training camera where there is one, else a view of the whole scene."""
-    return from_camera(scene.cameras[0] if scene.cameras else extent.home, extent)
+def frame_all(view: OrbitCamera, extent: Extent, size: tuple[int, int]) -> OrbitCamera:
+    """Stand back, or come nearer, until a window of `size` pixels holds the scene; the direction is kept."""
+    eye = framing_eye(extent.sample, view.rotation, view.intrinsics.fitted(*size))
+    forward = view.rotation[2]
+    if eye is None:
+        return focus(view, extent.centre, 2.6 * extent.radius)
+    distance = max(median_depth(extent.sample, eye, forward), 1e-3 * extent.radius)
+    return replace(view, target=eye + distance * forward, distance=distance)
+
+
+def holding_distance(view: OrbitCamera, box: Array) -> float:
+    """Distance from which a thing in `box` (2, 3) fills about half of the picture, world units."""
+    radius = 0.5 * float(np.linalg.norm(box[1] - box[0]))
+    return SURROUNDINGS * radius / math.sin(math.radians(min(view.intrinsics.fov_degrees, 170.0)) / 2)
+
+
+def default_view(scene: Scene, extent: Extent, size: tuple[int, int]) -> OrbitCamera:
+    """The first training camera where there is one, else a view of the whole scene in a window of `size`
+    pixels."""
+    if scene.cameras:
+        return from_camera(scene.cameras[0], extent)
+    anywhere = OrbitCamera(extent.rotation, extent.centre, extent.radius, extent.up, symmetric_intrinsics())
+    return frame_all(anywhere, extent, size)

@@ -20,6 +20,7 @@ from langsplat_core.raster.opengl.draw import drawing, set_uniforms, shader
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.channel_textures import ArraySource, ChannelSource, GlSource, Textures
 from langsplat_viewer.channels import Layers, camera_key, depth_range
+from langsplat_viewer.looking import VISIBLE_ALPHA
 
 Backend = Literal["auto", "opengl", "cpu", "cuda"]
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swr ", "software", "swiftshader", "basic render")
@@ -131,6 +132,7 @@ class FrameRenderer:
             "display": NUMBERS[display],
             "query_colours": QUERY_COLOURS.astype("f4").tobytes(),
             "heat_ranges": np.array(full_ranges(heat_ranges, MAX_QUERIES), "f4").tobytes(),
+            "own_colours": picture.own_colours,
             "heat_opacity": picture.heat_opacity,
             "dim": picture.dim,
             "threshold": picture.threshold,
@@ -152,6 +154,14 @@ class FrameRenderer:
         finally:
             before.use()
         return np.frombuffer(pixels, np.uint8).reshape(camera.height, camera.width, 3)[::-1].copy()
+
+    def shows_nothing(self) -> bool:
+        """Whether the last drawn image, if there was one, holds nothing of the scene."""
+        if self._scene is None or not self._drawn:
+            return False
+        colours = self._textures[0]
+        alpha = np.frombuffer(colours.read(), colours.dtype).reshape(-1, colours.components)[:, -1]
+        return bool(alpha.max(initial=0) < VISIBLE_ALPHA)
 
     def depth_at(self, x_px: float, y_px: float) -> float | None:
         """Camera z of the surface in the pixel at a position in the last drawn image (in pixels of its

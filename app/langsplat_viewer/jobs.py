@@ -5,15 +5,20 @@ needs to know about threads.
 """
 
 import threading
+import time
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass, field
+from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from langsplat_core.errors import LangSplatError
 from langsplat_core.progress import Cancelled, Progress
 
 T = TypeVar("T")
+
+
+REPORT_EVERY = 0.1  # seconds between reports that are worth a new frame
 
 
 @dataclass(eq=False)
@@ -23,22 +28,43 @@ class Job:
     label: str
     done: Callable[[Any], None]
     failed: Callable[[str], None]
-    future: Future[Any] | None = None
+    work: Callable[[Progress], Any]
+    wake: Callable[[], None]
+    future: Future[Any] = field(default_factory=Future)
     step: tuple[str, float] = ("", 0.0)  # what it last reported, fraction in [0, 1]
     stopped: threading.Event = field(default_factory=threading.Event)
+    reported: float = 0.0  # when, seconds
 
     def report(self, label: str, fraction: float) -> None:
         """The `Progress` given to the work; raises Cancelled once the job is cancelled."""
         if self.stopped.is_set():
             raise Cancelled
         self.step = (label, fraction)
+        now = time.monotonic()
+        if now - self.reported >= REPORT_EVERY:
+            self.reported = now
+            self.wake()
+
+    def run(self) -> None:
+        """On the worker's thread."""
+        if not self.future.set_running_or_notify_cancel():
+            return
+        try:
+            self.future.set_result(self.work(self.report))
+        except BaseException as error:  # noqa: BLE001  whatever it is, the window's thread says it
+            self.future.set_exception(error)
+        self.wake()
 
 
 class Worker:
-    """Runs jobs one after the other."""
+    """Runs jobs one after the other, on a thread that ends with the process whatever it is doing."""
 
-    def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="langsplat-worker")
+    def __init__(self, wake: Callable[[], None] = lambda: None) -> None:
+        """`wake` is called on the worker's thread when there is something new to show."""
+        self.wake = wake
+        self.delivered = 0  # jobs whose outcome was handed over
+        self._waiting: SimpleQueue[Job | None] = SimpleQueue()
+        self._thread: threading.Thread | None = None
         self._jobs: list[Job] = []
 
     def submit(
@@ -49,24 +75,31 @@ class Worker:
         failed: Callable[[str], None],
     ) -> Job:
         """Queue `work`; `poll` will later call `done` with its result, or `failed` with one line."""
-        job = Job(label, done, failed)
-        job.future = self._pool.submit(work, job.report)
+        job = Job(label, done, failed, work, lambda: self.wake())
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="langsplat-worker", daemon=True)
+            self._thread.start()
         self._jobs.append(job)
+        self._waiting.put(job)
         return job
+
+    def _run(self) -> None:
+        while (job := self._waiting.get()) is not None:
+            job.run()
 
     def poll(self) -> None:
         """Deliver what has finished, in the order of submission. Call once per frame."""
-        finished = [job for job in self._jobs if job.future is not None and job.future.done()]
+        finished = [job for job in self._jobs if job.future.done()]
         self._jobs = [job for job in self._jobs if job not in finished]
         for job in finished:
+            self.delivered += 1
             deliver(job)
 
     def cancel(self) -> None:
         """Drop everything queued and stop the running job where it next reports progress."""
         for job in self._jobs:
             job.stopped.set()
-            if job.future is not None:
-                job.future.cancel()
+            job.future.cancel()
 
     @property
     def current(self) -> tuple[str, float] | None:
@@ -77,15 +110,20 @@ class Worker:
                 return label or job.label, fraction
         return None
 
+    @property
+    def is_running(self) -> bool:
+        """Whether some job has not come to its end yet, cancelled or not."""
+        return any(not job.future.done() for job in self._jobs)
+
     def close(self) -> None:
-        """Stop taking work; a job that runs ends by itself."""
+        """Stop taking work; a job that runs ends by itself, or with the process."""
         self.cancel()
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._waiting.put(None)
 
 
 def deliver(job: Job) -> None:
     """Call the right callback of a finished job; a cancelled one gets none."""
-    if job.stopped.is_set() or job.future is None:
+    if job.stopped.is_set():
         return
     try:
         error = job.future.exception()

@@ -11,6 +11,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.formats import load_scene
 from langsplat_core.formats.cameras_json import read_cameras
 from langsplat_core.formats.sog import META_NAME
+from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
@@ -93,15 +94,25 @@ def latent_level(level: LevelChoice) -> int:
     return LEVELS.index("whole" if level == "auto" else level)
 
 
-def warm_up(scene: Scene, backend: str) -> None:
-    """Have the CPU rasterizer compiled before the window first draws with it (once per installation)."""
+def warm_up(scene: Scene, backend: str, progress: Progress = silent) -> None:
+    """Have the CPU rasterizer compiled before the window first draws with it, and say so."""
     if backend == "cpu":
+        say_compiling(progress)
         from langsplat_core.raster import load_rasterizer
         from langsplat_viewer.channels import ArrayChannels, Layers
 
         channels, camera = ArrayChannels(load_rasterizer("cpu")), scene.framing_camera((16, 16))
         channels.render(scene, Layers(), camera, "none")
         channels.depth_at(scene, camera, 8, 8)
+
+
+def say_compiling(progress: Progress) -> None:
+    """Report that the CPU rasterizer's kernels are compiled next, unless an earlier run has done so."""
+    from langsplat_core.compiled import is_compiled
+    from langsplat_core.raster.cpu import blend
+
+    if not is_compiled(Path(blend.__file__)):
+        progress("compiling the drawing kernels, once per installation (half a minute)", 0.7)
 
 
 def services(encoder_id: str) -> Services:

@@ -3,8 +3,6 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.display.colour_maps import MAX_QUERIES
@@ -12,12 +10,11 @@ from langsplat_core.display.compose import HeatRanges
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.suggestions import Suggestions
-from langsplat_core.scene import Scene
-from langsplat_core.semantics.relevancy import FLOOR
+from langsplat_core.scene import Camera, Scene
+from langsplat_viewer import painting
 from langsplat_viewer.controls import Extent, OrbitCamera
 
 SLOTS = MAX_QUERIES  # queries shown at a time: one colour each
-NO_HEAT = (FLOOR, 1.0)  # heat range of a slot without an answer, whose relevancy is 0
 MAX_MESSAGES = 50
 GLIDE_SECONDS = 0.35
 
@@ -28,6 +25,7 @@ class Query:
 
     phrase: str
     slot: int | None = None  # index of its colour while shown, None while hidden
+    shown_since: int = 0  # larger for a query shown later
     result: QueryResult | None = None
     reading: str = ""  # how the phrase was understood, where it has structure
     problem: str = ""  # why it has no result, one line
@@ -74,6 +72,8 @@ class ViewerState:
 
     view: OrbitCamera | None = None
     glide: Glide | None = None
+    opening_camera: Camera | None = None  # what R returns to, where that is not the scene's own choice
+    nothing: str = ""  # why the picture shows nothing of the scene, where it does not
     camera_index: int | None = None  # training camera last jumped to
     fly_speed: float = 0.5  # scene radii per second
 
@@ -81,6 +81,7 @@ class ViewerState:
     latent_level: int = 2  # index into scene.LEVELS
     level: LevelChoice = "auto"
     queries: list[Query] = field(default_factory=list)
+    selected: Query | None = None  # whose details are shown
     typed: str = ""
     asked: list[str] = field(default_factory=list)  # what was searched for, the oldest first
     recalled: int = 0  # index into `asked` of the phrase last recalled; its length: none
@@ -96,6 +97,10 @@ class ViewerState:
     coarse_while_moving: bool = True
     show_panel: bool = True
     show_help: bool = False
+    show_palette: bool = False
+    palette_typed: str = ""
+    wants_file: bool = False  # the box for a path opens at the next frame
+    letters_muted: bool = False  # letters are no keys: they were meant for a box that cannot be typed in
 
     def say(self, text: str, is_error: bool = False) -> None:
         """Add one line to the messages area."""
@@ -103,22 +108,33 @@ class ViewerState:
         if not self.messages or self.messages[-1] != message:
             self.messages = [*self.messages[1 - MAX_MESSAGES :], message]
 
+    def in_order_of_showing(self) -> list[Query]:
+        """Queries that have a colour, the one shown longest first."""
+        return sorted((q for q in self.queries if q.slot is not None), key=lambda q: q.shown_since)
+
     def shown(self) -> list[Query | None]:
         """Answered queries by slot, as many as the highest slot in use."""
         by_slot = {q.slot: q for q in self.queries if q.slot is not None and q.result is not None}
         return [by_slot.get(slot) for slot in range(max(by_slot, default=-1) + 1)]
 
+    def shown_results(self) -> tuple[QueryResult | None, ...]:
+        """Their answers."""
+        return tuple(None if query is None else query.result for query in self.shown())
+
     def heat_ranges(self) -> HeatRanges:
-        """The relevancies at which the heat of each slot is 0 and 1."""
-        results = (None if q is None else q.result for q in self.shown())
-        return tuple(NO_HEAT if result is None else result.heat_range for result in results)
+        """The values at which the heat of each slot is 0 and 1."""
+        return painting.heat_ranges(self.shown_results(), self.picture.display)
+
+    def shown_picture(self) -> PictureConfig:
+        """The settings of the picture with what follows from the answers."""
+        return painting.fitted(self.picture, self.shown_results())
 
     def layers_key(self) -> tuple[object, ...]:
         """Changes exactly when `latent_rgb` or `relevancies` would. Holds the objects themselves: the id of
         a result that is gone may be given to the next one."""
         wants_latent = self._shows_latents() and self.latent is not None
-        results = tuple(None if q is None else q.result for q in self.shown())
-        return self.scene, self.latent_level if wants_latent else None, results
+        segments = self.picture.display == "segmentation"
+        return self.scene, self.latent_level if wants_latent else None, segments, self.shown_results()
 
     def latent_rgb(self) -> Array | None:
         """(N, 3) colours of the latents, while they are shown."""
@@ -131,12 +147,7 @@ class ViewerState:
         return DISPLAYS[self.picture.display].extra == "latent"
 
     def relevancies(self) -> Array | None:
-        """(N, Q) float32 relevancy of the shown queries at their levels; an unused slot is zero."""
-        shown = self.shown()
-        if self.scene is None or not shown:
+        """(N, Q) float32 of the shown queries, see `painting.columns`."""
+        if self.scene is None:
             return None
-        columns = np.zeros((len(self.scene.gaussians), len(shown)), np.float32)
-        for column, query in enumerate(shown):
-            if query is not None and query.result is not None:
-                columns[:, column] = query.result.relevancy[query.result.level]
-        return columns
+        return painting.columns(self.shown_results(), self.picture.display, len(self.scene.gaussians))

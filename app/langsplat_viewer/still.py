@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import moderngl
-import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import Display, LevelChoice, PictureConfig
@@ -17,11 +16,14 @@ from langsplat_core.formats.language import SUFFIX
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import check_phrase, run_phrase
-from langsplat_core.scene import LEVELS, Camera, Reading, Scene
+from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.phrases import split_phrases
+from langsplat_viewer import painting
+from langsplat_viewer.controls import default_view, extent_of
 from langsplat_viewer.frame import Backend
 from langsplat_viewer.headless import render_picture
-from langsplat_viewer.options import check_display, chosen_camera, latent_level
+from langsplat_viewer.looking import why_undrawable
+from langsplat_viewer.options import check_display, chosen_camera, latent_level, say_compiling
 from langsplat_viewer.saving import save_png
 from langsplat_viewer.state import SLOTS
 from langsplat_viewer.viewer import Services
@@ -58,7 +60,7 @@ def still_camera(scene: Scene, choice: str, size: tuple[int, int] | None) -> Cam
     """The camera of a picture: as chosen, else the first training camera, else one that frames the scene."""
     camera = chosen_camera(scene, choice) or (scene.cameras[0] if scene.cameras else None)
     if camera is None:
-        return scene.framing_camera(size or DEFAULT_SIZE)
+        return default_view(scene, extent_of(scene), size or DEFAULT_SIZE).camera(*(size or DEFAULT_SIZE))
     if size is None or size == (camera.width, camera.height):
         return camera
     return camera.with_intrinsics(camera.intrinsics.fitted(*size))
@@ -66,7 +68,8 @@ def still_camera(scene: Scene, choice: str, size: tuple[int, int] | None) -> Cam
 
 def describe(result: QueryResult) -> str:
     """One line for people and for scripts."""
-    place = "none" if result.place is None else "({})".format(", ".join(f"{v:.3f}" for v in result.place))
+    shown = None if result.verdict == "not here" else result.place
+    place = "none" if shown is None else "({})".format(", ".join(f"{v:.3f}" for v in shown))
     verdict: str = result.verdict
     if result.probability is not None:
         verdict += f" ({100 * result.probability:.0f} %)"
@@ -78,6 +81,9 @@ def draw_still(request: StillRequest, services: Services, progress: Progress = s
     """Draw and save the picture; returns the lines to print: the picture's, then one for each query."""
     progress("opening the scene", 0.1)
     scene = services.load_scene(request.path)
+    reason = why_undrawable(scene.gaussians)
+    if reason:  # before a text encoder is loaded for nothing
+        raise InputError(f"{request.path}: {reason}; export it again, or open another scene")
     check_display(scene, request.display, request.queries)
     camera = still_camera(scene, request.camera, request.size)
     engine = services.engine(scene)
@@ -88,16 +94,18 @@ def draw_still(request: StillRequest, services: Services, progress: Progress = s
     shown = results[-SLOTS:]  # as in the window, where a fourth query takes the oldest one's colour
 
     progress("drawing", 0.8)
+    if request.backend in ("auto", "cpu"):
+        say_compiling(progress)
     size = f"{camera.width}x{camera.height}"
     try:
         image = render_picture(
             scene,
             camera,
-            _picture(scene, request),
+            painting.fitted(PictureConfig(display=request.display), shown),
             backend=request.backend,
             latent_rgb=_latent(scene, request),
-            relevancies=_columns(shown),
-            heat_ranges=tuple(result.heat_range for result in shown),
+            relevancies=painting.columns(shown, request.display, len(scene.gaussians)),
+            heat_ranges=painting.heat_ranges(shown, request.display),
         )
         save_png(request.out, image)
     except MemoryError:
@@ -112,20 +120,8 @@ def draw_still(request: StillRequest, services: Services, progress: Progress = s
     return [f"{request.out}: {size}, {request.display}", *(describe(result) for result in results)]
 
 
-def _picture(scene: Scene, request: StillRequest) -> PictureConfig:
-    """What the window shows when a scene is opened: cut where a thing counts as there."""
-    reading = Reading() if scene.language is None else scene.language.reading
-    return PictureConfig(display=request.display, threshold=reading.found)
-
-
 def _latent(scene: Scene, request: StillRequest) -> Array | None:
     if DISPLAYS[request.display].extra != "latent" or scene.language is None:
         return None
     colours: Array = latent_colours(scene.language)[latent_level(request.level)]
     return colours
-
-
-def _columns(results: list[QueryResult]) -> Array | None:
-    if not results:
-        return None
-    return np.stack([result.relevancy[result.level] for result in results], axis=1)

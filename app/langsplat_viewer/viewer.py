@@ -3,9 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from langsplat_core.arrays import Array
+from langsplat_core.progress import Progress
 from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.scene import Scene
 from langsplat_viewer.jobs import Worker
@@ -29,11 +30,20 @@ class Services:
     load_scene: Callable[[Path], Scene]
     load_encoder: LoadEncoder
     encoder_id: str = ""  # in place of the text encoder that a scene names
-    warm_up: Callable[[Scene, str], None] = lambda scene, backend: None  # first use of a backend is slow
+    # the first use of a backend is slow
+    warm_up: Callable[[Scene, str, Progress], None] = lambda scene, backend, progress: None
 
     def engine(self, scene: Scene) -> QueryEngine:
         """What answers queries on `scene`."""
         return QueryEngine(scene, self.load_encoder, encoder_id=self.encoder_id)
+
+
+@dataclass(eq=False)
+class History:
+    """Moments (`actions.history`) to return to, the nearest one last."""
+
+    past: list[Any] = field(default_factory=list)
+    future: list[Any] = field(default_factory=list)
 
 
 @dataclass(eq=False)
@@ -45,4 +55,5 @@ class Viewer:
     worker: Worker = field(default_factory=Worker)
     engine: QueryEngine | None = None  # of the scene shown; asked on the worker only
     surface: Surface | None = None
+    history: History = field(default_factory=History)
     clock: float = 0.0  # seconds, as of the last `actions.tick`

@@ -15,19 +15,23 @@ import moderngl
 
 from langsplat_core.config import Display, LevelChoice
 from langsplat_core.errors import BackendError, InputError, LangSplatError
-from langsplat_viewer import actions
+from langsplat_viewer import actions, fonts
 from langsplat_viewer.canvas import Canvas, Renderer
 from langsplat_viewer.frame import Backend, FrameRenderer
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import chosen_camera, latent_level
 from langsplat_viewer.panels import layout, navigation
+from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.panels.scene import OpenDialog
 from langsplat_viewer.viewer import Services, Viewer
 
 TITLE = "LangSplat viewer"
 DEFAULT_SIZE = (1280, 800)
 GL_VERSIONS = ((4, 1), (3, 3))  # 4.1 draws splats on every system; 3.3 still shows the CPU's pictures
-IDLE_FPS = 8.0  # frames per second while nothing happens
+IDLE_FPS = 0.01  # frames per second while nothing happens: an event, or the worker, wakes the window at once
+DIALOG_FPS = 5.0  # while the system's file dialog is open, which is asked for its answer
+AWAKE_SECONDS = 0.4  # after an event: tooltips come, and widgets take their places in a few frames
+AWAKE_FRAMES = 4  # after news from the worker, for the same reason
 
 # What may go wrong while a picture is drawn, from drivers to arrays that do not fit. It is shown as a line in
 # the window: an exception that left a frame half way would take the whole window down.
@@ -65,6 +69,10 @@ def open_window(request: WindowRequest, services: Services) -> None:
     immapp.run(window.params())
     if window.failure is not None:
         raise window.failure
+    if window.viewer.worker.is_running:  # reading and encoding stop for nothing, and libraries wait for them
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
 
 
 def probe_gl() -> tuple[int, int]:
@@ -107,6 +115,9 @@ class Window:
         self._canvas: Canvas | None = None
         self._screen: moderngl.Framebuffer | None = None
         self.unfinished = False  # a finer picture is due
+        self.idles = True  # False for scripts that drive the window and count on its next frame
+        self._frames = AWAKE_FRAMES  # to be drawn whatever happens
+        self._last: tuple[object, ...] = ()  # what was there in the last frame
         self._titled: Path | None = None  # the scene that the window's title names
 
     def params(self) -> hello_imgui.RunnerParams:
@@ -130,6 +141,8 @@ class Window:
         gl.anti_aliasing_samples = 0  # splats gain nothing from it
         params.ini_disable = True  # the layout is fixed: nothing to remember, no file in the user's folder
         params.fps_idling.fps_idle = IDLE_FPS
+        params.fps_idling.time_active_after_last_event = AWAKE_SECONDS
+        params.callbacks.load_additional_fonts = fonts.load
         params.callbacks.setup_imgui_style = _style
         params.callbacks.post_init = self._start
         params.callbacks.show_gui = self._gui
@@ -149,6 +162,8 @@ class Window:
             return
         self._screen = ctx.detect_framebuffer()
         self.viewer.surface = self._canvas
+        self.viewer.worker.wake = glfw.post_empty_event
+        imgui.get_io().config_input_text_cursor_blink = False  # a blinking cursor would be drawn for ever
         glfw.set_drop_callback(glfw_window_hello_imgui(), self._dropped)  # type: ignore[arg-type]
         actions.open_scene(self.viewer, self._request.path, self._first_view)
 
@@ -159,7 +174,7 @@ class Window:
         try:
             camera = chosen_camera(state.scene, request.camera)
             if camera is not None:
-                actions.stand_at(viewer, camera)
+                actions.open_at(viewer, camera)
         except InputError as error:
             state.say(str(error), is_error=True)
         actions.set_level(viewer, request.level)
@@ -168,9 +183,8 @@ class Window:
         actions.set_display(viewer, request.display, latent_level(request.level))
 
     def drop(self, paths: list[str]) -> None:
-        """Files were dropped onto the window: open the first."""
-        if paths:
-            actions.open_scene(self.viewer, Path(paths[0]))
+        """Files were dropped onto the window."""
+        actions.open_dropped(self.viewer, [Path(path) for path in paths])
 
     def _dropped(self, window: object, paths: list[str]) -> None:
         self.drop(paths)
@@ -181,14 +195,31 @@ class Window:
             hello_imgui.get_runner_params().app_shall_exit = True
             return
         actions.tick(viewer, imgui.get_time())
-        area = layout.scene_area(viewer)
+        area = scene_area(viewer)
         scale = imgui.get_io().display_framebuffer_scale
         actions.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))
         self._title()
         layout.draw(viewer, self._dialog)
-        navigation.handle(viewer, layout.scene_area(viewer))
-        busy = self.unfinished or viewer.state.glide is not None
-        hello_imgui.get_runner_params().fps_idling.enable_idling = not busy
+        navigation.handle(viewer, scene_area(viewer))
+        self._pace()
+
+    def _pace(self) -> None:
+        """Say how soon the next frame is wanted: at once only while something moves or has just changed."""
+        state, idling = self.viewer.state, hello_imgui.get_runner_params().fps_idling
+        there = (state.view, self.viewer.worker.delivered, state.nothing)
+        changed = len(there) != len(self._last) or any(
+            a is not b and a != b for a, b in zip(there, self._last, strict=True)
+        )
+        self._last = there
+        self.idles = True  # False for scripts that drive the window and count on its next frame
+        self._frames = AWAKE_FRAMES if changed else max(self._frames - 1, 0)
+        busy = self.unfinished or state.glide is not None or self._frames > 0
+        idling.enable_idling = self.idles and (self.is_minimised() or not busy)
+        idling.fps_idle = DIALOG_FPS if self._dialog.is_open else IDLE_FPS
+
+    def is_minimised(self) -> bool:
+        """Whether nobody can see the window."""
+        return bool(glfw.get_window_attrib(glfw_window_hello_imgui(), glfw.ICONIFIED))
 
     def _title(self) -> None:
         path = self.viewer.state.path
@@ -199,7 +230,7 @@ class Window:
     def _picture(self) -> None:
         """Bring the picture up to date and put it behind the panels."""
         canvas, state = self._canvas, self.viewer.state
-        if canvas is None or self._screen is None:
+        if canvas is None or self._screen is None or self.is_minimised():
             return
         try:
             self.unfinished = canvas.update(state, imgui.get_time())
@@ -209,7 +240,7 @@ class Window:
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
         if canvas.texture is not None:
-            area = layout.scene_area(self.viewer)
+            area = scene_area(self.viewer)
             imgui.get_background_draw_list().add_image(
                 imgui.ImTextureRef(canvas.texture.glo),
                 ImVec2(area.left, area.top),
@@ -219,6 +250,7 @@ class Window:
             )
 
     def _stop(self) -> None:
+        self._dialog.close()
         self.viewer.worker.close()
 
 

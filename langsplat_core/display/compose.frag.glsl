@@ -10,6 +10,7 @@ uniform vec3 query_colours[MAX_QUERIES];
 
 uniform int display;            // one of DISPLAY_*
 uniform vec2 heat_ranges[MAX_QUERIES];  // relevancies at which heat is 0 and 1
+uniform bool own_colours;       // heat in the colour of each query instead of the colour map
 uniform float heat_opacity;
 uniform float dim;
 uniform float threshold;
@@ -30,12 +31,17 @@ vec3 turbo(float t) {
 
 vec3 heat_map(vec3 base, vec3 relevancy) {
     float heat = 0.0;
+    float total = 0.0;
+    vec3 mean = vec3(0.0);
     for (int j = 0; j < MAX_QUERIES; ++j) {
         vec2 range = heat_ranges[j];
-        heat = max(heat, (relevancy[j] - range.x) / (range.y - range.x));
+        float own = clamp((relevancy[j] - range.x) / (range.y - range.x), 0.0, 1.0);
+        heat = max(heat, own);
+        total += own;
+        mean += own * query_colours[j];
     }
-    heat = min(heat, 1.0);
-    return mix(base * dim, turbo(heat), heat_opacity * smoothstep(0.0, HEAT_FADE, heat));
+    vec3 hot = own_colours ? mean / max(total, 1e-9) : turbo(heat);
+    return mix(base * dim, hot, heat_opacity * smoothstep(0.0, own_colours ? 1.0 : HEAT_FADE, heat));
 }
 
 vec3 segments(vec3 base, vec3 relevancy) {
@@ -44,7 +50,9 @@ vec3 segments(vec3 base, vec3 relevancy) {
         if (relevancy[j] > relevancy[winner])
             winner = j;
     bool inside = relevancy[winner] > threshold;
-    return inside ? mix(base, query_colours[winner], SEGMENT_OPACITY) : base * dim;
+    vec2 range = heat_ranges[winner];
+    float opacity = SEGMENT_OPACITY * clamp((1.0 - range.x) / (range.y - range.x), 0.0, 1.0);
+    return inside ? mix(base, query_colours[winner], opacity) : base * dim;
 }
 
 vec3 depth_map(vec2 sums) {

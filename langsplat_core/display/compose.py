@@ -45,7 +45,7 @@ class Channels:
     rgb: Array  # (H, W, 3)
     alpha: Array  # (H, W) in [0, 1]
     latent: Array | None = None  # (H, W, 3) latent colours
-    relevancies: Array | None = None  # (H, W, Q), Q <= MAX_QUERIES
+    relevancies: Array | None = None  # (H, W, Q), Q <= MAX_QUERIES; or which Gaussians are members, 0 or 1
     depth_sum: Array | None = None  # (H, W) sum of weight * camera z, world units
     depth_range: tuple[float, float] = (0.0, 1.0)  # near and far end of the depth display, world units
 
@@ -103,20 +103,31 @@ def _latent(sheet: _Sheet) -> Array:
 
 
 def _heat(sheet: _Sheet) -> Array:
+    """One query by the colour map. Several by their own colours: where they overlap, the mean of the colours,
+    weighted by heat, as opaque as the hottest of them."""
     picture, relevancy = sheet.picture, sheet.relevancy()
-    low, high = np.transpose(full_ranges(sheet.heat_ranges, relevancy.shape[-1]))
-    heat = np.clip((relevancy - low) / (high - low), 0, 1).max(-1)
-    fade = np.clip(heat / HEAT_FADE, 0, 1)
+    count = relevancy.shape[-1]
+    low, high = np.transpose(full_ranges(sheet.heat_ranges, count))
+    heats = np.clip((relevancy - low) / (high - low), 0, 1)
+    heat = heats.max(-1)
+    if picture.own_colours:
+        fade, total = heat, np.maximum(heats.sum(-1, keepdims=True), 1e-9)
+        colours = heats / total @ QUERY_COLOURS[:count]
+    else:
+        fade, colours = np.clip(heat / HEAT_FADE, 0, 1), turbo(heat)
     mix = (picture.heat_opacity * fade * fade * (3 - 2 * fade))[..., None]  # smoothstep
-    return sheet.colours() * picture.dim * (1 - mix) + turbo(heat) * mix
+    return sheet.colours() * picture.dim * (1 - mix) + colours * mix
 
 
 def _segments(sheet: _Sheet) -> Array:
+    """The query that has most of a pixel, in its colour, as opaque as its value of 1 is hot."""
     picture, relevancy, colours = sheet.picture, sheet.relevancy(), sheet.colours()
+    low, high = np.transpose(full_ranges(sheet.heat_ranges, relevancy.shape[-1]))
+    opacity = SEGMENT_OPACITY * np.clip((1 - low) / (high - low), 0, 1)
     winner = relevancy.argmax(-1)
     inside = (relevancy.max(-1) > picture.threshold)[..., None]
-    tinted = colours * (1 - SEGMENT_OPACITY) + QUERY_COLOURS[winner] * SEGMENT_OPACITY
-    return np.where(inside, tinted, colours * picture.dim)
+    mix = opacity[winner][..., None]
+    return np.where(inside, colours * (1 - mix) + QUERY_COLOURS[winner] * mix, colours * picture.dim)
 
 
 def _depth(sheet: _Sheet) -> Array:

@@ -1,5 +1,8 @@
 """Viewers without a window."""
 
+import os
+import shutil
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,3 +28,23 @@ def opened(viewer: Viewer) -> Viewer:
     actions.open_scene(viewer, Path("blobs.ply"))
     settle(viewer)
     return viewer
+
+
+@pytest.fixture(scope="module")
+def display() -> Iterator[str]:
+    """The name of a display: a virtual one of our own where Xvfb is installed, else the session's."""
+    if shutil.which("Xvfb") is None:
+        if not os.environ.get("DISPLAY"):
+            pytest.skip("neither Xvfb nor a display")
+        yield os.environ["DISPLAY"]
+        return
+    reading, writing = os.pipe()
+    command = ["Xvfb", "-displayfd", str(writing), "-screen", "0", "1280x900x24", "-nolisten", "tcp"]
+    server = subprocess.Popen(command, pass_fds=[writing], stderr=subprocess.DEVNULL)
+    os.close(writing)
+    with os.fdopen(reading) as pipe:
+        number = pipe.readline().strip()
+    assert number, "Xvfb did not start"
+    yield f":{number}"
+    server.terminate()
+    server.wait(10)

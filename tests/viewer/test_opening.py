@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 from langsplat_core.formats import load_scene, save_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer import actions
+from langsplat_viewer.options import say_compiling
 from tests.support.fakes import blob_scene
 from tests.support.windowless import SCENES, errors, settle
 
@@ -125,3 +126,45 @@ def test_a_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
     said = errors(viewer)
     assert len(said) == 2
     assert all(name in reason for name, reason in zip(names, said, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("names", "opened_name", "said"),
+    [
+        (["blobs.ply", "plain.ply", "bare.ply"], "blobs.ply", "blobs.ply is opened, not plain.ply, bare.ply"),
+        (["notes.txt", "plain.ply"], "plain.ply", "plain.ply is opened, not notes.txt"),
+        (["blobs.cameras.json", "blobs.langsplat.safetensors", "blobs.ply"], "blobs.ply", ""),
+        (["blobs.ply", *"abcde"], "blobs.ply", "not a, b, c and 2 more"),
+    ],
+)
+def test_of_several_dropped_files_one_is_opened_and_the_others_named(viewer, names, opened_name, said):
+    actions.open_dropped(viewer, [Path(name) for name in names])
+    settle(viewer)
+    assert viewer.state.path.name == opened_name
+    assert (said in errors(viewer)[0]) if said else errors(viewer) == []
+
+
+def test_the_first_run_says_that_it_compiles(viewer, monkeypatch):
+    seen = []
+
+    def warm_up(scene, backend, progress):
+        say_compiling(progress)
+        seen.append(viewer.worker.current)
+
+    monkeypatch.setattr("langsplat_core.compiled.is_compiled", lambda source: False)
+    monkeypatch.setattr("langsplat_viewer.actions.opening.is_compiled", lambda source: False)
+    viewer.services = replace(viewer.services, warm_up=warm_up)
+    labels, submit = [], viewer.worker.submit
+    monkeypatch.setattr(
+        viewer.worker, "submit", lambda label, *rest: labels.append(label) or submit(label, *rest)
+    )
+    actions.open_scene(viewer, Path("blobs.ply"))
+    settle(viewer)
+    assert seen == [("compiling the drawing kernels, once per installation (half a minute)", 0.7)]
+    assert "compiling the search kernels, once per installation (half a minute)" in labels
+    assert errors(viewer) == []
+
+
+def test_an_installation_that_was_used_before_says_nothing_of_it(viewer, monkeypatch):
+    monkeypatch.setattr("langsplat_core.compiled.is_compiled", lambda source: True)
+    say_compiling(lambda label, fraction: pytest.fail(label))

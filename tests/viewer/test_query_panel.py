@@ -9,11 +9,18 @@ import pytest
 
 from langsplat_core.scene import Calibration, Odds, Reading
 from langsplat_viewer import actions
+from langsplat_viewer.panels import answers, query_box
 from langsplat_viewer.panels import query as panel
-from langsplat_viewer.panels import query_box
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene, language
 from tests.support.windowless import SCENES, settle
+
+
+class Flags:
+    """Every flag of a set of flags is 0."""
+
+    def __getattr__(self, name: str) -> int:
+        return 0
 
 
 class Paper:
@@ -27,6 +34,10 @@ class Paper:
             "get_content_region_avail": spacing,
             "get_style": SimpleNamespace(frame_padding=spacing, item_spacing=spacing),
             "get_frame_height": 10.0,
+            "get_frame_height_with_spacing": 14.0,
+            "get_text_line_height_with_spacing": 12.0,
+            "begin_child": True,
+            "selectable": (False, False),
             "get_cursor_pos_x": 0.0,
             "input_text_with_hint": (False, ""),
             "is_item_hovered": True,
@@ -36,9 +47,9 @@ class Paper:
 
     def __getattr__(self, name: str):
         if name.endswith("_"):  # a set of flags
-            return SimpleNamespace(enter_returns_true=0, callback_history=0, no_tooltip=0)
+            return Flags()
 
-        def call(*args: object) -> object:
+        def call(*args: object, **options: object) -> object:
             if name in ("text", "text_colored", "set_tooltip"):
                 self.said.append(str(args[-1]))
             return self.values.get(name, False)
@@ -49,10 +60,10 @@ class Paper:
 @pytest.fixture
 def paper(monkeypatch) -> Iterator[Paper]:
     made = Paper()
-    monkeypatch.setattr(panel, "imgui", made)
-    monkeypatch.setattr(query_box, "imgui", made)
-    monkeypatch.setattr(panel, "hello_imgui", made)
-    monkeypatch.setattr(panel, "small_wrapped", lambda text, colour: made.said.append(text))
+    for module in (panel, answers, query_box):
+        monkeypatch.setattr(module, "imgui", made)
+    for module in (panel, answers):
+        monkeypatch.setattr(module, "small_wrapped", lambda text, colour: made.said.append(text))
     return made
 
 

@@ -1,10 +1,8 @@
 """The window itself, on a virtual display, driven like a person would; and the canvas behind it."""
 
 import os
-import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +11,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.formats import save_scene
+from langsplat_core.scene import Scene
 from langsplat_viewer.canvas import REST_SECONDS, Canvas
 from langsplat_viewer.controls import default_view, extent_of, orbit
 from langsplat_viewer.state import ViewerState
@@ -21,31 +20,13 @@ from tests.support.fakes import blob_scene
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture(scope="module")
-def display() -> Iterator[str]:
-    """The name of a display: a virtual one of our own where Xvfb is installed, else the session's."""
-    if shutil.which("Xvfb") is None:
-        if not os.environ.get("DISPLAY"):
-            pytest.skip("neither Xvfb nor a display")
-        yield os.environ["DISPLAY"]
-        return
-    reading, writing = os.pipe()
-    command = ["Xvfb", "-displayfd", str(writing), "-screen", "0", "1280x900x24", "-nolisten", "tcp"]
-    server = subprocess.Popen(command, pass_fds=[writing], stderr=subprocess.DEVNULL)
-    os.close(writing)
-    with os.fdopen(reading) as pipe:
-        number = pipe.readline().strip()
-    assert number, "Xvfb did not start"
-    yield f":{number}"
-    server.terminate()
-    server.wait(10)
-
-
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Scenes with and without a language field, and one cut short."""
+    """Scenes with and without a language field, one cut short, and one of which nothing can be drawn."""
     for name, field in (("blobs", True), ("plain", False)):
         save_scene(tmp_path / f"{name}.ply", replace(blob_scene(field=field), path=None))
+    gaussians = replace(blob_scene().gaussians, opacity_logits=np.full(360, np.nan))
+    save_scene(tmp_path / "nothing.ply", Scene(gaussians))
     whole = (tmp_path / "plain.ply").read_bytes()
     (tmp_path / "truncated.ply").write_bytes(whole[: len(whole) // 2])
     return tmp_path
@@ -59,19 +40,23 @@ def folder(tmp_path: Path) -> Path:
         "without_field",
         "from_the_command_line",
         "broken_renderer",
+        "use_shortcuts",
+        "many_queries",
+        "type_while_opening",
+        "look_at_nothing",
         "close_while_opening",
     ],
 )
 def test_window(scenario: str, display: str, folder: Path):
     environment = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}
-    environment |= {"DISPLAY": display, "PYTHONPATH": str(ROOT)}
+    environment |= {"DISPLAY": display, "PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "app")))}
     run = subprocess.run(
         [sys.executable, "-m", "tests.viewer.window_driver", scenario, str(folder)],
         cwd=folder,
         env=environment,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
     )
     assert run.returncode == 0, (run.stdout + run.stderr)[-4000:]
     assert run.stdout.rstrip().endswith("PASSED"), (run.stdout + run.stderr)[-4000:]
@@ -104,6 +89,9 @@ class FakeRenderer:
     def read(self, camera, picture, heat_ranges=()):
         return np.zeros((camera.height, camera.width, 3), np.uint8)
 
+    def shows_nothing(self) -> bool:
+        return False
+
     def depth_at(self, x_px, y_px):
         return 2.0 if x_px > 100 else None
 
@@ -112,7 +100,9 @@ class FakeRenderer:
 def state() -> ViewerState:
     scene = blob_scene()
     extent = extent_of(scene)
-    return ViewerState(scene=scene, extent=extent, view=default_view(scene, extent), size=(200, 120))
+    return ViewerState(
+        scene=scene, extent=extent, view=default_view(scene, extent, (200, 120)), size=(200, 120)
+    )
 
 
 def drawn(renderer: FakeRenderer) -> list[object]:

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from imgui_bundle import imgui  # isort: skip
+from imgui_bundle import hello_imgui, imgui  # isort: skip
 from imgui_bundle.immapp import testing  # isort: skip
+from langsplat_core.display.colour_maps import QUERY_COLOURS
 from langsplat_core.errors import BackendError
 from langsplat_core.formats import load_scene
 from langsplat_core.scene import Scene
@@ -24,6 +25,7 @@ from langsplat_viewer.window import Window, WindowRequest
 from tests.support.fakes import CENTRES, FakeEncoder
 
 MUG, BOOK, PLANT = CENTRES
+PATIENCE = 240.0  # seconds: other tests may have the cores
 
 
 def digit_key(digit: int) -> imgui.Key:
@@ -52,6 +54,7 @@ class Session:
         self.window = Window(
             WindowRequest(folder / scene, size=(860, 620), **request), services, self._make_renderer
         )
+        self.window.idles = False
         self.state = self.window.viewer.state
 
     def _make_renderer(self, ctx) -> CountingRenderer:
@@ -61,6 +64,8 @@ class Session:
     def run(self, test: Callable[["Session"], None]) -> None:
         def body(ctx) -> None:
             self.ctx = ctx
+            engine = imgui.test_engine.get_io(hello_imgui.get_imgui_test_engine())
+            engine.config_watchdog_warning = engine.config_watchdog_kill_test = PATIENCE
             test(self)
 
         testing.run(test_function=body, runner_params=self.window.params())
@@ -132,6 +137,13 @@ def find_the_plant(s: Session, rgb: np.ndarray) -> None:
     assert s.state.view is before
     assert list(s.folder.glob("blobs-*.png")) == []
     assert s.state.queries[0].result.found
+    # Enter has left the box: the next letter is a key again.
+    s.ctx.key_press(imgui.Key.f)
+    s.settle()
+    assert s.state.typed == ""
+    np.testing.assert_allclose(s.state.view.target, s.state.queries[0].result.place)
+    s.ctx.key_press(imgui.Key.r)
+    s.settle()
     heat = s.shot("heat")
     hot = s.at(heat, PLANT)
     assert hot[0] > hot[2] + 60  # blue turned hot
@@ -151,7 +163,10 @@ def find_more(s: Session) -> np.ndarray:
     assert "sofa" in s.state.queries[1].problem
     s.search("mug")
     both = s.shot("both")
-    np.testing.assert_allclose(s.at(both, MUG), s.at(both, PLANT), atol=40)
+    # Each in its own colour.
+    for point, slot in ((PLANT, 0), (MUG, 2)):
+        tint = 255 * QUERY_COLOURS[slot]
+        np.testing.assert_allclose(s.at(both, point), 0.85 * tint, atol=45)
     return both
 
 
@@ -270,6 +285,126 @@ def close_while_opening(s: Session) -> None:
     assert s.window.viewer.worker.current is None
 
 
+def use_shortcuts(s: Session) -> None:
+    """Chords work everywhere, letters only by themselves and never while typing."""
+    s.wait(lambda: s.state.scene is not None)
+    s.settle()
+    key, ctrl, shift = imgui.Key, imgui.Key.mod_ctrl, imgui.Key.mod_shift
+    before = s.state.view
+    for chord in (ctrl | key.r, ctrl | key.p, ctrl | key.d, ctrl | digit_key(2), ctrl | key.q):
+        s.ctx.key_press(chord)
+        s.ctx.yield_(3)
+    assert s.state.view is before
+    assert s.state.picture.display == "rgb"
+    assert not list(s.folder.glob("blobs-*.png"))
+
+    s.ctx.key_press(ctrl | key.f)
+    s.ctx.yield_(3)
+    s.ctx.key_chars("far")
+    s.ctx.yield_(3)
+    assert (s.state.typed, s.state.view is before) == ("far", True)
+    s.ctx.key_press(key.f1)  # also while typing
+    s.ctx.yield_(2)
+    assert s.state.show_help
+    s.ctx.key_press(key.f1)
+    s.ctx.key_press(key.escape)
+    s.ctx.yield_(3)
+    assert not imgui.get_io().want_text_input
+    assert not s.state.show_help
+    s.ctx.key_press(shift | key.f)
+    s.settle()
+    assert s.state.view is not before
+    for back in (key.home, key.r):
+        s.drag((600, 300), (656, 279))
+        s.ctx.key_press(back)
+        s.settle()
+        start = s.state.scene.cameras[0].world_to_camera
+        np.testing.assert_allclose(s.state.view.camera(160, 120).world_to_camera, start, atol=1e-9)
+
+    s.ctx.key_press(ctrl | key.s)
+    s.ctx.yield_(2)
+    assert (s.folder / "blobs-001.png").exists()
+    s.ctx.key_chars("?")
+    s.ctx.yield_(2)
+    assert s.state.show_help
+    s.ctx.key_press(key.escape)
+    s.ctx.key_press(ctrl | shift | key.p)
+    s.ctx.yield_(3)
+    s.ctx.key_chars_append_enter("show depth")
+    s.ctx.yield_(3)
+    assert s.state.picture.display == "depth"
+    assert not s.state.show_palette
+    s.ctx.key_press(ctrl | key.z)
+    s.ctx.yield_(2)
+    assert s.state.picture.display == "rgb"
+    s.ctx.key_press(ctrl | key.o)
+    s.ctx.yield_(3)
+    assert s.ctx.item_exists("//**/##path")
+
+
+def many_queries(s: Session) -> None:
+    """However many there are and however long: the list keeps its place, the newest is on top."""
+    s.wait(lambda: s.state.scene is not None)
+    s.settle()
+    display = s.ctx.item_info("//**/Colours").rect_full.min.y
+    for phrase in (
+        "mug",
+        "plant",
+        "book or plant",
+        "a mug or a book or a plant or another mug or plant",
+        "pot",
+    ):
+        s.search(phrase)
+        assert s.ctx.item_info("//**/Colours").rect_full.min.y == display
+    closes = [item.rect_full for item in buttons(s, "x")]
+    panel = s.ctx.item_info("//**/Search").rect_full.max.x
+    assert closes
+    assert len({(rect.min.x, rect.max.x) for rect in closes}) == 1
+    assert all(rect.max.x <= panel + 1 for rect in closes)
+    phrase = s.state.queries[-1].phrase
+    s.shot("many")
+    s.ctx.item_click(f"//**/{phrase}/x")
+    s.ctx.yield_(2)
+    assert phrase not in [query.phrase for query in s.state.queries]
+    assert s.ctx.item_info("//**/Colours").rect_full.min.y == display
+
+
+def buttons(s: Session, label: str) -> list:
+    """What the list shows of them."""
+    names = [f"//**/{query.phrase}/{label}" for query in s.state.queries]
+    return [s.ctx.item_info(name) for name in names if s.ctx.item_exists(name)]
+
+
+def type_while_opening(s: Session) -> None:
+    """A word meant for the box that cannot be typed in yet is no row of keys."""
+    assert s.state.scene is None
+    box = s.ctx.item_info("//**/##phrase").rect_full
+    s.ctx.mouse_teleport_to_pos((box.min.x + 20, (box.min.y + box.max.y) / 2))
+    s.ctx.yield_()
+    s.ctx.mouse_click(0)
+    s.ctx.yield_(2)
+    assert s.state.letters_muted
+    for key in (imgui.Key.p, imgui.Key.tab, imgui.Key.f):
+        s.ctx.key_press(key)
+    s.ctx.yield_(2)
+    assert s.state.show_panel
+    assert not any("picture" in message.text for message in s.state.messages)
+    s.ctx.mouse_teleport_to_pos((600, 400))
+    s.ctx.mouse_click(0)
+    s.ctx.yield_(2)
+    assert not s.state.letters_muted
+    s.wait(lambda: s.state.scene is not None)
+
+
+def look_at_nothing(s: Session) -> None:
+    """A scene of which nothing can be drawn says so over the picture."""
+    s.wait(lambda: s.state.scene is not None)
+    s.settle()
+    assert "none of the 360 Gaussians can be drawn" in s.state.nothing
+    said = s.shot("nothing")[250:370, 400:]
+    assert said.max() > 150
+
+
 def slow_load(path: Path) -> Scene:
     time.sleep(1.0)
     return load_scene(path)
@@ -284,6 +419,10 @@ SCENARIOS = {
         {"queries": ("mug", "sofa", "plant"), "display": "segmentation", "level": "whole", "camera": "2"},
     ),
     "broken_renderer": (broken_renderer, "blobs.ply", {}),
+    "use_shortcuts": (use_shortcuts, "blobs.ply", {}),
+    "many_queries": (many_queries, "blobs.ply", {}),
+    "type_while_opening": (type_while_opening, "blobs.ply", {"load": slow_load}),
+    "look_at_nothing": (look_at_nothing, "nothing.ply", {}),
     "close_while_opening": (close_while_opening, "blobs.ply", {"load": slow_load}),
 }
 

@@ -4,10 +4,22 @@ from collections.abc import Callable
 
 import numpy as np
 
+from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera
-from langsplat_viewer.controls import OrbitCamera, between, focus, from_camera
+from langsplat_viewer.controls import (
+    OrbitCamera,
+    between,
+    default_view,
+    focus,
+    frame_all,
+    from_camera,
+    holding_distance,
+    zoom,
+)
 from langsplat_viewer.state import GLIDE_SECONDS, Glide, Query
 from langsplat_viewer.viewer import Viewer
+
+NEAREST = 0.004  # of the scene's radius: the closest that the eye comes to its centre of turning
 
 
 def tick(viewer: Viewer, now: float) -> None:
@@ -28,10 +40,11 @@ def move(viewer: Viewer, step: Callable[[OrbitCamera], OrbitCamera]) -> None:
         viewer.state.view, viewer.state.glide = step(viewer.state.view), None
 
 
-def stand_at(viewer: Viewer, camera: Camera) -> None:
-    """Take a camera's view at once."""
+def open_at(viewer: Viewer, camera: Camera) -> None:
+    """Take a camera's view at once; it is the opening view from now on."""
     extent = viewer.state.extent
     if extent is not None:
+        viewer.state.opening_camera = camera
         move(viewer, lambda view: from_camera(camera, extent))
 
 
@@ -41,16 +54,42 @@ def glide_to(viewer: Viewer, end: OrbitCamera) -> None:
         viewer.state.glide = Glide(viewer.state.view, end, viewer.clock)
 
 
+def zoom_by(viewer: Viewer, factor: float) -> None:
+    """Multiply the distance to the centre of turning, within what the scene's size makes sensible."""
+    extent = viewer.state.extent
+    if extent is not None:
+        nearest, farthest = NEAREST * extent.radius, extent.farthest
+        move(viewer, lambda view: zoom(view, factor, nearest, farthest))
+
+
 def set_fly_speed(viewer: Viewer, speed: float) -> None:
     """How fast the keys fly, scene radii per second."""
     viewer.state.fly_speed = speed
 
 
+def opening_view(viewer: Viewer) -> OrbitCamera | None:
+    """Where a scene is first seen from: the camera that was asked for, else the first training camera, else a
+    view of everything in the window as it is now. None without a scene."""
+    state = viewer.state
+    if state.scene is None or state.extent is None:
+        return None
+    if state.opening_camera is not None:
+        return from_camera(state.opening_camera, state.extent)
+    return default_view(state.scene, state.extent, state.size)
+
+
 def reset_view(viewer: Viewer) -> None:
-    """Frame the whole scene, upright."""
-    extent = viewer.state.extent
-    if extent is not None:
-        glide_to(viewer, from_camera(extent.home, extent))
+    """Return to the opening view."""
+    view = opening_view(viewer)
+    if view is not None:
+        glide_to(viewer, view)
+
+
+def frame_scene(viewer: Viewer) -> None:
+    """Show the whole scene, from the side that it is seen from now."""
+    state = viewer.state
+    if state.view is not None and state.extent is not None:
+        glide_to(viewer, frame_all(state.view, state.extent, state.size))
 
 
 def go_to_camera(viewer: Viewer, index: int) -> None:
@@ -71,21 +110,32 @@ def step_camera(viewer: Viewer, by: int) -> None:
 
 
 def focus_result(viewer: Viewer, query: Query | None = None) -> None:
-    """Bring a query's place to the centre, at a distance that shows its surroundings; without `query` the
-    latest one shown that was found; without any the middle of the scene."""
-    state, extent = viewer.state, viewer.state.extent
-    if extent is None or state.view is None:
+    """Bring a query's place to the centre, as near as the thing is small; without `query` the latest
+    one shown that was found; without any the whole scene."""
+    state = viewer.state
+    if state.extent is None or state.view is None:
         return
     if query is None:
-        found = [q for q in state.queries if q.slot is not None and q.result and q.result.found]
+        found = [q for q in state.in_order_of_showing() if q.result and q.result.found]
         query = found[-1] if found else None
-    if query is None or query.result is None or query.result.place is None:
-        glide_to(viewer, focus(state.view, extent.centre, 2.6 * extent.radius))
+    place = None if query is None or query.result is None else query.result.place
+    if query is None or query.result is None or place is None:
+        frame_scene(viewer)
         return
-    box = query.result.box
-    size = 0.1 * extent.radius if box is None else float(np.linalg.norm(box[1] - box[0]))
-    near = 0.5 * extent.radius
-    glide_to(viewer, focus(state.view, query.result.place, max(near, min(2.5 * size, state.view.distance))))
+    glide_to(viewer, focus(state.view, place, _distance_for(viewer, place, query.result.box)))
+
+
+def _distance_for(viewer: Viewer, place: Array, box: Array | None) -> float:
+    """From where a thing at `place` (3,) in `box` (2, 3) is seen, world units: no farther back than the
+    eye or the opening view are now, which in a room would be behind its wall."""
+    view, extent, home = viewer.state.view, viewer.state.extent, opening_view(viewer)
+    assert view is not None
+    assert extent is not None
+    assert home is not None
+    if box is None:
+        box = np.stack([place, place + 0.1 * extent.radius])
+    most = max(float(np.linalg.norm(place - view.eye)), home.distance)
+    return min(max(holding_distance(view, box), NEAREST * extent.radius), most)
 
 
 def focus_pixel(viewer: Viewer, u: float, v: float) -> None:

@@ -1,19 +1,29 @@
 """Opening scenes, and stopping what is under way."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from langsplat_core.arrays import Array
+from langsplat_core.compiled import is_compiled
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.display.latent_colours import latent_colours
+from langsplat_core.formats import cameras_json, language
 from langsplat_core.progress import Progress
+from langsplat_core.query import regions
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoders import DEMO
-from langsplat_viewer.actions.settings import set_display
-from langsplat_viewer.controls import Extent, OrbitCamera, default_view, extent_of
+from langsplat_viewer.actions.camera import opening_view
+from langsplat_viewer.actions.history import forget
+from langsplat_viewer.actions.settings import show_panel
+from langsplat_viewer.controls import Extent, extent_of
+from langsplat_viewer.looking import why_undrawable
 from langsplat_viewer.viewer import Viewer
+
+SCENE_SUFFIXES = (".ply", ".spz", ".splat", ".ksplat", ".sog")
+COMPANIONS = (cameras_json.SUFFIX, language.SUFFIX)  # files beside a scene, read with it
+NAMED = 3  # files that a message names
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +33,6 @@ class _Opened:
     scene: Scene
     unusable: dict[str, int]  # reason -> Gaussians that are therefore not drawn
     extent: Extent
-    view: OrbitCamera
     latent: Array | None  # (3, N, 3) colours
 
 
@@ -38,12 +47,11 @@ def open_scene(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = lamb
         progress(f"opening {path.name}", 0.1)
         scene = viewer.services.load_scene(path)
         progress(f"preparing {path.name}", 0.6)
-        viewer.services.warm_up(scene, backend)
+        viewer.services.warm_up(scene, backend, progress)
         progress(f"preparing {path.name}", 0.9)
         latent = None if scene.language is None else latent_colours(scene.language)
         unusable = scene.gaussians.invalid_rows()
-        extent = extent_of(scene)
-        return _Opened(scene, unusable, extent, default_view(scene, extent), latent)
+        return _Opened(scene, unusable, extent_of(scene), latent)
 
     def done(opened: _Opened) -> None:
         _show_scene(viewer, path, opened)
@@ -54,6 +62,34 @@ def open_scene(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = lamb
         viewer.state.say(reason, is_error=True)
 
     viewer.worker.submit(f"opening {path.name}", work, done, failed)
+
+
+def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
+    """Open the first scene among files that were dropped onto the window, and say what became of the others:
+    one scene is shown at a time, and what belongs to it lies beside it and is read with it."""
+    scenes = [path for path in paths if not path.name.endswith(COMPANIONS)] or list(paths)
+    if not scenes:
+        return
+    first = next((path for path in scenes if path.suffix.lower() in SCENE_SUFFIXES), scenes[0])
+    others = [path.name for path in scenes if path != first]
+    if others:
+        names = ", ".join(others[:NAMED]) + (
+            f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
+        )
+        viewer.state.say(f"one scene at a time: {first.name} is opened, not {names}", is_error=True)
+    open_scene(viewer, first)
+
+
+def ask_for_file(viewer: Viewer) -> None:
+    """Have the box for a path opened."""
+    show_panel(viewer, True)
+    viewer.state.wants_file = True
+
+
+def take_file_wish(viewer: Viewer) -> bool:
+    """Whether that box opens now; said once."""
+    wanted, viewer.state.wants_file = viewer.state.wants_file, False
+    return wanted
 
 
 def type_path(viewer: Viewer, text: str) -> None:
@@ -83,11 +119,14 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state, scene = viewer.state, opened.scene
     state.opening, state.path = None, path
     state.scene, state.extent, state.latent = scene, opened.extent, opened.latent
-    state.queries, state.camera_index, state.glide = [], 0 if scene.cameras else None, None
-    state.view = opened.view
+    state.queries, state.selected, state.glide = [], None, None
+    state.camera_index = 0 if scene.cameras else None
+    forget(viewer)
+    state.opening_camera = None
+    state.view, state.nothing = opening_view(viewer), why_undrawable(scene.gaussians)
     viewer.engine = viewer.services.engine(scene)
     if scene.language is None and DISPLAYS[state.picture.display].needs_field:
-        set_display(viewer, "rgb")
+        state.picture = replace(state.picture, display="rgb")
     reasons = ", ".join(f"{count:,} with {reason}" for reason, count in opened.unusable.items())
     not_drawn = f"; not drawn: {reasons}" if reasons else ""
     state.say(f"{path.name}: {len(scene.gaussians):,} Gaussians{not_drawn}")
@@ -96,8 +135,21 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     if scene.language is None:
         state.say(no_field(scene))
     else:
-        state.picture = replace(state.picture, threshold=scene.language.reading.found)
+        _compile_search(viewer)
         _warm_up_encoder(viewer, viewer.services.encoder_id or scene.language.encoder_id)
+
+
+def _compile_search(viewer: Viewer) -> None:
+    """Have what queries run on compiled before the first one, and say so, unless an earlier run did it."""
+    engine = viewer.engine
+    if engine is None or is_compiled(Path(regions.__file__)):
+        return
+    viewer.worker.submit(
+        "compiling the search kernels, once per installation (half a minute)",
+        lambda progress: engine.regions,
+        lambda regions: None,
+        lambda reason: viewer.state.say(reason, is_error=True),
+    )
 
 
 def _warm_up_encoder(viewer: Viewer, encoder_id: str) -> None:

@@ -1,5 +1,7 @@
 """Searching: the box, the list of queries, their colours and their level."""
 
+from dataclasses import replace
+
 from langsplat_core.config import LevelChoice
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import UnknownWordError
@@ -9,7 +11,8 @@ from langsplat_core.query.engine import no_field
 from langsplat_core.query.phrase_tree import Atom
 from langsplat_core.query.suggestions import corrected
 from langsplat_core.scene.phrases import phrase_key, split_phrases
-from langsplat_viewer.actions.settings import set_display, show_panel
+from langsplat_viewer.actions.history import remember
+from langsplat_viewer.actions.settings import mute_letters, show_panel
 from langsplat_viewer.state import SLOTS, Query
 from langsplat_viewer.viewer import Viewer
 
@@ -32,12 +35,12 @@ def _ask(viewer: Viewer, phrase: str) -> None:
         state.say(no_field(state.scene), is_error=True)
         return
     key = phrase_key(phrase)
-    query = next((q for q in state.queries if phrase_key(q.phrase) == key), None)
-    if query is None:
-        query = Query(phrase)
-        state.queries.append(query)
+    query = next((q for q in state.queries if phrase_key(q.phrase) == key), None) or Query(phrase)
+    remember(viewer)
+    state.queries = [*(q for q in state.queries if q is not query), query]  # in order of asking
     state.asked = [*(earlier for earlier in state.asked if phrase_key(earlier) != key), phrase]
     state.recalled = len(state.asked)
+    select(viewer, query)
     _answer(viewer, query, then_show=True)
 
 
@@ -46,19 +49,25 @@ def type_phrase(viewer: Viewer, text: str) -> None:
     viewer.state.typed = text
 
 
-def ask_typed(viewer: Viewer, again: bool) -> None:
-    """Search for what stands in the box and empty it; `again`: the next phrase can be typed at once."""
+def ask_typed(viewer: Viewer) -> None:
+    """Search for what stands in the box and empty it; the keyboard is the scene's again."""
     if not viewer.state.typed.strip():
         return
     ask(viewer, viewer.state.typed)
     viewer.state.typed = ""
-    viewer.state.focus_input = again
 
 
 def focus_search(viewer: Viewer) -> None:
-    """Have the search box take the keyboard."""
+    """Have the search box take the keyboard; where there is nothing to search, what is typed goes nowhere."""
     show_panel(viewer, True)
-    viewer.state.focus_input = True
+    scene = viewer.state.scene
+    if scene is None or scene.language is None:
+        viewer.state.say(
+            "open a scene first, then search it" if scene is None else no_field(scene), is_error=True
+        )
+        mute_letters(viewer, True)
+    else:
+        viewer.state.focus_input = True
 
 
 def take_search_focus(viewer: Viewer) -> bool:
@@ -89,15 +98,12 @@ def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
         query.result, query.problem, query.meant, query.pending = composed.answer, "", "", False
         query.reading = "" if isinstance(composed.tree, Atom) else composed.reading
         if then_show and query in viewer.state.queries:
-            show(viewer, query)
+            _give_slot(viewer, query)
             if not DISPLAYS[viewer.state.picture.display].needs_query:
-                set_display(viewer, "relevancy")
+                viewer.state.picture = replace(viewer.state.picture, display="relevancy")
 
     def failed(reason: str) -> None:
         query.problem, query.pending = reason, False
-        if query in viewer.state.queries:  # the list stays in the order of asking
-            viewer.state.queries.remove(query)
-            viewer.state.queries.append(query)
         viewer.state.say(reason, is_error=True)
 
     query.pending = True
@@ -109,34 +115,50 @@ def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
     )
 
 
+def select(viewer: Viewer, query: Query | None) -> None:
+    """Have the details of a query shown below the list."""
+    viewer.state.selected = query
+
+
 def show(viewer: Viewer, query: Query) -> None:
     """Show a query's heat; it takes the first free colour, else that of the longest shown one."""
+    if query.slot is None:
+        remember(viewer)
+        _give_slot(viewer, query)
+
+
+def _give_slot(viewer: Viewer, query: Query) -> None:
     if query.slot is not None:
         return
-    shown = [q for q in viewer.state.queries if q.slot is not None]
+    shown = viewer.state.in_order_of_showing()
     free = sorted(set(range(SLOTS)) - {q.slot for q in shown})
     query.slot = free[0] if free else shown[0].slot
+    query.shown_since = 1 + max((q.shown_since for q in shown), default=0)
     if not free:
         shown[0].slot = None
-    viewer.state.queries.remove(query)  # the list is in order of showing, so that the oldest is known
-    viewer.state.queries.append(query)
 
 
 def hide(viewer: Viewer, query: Query) -> None:
     """Keep a query in the list without its heat."""
+    remember(viewer)
     query.slot = None
 
 
 def remove(viewer: Viewer, query: Query) -> None:
     """Take a query off the list."""
-    if query in viewer.state.queries:
-        viewer.state.queries.remove(query)
+    state = viewer.state
+    if query in state.queries:
+        remember(viewer)
+        state.queries = [q for q in state.queries if q is not query]
+        if state.selected is query:
+            select(viewer, state.queries[-1] if state.queries else None)
 
 
 def set_level(viewer: Viewer, level: LevelChoice) -> None:
     """Choose the semantic level of all queries, or leave it to the score ("auto")."""
     if level == viewer.state.level:
         return
+    remember(viewer)
     viewer.state.level = level
     for query in viewer.state.queries:
         _answer(viewer, query)

@@ -5,6 +5,7 @@ from dataclasses import replace
 from langsplat_core.config import Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
+from langsplat_viewer.actions.history import remember
 from langsplat_viewer.viewer import Viewer
 
 
@@ -14,9 +15,10 @@ def set_display(viewer: Viewer, display: Display, latent_level: int | None = Non
     if DISPLAYS[display].needs_field and state.scene is not None and state.scene.language is None:
         state.say(no_field(state.scene), is_error=True)
         return
-    state.picture = replace(state.picture, display=display)
-    if latent_level is not None:
-        state.latent_level = latent_level
+    latent_level = state.latent_level if latent_level is None else latent_level
+    if (display, latent_level) != (state.picture.display, state.latent_level):
+        remember(viewer)
+    state.picture, state.latent_level = replace(state.picture, display=display), latent_level
 
 
 def set_picture(viewer: Viewer, picture: PictureConfig) -> None:
@@ -52,3 +54,25 @@ def show_help(viewer: Viewer, shown: bool) -> None:
 def toggle_help(viewer: Viewer) -> None:
     """Show the list of keys, or hide it again."""
     show_help(viewer, not viewer.state.show_help)
+
+
+def show_palette(viewer: Viewer, shown: bool) -> None:
+    """Whether the list of everything that can be done is there, its box empty."""
+    viewer.state.show_palette, viewer.state.palette_typed = shown, ""
+
+
+def type_command(viewer: Viewer, text: str) -> None:
+    """What stands in the box of that list."""
+    viewer.state.palette_typed = text
+
+
+def mute_letters(viewer: Viewer, muted: bool) -> None:
+    """Whether letters do nothing for now: they were meant for a box that cannot be typed in."""
+    viewer.state.letters_muted = muted
+
+
+def escape(viewer: Viewer) -> None:
+    """Close what lies over the scene, and let letters be keys again."""
+    show_help(viewer, False)
+    show_palette(viewer, False)
+    mute_letters(viewer, False)

@@ -3,27 +3,13 @@
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.panels.view import BUTTONS
+from langsplat_viewer.commands import COMMANDS, HELD
 from langsplat_viewer.viewer import Viewer
 
-KEYS = (
-    ("left drag", "turn around the centre"),
-    ("right drag, Shift + left drag", "move sideways"),
-    ("Ctrl + left drag", "look around from here"),
-    ("wheel", "nearer, farther"),
-    ("double click", "turn around the surface under the cursor"),
-    ("W A S D, Q E", "fly ahead, left, back, right, down, up"),
-    ("Shift, Alt", "fly faster, slower"),
-    ("[ ]", "roll"),
-    ("R", "whole scene"),
-    ("F", "focus on the latest result found"),
-    (", .", "previous, next training camera"),
-    (f"1 ... {len(BUTTONS)}", "display, in the panel's order"),
-    ("/", "type a search"),
-    ("Tab", "hide or show the panel"),
-    ("P", "save a picture"),
-    ("F1", "this list"),
-)
+
+def rows() -> tuple[tuple[str, str], ...]:
+    """(keys, what they do)."""
+    return (*HELD, *((", ".join(command.keys), command.does) for command in COMMANDS if command.keys))
 
 
 def draw(viewer: Viewer) -> None:
@@ -39,7 +25,7 @@ def draw(viewer: Viewer) -> None:
     if imgui.begin_table("keys", 2):
         imgui.table_setup_column("key", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(14))
         imgui.table_setup_column("does", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(17))
-        for key, what in KEYS:
+        for key, what in rows():
             imgui.table_next_row()
             imgui.table_next_column()
             imgui.text(key)

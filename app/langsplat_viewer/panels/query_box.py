@@ -31,7 +31,7 @@ def draw(viewer: Viewer) -> None:
     imgui.same_line()
     clicked = imgui.button("Search")
     if entered or clicked:
-        actions.ask_typed(viewer, again=entered)
+        actions.ask_typed(viewer)
     _offers(viewer)
 
 

@@ -27,6 +27,17 @@ class OpenDialog:
             kinds = ["Scenes", "*.ply *.spz *.splat *.ksplat *.sog", "All files", "*"]
             self._dialog = portable_file_dialogs.open_file("Open a scene", str(Path.cwd()), kinds)
 
+    @property
+    def is_open(self) -> bool:
+        """Whether an answer is waited for."""
+        return self._dialog is not None
+
+    def close(self) -> None:
+        """Close a dialog that was forgotten: this process would wait for it, without a window."""
+        if self._dialog is not None:
+            self._dialog.kill()
+            self._dialog = None
+
     def answer(self) -> Path | None:
         """The chosen file, once."""
         if self._dialog is None or not self._dialog.ready(0):
@@ -43,7 +54,7 @@ def draw(viewer: Viewer, dialog: OpenDialog) -> None:
     else:
         imgui.text(state.path.name if state.path else "scene")
         small_wrapped(_figures(viewer), MUTED)
-    if imgui.button("Open ..."):
+    if imgui.button("Open ...") or actions.take_file_wish(viewer):
         imgui.open_popup("open a scene")
     imgui.same_line()
     if imgui.button("Save picture"):

@@ -1,5 +1,7 @@
 """Colours and small widgets that the panels share."""
 
+from collections.abc import Callable
+
 from imgui_bundle import ImVec4, imgui
 
 GOOD = ImVec4(0.47, 0.80, 0.52, 1.0)
@@ -13,3 +15,15 @@ def small_wrapped(text: str, colour: ImVec4) -> None:
     imgui.push_style_color(imgui.Col_.text, colour)
     imgui.text_wrapped(text.replace("%", "%%"))
     imgui.pop_style_color()
+
+
+def elided(text: str, room: float, width_of: Callable[[str], float]) -> str:
+    """`text` in one line, cut with "..." where it is wider than `room`."""
+    text = " ".join(text.split())
+    if width_of(text) <= room:
+        return text
+    low, high = 0, len(text)  # as many letters as fit
+    while low < high:
+        middle = (low + high + 1) // 2
+        low, high = (middle, high) if width_of(text[:middle] + "...") <= room else (low, middle - 1)
+    return text[:low].rstrip() + "..."

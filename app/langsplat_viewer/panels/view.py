@@ -1,38 +1,16 @@
 """What is shown, and from where."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 
 from imgui_bundle import hello_imgui, imgui
 
-from langsplat_core.config import Display
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
-from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions
+from langsplat_viewer.commands import Button, buttons_of
 from langsplat_viewer.controls import FOV_RANGE, adopt_up, level, with_fov
 from langsplat_viewer.panels.style import MUTED, small_wrapped
 from langsplat_viewer.viewer import Viewer
-
-
-@dataclass(frozen=True)
-class Button:
-    """One way to look at the scene."""
-
-    label: str  # of a radio button, with imgui's suffix where another has the same
-    display: Display
-    latent_level: int | None = None  # index into LEVELS
-
-
-def _buttons(row: DisplayRow) -> tuple[Button, ...]:
-    """One for the display, but for each level one where it shows latents."""
-    if row.extra != "latent":
-        return (Button(row.label, row.name),)
-    return tuple(Button(f"{name}##{row.name}", row.name, level) for level, name in enumerate(LEVELS))
-
-
-BUTTONS = tuple(
-    button for row in DISPLAYS.values() for button in _buttons(row)
-)  # as the keys 1, 2, ... count
 
 
 def draw_display(viewer: Viewer) -> None:
@@ -46,8 +24,6 @@ def draw_display(viewer: Viewer) -> None:
         small_wrapped("search for something to see where it is", MUTED)
     if picture.display == "relevancy":
         picture = replace(picture, heat_opacity=_slider("Heat opacity", picture.heat_opacity, 0.0, 1.0))
-    if picture.display == "segmentation":
-        picture = replace(picture, threshold=_slider("Threshold", picture.threshold, 0.4, 1.0))
     if needs_query:
         picture = replace(picture, dim=_slider("Background", picture.dim, 0.0, 1.0))
     actions.set_picture(viewer, picture)
@@ -55,7 +31,7 @@ def draw_display(viewer: Viewer) -> None:
 
 def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
     """Displays that need the same, beside each other; one that has several buttons is named before them."""
-    buttons = [button for row in rows for button in _buttons(row)]
+    buttons = [button for row in rows for button in buttons_of(row)]
     if len(buttons) > len(rows):
         imgui.align_text_to_frame_padding()
         imgui.text(rows[0].label)
@@ -85,10 +61,14 @@ def draw_camera(viewer: Viewer) -> None:
         _training_cameras(viewer)
     if imgui.button("Reset (R)"):
         actions.reset_view(viewer)
+    _tip("Return to the opening view")
     imgui.same_line()
     if imgui.button("Focus (F)"):
         actions.focus_result(viewer)
     imgui.same_line()
+    if imgui.button("Frame all"):
+        actions.frame_scene(viewer)
+    _tip("Show the whole scene from this side (Shift + F)")
     if imgui.button("Horizon"):
         actions.move(viewer, level)
     _tip("Turn the picture until the horizon is level")

@@ -1,0 +1,38 @@
+"""What was asked and shown before, so that it can be undone."""
+
+from dataclasses import dataclass
+
+from langsplat_core.config import Display, LevelChoice
+from langsplat_viewer.state import Query, ViewerState
+from langsplat_viewer.viewer import Viewer
+
+LONGEST = 100  # steps that can be undone
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """The queries and how they were looked at."""
+
+    queries: tuple[tuple[Query, int | None, int], ...]  # with slot and shown_since
+    selected: Query | None
+    display: Display
+    latent_level: int
+    level: LevelChoice
+
+
+def now(state: ViewerState) -> Moment:
+    """How things stand."""
+    queries = tuple((query, query.slot, query.shown_since) for query in state.queries)
+    return Moment(queries, state.selected, state.picture.display, state.latent_level, state.level)
+
+
+def remember(viewer: Viewer) -> None:
+    """What follows can be undone: to be called before a change."""
+    history = viewer.history
+    history.past = [*history.past[1 - LONGEST :], now(viewer.state)]
+    history.future = []
+
+
+def forget(viewer: Viewer) -> None:
+    """Another scene: nothing of before can be undone."""
+    viewer.history.past, viewer.history.future = [], []

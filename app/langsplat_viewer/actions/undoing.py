@@ -1,0 +1,39 @@
+"""Undo and redo of what was asked and shown. The camera is not undone: R leads back."""
+
+from langsplat_viewer.actions.history import Moment, now
+from langsplat_viewer.actions.queries import set_level
+from langsplat_viewer.actions.settings import set_display
+from langsplat_viewer.viewer import Viewer
+
+
+def undo(viewer: Viewer) -> None:
+    """Go back to before the last query, removal, colour, level or display."""
+    history = viewer.history
+    if not history.past:
+        viewer.state.say("nothing to undo")
+        return
+    history.future.append(now(viewer.state))
+    _restore(viewer, history.past.pop())
+
+
+def redo(viewer: Viewer) -> None:
+    """Do again what was undone last."""
+    history = viewer.history
+    if not history.future:
+        viewer.state.say("nothing to redo")
+        return
+    history.past.append(now(viewer.state))
+    _restore(viewer, history.future.pop())
+
+
+def _restore(viewer: Viewer, moment: Moment) -> None:
+    state, history = viewer.state, viewer.history
+    for query in state.queries:
+        query.slot = None
+    for query, slot, since in moment.queries:
+        query.slot, query.shown_since = slot, since
+    state.queries, state.selected = [query for query, _, _ in moment.queries], moment.selected
+    past, future = history.past, history.future
+    set_level(viewer, moment.level)
+    set_display(viewer, moment.display, moment.latent_level)
+    history.past, history.future = past, future  # what the two have remembered is no step of its own

@@ -1,0 +1,99 @@
+"""Everything that can be done with one key or one click: one table, from which the keys, the list of keys and
+the list of commands are made."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from langsplat_core.config import Display
+from langsplat_core.display.displays import DISPLAYS, DisplayRow
+from langsplat_core.scene import LEVELS
+from langsplat_viewer import actions, saving
+from langsplat_viewer.controls import adopt_up, level
+from langsplat_viewer.viewer import Viewer
+
+
+@dataclass(frozen=True)
+class Button:
+    """One way to look at the scene."""
+
+    label: str  # of a radio button, with imgui's suffix where another has the same
+    display: Display
+    latent_level: int | None = None  # index into LEVELS
+
+
+def buttons_of(row: DisplayRow) -> tuple[Button, ...]:
+    """One for the display, but for each level one where it shows latents."""
+    if row.extra != "latent":
+        return (Button(row.label, row.name),)
+    return tuple(Button(f"{name}##{row.name}", row.name, index) for index, name in enumerate(LEVELS))
+
+
+BUTTONS = tuple(button for row in DISPLAYS.values() for button in buttons_of(row))
+
+
+@dataclass(frozen=True)
+class Command:
+    """One row: what it does, in words, and the keys for it.
+
+    Keys are written as people read them: "Ctrl+Shift+P", "F1", "R", or a typed character such as "?",
+    wherever that is on the keyboard. Those with Ctrl, and F1, also work while something is typed;
+    others never do, nor with Ctrl held.
+    """
+
+    does: str
+    act: Callable[[Viewer], object]
+    keys: tuple[str, ...] = ()
+    repeats: bool = False  # while held
+    is_edit: bool = False  # belongs to the box while one types, as it does everywhere
+
+
+def _show(button: Button) -> Callable[[Viewer], None]:
+    return lambda viewer: actions.set_display(viewer, button.display, button.latent_level)
+
+
+def _name(button: Button) -> str:
+    name = button.label.partition("##")[0]
+    return (
+        f"show {DISPLAYS[button.display].label.lower()}{'' if button.latent_level is None else ', ' + name}"
+    )
+
+
+COMMANDS: tuple[Command, ...] = (
+    Command("open a scene", actions.ask_for_file, ("Ctrl+O",)),
+    Command("save a picture", lambda viewer: saving.save_picture(viewer, Path.cwd()), ("Ctrl+S", "P")),
+    Command("save the view", lambda viewer: saving.save_view(viewer, Path.cwd())),
+    Command("search", actions.focus_search, ("Ctrl+F", "/")),
+    Command("undo", actions.undo, ("Ctrl+Z",), repeats=True, is_edit=True),
+    Command("redo", actions.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), repeats=True, is_edit=True),
+    Command("find a command", lambda viewer: actions.show_palette(viewer, True), ("Ctrl+Shift+P",)),
+    Command("return to the opening view", actions.reset_view, ("R", "Home")),
+    Command("frame everything", actions.frame_scene, ("Shift+F",)),
+    Command("focus on the latest result found", actions.focus_result, ("F",)),
+    Command("previous training camera", lambda viewer: actions.step_camera(viewer, -1), (",",), repeats=True),
+    Command("next training camera", lambda viewer: actions.step_camera(viewer, 1), (".",), repeats=True),
+    Command("level the horizon", lambda viewer: actions.move(viewer, level)),
+    Command("take the picture's up as the world's", lambda viewer: actions.move(viewer, adopt_up)),
+    *(Command(_name(button), _show(button), (str(key),)) for key, button in enumerate(BUTTONS, start=1)),
+    Command("hide or show the panel", actions.toggle_panel, ("Tab",)),
+    Command("this list of keys", actions.toggle_help, ("F1", "?")),
+    Command("close what lies over the scene", actions.escape, ("Esc",)),
+)
+
+# What the mouse does and what keys do for as long as they are held (`panels.navigation`), for people to read.
+HELD: tuple[tuple[str, str], ...] = (
+    ("left drag", "turn around the centre"),
+    ("right drag, Shift + left drag", "move sideways"),
+    ("Ctrl + left drag", "look around from here"),
+    ("wheel", "nearer, farther"),
+    ("double click", "turn around the surface under the cursor"),
+    ("W A S D, Q E", "fly ahead, left, back, right, down, up"),
+    ("Shift, Alt", "fly faster, slower"),
+    ("[ ]", "roll"),
+)
+
+
+def matching(text: str) -> list[Command]:
+    """The commands whose words hold every word of `text`; all of them for none."""
+    words = text.lower().split()
+    return [command for command in COMMANDS if all(word in command.does.lower() for word in words)]

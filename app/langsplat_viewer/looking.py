@@ -1,0 +1,64 @@
+"""Image formation for looking round: what training would clip is shown, a picture of nothing explained."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from langsplat_core.arrays import logit
+from langsplat_core.config import INRIA, RasterSettings
+from langsplat_core.scene import Camera, Gaussians, Scene
+
+NEAR_SHARE = 0.25  # of the depth of what is nearest in the picture
+NEAREST_SHARE = 0.01  # of the Gaussians in the picture that count as the nearest
+LEAST_NEAR = 1e-3  # of the depth of the middle one: nearer, a Gaussian would be a fog over everything
+VISIBLE_ALPHA = 1 / 255
+_SAMPLE = 20_000  # Gaussians looked at; quantiles need no more
+
+
+def near_plane(gaussians: Gaussians, camera: Camera, most: float = INRIA.near) -> float:
+    """Where the near plane lies for looking, world units: a share of the depth of what is nearest in the
+    picture, so that one can go as near to a thing as it is small; at most `most`, the constant of training,
+    so that the view of a photograph is the one that was trained."""
+    rows = slice(None, None, max(len(gaussians) // _SAMPLE, 1))
+    means = gaussians.means[rows].astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        pixels, depths = camera.project(means)
+        inside = (depths > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+        inside &= gaussians.opacity_logits[rows] > logit(np.array(VISIBLE_ALPHA))
+    if not inside.any():
+        return most
+    nearest, middle = np.quantile(depths[inside], [NEAREST_SHARE, 0.5])
+    return float(min(most, max(NEAR_SHARE * nearest, LEAST_NEAR * middle)))
+
+
+def looking_settings(scene: Scene, camera: Camera) -> RasterSettings:
+    """The scene's own image formation, with the near plane of `near_plane`."""
+    settings = scene.raster_settings()
+    return replace(settings, near=near_plane(scene.gaussians, camera, settings.near))
+
+
+def why_undrawable(gaussians: Gaussians) -> str:
+    """Why no camera could see anything of these; empty where one could."""
+    count = len(gaussians)
+    if count == 0:
+        return "the scene holds no Gaussians"
+    valid = gaussians.valid()
+    if not valid.any():
+        reasons = ", ".join(f"{rows:,} with {reason}" for reason, rows in gaussians.invalid_rows().items())
+        return f"none of the {count:,} Gaussians can be drawn: {reasons}"
+    if (gaussians.opacity_logits[valid] < logit(np.array(VISIBLE_ALPHA))).all():
+        return f"all {int(valid.sum()):,} Gaussians are transparent"
+    return ""
+
+
+def why_nothing(gaussians: Gaussians, camera: Camera) -> str:
+    """Why a picture that shows nothing does."""
+    reason = why_undrawable(gaussians)
+    if reason:
+        return reason
+    _, depths = camera.project(gaussians.means[gaussians.valid()].astype(np.float64))
+    if (depths <= 0).all():
+        return "the whole scene lies behind the camera"
+    if (depths <= near_plane(gaussians, camera)).all():
+        return "the whole scene lies nearer than the camera can see"
+    return "nothing of the scene lies in this picture"

@@ -1,0 +1,112 @@
+"""What was searched: one line each in an area of its own, and the details of the one that was chosen."""
+
+from imgui_bundle import ImVec2, ImVec4, imgui
+
+from langsplat_core.display.colour_maps import QUERY_COLOURS
+from langsplat_core.scene import LEVELS
+from langsplat_viewer import actions
+from langsplat_viewer.panels.style import BAD, GOOD, MUTED, elided, small_wrapped
+from langsplat_viewer.state import Query
+from langsplat_viewer.viewer import Viewer
+
+ROWS = 3.5  # that the list shows at a time: the half one says that there are more
+DETAIL_LINES = 3  # of text, beside the line of buttons
+HIDDEN = (0.25, 0.25, 0.25)
+
+
+def draw(viewer: Viewer) -> None:
+    """The list, newest first, and the chosen query. Both keep their height, so that nothing below them moves
+    under the mouse when an answer arrives."""
+    row = imgui.get_frame_height_with_spacing()
+    if imgui.begin_child("queries", ImVec2(0, ROWS * row), imgui.ChildFlags_.none):
+        if not viewer.state.queries:
+            imgui.text_colored(MUTED, "what you search is listed here")
+        for query in reversed(viewer.state.queries):
+            imgui.push_id(query.phrase)
+            _line(viewer, query)
+            imgui.pop_id()
+    imgui.end_child()
+    height = row + DETAIL_LINES * imgui.get_text_line_height_with_spacing()
+    if imgui.begin_child("details", ImVec2(0, height), imgui.ChildFlags_.none):
+        chosen = viewer.state.selected
+        if chosen is not None:
+            _details(viewer, chosen)
+    imgui.end_child()
+
+
+def _line(viewer: Viewer, query: Query) -> None:
+    """Colour, phrase, verdict and a button to take it off; the phrase gets what the others leave."""
+    spacing, side = imgui.get_style().item_spacing.x, imgui.get_frame_height()
+    verdict_width = imgui.calc_text_size("weak match").x
+    left, right = imgui.get_cursor_pos_x(), imgui.get_content_region_avail().x
+    room = right - 2 * side - verdict_width - 3 * spacing
+    _swatch(viewer, query, side)
+    imgui.same_line()
+    chosen = viewer.state.selected is query
+    imgui.push_style_var(imgui.StyleVar_.selectable_text_align, ImVec2(0, 0.5))
+    name = elided(query.phrase, room, lambda text: imgui.calc_text_size(text).x)
+    if imgui.selectable(f"{name}##phrase of list", chosen, size=ImVec2(room, side))[0]:
+        actions.select(viewer, query)
+    imgui.pop_style_var()
+    if name != query.phrase and imgui.is_item_hovered():
+        imgui.set_tooltip(query.phrase)
+    imgui.same_line(left + right - side - spacing - verdict_width)
+    imgui.align_text_to_frame_padding()
+    _verdict(query)
+    imgui.same_line(left + right - side)
+    if imgui.button("x", ImVec2(side, 0)):
+        actions.remove(viewer, query)
+    if imgui.is_item_hovered():
+        imgui.set_tooltip("Take it off the list")
+
+
+def _swatch(viewer: Viewer, query: Query, side: float) -> None:
+    shown = query.slot is not None
+    red, green, blue = HIDDEN if query.slot is None else QUERY_COLOURS[query.slot]
+    flags = imgui.ColorEditFlags_.no_tooltip
+    if imgui.color_button("##shown", ImVec4(red, green, blue, 1.0), flags, ImVec2(side, side)):
+        if shown:
+            actions.hide(viewer, query)
+        else:
+            actions.show(viewer, query)
+    if imgui.is_item_hovered():
+        imgui.set_tooltip("Click to hide" if shown else "Click to show")
+
+
+def _verdict(query: Query) -> None:
+    if query.pending:
+        imgui.text_colored(MUTED, "...")
+    elif query.problem:
+        imgui.text_colored(BAD, "not asked")
+    elif query.result is not None:
+        imgui.text_colored(GOOD if query.result.found else MUTED, query.result.verdict)
+        probability = query.result.probability
+        if imgui.is_item_hovered() and probability is not None:
+            imgui.set_tooltip(f"{100 * probability:.0f} % likely to be there")
+
+
+def _details(viewer: Viewer, query: Query) -> None:
+    """Place and a button to go there, scores per level, how it was read or why it was not answered."""
+    result = query.result
+    place = None if result is None or result.verdict == "not here" else result.place
+    imgui.begin_disabled(place is None)
+    if imgui.button("Focus"):
+        actions.focus_result(viewer, query)
+    imgui.end_disabled()
+    if place is not None:
+        imgui.same_line()
+        imgui.align_text_to_frame_padding()
+        imgui.text_colored(MUTED, "at " + "  ".join(f"{v:.2f}" for v in place))
+    if query.problem:
+        small_wrapped(query.problem, BAD)
+    if result is not None:
+        for index, (name, score) in enumerate(zip(LEVELS, result.scores, strict=True)):
+            if index:
+                imgui.same_line()
+            text = f"{name} {score:.2f}"
+            if index == result.level:
+                imgui.text(text)
+            else:
+                imgui.text_colored(MUTED, text)
+    if query.reading:
+        small_wrapped(f"read as: {query.reading}", MUTED)

@@ -1,0 +1,68 @@
+"""The table of commands: keys, help and palette are made from it."""
+
+from collections import Counter
+
+import pytest
+
+from langsplat_viewer import actions
+from langsplat_viewer.commands import BUTTONS, COMMANDS, matching
+from langsplat_viewer.panels.help import rows
+from langsplat_viewer.panels.keyboard import chord
+
+KEYS = {key: command for command in COMMANDS for key in command.keys}
+
+
+def test_no_key_does_two_things():
+    assert [key for key, count in Counter(k for c in COMMANDS for k in c.keys).items() if count > 1] == []
+
+
+@pytest.mark.parametrize(
+    ("key", "does"),
+    [
+        ("Ctrl+O", "open a scene"),
+        ("Ctrl+S", "save a picture"),
+        ("Ctrl+F", "search"),
+        ("Ctrl+Z", "undo"),
+        ("Ctrl+Shift+P", "find a command"),
+        ("R", "return to the opening view"),
+        ("Home", "return to the opening view"),
+        ("F1", "this list of keys"),
+        ("?", "this list of keys"),
+        ("Esc", "close what lies over the scene"),
+    ],
+)
+def test_keys_are_what_they_are_everywhere(key, does):
+    assert KEYS[key].does == does
+
+
+def test_every_key_is_understood_and_letters_are_plain():
+    for key in KEYS:
+        understood = chord(key)
+        assert (understood.key is None) == bool(understood.character)
+        assert understood.is_plain == (not key.startswith("Ctrl") and key not in ("F1", "Esc")), key
+    assert chord("Ctrl+Shift+P").ctrl
+    assert chord("Ctrl+Shift+P").shift
+    assert chord("Shift+F").is_plain  # a capital letter is typed
+
+
+def test_help_lists_every_key():
+    listed = " ".join(keys for keys, _ in rows())
+    assert all(key in listed for key in KEYS)
+
+
+def test_every_display_has_its_digit():
+    assert [f"{n}" in KEYS for n in range(1, len(BUTTONS) + 1)] == [True] * len(BUTTONS)
+
+
+def test_commands_are_found_by_their_words(opened):
+    assert matching("") == list(COMMANDS)
+    (found,) = matching("OPENING view")
+    assert found.act is actions.reset_view
+    assert matching("make coffee") == []
+
+
+def test_every_command_does_something_sensible_before_a_scene_is_open(viewer, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for command in COMMANDS:
+        command.act(viewer)
+    assert list(tmp_path.iterdir()) == []

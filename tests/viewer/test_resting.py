@@ -1,0 +1,58 @@
+"""The window at rest costs nothing, and leaves when it is told to."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from langsplat_core.formats import save_scene
+from tests.support.fakes import blob_scene
+
+ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.long
+
+
+def run(scenario: str, display: str, folder: Path, **environment: str) -> str:
+    """The output of one scenario of `resting_driver`."""
+    save_scene(folder / "blobs.ply", blob_scene())
+    inherited = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}
+    paths = os.pathsep.join((str(ROOT), str(ROOT / "app")))
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.viewer.resting_driver", scenario, str(folder / "blobs.ply")],
+        env=inherited | {"DISPLAY": display, "PYTHONPATH": paths} | environment,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, (done.stdout + done.stderr)[-3000:]
+    return done.stdout
+
+
+def test_at_rest_no_frame_is_drawn_and_no_time_is_used(display, tmp_path):
+    words = run("rest", display, tmp_path).split()
+    assert int(words[1]) <= 2  # one in a hundred seconds, and a late one
+    assert float(words[3]) < 0.01
+
+
+def test_closing_does_not_wait_for_what_is_being_read(display, tmp_path):
+    began = time.monotonic()
+    run("leave", display, tmp_path)
+    assert time.monotonic() - began < 45  # the reading takes 60
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a dialog program of its own")
+def test_a_forgotten_file_dialog_goes_with_the_window(display, tmp_path):
+    program = tmp_path / "bin" / "zenity"
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/pid\nexec sleep 100\n")
+    program.chmod(0o755)
+    began = time.monotonic()
+    run("forget", display, tmp_path, PATH=f"{program.parent}{os.pathsep}{os.environ['PATH']}")
+    assert time.monotonic() - began < 60
+    number = int((tmp_path / "pid").read_text())
+    assert not psutil.pid_exists(number) or psutil.Process(number).status() == psutil.STATUS_ZOMBIE
