@@ -139,7 +139,7 @@ def test_a_scene_without_cameras_is_framed(viewer, folder):
         (["."], "is a folder"),
         (["x" * 5000 + ".ply"], "cannot be opened"),
         (["truncated.ply"], "truncated.ply: truncated"),
-        (["edited.ply"], "edited.langsplat.safetensors"),
+        (["edited.ply", "--query", "mug"], "edited.langsplat.safetensors"),
         (["blobs.ply", "--query", "sofa"], "'sofa'"),
         (["blobs.ply", "--query", " "], "empty"),
         (["blobs.ply", "--camera", "3"], "cameras 0 to 2"),
