@@ -50,9 +50,8 @@ class DatasetConfig:
 
     max_side: Side = 800  # photographs are shrunk until their longer side has at most this many pixels
     test_every: CountOrZero = 8  # every n-th view, in name order, is held out from training; 0 holds out none
-    metres_per_unit: Positive | None = (
-        None  # of the dataset's world; None: as transforms.json says, if it does
-    )
+    metres_per_unit: Positive | None = None
+    """Of the dataset's world; None: as transforms.json says, if it does."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ class MaskConfig:
     stability: Share = 0.85  # least stability of a mask that is kept
     stability_offset: NotNegative = 1.0  # of the two cuts whose overlap is the stability, in logits
     box_nms: Share = 0.7  # overlap of boxes from which the worse mask goes
-    min_region: CountOrZero = 100  # px
+    min_region: CountOrZero = 100  # px; smaller regions and holes are removed
     nms_iou: Share = 0.8  # overlap of masks of a level from which the worse one goes
     nms_score: Share = 0.7  # least score of a mask behind that
     nms_inner: Share = 0.5  # how far inside another a mask may lie
@@ -181,9 +180,8 @@ class CompactConfig:
     """How small a scene may be made (`langsplat compact`)."""
 
     max_psnr_loss: Decibels = 0.1  # dB, mean over the measuring views; nothing that loses more is written
-    views: SeveralCount = (
-        96  # at most, of the scene's cameras or photographs; a sixth of them measures the loss
-    )
+    views: SeveralCount = 96
+    """At most, of the scene's cameras or photographs; a sixth of them measures the loss."""
     max_side: Side = 800  # pictures are drawn with at most this many pixels on their longer side
     # dB that the scene is assumed to have where no photographs are given: higher is more cautious
     assumed_psnr: Annotated[float, Range(0.0, 200.0, above=True)] = 35.0

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from langsplat_core.cli.checks import OutFile
+from langsplat_core.cli.checks import OutFile, OutFolder
 from langsplat_core.errors import InputError
 from langsplat_core.files import check_output_folder
 from langsplat_core.lab.config import BenchmarkConfig
@@ -21,7 +21,7 @@ class EvalSynthetic:
     continues where it stopped."""
 
     config: Annotated[BenchmarkConfig, tyro.conf.arg(name="")] = field(default_factory=BenchmarkConfig)
-    work: Path = Path("eval_out")
+    work: OutFolder = Path("eval_out")
     """Folder for the rooms and all intermediate results."""
     json: OutFile | None = None
     """Also write all figures to this file."""

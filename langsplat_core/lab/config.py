@@ -48,7 +48,7 @@ class BenchmarkConfig:
     size: Size = (400, 300)  # width and height, pixels
     steps: Count = 1_500  # of radiance training
     max_gaussians: Count = 50_000  # of a room
-    masks: MaskOrigin = "truth"
+    masks: MaskOrigin = "truth"  # where outlines come from
     encoder: str = "demo"  # "demo" for the bundled one, a folder, or a hub id
     codec: CodecConfig = field(default_factory=CodecConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
@@ -85,7 +85,7 @@ class LiftBenchConfig:
 class PaperBenchConfig:
     """The paper's comparisons, on rooms with known truth (`langsplat bench paper`)."""
 
-    tier: Tier = "clutter"
+    tier: Tier = "clutter"  # how crowded the rooms are
     seeds: Seeds = (301, 302, 303, 304, 305)
     """Of the rooms; never that of the bundled scene, nor 201 to 203, on which the readings were tuned."""
     dims: tuple[Latents, ...] = (1, 2, 3, 8)

@@ -12,7 +12,7 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.convert import Convert
 from langsplat_core.cli.run import main
-from langsplat_core.errors import FormatError
+from langsplat_core.errors import InputError
 from langsplat_core.formats import (
     companion_path,
     language,
@@ -79,8 +79,11 @@ def test_a_sidecar_of_other_gaussians_is_refused_and_can_be_rematched(tmp_path):
     convert(tmp_path / "a.ply", tmp_path / "a.spz")
     sidecar = companion_path(tmp_path / "a.spz", language.SUFFIX)
     sidecar.write_bytes(companion_path(tmp_path / "a.ply", language.SUFFIX).read_bytes())
-    with pytest.raises(FormatError, match="other positions"):
-        load_scene(tmp_path / "a.spz")
+    opened = load_scene(tmp_path / "a.spz")
+    assert opened.language is None
+    assert "other positions" in opened.unread[0]
+    with pytest.raises(InputError, match="mend or remove it first"):
+        convert(tmp_path / "a.spz", tmp_path / "c.spz")
     got = convert(tmp_path / "a.spz", tmp_path / "b.spz", sidecar)
     assert got.language is not None
     np.testing.assert_array_equal(got.language.latents, full_scene().language.latents)

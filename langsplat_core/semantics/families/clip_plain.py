@@ -20,9 +20,9 @@ from langsplat_core.semantics.encoder import Logits
 from langsplat_core.semantics.tokens import FILE, check_whole, read_tokenizer
 from langsplat_core.semantics.weights import CONFIG, SAFE, Weights
 
-MOST_WEIGHTS = (
-    20_000_000  # of the text half; above it torch's threads are worth their import, docs/encoders.md
-)
+# Of the text half. NumPy was the quicker one at 63 million too (docs/encoders.md); but checkpoints that large
+# come from elsewhere, and their tokenizers have not been compared with transformers' reading of them.
+MOST_WEIGHTS = 20_000_000
 TEMPERATURE = 10.0  # of LERF and LangSplat, whatever scale a checkpoint ended its training with
 READABLE = ("F16", "F32", "F64")  # types of safetensors that NumPy has too
 LEGACY_END = 2  # of configurations whose end token is the one with the highest number
