@@ -41,7 +41,7 @@ class BenchmarkConfig:
     size: tuple[int, int] = (400, 300)  # width and height, pixels
     steps: int = 1_500  # of radiance training
     max_gaussians: int = 50_000  # of a room
-    masks: MaskOrigin = "truth"
+    masks: MaskOrigin = "truth"  # whose masks the fields are made of
     encoder: str = "demo"  # "demo" for the bundled one, a folder, or a hub id
     codec: CodecConfig = field(default_factory=CodecConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
@@ -94,7 +94,7 @@ class VerdictBenchConfig:
     tiers: tuple[Tier, ...] = ("clutter",)  # how crowded the rooms are
     seeds: tuple[int, ...] = (301, 302, 303, 304, 305)
     """Of the rooms; never that of the bundled scene, nor 201 to 203, which calibrate the demo encoder."""
-    masks: MaskOrigin = "truth"
+    masks: MaskOrigin = "truth"  # whose masks the fields are made of
     """Exact outlines, the same with 15 % wrong vectors, the weight-free segmenter's."""
     codec: CodecConfig = CodecConfig()  # noqa: RUF009 (frozen)
 

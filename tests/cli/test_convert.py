@@ -12,6 +12,7 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.convert import Convert
 from langsplat_core.cli.run import main
+from langsplat_core.errors import InputError
 from langsplat_core.formats import (
     companion_path,
     language,
