@@ -118,7 +118,7 @@ class VerdictBenchConfig:
     tiers: tuple[Tier, ...] = ("clutter",)  # how crowded the rooms are
     seeds: Seeds = (301, 302, 303, 304, 305)
     """Of the rooms; never that of the bundled scene, nor 201 to 203, which calibrate the demo encoder."""
-    masks: MaskOrigin = "truth"
+    masks: MaskOrigin = "truth"  # whose masks the fields are made of
     """Exact outlines, the same with 15 % wrong vectors, the weight-free segmenter's."""
     codec: CodecConfig = CodecConfig()  # noqa: RUF009 (frozen)
 
