@@ -20,6 +20,11 @@ def printable_line(text: object, limit: int = LINE_LIMIT) -> str:
     return f"{line[: limit - tail - 3]}...{line[-tail:]}"
 
 
+def quoted(content: object, limit: int = 60) -> str:
+    """What a file holds, quoted as a part of a message: at most `limit` characters with its escapes."""
+    return printable_line(repr(content), limit)
+
+
 class LangSplatError(Exception):
     """Base of every error that the command line turns into one line and exit code 2.
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from langsplat_core.errors import LINE_LIMIT, EncoderError, InputError, printable_line
+from langsplat_core.errors import LINE_LIMIT, EncoderError, InputError, printable_line, quoted
 
 
 @pytest.mark.parametrize(
@@ -29,3 +29,8 @@ def test_a_long_line_keeps_its_ends() -> None:
     assert line.endswith("xxx end")
     assert len(str(InputError("y" * 10_000))) == LINE_LIMIT
     assert printable_line("z" * 100, 100) == "z" * 100
+
+
+def test_a_quotation_is_short_with_its_escapes() -> None:
+    assert quoted("red mug", 60) == "'red mug'"
+    assert len(quoted("\x00" * 60, 60)) == 60

@@ -19,6 +19,8 @@ from langsplat_core.scene import FARTHEST
 
 Result = TypeVar("Result")
 
+MOST_DIGITS = 20  # of a whole number of 64 bits
+
 # id -> name and parameters, in file order
 CAMERA_MODELS = {
     0: ("SIMPLE_PINHOLE", "f cx cy"),
@@ -103,7 +105,8 @@ def read_model(folder: Path) -> SparseModel:
     for image in images:
         if image.camera_id not in cameras:
             raise FormatError(
-                f"{folder / f'images{suffix}'}: {image.name} was taken with camera {image.camera_id}, "
+                f"{folder / f'images{suffix}'}: {printable_line(image.name, 80)} was taken with camera "
+                f"{image.camera_id}, "
                 "which the model lacks; export the model again"
             )
     points_file = folder / f"points3D{suffix}"
@@ -196,6 +199,13 @@ def _lines(data: bytes) -> list[str]:
     return [line.strip() for line in data.decode().splitlines() if not line.startswith("#")]
 
 
+def _whole(text: str) -> int:
+    """Python's own numbers have no limit, and no place in a message then."""
+    if len(text) > MOST_DIGITS:
+        raise ValueError(f"a whole number of {len(text)} digits")
+    return int(text)
+
+
 def _text_cameras(data: bytes) -> dict[int, ModelCamera]:
     sizes = {name: len(keys.split()) for name, keys in CAMERA_MODELS.values()}
     cameras = {}
@@ -203,7 +213,7 @@ def _text_cameras(data: bytes) -> dict[int, ModelCamera]:
         camera_id, model, width, height, *params = line.split()
         if len(params) != sizes.get(model):
             raise ValueError(f"camera {camera_id}: {len(params)} parameters do not make a {model}")
-        cameras[int(camera_id)] = _camera(model, int(width), int(height), tuple(map(float, params)))
+        cameras[_whole(camera_id)] = _camera(model, _whole(width), _whole(height), tuple(map(float, params)))
     return cameras
 
 
@@ -215,7 +225,7 @@ def _text_images(data: bytes) -> list[ModelImage]:
     for line in lines[::2]:  # every second line lists 2D points, and may be empty
         _, *pose, camera_id, name = line.split(maxsplit=9)
         numbers = np.array(pose, np.float64)
-        images.append(_image(name, int(camera_id), numbers[:4], numbers[4:]))
+        images.append(_image(name, _whole(camera_id), numbers[:4], numbers[4:]))
     return images
 
 
@@ -224,7 +234,7 @@ def _text_points(data: bytes) -> Points:
     for line in filter(None, _lines(data)):
         fields = line.split()
         numbers = [float(field) for field in fields[1:4]]
-        rows.append((numbers, [int(c) for c in fields[4:7]], float(fields[7]), len(fields[8:]) // 2))
+        rows.append((numbers, [_whole(c) for c in fields[4:7]], float(fields[7]), len(fields[8:]) // 2))
     return _points(rows)
 
 

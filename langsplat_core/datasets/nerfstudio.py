@@ -18,7 +18,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.datasets.capture import Capture, tell_of_lost_points
 from langsplat_core.datasets.images import PHOTO_SUFFIXES, Photo, develop, shortened
 from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, FisheyeDistortion, PhotoIntrinsics
-from langsplat_core.errors import FormatError, InputError, printable_line
+from langsplat_core.errors import FormatError, InputError, printable_line, quoted
 from langsplat_core.parsing.cloud import read_cloud
 from langsplat_core.parsing.opening import read_json_file
 from langsplat_core.parsing.pictures import PictureError, picture_size
@@ -155,7 +155,9 @@ def _distortion(values: Json) -> Distortion:
     if model == "OPENCV_FISHEYE" or values.get("is_fisheye") is True:
         return FisheyeDistortion(k1, k2, k3, k4)
     if model not in PERSPECTIVE:
-        raise ValueError(f'"camera_model" {model!r} is not one of {", ".join(PERSPECTIVE)}, OPENCV_FISHEYE')
+        raise ValueError(
+            f'"camera_model" {quoted(model)} is not one of {", ".join(PERSPECTIVE)}, OPENCV_FISHEYE'
+        )
     if k4 != 0:
         raise ValueError('"k4" has no agreed meaning for a perspective lens; undistort the photographs first')
     return BrownDistortion(k1, k2, p1, p2, k3)

@@ -7,7 +7,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from langsplat_core.arrays import Array, check_array
-from langsplat_core.errors import FormatError, printable_line
+from langsplat_core.errors import FormatError, printable_line, quoted
 from langsplat_core.formats.packed_positions import step, unpack_positions
 from langsplat_core.parsing.opening import open_for_reading, parse_json
 from langsplat_core.scene import LEVELS, Calibration, LanguageField, Odds, Reading, codec_from_tensors
@@ -50,7 +50,9 @@ def read_stored(path: Path) -> Stored:
                 kind = file.get_slice(name).get_dtype()
                 wanted = (_WHOLE[name],) if name in _WHOLE else _FLOATS[metadata["version"]]
                 if kind not in wanted:
-                    raise FormatError(f"{path}: tensor {name!r} is {kind}; expected {' or '.join(wanted)}")
+                    raise FormatError(
+                        f"{path}: tensor {quoted(name)} is {kind}; expected {' or '.join(wanted)}"
+                    )
                 tensor = file.get_tensor(name)
                 tensors[name] = tensor if name in _WHOLE else tensor.astype(np.float32)
     except SafetensorError as error:
@@ -64,14 +66,14 @@ def _check_metadata(metadata: dict[str, str], path: Path) -> None:
     version = metadata.get("version")
     if version not in _KEYS:
         raise FormatError(
-            f"{path}: language format version {version!r}; this program reads {' and '.join(_KEYS)}, "
+            f"{path}: language format version {quoted(version)}; this program reads {' and '.join(_KEYS)}, "
             "update it"
         )
     for key in _KEYS[version]:
         if key not in metadata:
             raise FormatError(f"{path}: the header has no {key!r}")
     if metadata["levels"] != ",".join(LEVELS):
-        raise FormatError(f"{path}: levels {metadata['levels'][:60]!r}; expected {','.join(LEVELS)!r}")
+        raise FormatError(f"{path}: levels {quoted(metadata['levels'], 60)}; expected {','.join(LEVELS)!r}")
 
 
 def _assemble(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> Stored:
@@ -83,7 +85,7 @@ def _assemble(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -
             raise FormatError(f"{path}: tensor {name!r} is missing")
     for name, tensor in tensors.items():
         if name != "means" and not np.isfinite(tensor).all():
-            raise FormatError(f"{path}: tensor {name!r} holds numbers that are not finite")
+            raise FormatError(f"{path}: tensor {quoted(name)} holds numbers that are not finite")
     try:
         field = _field(tensors, metadata, latents_name, path)
         means, precision = _means(tensors, len(field))

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import Array, logit
-from langsplat_core.errors import FormatError
+from langsplat_core.errors import FormatError, quoted
 from langsplat_core.formats.compressed_ply import smallest_three
 from langsplat_core.parsing.archives import Archive, opened_archive
 from langsplat_core.parsing.opening import open_for_reading, parse_json
@@ -146,7 +146,7 @@ class _Planes:
     def _image(self, key: str, index: int, suits: Callable[[int, int], bool]) -> Array:
         """(H, W, 4) uint8; `suits` judges (width, height) before anything is decoded."""
         name = self._meta.file_name(key, index)
-        what = f"{self._meta.path}: image {name!r} of {key!r}"
+        what = f"{self._meta.path}: image {quoted(name)} of {key!r}"
         data = self._fetch(name, IMAGE_LIMIT)
         if key == "means" and self.count > PIXELS_PER_BYTE * len(data) + SLACK_PIXELS:
             raise FormatError(f"{what} has {len(data)} bytes, too few for {self.count} Gaussians")
@@ -171,7 +171,9 @@ class _Meta:
     def check_version(self) -> None:
         version = self.content.get("version", 1)
         if version != 2:
-            raise FormatError(f"{self.path}: SOG version {version!r}; only 2 is read, export the scene again")
+            raise FormatError(
+                f"{self.path}: SOG version {quoted(version)}; only 2 is read, export the scene again"
+            )
 
     def antialiased(self) -> bool:
         return self.content.get("model") == "antialiased" or self.content.get("antialias") is True

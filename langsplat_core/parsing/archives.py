@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from langsplat_core.errors import FormatError, LangSplatError
+from langsplat_core.errors import FormatError, LangSplatError, quoted
 from langsplat_core.parsing.opening import open_for_reading
 
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -33,16 +33,16 @@ class Archive:
         try:
             info = self._archive.getinfo(name)
         except KeyError:
-            raise FormatError(f"{self.path}: has no {name[:60]!r} inside") from None
+            raise FormatError(f"{self.path}: has no {quoted(name, 60)} inside") from None
         if info.compress_type not in METHODS:
             raise FormatError(
-                f"{self.path}: {name[:60]!r} inside is packed by method {info.compress_type}; "
+                f"{self.path}: {quoted(name, 60)} inside is packed by method {info.compress_type}; "
                 "pack the archive again with deflate"
             )
         with self._archive.open(info) as member:
             content = member.read(limit + 1)
         if len(content) > limit:
-            raise FormatError(f"{self.path}: {name[:60]!r} inside has more than {limit} bytes")
+            raise FormatError(f"{self.path}: {quoted(name, 60)} inside has more than {limit} bytes")
         return content
 
 

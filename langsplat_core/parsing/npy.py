@@ -10,7 +10,7 @@ from typing import BinaryIO
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import FormatError
+from langsplat_core.errors import FormatError, quoted
 from langsplat_core.parsing.archives import opened_archive
 from langsplat_core.parsing.opening import open_for_reading
 
@@ -40,7 +40,7 @@ def read_npz(path: Path) -> dict[str, Array]:
         for member in archive.names:
             data = archive.read(member, MEMBER_LIMIT)
             name = member.removesuffix(".npy")
-            arrays[name] = _parse(io.BytesIO(data), len(data), f"{path}: {name[:60]!r}")
+            arrays[name] = _parse(io.BytesIO(data), len(data), f"{path}: {quoted(name, 60)}")
     return arrays
 
 

@@ -6,7 +6,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from langsplat_core.errors import FormatError
+from langsplat_core.errors import FormatError, quoted
 
 HEADER_LIMIT = 64 * 1024  # bytes; a real header of 62 properties takes about 1.5 KiB
 NAME_LIMIT = 64  # characters; the longest of known programs has 17
@@ -105,7 +105,7 @@ def _parse(lines: list[str], size: int, path: Path) -> PlyHeader:
             last = elements[-1]
             elements[-1] = PlyElement(last.name, last.count, (*last.properties, _property(words, line, path)))
         elif line:
-            raise FormatError(f"{path}: header line {line[:60]!r} is not understood")
+            raise FormatError(f"{path}: header line {quoted(line, 60)} is not understood")
     if byte_order is None:
         raise FormatError(f"{path}: the header has no 'format' line")
     for element in elements:
@@ -121,7 +121,9 @@ def is_name(word: str) -> bool:
 
 def _name(word: str, path: Path) -> str:
     if not is_name(word):
-        raise FormatError(f"{path}: the header has the name {word[:40]!r}; expected a short printable word")
+        raise FormatError(
+            f"{path}: the header has the name {quoted(word, 40)}; expected a short printable word"
+        )
     return word
 
 
@@ -129,7 +131,7 @@ def _count(words: list[str], path: Path) -> int:
     # isdecimal refuses signs, and twenty digits are far beyond any file (int() of a million is slow)
     if not (words[1].isascii() and words[1].isdecimal() and len(words[1]) <= 20):
         raise FormatError(
-            f"{path}: element {words[0]} has the count {words[1][:30]!r}; expected a whole number, 0 or more"
+            f"{path}: element {words[0]} has the count {quoted(words[1], 30)}; expected a whole number from 0"
         )
     return int(words[1])
 
@@ -142,12 +144,12 @@ def _property(words: list[str], line: str, path: Path) -> PlyProperty:
         if _TYPES[words[1]].startswith("f"):
             raise FormatError(f"{path}: list {name!r} has a length of type {words[1]}; expected int")
         return PlyProperty(name, _TYPES[words[2]], _TYPES[words[1]])
-    raise FormatError(f"{path}: header line {line[:60]!r} is not a valid property")
+    raise FormatError(f"{path}: header line {quoted(line, 60)} is not a valid property")
 
 
 def _require_unique(names: list[str], what: str, path: Path) -> None:
     seen: set[str] = set()
     for name in names:
         if name in seen:
-            raise FormatError(f"{path}: {what} {name[:40]!r} is declared twice")
+            raise FormatError(f"{path}: {what} {quoted(name, 40)} is declared twice")
         seen.add(name)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from langsplat_core.arrays import Array
+from langsplat_core.errors import quoted
 from langsplat_core.scene.codec.autoencoder import AutoencoderCodec
 from langsplat_core.scene.codec.codebook import CodebookCodec, principal_colours
 from langsplat_core.scene.codec.linear import LinearCodec
@@ -41,5 +42,7 @@ KINDS: Mapping[str, type[Codec]] = MappingProxyType(
 def codec_from_tensors(kind: str, tensors: dict[str, Array]) -> Codec:
     """Rebuild a codec from its kind and named weights; ValueError if they do not belong together."""
     if kind not in KINDS:
-        raise ValueError(f"unknown codec kind {kind!r}; this version knows {', '.join(map(repr, KINDS))}")
+        raise ValueError(
+            f"unknown codec kind {quoted(kind)}; this version knows {', '.join(map(repr, KINDS))}"
+        )
     return KINDS[kind].from_tensors(tensors)
