@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
-from rich.console import Console
 from rich.table import Table
 
 from langsplat_core.cli.checks import OutFile
+from langsplat_core.cli.console import OutputConsole
 from langsplat_core.config import CompactConfig
 from langsplat_core.progress import TerminalProgress
 
@@ -41,7 +41,7 @@ class Compact:
         if self.json:
             print(json.dumps({"out": str(out), **asdict(report)}, indent=1))
             return
-        console = Console()
+        console = OutputConsole()
         console.print(_table(report))
         for line in (*_notes(report), f"written: {out}"):
             console.print(line, soft_wrap=True, highlight=False, markup=False)

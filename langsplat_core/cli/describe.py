@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.table import Table
 
+from langsplat_core.cli.console import OutputConsole
 from langsplat_core.config import Count, CountOrZero
 from langsplat_core.errors import InputError
 from langsplat_core.formats import load_scene
@@ -185,8 +185,8 @@ def _print_inventory(entries: list[dict[str, Any]]) -> None:
             centre = " ".join(f"{value:.2f}" for value in spot["centre"])
             start = names if number == 0 else ("", "", "", "")
             table.add_row(*start, f"{100 * spot['share']:.2f}", _looks(spot), centre)
-    console = Console()
-    Console(width=max(WIDTH, console.width)).print(table)
+    console = OutputConsole()
+    OutputConsole(width=max(WIDTH, console.width)).print(table)
     if not entries:
         print("nothing of the vocabulary was found in the scene")
 

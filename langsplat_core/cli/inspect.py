@@ -11,11 +11,11 @@ from itertools import accumulate
 from pathlib import Path
 
 import tyro
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from langsplat_core import __version__
+from langsplat_core.cli.console import OutputConsole
 from langsplat_core.errors import BackendError, LangSplatError
 from langsplat_core.formats import load_scene
 from langsplat_core.formats.summary import NEEDLE, OPACITY_EDGES, SceneSummary, disk_bytes, summarise
@@ -52,7 +52,7 @@ class Inspect:
             table.add_row(name, Text(value))
         for reason in scene.unread:
             table.add_row("not read", Text(reason))
-        Console().print(table)
+        OutputConsole().print(table)
 
 
 def _lines(a: SceneSummary) -> list[tuple[str, str]]:
