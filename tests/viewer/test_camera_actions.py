@@ -123,7 +123,8 @@ def test_a_scene_without_cameras_opens_and_returns_to_a_view_of_everything(viewe
 def test_reset_returns_to_the_opening_view(opened):
     for camera in (opened.state.scene.cameras[0], opened.state.scene.cameras[2]):
         if camera is not opened.state.scene.cameras[0]:
-            actions.open_at(opened, camera)  # as --camera asks for it
+            actions.open_at(opened, camera.resized(40, 30))  # as --camera asks for it
+            assert opened.state.camera_index == 2
         actions.go_to_camera(opened, 1)
         actions.zoom_by(opened, 0.3)
         actions.reset_view(opened)

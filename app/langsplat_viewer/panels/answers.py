@@ -43,11 +43,9 @@ def _line(viewer: Viewer, query: Query) -> None:
     _swatch(viewer, query, side)
     imgui.same_line()
     chosen = viewer.state.selected is query
-    imgui.push_style_var(imgui.StyleVar_.selectable_text_align, ImVec2(0, 0.5))
     name = elided(query.phrase, room, lambda text: imgui.calc_text_size(text).x)
-    if imgui.selectable(f"{name}##phrase of list", chosen, size=ImVec2(room, side))[0]:
+    if imgui.selectable(f"{name}##phrase of list", chosen, size=ImVec2(room, 0))[0]:
         actions.select(viewer, query)
-    imgui.pop_style_var()
     if name != query.phrase and imgui.is_item_hovered():
         imgui.set_tooltip(query.phrase)
     imgui.same_line(left + right - side - spacing - verdict_width)
