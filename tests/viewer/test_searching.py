@@ -206,5 +206,6 @@ def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch,
     settle(viewer)
     result = viewer.state.queries[0].result
     assert (result.verdict, result.found) == (verdict, verdict == "found")
+    assert (viewer.state.queries[0].slot is None) == (verdict == "not here")
     said = f"'mug': {verdict} ({100 * result.probability:.0f} %), score "
     assert describe(result).startswith(said)

@@ -44,7 +44,11 @@ def open_at(viewer: Viewer, camera: Camera) -> None:
     """Take a camera's view at once; it is the opening view from now on."""
     extent, scene = viewer.state.extent, viewer.state.scene
     if extent is not None and scene is not None:
-        same = (i for i, own in enumerate(scene.cameras) if np.array_equal(own.world_to_camera, camera.world_to_camera))
+        same = (
+            i
+            for i, own in enumerate(scene.cameras)
+            if np.array_equal(own.world_to_camera, camera.world_to_camera)
+        )
         viewer.state.camera_index = next(same, None)
         viewer.state.opening_camera = camera
         move(viewer, lambda view: from_camera(camera, extent))

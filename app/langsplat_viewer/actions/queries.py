@@ -77,7 +77,7 @@ def take_search_focus(viewer: Viewer) -> bool:
 
 
 def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
-    """Have the worker answer `query` at the current level choice. Only what is answered takes a colour."""
+    """Have the worker answer `query` at the current level choice; only what may be there takes a colour."""
     engine, level = viewer.engine, viewer.state.level
     if engine is None:
         return
@@ -98,7 +98,8 @@ def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
         query.result, query.problem, query.meant, query.pending = composed.answer, "", "", False
         query.reading = "" if isinstance(composed.tree, Atom) else composed.reading
         if then_show and query in viewer.state.queries:
-            _give_slot(viewer, query)
+            if composed.answer.verdict != "not here":  # nothing is painted for it
+                _give_slot(viewer, query)
             if not DISPLAYS[viewer.state.picture.display].needs_query:
                 viewer.state.picture = replace(viewer.state.picture, display="relevancy")
 
