@@ -18,6 +18,7 @@ from langsplat_core.datasets.intrinsics import (
     PhotoIntrinsics,
 )
 from langsplat_core.errors import FormatError, InputError, printable_line
+from langsplat_core.files import shown
 from langsplat_core.progress import Progress
 
 log = logging.getLogger("langsplat")
@@ -57,8 +58,8 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
     missing = {photo.label for photo in photos if not os.path.isfile(photo.path)}
     if missing and len(missing) == len(photos):
         raise InputError(
-            f"none of the {len(photos)} photographs named by {model_folder} exists "
-            f"(first: {printable_line(photos[0].path, 120)}); put them into {folder / 'images'}"
+            f"none of the {len(photos)} photographs named by {shown(model_folder)} exists "
+            f"(first: {printable_line(photos[0].path, 120)}); put them into {shown(folder / 'images')}"
         )
     if missing:
         log.warning(

@@ -122,7 +122,8 @@ def test_a_reader_that_has_enough() -> None:
 def test_a_signal_ends_a_command_in_a_line(number: int, said: str, tmp_path: Path) -> None:
     """With pycolmap imported, whose library would print a stack trace."""
     code = (
-        "import sys, time\nfrom langsplat_core.cli.run import main\n"
+        "import signal, sys, time\nfrom langsplat_core.cli.run import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # which a shell's background ignores
         "from dataclasses import dataclass\n"
         "@dataclass\nclass Waits:\n    def run(self):\n"
         "        from langsplat_core.datasets import load_capture\n"

@@ -1,6 +1,7 @@
 """A CLIP small enough to be made while a test runs, in the layout of Hugging Face."""
 
 from pathlib import Path
+from string import ascii_lowercase, digits
 
 import torch
 from transformers import CLIPConfig, CLIPModel, CLIPTokenizer
@@ -10,13 +11,14 @@ SIDE = 32
 
 
 def tiny_clip(folder: Path, half: bool = False) -> CLIPModel:
-    """A CLIP of two narrow layers with a word-level vocabulary, saved in Hugging Face layout."""
-    letters = sorted({letter for word in WORDS for letter in word})
+    """A CLIP of two narrow layers that spells, saved in Hugging Face layout. It reads every everyday phrase
+    whole, and no marks."""
+    letters = ascii_lowercase + digits
     tokens = ["<|startoftext|>", "<|endoftext|>", *letters, *(f"{letter}</w>" for letter in letters)]
     tokenizer = CLIPTokenizer(vocab={token: i for i, token in enumerate(tokens)}, merges=[])
     tokenizer.save_pretrained(folder)
     tower = {"hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2}
-    text = tower | {"vocab_size": len(tokens), "max_position_embeddings": 12}
+    text = tower | {"vocab_size": len(tokens), "max_position_embeddings": 40}
     text |= {"bos_token_id": 0, "eos_token_id": 1, "pad_token_id": 1}
     torch.manual_seed(0)
     model = CLIPModel(

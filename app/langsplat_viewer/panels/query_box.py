@@ -1,6 +1,6 @@
 """The box to type a search in, and what is offered below it: examples, completions, corrections."""
 
-from imgui_bundle import imgui
+from imgui_bundle import ImVec2, imgui
 
 from langsplat_viewer import actions
 from langsplat_viewer.panels.style import MUTED
@@ -8,6 +8,7 @@ from langsplat_viewer.viewer import Viewer
 
 HINT = "what to look for"
 HINT_EXAMPLES = 2
+OFFER_LINES = 2  # more are scrolled to
 
 
 def draw(viewer: Viewer) -> None:
@@ -42,10 +43,16 @@ def hint(viewer: Viewer) -> str:
 
 
 def _offers(viewer: Viewer) -> None:
-    """Small buttons, as many in a row as fit."""
-    title, phrases = actions.offers(viewer)
-    if not phrases:
-        return
+    """Small buttons, as many in a row as fit, in a place of their own, so that nothing moves below."""
+    height = OFFER_LINES * imgui.get_text_line_height_with_spacing()
+    if imgui.begin_child("offers", ImVec2(0, height), imgui.ChildFlags_.none):
+        title, phrases = actions.offers(viewer)
+        if phrases:
+            _buttons(viewer, title, phrases)
+    imgui.end_child()
+
+
+def _buttons(viewer: Viewer, title: str, phrases: tuple[str, ...]) -> None:
     imgui.text_colored(MUTED, title)
     style = imgui.get_style()
     for number, phrase in enumerate(phrases):

@@ -14,7 +14,7 @@ from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.semantics.encoders import load_text_encoder
 
-WHOLE = DatasetConfig(max_side=100_000)  # photographs are not shrunk
+WHOLE = DatasetConfig(max_side=65_536)  # photographs are not shrunk
 
 
 def measure_scene(scene_path: Path, dataset: Path, reading: Reading, progress: Progress = silent) -> str:
