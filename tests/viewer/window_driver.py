@@ -243,8 +243,7 @@ def without_field(s: Session) -> None:
     assert s.ctx.item_exists("//**/##phrase")
     s.ctx.item_click("//**/Keys")
     s.ctx.item_click("//**/##next")
-    s.settle()
-    assert s.state.camera_index == 1
+    s.wait(lambda: s.state.camera_index == 1)
     s.shot("keys")
 
 
