@@ -211,7 +211,6 @@ class Window:
             a is not b and a != b for a, b in zip(there, self._last, strict=True)
         )
         self._last = there
-        self.idles = True  # False for scripts that drive the window and count on its next frame
         self._frames = AWAKE_FRAMES if changed else max(self._frames - 1, 0)
         busy = self.unfinished or state.glide is not None or self._frames > 0
         idling.enable_idling = self.idles and (self.is_minimised() or not busy)

@@ -58,8 +58,8 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
     missing = {photo.label for photo in photos if not os.path.isfile(photo.path)}
     if missing and len(missing) == len(photos):
         raise InputError(
-            f"none of the {len(photos)} photographs named by {shown(model_folder)} exists "
-            f"(first: {printable_line(photos[0].path, 120)}); put them into {shown(folder / 'images')}"
+            f"{shown(model_folder)}: none of its {len(photos)} photographs exists "
+            f"(first: {printable_line(photos[0].label, 60)}); put them into {shown(folder / 'images')}"
         )
     if missing:
         log.warning(

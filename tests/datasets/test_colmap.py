@@ -119,7 +119,7 @@ def test_no_photograph_at_all_is_an_error(tmp_path: Path) -> None:
     write_dataset(tmp_path)
     for photo in (tmp_path / "images").iterdir():
         photo.unlink()
-    with pytest.raises(InputError, match=r"none of the 3 photographs .*view_.*png"):
+    with pytest.raises(InputError, match=r"none of its 3 photographs .*view_.*png"):
         load_capture(tmp_path, CONFIG, tmp_path / "work")
 
 
