@@ -21,6 +21,7 @@ from langsplat_viewer.options import (
     scene_path,
     services,
 )
+from langsplat_viewer.preferences import preferences_folder
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,8 @@ class ViewerCommand:
     """What draws."""
     encoder: Annotated[str, tyro.conf.arg(metavar="ID|FOLDER")] = ""
     """Text encoder in place of the one that the scene names."""
+    fresh: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Neither use nor change the remembered layout, settings and recent files."""
     headless: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Draw one picture without a window and print the answers."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE.png")] = None
@@ -91,6 +94,7 @@ class ViewerCommand:
                 size=size,
                 camera=self.camera,
                 backend=self.backend,
+                settings=None if self.fresh else preferences_folder(),
             ),
             services(self.encoder),
         )

@@ -1,5 +1,5 @@
-"""Everything that can be done with one key or one click: one table, from which the keys, the list of keys and
-the list of commands are made."""
+"""Everything that can be done with one key or one click: one table, from which the menus, the keys, the list
+of keys and the list of commands are made."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -44,6 +44,7 @@ class Command:
     does: str
     act: Callable[[Viewer], object]
     keys: tuple[str, ...] = ()
+    menu: str = ""  # one of MENUS; without one it is found in the list of commands alone
     repeats: bool = False  # while held
     is_edit: bool = False  # belongs to the box while one types, as it does everywhere
 
@@ -59,24 +60,38 @@ def _name(button: Button) -> str:
     )
 
 
+def _panel(title: str) -> Command:
+    return Command(f"panel: {title}", lambda viewer: actions.open_panel(viewer, title))
+
+
+PANEL_TITLES = ("Search", "Scene", "Display", "Camera", "Messages")
+MENUS = ("File", "Edit", "View", "Camera", "Window", "Help")
+
 COMMANDS: tuple[Command, ...] = (
-    Command("open a scene", actions.ask_for_file, ("Ctrl+O",)),
-    Command("save a picture", lambda viewer: saving.save_picture(viewer, Path.cwd()), ("Ctrl+S", "P")),
-    Command("save the view", lambda viewer: saving.save_view(viewer, Path.cwd())),
-    Command("search", actions.focus_search, ("Ctrl+F", "/")),
-    Command("undo", actions.undo, ("Ctrl+Z",), repeats=True, is_edit=True),
-    Command("redo", actions.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), repeats=True, is_edit=True),
-    Command("find a command", lambda viewer: actions.show_palette(viewer, True), ("Ctrl+Shift+P",)),
-    Command("return to the opening view", actions.reset_view, ("R", "Home")),
-    Command("frame everything", actions.frame_scene, ("Shift+F",)),
-    Command("focus on the latest result found", actions.focus_result, ("F",)),
-    Command("previous training camera", lambda viewer: actions.step_camera(viewer, -1), (",",), repeats=True),
-    Command("next training camera", lambda viewer: actions.step_camera(viewer, 1), (".",), repeats=True),
-    Command("level the horizon", lambda viewer: actions.move(viewer, level)),
-    Command("take the picture's up as the world's", lambda viewer: actions.move(viewer, adopt_up)),
-    *(Command(_name(button), _show(button), (str(key),)) for key, button in enumerate(BUTTONS, start=1)),
-    Command("hide or show the panel", actions.toggle_panel, ("Tab",)),
-    Command("this list of keys", actions.toggle_help, ("F1", "?")),
+    Command("open a scene", actions.ask_for_file, ("Ctrl+O",), "File"),
+    Command(
+        "save a picture", lambda viewer: saving.save_picture(viewer, Path.cwd()), ("Ctrl+S", "P"), "File"
+    ),
+    Command("save the view", lambda viewer: saving.save_view(viewer, Path.cwd()), menu="File"),
+    Command("search", actions.focus_search, ("Ctrl+F", "/"), "Edit"),
+    Command("undo", actions.undo, ("Ctrl+Z",), "Edit", repeats=True, is_edit=True),
+    Command("redo", actions.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), "Edit", repeats=True, is_edit=True),
+    *(Command(_name(button), _show(button), (str(key),), "View") for key, button in enumerate(BUTTONS, 1)),
+    Command("return to the opening view", actions.reset_view, ("R", "Home"), "Camera"),
+    Command("frame everything", actions.frame_scene, ("Shift+F",), "Camera"),
+    Command("focus on the latest result found", actions.focus_result, ("F",), "Camera"),
+    Command(
+        "previous training camera", lambda viewer: actions.step_camera(viewer, -1), (",",), "Camera", True
+    ),
+    Command("next training camera", lambda viewer: actions.step_camera(viewer, 1), (".",), "Camera", True),
+    Command("level the horizon", lambda viewer: actions.move(viewer, level), menu="Camera"),
+    Command(
+        "take the picture's up as the world's", lambda viewer: actions.move(viewer, adopt_up), menu="Camera"
+    ),
+    Command("hide or show the panels", actions.toggle_panel, ("Tab",), "Window"),
+    *(_panel(title) for title in PANEL_TITLES),
+    Command("find a command", lambda viewer: actions.show_palette(viewer, True), ("Ctrl+Shift+P",), "Help"),
+    Command("list of keys", actions.toggle_help, ("F1", "?"), "Help"),
     Command("close what lies over the scene", actions.escape, ("Esc",)),
 )
 
@@ -97,3 +112,8 @@ def matching(text: str) -> list[Command]:
     """The commands whose words hold every word of `text`; all of them for none."""
     words = text.lower().split()
     return [command for command in COMMANDS if all(word in command.does.lower() for word in words)]
+
+
+def in_menu(menu: str) -> list[Command]:
+    """The commands of one of MENUS, in their order."""
+    return [command for command in COMMANDS if command.menu == menu]

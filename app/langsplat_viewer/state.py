@@ -12,7 +12,9 @@ from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.suggestions import Suggestions
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer import painting
+from langsplat_viewer.browsing import Listing
 from langsplat_viewer.controls import Extent, OrbitCamera
+from langsplat_viewer.preferences import Preferences
 
 SLOTS = MAX_QUERIES  # queries shown at a time: one colour each
 MAX_MESSAGES = 50
@@ -95,11 +97,13 @@ class ViewerState:
     backend: str = ""
     size: tuple[int, int] = (1, 1)  # pixels of the scene's area
     coarse_while_moving: bool = True
-    show_panel: bool = True
+    wanted_panel: str = ""  # the title of one that is opened and brought to the front at the next frame
+    show_panel: bool = True  # the panels, as many as are open
     show_help: bool = False
     show_palette: bool = False
     palette_typed: str = ""
-    wants_file: bool = False  # the box for a path opens at the next frame
+    browser: Listing | None = None  # the folder that the file browser shows, while it is open
+    preferences: Preferences = field(default_factory=Preferences)
     letters_muted: bool = False  # letters are no keys: they were meant for a box that cannot be typed in
 
     def say(self, text: str, is_error: bool = False) -> None:

@@ -20,16 +20,15 @@ from langsplat_viewer.canvas import Canvas, Renderer
 from langsplat_viewer.frame import Backend, FrameRenderer
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import chosen_camera, latent_level
-from langsplat_viewer.panels import layout, navigation
+from langsplat_viewer.panels import keyboard, layout, menu, navigation
 from langsplat_viewer.panels.area import scene_area
-from langsplat_viewer.panels.scene import OpenDialog
+from langsplat_viewer.remembered import Remembered
 from langsplat_viewer.viewer import Services, Viewer
 
 TITLE = "LangSplat viewer"
 DEFAULT_SIZE = (1280, 800)
 GL_VERSIONS = ((4, 1), (3, 3))  # 4.1 draws splats on every system; 3.3 still shows the CPU's pictures
 IDLE_FPS = 0.01  # frames per second while nothing happens: an event, or the worker, wakes the window at once
-DIALOG_FPS = 5.0  # while the system's file dialog is open, which is asked for its answer
 AWAKE_SECONDS = 0.4  # after an event: tooltips come, and widgets take their places in a few frames
 AWAKE_FRAMES = 4  # after news from the worker, for the same reason
 
@@ -61,6 +60,7 @@ class WindowRequest:
     size: tuple[int, int] | None = None  # of the window, pixels
     camera: str = ""
     backend: Backend = "auto"
+    settings: Path | None = None  # folder of what is remembered between windows; None: nothing is
 
 
 def open_window(request: WindowRequest, services: Services) -> None:
@@ -111,7 +111,8 @@ class Window:
         self.failure: LangSplatError | None = None  # why the window could not work
         self._request = request
         self._make_renderer = make_renderer
-        self._dialog = OpenDialog()
+        self._hiding = layout.Hiding()
+        self._remembered = Remembered(request.settings, self.viewer.state)
         self._canvas: Canvas | None = None
         self._screen: moderngl.Framebuffer | None = None
         self.unfinished = False  # a finer picture is due
@@ -129,21 +130,23 @@ class Window:
         window.window_geometry.size = self._request.size or DEFAULT_SIZE
         if self._request.size is not None:
             window.window_geometry.window_size_measure_mode = hello_imgui.WindowSizeMeasureMode.screen_coords
-        window.restore_previous_geometry = False
-        params.imgui_window_params.default_imgui_window_type = (
-            hello_imgui.DefaultImGuiWindowType.no_default_window
-        )
-        params.imgui_window_params.background_color = ImVec4(0, 0, 0, 1)
+        self._remembered.load(params, restore_size=self._request.size is None)
+        panels = params.imgui_window_params
+        panels.default_imgui_window_type = hello_imgui.DefaultImGuiWindowType.provide_full_screen_dock_space
+        panels.show_menu_bar, panels.show_menu_app, panels.show_menu_view = True, False, False
+        panels.remember_theme = False  # it is one of the preferences
+        panels.background_color = ImVec4(0, 0, 0, 1)
+        params.docking_params = layout.params(self.viewer, window.window_geometry.size[0])
         gl = params.renderer_backend_options.open_gl_options
         gl.major_version, gl.minor_version = major, minor
         gl.glsl_version = "410" if (major, minor) >= (4, 1) else "330"
         gl.use_core_profile = gl.use_forward_compat = True
         gl.anti_aliasing_samples = 0  # splats gain nothing from it
-        params.ini_disable = True  # the layout is fixed: nothing to remember, no file in the user's folder
         params.fps_idling.fps_idle = IDLE_FPS
         params.fps_idling.time_active_after_last_event = AWAKE_SECONDS
         params.callbacks.load_additional_fonts = fonts.load
-        params.callbacks.setup_imgui_style = _style
+        params.callbacks.setup_imgui_style = self._remembered.style
+        params.callbacks.show_menus = lambda: menu.draw(self.viewer)
         params.callbacks.post_init = self._start
         params.callbacks.show_gui = self._gui
         params.callbacks.before_imgui_render = self._picture
@@ -195,13 +198,11 @@ class Window:
             hello_imgui.get_runner_params().app_shall_exit = True
             return
         actions.tick(viewer, imgui.get_time())
-        area = scene_area(viewer)
-        scale = imgui.get_io().display_framebuffer_scale
-        actions.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))
+        keyboard.muted_until_clicked(viewer)  # hello_imgui draws the panels after this
+        self._hiding.apply(viewer)
+        layout.show_wanted(viewer)
         self._title()
-        layout.draw(viewer, self._dialog)
-        navigation.handle(viewer, scene_area(viewer))
-        self._pace()
+        self._remembered.update()
 
     def _pace(self) -> None:
         """Say how soon the next frame is wanted: at once only while something moves or has just changed."""
@@ -214,7 +215,6 @@ class Window:
         self._frames = AWAKE_FRAMES if changed else max(self._frames - 1, 0)
         busy = self.unfinished or state.glide is not None or self._frames > 0
         idling.enable_idling = self.idles and (self.is_minimised() or not busy)
-        idling.fps_idle = DIALOG_FPS if self._dialog.is_open else IDLE_FPS
 
     def is_minimised(self) -> bool:
         """Whether nobody can see the window."""
@@ -227,8 +227,17 @@ class Window:
             self._titled = path
 
     def _picture(self) -> None:
-        """Bring the picture up to date and put it behind the panels."""
-        canvas, state = self._canvas, self.viewer.state
+        """After the panels: take what they left of mouse and keys, bring the picture up to date and put it
+        behind them."""
+        if self.failure is not None:
+            return
+        viewer, area = self.viewer, scene_area()
+        layout.draw_over(viewer)
+        navigation.handle(viewer, area)
+        scale = imgui.get_io().display_framebuffer_scale
+        actions.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))
+        self._pace()
+        canvas, state = self._canvas, viewer.state
         if canvas is None or self._screen is None or self.is_minimised():
             return
         try:
@@ -239,7 +248,6 @@ class Window:
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
         if canvas.texture is not None:
-            area = scene_area(self.viewer)
             imgui.get_background_draw_list().add_image(
                 imgui.ImTextureRef(canvas.texture.glo),
                 ImVec2(area.left, area.top),
@@ -249,17 +257,5 @@ class Window:
             )
 
     def _stop(self) -> None:
-        self._dialog.close()
+        self._remembered.update()
         self.viewer.worker.close()
-
-
-def _style() -> None:
-    """Calm and dark: one accent, little contrast between the widgets."""
-    hello_imgui.apply_theme(hello_imgui.ImGuiTheme_.darcula_darker)
-    style = imgui.get_style()
-    style.window_padding = ImVec2(12, 10)
-    style.item_spacing = ImVec2(8, 6)
-    style.frame_rounding = 4
-    style.window_border_size = 0
-    popup = style.color_(imgui.Col_.popup_bg)
-    style.set_color_(imgui.Col_.popup_bg, ImVec4(popup.x, popup.y, popup.z, 1))

@@ -48,12 +48,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors.numpy import save_file
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import FormatError
 from langsplat_core.files import atomic_path
-from langsplat_core.formats.language_tensors import CODEC, FORMAT, VERSION, Stored, read_stored
+from langsplat_core.formats.language_tensors import CODEC, FORMAT, VERSION, Stored, read_stored, save_tensors
 from langsplat_core.formats.packed_positions import pack_positions
 from langsplat_core.scene import LEVELS, NO_THING, LanguageField
 
@@ -101,7 +100,7 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
         odds = astuple(field.reading.calibration)
         metadata["calibration"] = json.dumps([[float(n) for n in numbers] for numbers in odds])
     with atomic_path(path) as temporary:
-        save_file({name: np.ascontiguousarray(t) for name, t in tensors.items()}, temporary, metadata)
+        save_tensors(temporary, tensors, metadata)
 
 
 def _narrow(tensor: Array) -> Array:

@@ -1,10 +1,13 @@
 """The tensors of a language sidecar, read and checked; the layout stands in `language`."""
 
+import json
+import struct
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import FormatError, printable_line, quoted
@@ -158,3 +161,19 @@ def _phrases(metadata: dict[str, str], path: Path) -> list[str]:
     if len(set(phrases)) != len(phrases):
         raise FormatError(f"{path}: the header's 'phrases' name one phrase twice")
     return phrases
+
+
+def save_tensors(path: Path, tensors: dict[str, Array], metadata: dict[str, str]) -> None:
+    """Write a safetensors file that is the same, byte for byte, whenever its content is.
+
+    The library writes the metadata in an order of its own, another one each time; here they are sorted.
+    """
+    save_file({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}, path, metadata)
+    with open(path, "r+b") as file:
+        (size,) = struct.unpack("<Q", file.read(8))
+        header = json.loads(file.read(size))
+        header["__metadata__"] = dict(sorted(metadata.items()))
+        text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+        if len(text) <= size:  # always, unless the library begins to write JSON in another way
+            file.seek(8)
+            file.write(text.ljust(size))

@@ -323,3 +323,12 @@ def header_of(path: Path, metadata: bool = False) -> dict:
     header = json.loads(raw[8 : 8 + struct.unpack("<Q", raw[:8])[0]])
     own = header.pop("__metadata__")
     return own if metadata else header
+
+
+def test_the_same_field_makes_the_same_bytes(tmp_path, means):
+    written = set()
+    for number in range(6):  # the library orders the metadata anew each time
+        path = tmp_path / f"{number}.langsplat.safetensors"
+        write_language(path, random_field(N), means)
+        written.add(path.read_bytes())
+    assert len(written) == 1

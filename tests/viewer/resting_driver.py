@@ -1,9 +1,9 @@
 """Opens the real window as the program does, without the test engine, and lets it be; run by test_resting.py.
 
-    python -m tests.viewer.resting_driver rest|leave|forget SCENE.ply
+    python -m tests.viewer.resting_driver rest|leave SCENE.ply
 
 rest: prints frames per second and the share of a core while nothing happens. leave: closes the window while
-a scene is being read for a minute. forget: closes it while the system's file dialog is open.
+a scene is being read for a minute.
 """
 
 import sys
@@ -18,9 +18,7 @@ from imgui_bundle.glfw_utils import glfw_window_hello_imgui
 
 import glfw  # isort: skip
 from langsplat_core.formats import load_scene
-from langsplat_viewer import window as window_module
 from langsplat_viewer.frame import FrameRenderer
-from langsplat_viewer.panels.scene import OpenDialog
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest, open_window
 from tests.support.fakes import FakeEncoder
@@ -84,21 +82,5 @@ def leave(path: Path) -> None:
     open_window(WindowRequest(path, size=(860, 620)), Services(slow_load, lambda encoder_id: FakeEncoder()))
 
 
-def forget(path: Path) -> None:
-    dialogs: list[OpenDialog] = []
-
-    class Forgotten(OpenDialog):
-        """Open from the first frame on."""
-
-        def answer(self) -> Path | None:
-            self.start()
-            dialogs.append(self)
-            return super().answer()
-
-    window_module.OpenDialog = Forgotten
-    close_after(2.0, lambda: bool(dialogs))
-    open_window(WindowRequest(path, size=(860, 620)), Services(load_scene, lambda encoder_id: FakeEncoder()))
-
-
 if __name__ == "__main__":
-    {"rest": rest, "leave": leave, "forget": forget}[sys.argv[1]](Path(sys.argv[2]))
+    {"rest": rest, "leave": leave}[sys.argv[1]](Path(sys.argv[2]))

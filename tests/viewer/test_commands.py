@@ -5,9 +5,10 @@ from collections import Counter
 import pytest
 
 from langsplat_viewer import actions
-from langsplat_viewer.commands import BUTTONS, COMMANDS, matching
+from langsplat_viewer.commands import BUTTONS, COMMANDS, MENUS, PANEL_TITLES, in_menu, matching
 from langsplat_viewer.panels.help import rows
 from langsplat_viewer.panels.keyboard import chord
+from langsplat_viewer.panels.layout import PANELS
 
 KEYS = {key: command for command in COMMANDS for key in command.keys}
 
@@ -26,8 +27,8 @@ def test_no_key_does_two_things():
         ("Ctrl+Shift+P", "find a command"),
         ("R", "return to the opening view"),
         ("Home", "return to the opening view"),
-        ("F1", "this list of keys"),
-        ("?", "this list of keys"),
+        ("F1", "list of keys"),
+        ("?", "list of keys"),
         ("Esc", "close what lies over the scene"),
     ],
 )
@@ -43,6 +44,20 @@ def test_every_key_is_understood_and_letters_are_plain():
     assert chord("Ctrl+Shift+P").ctrl
     assert chord("Ctrl+Shift+P").shift
     assert chord("Shift+F").is_plain  # a capital letter is typed
+
+
+def test_every_menu_has_commands_and_every_menu_named_is_there():
+    assert all(in_menu(menu) for menu in MENUS)
+    assert {command.menu for command in COMMANDS} - {""} == set(MENUS)
+
+
+def test_every_panel_can_be_opened_by_a_command(viewer):
+    assert tuple(panel.title for panel in PANELS) == PANEL_TITLES
+    for title in PANEL_TITLES:
+        (command,) = matching(f"panel: {title}")
+        command.act(viewer)
+        assert actions.take_wanted_panel(viewer) == title
+    assert actions.take_wanted_panel(viewer) == ""
 
 
 def test_help_lists_every_key():

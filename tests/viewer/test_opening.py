@@ -104,15 +104,6 @@ def test_cancelled_opening_shows_nothing(viewer):
     assert viewer.state.scene is None
 
 
-def test_a_path_can_be_typed(viewer):
-    actions.type_path(viewer, "  ")
-    assert not actions.open_typed(viewer)
-    actions.type_path(viewer, " blobs.ply ")
-    assert actions.open_typed(viewer)
-    settle(viewer)
-    assert viewer.state.scene is SCENES["blobs.ply"]
-
-
 def test_a_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
     path = tmp_path / "a.ply"
     save_scene(path, replace(blob_scene(), path=None))

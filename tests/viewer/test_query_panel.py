@@ -9,8 +9,8 @@ import pytest
 
 from langsplat_core.scene import Calibration, Odds, Reading
 from langsplat_viewer import actions
-from langsplat_viewer.panels import answers, query_box
-from langsplat_viewer.panels import query as panel
+from langsplat_viewer.panels import answers, query_box, style
+from langsplat_viewer.panels import search as panel
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene, language
 from tests.support.windowless import SCENES, settle
@@ -32,7 +32,11 @@ class Paper:
         self.values = {
             "calc_text_size": spacing,
             "get_content_region_avail": spacing,
-            "get_style": SimpleNamespace(frame_padding=spacing, item_spacing=spacing),
+            "get_style": SimpleNamespace(
+                frame_padding=spacing,
+                item_spacing=spacing,
+                color_=lambda which: SimpleNamespace(x=0, y=0, z=0),
+            ),
             "get_frame_height": 10.0,
             "get_frame_height_with_spacing": 14.0,
             "get_text_line_height_with_spacing": 12.0,
@@ -64,6 +68,7 @@ def paper(monkeypatch) -> Iterator[Paper]:
         monkeypatch.setattr(module, "imgui", made)
     for module in (panel, answers):
         monkeypatch.setattr(module, "small_wrapped", lambda text, colour: made.said.append(text))
+    monkeypatch.setattr(style, "imgui", made)
     return made
 
 

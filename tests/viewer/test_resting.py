@@ -6,7 +6,6 @@ import sys
 import time
 from pathlib import Path
 
-import psutil
 import pytest
 
 from langsplat_core.formats import save_scene
@@ -43,16 +42,3 @@ def test_closing_does_not_wait_for_what_is_being_read(display, tmp_path):
     began = time.monotonic()
     run("leave", display, tmp_path)
     assert time.monotonic() - began < 45  # the reading takes 60
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a dialog program of its own")
-def test_a_forgotten_file_dialog_goes_with_the_window(display, tmp_path):
-    program = tmp_path / "bin" / "zenity"
-    program.parent.mkdir()
-    program.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/pid\nexec sleep 100\n")
-    program.chmod(0o755)
-    began = time.monotonic()
-    run("forget", display, tmp_path, PATH=f"{program.parent}{os.pathsep}{os.environ['PATH']}")
-    assert time.monotonic() - began < 60
-    number = int((tmp_path / "pid").read_text())
-    assert not psutil.pid_exists(number) or psutil.Process(number).status() == psutil.STATUS_ZOMBIE

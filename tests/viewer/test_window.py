@@ -41,6 +41,7 @@ def folder(tmp_path: Path) -> Path:
         "from_the_command_line",
         "broken_renderer",
         "use_shortcuts",
+        "arrange_panels",
         "many_queries",
         "type_while_opening",
         "look_at_nothing",
@@ -48,6 +49,17 @@ def folder(tmp_path: Path) -> Path:
     ],
 )
 def test_window(scenario: str, display: str, folder: Path):
+    drive(scenario, display, folder)
+
+
+@pytest.mark.long
+def test_what_was_arranged_is_found_again(display: str, folder: Path):
+    drive("leave_settings", display, folder)
+    drive("find_settings", display, folder)
+
+
+def drive(scenario: str, display: str, folder: Path) -> None:
+    """Play one scenario of `window_driver`."""
     environment = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}
     environment |= {"DISPLAY": display, "PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "app")))}
     run = subprocess.run(

@@ -4,6 +4,15 @@ Each takes the `Viewer` and changes its state; long work goes to the worker. Non
 something a user did: the reason appears in the messages area.
 """
 
+from langsplat_viewer.actions.browsing import (
+    ask_for_file,
+    browse,
+    choose,
+    close_browser,
+    open_recent,
+    open_typed,
+    type_path,
+)
 from langsplat_viewer.actions.camera import (
     focus_pixel,
     focus_result,
@@ -19,15 +28,7 @@ from langsplat_viewer.actions.camera import (
     zoom_by,
 )
 from langsplat_viewer.actions.offers import ask_offered, offers, prepare_suggestions, recall
-from langsplat_viewer.actions.opening import (
-    ask_for_file,
-    cancel,
-    open_dropped,
-    open_scene,
-    open_typed,
-    take_file_wish,
-    type_path,
-)
+from langsplat_viewer.actions.opening import cancel, open_dropped, open_scene
 from langsplat_viewer.actions.queries import (
     ask,
     ask_typed,
@@ -43,13 +44,18 @@ from langsplat_viewer.actions.queries import (
 from langsplat_viewer.actions.settings import (
     escape,
     mute_letters,
+    note_panels,
+    open_panel,
     resize,
     set_coarse_while_moving,
     set_display,
     set_picture,
+    set_theme,
+    set_ui_scale,
     show_help,
     show_palette,
     show_panel,
+    take_wanted_panel,
     toggle_help,
     toggle_panel,
     type_command,
@@ -61,7 +67,10 @@ __all__ = [
     "ask_for_file",
     "ask_offered",
     "ask_typed",
+    "browse",
     "cancel",
+    "choose",
+    "close_browser",
     "escape",
     "focus_pixel",
     "focus_result",
@@ -72,9 +81,12 @@ __all__ = [
     "hide",
     "move",
     "mute_letters",
+    "note_panels",
     "offers",
     "open_at",
     "open_dropped",
+    "open_panel",
+    "open_recent",
     "open_scene",
     "open_typed",
     "prepare_suggestions",
@@ -89,13 +101,15 @@ __all__ = [
     "set_fly_speed",
     "set_level",
     "set_picture",
+    "set_theme",
+    "set_ui_scale",
     "show",
     "show_help",
     "show_palette",
     "show_panel",
     "step_camera",
-    "take_file_wish",
     "take_search_focus",
+    "take_wanted_panel",
     "tick",
     "toggle_help",
     "toggle_panel",

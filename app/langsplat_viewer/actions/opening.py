@@ -16,12 +16,12 @@ from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions.camera import opening_view
 from langsplat_viewer.actions.history import forget
-from langsplat_viewer.actions.settings import show_panel
+from langsplat_viewer.browsing import SCENE_SUFFIXES
 from langsplat_viewer.controls import Extent, extent_of
 from langsplat_viewer.looking import why_undrawable
+from langsplat_viewer.preferences import with_recent
 from langsplat_viewer.viewer import Viewer
 
-SCENE_SUFFIXES = (".ply", ".spz", ".splat", ".ksplat", ".sog")
 COMPANIONS = (cameras_json.SUFFIX, language.SUFFIX)  # files beside a scene, read with it
 NAMED = 3  # files that a message names
 
@@ -80,31 +80,6 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
     open_scene(viewer, first)
 
 
-def ask_for_file(viewer: Viewer) -> None:
-    """Have the box for a path opened."""
-    show_panel(viewer, True)
-    viewer.state.wants_file = True
-
-
-def take_file_wish(viewer: Viewer) -> bool:
-    """Whether that box opens now; said once."""
-    wanted, viewer.state.wants_file = viewer.state.wants_file, False
-    return wanted
-
-
-def type_path(viewer: Viewer, text: str) -> None:
-    """What stands in the box for a path."""
-    viewer.state.path_typed = text
-
-
-def open_typed(viewer: Viewer) -> bool:
-    """Open what the box for a path names; whether it names anything."""
-    text = viewer.state.path_typed.strip()
-    if text:
-        open_scene(viewer, Path(text).expanduser())
-    return bool(text)
-
-
 def cancel(viewer: Viewer) -> None:
     """Drop the work under way."""
     viewer.worker.cancel()
@@ -122,6 +97,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state.queries, state.selected, state.glide = [], None, None
     state.camera_index = 0 if scene.cameras else None
     forget(viewer)
+    state.preferences = with_recent(state.preferences, path.absolute())
     state.opening_camera = None
     state.view, state.nothing = opening_view(viewer), why_undrawable(scene.gaussians)
     viewer.engine = viewer.services.engine(scene)

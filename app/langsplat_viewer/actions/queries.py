@@ -12,7 +12,7 @@ from langsplat_core.query.phrase_tree import Atom
 from langsplat_core.query.suggestions import corrected
 from langsplat_core.scene.phrases import phrase_key, split_phrases
 from langsplat_viewer.actions.history import remember
-from langsplat_viewer.actions.settings import mute_letters, show_panel
+from langsplat_viewer.actions.settings import mute_letters, open_panel
 from langsplat_viewer.state import SLOTS, Query
 from langsplat_viewer.viewer import Viewer
 
@@ -59,7 +59,7 @@ def ask_typed(viewer: Viewer) -> None:
 
 def focus_search(viewer: Viewer) -> None:
     """Have the search box take the keyboard; where there is nothing to search, what is typed goes nowhere."""
-    show_panel(viewer, True)
+    open_panel(viewer, "Search")
     scene = viewer.state.scene
     if scene is None or scene.language is None:
         viewer.state.say(

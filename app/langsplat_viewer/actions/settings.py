@@ -6,6 +6,7 @@ from langsplat_core.config import Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
 from langsplat_viewer.actions.history import remember
+from langsplat_viewer.preferences import SCALES, Theme
 from langsplat_viewer.viewer import Viewer
 
 
@@ -31,19 +32,49 @@ def set_coarse_while_moving(viewer: Viewer, coarse: bool) -> None:
     viewer.state.coarse_while_moving = coarse
 
 
+def set_theme(viewer: Viewer, theme: Theme) -> None:
+    """Dark or light panels, from now on."""
+    viewer.state.preferences = replace(viewer.state.preferences, theme=theme)
+
+
+def set_ui_scale(viewer: Viewer, scale: float) -> None:
+    """How large letters and widgets are, within `preferences.SCALES`."""
+    low, high = SCALES
+    viewer.state.preferences = replace(viewer.state.preferences, ui_scale=min(max(scale, low), high))
+
+
 def resize(viewer: Viewer, width: int, height: int) -> None:
     """The scene's area of the window, pixels."""
     viewer.state.size = (max(1, width), max(1, height))
 
 
 def show_panel(viewer: Viewer, shown: bool) -> None:
-    """Whether the column of panels is there."""
+    """Whether the panels are there."""
     viewer.state.show_panel = shown
 
 
 def toggle_panel(viewer: Viewer) -> None:
-    """Hide the column of panels, or show it again."""
+    """Hide the panels, or show them again."""
     show_panel(viewer, not viewer.state.show_panel)
+
+
+def open_panel(viewer: Viewer, title: str) -> None:
+    """Have a panel opened, in front of those it shares its place with."""
+    show_panel(viewer, True)
+    viewer.state.wanted_panel = title
+
+
+def take_wanted_panel(viewer: Viewer) -> str:
+    """The panel that is opened now, "" for none; said once."""
+    title, viewer.state.wanted_panel = viewer.state.wanted_panel, ""
+    return title
+
+
+def note_panels(viewer: Viewer, titles: tuple[str, ...]) -> None:
+    """Remember which panels are open."""
+    state = viewer.state
+    if titles != state.preferences.panels:
+        state.preferences = replace(state.preferences, panels=titles)
 
 
 def show_help(viewer: Viewer, shown: bool) -> None:
@@ -75,4 +106,5 @@ def escape(viewer: Viewer) -> None:
     """Close what lies over the scene, and let letters be keys again."""
     show_help(viewer, False)
     show_palette(viewer, False)
+    viewer.state.browser = None
     mute_letters(viewer, False)

@@ -5,7 +5,7 @@ from imgui_bundle import ImVec2, ImVec4, imgui
 from langsplat_core.display.colour_maps import QUERY_COLOURS
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions
-from langsplat_viewer.panels.style import BAD, GOOD, MUTED, elided, small_wrapped
+from langsplat_viewer.panels.style import bad, elided, good, muted, small_wrapped
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
 
@@ -20,7 +20,7 @@ def draw(viewer: Viewer) -> None:
     row = imgui.get_frame_height_with_spacing()
     if imgui.begin_child("queries", ImVec2(0, ROWS * row), imgui.ChildFlags_.none):
         if not viewer.state.queries:
-            imgui.text_colored(MUTED, "what you search is listed here")
+            imgui.text_colored(muted(), "what you search is listed here")
         for query in reversed(viewer.state.queries):
             imgui.push_id(query.phrase)
             _line(viewer, query)
@@ -73,11 +73,11 @@ def _swatch(viewer: Viewer, query: Query, side: float) -> None:
 
 def _verdict(query: Query) -> None:
     if query.pending:
-        imgui.text_colored(MUTED, "...")
+        imgui.text_colored(muted(), "...")
     elif query.problem:
-        imgui.text_colored(BAD, "not asked")
+        imgui.text_colored(bad(), "not asked")
     elif query.result is not None:
-        imgui.text_colored(GOOD if query.result.found else MUTED, query.result.verdict)
+        imgui.text_colored(good() if query.result.found else muted(), query.result.verdict)
         probability = query.result.probability
         if imgui.is_item_hovered() and probability is not None:
             imgui.set_tooltip(f"{100 * probability:.0f} % likely to be there")
@@ -94,9 +94,9 @@ def _details(viewer: Viewer, query: Query) -> None:
     if place is not None:
         imgui.same_line()
         imgui.align_text_to_frame_padding()
-        imgui.text_colored(MUTED, "at " + "  ".join(f"{v:.2f}" for v in place))
+        imgui.text_colored(muted(), "at " + "  ".join(f"{v:.2f}" for v in place))
     if query.problem:
-        small_wrapped(query.problem, BAD)
+        small_wrapped(query.problem, bad())
     if result is not None:
         for index, (name, score) in enumerate(zip(LEVELS, result.scores, strict=True)):
             if index:
@@ -105,6 +105,6 @@ def _details(viewer: Viewer, query: Query) -> None:
             if index == result.level:
                 imgui.text(text)
             else:
-                imgui.text_colored(MUTED, text)
+                imgui.text_colored(muted(), text)
     if query.reading:
-        small_wrapped(f"read as: {query.reading}", MUTED)
+        small_wrapped(f"read as: {query.reading}", muted())

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 from imgui_bundle import hello_imgui, imgui
 
-from langsplat_viewer.panels.style import PANEL_EM
-from langsplat_viewer.viewer import Viewer
+MAIN_DOCK = "MainDockSpace"  # hello_imgui's name for the whole window below the menus
 
 
 @dataclass(frozen=True)
@@ -22,8 +21,11 @@ class Area:
         return (x - self.left) / self.width, (y - self.top) / self.height
 
 
-def scene_area(viewer: Viewer) -> Area:
-    """What the panel leaves free, at least one unit wide."""
-    display = imgui.get_io().display_size
-    left = min(hello_imgui.em_size(PANEL_EM), 0.6 * display.x) if viewer.state.show_panel else 0.0
-    return Area(left, 0.0, max(display.x - left, 1.0), max(display.y, 1.0))
+def scene_area() -> Area:
+    """What menus and docked panels leave free, at least one unit wide and high."""
+    dock = hello_imgui.get_runner_params().docking_params.dock_space_id_from_name(MAIN_DOCK)
+    node = imgui.internal.dock_builder_get_central_node(dock) if dock else None
+    if node is None:  # in the first frame
+        display = imgui.get_io().display_size
+        return Area(0.0, 0.0, max(display.x, 1.0), max(display.y, 1.0))
+    return Area(node.pos.x, node.pos.y, max(node.size.x, 1.0), max(node.size.y, 1.0))

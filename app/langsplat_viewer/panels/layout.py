@@ -1,50 +1,106 @@
-"""Where the panels lie: one column on the left, the scene on the rest."""
+"""Where the panels lie: docked around the scene, each where its user left it."""
 
-from imgui_bundle import ImVec2, imgui
+from collections.abc import Callable
+from dataclasses import dataclass
 
-from langsplat_viewer.panels import help, keyboard, legend, palette, query, scene, status, view
-from langsplat_viewer.panels.area import Area, scene_area
-from langsplat_viewer.panels.scene import OpenDialog
+from imgui_bundle import ImVec2, hello_imgui, imgui
+
+from langsplat_viewer import actions
+from langsplat_viewer.panels import browser, help, legend, messages, palette, scene, search, view
+from langsplat_viewer.panels.area import MAIN_DOCK, scene_area
 from langsplat_viewer.viewer import Viewer
 
-PANEL = "LangSplat"
+LEFT, MIDDLE, FOOT = "Left", "Middle", "Foot"  # docks of the column beside the scene
+COLUMN = 345.0  # its width at first, window units
+MOST_SHARE, MIDDLE_SHARE, FOOT_SHARE = 0.4, 0.42, 0.19
 
 
-def draw(viewer: Viewer, dialog: OpenDialog) -> None:
-    """All panels."""
-    keyboard.muted_until_clicked(viewer)
-    area = scene_area(viewer)
-    if viewer.state.show_panel:
-        _column(viewer, dialog, area)
+@dataclass(frozen=True)
+class Panel:
+    """A window that can be docked, resized and closed."""
+
+    title: str
+    dock: str  # where it lies until it is moved
+    draw: Callable[[Viewer], None]
+    is_open: bool = True  # until it is opened or closed
+
+
+PANELS: tuple[Panel, ...] = (
+    Panel("Search", LEFT, search.draw),
+    Panel("Scene", LEFT, scene.draw),
+    Panel("Display", MIDDLE, view.draw_display),
+    Panel("Camera", MIDDLE, view.draw_camera),
+    Panel("Messages", FOOT, messages.draw),
+)
+
+
+def params(viewer: Viewer, width: float) -> hello_imgui.DockingParams:
+    """The docks of a window `width` units wide, and the panels in them, for hello_imgui to draw."""
+    docking = hello_imgui.DockingParams()
+    docking.docking_splits = [
+        hello_imgui.DockingSplit(MAIN_DOCK, LEFT, imgui.Dir.left, min(COLUMN / width, MOST_SHARE)),
+        hello_imgui.DockingSplit(LEFT, FOOT, imgui.Dir.down, FOOT_SHARE),
+        hello_imgui.DockingSplit(LEFT, MIDDLE, imgui.Dir.down, MIDDLE_SHARE),
+    ]
+    docking.dockable_windows = [_window(viewer, panel) for panel in PANELS]
+    # The scene itself is no panel: nothing is docked over it.
+    docking.main_dock_space_node_flags = (
+        imgui.DockNodeFlags_.passthru_central_node | imgui.DockNodeFlags_.no_docking_over_central_node
+    )
+    return docking
+
+
+def _window(viewer: Viewer, panel: Panel) -> hello_imgui.DockableWindow:
+    remembered = viewer.state.preferences.panels
+    is_open = panel.is_open if remembered is None else panel.title in remembered
+    window = hello_imgui.DockableWindow(panel.title, panel.dock, lambda: panel.draw(viewer), is_open)
+    window.remember_is_visible = False  # the preferences do
+    window.window_size = ImVec2(360, 330)
+    return window
+
+
+def show_wanted(viewer: Viewer) -> None:
+    """Open the panel that an action wants seen, in front of those it shares its place with."""
+    title = actions.take_wanted_panel(viewer)
+    if title:
+        docking = hello_imgui.get_runner_params().docking_params
+        docking.dockable_window_of_name(title).is_visible = True
+        docking.focus_dockable_window(title)
+
+
+class Hiding:
+    """Takes all panels away at one key, and brings back those that were there."""
+
+    def __init__(self) -> None:
+        self._hidden: list[str] = []
+
+    def apply(self, viewer: Viewer) -> None:
+        """Once per frame: hide them or bring them back where that has changed, and note which are open."""
+        docking, shown = hello_imgui.get_runner_params().docking_params, viewer.state.show_panel
+        if not shown and not self._hidden:
+            self._hidden = [window.label for window in docking.dockable_windows if window.is_visible]
+            for window in docking.dockable_windows:
+                window.is_visible = False
+        elif shown and self._hidden:
+            for title in self._hidden:
+                docking.dockable_window_of_name(title).is_visible = True
+            self._hidden = []
+        if shown:
+            visible = (window.label for window in docking.dockable_windows if window.is_visible)
+            actions.note_panels(viewer, tuple(visible))
+
+
+def draw_over(viewer: Viewer) -> None:
+    """What lies over the scene, after the panels."""
+    area = scene_area()
     said = _said(viewer)
     if said:
         legend.say(said, area)
     else:
         legend.draw(viewer, area)
+    browser.draw(viewer)
     help.draw(viewer)
     palette.draw(viewer)
-
-
-def _column(viewer: Viewer, dialog: OpenDialog, area: Area) -> None:
-    imgui.set_next_window_pos(ImVec2(0, 0))
-    imgui.set_next_window_size(ImVec2(area.left, area.height))
-    flags = (
-        imgui.WindowFlags_.no_title_bar
-        | imgui.WindowFlags_.no_resize
-        | imgui.WindowFlags_.no_move
-        | imgui.WindowFlags_.no_collapse
-        | imgui.WindowFlags_.no_saved_settings
-        | imgui.WindowFlags_.no_bring_to_front_on_focus
-    )
-    imgui.begin(PANEL, None, flags)
-    if imgui.begin_child("controls", ImVec2(0, -status.foot_height())):
-        scene.draw(viewer, dialog)
-        query.draw(viewer)
-        view.draw_display(viewer)
-        view.draw_camera(viewer)
-    imgui.end_child()
-    status.draw(viewer)
-    imgui.end()
 
 
 def _said(viewer: Viewer) -> str:

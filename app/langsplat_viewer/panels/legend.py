@@ -32,7 +32,9 @@ def draw(viewer: Viewer, area: Area) -> None:
     slots = painting.painted(shown)
     if state.scene is None or state.picture.display != "relevancy" or not slots:
         return
-    corner = ImVec2(area.left + area.width - hello_imgui.em_size(0.7), area.height - hello_imgui.em_size(0.7))
+    corner = ImVec2(
+        area.left + area.width - hello_imgui.em_size(0.7), area.top + area.height - hello_imgui.em_size(0.7)
+    )
     imgui.set_next_window_pos(corner, imgui.Cond_.always, ImVec2(1, 1))
     imgui.set_next_window_bg_alpha(0.75)
     imgui.begin("relevancy", None, QUIET)

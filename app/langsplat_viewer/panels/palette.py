@@ -4,7 +4,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
 from langsplat_viewer.commands import Command, matching
-from langsplat_viewer.panels.style import MUTED
+from langsplat_viewer.panels.style import muted
 from langsplat_viewer.viewer import Viewer
 
 WIDTH_EM, HEIGHT_EM = 26.0, 20.0
@@ -48,6 +48,6 @@ def _clicked(found: list[Command]) -> Command | None:
                 chosen = command
             keys = ", ".join(command.keys)
             imgui.same_line(right - imgui.calc_text_size(keys).x)
-            imgui.text_colored(MUTED, keys)
+            imgui.text_colored(muted(), keys)
     imgui.end_child()
     return chosen

@@ -3,7 +3,7 @@
 from imgui_bundle import ImVec2, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.panels.style import MUTED
+from langsplat_viewer.panels.style import muted
 from langsplat_viewer.viewer import Viewer
 
 HINT = "what to look for"
@@ -53,7 +53,7 @@ def _offers(viewer: Viewer) -> None:
 
 
 def _buttons(viewer: Viewer, title: str, phrases: tuple[str, ...]) -> None:
-    imgui.text_colored(MUTED, title)
+    imgui.text_colored(muted(), title)
     style = imgui.get_style()
     for number, phrase in enumerate(phrases):
         imgui.same_line()

@@ -2,12 +2,56 @@
 
 from collections.abc import Callable
 
-from imgui_bundle import ImVec4, imgui
+from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
-GOOD = ImVec4(0.47, 0.80, 0.52, 1.0)
-BAD = ImVec4(0.95, 0.58, 0.45, 1.0)
-MUTED = ImVec4(0.62, 0.64, 0.67, 1.0)
-PANEL_EM = 23.0  # width of the panel, in heights of a letter
+from langsplat_viewer.preferences import Preferences
+
+# Window units at a scale of 1.
+SPACES = {
+    "window_padding": (10.0, 8.0),
+    "frame_padding": (4.0, 3.0),
+    "item_spacing": (8.0, 6.0),
+    "item_inner_spacing": (4.0, 4.0),
+    "cell_padding": (4.0, 2.0),
+}
+SIZES = {"frame_rounding": 4.0, "indent_spacing": 21.0, "scrollbar_size": 14.0, "grab_min_size": 12.0}
+
+
+def apply(preferences: Preferences) -> None:
+    """Calm: one accent, little contrast between the widgets. To be called once for every change."""
+    dark = preferences.theme == "dark"
+    themes = hello_imgui.ImGuiTheme_
+    hello_imgui.apply_theme(themes.darcula_darker if dark else themes.imgui_colors_light)
+    style = imgui.get_style()
+    scale = preferences.ui_scale
+    for name, (x, y) in SPACES.items():
+        setattr(style, name, ImVec2(x * scale, y * scale))
+    for name, size in SIZES.items():
+        setattr(style, name, size * scale)
+    style.window_border_size = 0
+    style.font_scale_main = scale
+    popup = style.color_(imgui.Col_.popup_bg)
+    style.set_color_(imgui.Col_.popup_bg, ImVec4(popup.x, popup.y, popup.z, 1))
+
+
+def good() -> ImVec4:
+    """What was found, readable on the theme's background."""
+    return ImVec4(0.47, 0.80, 0.52, 1.0) if _is_dark() else ImVec4(0.05, 0.45, 0.15, 1.0)
+
+
+def bad() -> ImVec4:
+    """What went wrong."""
+    return ImVec4(0.95, 0.58, 0.45, 1.0) if _is_dark() else ImVec4(0.70, 0.15, 0.05, 1.0)
+
+
+def muted() -> ImVec4:
+    """What explains."""
+    return ImVec4(0.62, 0.64, 0.67, 1.0) if _is_dark() else ImVec4(0.35, 0.36, 0.40, 1.0)
+
+
+def _is_dark() -> bool:
+    background = imgui.get_style().color_(imgui.Col_.window_bg)
+    return background.x + background.y + background.z < 1.5
 
 
 def small_wrapped(text: str, colour: ImVec4) -> None:

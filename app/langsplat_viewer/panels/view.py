@@ -9,19 +9,18 @@ from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_viewer import actions
 from langsplat_viewer.commands import Button, buttons_of
 from langsplat_viewer.controls import FOV_RANGE, adopt_up, level, with_fov
-from langsplat_viewer.panels.style import MUTED, small_wrapped
+from langsplat_viewer.panels.style import muted, small_wrapped
 from langsplat_viewer.viewer import Viewer
 
 
 def draw_display(viewer: Viewer) -> None:
     """Which channel, and how strong the heat."""
-    imgui.separator_text("Display")
     for _, group in groupby(DISPLAYS.values(), lambda row: (row.needs_field, row.needs_query)):
         _display_line(viewer, tuple(group))
     picture = viewer.state.picture
     needs_query = DISPLAYS[picture.display].needs_query
     if needs_query and not viewer.state.shown():
-        small_wrapped("search for something to see where it is", MUTED)
+        small_wrapped("search for something to see where it is", muted())
     if picture.display == "relevancy":
         picture = replace(picture, heat_opacity=_slider("Heat opacity", picture.heat_opacity, 0.0, 1.0))
     if needs_query:
@@ -54,7 +53,6 @@ def _display_button(viewer: Viewer, button: Button) -> None:
 
 def draw_camera(viewer: Viewer) -> None:
     """Training cameras, reset, lens, speed."""
-    imgui.separator_text("Camera")
     state = viewer.state
     imgui.begin_disabled(state.view is None)
     if state.scene is not None and state.scene.cameras:

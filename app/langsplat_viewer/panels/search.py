@@ -8,7 +8,7 @@ from langsplat_core.config import LevelChoice
 from langsplat_core.query.engine import no_field
 from langsplat_viewer import actions
 from langsplat_viewer.panels import answers, query_box
-from langsplat_viewer.panels.style import MUTED, small_wrapped
+from langsplat_viewer.panels.style import muted, small_wrapped
 from langsplat_viewer.viewer import Viewer
 
 CHOICES: tuple[LevelChoice, ...] = get_args(LevelChoice)
@@ -16,10 +16,9 @@ CHOICES: tuple[LevelChoice, ...] = get_args(LevelChoice)
 
 def draw(viewer: Viewer) -> None:
     """Box, level, list."""
-    imgui.separator_text("Search")
     scene = viewer.state.scene
     if scene is not None and scene.language is None:
-        small_wrapped(no_field(scene), MUTED)
+        small_wrapped(no_field(scene), muted())
         return
     imgui.begin_disabled(scene is None)
     imgui.begin_group()

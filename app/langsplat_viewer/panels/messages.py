@@ -1,26 +1,23 @@
-"""Progress, messages and figures: the foot of the panel, always in sight."""
+"""Progress, messages and figures."""
 
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.panels.style import BAD, MUTED, small_wrapped
+from langsplat_viewer.panels.style import bad, muted, small_wrapped
 from langsplat_viewer.viewer import Viewer
-
-FOOT_EM = 9.5  # height of the foot
 
 
 def draw(viewer: Viewer) -> None:
     """What is being done, what was said (the latest first), and how fast pictures are made."""
-    imgui.separator_text("Messages")
     if viewer.worker.current is not None:
         _progress(viewer, *viewer.worker.current)
     line = imgui.get_text_line_height_with_spacing()
     if imgui.begin_child("messages", ImVec2(0, -line)):
         for message in reversed(viewer.state.messages):
-            small_wrapped(message.text, BAD if message.is_error else MUTED)
+            small_wrapped(message.text, bad() if message.is_error else muted())
     imgui.end_child()
     idling = hello_imgui.get_runner_params().fps_idling.is_idling
-    imgui.text_colored(MUTED, figures(viewer, None if idling else imgui.get_io().framerate))
+    imgui.text_colored(muted(), figures(viewer, None if idling else imgui.get_io().framerate))
 
 
 def figures(viewer: Viewer, frames_per_second: float | None) -> str:
@@ -43,8 +40,3 @@ def _progress(viewer: Viewer, label: str, fraction: float) -> None:
     imgui.same_line()
     if imgui.button("Cancel"):
         actions.cancel(viewer)
-
-
-def foot_height() -> float:
-    """Window units that the foot takes."""
-    return hello_imgui.em_size(FOOT_EM)

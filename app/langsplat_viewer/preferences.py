@@ -1,0 +1,84 @@
+"""What a user chose once and wants again the next time: kept in the platform's folder for settings."""
+
+import json
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import platformdirs
+
+from langsplat_core.errors import InputError, printable_line
+from langsplat_core.files import atomic_path
+
+Theme = Literal["dark", "light"]
+THEMES: tuple[Theme, ...] = get_args(Theme)
+SCALES = (0.75, 3.0)  # least and largest size of letters and widgets
+MOST_RECENT = 12
+FILE_NAME, LAYOUT_NAME = "preferences.json", "layout.ini"
+LARGEST = 1_000_000  # bytes of the file
+_LISTS = {"recent", "panels"}
+
+
+@dataclass(frozen=True)
+class Preferences:
+    """The settings that outlive a window."""
+
+    theme: Theme = "dark"
+    ui_scale: float = 1.0  # of letters and widgets, within `SCALES`
+    recent: tuple[str, ...] = ()  # scenes that were opened, the latest first
+    panels: tuple[str, ...] | None = None  # titles of those that are open; None: those that are at first
+
+    def __post_init__(self) -> None:
+        if self.theme not in THEMES:
+            raise InputError(f'theme "{printable_line(self.theme, 40)}"; there are {", ".join(THEMES)}')
+        is_number = isinstance(self.ui_scale, int | float) and not isinstance(self.ui_scale, bool)
+        if not (is_number and SCALES[0] <= self.ui_scale <= SCALES[1]):
+            raise InputError(f"ui_scale is not a number from {SCALES[0]} to {SCALES[1]}")
+        for name in _LISTS:
+            if not all(isinstance(item, str) for item in getattr(self, name) or ()):
+                raise InputError(f"{name} is not a list of texts")
+
+
+def preferences_folder() -> Path:
+    """Where they are kept; need not exist."""
+    return Path(platformdirs.user_config_path("langsplat-viewer", appauthor=False))
+
+
+def load_preferences(folder: Path) -> Preferences:
+    """Those of `folder`, the defaults where there are none. InputError where the file makes no sense."""
+    path = folder / FILE_NAME
+    try:
+        text = path.read_bytes()[:LARGEST]
+        return _from_json(json.loads(text))
+    except FileNotFoundError:
+        return Preferences()
+    except (OSError, ValueError, RecursionError, InputError) as error:
+        reason = printable_line(getattr(error, "strerror", None) or error, 120)
+        raise InputError(f"{path}: {reason}; the defaults are used; mend or delete it") from None
+
+
+def _from_json(top: Any) -> Preferences:
+    if not isinstance(top, dict):
+        raise InputError("no JSON object")
+    known = {field.name for field in fields(Preferences)}
+    values = {name: value for name, value in top.items() if name in known}  # a later version may add some
+    for name in _LISTS & values.keys():
+        if isinstance(values[name], list):
+            values[name] = tuple(values[name])
+        elif values[name] is not None or name != "panels":
+            raise InputError(f"{name} is not a list of texts")
+    return Preferences(**values)
+
+
+def save_preferences(folder: Path, preferences: Preferences) -> None:
+    """Keep them, whole or not at all. OSError where the folder cannot be written."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_path(folder / FILE_NAME) as temporary:
+        temporary.write_text(json.dumps(asdict(preferences), indent=1), encoding="utf-8")
+
+
+def with_recent(preferences: Preferences, path: Path) -> Preferences:
+    """With `path` as the scene that was opened last."""
+    name = str(path)
+    others = tuple(other for other in preferences.recent if other != name)
+    return replace(preferences, recent=(name, *others)[:MOST_RECENT])
