@@ -73,6 +73,7 @@ COMMANDS: tuple[Command, ...] = (
         "save a picture", lambda viewer: saving.save_picture(viewer, Path.cwd()), ("Ctrl+S", "P"), "File"
     ),
     Command("save the view", lambda viewer: saving.save_view(viewer, Path.cwd()), menu="File"),
+    Command("save the queries", lambda viewer: actions.save_queries(viewer, Path.cwd()), menu="File"),
     Command("search", actions.focus_search, ("Ctrl+F", "/"), "Edit"),
     Command("undo", actions.undo, ("Ctrl+Z",), "Edit", repeats=True, is_edit=True),
     Command("redo", actions.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), "Edit", repeats=True, is_edit=True),

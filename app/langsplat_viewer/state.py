@@ -28,7 +28,9 @@ class Query:
     phrase: str
     slot: int | None = None  # index of its colour while shown, None while hidden
     shown_since: int = 0  # larger for a query shown later
-    result: QueryResult | None = None
+    result: QueryResult | None = None  # as it is shown
+    automatic: QueryResult | None = None  # the same where it ends by itself
+    cut: float | None = None  # relevancy at which it ends instead
     reading: str = ""  # how the phrase was understood, where it has structure
     problem: str = ""  # why it has no result, one line
     meant: str = ""  # the phrase with its unknown words replaced by known ones, where there are such
@@ -85,6 +87,8 @@ class ViewerState:
     queries: list[Query] = field(default_factory=list)
     selected: Query | None = None  # whose details are shown
     typed: str = ""
+    canonical: tuple[str, ...] = ()  # phrases that everything is compared with; none: the scene's own
+    canonical_typed: str = ""
     asked: list[str] = field(default_factory=list)  # what was searched for, the oldest first
     recalled: int = 0  # index into `asked` of the phrase last recalled; its length: none
     suggestions: Suggestions = field(default_factory=Suggestions)

@@ -12,7 +12,7 @@ from langsplat_viewer.viewer import Viewer
 
 LEFT, MIDDLE, FOOT = "Left", "Middle", "Foot"  # docks of the column beside the scene
 COLUMN = 345.0  # its width at first, window units
-MOST_SHARE, MIDDLE_SHARE, FOOT_SHARE = 0.4, 0.42, 0.19
+MOST_SHARE, MIDDLE_SHARE, FOOT_SHARE = 0.4, 0.36, 0.15
 
 
 @dataclass(frozen=True)
