@@ -9,6 +9,7 @@ from langsplat_core.display.colour_maps import MAX_QUERIES
 from langsplat_core.display.compose import HeatRanges
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.pointing import Pointed
 from langsplat_core.query.suggestions import Suggestions
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer import painting
@@ -65,6 +66,18 @@ class FrameStats:
 
 
 @dataclass(eq=False)
+class Hover:
+    """The mouse over the scene, while it and the camera rest."""
+
+    pixel: tuple[int, int]  # column and row in the scene's area
+    view: OrbitCamera
+    since: float  # seconds, on the window's clock
+    asked: bool = False
+    found: Pointed | None = None
+    phrases: tuple[str, ...] = ()  # whose relevancies it has
+
+
+@dataclass(eq=False)
 class ViewerState:
     """The viewer without its window."""
 
@@ -80,6 +93,9 @@ class ViewerState:
     nothing: str = ""  # why the picture shows nothing of the scene, where it does not
     camera_index: int | None = None  # training camera last jumped to
     fly_speed: float = 0.5  # scene radii per second
+
+    pointing: bool = False  # it is said what lies under the cursor
+    hover: Hover | None = None
 
     picture: PictureConfig = field(default_factory=PictureConfig)
     latent_level: int = 2  # index into scene.LEVELS

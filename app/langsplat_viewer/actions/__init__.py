@@ -37,6 +37,7 @@ from langsplat_viewer.actions.camera import (
 )
 from langsplat_viewer.actions.offers import ask_offered, offers, prepare_suggestions, recall
 from langsplat_viewer.actions.opening import cancel, open_scene
+from langsplat_viewer.actions.pointing import hover, toggle_pointing
 from langsplat_viewer.actions.queries import (
     ask,
     ask_typed,
@@ -88,6 +89,7 @@ __all__ = [
     "glide_to",
     "go_to_camera",
     "hide",
+    "hover",
     "load_queries",
     "move",
     "mute_letters",
@@ -125,6 +127,7 @@ __all__ = [
     "tick",
     "toggle_help",
     "toggle_panel",
+    "toggle_pointing",
     "type_canonical",
     "type_command",
     "type_path",

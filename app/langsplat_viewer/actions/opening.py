@@ -80,7 +80,8 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state.preferences = with_recent(state.preferences, path.absolute())
     state.opening_camera = None
     state.view, state.nothing = opening_view(viewer), why_undrawable(scene.gaussians)
-    viewer.engine = viewer.services.engine(scene)
+    viewer.engine, viewer.describer, state.hover = viewer.services.engine(scene), None, None
+    state.pointing = state.pointing and scene.language is not None
     if scene.language is None and DISPLAYS[state.picture.display].needs_field:
         state.picture = replace(state.picture, display="rgb")
     reasons = ", ".join(f"{count:,} with {reason}" for reason, count in opened.unusable.items())
