@@ -64,11 +64,12 @@ def _panel(title: str) -> Command:
     return Command(f"panel: {title}", lambda viewer: actions.open_panel(viewer, title))
 
 
-PANEL_TITLES = ("Search", "Scene", "Display", "Camera", "Messages")
+PANEL_TITLES = ("Search", "Scene", "Display", "Camera", "Train", "Messages")
 MENUS = ("File", "Edit", "View", "Camera", "Window", "Help")
 
 COMMANDS: tuple[Command, ...] = (
     Command("open a scene", actions.ask_for_file, ("Ctrl+O",), "File"),
+    Command("train a scene", lambda viewer: actions.open_panel(viewer, "Train"), menu="File"),
     Command(
         "save a picture", lambda viewer: saving.save_picture(viewer, Path.cwd()), ("Ctrl+S", "P"), "File"
     ),

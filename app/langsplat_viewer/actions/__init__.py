@@ -69,6 +69,14 @@ from langsplat_viewer.actions.settings import (
     toggle_panel,
     type_command,
 )
+from langsplat_viewer.actions.training import (
+    choose_photographs,
+    fill_in,
+    look_at_training,
+    start_training,
+    stop_training,
+    watch_training,
+)
 from langsplat_viewer.actions.undoing import redo, undo
 
 __all__ = [
@@ -79,9 +87,11 @@ __all__ = [
     "browse",
     "cancel",
     "choose",
+    "choose_photographs",
     "close_browser",
     "compare_with",
     "escape",
+    "fill_in",
     "focus_pixel",
     "focus_result",
     "focus_search",
@@ -91,6 +101,7 @@ __all__ = [
     "hide",
     "hover",
     "load_queries",
+    "look_at_training",
     "move",
     "mute_letters",
     "note_panels",
@@ -121,7 +132,9 @@ __all__ = [
     "show_help",
     "show_palette",
     "show_panel",
+    "start_training",
     "step_camera",
+    "stop_training",
     "take_search_focus",
     "take_wanted_panel",
     "tick",
@@ -133,5 +146,6 @@ __all__ = [
     "type_path",
     "type_phrase",
     "undo",
+    "watch_training",
     "zoom_by",
 ]

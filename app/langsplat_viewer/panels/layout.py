@@ -6,7 +6,18 @@ from dataclasses import dataclass
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.panels import browser, help, legend, messages, palette, pointing, scene, search, view
+from langsplat_viewer.panels import (
+    browser,
+    help,
+    legend,
+    messages,
+    palette,
+    pointing,
+    scene,
+    search,
+    train,
+    view,
+)
 from langsplat_viewer.panels.area import MAIN_DOCK, scene_area
 from langsplat_viewer.viewer import Viewer
 
@@ -30,6 +41,7 @@ PANELS: tuple[Panel, ...] = (
     Panel("Scene", LEFT, scene.draw),
     Panel("Display", MIDDLE, view.draw_display),
     Panel("Camera", MIDDLE, view.draw_camera),
+    Panel("Train", LEFT, train.draw, is_open=False),
     Panel("Messages", FOOT, messages.draw),
 )
 
