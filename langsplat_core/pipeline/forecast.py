@@ -34,7 +34,7 @@ def plan(config: TrainConfig, photographs: int, has_cameras: bool, has_gaussians
     per_photograph = _mask_seconds(config.masks, megapixels) + _encoder_seconds(config.clip.model)
     gaussians = config.radiance.max_gaussians
     # A step costs what it draws, and what it keeps: 0.03 s at 0.1 megapixels, 0.1 s at 100 000 Gaussians.
-    step = 0.3 * megapixels + 1e-6 * min(gaussians, 300_000)
+    step = 0.5 * megapixels + 1e-6 * min(gaussians, 300_000)
     codec = 3 + 0.02 * min(config.codec.size or 2500, 4096)
     lifting = photographs * (0.2 + 0.5 * megapixels) + 1e-4 * gaussians * min(photographs, 100) / 50
     if config.lift.mode == "gradient":
@@ -46,7 +46,7 @@ def plan(config: TrainConfig, photographs: int, has_cameras: bool, has_gaussians
                 *("preparing photographs", "finding features", "matching photographs", "locating cameras"),
                 *("triangulating points", "reading photographs"),
             ),
-            photographs * (0.05 if has_cameras else 4.0),
+            photographs * (0.05 if has_cameras else 6.0),
         ),
         Stage("masks and vectors", ("masks (",), photographs * per_photograph),
         Stage("Gaussians", ("Training Gaussians",), 0.0 if has_gaussians else config.radiance.steps * step),
@@ -56,12 +56,12 @@ def plan(config: TrainConfig, photographs: int, has_cameras: bool, has_gaussians
 
 def _mask_seconds(masks: MaskConfig, megapixels: float) -> float:
     if not masks.sam or masks.source == "graph":
-        return 12 * megapixels
+        return 18 * megapixels
     return 590.0 * (5 if masks.crop_layers else 1) if "huge" in masks.sam else 330.0
 
 
 def _encoder_seconds(model: str) -> float:
-    return 0.8 if model == "demo" else 130.0
+    return 1.2 if model == "demo" else 130.0
 
 
 def count_photographs(dataset: Path) -> tuple[int, bool]:
