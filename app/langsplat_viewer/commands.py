@@ -77,6 +77,8 @@ COMMANDS: tuple[Command, ...] = (
     Command("undo", actions.undo, ("Ctrl+Z",), "Edit", repeats=True, is_edit=True),
     Command("redo", actions.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), "Edit", repeats=True, is_edit=True),
     *(Command(_name(button), _show(button), (str(key),), "View") for key, button in enumerate(BUTTONS, 1)),
+    Command("compare two displays", actions.toggle_wipe, ("V",), "View"),
+    Command("three levels side by side", actions.toggle_levels, menu="View"),
     Command("return to the opening view", actions.reset_view, ("R", "Home"), "Camera"),
     Command("frame everything", actions.frame_scene, ("Shift+F",), "Camera"),
     Command("focus on the latest result found", actions.focus_result, ("F",), "Camera"),

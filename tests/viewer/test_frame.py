@@ -66,7 +66,7 @@ def test_the_shader_composes_as_numpy_does(gl, monkeypatch, display, queries):
     fields = {"latent": ("latent",), "relevancies": ("relevancies",), "depth": ("depth_sum",)}.get(extra, ())
     others = {"latent", "relevancies", "depth_sum"} - set(fields)
     shown = replace(channels, **dict.fromkeys(others))
-    monkeypatch.setattr(ArrayChannels, "render", lambda *_: shown)
+    monkeypatch.setattr(ArrayChannels, "render_all", lambda *_: [shown])
     monkeypatch.setattr("langsplat_viewer.frame.depth_range", lambda *_: channels.depth_range)
     renderer = FrameRenderer(gl, "cpu")
     renderer.set_scene(SCENE)

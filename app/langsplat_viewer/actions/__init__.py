@@ -41,6 +41,7 @@ from langsplat_viewer.actions.queries import (
     take_search_focus,
     type_phrase,
 )
+from langsplat_viewer.actions.seeing import compare_with, move_line, show_one, toggle_levels, toggle_wipe
 from langsplat_viewer.actions.settings import (
     escape,
     mute_letters,
@@ -71,6 +72,7 @@ __all__ = [
     "cancel",
     "choose",
     "close_browser",
+    "compare_with",
     "escape",
     "focus_pixel",
     "focus_result",
@@ -80,6 +82,7 @@ __all__ = [
     "go_to_camera",
     "hide",
     "move",
+    "move_line",
     "mute_letters",
     "note_panels",
     "offers",
@@ -105,6 +108,7 @@ __all__ = [
     "set_ui_scale",
     "show",
     "show_help",
+    "show_one",
     "show_palette",
     "show_panel",
     "step_camera",
@@ -112,7 +116,9 @@ __all__ = [
     "take_wanted_panel",
     "tick",
     "toggle_help",
+    "toggle_levels",
     "toggle_panel",
+    "toggle_wipe",
     "type_command",
     "type_path",
     "type_phrase",

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.panels import browser, help, legend, messages, palette, scene, search, view
+from langsplat_viewer.panels import browser, help, legend, messages, palette, pictures, scene, search, view
 from langsplat_viewer.panels.area import MAIN_DOCK, scene_area
 from langsplat_viewer.viewer import Viewer
 
@@ -98,6 +98,7 @@ def draw_over(viewer: Viewer) -> None:
         legend.say(said, area)
     else:
         legend.draw(viewer, area)
+    pictures.draw_grip(viewer, area)
     browser.draw(viewer)
     help.draw(viewer)
     palette.draw(viewer)

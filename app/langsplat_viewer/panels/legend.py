@@ -8,7 +8,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 from langsplat_core.arrays import Array
 from langsplat_core.display.colour_maps import QUERY_COLOURS, turbo
 from langsplat_core.query.answers import QueryResult
-from langsplat_viewer import painting
+from langsplat_viewer import painting, splitting
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.panels.style import elided
 from langsplat_viewer.viewer import Viewer
@@ -30,7 +30,8 @@ def draw(viewer: Viewer, area: Area) -> None:
     state = viewer.state
     shown = state.shown_results()
     slots = painting.painted(shown)
-    if state.scene is None or state.picture.display != "relevancy" or not slots:
+    heats = any(one.picture.display == "relevancy" for one in splitting.pictures(state))
+    if state.scene is None or not heats or not slots:
         return
     corner = ImVec2(
         area.left + area.width - hello_imgui.em_size(0.7), area.top + area.height - hello_imgui.em_size(0.7)

@@ -6,8 +6,9 @@ from itertools import groupby
 from imgui_bundle import hello_imgui, imgui
 
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
+from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions
-from langsplat_viewer.commands import Button, buttons_of
+from langsplat_viewer.commands import BUTTONS, Button, buttons_of
 from langsplat_viewer.controls import FOV_RANGE, adopt_up, level, with_fov
 from langsplat_viewer.panels.style import muted, small_wrapped
 from langsplat_viewer.viewer import Viewer
@@ -17,6 +18,7 @@ def draw_display(viewer: Viewer) -> None:
     """Which channel, and how strong the heat."""
     for _, group in groupby(DISPLAYS.values(), lambda row: (row.needs_field, row.needs_query)):
         _display_line(viewer, tuple(group))
+    _compared(viewer)
     picture = viewer.state.picture
     needs_query = DISPLAYS[picture.display].needs_query
     if needs_query and not viewer.state.shown():
@@ -49,6 +51,35 @@ def _display_button(viewer: Viewer, button: Button) -> None:
     if imgui.radio_button(button.label, chosen):
         actions.set_display(viewer, button.display, button.latent_level)
     imgui.end_disabled()
+
+
+def _compared(viewer: Viewer) -> None:
+    """What is shown beside it."""
+    state, split = viewer.state, viewer.state.seeing.split
+    second = Button("", split.second, split.second_level if split.second == "latent" else None)
+    shown = {"off": "nothing", "levels": "three levels", "wipe": compared_name(second)}[split.mode]
+    imgui.set_next_item_width(hello_imgui.em_size(11))
+    if not imgui.begin_combo("Beside it", shown):
+        return
+    if imgui.selectable("nothing", split.mode == "off")[0]:
+        actions.show_one(viewer)
+    without_field = state.scene is not None and state.scene.language is None
+    for button in BUTTONS:
+        imgui.begin_disabled(without_field and DISPLAYS[button.display].needs_field)
+        if imgui.selectable(compared_name(button), shown == compared_name(button))[0]:
+            actions.compare_with(viewer, button.display, button.latent_level)
+        imgui.end_disabled()
+    imgui.begin_disabled(without_field)
+    if imgui.selectable("three levels", split.mode == "levels")[0] and split.mode != "levels":
+        actions.toggle_levels(viewer)
+    imgui.end_disabled()
+    imgui.end_combo()
+
+
+def compared_name(button: Button) -> str:
+    """What a display is called in the list of those that can be beside another."""
+    row = DISPLAYS[button.display]
+    return row.label if button.latent_level is None else f"{row.label}, {LEVELS[button.latent_level]}"
 
 
 def draw_camera(viewer: Viewer) -> None:

@@ -1,0 +1,31 @@
+"""Settings of looking that are neither the camera's nor the picture's: plain data, a part of the state."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from langsplat_core.config import Display
+
+SplitMode = Literal["off", "wipe", "levels"]
+AT_RANGE = (0.02, 0.98)  # of the area's width, where the line can be: it stays within reach
+
+
+@dataclass(frozen=True)
+class Split:
+    """Several pictures of one camera in the scene's area.
+
+    "wipe": the display that is chosen left of a line, `second` right of it. "levels": three columns, from
+    subpart to whole, with the relevancy of the shown queries at each level where a display of answers is
+    chosen, else with the latents.
+    """
+
+    mode: SplitMode = "off"
+    second: Display = "depth"
+    second_level: int = 2  # index into scene.LEVELS, where latents are shown
+    at: float = 0.5  # where the line is, of the area's width
+
+
+@dataclass(frozen=True)
+class Seeing:
+    """How the scene is looked at."""
+
+    split: Split = Split()
