@@ -16,7 +16,7 @@ SCALES = (0.75, 3.0)  # least and largest size of letters and widgets
 MOST_RECENT = 12
 FILE_NAME, LAYOUT_NAME = "preferences.json", "layout.ini"
 LARGEST = 1_000_000  # bytes of the file
-_LISTS = {"recent", "panels"}
+_LISTS = {"recent", "panels", "overlays"}
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,7 @@ class Preferences:
     theme: Theme = "dark"
     ui_scale: float = 1.0  # of letters and widgets, within `SCALES`
     recent: tuple[str, ...] = ()  # scenes that were opened, the latest first
+    overlays: tuple[str, ...] = ()  # of `seeing.OVERLAYS`, those that lie over the scene
     panels: tuple[str, ...] | None = None  # titles of those that are open; None: those that are at first
 
     def __post_init__(self) -> None:

@@ -1,7 +1,8 @@
 """Settings of looking that are neither the camera's nor the picture's: plain data, a part of the state."""
 
-from dataclasses import dataclass
-from typing import Literal
+import math
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 from langsplat_core.config import Display
 
@@ -24,8 +25,31 @@ class Split:
     at: float = 0.5  # where the line is, of the area's width
 
 
+Overlay = Literal["cameras", "cube", "grid"]
+OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
+Point = tuple[float, float, float]  # world units
+
+
+@dataclass(frozen=True)
+class Ruler:
+    """A distance between two points on the surface."""
+
+    measures: bool = False  # a click on the scene sets a point
+    points: tuple[Point, ...] = ()  # at most two
+
+    @property
+    def length(self) -> float | None:
+        """World units; None before there are two points."""
+        return math.dist(*self.points) if len(self.points) > 1 else None
+
+    def with_point(self, point: Point) -> "Ruler":
+        """Set the second point, or the first of a new measurement."""
+        return replace(self, points=(*self.points, point) if len(self.points) == 1 else (point,))
+
+
 @dataclass(frozen=True)
 class Seeing:
     """How the scene is looked at."""
 
     split: Split = Split()
+    ruler: Ruler = Ruler()

@@ -20,7 +20,7 @@ from langsplat_viewer.canvas import Canvas, Renderer
 from langsplat_viewer.frame import Backend, FrameRenderer
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import chosen_camera, latent_level
-from langsplat_viewer.panels import keyboard, layout, menu, navigation, pictures
+from langsplat_viewer.panels import keyboard, layout, menu, navigation, over, pictures
 from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.remembered import Remembered
 from langsplat_viewer.viewer import Services, Viewer
@@ -248,6 +248,7 @@ class Window:
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
         pictures.draw(viewer, area, canvas.textures)
+        over.draw(viewer, area)
 
     def _stop(self) -> None:
         self._remembered.update()

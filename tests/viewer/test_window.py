@@ -47,6 +47,7 @@ def folder(tmp_path: Path) -> Path:
         "look_at_nothing",
         "close_while_opening",
         "split_the_view",
+        "draw_over_the_scene",
     ],
 )
 def test_window(scenario: str, display: str, folder: Path):

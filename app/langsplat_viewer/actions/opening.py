@@ -20,6 +20,7 @@ from langsplat_viewer.browsing import SCENE_SUFFIXES
 from langsplat_viewer.controls import Extent, extent_of
 from langsplat_viewer.looking import why_undrawable
 from langsplat_viewer.preferences import with_recent
+from langsplat_viewer.seeing import Ruler
 from langsplat_viewer.viewer import Viewer
 
 COMPANIONS = (cameras_json.SUFFIX, language.SUFFIX)  # files beside a scene, read with it
@@ -96,6 +97,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state.scene, state.extent, state.latent = scene, opened.extent, opened.latent
     state.queries, state.selected, state.glide = [], None, None
     state.camera_index = 0 if scene.cameras else None
+    state.seeing = replace(state.seeing, ruler=Ruler())
     forget(viewer)
     state.preferences = with_recent(state.preferences, path.absolute())
     state.opening_camera = None

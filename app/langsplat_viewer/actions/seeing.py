@@ -1,11 +1,13 @@
-"""Several pictures side by side."""
+"""Several pictures side by side, and what lies over them."""
 
 from dataclasses import replace
 
 from langsplat_core.config import Display
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
-from langsplat_viewer.seeing import AT_RANGE, Split
+from langsplat_viewer.actions.camera import glide_to
+from langsplat_viewer.seeing import AT_RANGE, OVERLAYS, Overlay, Ruler, Split
+from langsplat_viewer.view_cube import facing
 from langsplat_viewer.viewer import Viewer
 
 
@@ -44,6 +46,48 @@ def move_line(viewer: Viewer, at: float) -> None:
     """Where the line is that divides the two pictures, as a fraction of the area's width."""
     low, high = AT_RANGE
     _set_split(viewer, replace(viewer.state.seeing.split, at=min(max(at, low), high)))
+
+
+def show_overlay(viewer: Viewer, overlay: Overlay, shown: bool) -> None:
+    """Whether something lies over the scene; remembered."""
+    preferences = viewer.state.preferences
+    kept = {*preferences.overlays, overlay} if shown else {*preferences.overlays} - {overlay}
+    overlays = tuple(name for name in OVERLAYS if name in kept)
+    viewer.state.preferences = replace(preferences, overlays=overlays)
+
+
+def toggle_overlay(viewer: Viewer, overlay: Overlay) -> None:
+    """Show it, or take it away."""
+    show_overlay(viewer, overlay, overlay not in viewer.state.preferences.overlays)
+
+
+def turn_to_face(viewer: Viewer, face: str) -> None:
+    """Look straight at one face of the view cube, by its name in `view_cube.FACES`."""
+    if viewer.state.view is not None:
+        glide_to(viewer, facing(viewer.state.view, face))
+
+
+def measure(viewer: Viewer, on: bool) -> None:
+    """Whether clicks on the scene set the points of the ruler; what was measured goes when it ends."""
+    ruler = viewer.state.seeing.ruler
+    if on != ruler.measures:
+        viewer.state.seeing = replace(viewer.state.seeing, ruler=Ruler(on))
+
+
+def toggle_measuring(viewer: Viewer) -> None:
+    """Begin to measure, or end it."""
+    measure(viewer, not viewer.state.seeing.ruler.measures)
+
+
+def measure_at(viewer: Viewer, u: float, v: float) -> None:
+    """Set a point of the ruler on the surface; (u, v) are fractions of the scene's area."""
+    point = None if viewer.surface is None else viewer.surface.point_at(u, v)
+    if point is None:
+        viewer.state.say("nothing under the cursor to measure from")
+        return
+    x, y, z = (float(part) for part in point)
+    seeing = viewer.state.seeing
+    viewer.state.seeing = replace(seeing, ruler=seeing.ruler.with_point((x, y, z)))
 
 
 def _can_show(viewer: Viewer, needs_field: bool) -> bool:

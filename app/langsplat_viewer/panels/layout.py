@@ -6,7 +6,18 @@ from dataclasses import dataclass
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.panels import browser, help, legend, messages, palette, pictures, scene, search, view
+from langsplat_viewer.panels import (
+    browser,
+    cube,
+    help,
+    legend,
+    messages,
+    palette,
+    pictures,
+    scene,
+    search,
+    view,
+)
 from langsplat_viewer.panels.area import MAIN_DOCK, scene_area
 from langsplat_viewer.viewer import Viewer
 
@@ -31,6 +42,7 @@ PANELS: tuple[Panel, ...] = (
     Panel("Display", MIDDLE, view.draw_display),
     Panel("Camera", MIDDLE, view.draw_camera),
     Panel("Messages", FOOT, messages.draw),
+    Panel("Overlays", MIDDLE, view.draw_overlays, is_open=False),
 )
 
 
@@ -99,6 +111,7 @@ def draw_over(viewer: Viewer) -> None:
     else:
         legend.draw(viewer, area)
     pictures.draw_grip(viewer, area)
+    cube.draw(viewer, area)
     browser.draw(viewer)
     help.draw(viewer)
     palette.draw(viewer)

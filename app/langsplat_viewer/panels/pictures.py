@@ -65,14 +65,14 @@ def _name(viewer: Viewer, area: Area) -> None:
     gap, top = hello_imgui.em_size(0.6), area.top + hello_imgui.em_size(0.5)
     if split.mode == "wipe":
         x = area.left + split.at * area.width
-        _text(names[0], x - gap - imgui.calc_text_size(names[0]).x, top, area)
-        _text(names[1], x + gap, top, area)
+        text_on_shade(names[0], x - gap - imgui.calc_text_size(names[0]).x, top, area)
+        text_on_shade(names[1], x + gap, top, area)
     elif split.mode == "levels":
         for place, name in enumerate(names):
-            _text(name, area.left + place * area.width / len(names) + gap, top, area)
+            text_on_shade(name, area.left + place * area.width / len(names) + gap, top, area)
 
 
-def _text(text: str, x: float, y: float, area: Area) -> None:
+def text_on_shade(text: str, x: float, y: float, area: Area) -> None:
     """On a shade, nowhere outside the area."""
     paint, size, edge = imgui.get_background_draw_list(), imgui.calc_text_size(text), hello_imgui.em_size(0.2)
     paint.push_clip_rect(ImVec2(area.left, area.top), ImVec2(area.left + area.width, area.top + area.height))

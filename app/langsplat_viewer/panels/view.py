@@ -8,8 +8,9 @@ from imgui_bundle import hello_imgui, imgui
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions
-from langsplat_viewer.commands import BUTTONS, Button, buttons_of
+from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of
 from langsplat_viewer.controls import FOV_RANGE, adopt_up, level, with_fov
+from langsplat_viewer.overlays import length_text
 from langsplat_viewer.panels.style import muted, small_wrapped
 from langsplat_viewer.viewer import Viewer
 
@@ -80,6 +81,31 @@ def compared_name(button: Button) -> str:
     """What a display is called in the list of those that can be beside another."""
     row = DISPLAYS[button.display]
     return row.label if button.latent_level is None else f"{row.label}, {LEVELS[button.latent_level]}"
+
+
+def draw_overlays(viewer: Viewer) -> None:
+    """What lies over the scene, and the ruler."""
+    state = viewer.state
+    for name, title in OVERLAY_TITLES.items():
+        changed, shown = imgui.checkbox(title.capitalize(), name in state.preferences.overlays)
+        if changed:
+            actions.show_overlay(viewer, name, shown)
+    ruler, scene = state.seeing.ruler, state.scene
+    imgui.begin_disabled(scene is None)
+    changed, measures = imgui.checkbox("Measure (M)", ruler.measures)
+    if changed:
+        actions.measure(viewer, measures)
+    _tip("Click two points on the surface; Esc ends it")
+    imgui.end_disabled()
+    if ruler.measures:
+        words = ("click a first point", "click a second point")
+        length = ruler.length
+        text = words[len(ruler.points) % 2] if length is None or scene is None else ""
+        if length is not None and scene is not None:
+            text = length_text(length, scene.metres_per_unit)
+        small_wrapped(text, muted())
+        if scene is not None and scene.metres_per_unit is None:
+            small_wrapped("the scene has no scale in metres; langsplat scale gives it one", muted())
 
 
 def draw_camera(viewer: Viewer) -> None:

@@ -1,0 +1,56 @@
+"""What lies over the scene, and the ruler."""
+
+import pytest
+
+from langsplat_viewer import actions
+from langsplat_viewer.commands import OVERLAY_TITLES, matching
+from langsplat_viewer.preferences import load_preferences, save_preferences
+from langsplat_viewer.seeing import OVERLAYS, Ruler
+from tests.support.windowless import settle
+
+
+def test_overlays_are_shown_and_remembered(opened, tmp_path):
+    for name in reversed(OVERLAYS):
+        actions.toggle_overlay(opened, name)
+    assert opened.state.preferences.overlays == OVERLAYS
+    save_preferences(tmp_path, opened.state.preferences)
+    assert load_preferences(tmp_path).overlays == OVERLAYS
+    actions.show_overlay(opened, "cube", False)
+    actions.show_overlay(opened, "cube", False)
+    assert opened.state.preferences.overlays == ("cameras", "grid")
+
+
+def test_every_overlay_has_a_command(opened):
+    for name, title in OVERLAY_TITLES.items():
+        (command,) = matching(title)
+        command.act(opened)
+        assert name in opened.state.preferences.overlays
+
+
+def test_two_clicks_measure_and_a_third_begins_anew(opened):
+    actions.toggle_measuring(opened)
+    assert opened.state.seeing.ruler.length is None
+    actions.measure_at(opened, 0.5, 0.5)
+    actions.measure_at(opened, 0.8, 0.1)  # the fake surface: (u - 0.5, v - 0.5, 0)
+    assert opened.state.seeing.ruler.length == pytest.approx(0.5)
+    actions.measure_at(opened, 0.6, 0.6)
+    assert opened.state.seeing.ruler.length is None
+    assert len(opened.state.seeing.ruler.points) == 1
+
+
+def test_a_click_beside_everything_is_said(opened):
+    actions.measure(opened, True)
+    actions.measure_at(opened, 0.95, 0.5)
+    assert opened.state.seeing.ruler.points == ()
+    assert "nothing under the cursor" in opened.state.messages[-1].text
+
+
+def test_measuring_ends_with_esc_and_with_another_scene(opened):
+    from pathlib import Path
+
+    for end in (actions.escape, lambda viewer: actions.open_scene(viewer, Path("plain.ply"))):
+        actions.measure(opened, True)
+        actions.measure_at(opened, 0.5, 0.5)
+        end(opened)
+        settle(opened)
+        assert opened.state.seeing.ruler == Ruler()
