@@ -14,7 +14,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
-from langsplat_core.display.colour_maps import MAX_QUERIES, QUERY_COLOURS, TURBO
+from langsplat_core.display.colour_maps import COLOUR_MAPS, MAX_QUERIES, QUERY_COLOURS
 from langsplat_core.display.compose import HeatRanges, full_ranges, shader_defines
 from langsplat_core.display.displays import DISPLAYS, NUMBERS, Extra
 from langsplat_core.raster import load_rasterizer
@@ -70,7 +70,8 @@ class FrameRenderer:
             fragment_shader=shader("compose.frag", 330, "langsplat_core.display", **shader_defines()),
         )
         self._vao = ctx.vertex_array(self._program, [])
-        self._turbo = ctx.texture((len(TURBO), 1), 3, TURBO.tobytes())
+        tables = np.stack(list(COLOUR_MAPS.values()))
+        self._maps = ctx.texture((tables.shape[1], len(tables)), 3, tables.tobytes(), alignment=1)
         self._scene: Scene | None = None
         self._layers = Layers()
         self._camera: Camera | None = None  # of the last draw
@@ -127,14 +128,15 @@ class FrameRenderer:
         `heat_ranges` as in `display.compose`; `layers` of this picture alone, None: those that are set.
         """
         if self._scene is None:
-            target.clear(*picture.background, 1.0, viewport=target.viewport)
+            colour = (0.0, 0.0, 0.0, 0.0) if picture.transparent else (*picture.background, 1.0)
+            target.clear(*colour, viewport=target.viewport)
             target.use()
             return
         channel = (layers or self._layers).channel(picture)
         self._rasterize(camera, [channel])
         self._camera = camera
         set_uniforms(self._program, self._uniforms(camera, picture, heat_ranges, channel.extra))
-        for unit, texture in enumerate((self._textures[0], self._texture_of(channel), self._turbo)):
+        for unit, texture in enumerate((self._textures[0], self._texture_of(channel), self._maps)):
             texture.use(unit)
         with drawing(self._ctx, target, moderngl.NOTHING):
             self._vao.render(moderngl.TRIANGLES, vertices=3)
@@ -149,7 +151,9 @@ class FrameRenderer:
         return {
             "colours": 0,
             "extra": 1,
-            "turbo_table": 2,
+            "colour_maps": 2,
+            "colour_map": list(COLOUR_MAPS).index(picture.colour_map),
+            "transparent": picture.transparent,
             "display": NUMBERS[display],
             "query_colours": QUERY_COLOURS.astype("f4").tobytes(),
             "heat_ranges": np.array(full_ranges(heat_ranges, MAX_QUERIES), "f4").tobytes(),
@@ -169,8 +173,8 @@ class FrameRenderer:
         heat_ranges: HeatRanges = (),
         layers: Layers | None = None,
     ) -> Array:
-        """(H, W, 3) uint8 picture as `draw` makes it, at the camera's size, row 0 on top; leaves bound what
-        was bound."""
+        """(H, W, 3) uint8 picture as `draw` makes it, (H, W, 4) of a transparent one, at the camera's size,
+        row 0 on top; leaves bound what was bound."""
         size = (camera.width, camera.height)
         if self._own is None or self._own.size != size:
             self._release_own()
@@ -178,10 +182,11 @@ class FrameRenderer:
         before = self._ctx.fbo or self._ctx.detect_framebuffer(0)
         try:
             self.draw(self._own, camera, picture, heat_ranges, layers)
-            pixels = self._own.read(components=3, alignment=1)
+            components = 4 if picture.transparent else 3
+            pixels = self._own.read(components=components, alignment=1)
         finally:
             before.use()
-        return np.frombuffer(pixels, np.uint8).reshape(camera.height, camera.width, 3)[::-1].copy()
+        return np.frombuffer(pixels, np.uint8).reshape(camera.height, camera.width, components)[::-1].copy()
 
     def shows_nothing(self) -> bool:
         """Whether the last drawn image, if there was one, holds nothing of the scene."""
@@ -217,4 +222,4 @@ class FrameRenderer:
         self._source.release()
         self._vao.release()
         self._program.release()
-        self._turbo.release()
+        self._maps.release()

@@ -53,3 +53,4 @@ class Seeing:
 
     split: Split = Split()
     ruler: Ruler = Ruler()
+    transparent: bool = False  # pictures are saved without a background

@@ -2,9 +2,10 @@
 
 import pytest
 
-from langsplat_viewer import actions
+from langsplat_core.errors import InputError
+from langsplat_viewer import actions, saving
 from langsplat_viewer.commands import OVERLAY_TITLES, matching
-from langsplat_viewer.preferences import load_preferences, save_preferences
+from langsplat_viewer.preferences import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.seeing import OVERLAYS, Ruler
 from tests.support.windowless import settle
 
@@ -25,6 +26,27 @@ def test_every_overlay_has_a_command(opened):
         (command,) = matching(title)
         command.act(opened)
         assert name in opened.state.preferences.overlays
+
+
+def test_the_colour_map_is_remembered(opened, tmp_path):
+    actions.set_colour_map(opened, "cividis")
+    assert opened.state.shown_picture().colour_map == "cividis"
+    save_preferences(tmp_path, opened.state.preferences)
+    assert load_preferences(tmp_path).colour_map == "cividis"
+    (tmp_path / FILE_NAME).write_text('{"colour_map": "rainbow"}')
+    with pytest.raises(InputError, match=r"rainbow.*viridis"):
+        load_preferences(tmp_path)
+
+
+def test_pictures_are_saved_without_background_if_so_chosen(opened, tmp_path):
+    asked = []
+    capture = opened.surface.capture
+    opened.surface.capture = lambda state: asked.append(state.picture.transparent) or capture(state)
+    saving.save_picture(opened, tmp_path)
+    actions.save_transparent(opened, True)
+    saving.save_picture(opened, tmp_path)
+    assert asked == [False, True]
+    assert not opened.state.picture.transparent  # on screen there is a background
 
 
 def test_two_clicks_measure_and_a_third_begins_anew(opened):

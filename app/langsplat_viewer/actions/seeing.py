@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from langsplat_core.config import Display
+from langsplat_core.config import ColourMap, Display
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
 from langsplat_viewer.actions.camera import glide_to
@@ -46,6 +46,18 @@ def move_line(viewer: Viewer, at: float) -> None:
     """Where the line is that divides the two pictures, as a fraction of the area's width."""
     low, high = AT_RANGE
     _set_split(viewer, replace(viewer.state.seeing.split, at=min(max(at, low), high)))
+
+
+def set_colour_map(viewer: Viewer, colour_map: ColourMap) -> None:
+    """The colours of relevancy and depth; remembered."""
+    state = viewer.state
+    state.picture = replace(state.picture, colour_map=colour_map)
+    state.preferences = replace(state.preferences, colour_map=colour_map)
+
+
+def save_transparent(viewer: Viewer, transparent: bool) -> None:
+    """Whether pictures are saved without their background."""
+    viewer.state.seeing = replace(viewer.state.seeing, transparent=transparent)
 
 
 def show_overlay(viewer: Viewer, overlay: Overlay, shown: bool) -> None:

@@ -6,7 +6,8 @@ import numpy as np
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
-from langsplat_core.display.colour_maps import QUERY_COLOURS, turbo
+from langsplat_core.config import ColourMap
+from langsplat_core.display.colour_maps import QUERY_COLOURS, mapped
 from langsplat_core.query.answers import QueryResult
 from langsplat_viewer import painting, splitting
 from langsplat_viewer.panels.area import Area
@@ -42,7 +43,8 @@ def draw(viewer: Viewer, area: Area) -> None:
     for slot in slots:
         result = shown[slot]
         if result is not None:
-            _bar(result, bar_colours(slot, painting.STRENGTH[result.verdict], alone=len(slots) == 1))
+            strength = painting.STRENGTH[result.verdict]
+            _bar(result, bar_colours(slot, strength, len(slots) == 1, state.picture.colour_map))
     imgui.end()
 
 
@@ -59,12 +61,12 @@ def say(text: str, area: Area) -> None:
     imgui.end()
 
 
-def bar_colours(slot: int, strength: float, alone: bool) -> Array:
+def bar_colours(slot: int, strength: float, alone: bool, colour_map: ColourMap = "turbo") -> Array:
     """(STEPS, 3) colours of a bar from its coldest to its hottest end, as the picture has them: the colour
     map for a query that is painted alone, else black to its own colour; what is half as strong ends there."""
     heat = np.linspace(0, strength, STEPS)
     if alone:
-        return turbo(heat)
+        return mapped(heat, colour_map)
     return (heat * heat * (3 - 2 * heat))[:, None] * QUERY_COLOURS[slot]
 
 

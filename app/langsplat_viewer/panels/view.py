@@ -5,14 +5,17 @@ from itertools import groupby
 
 from imgui_bundle import hello_imgui, imgui
 
+from langsplat_core.display.colour_maps import COLOUR_MAPS
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
-from langsplat_viewer import actions
+from langsplat_viewer import actions, splitting
 from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of
 from langsplat_viewer.controls import FOV_RANGE, adopt_up, level, with_fov
 from langsplat_viewer.overlays import length_text
 from langsplat_viewer.panels.style import muted, small_wrapped
 from langsplat_viewer.viewer import Viewer
+
+BACKDROPS = {"Black": 0.0, "Grey": 0.5, "White": 1.0}
 
 
 def draw_display(viewer: Viewer) -> None:
@@ -28,7 +31,40 @@ def draw_display(viewer: Viewer) -> None:
         picture = replace(picture, heat_opacity=_slider("Heat opacity", picture.heat_opacity, 0.0, 1.0))
     if needs_query:
         picture = replace(picture, dim=_slider("Background", picture.dim, 0.0, 1.0))
-    actions.set_picture(viewer, picture)
+    actions.set_picture(viewer, replace(picture, background=_backdrop(picture.background)))
+    _tip("What shows where the scene is not")
+    transparent = viewer.state.seeing.transparent
+    changed, transparent = imgui.checkbox("Save without backdrop", transparent)
+    if changed:
+        actions.save_transparent(viewer, transparent)
+    _tip("Pictures are saved transparent where the scene is not")
+    _colour_map(viewer)
+
+
+def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Three to choose from, and one's own."""
+    for place, (name, grey) in enumerate(BACKDROPS.items()):
+        if place:
+            imgui.same_line()
+        if imgui.radio_button(name, background == (grey,) * 3):
+            return (grey,) * 3
+    imgui.same_line()
+    flags = imgui.ColorEditFlags_.no_inputs | imgui.ColorEditFlags_.uint8
+    changed, colour = imgui.color_edit3("Backdrop", list(background), flags)
+    red, green, blue = (min(max(float(part), 0.0), 1.0) for part in colour)
+    return (red, green, blue) if changed else background
+
+
+def _colour_map(viewer: Viewer) -> None:
+    """Where something is shown by it."""
+    shown = {DISPLAYS[one.picture.display].name for one in splitting.pictures(viewer.state)}
+    if not shown & {"relevancy", "depth"}:
+        return
+    names = list(COLOUR_MAPS)
+    imgui.set_next_item_width(hello_imgui.em_size(11))
+    changed, chosen = imgui.combo("Colour map", names.index(viewer.state.picture.colour_map), list(names))
+    if changed:
+        actions.set_colour_map(viewer, names[chosen])
 
 
 def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
