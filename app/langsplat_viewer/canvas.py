@@ -18,7 +18,8 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_viewer import splitting
 from langsplat_viewer.channels import Layers
 from langsplat_viewer.controls import OrbitCamera
-from langsplat_viewer.looking import why_nothing, why_undrawable
+from langsplat_viewer.looking import drawn_scene, why_nothing, why_undrawable
+from langsplat_viewer.seeing import Splats
 from langsplat_viewer.state import FrameStats, ViewerState
 
 SCALES = (1.0, 0.5, 0.25)
@@ -82,7 +83,7 @@ class Canvas:
         self._targets: dict[Key, moderngl.Framebuffer] = {}  # the latest used last
         self._textures: dict[Key, moderngl.Texture] = {}
         self._state: ViewerState | None = None  # that was last shown
-        self._scene: Scene | None = None
+        self._scene: tuple[Scene, Splats] | None = None  # what the renderer has
         self._layers: list[tuple[tuple[object, ...], Layers | None]] = []  # of each picture, with their key
         self._drawn: tuple[object, ...] | None = None  # what the texture shows
         self._view: OrbitCamera | None = None
@@ -110,7 +111,7 @@ class Canvas:
         scale = self._scale() if moving and state.coarse_while_moving else 1.0
         shown = splitting.pictures(state)
         looks = tuple((one.layers_key(), one.shown_picture(), one.heat_ranges()) for one in shown)
-        key = (looks, state.view, splitting.picture_size(state), scale)
+        key = (looks, state.seeing.splats, state.view, splitting.picture_size(state), scale)
         if key != self._drawn:
             self._drawn = key
             self._draw(state, shown, scale)
@@ -133,9 +134,10 @@ class Canvas:
         keep those of the others, whose arrays stay the same objects while nothing changes."""
         scene, first = shown[0].scene, shown[0]
         assert scene is not None
-        if scene is not self._scene:
-            self._scene, self._layers = scene, []
-            self._renderer.set_scene(scene)
+        splats = first.seeing.splats
+        if self._scene is None or self._scene[0] is not scene or self._scene[1] != splats:
+            self._scene, self._layers = (scene, splats), []
+            self._renderer.set_scene(drawn_scene(scene, splats))
         if not self._layers or self._layers[0][0] != first.layers_key():
             self._layers[:1] = [(first.layers_key(), None)]
             self._renderer.set_layers(first.latent_rgb(), first.relevancies())

@@ -47,10 +47,23 @@ class Ruler:
         return replace(self, points=(*self.points, point) if len(self.points) == 1 else (point,))
 
 
+SIZE_RANGE = (0.1, 1.0)
+MOST_DEGREE = 3
+
+
+@dataclass(frozen=True)
+class Splats:
+    """How the Gaussians are drawn, for looking alone: answers and files have them as they are."""
+
+    size: float = 1.0  # factor of every axis, within SIZE_RANGE: small ones are points, and show gaps
+    sh_degree: int = MOST_DEGREE  # at most; 0: colours that do not depend on the direction
+
+
 @dataclass(frozen=True)
 class Seeing:
     """How the scene is looked at."""
 
     split: Split = Split()
     ruler: Ruler = Ruler()
+    splats: Splats = Splats()
     transparent: bool = False  # pictures are saved without a background

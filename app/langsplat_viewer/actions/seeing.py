@@ -6,7 +6,7 @@ from langsplat_core.config import ColourMap, Display
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
 from langsplat_viewer.actions.camera import glide_to
-from langsplat_viewer.seeing import AT_RANGE, OVERLAYS, Overlay, Ruler, Split
+from langsplat_viewer.seeing import AT_RANGE, MOST_DEGREE, OVERLAYS, SIZE_RANGE, Overlay, Ruler, Splats, Split
 from langsplat_viewer.view_cube import facing
 from langsplat_viewer.viewer import Viewer
 
@@ -58,6 +58,15 @@ def set_colour_map(viewer: Viewer, colour_map: ColourMap) -> None:
 def save_transparent(viewer: Viewer, transparent: bool) -> None:
     """Whether pictures are saved without their background."""
     viewer.state.seeing = replace(viewer.state.seeing, transparent=transparent)
+
+
+def set_splats(viewer: Viewer, splats: Splats) -> None:
+    """How the Gaussians are drawn, within what there is."""
+    low, high = SIZE_RANGE
+    degree = min(max(splats.sh_degree, 0), MOST_DEGREE)
+    kept = Splats(min(max(splats.size, low), high), degree)
+    if kept != viewer.state.seeing.splats:
+        viewer.state.seeing = replace(viewer.state.seeing, splats=kept)
 
 
 def show_overlay(viewer: Viewer, overlay: Overlay, shown: bool) -> None:

@@ -13,6 +13,7 @@ from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_o
 from langsplat_viewer.controls import FOV_RANGE, adopt_up, level, with_fov
 from langsplat_viewer.overlays import length_text
 from langsplat_viewer.panels.style import muted, small_wrapped
+from langsplat_viewer.seeing import MOST_DEGREE, SIZE_RANGE, Splats
 from langsplat_viewer.viewer import Viewer
 
 BACKDROPS = {"Black": 0.0, "Grey": 0.5, "White": 1.0}
@@ -30,7 +31,9 @@ def draw_display(viewer: Viewer) -> None:
     if picture.display == "relevancy":
         picture = replace(picture, heat_opacity=_slider("Heat opacity", picture.heat_opacity, 0.0, 1.0))
     if needs_query:
-        picture = replace(picture, dim=_slider("Background", picture.dim, 0.0, 1.0))
+        picture = replace(picture, dim=_slider("Rest dimmed to", picture.dim, 0.0, 1.0))
+    _colour_map(viewer)
+    picture = replace(picture, colour_map=viewer.state.picture.colour_map)
     actions.set_picture(viewer, replace(picture, background=_backdrop(picture.background)))
     _tip("What shows where the scene is not")
     transparent = viewer.state.seeing.transparent
@@ -38,7 +41,22 @@ def draw_display(viewer: Viewer) -> None:
     if changed:
         actions.save_transparent(viewer, transparent)
     _tip("Pictures are saved transparent where the scene is not")
-    _colour_map(viewer)
+    _splats(viewer)
+
+
+def _splats(viewer: Viewer) -> None:
+    """How the Gaussians are drawn."""
+    scene, splats = viewer.state.scene, viewer.state.seeing.splats
+    size = _slider("Splat size", splats.size, *SIZE_RANGE)
+    _tip("Smaller, every Gaussian can be seen; answers and files do not change")
+    degree, most = splats.sh_degree, MOST_DEGREE if scene is None else scene.gaussians.sh_degree
+    if most > 0:
+        imgui.set_next_item_width(hello_imgui.em_size(11))
+        flags = imgui.SliderFlags_.always_clamp
+        changed, chosen = imgui.slider_int("SH degree", min(degree, most), 0, most, "%d", flags)
+        degree = (MOST_DEGREE if chosen == most else chosen) if changed else degree
+        _tip("Up to which degree colours change with the direction that they are seen from")
+    actions.set_splats(viewer, Splats(size, degree))
 
 
 def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, float]:
