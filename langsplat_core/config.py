@@ -205,6 +205,7 @@ class CompactConfig:
 
 
 Display = Literal["rgb", "latent", "relevancy", "segmentation", "depth", "alpha"]
+ColourMap = Literal["turbo", "viridis", "cividis", "magma", "grey"]
 LevelChoice = Literal["auto", "subpart", "part", "whole"]
 
 
@@ -214,8 +215,10 @@ class PictureConfig:
 
     display: Display = "rgb"
     heat_opacity: Share = 0.85  # of the heat map over the colours where relevancy is high
+    colour_map: ColourMap = "turbo"  # of relevancy and depth; viridis and cividis suit the colour-blind
     dim: Share = 0.45  # colours are multiplied by this where a query finds nothing
     own_colours: bool = False  # heat in the colour of each query instead of the colour map
     threshold: Share = 0.5  # of a pixel's light from an answer's Gaussians from which it is segmented
     alpha_gate: Share = 0.3  # pixels with less alpha carry no relevancy
     background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)  # display values in [0, 1]
+    transparent: bool = False  # no background: the picture has a fourth channel, the scene's alpha

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from langsplat_core.cli.run import main
-from langsplat_core.config import LevelChoice
+from langsplat_core.config import ColourMap, LevelChoice
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_viewer.frame import Backend
@@ -50,6 +50,10 @@ class ViewerCommand:
     """Draw one picture without a window and print the answers."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE.png")] = None
     """Where --headless writes."""
+    colour_map: ColourMap | None = None
+    """Colours of relevancy and depth in a picture of --headless (default: turbo)."""
+    transparent: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Draw the picture of --headless without a background, transparent where the scene is not."""
 
     def run(self) -> None:
         size = parse_size(self.size)
@@ -72,6 +76,8 @@ class ViewerCommand:
             size=size,
             camera=self.camera,
             backend=self.backend,
+            colour_map=self.colour_map or "turbo",
+            transparent=self.transparent,
         )
         bars: AbstractContextManager[Progress] = nullcontext(silent)
         if sys.stderr.isatty():
@@ -83,6 +89,12 @@ class ViewerCommand:
     def _window(self, path: Path, size: tuple[int, int] | None) -> None:
         if self.out is not None:
             raise InputError("--out is for pictures without a window; add --headless")
+        for option, given in (("--colour-map", self.colour_map), ("--transparent", self.transparent)):
+            if given:
+                raise InputError(
+                    f"{option} is for pictures without a window; choose it in the panel Display, "
+                    "or add --headless"
+                )
         from langsplat_viewer.window import WindowRequest, open_window
 
         open_window(

@@ -1,11 +1,11 @@
-"""The picture of the scene as a texture, drawn again only when something it depends on has changed.
+"""The pictures of the scene as textures, drawn again only when something it depends on has changed.
 
 Needs a GL context but no window. While the camera moves on a slow machine the picture is drawn at a
 fraction of the window's resolution; as soon as it rests, once more at full resolution.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import moderngl
@@ -15,13 +15,19 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.compose import HeatRanges
 from langsplat_core.scene import Camera, Scene
+from langsplat_viewer import splitting
+from langsplat_viewer.channels import Layers
 from langsplat_viewer.controls import OrbitCamera
-from langsplat_viewer.looking import why_nothing, why_undrawable
+from langsplat_viewer.looking import drawn_scene, why_nothing, why_undrawable
+from langsplat_viewer.seeing import Splats
 from langsplat_viewer.state import FrameStats, ViewerState
 
 SCALES = (1.0, 0.5, 0.25)
 MOVING_BUDGET = 80.0  # milliseconds per picture that still feel like motion
 REST_SECONDS = 0.15  # without a move, after which the fine picture is drawn
+
+
+Key = tuple[int, int, int]  # which picture, width, height
 
 
 class Renderer(Protocol):
@@ -35,16 +41,26 @@ class Renderer(Protocol):
     def set_layers(self, latent_rgb: Array | None, relevancies: Array | None) -> None:
         """(N, 3) latent colours and (N, Q) relevancies, Q <= 3, of the scene's Gaussians."""
 
+    def prepare(self, camera: Camera, pictures: Sequence[tuple[PictureConfig, Layers | None]]) -> None:
+        """Rasterize at once what several pictures of one camera need."""
+
     def draw(
         self,
         target: moderngl.Framebuffer,
         camera: Camera,
         picture: PictureConfig,
         heat_ranges: HeatRanges = (),
+        layers: Layers | None = None,
     ) -> None:
-        """Draw into `target`, which has the camera's size."""
+        """Draw into `target`, which has the camera's size; with `layers` in place of those that are set."""
 
-    def read(self, camera: Camera, picture: PictureConfig, heat_ranges: HeatRanges = ()) -> Array:
+    def read(
+        self,
+        camera: Camera,
+        picture: PictureConfig,
+        heat_ranges: HeatRanges = (),
+        layers: Layers | None = None,
+    ) -> Array:
         """(H, W, 3) uint8 picture."""
 
     def shows_nothing(self) -> bool:
@@ -64,17 +80,19 @@ class Canvas:
         self._ctx = ctx
         self._renderer = renderer
         self._clock = clock
-        self._targets: dict[tuple[int, int], moderngl.Framebuffer] = {}  # by size, the latest used last
-        self._textures: dict[tuple[int, int], moderngl.Texture] = {}
-        self._scene: Scene | None = None
-        self._layers: tuple[object, ...] | None = None
+        self._targets: dict[Key, moderngl.Framebuffer] = {}  # the latest used last
+        self._textures: dict[Key, moderngl.Texture] = {}
+        self._state: ViewerState | None = None  # that was last shown
+        self._scene: tuple[Scene, Splats] | None = None  # what the renderer has
+        self._layers: list[tuple[tuple[object, ...], Layers | None]] = []  # of each picture, with their key
         self._drawn: tuple[object, ...] | None = None  # what the texture shows
         self._view: OrbitCamera | None = None
         self._moved = -1e9  # when the view last changed, seconds
         self._fine_ms = 0.0
         self._camera: Camera | None = None
         self._unsure = False  # whether the picture shows anything is not known yet
-        self.texture: moderngl.Texture | None = None  # RGBA8, first row at the bottom, as GL has it
+        # Of `splitting.pictures`; RGBA8, first row at the bottom, as GL has it.
+        self.textures: tuple[moderngl.Texture, ...] = ()
 
     def update(self, state: ViewerState, now: float) -> bool:
         """Draw if anything changed since the last call; returns whether a finer picture is still due.
@@ -82,6 +100,7 @@ class Canvas:
         `now` in seconds. Raises what the renderer raises (BackendError, moderngl.Error); the same
         picture is then not tried again.
         """
+        self._state = state
         if state.scene is None or state.view is None:
             return False
         if state.view is not self._view:
@@ -90,12 +109,12 @@ class Canvas:
             self._view = state.view
         moving = now - self._moved < REST_SECONDS
         scale = self._scale() if moving and state.coarse_while_moving else 1.0
-        size = (max(1, round(state.size[0] * scale)), max(1, round(state.size[1] * scale)))
-        picture = state.shown_picture()
-        key = (state.layers_key(), picture, state.view, state.size, scale, state.heat_ranges())
+        shown = splitting.pictures(state)
+        looks = tuple((one.layers_key(), one.shown_picture(), one.heat_ranges()) for one in shown)
+        key = (looks, state.seeing.splats, state.view, splitting.picture_size(state), scale)
         if key != self._drawn:
             self._drawn = key
-            self._draw(state, size, scale)
+            self._draw(state, shown, scale)
             state.nothing, self._unsure = "", True
         if self._unsure and not moving and self._camera is not None:
             self._unsure = False  # asked at rest only: it reads the picture back
@@ -110,50 +129,70 @@ class Canvas:
         within = [s for s in SCALES if self._fine_ms * s * s <= MOVING_BUDGET]
         return within[0] if within else SCALES[-1]
 
-    def _sync(self, state: ViewerState) -> None:
-        """Hand the scene and the layers to the renderer if they are not the ones it has."""
-        assert state.scene is not None
-        if state.scene is not self._scene:
-            self._scene = state.scene
-            self._renderer.set_scene(state.scene)
-            self._layers = None
-        if state.layers_key() != self._layers:
-            self._layers = state.layers_key()
-            self._renderer.set_layers(state.latent_rgb(), state.relevancies())
+    def _sync(self, shown: Sequence[ViewerState]) -> None:
+        """Hand the scene and the layers of the first picture to the renderer if they are not the ones it has;
+        keep those of the others, whose arrays stay the same objects while nothing changes."""
+        scene, first = shown[0].scene, shown[0]
+        assert scene is not None
+        splats = first.seeing.splats
+        if self._scene is None or self._scene[0] is not scene or self._scene[1] != splats:
+            self._scene, self._layers = (scene, splats), []
+            self._renderer.set_scene(drawn_scene(scene, splats))
+        if not self._layers or self._layers[0][0] != first.layers_key():
+            self._layers[:1] = [(first.layers_key(), None)]
+            self._renderer.set_layers(first.latent_rgb(), first.relevancies())
+        del self._layers[len(shown) :]
+        for place, one in enumerate(shown[1:], 1):
+            if len(self._layers) == place or self._layers[place][0] != one.layers_key():
+                layers = Layers(one.latent_rgb(), one.relevancies())
+                self._layers[place : place + 1] = [(one.layers_key(), layers)]
 
-    def _draw(self, state: ViewerState, size: tuple[int, int], scale: float) -> None:
+    def _prepare(self, shown: Sequence[ViewerState], camera: Camera) -> list[Layers | None]:
+        """Have the renderer ready to draw all pictures; returns the layers of each."""
+        self._sync(shown)
+        layers = [layers for _, layers in self._layers]
+        if len(shown) > 1:
+            looks = [one.shown_picture() for one in shown]
+            self._renderer.prepare(camera, list(zip(looks, layers, strict=True)))
+        return layers
+
+    def _draw(self, state: ViewerState, shown: Sequence[ViewerState], scale: float) -> None:
         assert state.view is not None
-        self._sync(state)
-        target = self._target(size)
-        camera = state.view.camera(*size)
+        width, height = (max(1, round(side * scale)) for side in splitting.picture_size(state))
+        camera = state.view.camera(width, height)
+        keys = [(place, width, height) for place in range(len(shown))]
+        targets = [self._target(key, len(shown)) for key in keys]
         began = self._clock()
-        self._renderer.draw(target, camera, state.shown_picture(), state.heat_ranges())
+        for target, one, layers in zip(targets, shown, self._prepare(shown, camera), strict=True):
+            self._renderer.draw(target, camera, one.shown_picture(), one.heat_ranges(), layers)
         self._ctx.finish()
         milliseconds = 1e3 * (self._clock() - began)
         if scale == 1:
             self._fine_ms = milliseconds
         self._camera = camera
-        self.texture = self._textures[size]
-        state.stats = FrameStats(milliseconds, *size, scale)
+        self.textures = tuple(self._textures[key] for key in keys)
+        state.stats = FrameStats(milliseconds, width, height, scale)
 
-    def _target(self, size: tuple[int, int]) -> moderngl.Framebuffer:
-        """A framebuffer of this size; the last few sizes are kept, because moving alternates between two."""
-        if size not in self._targets:
-            if len(self._targets) >= len(SCALES):
+    def _target(self, key: Key, count: int) -> moderngl.Framebuffer:
+        """A framebuffer for one of `count` pictures; those of the last few sizes are kept, because moving
+        alternates between two."""
+        if key not in self._targets:
+            while len(self._targets) >= len(SCALES) * count:
                 oldest = next(iter(self._targets))
                 self._targets.pop(oldest).release()
                 self._textures.pop(oldest).release()
-            texture = self._ctx.texture(size, 4)
+            texture = self._ctx.texture(key[1:], 4)
             texture.repeat_x = texture.repeat_y = False
-            self._textures[size] = texture
-            self._targets[size] = self._ctx.framebuffer([texture])
-        self._targets[size] = self._targets.pop(size)
-        return self._targets[size]
+            self._textures[key] = texture
+            self._targets[key] = self._ctx.framebuffer([texture])
+        self._targets[key] = self._targets.pop(key)
+        return self._targets[key]
 
     def point_at(self, u: float, v: float) -> Array | None:
         """See `viewer.Surface`."""
-        if self._camera is None:
+        if self._camera is None or self._state is None:
             return None
+        u = splitting.within_picture(self._state.seeing.split, u)
         pixel = (u * self._camera.width, v * self._camera.height)
         depth = self._renderer.depth_at(*pixel)
         return None if depth is None or depth <= 0 else self._camera.unproject(pixel, depth)
@@ -161,6 +200,10 @@ class Canvas:
     def capture(self, state: ViewerState) -> Array:
         """See `viewer.Surface`."""
         assert state.view is not None
-        self._sync(state)
-        self._camera = state.view.camera(*state.size)
-        return np.asarray(self._renderer.read(self._camera, state.shown_picture(), state.heat_ranges()))
+        shown = splitting.pictures(state)
+        self._camera = camera = state.view.camera(*splitting.picture_size(state))
+        images = [
+            np.asarray(self._renderer.read(camera, one.shown_picture(), one.heat_ranges(), layers))
+            for one, layers in zip(shown, self._prepare(shown, camera), strict=True)
+        ]
+        return splitting.joined(state.seeing.split, images)

@@ -1,19 +1,19 @@
 """Channel textures: what the composite shader reads, from either rasterizer."""
 
+from collections.abc import Sequence
 from typing import Literal, Protocol
 
 import moderngl
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.display.displays import Extra
 from langsplat_core.raster import Rasterizer
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer, GlView, Source
 from langsplat_core.scene import Camera, Scene
-from langsplat_viewer.channels import ArrayChannels, Layers
+from langsplat_viewer.channels import ArrayChannels, Channel
 from langsplat_viewer.looking import looking_settings
 
-Textures = tuple[moderngl.Texture, ...]  # colours with alpha and, if asked for, one further channel
+Textures = tuple[moderngl.Texture, ...]  # colours with alpha, then one for each channel that was wanted
 
 
 class ChannelSource(Protocol):
@@ -22,11 +22,9 @@ class ChannelSource(Protocol):
     def set_scene(self, scene: Scene) -> None:
         """Show another scene."""
 
-    def set_layers(self, layers: Layers) -> None:
-        """Show other layers of the same scene."""
-
-    def render(self, camera: Camera, extra: Extra) -> Textures:
-        """Channel textures, valid until the next call."""
+    def render(self, camera: Camera, wanted: Sequence[Channel]) -> Textures:
+        """Colours, then the texture of each channel (the colours' for "none"), valid until the next call.
+        At most three with values, none of them twice."""
 
     def depth_at(self, camera: Camera, column: int, row: int) -> tuple[float, float]:
         """Surface depth (world units, 0: nothing) and alpha of one pixel."""
@@ -40,37 +38,44 @@ class GlSource:
 
     def __init__(self, ctx: moderngl.Context, precision: Literal["half", "single"]) -> None:
         self._rasterizer = GlRasterizer(ctx, precision)
-        self._layers = Layers()
-        self._uploads: dict[str, moderngl.Texture] = {}
+        self._uploads: dict[int, tuple[Array, moderngl.Texture]] = {}  # by the id of the array, which is held
 
     def set_scene(self, scene: Scene) -> None:
-        self.set_layers(Layers())
+        self._keep([])
         self._scene = scene
-
-    def set_layers(self, layers: Layers) -> None:
-        for texture in self._uploads.values():
-            texture.release()
-        self._uploads.clear()
-        self._layers = layers
 
     def _view(self, camera: Camera) -> GlView:
         return self._rasterizer.view(self._scene.gaussians, camera, looking_settings(self._scene, camera))
 
-    def render(self, camera: Camera, extra: Extra) -> Textures:
-        sources: list[Source] = ["colour"]
+    def render(self, camera: Camera, wanted: Sequence[Channel]) -> Textures:
+        self._keep(wanted)
         view = self._view(camera)
-        values = self._layers.values(extra)
-        if values is not None:
-            if extra not in self._uploads:
-                self._uploads[extra] = self._rasterizer.scene(self._scene.gaussians).upload(values)
-            sources.append(self._uploads[extra])
-        return self._rasterizer.draw(view, sources, with_depth=extra == "depth")
+        sources: list[Source] = ["colour", *(self._upload(c.values) for c in wanted if c.values is not None)]
+        images = self._rasterizer.draw(view, sources, with_depth=any(c.extra == "depth" for c in wanted))
+        colours, *layers = images[: len(sources)]
+        valued = iter(layers)
+        by_channel = (
+            next(valued) if c.values is not None else images[-1] if c.extra == "depth" else colours
+            for c in wanted
+        )
+        return (colours, *by_channel)
+
+    def _upload(self, values: Array) -> moderngl.Texture:
+        if id(values) not in self._uploads:
+            texture = self._rasterizer.scene(self._scene.gaussians).upload(values)
+            self._uploads[id(values)] = values, texture
+        return self._uploads[id(values)][1]
+
+    def _keep(self, wanted: Sequence[Channel]) -> None:
+        """Release what was uploaded for other channels."""
+        for key in set(self._uploads) - {id(channel.values) for channel in wanted}:
+            self._uploads.pop(key)[1].release()
 
     def depth_at(self, camera: Camera, column: int, row: int) -> tuple[float, float]:
         return self._view(camera).depth_at(column, row)
 
     def release(self) -> None:
-        self.set_layers(Layers())
+        self._keep([])
         self._rasterizer.release()
 
 
@@ -80,39 +85,36 @@ class ArraySource:
     def __init__(self, ctx: moderngl.Context, rasterizer: Rasterizer) -> None:
         self._ctx = ctx
         self._channels = ArrayChannels(rasterizer)
-        self._layers = Layers()
-        self._textures: dict[str, moderngl.Texture] = {}
+        self._textures: dict[tuple[int, int], moderngl.Texture] = {}  # by place and number of components
 
     def set_scene(self, scene: Scene) -> None:
         self._scene = scene
-        self._layers = Layers()
 
-    def set_layers(self, layers: Layers) -> None:
-        self._layers = layers
+    def render(self, camera: Camera, wanted: Sequence[Channel]) -> Textures:
+        drawn = self._channels.render_all(self._scene, camera, wanted or [Channel()])
+        colours = self._upload(0, 4, drawn[0].rgb, drawn[0].alpha)
+        textures = [colours]
+        for place, channels in enumerate(drawn[: len(wanted)], 1):
+            image = channels.latent if channels.latent is not None else channels.relevancies
+            if channels.depth_sum is not None:
+                textures.append(self._upload(place, 2, channels.depth_sum[..., None], channels.alpha))
+            elif image is not None:
+                textures.append(self._upload(place, 4, image, channels.alpha))
+            else:
+                textures.append(colours)
+        return tuple(textures)
 
-    def render(self, camera: Camera, extra: Extra) -> Textures:
-        channels = self._channels.render(self._scene, self._layers, camera, extra)
-        images = {"colours": channels.rgb}
-        if channels.depth_sum is not None:
-            images["depth"] = channels.depth_sum[..., None]
-        elif channels.latent is not None:
-            images["extra"] = channels.latent
-        elif channels.relevancies is not None:
-            images["extra"] = channels.relevancies
-        return tuple(self._upload(role, image, channels.alpha) for role, image in images.items())
-
-    def _upload(self, role: str, image: Array, alpha: Array) -> moderngl.Texture:
+    def _upload(self, place: int, components: int, image: Array, alpha: Array) -> moderngl.Texture:
         """(H, W, C) -> RGBA, or RG for depth, alpha last."""
-        components = 2 if role == "depth" else 4
         packed = np.zeros((*alpha.shape, components), np.float32)
         packed[..., : image.shape[2]] = image
         packed[..., -1] = alpha
-        size = alpha.shape[::-1]
-        texture = self._textures.get(role)
+        size, key = alpha.shape[::-1], (place, components)
+        texture = self._textures.get(key)
         if texture is None or texture.size != size:
             if texture is not None:
                 texture.release()
-            texture = self._textures[role] = self._ctx.texture(size, components, dtype="f4")
+            texture = self._textures[key] = self._ctx.texture(size, components, dtype="f4")
             texture.repeat_x = texture.repeat_y = False
         texture.write(packed)
         return texture

@@ -1,5 +1,6 @@
 """Which channels a picture needs, and those channels as arrays. No graphics device here."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,19 @@ from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_viewer.looking import looking_settings
 
 _DEPTH_SAMPLE = 20_000  # Gaussians looked at for the depth range; quantiles need no more
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """What is rasterized beside colours and alpha for one picture."""
+
+    extra: Extra = "none"
+    values: Array | None = None  # (N, 1 to 3) per Gaussian; None for "none" and "depth"
+
+    @property
+    def key(self) -> tuple[Extra, int]:
+        """Equal for the same channel, as long as one of the two is held."""
+        return self.extra, id(self.values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +55,11 @@ class Layers:
         extra = DISPLAYS[picture.display].extra
         absent = extra in ("latent", "relevancies") and self.values(extra) is None
         return "none" if absent else extra
+
+    def channel(self, picture: PictureConfig) -> Channel:
+        """That channel with its values."""
+        extra = self.extra(picture)
+        return Channel(extra, self.values(extra))
 
     def values(self, extra: Extra) -> Array | None:
         """The layer that is rasterized as `extra`, if there is one."""
@@ -95,17 +114,28 @@ class ArrayChannels:
 
     def render(self, scene: Scene, layers: Layers, camera: Camera, extra: Extra) -> Channels:
         """Colours, alpha and `extra`, in one pass."""
+        return self.render_all(scene, camera, [Channel(extra, layers.values(extra))])[0]
+
+    def render_all(self, scene: Scene, camera: Camera, wanted: Sequence[Channel]) -> list[Channels]:
+        """For each of `wanted` the colours, alpha and that channel; all of them in one pass."""
         gaussians = scene.gaussians
-        values = camera_depths(gaussians, camera) if extra == "depth" else layers.values(extra)
+        columns = [camera_depths(gaussians, camera) if c.extra == "depth" else c.values for c in wanted]
+        present = [column for column in columns if column is not None]
+        values = np.concatenate(present, 1) if len(present) > 1 else next(iter(present), None)
         drawn = splat_colours(self.view(scene, camera), gaussians, camera, values)
-        return Channels(
-            rgb=drawn.colours,
-            alpha=drawn.alpha,
-            latent=drawn.values if extra == "latent" else None,
-            relevancies=drawn.values if extra == "relevancies" else None,
-            depth_sum=drawn.values[..., 0] if extra == "depth" else None,
-            depth_range=depth_range(gaussians, camera) if extra == "depth" else (0.0, 1.0),
-        )
+        ends = np.cumsum([0 if column is None else column.shape[1] for column in columns])
+        parts = np.split(drawn.values, ends[:-1], axis=2)
+        return [
+            Channels(
+                rgb=drawn.colours,
+                alpha=drawn.alpha,
+                latent=part if channel.extra == "latent" else None,
+                relevancies=part if channel.extra == "relevancies" else None,
+                depth_sum=part[..., 0] if channel.extra == "depth" else None,
+                depth_range=depth_range(gaussians, camera) if channel.extra == "depth" else (0.0, 1.0),
+            )
+            for channel, part in zip(wanted, parts, strict=True)
+        ]
 
     def depth_at(self, scene: Scene, camera: Camera, column: int, row: int) -> tuple[float, float]:
         """Depth of the surface in a pixel (the median where the rasterizer knows it, else the mean, as where

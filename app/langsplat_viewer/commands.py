@@ -10,6 +10,7 @@ from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions, saving
 from langsplat_viewer.controls import adopt_up, level
+from langsplat_viewer.seeing import Overlay
 from langsplat_viewer.viewer import Viewer
 
 
@@ -64,7 +65,18 @@ def _panel(title: str) -> Command:
     return Command(f"panel: {title}", lambda viewer: actions.open_panel(viewer, title))
 
 
-PANEL_TITLES = ("Search", "Scene", "Display", "Camera", "Train", "Messages")
+def _overlay(name: Overlay, title: str) -> Command:
+    return Command(
+        f"show or hide the {title}", lambda viewer: actions.toggle_overlay(viewer, name), menu="View"
+    )
+
+
+OVERLAY_TITLES: dict[Overlay, str] = {
+    "cameras": "training cameras",
+    "cube": "view cube",
+    "grid": "ground grid",
+}
+PANEL_TITLES = ("Search", "Scene", "Display", "Camera", "Train", "Messages", "Overlays")
 MENUS = ("File", "Edit", "View", "Camera", "Window", "Help")
 
 COMMANDS: tuple[Command, ...] = (
@@ -80,6 +92,10 @@ COMMANDS: tuple[Command, ...] = (
     Command("redo", actions.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), "Edit", repeats=True, is_edit=True),
     *(Command(_name(button), _show(button), (str(key),), "View") for key, button in enumerate(BUTTONS, 1)),
     Command("say what is under the cursor", actions.toggle_pointing, ("I",), "View"),
+    Command("compare two displays", actions.toggle_wipe, ("V",), "View"),
+    Command("three levels side by side", actions.toggle_levels, menu="View"),
+    *(_overlay(name, title) for name, title in OVERLAY_TITLES.items()),
+    Command("measure a distance", actions.toggle_measuring, ("M",), "View"),
     Command("return to the opening view", actions.reset_view, ("R", "Home"), "Camera"),
     Command("frame everything", actions.frame_scene, ("Shift+F",), "Camera"),
     Command("focus on the latest result found", actions.focus_result, ("F",), "Camera"),

@@ -2,9 +2,11 @@
 
 A rasterizer fills channel textures (colours, and the one further channel that the display needs); a
 composite shader turns them into the picture. The channels are kept while camera, scene and layers stay,
-so that moving a slider or repainting the user interface costs only the composite pass.
+so that moving a slider or repainting the user interface costs only the composite pass. Several pictures of
+one camera share one pass of the rasterizer, see `FrameRenderer.prepare`.
 """
 
+from collections.abc import Sequence
 from typing import Literal
 
 import moderngl
@@ -12,14 +14,14 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
-from langsplat_core.display.colour_maps import MAX_QUERIES, QUERY_COLOURS, TURBO
+from langsplat_core.display.colour_maps import COLOUR_MAPS, MAX_QUERIES, QUERY_COLOURS
 from langsplat_core.display.compose import HeatRanges, full_ranges, shader_defines
 from langsplat_core.display.displays import DISPLAYS, NUMBERS, Extra
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.opengl.draw import drawing, set_uniforms, shader
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.channel_textures import ArraySource, ChannelSource, GlSource, Textures
-from langsplat_viewer.channels import Layers, camera_key, depth_range
+from langsplat_viewer.channels import Channel, Layers, camera_key, depth_range
 from langsplat_viewer.looking import VISIBLE_ALPHA
 
 Backend = Literal["auto", "opengl", "cpu", "cuda"]
@@ -68,26 +70,49 @@ class FrameRenderer:
             fragment_shader=shader("compose.frag", 330, "langsplat_core.display", **shader_defines()),
         )
         self._vao = ctx.vertex_array(self._program, [])
-        self._turbo = ctx.texture((len(TURBO), 1), 3, TURBO.tobytes())
+        tables = np.stack(list(COLOUR_MAPS.values()))
+        self._maps = ctx.texture((tables.shape[1], len(tables)), 3, tables.tobytes(), alignment=1)
         self._scene: Scene | None = None
         self._layers = Layers()
         self._camera: Camera | None = None  # of the last draw
-        self._drawn: tuple[object, ...] = ()  # what `_textures` show
+        self._drawn: tuple[object, ...] = ()  # camera whose channels are held
+        self._channels: Sequence[Channel] = ()  # those of `_textures` after the colours
         self._textures: Textures = ()
         self._own: moderngl.Framebuffer | None = None
 
     def set_scene(self, scene: Scene) -> None:
         """Show another scene, without layers."""
         self._source.set_scene(scene)
-        self._scene, self._layers, self._camera, self._drawn = scene, Layers(), None, ()
+        self._scene, self._layers, self._camera = scene, Layers(), None
+        self._drawn, self._channels = (), ()
 
     def set_layers(self, latent_rgb: Array | None, relevancies: Array | None) -> None:
         """What the displays "latent" and "relevancy" show: (N, 3) colours in [0, 1] of the level shown;
         (N, Q) relevancies in [0, 1] of 1 to MAX_QUERIES queries. ValueError for other shapes."""
         layers = Layers(latent_rgb, relevancies)
         layers.check(0 if self._scene is None else len(self._scene.gaussians))
-        self._source.set_layers(layers)
-        self._layers, self._drawn = layers, ()
+        self._layers = layers
+
+    def prepare(self, camera: Camera, pictures: Sequence[tuple[PictureConfig, Layers | None]]) -> None:
+        """Rasterize in one pass what several pictures of one camera need, at most three, unless it is all
+        there; their `draw` or `read` then only composes. Layers of a picture as in `draw`."""
+        if self._scene is not None:
+            self._rasterize(camera, [(layers or self._layers).channel(p) for p, layers in pictures])
+
+    def _rasterize(self, camera: Camera, wanted: Sequence[Channel]) -> None:
+        """Have `wanted` among the channels that are held."""
+        held = {channel.key for channel in self._channels}
+        needed = {channel.key: channel for channel in wanted if channel.extra != "none"}
+        if self._drawn == camera_key(camera) and needed.keys() <= held:
+            return
+        self._drawn, self._channels = (), ()
+        self._textures = self._source.render(camera, list(needed.values()))
+        self._drawn, self._channels = camera_key(camera), tuple(needed.values())
+
+    def _texture_of(self, channel: Channel) -> moderngl.Texture:
+        """The one that holds a channel; the colours where it is none."""
+        places = (place for place, held in enumerate(self._channels, 1) if held.key == channel.key)
+        return self._textures[next(places, 0)]
 
     def draw(
         self,
@@ -95,25 +120,23 @@ class FrameRenderer:
         camera: Camera,
         picture: PictureConfig,
         heat_ranges: HeatRanges = (),
+        layers: Layers | None = None,
     ) -> None:
         """Fill `target`'s viewport with the picture and leave `target` bound.
 
         The image is rasterized at the camera's size and stretched to the viewport if that is another.
-        `heat_ranges` as in `display.compose`.
+        `heat_ranges` as in `display.compose`; `layers` of this picture alone, None: those that are set.
         """
         if self._scene is None:
-            target.clear(*picture.background, 1.0, viewport=target.viewport)
+            colour = (0.0, 0.0, 0.0, 0.0) if picture.transparent else (*picture.background, 1.0)
+            target.clear(*colour, viewport=target.viewport)
             target.use()
             return
-        extra = self._layers.extra(picture)
-        wanted = (*camera_key(camera), extra)
-        if self._drawn != wanted:
-            self._drawn = ()
-            self._textures = self._source.render(camera, extra)
-            self._drawn = wanted
+        channel = (layers or self._layers).channel(picture)
+        self._rasterize(camera, [channel])
         self._camera = camera
-        set_uniforms(self._program, self._uniforms(camera, picture, heat_ranges, extra))
-        for unit, texture in enumerate((*self._textures, self._turbo)):
+        set_uniforms(self._program, self._uniforms(camera, picture, heat_ranges, channel.extra))
+        for unit, texture in enumerate((self._textures[0], self._texture_of(channel), self._maps)):
             texture.use(unit)
         with drawing(self._ctx, target, moderngl.NOTHING):
             self._vao.render(moderngl.TRIANGLES, vertices=3)
@@ -127,8 +150,10 @@ class FrameRenderer:
         display = picture.display if extra == DISPLAYS[picture.display].extra else "rgb"
         return {
             "colours": 0,
-            "extra": len(self._textures) - 1,
-            "turbo_table": len(self._textures),
+            "extra": 1,
+            "colour_maps": 2,
+            "colour_map": list(COLOUR_MAPS).index(picture.colour_map),
+            "transparent": picture.transparent,
             "display": NUMBERS[display],
             "query_colours": QUERY_COLOURS.astype("f4").tobytes(),
             "heat_ranges": np.array(full_ranges(heat_ranges, MAX_QUERIES), "f4").tobytes(),
@@ -141,19 +166,27 @@ class FrameRenderer:
             "depth_range": depth_range(self._scene.gaussians, camera) if extra == "depth" else (0.0, 1.0),
         }
 
-    def read(self, camera: Camera, picture: PictureConfig, heat_ranges: HeatRanges = ()) -> Array:
-        """(H, W, 3) uint8 picture at the camera's size, row 0 on top; leaves bound what was bound."""
+    def read(
+        self,
+        camera: Camera,
+        picture: PictureConfig,
+        heat_ranges: HeatRanges = (),
+        layers: Layers | None = None,
+    ) -> Array:
+        """(H, W, 3) uint8 picture as `draw` makes it, (H, W, 4) of a transparent one, at the camera's size,
+        row 0 on top; leaves bound what was bound."""
         size = (camera.width, camera.height)
         if self._own is None or self._own.size != size:
             self._release_own()
             self._own = self._ctx.framebuffer([self._ctx.texture(size, 4)])
         before = self._ctx.fbo or self._ctx.detect_framebuffer(0)
         try:
-            self.draw(self._own, camera, picture, heat_ranges)
-            pixels = self._own.read(components=3, alignment=1)
+            self.draw(self._own, camera, picture, heat_ranges, layers)
+            components = 4 if picture.transparent else 3
+            pixels = self._own.read(components=components, alignment=1)
         finally:
             before.use()
-        return np.frombuffer(pixels, np.uint8).reshape(camera.height, camera.width, 3)[::-1].copy()
+        return np.frombuffer(pixels, np.uint8).reshape(camera.height, camera.width, components)[::-1].copy()
 
     def shows_nothing(self) -> bool:
         """Whether the last drawn image, if there was one, holds nothing of the scene."""
@@ -189,4 +222,4 @@ class FrameRenderer:
         self._source.release()
         self._vao.release()
         self._program.release()
-        self._turbo.release()
+        self._maps.release()

@@ -24,7 +24,8 @@ def render_picture(
     relevancies: Array | None = None,
     heat_ranges: HeatRanges = (),
 ) -> Array:
-    """(H, W, 3) uint8 picture of `scene`, row 0 on top; layers as in `FrameRenderer.set_layers`.
+    """(H, W, 3) uint8 picture of `scene`, row 0 on top, (H, W, 4) where it is transparent; layers as in
+    `FrameRenderer.set_layers`.
 
     Backends "cpu" and "cuda" touch no GL at all; "auto" takes "cpu" where GL is absent or software.
     Raises BackendError where the backend cannot work, InputError where nothing of the scene shows.

@@ -6,7 +6,8 @@ import numpy as np
 
 from langsplat_core.arrays import logit
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.scene import SH_COUNTS, Camera, Gaussians, Scene
+from langsplat_viewer.seeing import Splats
 
 NEAR_SHARE = 0.25  # of the depth of what is nearest in the picture
 NEAREST_SHARE = 0.01  # of the Gaussians in the picture that count as the nearest
@@ -29,6 +30,18 @@ def near_plane(gaussians: Gaussians, camera: Camera, most: float = INRIA.near) -
         return most
     nearest, middle = np.quantile(depths[inside], [NEAREST_SHARE, 0.5])
     return float(min(most, max(NEAR_SHARE * nearest, LEAST_NEAR * middle)))
+
+
+def drawn_scene(scene: Scene, splats: Splats) -> Scene:
+    """The scene with its Gaussians as `splats` wants them drawn; the scene itself where that changes nothing.
+    The rows stay the same, so that layers fit both."""
+    gaussians = scene.gaussians
+    if splats.size != 1:
+        scales = gaussians.log_scales + np.float32(np.log(splats.size))
+        gaussians = replace(gaussians, log_scales=scales)
+    if splats.sh_degree < gaussians.sh_degree:
+        gaussians = replace(gaussians, sh=gaussians.sh[:, : SH_COUNTS[splats.sh_degree]])
+    return scene if gaussians is scene.gaussians else replace(scene, gaussians=gaussians)
 
 
 def looking_settings(scene: Scene, camera: Camera) -> RasterSettings:

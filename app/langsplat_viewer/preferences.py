@@ -7,6 +7,7 @@ from typing import Any, Literal, get_args
 
 import platformdirs
 
+from langsplat_core.config import ColourMap
 from langsplat_core.errors import InputError, printable_line
 from langsplat_core.files import atomic_path
 
@@ -16,7 +17,7 @@ SCALES = (0.75, 3.0)  # least and largest size of letters and widgets
 MOST_RECENT = 12
 FILE_NAME, LAYOUT_NAME = "preferences.json", "layout.ini"
 LARGEST = 1_000_000  # bytes of the file
-_LISTS = {"recent", "panels"}
+_LISTS = {"recent", "panels", "overlays"}
 
 
 @dataclass(frozen=True)
@@ -27,10 +28,15 @@ class Preferences:
     ui_scale: float = 1.0  # of letters and widgets, within `SCALES`
     recent: tuple[str, ...] = ()  # scenes that were opened, the latest first
     panels: tuple[str, ...] | None = None  # titles of those that are open; None: those that are at first
+    colour_map: ColourMap = "turbo"  # of relevancy and depth
+    overlays: tuple[str, ...] = ()  # of `seeing.OVERLAYS`, those that lie over the scene
 
     def __post_init__(self) -> None:
         if self.theme not in THEMES:
             raise InputError(f'theme "{printable_line(self.theme, 40)}"; there are {", ".join(THEMES)}')
+        if self.colour_map not in get_args(ColourMap):
+            known = ", ".join(get_args(ColourMap))
+            raise InputError(f'colour_map "{printable_line(self.colour_map, 40)}"; there are {known}')
         is_number = isinstance(self.ui_scale, int | float) and not isinstance(self.ui_scale, bool)
         if not (is_number and SCALES[0] <= self.ui_scale <= SCALES[1]):
             raise InputError(f"ui_scale is not a number from {SCALES[0]} to {SCALES[1]}")

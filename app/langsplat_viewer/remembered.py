@@ -1,5 +1,6 @@
 """What one window leaves for the next: preferences, and the layout of the panels."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from imgui_bundle import hello_imgui
@@ -35,6 +36,7 @@ class Remembered:
             self._state.say(f"settings are not remembered: {one_line(error)}", is_error=True)
             return
         self._kept = self._state.preferences
+        self._state.picture = replace(self._state.picture, colour_map=self._kept.colour_map)
         params.ini_disable = False
         params.ini_folder_type = hello_imgui.IniFolderType.absolute_path
         params.ini_filename = str(self._folder / LAYOUT_NAME)

@@ -1,5 +1,7 @@
 """Pictures and cameras to files, whole or not at all."""
 
+from copy import copy
+from dataclasses import replace
 from pathlib import Path
 
 from PIL import Image
@@ -21,20 +23,23 @@ def free_name(folder: Path, stem: str, suffix: str) -> Path:
 
 
 def save_png(path: Path, image: Array) -> None:
-    """Write an (H, W, 3) uint8 picture, whole or not at all."""
+    """Write an (H, W, 3) or (H, W, 4) uint8 picture, whole or not at all."""
     with atomic_path(path) as temporary:
         Image.fromarray(image).save(temporary, format="PNG")
 
 
 def save_picture(viewer: Viewer, folder: Path) -> Path | None:
-    """Save the scene as shown to a new PNG in `folder`; returns its path, None if that failed."""
+    """Save the scene as shown, without its background if that was chosen, to a new PNG in `folder`;
+    returns its path, None if that failed."""
     state = viewer.state
     if viewer.surface is None or state.scene is None:
         state.say("open a scene first, then save a picture of it", is_error=True)
         return None
     path = free_name(folder, state.path.stem if state.path else "picture", ".png")
     try:
-        save_png(path, viewer.surface.capture(state))
+        shown = copy(state)
+        shown.picture = replace(state.picture, transparent=state.seeing.transparent)
+        save_png(path, viewer.surface.capture(shown))
     except (OSError, LangSplatError) as error:
         state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
         return None

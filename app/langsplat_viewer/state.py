@@ -16,6 +16,7 @@ from langsplat_viewer import painting
 from langsplat_viewer.browsing import Listing
 from langsplat_viewer.controls import Extent, OrbitCamera
 from langsplat_viewer.preferences import Preferences
+from langsplat_viewer.seeing import Seeing
 
 SLOTS = MAX_QUERIES  # queries shown at a time: one colour each
 MAX_MESSAGES = 50
@@ -109,6 +110,7 @@ class ViewerState:
 
     picture: PictureConfig = field(default_factory=PictureConfig)
     latent_level: int = 2  # index into scene.LEVELS
+    seeing: Seeing = field(default_factory=Seeing)
     level: LevelChoice = "auto"
     queries: list[Query] = field(default_factory=list)
     selected: Query | None = None  # whose details are shown

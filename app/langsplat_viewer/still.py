@@ -7,7 +7,7 @@ from pathlib import Path
 import moderngl
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import Display, LevelChoice, PictureConfig
+from langsplat_core.config import ColourMap, Display, LevelChoice, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.display.latent_colours import latent_colours
 from langsplat_core.errors import BackendError, InputError
@@ -44,6 +44,8 @@ class StillRequest:
     size: tuple[int, int] | None = None  # pixels; None: the training camera's, else DEFAULT_SIZE
     camera: str = ""
     backend: Backend = "auto"
+    colour_map: ColourMap = "turbo"
+    transparent: bool = False
 
 
 def check_out(out: Path | None) -> Path:
@@ -96,12 +98,15 @@ def draw_still(request: StillRequest, services: Services, progress: Progress = s
     progress("drawing", 0.8)
     if request.backend in ("auto", "cpu"):
         say_compiling(progress)
+    picture = PictureConfig(
+        display=request.display, colour_map=request.colour_map, transparent=request.transparent
+    )
     size = f"{camera.width}x{camera.height}"
     try:
         image = render_picture(
             scene,
             camera,
-            painting.fitted(PictureConfig(display=request.display), shown),
+            painting.fitted(picture, shown),
             backend=request.backend,
             latent_rgb=_latent(scene, request),
             relevancies=painting.columns(shown, request.display, len(scene.gaussians)),

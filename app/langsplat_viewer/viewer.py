@@ -22,7 +22,8 @@ class Surface(Protocol):
         """(3,) world point of the surface at a place in the picture, fractions from the top left corner."""
 
     def capture(self, state: ViewerState) -> Array:
-        """(H, W, 3) uint8, the scene as shown, at full resolution and without panels."""
+        """(H, W, 3) uint8, or (H, W, 4) of a transparent picture: the scene as shown, at full resolution
+        and without panels."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 # imgui_bundle brings its own GLFW library and must be imported first, else the process holds two.
-from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui, immapp  # isort: skip
+from imgui_bundle import ImVec4, hello_imgui, imgui, immapp  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
 import moderngl
@@ -20,7 +20,7 @@ from langsplat_viewer.canvas import Canvas, Renderer
 from langsplat_viewer.frame import Backend, FrameRenderer
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import chosen_camera, latent_level
-from langsplat_viewer.panels import keyboard, layout, menu, navigation
+from langsplat_viewer.panels import keyboard, layout, menu, navigation, over, pictures
 from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.remembered import Remembered
 from langsplat_viewer.viewer import Services, Viewer
@@ -248,14 +248,8 @@ class Window:
             state.say(one_line(error), is_error=True)
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
-        if canvas.texture is not None:
-            imgui.get_background_draw_list().add_image(
-                imgui.ImTextureRef(canvas.texture.glo),
-                ImVec2(area.left, area.top),
-                ImVec2(area.left + area.width, area.top + area.height),
-                ImVec2(0, 1),  # GL's first row is the lowest
-                ImVec2(1, 0),
-            )
+        pictures.draw(viewer, area, canvas.textures)
+        over.draw(viewer, area)
 
     def _stop(self) -> None:
         self._remembered.update()

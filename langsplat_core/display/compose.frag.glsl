@@ -1,11 +1,12 @@
 // From channels to a picture; compose.py beside it is the plain twin of this file and a test compares the
 // two. Channels are premultiplied by alpha, row 0 is the top row. DISPLAY_*, HEAT_FADE, SEGMENT_OPACITY,
-// MAX_QUERIES and TURBO_NODES are defined from there when the source is built.
+// LEAST_ALPHA, MAX_QUERIES and MAP_NODES are defined from there when the source is built.
 
 uniform sampler2D colours;      // rgb, alpha
 uniform sampler2D extra;        // latent colours, alpha; one query per channel (0: none), alpha; or
                                 // sum of weight * camera z, alpha
-uniform sampler2D turbo_table;  // TURBO_NODES x 1
+uniform sampler2D colour_maps;  // MAP_NODES x maps
+uniform int colour_map;         // row of the one in use
 uniform vec3 query_colours[MAX_QUERIES];
 
 uniform int display;            // one of DISPLAY_*
@@ -16,17 +17,18 @@ uniform float dim;
 uniform float threshold;
 uniform float alpha_gate;
 uniform vec3 background;
+uniform bool transparent;       // no background, alpha as a fourth channel, colours not premultiplied
 uniform vec2 depth_range;       // world units
 
 in vec2 uv;
 out vec4 picture;
 
-vec3 turbo(float t) {
-    float position = clamp(t, 0.0, 1.0) * float(TURBO_NODES - 1);
-    int low = min(int(position), TURBO_NODES - 2);
+vec3 mapped(float t) {
+    float position = clamp(t, 0.0, 1.0) * float(MAP_NODES - 1);
+    int low = min(int(position), MAP_NODES - 2);
     // Two fetches, not a filtered lookup: filters round the fraction to 8 bits.
-    return mix(texelFetch(turbo_table, ivec2(low, 0), 0).rgb,
-               texelFetch(turbo_table, ivec2(low + 1, 0), 0).rgb, position - float(low));
+    return mix(texelFetch(colour_maps, ivec2(low, colour_map), 0).rgb,
+               texelFetch(colour_maps, ivec2(low + 1, colour_map), 0).rgb, position - float(low));
 }
 
 vec3 heat_map(vec3 base, vec3 relevancy) {
@@ -40,7 +42,7 @@ vec3 heat_map(vec3 base, vec3 relevancy) {
         total += own;
         mean += own * query_colours[j];
     }
-    vec3 hot = own_colours ? mean / max(total, 1e-9) : turbo(heat);
+    vec3 hot = own_colours ? mean / max(total, 1e-9) : mapped(heat);
     return mix(base * dim, hot, heat_opacity * smoothstep(0.0, own_colours ? 1.0 : HEAT_FADE, heat));
 }
 
@@ -57,19 +59,21 @@ vec3 segments(vec3 base, vec3 relevancy) {
 
 vec3 depth_map(vec2 sums) {
     float t = (sums.r / max(sums.g, 1e-9) - depth_range.x) / max(depth_range.y - depth_range.x, 1e-9);
-    return sums.g > alpha_gate ? turbo(1.0 - clamp(t, 0.0, 1.0)) : background;
+    return sums.g > alpha_gate ? mapped(1.0 - clamp(t, 0.0, 1.0)) : transparent ? vec3(0.0) : background;
 }
 
 void main() {
     vec2 place = vec2(uv.x, 1.0 - uv.y);
     vec4 c = texture(colours, place);
     vec4 sums = texture(extra, place);
-    vec3 uncovered = (1.0 - c.a) * background;
-    vec3 base = clamp(c.rgb + uncovered, 0.0, 1.0);
+    vec3 uncovered = transparent ? vec3(0.0) : (1.0 - c.a) * background;
+    float share = transparent ? max(c.a, LEAST_ALPHA) : 1.0;
+    vec3 base = clamp(c.rgb / share + uncovered, 0.0, 1.0);
+    float opacity = transparent ? c.a : 1.0;
     vec3 relevancy = sums.a > alpha_gate ? sums.rgb / sums.a : vec3(0.0);
     vec3 shown = base;
     if (display == DISPLAY_LATENT)
-        shown = sums.rgb + uncovered;
+        shown = sums.rgb / share + uncovered;
     else if (display == DISPLAY_RELEVANCY)
         shown = heat_map(base, relevancy);
     else if (display == DISPLAY_SEGMENTATION)
@@ -78,5 +82,9 @@ void main() {
         shown = depth_map(sums.rg);
     else if (display == DISPLAY_ALPHA)
         shown = vec3(c.a);
-    picture = vec4(clamp(shown, 0.0, 1.0), 1.0);
+    if (transparent && display == DISPLAY_DEPTH)
+        opacity = sums.g > alpha_gate ? 1.0 : 0.0;
+    else if (display == DISPLAY_ALPHA)
+        opacity = 1.0;
+    picture = vec4(clamp(shown, 0.0, 1.0), opacity);
 }

@@ -13,11 +13,12 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import Display, PictureConfig
-from langsplat_core.display.colour_maps import MAX_QUERIES, QUERY_COLOURS, TURBO, turbo
+from langsplat_core.display.colour_maps import MAX_QUERIES, NODES, QUERY_COLOURS, mapped
 from langsplat_core.display.displays import DISPLAYS, NUMBERS, Extra
 
 HEAT_FADE = 0.35  # heat at which the heat map reaches its full opacity
 SEGMENT_OPACITY = 0.6
+LEAST_ALPHA = 1 / 255  # that colours are divided by; what is less is not seen in a picture of bytes
 
 HeatRanges = tuple[tuple[float, float], ...]  # per query, the relevancies at which heat is 0 and 1
 
@@ -28,8 +29,9 @@ def shader_defines() -> dict[str, int | float]:
     return numbers | {
         "HEAT_FADE": HEAT_FADE,
         "SEGMENT_OPACITY": SEGMENT_OPACITY,
+        "LEAST_ALPHA": LEAST_ALPHA,
         "MAX_QUERIES": MAX_QUERIES,
-        "TURBO_NODES": len(TURBO),
+        "MAP_NODES": NODES,
     }
 
 
@@ -65,11 +67,22 @@ class _Sheet:
 
     def uncovered(self) -> Array:
         """(H, W, 3) what shows of the background."""
+        if self.picture.transparent:
+            return np.zeros_like(self.channels.rgb)
         return (1 - self.channels.alpha)[..., None] * np.asarray(self.picture.background)
 
     def colours(self) -> Array:
         """(H, W, 3) in [0, 1], the scene over the background."""
-        return np.clip(self.channels.rgb + self.uncovered(), 0, 1)
+        return np.clip(self.of_scene(self.channels.rgb) + self.uncovered(), 0, 1)
+
+    def of_scene(self, total: Array) -> Array:
+        """(H, W, 3) premultiplied sums as they enter the picture: where that is transparent its colours are
+        the scene's own, undiluted, as PNG wants them."""
+        return (
+            total / np.maximum(self.channels.alpha, LEAST_ALPHA)[..., None]
+            if self.picture.transparent
+            else total
+        )
 
     def relevancy(self) -> Array:
         """(H, W, Q) in [0, 1]."""
@@ -83,7 +96,8 @@ def gated_mean(total: Array, alpha: Array, gate: float) -> Array:
 
 
 def compose(channels: Channels, picture: PictureConfig, heat_ranges: HeatRanges = ()) -> Array:
-    """(H, W, 3) uint8 picture. Where a display's further channel is absent it shows the plain colours.
+    """(H, W, 3) uint8 picture; with `picture.transparent` (H, W, 4), its colours not premultiplied. Where a
+    display's further channel is absent it shows the plain colours.
 
     heat_ranges: per query, the relevancies at which its heat is 0 and 1; see `full_ranges`.
     """
@@ -91,7 +105,19 @@ def compose(channels: Channels, picture: PictureConfig, heat_ranges: HeatRanges 
     extra = channels.alpha if wanted == "none" else channels.extra(wanted)
     draw = _colours if extra is None else _DRAW[picture.display]
     sheet = _Sheet(channels, channels.alpha if extra is None else extra, picture, heat_ranges)
-    return np.rint(255 * np.clip(draw(sheet), 0, 1)).astype(np.uint8)
+    drawn = draw(sheet)
+    if picture.transparent:
+        drawn = np.concatenate([drawn, _opacity(sheet, draw)[..., None]], -1)
+    return np.rint(255 * np.clip(drawn, 0, 1)).astype(np.uint8)
+
+
+def _opacity(sheet: _Sheet, draw: Callable[[_Sheet], Array]) -> Array:
+    """(H, W) alpha of a transparent picture: the scene's; the display of alpha itself is opaque, and depth
+    is there or not."""
+    alpha = sheet.channels.alpha
+    if draw is _depth:
+        return np.asarray(alpha > sheet.picture.alpha_gate, alpha.dtype)
+    return np.ones_like(alpha) if draw is _alpha else alpha
 
 
 def _colours(sheet: _Sheet) -> Array:
@@ -99,7 +125,7 @@ def _colours(sheet: _Sheet) -> Array:
 
 
 def _latent(sheet: _Sheet) -> Array:
-    return sheet.extra + sheet.uncovered()
+    return sheet.of_scene(sheet.extra) + sheet.uncovered()
 
 
 def _heat(sheet: _Sheet) -> Array:
@@ -114,7 +140,7 @@ def _heat(sheet: _Sheet) -> Array:
         fade, total = heat, np.maximum(heats.sum(-1, keepdims=True), 1e-9)
         colours = heats / total @ QUERY_COLOURS[:count]
     else:
-        fade, colours = np.clip(heat / HEAT_FADE, 0, 1), turbo(heat)
+        fade, colours = np.clip(heat / HEAT_FADE, 0, 1), mapped(heat, picture.colour_map)
     mix = (picture.heat_opacity * fade * fade * (3 - 2 * fade))[..., None]  # smoothstep
     return sheet.colours() * picture.dim * (1 - mix) + colours * mix
 
@@ -135,7 +161,8 @@ def _depth(sheet: _Sheet) -> Array:
     near, far = sheet.channels.depth_range
     depth = gated_mean(sheet.extra[..., None], alpha, gate)[..., 0]
     t = np.clip((depth - near) / max(far - near, 1e-9), 0, 1)
-    return np.where((alpha > gate)[..., None], turbo(1 - t), np.asarray(sheet.picture.background))
+    backdrop = np.zeros(3) if sheet.picture.transparent else np.asarray(sheet.picture.background)
+    return np.where((alpha > gate)[..., None], mapped(1 - t, sheet.picture.colour_map), backdrop)
 
 
 def _alpha(sheet: _Sheet) -> Array:

@@ -66,17 +66,17 @@ def test_the_cut_of_an_answer_is_the_least_relevancy_in_it(asked):
 def test_everything_can_be_compared_with_other_phrases(asked):
     (query,) = asked.state.queries
     before = query.result
-    actions.compare_with(asked, "book, plant")
+    actions.set_canonical(asked, "book, plant")
     settle(asked)
     assert asked.state.canonical == ("book", "plant")
     assert asked.engine.canonical_phrases == ("book", "plant")
     assert np.abs(query.result.relevancy - before.relevancy).max() > 0.01
     assert query.result.probability is None
-    actions.compare_with(asked, "sofa")  # never taught: all stays as it was
+    actions.set_canonical(asked, "sofa")  # never taught: all stays as it was
     settle(asked)
     assert "sofa" in errors(asked)[-1]
     assert asked.state.canonical == ("book", "plant")
-    actions.compare_with(asked, "")
+    actions.set_canonical(asked, "")
     settle(asked)
     assert asked.state.canonical == ()
     assert asked.engine.canonical_phrases == CANONICAL_PHRASES
@@ -89,7 +89,7 @@ def test_a_set_of_queries_is_asked_again(asked, tmp_path):
     settle(asked)
     actions.hide(asked, asked.state.queries[1])
     actions.set_level(asked, "whole")
-    actions.compare_with(asked, "book")
+    actions.set_canonical(asked, "book")
     settle(asked)
     path = actions.save_queries(asked, tmp_path)
     assert path.name == "blobs-001.queries.json"
@@ -122,7 +122,7 @@ def test_nothing_to_save_and_nothing_to_ask_of(viewer, opened, tmp_path):
     write_queries(tmp_path / "a.queries.json", QuerySet((SavedQuery("mug"),)))
     actions.load_queries(opened, tmp_path / "a.queries.json")
     assert "searched" in errors(opened)[-1]
-    actions.compare_with(opened, "book")
+    actions.set_canonical(opened, "book")
     assert "language field" in errors(opened)[-1]
     assert opened.state.queries == []
 

@@ -110,6 +110,25 @@ def test_every_display_is_another_picture(viewer, folder):
         seen.append(image)
 
 
+def test_a_transparent_picture_in_another_colour_map(viewer, folder):
+    for out, more in (("a.png", ()), ("b.png", ("--colour-map", "cividis", "--transparent"))):
+        code, _, errors = viewer("blobs.ply", "--display", "depth", "--headless", "--out", out, *more)
+        assert (code, errors) == (0, [])
+    plain, clear = picture(folder / "a.png"), picture(folder / "b.png")
+    assert (plain.shape[2], clear.shape[2]) == (3, 4)
+    inside = clear[..., 3] == 255
+    assert 0.01 < inside.mean() < 0.9
+    assert (clear[~inside] == 0).all()
+    assert np.abs(clear[..., :3][inside] - plain[inside]).max() > 60
+
+
+@pytest.mark.parametrize("option", [("--transparent",), ("--colour-map", "grey")])
+def test_options_of_pictures_say_where_the_window_has_them(viewer, folder, option):
+    code, _, errors = viewer("blobs.ply", *option)
+    assert code == 2
+    assert "panel Display" in errors[0]
+
+
 def test_a_size_holds_the_whole_photograph(viewer, folder):
     viewer("blobs.ply", "--headless", "--out", "a.png")
     viewer("blobs.ply", "--headless", "--out", "b.png", "--size", "400x120")

@@ -10,6 +10,7 @@ import pytest
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
+from langsplat_core.display.colour_maps import COLOUR_MAPS
 from langsplat_core.display.compose import Channels, compose
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.raster.reference import ReferenceRasterizer
@@ -66,7 +67,7 @@ def test_the_shader_composes_as_numpy_does(gl, monkeypatch, display, queries):
     fields = {"latent": ("latent",), "relevancies": ("relevancies",), "depth": ("depth_sum",)}.get(extra, ())
     others = {"latent", "relevancies", "depth_sum"} - set(fields)
     shown = replace(channels, **dict.fromkeys(others))
-    monkeypatch.setattr(ArrayChannels, "render", lambda *_: shown)
+    monkeypatch.setattr(ArrayChannels, "render_all", lambda *_: [shown])
     monkeypatch.setattr("langsplat_viewer.frame.depth_range", lambda *_: channels.depth_range)
     renderer = FrameRenderer(gl, "cpu")
     renderer.set_scene(SCENE)
@@ -75,6 +76,35 @@ def test_the_shader_composes_as_numpy_does(gl, monkeypatch, display, queries):
     for ranges in ((), ((0.5, 0.9),), ((0.5, 0.9), (0.4, 0.52), (0.0, 0.7))[:queries]):
         got = renderer.read(CAMERA.resized(50, 40), picture, ranges)
         assert largest_difference(got, compose(shown, picture, ranges)) <= 1
+    renderer.release()
+
+
+@pytest.mark.parametrize("colour_map", COLOUR_MAPS)
+@pytest.mark.parametrize("display", ["relevancy", "depth"])
+def test_the_shader_maps_colours_as_numpy_does(gl, monkeypatch, display, colour_map):
+    check_composition(gl, monkeypatch, replace(PICTURE, display=display, colour_map=colour_map))
+
+
+@pytest.mark.parametrize("display", DISPLAYS)
+def test_the_shader_is_transparent_where_numpy_is(gl, monkeypatch, display):
+    check_composition(gl, monkeypatch, replace(PICTURE, display=display, transparent=True))
+
+
+def check_composition(gl, monkeypatch, picture: PictureConfig) -> None:
+    """One query; the channels as numbers, whatever the rasterizer."""
+    channels = random_channels(5, 1)
+    extra = DISPLAYS[picture.display].extra
+    field = {"latent": "latent", "relevancies": "relevancies", "depth": "depth_sum"}.get(extra, "")
+    shown = replace(channels, **dict.fromkeys({"latent", "relevancies", "depth_sum"} - {field}))
+    monkeypatch.setattr(ArrayChannels, "render_all", lambda *_: [shown])
+    monkeypatch.setattr("langsplat_viewer.frame.depth_range", lambda *_: channels.depth_range)
+    renderer = FrameRenderer(gl, "cpu")
+    renderer.set_scene(SCENE)
+    renderer.set_layers(LATENT, random_values(COUNT, 1))
+    got = renderer.read(CAMERA.resized(50, 40), picture, ((0.5, 0.9),))
+    expected = compose(shown, picture, ((0.5, 0.9),))
+    assert got.shape == expected.shape == (40, 50, 4 if picture.transparent else 3)
+    assert largest_difference(got, expected) <= 1
     renderer.release()
 
 

@@ -46,6 +46,8 @@ def folder(tmp_path: Path) -> Path:
         "type_while_opening",
         "look_at_nothing",
         "close_while_opening",
+        "split_the_view",
+        "draw_over_the_scene",
     ],
 )
 def test_window(scenario: str, display: str, folder: Path):
@@ -93,12 +95,15 @@ class FakeRenderer:
     def set_layers(self, latent_rgb, relevancies) -> None:
         self.calls.append(("layers", latent_rgb is not None))
 
-    def draw(self, target, camera, picture, heat_ranges=()) -> None:
+    def prepare(self, camera, pictures) -> None:
+        self.calls.append(("prepare", [picture.display for picture, _ in pictures]))
+
+    def draw(self, target, camera, picture, heat_ranges=(), layers=None) -> None:
         self.calls.append(("draw", (camera.width, camera.height)))
         self.now += self.seconds
         target.clear(1.0, 0.0, 0.0, 1.0)
 
-    def read(self, camera, picture, heat_ranges=()):
+    def read(self, camera, picture, heat_ranges=(), layers=None):
         return np.zeros((camera.height, camera.width, 3), np.uint8)
 
     def shows_nothing(self) -> bool:
@@ -139,7 +144,7 @@ def test_canvas_draws_only_changes(gl, state):
     state.latent, state.picture = np.zeros((3, 360, 3), np.float32), replace(state.picture, display="latent")
     canvas.update(state, 7.0)
     assert renderer.calls == [("layers", True), ("draw", (200, 120))]
-    assert np.frombuffer(canvas.texture.read(), np.uint8)[:4].tolist() == [255, 0, 0, 255]
+    assert np.frombuffer(canvas.textures[0].read(), np.uint8)[:4].tolist() == [255, 0, 0, 255]
 
 
 @pytest.mark.parametrize(("fine_ms", "coarse"), [(10, (200, 120)), (150, (100, 60)), (5000, (50, 30))])
@@ -173,8 +178,8 @@ def test_canvas_keeps_few_textures(gl, state):
     for width in range(20, 40):
         state.size = (width, 20)
         canvas.update(state, 0.0)
-        assert canvas.texture.size == (width, 20)
-        seen.append(canvas.texture)
+        assert canvas.textures[0].size == (width, 20)
+        seen.append(canvas.textures[0])
     kept = [texture for texture in seen if not isinstance(texture.mglo, moderngl.InvalidObject)]
     assert len(kept) <= 3
 

@@ -33,7 +33,7 @@ def type_canonical(viewer: Viewer, text: str) -> None:
     viewer.state.canonical_typed = text
 
 
-def compare_with(viewer: Viewer, text: str) -> None:
+def set_canonical(viewer: Viewer, text: str) -> None:
     """Compare everything with other canonical phrases, between commas; "" for the scene's own again."""
     phrases = tuple(split_phrases(text))
     engine, state = viewer.engine, viewer.state
@@ -82,7 +82,7 @@ def load_queries(viewer: Viewer, path: Path) -> None:
         state.say(f"{path.name}: open a scene that can be searched first", is_error=True)
         return
     if wanted.canonical != state.canonical:
-        compare_with(viewer, ", ".join(wanted.canonical))
+        set_canonical(viewer, ", ".join(wanted.canonical))
     set_level(viewer, wanted.level)
     for query in wanted.queries:
         ask_one(viewer, query.phrase, cut=query.cut, then_show=query.shown)

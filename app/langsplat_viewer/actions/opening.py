@@ -18,6 +18,7 @@ from langsplat_viewer.actions.history import forget
 from langsplat_viewer.controls import Extent, extent_of
 from langsplat_viewer.looking import why_undrawable
 from langsplat_viewer.preferences import with_recent
+from langsplat_viewer.seeing import Ruler
 from langsplat_viewer.viewer import Viewer
 
 
@@ -76,6 +77,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state.queries, state.selected, state.glide = [], None, None
     state.canonical, state.canonical_typed = (), ""
     state.camera_index = 0 if scene.cameras else None
+    state.seeing = replace(state.seeing, ruler=Ruler())
     forget(viewer)
     state.preferences = with_recent(state.preferences, path.absolute())
     state.opening_camera = None

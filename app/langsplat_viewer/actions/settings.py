@@ -6,6 +6,7 @@ from langsplat_core.config import Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
 from langsplat_viewer.actions.history import remember
+from langsplat_viewer.actions.seeing import measure
 from langsplat_viewer.preferences import SCALES, Theme
 from langsplat_viewer.viewer import Viewer
 
@@ -106,5 +107,6 @@ def escape(viewer: Viewer) -> None:
     """Close what lies over the scene, and let letters be keys again."""
     show_help(viewer, False)
     show_palette(viewer, False)
+    measure(viewer, False)
     viewer.state.browser = None
     mute_letters(viewer, False)

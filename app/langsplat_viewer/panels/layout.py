@@ -8,10 +8,12 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 from langsplat_viewer import actions
 from langsplat_viewer.panels import (
     browser,
+    cube,
     help,
     legend,
     messages,
     palette,
+    pictures,
     pointing,
     scene,
     search,
@@ -43,6 +45,7 @@ PANELS: tuple[Panel, ...] = (
     Panel("Camera", MIDDLE, view.draw_camera),
     Panel("Train", LEFT, train.draw, is_open=False),
     Panel("Messages", FOOT, messages.draw),
+    Panel("Overlays", MIDDLE, view.draw_overlays, is_open=False),
 )
 
 
@@ -111,6 +114,8 @@ def draw_over(viewer: Viewer) -> None:
     else:
         legend.draw(viewer, area)
         pointing.draw(viewer)
+    pictures.draw_grip(viewer, area)
+    cube.draw(viewer, area)
     browser.draw(viewer)
     help.draw(viewer)
     palette.draw(viewer)

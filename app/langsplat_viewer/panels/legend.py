@@ -6,9 +6,10 @@ import numpy as np
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
-from langsplat_core.display.colour_maps import QUERY_COLOURS, turbo
+from langsplat_core.config import ColourMap
+from langsplat_core.display.colour_maps import QUERY_COLOURS, mapped
 from langsplat_core.query.answers import QueryResult
-from langsplat_viewer import painting
+from langsplat_viewer import painting, splitting
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.panels.style import elided
 from langsplat_viewer.viewer import Viewer
@@ -30,7 +31,8 @@ def draw(viewer: Viewer, area: Area) -> None:
     state = viewer.state
     shown = state.shown_results()
     slots = painting.painted(shown)
-    if state.scene is None or state.picture.display != "relevancy" or not slots:
+    heats = any(one.picture.display == "relevancy" for one in splitting.pictures(state))
+    if state.scene is None or not heats or not slots:
         return
     corner = ImVec2(
         area.left + area.width - hello_imgui.em_size(0.7), area.top + area.height - hello_imgui.em_size(0.7)
@@ -41,7 +43,8 @@ def draw(viewer: Viewer, area: Area) -> None:
     for slot in slots:
         result = shown[slot]
         if result is not None:
-            _bar(result, bar_colours(slot, painting.STRENGTH[result.verdict], alone=len(slots) == 1))
+            strength = painting.STRENGTH[result.verdict]
+            _bar(result, bar_colours(slot, strength, len(slots) == 1, state.picture.colour_map))
     imgui.end()
 
 
@@ -58,12 +61,12 @@ def say(text: str, area: Area) -> None:
     imgui.end()
 
 
-def bar_colours(slot: int, strength: float, alone: bool) -> Array:
+def bar_colours(slot: int, strength: float, alone: bool, colour_map: ColourMap = "turbo") -> Array:
     """(STEPS, 3) colours of a bar from its coldest to its hottest end, as the picture has them: the colour
     map for a query that is painted alone, else black to its own colour; what is half as strong ends there."""
     heat = np.linspace(0, strength, STEPS)
     if alone:
-        return turbo(heat)
+        return mapped(heat, colour_map)
     return (heat * heat * (3 - 2 * heat))[:, None] * QUERY_COLOURS[slot]
 
 

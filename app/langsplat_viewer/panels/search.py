@@ -46,9 +46,9 @@ def _canonical(viewer: Viewer) -> None:
     entered, typed = imgui.input_text_with_hint("##canonical", hint, state.canonical_typed, flags)
     actions.type_canonical(viewer, typed)
     if entered:
-        actions.compare_with(viewer, typed)
+        actions.set_canonical(viewer, typed)
     if state.canonical and imgui.button("The scene's own"):
-        actions.compare_with(viewer, "")
+        actions.set_canonical(viewer, "")
 
 
 def _level(viewer: Viewer) -> None:

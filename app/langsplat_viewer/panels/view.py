@@ -5,18 +5,25 @@ from itertools import groupby
 
 from imgui_bundle import hello_imgui, imgui
 
+from langsplat_core.display.colour_maps import COLOUR_MAPS
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
-from langsplat_viewer import actions
-from langsplat_viewer.commands import Button, buttons_of
+from langsplat_core.scene import LEVELS
+from langsplat_viewer import actions, splitting
+from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of
 from langsplat_viewer.controls import FOV_RANGE, adopt_up, level, with_fov
+from langsplat_viewer.overlays import length_text
 from langsplat_viewer.panels.style import muted, small_wrapped
+from langsplat_viewer.seeing import MOST_DEGREE, SIZE_RANGE, Splats
 from langsplat_viewer.viewer import Viewer
+
+BACKDROPS = {"Black": 0.0, "Grey": 0.5, "White": 1.0}
 
 
 def draw_display(viewer: Viewer) -> None:
     """Which channel, and how strong the heat."""
     for _, group in groupby(DISPLAYS.values(), lambda row: (row.needs_field, row.needs_query)):
         _display_line(viewer, tuple(group))
+    _compared(viewer)
     picture = viewer.state.picture
     needs_query = DISPLAYS[picture.display].needs_query
     if needs_query and not viewer.state.shown():
@@ -24,8 +31,58 @@ def draw_display(viewer: Viewer) -> None:
     if picture.display == "relevancy":
         picture = replace(picture, heat_opacity=_slider("Heat opacity", picture.heat_opacity, 0.0, 1.0))
     if needs_query:
-        picture = replace(picture, dim=_slider("Background", picture.dim, 0.0, 1.0))
-    actions.set_picture(viewer, picture)
+        picture = replace(picture, dim=_slider("Rest dimmed to", picture.dim, 0.0, 1.0))
+    _colour_map(viewer)
+    picture = replace(picture, colour_map=viewer.state.picture.colour_map)
+    actions.set_picture(viewer, replace(picture, background=_backdrop(picture.background)))
+    _tip("What shows where the scene is not")
+    transparent = viewer.state.seeing.transparent
+    changed, transparent = imgui.checkbox("Save without backdrop", transparent)
+    if changed:
+        actions.save_transparent(viewer, transparent)
+    _tip("Pictures are saved transparent where the scene is not")
+    _splats(viewer)
+
+
+def _splats(viewer: Viewer) -> None:
+    """How the Gaussians are drawn."""
+    scene, splats = viewer.state.scene, viewer.state.seeing.splats
+    size = _slider("Splat size", splats.size, *SIZE_RANGE)
+    _tip("Smaller, every Gaussian can be seen; answers and files do not change")
+    degree, most = splats.sh_degree, MOST_DEGREE if scene is None else scene.gaussians.sh_degree
+    if most > 0:
+        imgui.set_next_item_width(hello_imgui.em_size(11))
+        flags = imgui.SliderFlags_.always_clamp
+        changed, chosen = imgui.slider_int("SH degree", min(degree, most), 0, most, "%d", flags)
+        degree = (MOST_DEGREE if chosen == most else chosen) if changed else degree
+        _tip("Up to which degree colours change with the direction that they are seen from")
+    actions.set_splats(viewer, Splats(size, degree))
+
+
+def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Three to choose from, and one's own."""
+    for place, (name, grey) in enumerate(BACKDROPS.items()):
+        if place:
+            imgui.same_line()
+        if imgui.radio_button(name, background == (grey,) * 3):
+            return (grey,) * 3
+    imgui.same_line()
+    flags = imgui.ColorEditFlags_.no_inputs | imgui.ColorEditFlags_.uint8
+    changed, colour = imgui.color_edit3("Backdrop", list(background), flags)
+    red, green, blue = (min(max(float(part), 0.0), 1.0) for part in colour)
+    return (red, green, blue) if changed else background
+
+
+def _colour_map(viewer: Viewer) -> None:
+    """Where something is shown by it."""
+    shown = {DISPLAYS[one.picture.display].name for one in splitting.pictures(viewer.state)}
+    if not shown & {"relevancy", "depth"}:
+        return
+    names = list(COLOUR_MAPS)
+    imgui.set_next_item_width(hello_imgui.em_size(11))
+    changed, chosen = imgui.combo("Colour map", names.index(viewer.state.picture.colour_map), list(names))
+    if changed:
+        actions.set_colour_map(viewer, names[chosen])
 
 
 def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
@@ -49,6 +106,60 @@ def _display_button(viewer: Viewer, button: Button) -> None:
     if imgui.radio_button(button.label, chosen):
         actions.set_display(viewer, button.display, button.latent_level)
     imgui.end_disabled()
+
+
+def _compared(viewer: Viewer) -> None:
+    """What is shown beside it."""
+    state, split = viewer.state, viewer.state.seeing.split
+    second = Button("", split.second, split.second_level if split.second == "latent" else None)
+    shown = {"off": "nothing", "levels": "three levels", "wipe": compared_name(second)}[split.mode]
+    imgui.set_next_item_width(hello_imgui.em_size(11))
+    if not imgui.begin_combo("Beside it", shown):
+        return
+    if imgui.selectable("nothing", split.mode == "off")[0]:
+        actions.show_one(viewer)
+    without_field = state.scene is not None and state.scene.language is None
+    for button in BUTTONS:
+        imgui.begin_disabled(without_field and DISPLAYS[button.display].needs_field)
+        if imgui.selectable(compared_name(button), shown == compared_name(button))[0]:
+            actions.compare_with(viewer, button.display, button.latent_level)
+        imgui.end_disabled()
+    imgui.begin_disabled(without_field)
+    if imgui.selectable("three levels", split.mode == "levels")[0] and split.mode != "levels":
+        actions.toggle_levels(viewer)
+    imgui.end_disabled()
+    imgui.end_combo()
+
+
+def compared_name(button: Button) -> str:
+    """What a display is called in the list of those that can be beside another."""
+    row = DISPLAYS[button.display]
+    return row.label if button.latent_level is None else f"{row.label}, {LEVELS[button.latent_level]}"
+
+
+def draw_overlays(viewer: Viewer) -> None:
+    """What lies over the scene, and the ruler."""
+    state = viewer.state
+    for name, title in OVERLAY_TITLES.items():
+        changed, shown = imgui.checkbox(title.capitalize(), name in state.preferences.overlays)
+        if changed:
+            actions.show_overlay(viewer, name, shown)
+    ruler, scene = state.seeing.ruler, state.scene
+    imgui.begin_disabled(scene is None)
+    changed, measures = imgui.checkbox("Measure (M)", ruler.measures)
+    if changed:
+        actions.measure(viewer, measures)
+    _tip("Click two points on the surface; Esc ends it")
+    imgui.end_disabled()
+    if ruler.measures:
+        words = ("click a first point", "click a second point")
+        length = ruler.length
+        text = words[len(ruler.points) % 2] if length is None or scene is None else ""
+        if length is not None and scene is not None:
+            text = length_text(length, scene.metres_per_unit)
+        small_wrapped(text, muted())
+        if scene is not None and scene.metres_per_unit is None:
+            small_wrapped("the scene has no scale in metres; langsplat scale gives it one", muted())
 
 
 def draw_camera(viewer: Viewer) -> None:

@@ -1,0 +1,143 @@
+"""What lies over the picture as lines: where they are in the world, and where on screen. Plain maths in
+float64, no window."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.scene import Camera
+from langsplat_viewer.controls import Extent
+from langsplat_viewer.framing import Sample
+
+LEAST_DEPTH = 1e-3  # of the scene's radius: lines end this far in front of the eye
+FRUSTUM_DEPTH = 0.12  # of the scene's radius: how deep a camera is drawn
+GROUND_SHARE = 0.02  # of the scene's weight that lies below the ground
+GRID_LINES = 10  # about as many across the scene
+GRID_REACH = 1.2  # of the scene's radius, from its middle to the edge of the grid
+FRUSTUM_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))  # of eye and corners
+
+
+def clip_segments(camera: Camera, segments: Array, least_depth: float) -> tuple[Array, Array]:
+    """(M, 2, 3) segments between world points -> (K, 2, 2) their visible parts in pixels of `camera`, and the
+    (K,) rows they come from, in rising order.
+
+    A segment is cut where its camera z is `least_depth` (world units, > 0) and at the four planes through the
+    eye and the picture's borders. All are linear in camera space, so that nothing is divided before the cut
+    and no coordinate on screen is beyond the picture.
+    """
+    points = segments.astype(np.float64) @ camera.rotation.T + camera.world_to_camera[:3, 3]
+    start, step = points[:, 0], points[:, 1] - points[:, 0]
+    planes = np.array(
+        [
+            [camera.fx, 0, camera.cx],
+            [-camera.fx, 0, camera.width - camera.cx],
+            [0, camera.fy, camera.cy],
+            [0, -camera.fy, camera.height - camera.cy],
+            [0, 0, 1],
+        ]
+    )
+    offsets = np.array([0, 0, 0, 0, -least_depth])
+    inside, slope = start @ planes.T + offsets, step @ planes.T  # >= 0 is inside
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = -inside / slope
+    enters = np.where(slope > 0, crossing, np.where((slope == 0) & (inside < 0), np.inf, 0)).max(1)
+    leaves = np.where(slope < 0, crossing, 1).min(1)
+    enters, leaves = np.maximum(enters, 0), np.minimum(leaves, 1)
+    rows = np.flatnonzero(enters <= leaves)
+    ends = start[rows, None] + np.stack([enters[rows], leaves[rows]], 1)[..., None] * step[rows, None]
+    depth = np.maximum(ends[..., 2:], least_depth)  # rounding must not take an end behind the plane
+    return ends[..., :2] / depth * (camera.fx, camera.fy) + (camera.cx, camera.cy), rows
+
+
+def frusta(cameras: Sequence[Camera], depth: float) -> Array:
+    """(C, 8, 2, 3) edges of the pyramids from each camera's eye to its picture at `depth` world units, the
+    four from the eye first."""
+    made = np.zeros((len(cameras), 5, 3))
+    for row, camera in zip(made, cameras, strict=True):
+        w, h = camera.width, camera.height
+        row[0] = camera.position
+        row[1:] = [camera.unproject(corner, depth) for corner in ((0, 0), (w, 0), (w, h), (0, h))]
+    edges: Array = made[:, np.array(FRUSTUM_EDGES)]
+    return edges
+
+
+def nearest_segment(segments: Array, point: tuple[float, float]) -> tuple[int, float]:
+    """Of (K, 2, 2) segments on screen the row nearest to a point, and its distance in pixels; (-1, inf)
+    without any."""
+    if not len(segments):
+        return -1, math.inf
+    start, step = segments[:, 0], segments[:, 1] - segments[:, 0]
+    length = np.maximum((step**2).sum(1), 1e-12)
+    along = np.clip(((np.asarray(point) - start) * step).sum(1) / length, 0, 1)
+    distances = np.linalg.norm(start + along[:, None] * step - point, axis=1)
+    row = int(distances.argmin())
+    return row, float(distances[row])
+
+
+def frame_of(up: Array) -> Array:
+    """(3, 3) rows right, up and front of a world whose up is `up` (3,) unit: right is the world axis that is
+    most level, made level; front is towards who looks at it with right on the right."""
+    axis = np.eye(3)[int(np.argmin(np.abs(up)))]
+    right = axis - (axis @ up) * up
+    right /= np.linalg.norm(right)
+    return np.stack([right, up, np.cross(right, up)])
+
+
+def round_length(length: float) -> float:
+    """The nearest of 1, 2 and 5 times a power of ten; `length` > 0."""
+    power = 10.0 ** math.floor(math.log10(length))
+    return min((factor * power for factor in (1, 2, 5, 10)), key=lambda value: abs(math.log(value / length)))
+
+
+def length_text(units: float, metres_per_unit: float | None) -> str:
+    """A length in world units, and in metres where the scene has a scale."""
+    text = f"{units:.4g} units"
+    return text if metres_per_unit is None else f"{units * metres_per_unit:.4g} m ({text})"
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Lines on the ground."""
+
+    segments: Array  # (M, 2, 3) world units
+    spacing: float  # world units
+    marks: tuple[tuple[str, Array], ...]  # what a line is called, and where that is written (3,)
+
+
+def ground_grid(extent: Extent, up: Array, metres_per_unit: float | None) -> Grid:
+    """A level grid below almost all of the scene. Its lines are round lengths apart and at round distances
+    from the world's origin: in metres where the scene has a scale, else in world units."""
+    scale = metres_per_unit or 1.0
+    frame = frame_of(up)
+    spacing = round_length(2 * GRID_REACH * extent.radius / GRID_LINES * scale) / scale
+    right, height, front = frame @ extent.centre
+    height = _lowest(extent.sample, up, height - extent.radius)
+    reach = GRID_REACH * extent.radius
+    across, ahead = (_multiples(middle - reach, middle + reach, spacing) for middle in (right, front))
+
+    def point(x: float, z: float) -> Array:
+        return np.array([x, height, z]) @ frame
+
+    lines = [(point(x, ahead[0]), point(x, ahead[-1])) for x in across]
+    lines += [(point(across[0], z), point(across[-1], z)) for z in ahead]
+    marks = [(f"{x * scale:.4g}", point(x, ahead[0])) for x in across[1:]]
+    marks += [(f"{z * scale:.4g}", point(across[0], z)) for z in ahead[1:]]
+    return Grid(np.array(lines), spacing, tuple(marks))
+
+
+def _multiples(low: float, high: float, spacing: float) -> Array:
+    """The multiples of `spacing` that hold [low, high] between them."""
+    return spacing * np.arange(math.floor(low / spacing), math.ceil(high / spacing) + 1)
+
+
+def _lowest(sample: Sample, up: Array, otherwise: float) -> float:
+    """Height along `up` below which `GROUND_SHARE` of the scene's weight lies."""
+    if not len(sample.points):
+        return otherwise
+    heights = sample.points @ up
+    order = np.argsort(heights)
+    shares = np.cumsum(sample.weights[order])
+    return float(heights[order][np.searchsorted(shares, GROUND_SHARE * shares[-1])])

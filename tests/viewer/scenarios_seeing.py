@@ -1,0 +1,135 @@
+"""Scenarios of `window_driver` about seeing: several pictures, what is drawn over them, measuring."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from imgui_bundle import imgui  # isort: skip
+from langsplat_viewer.panels.area import scene_area
+from langsplat_viewer.panels.cube import EDGE
+from langsplat_viewer.view_cube import visible_faces
+from tests.support.fakes import CENTRES
+
+MUG, BOOK, PLANT = CENTRES
+
+
+def begin(s: Any) -> None:
+    s.wait(lambda: s.state.scene is not None)
+    s.settle()
+
+
+def split_the_view(s: Any) -> None:
+    """The line is dragged without the camera; nothing is drawn for it, and nothing at rest."""
+    begin(s)
+    rgb = s.shot("rgb")
+    s.ctx.key_press(imgui.Key.v)
+    s.settle()
+    assert s.state.seeing.split.mode == "wipe"
+    both, area, before = s.shot("both"), scene_area(), s.state.view
+    np.testing.assert_allclose(s.at(both, MUG), s.at(rgb, MUG), atol=2)
+    assert np.abs(s.at(both, PLANT) - s.at(rgb, PLANT)).max() > 40  # depth
+
+    middle, y = area.left + area.width / 2, area.top + 0.8 * area.height
+    drawn = s.renderer.count
+    s.drag((middle, y), (area.left + 0.9 * area.width, y))
+    s.settle()
+    assert abs(s.state.seeing.split.at - 0.9) < 0.02
+    assert s.state.view is before
+    assert s.renderer.count == drawn
+    np.testing.assert_allclose(s.at(s.shot("wiped"), PLANT), s.at(rgb, PLANT), atol=2)
+
+    s.drag((middle, y), (middle + 40, y))  # beside the line the camera turns as ever
+    s.settle()
+    assert s.state.view is not before
+    s.menu("View", "Three levels side by side")
+    s.settle()
+    levels = s.shot("levels")
+    assert s.renderer.count > drawn
+    thirds = [levels[250:400, int(area.left + (i + 0.5) * area.width / 3)] for i in range(3)]
+    assert np.abs(thirds[0] - thirds[2]).max() > 30
+    drawn = s.renderer.count
+    s.ctx.yield_(20)
+    assert s.renderer.count == drawn
+
+
+def on_screen(s: Any, point: np.ndarray) -> tuple[float, float]:
+    """Where a world point is in the window."""
+    area = scene_area()
+    pixels, _ = s.state.view.camera(*s.state.size).project(point[None])
+    return float(pixels[0, 0] + area.left), float(pixels[0, 1] + area.top)
+
+
+def click(s: Any, place: tuple[float, float]) -> None:
+    s.ctx.mouse_teleport_to_pos(place)
+    s.ctx.yield_(2)
+    s.ctx.mouse_click(0)
+    s.ctx.yield_(2)
+
+
+def draw_over_the_scene(s: Any) -> None:
+    """The cube turns the view, a click on a camera stands there, two clicks measure."""
+    begin(s)
+    s.menu("View", "Show or hide the view cube")
+    s.menu("View", "Show or hide the training cameras")
+    s.settle()
+    area = scene_area()
+    before = s.state.view
+    side = s.ctx.item_info("//view cube/cube").rect_full
+    assert side.max.x <= area.left + area.width + 1
+    name, place = next(face for face in faces_on_screen(s, side) if face[0] == "front")
+    click(s, place)
+    s.settle()
+    assert s.state.view is not before
+    assert [face[0] for face in faces_on_screen(s, side)] == [name]
+
+    for _ in range(8):  # until all cameras are in the picture
+        s.ctx.mouse_teleport_to_pos((area.left + area.width / 2, area.top + area.height / 2))
+        s.ctx.mouse_wheel_y(-1)
+        s.ctx.yield_(2)
+    s.settle()
+    camera = s.state.scene.cameras[2]
+    seen = s.shot("cameras")
+    s.menu("View", "Show or hide the training cameras")
+    s.settle()
+    assert np.abs(seen - s.shot("none"))[:, int(area.left) :].max() > 60
+    s.menu("View", "Show or hide the training cameras")
+    click(s, on_screen(s, camera.position))
+    s.settle()
+    assert s.state.camera_index == 2
+    got = s.state.view.camera(160, 120).world_to_camera
+    np.testing.assert_allclose(got, camera.world_to_camera, atol=1e-9)
+
+    s.ctx.key_press(imgui.Key.m)
+    s.ctx.yield_(2)
+    turned = s.state.view
+    for thing in (MUG, BOOK):
+        click(s, on_screen(s, thing))
+    assert s.state.view is turned
+    assert abs(s.state.seeing.ruler.length - np.linalg.norm(MUG - BOOK)) < 0.2
+    s.shot("ruler")
+    drawn = s.renderer.count
+    s.ctx.yield_(20)
+    assert s.renderer.count == drawn
+    s.ctx.key_press(imgui.Key.escape)
+    s.ctx.yield_(2)
+    assert not s.state.seeing.ruler.measures
+
+
+def faces_on_screen(s: Any, side: Any) -> list[tuple[str, tuple[float, float]]]:
+    """Name and middle of each face of the cube that is seen, in the window."""
+    middle, scale = (
+        ((side.min.x + side.max.x) / 2, (side.min.y + side.max.y) / 2),
+        EDGE * (side.max.x - side.min.x),
+    )
+    return [
+        (face.name, (middle[0] + scale * face.centre[0], middle[1] + scale * face.centre[1]))
+        for face in visible_faces(s.state.view)
+    ]
+
+
+Scenario = tuple[Callable[[Any], None], str, dict[str, Any]]
+SCENARIOS: dict[str, Scenario] = {
+    "split_the_view": (split_the_view, "blobs.ply", {}),
+    "draw_over_the_scene": (draw_over_the_scene, "blobs.ply", {}),
+}
