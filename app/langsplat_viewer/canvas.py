@@ -17,11 +17,13 @@ from langsplat_core.display.compose import HeatRanges
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.controls import OrbitCamera
 from langsplat_viewer.looking import why_nothing, why_undrawable
+from langsplat_viewer.marked_scene import MarkedScene, marked_scene
 from langsplat_viewer.state import FrameStats, ViewerState
 
 SCALES = (1.0, 0.5, 0.25)
 MOVING_BUDGET = 80.0  # milliseconds per picture that still feel like motion
 REST_SECONDS = 0.15  # without a move, after which the fine picture is drawn
+NOTHING_LEFT = "all of the scene is hidden or deleted: U shows what is hidden, Ctrl+Z undoes"
 
 
 class Renderer(Protocol):
@@ -53,6 +55,9 @@ class Renderer(Protocol):
     def depth_at(self, x_px: float, y_px: float) -> float | None:
         """Camera z of the surface at a pixel of the last picture, world units."""
 
+    def depth_map(self) -> Array | None:
+        """(H, W) the same at every pixel, 0 where there is none; None before the first picture."""
+
 
 class Canvas:
     """Keeps a texture up to date with a `ViewerState`."""
@@ -66,7 +71,8 @@ class Canvas:
         self._clock = clock
         self._targets: dict[tuple[int, int], moderngl.Framebuffer] = {}  # by size, the latest used last
         self._textures: dict[tuple[int, int], moderngl.Texture] = {}
-        self._scene: Scene | None = None
+        self._scene: Scene | None = None  # that the renderer has
+        self._marked: MarkedScene | None = None  # whose it is
         self._layers: tuple[object, ...] | None = None
         self._drawn: tuple[object, ...] | None = None  # what the texture shows
         self._view: OrbitCamera | None = None
@@ -100,10 +106,16 @@ class Canvas:
         if self._unsure and not moving and self._camera is not None:
             self._unsure = False  # asked at rest only: it reads the picture back
             if self._renderer.shows_nothing():
-                reason = why_nothing(state.scene.gaussians, self._camera)
-                elsewhere = not why_undrawable(state.scene.gaussians)  # another view would show something
-                state.nothing = f"{reason}: press R for the opening view" if elsewhere else reason
+                state.nothing = self._why_nothing(state.scene, self._camera)
         return moving
+
+    def _why_nothing(self, source: Scene, camera: Camera) -> str:
+        gaussians = source.gaussians if self._scene is None else self._scene.gaussians
+        if len(source.gaussians) and not len(gaussians):
+            return NOTHING_LEFT
+        reason = why_nothing(gaussians, camera)
+        elsewhere = not why_undrawable(gaussians)  # another view would show something
+        return f"{reason}: press R for the opening view" if elsewhere else reason
 
     def _scale(self) -> float:
         """The largest scale at which a picture is expected within the budget."""
@@ -113,13 +125,15 @@ class Canvas:
     def _sync(self, state: ViewerState) -> None:
         """Hand the scene and the layers to the renderer if they are not the ones it has."""
         assert state.scene is not None
-        if state.scene is not self._scene:
-            self._scene = state.scene
-            self._renderer.set_scene(state.scene)
+        marked = self._marked = marked_scene(state.scene, state.selection.marks, self._marked)
+        if marked.scene is not self._scene:
+            self._scene = marked.scene
+            self._renderer.set_scene(marked.scene)
             self._layers = None
         if state.layers_key() != self._layers:
             self._layers = state.layers_key()
-            self._renderer.set_layers(state.latent_rgb(), state.relevancies())
+            latent = marked.layer(state.latent_rgb(), is_colour=True)
+            self._renderer.set_layers(latent, marked.layer(state.relevancies()))
 
     def _draw(self, state: ViewerState, size: tuple[int, int], scale: float) -> None:
         assert state.view is not None
@@ -157,6 +171,10 @@ class Canvas:
         pixel = (u * self._camera.width, v * self._camera.height)
         depth = self._renderer.depth_at(*pixel)
         return None if depth is None or depth <= 0 else self._camera.unproject(pixel, depth)
+
+    def depths(self) -> Array | None:
+        """See `viewer.Surface`."""
+        return None if self._camera is None else self._renderer.depth_map()
 
     def capture(self, state: ViewerState) -> Array:
         """See `viewer.Surface`."""

@@ -16,10 +16,12 @@ from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions.camera import opening_view
 from langsplat_viewer.actions.history import forget
+from langsplat_viewer.actions.leaving import leave
 from langsplat_viewer.browsing import SCENE_SUFFIXES
 from langsplat_viewer.controls import Extent, extent_of
 from langsplat_viewer.looking import why_undrawable
 from langsplat_viewer.preferences import with_recent
+from langsplat_viewer.selecting import of_scene
 from langsplat_viewer.viewer import Viewer
 
 COMPANIONS = (cameras_json.SUFFIX, language.SUFFIX)  # files beside a scene, read with it
@@ -38,7 +40,12 @@ class _Opened:
 
 def open_scene(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = lambda viewer: None) -> None:
     """Read a scene in the background; `then` runs once it is on screen. The scene shown so far stays
-    until the new one is there, and for good if that fails."""
+    until the new one is there, and for good if that fails; what was deleted in it and not saved is asked
+    about first."""
+    leave(viewer, lambda viewer: _open(viewer, path, then), f"{path.name} is opened")
+
+
+def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None]) -> None:
     cancel(viewer)
     viewer.state.opening = path
     backend = viewer.state.backend
@@ -95,6 +102,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state.opening, state.path = None, path
     state.scene, state.extent, state.latent = scene, opened.extent, opened.latent
     state.queries, state.selected, state.glide = [], None, None
+    state.selection = of_scene(state.selection, len(scene.gaussians))
     state.camera_index = 0 if scene.cameras else None
     forget(viewer)
     state.preferences = with_recent(state.preferences, path.absolute())

@@ -1,4 +1,7 @@
-"""Undo and redo of what was asked and shown. The camera is not undone: R leads back."""
+"""Undo and redo of what was asked, shown, selected, hidden and deleted. The camera is not undone: R leads
+back."""
+
+from dataclasses import replace
 
 from langsplat_viewer.actions.history import Moment, now
 from langsplat_viewer.actions.queries import set_level
@@ -7,7 +10,7 @@ from langsplat_viewer.viewer import Viewer
 
 
 def undo(viewer: Viewer) -> None:
-    """Go back to before the last query, removal, colour, level or display."""
+    """Go back to before the last query, removal, colour, level, display, selection, hiding or deletion."""
     history = viewer.history
     if not history.past:
         viewer.state.say("nothing to undo")
@@ -33,6 +36,7 @@ def _restore(viewer: Viewer, moment: Moment) -> None:
     for query, slot, since in moment.queries:
         query.slot, query.shown_since = slot, since
     state.queries, state.selected = [query for query, _, _ in moment.queries], moment.selected
+    state.selection = replace(state.selection, marks=moment.marks, stroke=None)
     past, future = history.past, history.future
     set_level(viewer, moment.level)
     set_display(viewer, moment.display, moment.latent_level)
