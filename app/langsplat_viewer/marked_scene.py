@@ -13,8 +13,8 @@ from langsplat_core.formats.inria_layout import SH_C0
 from langsplat_core.scene import Scene
 from langsplat_viewer.selecting import Marks
 
-TINT = np.array([1.0, 0.88, 0.1], np.float32)  # unlike the colours of queries, and rare in photographs
-STRENGTH = 0.65  # of the tint; the rest is the thing's own colour, so that its shape stays readable
+TINT = np.array([1.0, 0.15, 0.85], np.float32)  # unlike the colours of queries, and rare in photographs
+STRENGTH = 0.6  # of the tint; the rest is the thing's own colour, so that its shape stays readable
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,19 @@ from dataclasses import dataclass
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.panels import browser, help, legend, messages, palette, scene, search, view
+from langsplat_viewer.panels import (
+    browser,
+    help,
+    legend,
+    messages,
+    palette,
+    scene,
+    search,
+    select,
+    stroke,
+    unsaved,
+    view,
+)
 from langsplat_viewer.panels.area import MAIN_DOCK, scene_area
 from langsplat_viewer.viewer import Viewer
 
@@ -30,6 +42,7 @@ PANELS: tuple[Panel, ...] = (
     Panel("Scene", LEFT, scene.draw),
     Panel("Display", MIDDLE, view.draw_display),
     Panel("Camera", MIDDLE, view.draw_camera),
+    Panel("Select", MIDDLE, select.draw, is_open=False),
     Panel("Messages", FOOT, messages.draw),
 )
 
@@ -98,6 +111,8 @@ def draw_over(viewer: Viewer) -> None:
         legend.say(said, area)
     else:
         legend.draw(viewer, area)
+        stroke.draw(viewer, area)
+    unsaved.draw(viewer)
     browser.draw(viewer)
     help.draw(viewer)
     palette.draw(viewer)
