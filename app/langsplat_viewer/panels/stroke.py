@@ -78,7 +78,7 @@ def _on_screen(line: Array, area: Area) -> list[Any]:
 
 def _line(paint: Any, points: list[Any]) -> None:
     paint.add_polyline(points, _packed(DARK), 3.0, 0)
-    paint.add_polyline(points, _packed(LIGHT), 1.0, 0)
+    paint.add_polyline(points, _packed(LIGHT), 1.5, 0)
 
 
 def _stripe(paint: Any, points: list[Any], radius: float) -> None:
