@@ -7,12 +7,12 @@ lies on or behind the camera's plane, or has no finite place, is never inside.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.scene import Camera
 
 BEHIND = 0.03  # of the surface's depth: a centre no farther behind it is on the surface that one sees
-CHUNK = 1 << 22  # pairs of centres and edges that are compared at a time: 32 MB for each number of a pair
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,8 @@ def in_polygon(seen: Projected, outline: Array) -> Array:
     """(N,) bool: inside the closed `outline` (K, 2), pixels, by the even-odd rule; nothing for fewer than
     three corners. What lies exactly on an edge may count either way.
 
-    A ray from the centre to the right crosses an odd number of edges (Shimrat 1962, Algorithm 112).
+    A ray from the centre to the right crosses an odd number of edges (Shimrat 1962, Algorithm 112). Centres
+    are sorted by height once, so that an edge meets only those that are level with it.
     """
     outline = np.asarray(outline, np.float64)
     check_array("outline", outline, ("K", 2))
@@ -56,18 +57,15 @@ def in_polygon(seen: Projected, outline: Array) -> Array:
     if len(outline) < 3:
         return inside
     near = np.flatnonzero(in_rectangle(seen, outline.min(0), outline.max(0)))
-    start, end = outline, np.roll(outline, -1, axis=0)
-    slope = np.divide(
-        end[:, 0] - start[:, 0],
-        end[:, 1] - start[:, 1],
-        out=np.zeros(len(outline)),
-        where=end[:, 1] != start[:, 1],  # a level edge is crossed by no level ray
-    )
-    for rows in _chunks(near, len(outline)):
-        x, y = seen.pixels[rows].T[..., None]
-        spans = (start[:, 1] <= y) != (end[:, 1] <= y)
-        crossed = spans & (x < start[:, 0] + (y - start[:, 1]) * slope)
-        inside[rows] = crossed.sum(1) % 2 == 1
+    near = near[np.argsort(seen.pixels[near, 1], kind="stable")]
+    x, y = seen.pixels[near].T
+    odd = np.zeros(len(near), bool)
+    for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        first, last = np.searchsorted(y, (min(y0, y1), max(y0, y1)))
+        level = slice(first, last)
+        if first < last:  # also: the edge is not level itself
+            odd[level] ^= x[level] < x0 + (y[level] - y0) * ((x1 - x0) / (y1 - y0))
+    inside[near] = odd
     return inside
 
 
@@ -77,18 +75,27 @@ def in_stroke(seen: Projected, path: Array, radius: float) -> Array:
     path = np.asarray(path, np.float64)
     check_array("path", path, ("K", 2))
     inside = np.zeros(len(seen.depths), bool)
-    if len(path) == 0:
+    near = np.flatnonzero(_in_reach(seen, path, radius))
+    if len(near) == 0:
         return inside
-    near = np.flatnonzero(in_rectangle(seen, path.min(0) - radius, path.max(0) + radius))
-    start = path[:-1] if len(path) > 1 else path
-    along = np.diff(path, axis=0) if len(path) > 1 else np.zeros((1, 2))
-    lengths = np.maximum((along**2).sum(1), 1e-300)
-    for rows in _chunks(near, len(start)):
-        dx, dy = (seen.pixels[rows][:, None] - start).transpose(2, 0, 1)
-        share = np.clip((dx * along[:, 0] + dy * along[:, 1]) / lengths, 0, 1)
-        squares = (dx - share * along[:, 0]) ** 2 + (dy - share * along[:, 1]) ** 2
-        inside[rows] = squares.min(1) <= radius**2
+    pixels = seen.pixels[near]
+    tree = cKDTree(pixels)
+    swept = np.zeros(len(near), bool)
+    for start, end in zip(path, path[1:] if len(path) > 1 else path, strict=False):
+        half = (end - start) / 2
+        around = 1.001 * (radius + np.hypot(*half)) + 1e-9  # a little more: what counts is decided below
+        some = np.array(tree.query_ball_point(start + half, around, return_sorted=False), np.intp)
+        offsets = pixels[some] - start
+        share = np.clip(offsets @ (2 * half) / max(4 * half @ half, 1e-300), 0, 1)
+        swept[some] |= ((offsets - share[:, None] * (2 * half)) ** 2).sum(1) <= radius**2
+    inside[near] = swept
     return inside
+
+
+def _in_reach(seen: Projected, path: Array, radius: float) -> Array:
+    if len(path) == 0:
+        return np.zeros(len(seen.depths), bool)
+    return in_rectangle(seen, path.min(0) - radius, path.max(0) + radius)
 
 
 def on_surface(seen: Projected, depths: Array, size: tuple[int, int], behind: float = BEHIND) -> Array:
@@ -106,9 +113,3 @@ def on_surface(seen: Projected, depths: Array, size: tuple[int, int], behind: fl
     there = depths[rows[numbers].astype(np.intp), columns[numbers].astype(np.intp)].astype(np.float64)
     inside[numbers] = (there <= 0) | (seen.depths[numbers] <= there * (1 + behind))
     return inside
-
-
-def _chunks(rows: Array, each: int) -> list[Array]:
-    """`rows` in parts of which every one is compared with `each` edges at once."""
-    step = max(CHUNK // each, 1)
-    return [rows[first : first + step] for first in range(0, len(rows), step)]

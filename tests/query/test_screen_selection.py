@@ -5,7 +5,6 @@ from math import cos, hypot, inf, nan, pi, sin
 import numpy as np
 import pytest
 
-from langsplat_core.query import screen_selection
 from langsplat_core.query.screen_selection import (
     Projected,
     in_polygon,
@@ -51,9 +50,7 @@ def plainly_from_segment(x: float, y: float, start, end) -> float:
     return hypot(x - x0 - t * (x1 - x0), y - y0 - t * (y1 - y0))
 
 
-@pytest.mark.parametrize("chunk", [screen_selection.CHUNK, 50])
-def test_an_outline_holds_what_a_walk_around_it_says(seen, monkeypatch, chunk):
-    monkeypatch.setattr(screen_selection, "CHUNK", chunk)
+def test_an_outline_holds_what_a_walk_around_it_says(seen):
     for outline in (star(), star()[::-1], np.array([[5, 5], [70, 20], [30, 55.0]])):
         wanted = [
             bool(z > 0 and plainly_in_polygon(x, y, outline.tolist()))
@@ -68,9 +65,7 @@ def test_an_outline_of_less_than_three_corners_holds_nothing(seen):
     assert not in_polygon(seen, np.array([[0.0, 0.0], [80.0, 60.0]])).any()
 
 
-@pytest.mark.parametrize("chunk", [screen_selection.CHUNK, 50])
-def test_a_stroke_is_as_wide_as_its_brush(seen, monkeypatch, chunk):
-    monkeypatch.setattr(screen_selection, "CHUNK", chunk)
+def test_a_stroke_is_as_wide_as_its_brush(seen):
     path = np.array([[10, 10], [60, 15], [60, 15], [62, 50.0]])
     segments = list(zip(path[:-1].tolist(), path[1:].tolist(), strict=True))
     wanted = [

@@ -57,7 +57,7 @@ def select_with_the_mouse(s: "Session") -> None:
     seen = s.state.selection.marks.selected
     assert 10 < seen.sum() < 110  # the front of it
     click(s, "//**/Only what is visible")
-    before, fields = s.state.view, [s.state.view.rotation, s.state.view.target]
+    before = s.state.view
     s.drag(*around(s, PLANT))
     s.settle()
     assert s.state.view is before  # the drag turned nothing
@@ -73,6 +73,17 @@ def select_with_the_mouse(s: "Session") -> None:
     s.settle()
     assert marked(s.window.viewer)[0] == "book plant"
 
+    hide_and_undo(s, plain)
+    save_the_rest(s)
+    s.ctx.key_press(imgui.Key.escape)
+    s.ctx.yield_(3)
+    assert s.state.selection.tool is None
+    s.drag((600, 300), (656, 279))
+    s.settle()
+    assert not np.array_equal(before.rotation, s.state.view.rotation)  # the drag turns again
+
+
+def hide_and_undo(s: "Session", plain: np.ndarray) -> None:
     s.ctx.key_press(imgui.Key.h)
     s.settle()
     assert marked(s.window.viewer) == ("", "book plant", "")
@@ -82,21 +93,16 @@ def select_with_the_mouse(s: "Session") -> None:
     s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
     s.settle()
     assert marked(s.window.viewer) == ("book plant", "", "")
+
+
+def save_the_rest(s: "Session") -> None:
     s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.i)
     s.settle()
     assert marked(s.window.viewer)[0] == "mug"
-    click(s, "//**/Selection##verb")
-    s.wait(lambda: (s.folder / "blobs-selection-001.ply").exists())
+    s.menu("Select", "Save the selection")
     s.settle()
     written = load_scene(s.folder / "blobs-selection-001.ply")
     assert len(written.gaussians) == len(written.language) == s.state.selection.marks.selected.sum()
-
-    s.ctx.key_press(imgui.Key.escape)
-    s.ctx.yield_(3)
-    assert s.state.selection.tool is None
-    s.drag((600, 300), (656, 279))
-    s.settle()
-    assert not np.array_equal(fields[0], s.state.view.rotation)  # the drag turns again
 
 
 def outline_and_rest(s: "Session") -> None:
