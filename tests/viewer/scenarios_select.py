@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from imgui_bundle import hello_imgui, imgui  # isort: skip
+from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
+import glfw  # isort: skip
 from langsplat_core.formats import load_scene
 from langsplat_viewer.marked_scene import TINT
 from langsplat_viewer.panels.area import scene_area
@@ -148,6 +150,10 @@ def ask_before_leaving(s: "Session") -> None:
     assert not hello_imgui.get_runner_params().app_shall_exit
     click(s, "//**/Cancel")
     assert not s.state.selection.may_close
+    glfw.set_window_should_close(glfw_window_hello_imgui(), True)  # its cross was clicked
+    s.wait(lambda: s.state.selection.leaving is not None)
+    click(s, "//**/Cancel")
+    assert marked(s.window.viewer) == ("", "", "mug")
 
     s.window.drop([str(s.folder / "plain.ply")])
     s.ctx.yield_(4)

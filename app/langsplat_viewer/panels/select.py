@@ -130,7 +130,8 @@ def _same_line(place: int, text: str, more: float = 0.0) -> None:
     if place == 0:
         return
     imgui.same_line()
-    if imgui.get_content_region_avail().x < imgui.calc_text_size(text).x + more + hello_imgui.em_size(0.6):
+    wide = imgui.calc_text_size(text).x + 2 * imgui.get_style().frame_padding.x + more
+    if imgui.get_content_region_avail().x < wide:
         imgui.new_line()
 
 

@@ -22,7 +22,7 @@ HINTS: dict[Tool, str] = {
 }
 KEYS = "Shift adds, Ctrl removes, both intersect; Esc leaves"
 LIGHT, DARK = (1.0, 1.0, 1.0, 0.95), (0.0, 0.0, 0.0, 0.6)  # a line in two colours is seen on every picture
-PAINT = (*map(float, TINT), 0.35)
+PAINT = (float(TINT[0]), float(TINT[1]), float(TINT[2]), 0.35)
 
 
 def handle(viewer: Viewer, area: Area) -> None:
