@@ -19,12 +19,14 @@ from langsplat_viewer import splitting
 from langsplat_viewer.channels import Layers
 from langsplat_viewer.controls import OrbitCamera
 from langsplat_viewer.looking import drawn_scene, why_nothing, why_undrawable
+from langsplat_viewer.marked_scene import MarkedScene, marked_scene
 from langsplat_viewer.seeing import Splats
 from langsplat_viewer.state import FrameStats, ViewerState
 
 SCALES = (1.0, 0.5, 0.25)
 MOVING_BUDGET = 80.0  # milliseconds per picture that still feel like motion
 REST_SECONDS = 0.15  # without a move, after which the fine picture is drawn
+NOTHING_LEFT = "all of the scene is hidden or deleted: U shows what is hidden, Ctrl+Z undoes"
 
 
 Key = tuple[int, int, int]  # which picture, width, height
@@ -69,6 +71,9 @@ class Renderer(Protocol):
     def depth_at(self, x_px: float, y_px: float) -> float | None:
         """Camera z of the surface at a pixel of the last picture, world units."""
 
+    def depth_map(self) -> Array | None:
+        """(H, W) the same at every pixel, 0 where there is none; None before the first picture."""
+
 
 class Canvas:
     """Keeps a texture up to date with a `ViewerState`."""
@@ -84,6 +89,7 @@ class Canvas:
         self._textures: dict[Key, moderngl.Texture] = {}
         self._state: ViewerState | None = None  # that was last shown
         self._scene: tuple[Scene, Splats] | None = None  # what the renderer has
+        self._marked: MarkedScene | None = None  # whose it is
         self._layers: list[tuple[tuple[object, ...], Layers | None]] = []  # of each picture, with their key
         self._drawn: tuple[object, ...] | None = None  # what the texture shows
         self._view: OrbitCamera | None = None
@@ -119,10 +125,16 @@ class Canvas:
         if self._unsure and not moving and self._camera is not None:
             self._unsure = False  # asked at rest only: it reads the picture back
             if self._renderer.shows_nothing():
-                reason = why_nothing(state.scene.gaussians, self._camera)
-                elsewhere = not why_undrawable(state.scene.gaussians)  # another view would show something
-                state.nothing = f"{reason}: press R for the opening view" if elsewhere else reason
+                state.nothing = self._why_nothing(state.scene, self._camera)
         return moving
+
+    def _why_nothing(self, source: Scene, camera: Camera) -> str:
+        gaussians = source.gaussians if self._marked is None else self._marked.scene.gaussians
+        if len(source.gaussians) and not len(gaussians):
+            return NOTHING_LEFT
+        reason = why_nothing(gaussians, camera)
+        elsewhere = not why_undrawable(gaussians)  # another view would show something
+        return f"{reason}: press R for the opening view" if elsewhere else reason
 
     def _scale(self) -> float:
         """The largest scale at which a picture is expected within the budget."""
@@ -132,20 +144,21 @@ class Canvas:
     def _sync(self, shown: Sequence[ViewerState]) -> None:
         """Hand the scene and the layers of the first picture to the renderer if they are not the ones it has;
         keep those of the others, whose arrays stay the same objects while nothing changes."""
-        scene, first = shown[0].scene, shown[0]
-        assert scene is not None
+        source, first = shown[0].scene, shown[0]
+        assert source is not None
+        marked = self._marked = marked_scene(source, first.selection.marks, self._marked)
         splats = first.seeing.splats
-        if self._scene is None or self._scene[0] is not scene or self._scene[1] != splats:
-            self._scene, self._layers = (scene, splats), []
-            self._renderer.set_scene(drawn_scene(scene, splats))
+        if self._scene is None or self._scene[0] is not marked.scene or self._scene[1] != splats:
+            self._scene, self._layers = (marked.scene, splats), []
+            self._renderer.set_scene(drawn_scene(marked.scene, splats))
         if not self._layers or self._layers[0][0] != first.layers_key():
             self._layers[:1] = [(first.layers_key(), None)]
-            self._renderer.set_layers(first.latent_rgb(), first.relevancies())
+            layers = _layers(first, marked)
+            self._renderer.set_layers(layers.latent_rgb, layers.relevancies)
         del self._layers[len(shown) :]
         for place, one in enumerate(shown[1:], 1):
             if len(self._layers) == place or self._layers[place][0] != one.layers_key():
-                layers = Layers(one.latent_rgb(), one.relevancies())
-                self._layers[place : place + 1] = [(one.layers_key(), layers)]
+                self._layers[place : place + 1] = [(one.layers_key(), _layers(one, marked))]
 
     def _prepare(self, shown: Sequence[ViewerState], camera: Camera) -> list[Layers | None]:
         """Have the renderer ready to draw all pictures; returns the layers of each."""
@@ -197,6 +210,10 @@ class Canvas:
         depth = self._renderer.depth_at(*pixel)
         return None if depth is None or depth <= 0 else self._camera.unproject(pixel, depth)
 
+    def depths(self) -> Array | None:
+        """See `viewer.Surface`."""
+        return None if self._camera is None else self._renderer.depth_map()
+
     def capture(self, state: ViewerState) -> Array:
         """See `viewer.Surface`."""
         assert state.view is not None
@@ -207,3 +224,8 @@ class Canvas:
             for one, layers in zip(shown, self._prepare(shown, camera), strict=True)
         ]
         return splitting.joined(state.seeing.split, images)
+
+
+def _layers(state: ViewerState, marked: MarkedScene) -> Layers:
+    """What one picture shows beside colours, of the Gaussians that are drawn."""
+    return Layers(marked.layer(state.latent_rgb(), is_colour=True), marked.layer(state.relevancies()))

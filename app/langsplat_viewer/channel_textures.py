@@ -10,7 +10,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.raster import Rasterizer
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer, GlView, Source
 from langsplat_core.scene import Camera, Scene
-from langsplat_viewer.channels import ArrayChannels, Channel
+from langsplat_viewer.channels import ArrayChannels, Channel, surface_depths
 from langsplat_viewer.looking import looking_settings
 
 Textures = tuple[moderngl.Texture, ...]  # colours with alpha, then one for each channel that was wanted
@@ -28,6 +28,9 @@ class ChannelSource(Protocol):
 
     def depth_at(self, camera: Camera, column: int, row: int) -> tuple[float, float]:
         """Surface depth (world units, 0: nothing) and alpha of one pixel."""
+
+    def depth_map(self, camera: Camera) -> Array:
+        """(H, W) surface depth, 0 where less than half the light is stopped. It ends `render`'s textures."""
 
     def release(self) -> None:
         """Give the device memory back."""
@@ -73,6 +76,9 @@ class GlSource:
 
     def depth_at(self, camera: Camera, column: int, row: int) -> tuple[float, float]:
         return self._view(camera).depth_at(column, row)
+
+    def depth_map(self, camera: Camera) -> Array:
+        return surface_depths(self._view(camera), len(self._scene.gaussians))
 
     def release(self) -> None:
         self._keep([])
@@ -121,6 +127,9 @@ class ArraySource:
 
     def depth_at(self, camera: Camera, column: int, row: int) -> tuple[float, float]:
         return self._channels.depth_at(self._scene, camera, column, row)
+
+    def depth_map(self, camera: Camera) -> Array:
+        return surface_depths(self._channels.view(self._scene, camera), len(self._scene.gaussians))
 
     def release(self) -> None:
         for texture in self._textures.values():

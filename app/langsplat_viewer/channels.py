@@ -91,6 +91,15 @@ def camera_key(camera: Camera) -> tuple[object, ...]:
     return camera.intrinsics, camera.world_to_camera.tobytes()
 
 
+def surface_depths(view: View, count: int) -> Array:
+    """(H, W) depth of the surface as a view of `count` Gaussians has it: the median where the rasterizer
+    knows it, else the mean; world units, 0 where less than half of the light is stopped."""
+    if isinstance(view, MedianDepth):
+        return view.median_depth()
+    _, alpha = view.splat(np.empty((count, 0), np.float32))
+    return np.where(alpha >= 0.5, view.depth(), 0)
+
+
 class ArrayChannels:
     """Channels by a rasterizer that returns arrays; the projection is kept while the camera rests."""
 

@@ -9,8 +9,10 @@ from langsplat_core.config import Display
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions, saving
+from langsplat_viewer.actions.exporting import Part
 from langsplat_viewer.controls import adopt_up, level
 from langsplat_viewer.seeing import Overlay
+from langsplat_viewer.selecting import TOOLS, Tool
 from langsplat_viewer.viewer import Viewer
 
 
@@ -76,8 +78,20 @@ OVERLAY_TITLES: dict[Overlay, str] = {
     "cube": "view cube",
     "grid": "ground grid",
 }
-PANEL_TITLES = ("Search", "Scene", "Display", "Camera", "Train", "Messages", "Overlays")
-MENUS = ("File", "Edit", "View", "Camera", "Window", "Help")
+
+
+def _tool(tool: Tool) -> Command:
+    return Command(f"select: {tool}", lambda viewer: actions.use_tool(viewer, tool), menu="Select")
+
+
+def _export(does: str, part: Part, as_points: bool = False) -> Command:
+    return Command(
+        does, lambda viewer: actions.export(viewer, Path.cwd(), part, as_points=as_points), menu="Select"
+    )
+
+
+PANEL_TITLES = ("Search", "Scene", "Display", "Camera", "Select", "Train", "Messages", "Overlays")
+MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
 COMMANDS: tuple[Command, ...] = (
     Command("open a scene", actions.ask_for_file, ("Ctrl+O",), "File"),
@@ -90,6 +104,21 @@ COMMANDS: tuple[Command, ...] = (
     Command("search", actions.focus_search, ("Ctrl+F", "/"), "Edit"),
     Command("undo", actions.undo, ("Ctrl+Z",), "Edit", repeats=True, is_edit=True),
     Command("redo", actions.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), "Edit", repeats=True, is_edit=True),
+    Command("select everything", actions.select_all, ("Ctrl+A",), "Select", is_edit=True),
+    Command("select nothing", actions.select_none, ("Ctrl+D", "Ctrl+Shift+A"), "Select", is_edit=True),
+    Command("invert the selection", actions.invert_selection, ("Ctrl+I",), "Select", is_edit=True),
+    Command("select what the search found", actions.select_query, menu="Select"),
+    Command("grow the selection", actions.grow_selection, menu="Select"),
+    Command("shrink the selection", actions.shrink_selection, menu="Select"),
+    *(_tool(tool) for tool in TOOLS),
+    Command("hide the selection", actions.hide_selected, ("H",), "Select"),
+    Command("isolate the selection", actions.isolate_selected, ("Shift+H",), "Select"),
+    Command("show all that is hidden", actions.show_hidden, ("U", "Alt+H"), "Select"),
+    Command("delete the selection", actions.delete_selected, ("Delete",), "Select"),
+    _export("save the selection", "selection"),
+    _export("save the selection as points", "selection", as_points=True),
+    _export("save the rest", "rest"),
+    _export("save the scene without what was deleted", "edited"),
     *(Command(_name(button), _show(button), (str(key),), "View") for key, button in enumerate(BUTTONS, 1)),
     Command("say what is under the cursor", actions.toggle_pointing, ("I",), "View"),
     Command("compare two displays", actions.toggle_wipe, ("V",), "View"),
@@ -120,6 +149,7 @@ HELD: tuple[tuple[str, str], ...] = (
     ("right drag, Shift + left drag", "move sideways"),
     ("Ctrl + left drag", "look around from here"),
     ("wheel", "nearer, farther"),
+    ("left drag with a tool", "select; the middle button turns"),
     ("double click", "turn around the surface under the cursor"),
     ("W A S D, Q E", "fly ahead, left, back, right, down, up"),
     ("Shift, Alt", "fly faster, slower"),

@@ -209,6 +209,14 @@ class FrameRenderer:
         depth, alpha = self._source.depth_at(camera, int(x_px), int(y_px))
         return depth if alpha > PICK_ALPHA and depth > 0 else None
 
+    def depth_map(self) -> Array | None:
+        """(H, W) camera z of the surface in every pixel of the last drawn image, world units, 0 where nothing
+        stops half the light; None before anything was drawn."""
+        if self._camera is None:
+            return None
+        self._drawn = ()  # the rasterizer draws, and its textures hold until then
+        return self._source.depth_map(self._camera)
+
     def _release_own(self) -> None:
         if self._own is not None:
             texture = self._own.color_attachments[0]

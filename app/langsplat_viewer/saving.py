@@ -2,6 +2,7 @@
 
 from copy import copy
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 from PIL import Image
@@ -14,12 +15,14 @@ from langsplat_viewer.jobs import one_line
 from langsplat_viewer.viewer import Viewer
 
 
-def free_name(folder: Path, stem: str, suffix: str) -> Path:
-    """The first of stem-001, stem-002, ... that does not exist in `folder`."""
-    number = 1
-    while (path := folder / f"{stem}-{number:03d}{suffix}").exists():
-        number += 1
-    return path
+def free_name(folder: Path, stem: str, suffix: str, companions: tuple[str, ...] = ()) -> Path:
+    """The first of stem-001, stem-002, ... that does not exist in `folder`, nor with the suffixes of files
+    that are written beside it."""
+    for number in count(1):
+        name = f"{stem}-{number:03d}"
+        if not any((folder / f"{name}{ending}").exists() for ending in (suffix, *companions)):
+            break
+    return folder / f"{name}{suffix}"
 
 
 def save_png(path: Path, image: Array) -> None:

@@ -17,6 +17,7 @@ from langsplat_viewer.browsing import Listing
 from langsplat_viewer.controls import Extent, OrbitCamera
 from langsplat_viewer.preferences import Preferences
 from langsplat_viewer.seeing import Seeing
+from langsplat_viewer.selecting import Selection
 
 SLOTS = MAX_QUERIES  # queries shown at a time: one colour each
 MAX_MESSAGES = 50
@@ -137,6 +138,7 @@ class ViewerState:
     palette_typed: str = ""
     browser: Listing | None = None  # the folder that the file browser shows, while it is open
     preferences: Preferences = field(default_factory=Preferences)
+    selection: Selection = field(default_factory=Selection)
     letters_muted: bool = False  # letters are no keys: they were meant for a box that cannot be typed in
 
     def say(self, text: str, is_error: bool = False) -> None:
@@ -167,11 +169,12 @@ class ViewerState:
         return painting.fitted(self.picture, self.shown_results())
 
     def layers_key(self) -> tuple[object, ...]:
-        """Changes exactly when `latent_rgb` or `relevancies` would. Holds the objects themselves: the id of
-        a result that is gone may be given to the next one."""
+        """Changes exactly when `latent_rgb`, `relevancies` or the marks would. Holds the objects themselves:
+        the id of a result that is gone may be given to the next one."""
         wants_latent = self._shows_latents() and self.latent is not None
         segments = self.picture.display == "segmentation"
-        return self.scene, self.latent_level if wants_latent else None, segments, self.shown_results()
+        level = self.latent_level if wants_latent else None
+        return self.scene, level, segments, self.shown_results(), self.selection.marks
 
     def latent_rgb(self) -> Array | None:
         """(N, 3) colours of the latents, while they are shown."""

@@ -21,6 +21,10 @@ class Surface(Protocol):
     def point_at(self, u: float, v: float) -> Array | None:
         """(3,) world point of the surface at a place in the picture, fractions from the top left corner."""
 
+    def depths(self) -> Array | None:
+        """(H, W) camera z of the surface all over the picture, world units, 0 where nothing is drawn; its
+        size may be another than the window's. None while there is no picture."""
+
     def capture(self, state: ViewerState) -> Array:
         """(H, W, 3) uint8, or (H, W, 4) of a transparent picture: the scene as shown, at full resolution
         and without panels."""

@@ -150,6 +150,7 @@ class Window:
         params.callbacks.post_init = self._start
         params.callbacks.show_gui = self._gui
         params.callbacks.before_imgui_render = self._picture
+        params.callbacks.confirm_exit = self._may_close
         params.callbacks.before_exit = self._stop
         return params
 
@@ -197,6 +198,8 @@ class Window:
         if self.failure is not None:  # leaving before a first frame would trip an assertion of hello_imgui
             hello_imgui.get_runner_params().app_shall_exit = True
             return
+        if viewer.state.selection.may_close:
+            hello_imgui.get_runner_params().app_shall_exit = True
         actions.tick(viewer, imgui.get_time())
         actions.watch_training(viewer)
         keyboard.muted_until_clicked(viewer)  # hello_imgui draws the panels after this
@@ -208,7 +211,8 @@ class Window:
     def _pace(self) -> None:
         """Say how soon the next frame is wanted: at once only while something moves or has just changed."""
         state, idling = self.viewer.state, hello_imgui.get_runner_params().fps_idling
-        there = (state.view, self.viewer.worker.delivered, state.nothing, state.hover)
+        asked = (state.selection.leaving, state.selection.may_close)
+        there = (state.view, self.viewer.worker.delivered, state.nothing, state.hover, *asked)
         changed = len(there) != len(self._last) or any(
             a is not b and a != b for a, b in zip(there, self._last, strict=True)
         )
@@ -251,7 +255,13 @@ class Window:
         pictures.draw(viewer, area, canvas.textures)
         over.draw(viewer, area)
 
+    def _may_close(self) -> bool:
+        """The window is asked to close."""
+        glfw.post_empty_event()  # where there is a question, it is drawn now
+        return actions.may_close(self.viewer)
+
     def _stop(self) -> None:
+        actions.finish_writing(self.viewer)
         self._remembered.update()
         self.viewer.worker.close()
         if self.viewer.training is not None:

@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.query.boxes import OrientedBox
+from langsplat_core.query.regions import Regions
 from langsplat_core.query.surface import Surface
 
 
@@ -63,6 +64,16 @@ def in_oriented_box(means: Array, box: OrientedBox) -> Array:
     """(N, 3) -> (N,) bool: inside `box`, faces included."""
     with np.errstate(invalid="ignore"):
         return box.contains(np.asarray(means, np.float64))
+
+
+def at_point(surface: Surface, regions: Regions, level: int, point: Array) -> Array:
+    """(N,) bool: the whole region, at a level (index into LEVELS), of what lies nearest to `point` (3,),
+    world units, with the faint ones beside it. Nothing where the scene has no surface."""
+    if len(surface.rows) == 0:
+        return np.zeros(len(surface.anchors), bool)
+    nearest = int(((surface.positions - point) ** 2).sum(1).argmin())
+    same: Array = regions.everywhere[level] == regions.of[level][nearest]
+    return same
 
 
 def grow_steps(surface: Surface, selected: Array, steps: int = 1) -> Array:

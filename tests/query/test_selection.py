@@ -9,9 +9,11 @@ import pytest
 from langsplat_core.errors import InputError
 from langsplat_core.query import selection
 from langsplat_core.query.boxes import OrientedBox
+from langsplat_core.query.regions import build_regions
 from langsplat_core.query.surface import Surface, build_surface
 from langsplat_core.scene import Gaussians
 from tests.support.scenes import random_gaussians
+from tests.support.two_blobs import two_blob_scene
 
 
 def sheet(side: int = 20, spacing: float = 0.1) -> Gaussians:
@@ -122,6 +124,20 @@ def test_shrinking_keeps_where_the_surface_ends():
     everything = np.ones(len(gaussians), bool)
     assert selection.shrink(surface, everything, 5.0).all()
     assert selection.shrink_steps(surface, everything, 5).all()
+
+
+def test_what_lies_nearest_to_a_point_is_selected_as_a_region():
+    scene, left, right = two_blob_scene()
+    surface = build_surface(scene.gaussians)
+    regions = build_regions(surface, scene.language)
+    for level in (1, 2):  # at which the two mean something
+        first = selection.at_point(surface, regions, level, left.mean(0))
+        assert first.tolist() == [True] * len(left) + [False] * len(right)
+        second = selection.at_point(surface, regions, level, right.mean(0) + [9.0, 0, 0])
+        assert (second == ~first).all()
+    nothing = scene.take(np.zeros(len(scene.gaussians), bool))
+    surface = build_surface(nothing.gaussians)
+    assert len(selection.at_point(surface, regions, 2, np.zeros(3))) == 0
 
 
 @pytest.mark.parametrize("wrong", [-1, inf, nan])

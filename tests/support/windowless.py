@@ -26,6 +26,10 @@ class FakeSurface:
     def point_at(self, u: float, v: float):
         return None if u > 0.9 else np.array([u - 0.5, v - 0.5, 0.0])
 
+    def depths(self):
+        """Nothing is drawn, so that nothing is hidden."""
+        return np.zeros((12, 16), np.float32)
+
     def capture(self, state: ViewerState):
         return np.full((6, 8, 3), 77, np.uint8)
 

@@ -26,6 +26,15 @@ def test_no_key_does_two_things():
         ("Ctrl+Z", "undo"),
         ("Ctrl+Shift+P", "find a command"),
         ("R", "return to the opening view"),
+        ("Ctrl+A", "select everything"),
+        ("Ctrl+D", "select nothing"),
+        ("Ctrl+Shift+A", "select nothing"),
+        ("Ctrl+I", "invert the selection"),
+        ("H", "hide the selection"),
+        ("Shift+H", "isolate the selection"),
+        ("U", "show all that is hidden"),
+        ("Alt+H", "show all that is hidden"),
+        ("Delete", "delete the selection"),
         ("Home", "return to the opening view"),
         ("F1", "list of keys"),
         ("?", "list of keys"),
@@ -43,6 +52,7 @@ def test_every_key_is_understood_and_letters_are_plain():
         assert understood.is_plain == (not key.startswith("Ctrl") and key not in ("F1", "Esc")), key
     assert chord("Ctrl+Shift+P").ctrl
     assert chord("Ctrl+Shift+P").shift
+    assert (chord("Alt+H").alt, chord("H").alt) == (True, False)
     assert chord("Shift+F").is_plain  # a capital letter is typed
 
 

@@ -250,11 +250,16 @@ def test_picking_finds_the_surface(gl):
     for backend in ("opengl", "cpu"):
         renderer = FrameRenderer(gl, backend)
         assert renderer.depth_at(32, 24) is None
+        assert renderer.depth_map() is None
         renderer.set_scene(Scene(both))
         assert renderer.depth_at(32, 24) is None  # nothing drawn yet
         renderer.read(FRONT, PictureConfig())
         assert renderer.depth_at(32.0, 24.0) == pytest.approx(4.0, rel=1e-5)
         assert renderer.depth_at(0.5, 0.5) is None
+        depths = renderer.depth_map()
+        assert depths.shape == (FRONT.height, FRONT.width)
+        assert depths[24, 32] == pytest.approx(renderer.depth_at(32.0, 24.0), rel=0.2)  # the mean on a device
+        assert depths[0, 0] == 0
         assert renderer.depth_at(-1.0, 3.0) is None
         assert renderer.depth_at(64.0, 3.0) is None
         renderer.set_scene(Scene(faint))

@@ -4,14 +4,26 @@ from pathlib import Path
 
 import pytest
 
+from langsplat_core.query.describe import Describer
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.pointing import look_at_pixel
+from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_viewer import actions
 from langsplat_viewer.panels.pointing import figures, said
-from tests.support.fakes import CENTRES
+from tests.support.fakes import CENTRES, FakeEncoder, blob_scene
 from tests.support.windowless import errors, settle
 
 
+@pytest.fixture(scope="module")
+def compiled() -> None:
+    """The kernels that look at a pixel: half a minute on a fresh machine."""
+    engine = QueryEngine(blob_scene(), lambda encoder_id: FakeEncoder())
+    camera = engine.scene.cameras[0].resized(16, 12)
+    look_at_pixel(load_lifting_rasterizer("cpu"), Describer(engine, ("mug",)), camera, (8, 6))
+
+
 @pytest.fixture
-def pointing(opened):
+def pointing(compiled, opened):
     """The mug asked for, and the mouse asked about."""
     actions.resize(opened, 160, 120)
     actions.ask(opened, "mug")

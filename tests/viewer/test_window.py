@@ -12,8 +12,9 @@ import pytest
 
 from langsplat_core.formats import save_scene
 from langsplat_core.scene import Scene
-from langsplat_viewer.canvas import REST_SECONDS, Canvas
+from langsplat_viewer.canvas import NOTHING_LEFT, REST_SECONDS, Canvas
 from langsplat_viewer.controls import default_view, extent_of, orbit
+from langsplat_viewer.selecting import unmarked
 from langsplat_viewer.state import ViewerState
 from tests.support.fakes import blob_scene
 
@@ -43,6 +44,9 @@ def folder(tmp_path: Path) -> Path:
         "use_shortcuts",
         "arrange_panels",
         "many_queries",
+        "select_with_the_mouse",
+        "outline_and_rest",
+        "ask_before_leaving",
         "type_while_opening",
         "look_at_nothing",
         "close_while_opening",
@@ -145,6 +149,27 @@ def test_canvas_draws_only_changes(gl, state):
     canvas.update(state, 7.0)
     assert renderer.calls == [("layers", True), ("draw", (200, 120))]
     assert np.frombuffer(canvas.textures[0].read(), np.uint8)[:4].tolist() == [255, 0, 0, 255]
+
+
+def test_canvas_draws_what_is_marked_once(gl, state):
+    renderer = FakeRenderer()
+    canvas = Canvas(gl, renderer)
+    canvas.update(state, 0.0)
+    renderer.calls.clear()
+    marks = unmarked(360)
+    for hidden, count in ((np.arange(360) < 100, 260), (np.ones(360, bool), 0), (marks.hidden, 360)):
+        state.selection = replace(state.selection, marks=replace(marks, hidden=hidden))
+        for second in range(3):
+            canvas.update(state, float(second))
+        (kind, scene), *others = renderer.calls
+        assert (kind, [name for name, _ in others]) == ("scene", ["layers", "draw"])
+        assert len(scene.gaussians) == count
+        renderer.calls.clear()
+    assert scene is state.scene  # the source itself again
+    renderer.shows_nothing = lambda: True
+    state.selection = replace(state.selection, marks=replace(marks, deleted=np.ones(360, bool)))
+    canvas.update(state, 9.0)
+    assert state.nothing == NOTHING_LEFT
 
 
 @pytest.mark.parametrize(("fine_ms", "coarse"), [(10, (200, 120)), (150, (100, 60)), (5000, (50, 30))])

@@ -1,8 +1,9 @@
-"""What was asked and shown before, so that it can be undone."""
+"""What was asked, shown and marked before, so that it can be undone."""
 
 from dataclasses import dataclass
 
 from langsplat_core.config import Display, LevelChoice
+from langsplat_viewer.selecting import Marks
 from langsplat_viewer.state import Query, ViewerState
 from langsplat_viewer.viewer import Viewer
 
@@ -11,19 +12,21 @@ LONGEST = 100  # steps that can be undone
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """The queries and how they were looked at."""
+    """The queries and how they were looked at; what is selected, hidden and deleted."""
 
     queries: tuple[tuple[Query, int | None, int, float | None], ...]  # with slot, shown_since and cut
     selected: Query | None
     display: Display
     latent_level: int
     level: LevelChoice
+    marks: Marks
 
 
 def now(state: ViewerState) -> Moment:
     """How things stand."""
     queries = tuple((query, query.slot, query.shown_since, query.cut) for query in state.queries)
-    return Moment(queries, state.selected, state.picture.display, state.latent_level, state.level)
+    picture, marks = state.picture, state.selection.marks
+    return Moment(queries, state.selected, picture.display, state.latent_level, state.level, marks)
 
 
 def remember(viewer: Viewer) -> None:

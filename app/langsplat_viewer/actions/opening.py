@@ -15,10 +15,12 @@ from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions.camera import opening_view
 from langsplat_viewer.actions.history import forget
+from langsplat_viewer.actions.leaving import leave
 from langsplat_viewer.controls import Extent, extent_of
 from langsplat_viewer.looking import why_undrawable
 from langsplat_viewer.preferences import with_recent
 from langsplat_viewer.seeing import Ruler
+from langsplat_viewer.selecting import of_scene
 from langsplat_viewer.viewer import Viewer
 
 
@@ -34,7 +36,12 @@ class _Opened:
 
 def open_scene(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = lambda viewer: None) -> None:
     """Read a scene in the background; `then` runs once it is on screen. The scene shown so far stays
-    until the new one is there, and for good if that fails."""
+    until the new one is there, and for good if that fails; what was deleted in it and not saved is asked
+    about first."""
+    leave(viewer, lambda viewer: _open(viewer, path, then), f"{path.name} is opened")
+
+
+def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None]) -> None:
     cancel(viewer)
     viewer.state.opening = path
     backend = viewer.state.backend
@@ -76,6 +83,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state.scene, state.extent, state.latent = scene, opened.extent, opened.latent
     state.queries, state.selected, state.glide = [], None, None
     state.canonical, state.canonical_typed = (), ""
+    state.selection = of_scene(state.selection, len(scene.gaussians))
     state.camera_index = 0 if scene.cameras else None
     state.seeing = replace(state.seeing, ruler=Ruler())
     forget(viewer)

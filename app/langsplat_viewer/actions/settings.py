@@ -6,7 +6,9 @@ from langsplat_core.config import Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
 from langsplat_viewer.actions.history import remember
+from langsplat_viewer.actions.leaving import stay
 from langsplat_viewer.actions.seeing import measure
+from langsplat_viewer.actions.strokes import leave_tool
 from langsplat_viewer.preferences import SCALES, Theme
 from langsplat_viewer.viewer import Viewer
 
@@ -104,9 +106,14 @@ def mute_letters(viewer: Viewer, muted: bool) -> None:
 
 
 def escape(viewer: Viewer) -> None:
-    """Close what lies over the scene, and let letters be keys again."""
+    """Close what lies over the scene, and let letters be keys again; where nothing did, leave the tool."""
+    state = viewer.state
+    lay_over = state.show_help or state.show_palette or state.browser or state.selection.leaving
     show_help(viewer, False)
     show_palette(viewer, False)
     measure(viewer, False)
-    viewer.state.browser = None
+    state.browser = None
+    stay(viewer)
     mute_letters(viewer, False)
+    if not lay_over:
+        leave_tool(viewer)

@@ -1,4 +1,7 @@
-"""Undo and redo of what was asked and shown. The camera is not undone: R leads back."""
+"""Undo and redo of what was asked, shown, selected, hidden and deleted. The camera is not undone: R leads
+back."""
+
+from dataclasses import replace
 
 from langsplat_viewer.actions.asking import set_cut
 from langsplat_viewer.actions.history import Moment, now
@@ -8,7 +11,7 @@ from langsplat_viewer.viewer import Viewer
 
 
 def undo(viewer: Viewer) -> None:
-    """Go back to before the last query, removal, colour, level or display."""
+    """Go back to before the last query, removal, colour, level, display, selection, hiding or deletion."""
     history = viewer.history
     if not history.past:
         viewer.state.say("nothing to undo")
@@ -35,6 +38,7 @@ def _restore(viewer: Viewer, moment: Moment) -> None:
         query.slot, query.shown_since = slot, since
         set_cut(viewer, query, cut, is_new=False)
     state.queries, state.selected = [query for query, *_ in moment.queries], moment.selected
+    state.selection = replace(state.selection, marks=moment.marks, stroke=None)
     past, future = history.past, history.future
     set_level(viewer, moment.level)
     set_display(viewer, moment.display, moment.latent_level)

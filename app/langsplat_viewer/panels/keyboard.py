@@ -21,6 +21,7 @@ class Chord:
     character: str = ""
     ctrl: bool = False  # on a Mac the command key, as imgui has it
     shift: bool = False
+    alt: bool = False
     is_plain: bool = True  # not while something is typed
 
 
@@ -31,8 +32,8 @@ def chord(text: str) -> Chord:
     if not name.isalnum():
         return Chord(character=name)
     key = imgui.Key[f"_{name}" if name.isdigit() else NAMED.get(name, name.lower())]
-    ctrl, shift = "Ctrl" in held, "Shift" in held
-    return Chord(key, "", ctrl, shift, is_plain=not ctrl and name not in WHILE_TYPING)
+    ctrl, shift, alt = (name in held for name in ("Ctrl", "Shift", "Alt"))
+    return Chord(key, "", ctrl, shift, alt, is_plain=not ctrl and name not in WHILE_TYPING)
 
 
 def handle(viewer: Viewer) -> None:
@@ -50,7 +51,8 @@ def _pressed(wanted: Chord, command: Command, typing: bool, muted: bool) -> bool
         return False
     if wanted.key is None:
         return not io.key_ctrl and wanted.character in map(chr, io.input_queue_characters)
-    if io.key_alt or io.key_super or (io.key_ctrl, io.key_shift) != (wanted.ctrl, wanted.shift):
+    held = (io.key_ctrl, io.key_shift, io.key_alt)
+    if io.key_super or held != (wanted.ctrl, wanted.shift, wanted.alt):
         return False
     return imgui.is_key_pressed(wanted.key, command.repeats)
 

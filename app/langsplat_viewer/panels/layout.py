@@ -17,7 +17,10 @@ from langsplat_viewer.panels import (
     pointing,
     scene,
     search,
+    select,
+    stroke,
     train,
+    unsaved,
     view,
 )
 from langsplat_viewer.panels.area import MAIN_DOCK, scene_area
@@ -43,6 +46,7 @@ PANELS: tuple[Panel, ...] = (
     Panel("Scene", LEFT, scene.draw),
     Panel("Display", MIDDLE, view.draw_display),
     Panel("Camera", MIDDLE, view.draw_camera),
+    Panel("Select", MIDDLE, select.draw, is_open=False),
     Panel("Train", LEFT, train.draw, is_open=False),
     Panel("Messages", FOOT, messages.draw),
     Panel("Overlays", MIDDLE, view.draw_overlays, is_open=False),
@@ -114,8 +118,10 @@ def draw_over(viewer: Viewer) -> None:
     else:
         legend.draw(viewer, area)
         pointing.draw(viewer)
+        stroke.draw(viewer, area)
     pictures.draw_grip(viewer, area)
     cube.draw(viewer, area)
+    unsaved.draw(viewer)
     browser.draw(viewer)
     help.draw(viewer)
     palette.draw(viewer)

@@ -40,7 +40,7 @@ def _recent(viewer: Viewer) -> None:
         imgui.end_menu()
     imgui.separator()
     if imgui.menu_item("Quit", "", False)[0]:
-        hello_imgui.get_runner_params().app_shall_exit = True
+        actions.quit_viewer(viewer)
 
 
 def _panels() -> None:

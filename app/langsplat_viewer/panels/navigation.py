@@ -5,7 +5,7 @@ import math
 from imgui_bundle import imgui
 
 from langsplat_viewer import actions, controls
-from langsplat_viewer.panels import keyboard
+from langsplat_viewer.panels import keyboard, stroke
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.viewer import Viewer
 
@@ -17,6 +17,7 @@ WHEEL_STEP = 0.88  # factor of the distance per notch
 def handle(viewer: Viewer, area: Area) -> None:
     """Once per frame, after the panels: they take what is theirs first."""
     io = imgui.get_io()
+    stroke.handle(viewer, area)
     if viewer.state.view is not None and not io.want_capture_mouse:
         _mouse(viewer, area)
     actions.hover(viewer, _pixel(area))
@@ -37,19 +38,22 @@ def _pixel(area: Area) -> tuple[int, int] | None:
 
 
 def _mouse(viewer: Viewer, area: Area) -> None:
+    """The left button turns; while a tool has it, the middle one does."""
     io = imgui.get_io()
-    if imgui.is_mouse_double_clicked(0):
+    free = viewer.state.selection.tool is None
+    turns = 0 if free else 2
+    if free and imgui.is_mouse_double_clicked(0):
         actions.focus_pixel(viewer, *area.fraction(io.mouse_pos.x, io.mouse_pos.y))
         return
     dx, dy = io.mouse_delta.x, io.mouse_delta.y
     if dx or dy:
         turn = math.pi / area.height  # a drag over the whole height is half a turn
-        if _held(1) or _held(2) or (_held(0) and io.key_shift):
+        if _held(1) or (free and (_held(2) or (_held(0) and io.key_shift))):
             size = (max(round(area.width), 1), max(round(area.height), 1))
             actions.move(viewer, lambda view: controls.pan(view, dx, dy, size))
-        elif _held(0) and io.key_ctrl:
+        elif _held(turns) and io.key_ctrl:
             actions.move(viewer, lambda view: controls.look(view, dx * turn, dy * turn))
-        elif _held(0):
+        elif _held(turns):
             actions.move(viewer, lambda view: controls.orbit(view, dx * turn, dy * turn))
     if io.mouse_wheel:
         actions.zoom_by(viewer, WHEEL_STEP**io.mouse_wheel)
