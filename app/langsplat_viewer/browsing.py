@@ -1,9 +1,10 @@
-"""What the file browser lists: folders, and files that may be scenes."""
+"""What the file browser lists: folders, files that may be scenes, and sets of queries."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from langsplat_core.formats.sog import META_NAME
+from langsplat_viewer.querysets import SUFFIX as QUERIES
 
 SCENE_SUFFIXES = (".ply", ".spz", ".splat", ".ksplat", ".sog")
 MOST = 2000  # entries of a folder that are listed
@@ -14,7 +15,7 @@ class Entry:
     """One line of the list."""
 
     path: Path
-    is_scene: bool  # to be opened; else a folder to go into
+    is_file: bool  # to be opened; else a folder to go into
     size: int = 0  # bytes, of a file
 
 
@@ -35,7 +36,7 @@ def list_folder(folder: Path) -> Listing:
         entries = [entry for path in paths if (entry := _entry(path)) is not None]
     except OSError as error:
         return Listing(folder, problem=f"cannot be listed ({error.strerror or error})")
-    entries.sort(key=lambda entry: entry.is_scene)
+    entries.sort(key=lambda entry: entry.is_file)
     return Listing(folder, tuple(entries[:MOST]), max(len(entries) - MOST, 0))
 
 
@@ -44,8 +45,8 @@ def _entry(path: Path) -> Entry | None:
         return None
     try:
         if path.is_dir():
-            return Entry(path, is_scene=(path / META_NAME).is_file())
-        if path.suffix.lower() in SCENE_SUFFIXES:
+            return Entry(path, is_file=(path / META_NAME).is_file())
+        if path.suffix.lower() in SCENE_SUFFIXES or path.name.endswith(QUERIES):
             return Entry(path, True, path.stat().st_size)
     except OSError:  # it may not be looked at
         pass

@@ -73,10 +73,12 @@ COMMANDS: tuple[Command, ...] = (
         "save a picture", lambda viewer: saving.save_picture(viewer, Path.cwd()), ("Ctrl+S", "P"), "File"
     ),
     Command("save the view", lambda viewer: saving.save_view(viewer, Path.cwd()), menu="File"),
+    Command("save the queries", lambda viewer: actions.save_queries(viewer, Path.cwd()), menu="File"),
     Command("search", actions.focus_search, ("Ctrl+F", "/"), "Edit"),
     Command("undo", actions.undo, ("Ctrl+Z",), "Edit", repeats=True, is_edit=True),
     Command("redo", actions.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), "Edit", repeats=True, is_edit=True),
     *(Command(_name(button), _show(button), (str(key),), "View") for key, button in enumerate(BUTTONS, 1)),
+    Command("say what is under the cursor", actions.toggle_pointing, ("I",), "View"),
     Command("return to the opening view", actions.reset_view, ("R", "Home"), "Camera"),
     Command("frame everything", actions.frame_scene, ("Shift+F",), "Camera"),
     Command("focus on the latest result found", actions.focus_result, ("F",), "Camera"),

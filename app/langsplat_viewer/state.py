@@ -9,6 +9,7 @@ from langsplat_core.display.colour_maps import MAX_QUERIES
 from langsplat_core.display.compose import HeatRanges
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.pointing import Pointed
 from langsplat_core.query.suggestions import Suggestions
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer import painting
@@ -28,7 +29,9 @@ class Query:
     phrase: str
     slot: int | None = None  # index of its colour while shown, None while hidden
     shown_since: int = 0  # larger for a query shown later
-    result: QueryResult | None = None
+    result: QueryResult | None = None  # as it is shown
+    automatic: QueryResult | None = None  # the same where it ends by itself
+    cut: float | None = None  # relevancy at which it ends instead
     reading: str = ""  # how the phrase was understood, where it has structure
     problem: str = ""  # why it has no result, one line
     meant: str = ""  # the phrase with its unknown words replaced by known ones, where there are such
@@ -63,6 +66,18 @@ class FrameStats:
 
 
 @dataclass(eq=False)
+class Hover:
+    """The mouse over the scene, while it and the camera rest."""
+
+    pixel: tuple[int, int]  # column and row in the scene's area
+    view: OrbitCamera
+    since: float  # seconds, on the window's clock
+    asked: bool = False
+    found: Pointed | None = None
+    phrases: tuple[str, ...] = ()  # whose relevancies it has
+
+
+@dataclass(eq=False)
 class ViewerState:
     """The viewer without its window."""
 
@@ -79,12 +94,17 @@ class ViewerState:
     camera_index: int | None = None  # training camera last jumped to
     fly_speed: float = 0.5  # scene radii per second
 
+    pointing: bool = False  # it is said what lies under the cursor
+    hover: Hover | None = None
+
     picture: PictureConfig = field(default_factory=PictureConfig)
     latent_level: int = 2  # index into scene.LEVELS
     level: LevelChoice = "auto"
     queries: list[Query] = field(default_factory=list)
     selected: Query | None = None  # whose details are shown
     typed: str = ""
+    canonical: tuple[str, ...] = ()  # phrases that everything is compared with; none: the scene's own
+    canonical_typed: str = ""
     asked: list[str] = field(default_factory=list)  # what was searched for, the oldest first
     recalled: int = 0  # index into `asked` of the phrase last recalled; its length: none
     suggestions: Suggestions = field(default_factory=Suggestions)

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 from langsplat_core.arrays import Array
 from langsplat_core.progress import Progress
+from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.scene import Scene
 from langsplat_viewer.jobs import Worker
@@ -54,6 +55,7 @@ class Viewer:
     state: ViewerState = field(default_factory=ViewerState)
     worker: Worker = field(default_factory=Worker)
     engine: QueryEngine | None = None  # of the scene shown; asked on the worker only
+    describer: Describer | None = None  # of the same scene, once it was needed
     surface: Surface | None = None
     history: History = field(default_factory=History)
     clock: float = 0.0  # seconds, as of the last `actions.tick`

@@ -207,7 +207,7 @@ class Window:
     def _pace(self) -> None:
         """Say how soon the next frame is wanted: at once only while something moves or has just changed."""
         state, idling = self.viewer.state, hello_imgui.get_runner_params().fps_idling
-        there = (state.view, self.viewer.worker.delivered, state.nothing)
+        there = (state.view, self.viewer.worker.delivered, state.nothing, state.hover)
         changed = len(there) != len(self._last) or any(
             a is not b and a != b for a, b in zip(there, self._last, strict=True)
         )

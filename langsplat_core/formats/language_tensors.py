@@ -13,7 +13,15 @@ from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import FormatError, printable_line, quoted
 from langsplat_core.formats.packed_positions import step, unpack_positions
 from langsplat_core.parsing.opening import open_for_reading, parse_json
-from langsplat_core.scene import LEVELS, Calibration, LanguageField, Odds, Reading, codec_from_tensors
+from langsplat_core.scene import (
+    CANONICAL_PHRASES,
+    LEVELS,
+    Calibration,
+    LanguageField,
+    Odds,
+    Reading,
+    codec_from_tensors,
+)
 from langsplat_core.scene.codec import KINDS
 
 FORMAT, VERSION = "langsplat", "2"
@@ -113,6 +121,7 @@ def _field(
     phrases = _phrases(metadata, path)
     vectors = tensors.get("phrasebook", np.zeros((0, codec.vector_dim), np.float32))
     check_array("phrasebook", vectors, (len(phrases), codec.vector_dim))
+    check_array("canonical", tensors["canonical"], (len(CANONICAL_PHRASES), codec.vector_dim))
     reading = Reading()
     if metadata["version"] != "1":
         calibration = _calibration(metadata, path)

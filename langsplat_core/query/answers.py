@@ -1,6 +1,6 @@
 """From relevancies to an answer: by regions of the surface, or by the peak alone, as published."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -37,6 +37,14 @@ class QueryResult:
     members: Array  # (N,) bool: the Gaussians that answer, wherever they are
     place: Array | None  # (3,) world units
     box: Array | None  # (2, 3) corners, world units
+    own_cut: float | None = None  # relevancy from which on everything is a member, where it was set by hand
+
+    @property
+    def cut(self) -> float:
+        """The least relevancy of a member, of its region where it has one; the peak where there is none."""
+        if self.own_cut is not None:
+            return self.own_cut
+        return float(self.even[self.members].min(initial=self.peak))
 
     @property
     def verdict(self) -> Verdict:
@@ -48,9 +56,17 @@ class QueryResult:
     @property
     def heat_range(self) -> tuple[float, float]:
         """The relevancies at which a heat map of this answer is coldest and hottest."""
+        if self.own_cut is not None:
+            return min(self.own_cut, self.peak - MIN_HEAT_SPAN), self.peak
         if self.found and self.peak < FLOOR + MIN_HEAT_SPAN:  # best on its thing, not against all phrases
             return self.peak - MIN_HEAT_SPAN, self.peak
         return FLOOR, max(self.peak, FLOOR + MIN_HEAT_SPAN)
+
+
+def recut(result: QueryResult, cut: float) -> QueryResult:
+    """The same answer with everything as a member whose relevancy, that of its region where it has one, is
+    at least `cut`. Place, box and verdict stay: they are of the best, wherever the answer ends."""
+    return replace(result, own_cut=cut, members=result.even >= np.float32(cut))
 
 
 def by_regions(

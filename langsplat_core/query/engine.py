@@ -1,6 +1,7 @@
 """Answering phrases on a scene: encode, look up, read (`answers`)."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Protocol
 
@@ -72,13 +73,29 @@ class QueryEngine:
         self._encoder: TextEncoder | None = None
         self._encoded: dict[str, Array] = {}  # phrases asked so far, 2 KB each at D = 512
         self._encoder_checked = False
+        self._canonical: Array | None = None  # (C, D) in place of the scene's own
+        self.canonical_phrases: tuple[str, ...] = CANONICAL_PHRASES
 
     @property
     def field(self) -> LanguageField:
-        """The scene's language field; InputError where it has none."""
-        if self.scene.language is None:
+        """The scene's language field, see `compare_with`; InputError where it has none."""
+        field = self.scene.language
+        if field is None:
             raise InputError(no_field(self.scene))
-        return self.scene.language
+        if self._canonical is None:
+            return field
+        return replace(field, canonical=self._canonical, reading=replace(field.reading, calibration=None))
+
+    def compare_with(self, phrases: Sequence[str] = (), progress: Progress = silent) -> None:
+        """Take other canonical phrases (LERF, section 3.3: what everything is compared with) from now on;
+        none: the scene's own again. With others no probability is said, since it was calibrated on those.
+
+        Raises as `text_vectors` does, and leaves everything as it was then.
+        """
+        canonical = self.text_vectors(phrases, progress) if phrases else None
+        self._canonical = canonical
+        self.canonical_phrases = tuple(map(phrase_key, phrases)) or CANONICAL_PHRASES
+        self.__dict__.pop("_lookup", None)
 
     @property
     def encoder(self) -> TextEncoder:
@@ -182,7 +199,8 @@ class QueryEngine:
         if self._encoder_checked:
             return
         canonical = np.asarray(encoder.encode_texts(list(CANONICAL_PHRASES)), np.float64)
-        if ((canonical * self.field.canonical).sum(1) < SAME_ENCODER).any():
+        assert self.scene.language is not None
+        if ((canonical * self.scene.language.canonical).sum(1) < SAME_ENCODER).any():
             raise EncoderError(
                 f"the scene was made with other weights of {self.field.encoder_id}; give those with "
                 "--encoder, or make the scene again"

@@ -22,7 +22,7 @@ class LanguageField:
     latents: Array  # (3, N, d) of the codec's type; zero where a Gaussian was never observed
     confidence: Array  # (3, N) float32 >= 0: total blending weight with which it was observed
     codec: Codec
-    canonical: Array  # (4, D) float32 unit text vectors of CANONICAL_PHRASES
+    canonical: Array  # (C, D) float32 unit text vectors, of CANONICAL_PHRASES unless a query chose others
     encoder_id: str  # hub id or folder of the text encoder, e.g. "demo"
     phrasebook: Mapping[str, Array] = field(default_factory=dict)  # `phrase_key` -> (D,) unit vector
     reading: Reading = field(default_factory=Reading)
@@ -36,7 +36,9 @@ class LanguageField:
                 f"latents: {self.latents.max()} is not the number of one of {self.codec.index_size} codewords"
             )
         check_array("confidence", self.confidence, (len(LEVELS), "N"), dims, dtype=np.float32)
-        check_array("canonical", self.canonical, (len(CANONICAL_PHRASES), big), dtype=np.float32)
+        check_array("canonical", self.canonical, ("C", big), dtype=np.float32)
+        if len(self.canonical) == 0:
+            raise ValueError("canonical: a phrase is compared with one other at least")
         if self.things is not None:
             check_array("things", self.things, ("N",), dims, dtype=np.uint16)
         known = {phrase_key(phrase): vector for phrase, vector in self.phrasebook.items()}

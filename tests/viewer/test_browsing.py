@@ -23,7 +23,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_folders_come_first_and_what_is_no_scene_is_left_out(folder):
     listing = list_folder(folder)
-    listed = [(entry.path.name, entry.is_scene, entry.size) for entry in listing.entries]
+    listed = [(entry.path.name, entry.is_file, entry.size) for entry in listing.entries]
     assert listed == [
         ("B folder", False, 0),
         ("a.ply", True, 5),
@@ -57,10 +57,10 @@ def test_one_goes_into_folders_and_opens_scenes(viewer, folder, monkeypatch):
     monkeypatch.chdir(folder)
     actions.ask_for_file(viewer)
     assert viewer.state.browser.folder == folder
-    actions.choose(viewer, Entry(folder / "B folder", is_scene=False))
+    actions.choose(viewer, Entry(folder / "B folder", is_file=False))
     assert viewer.state.browser.folder == folder / "B folder"
     actions.browse(viewer, folder)
-    actions.choose(viewer, Entry(folder / "blobs.ply", is_scene=True))
+    actions.choose(viewer, Entry(folder / "blobs.ply", is_file=True))
     assert viewer.state.browser is None
     settle(viewer)
     assert viewer.state.scene is SCENES["blobs.ply"]

@@ -69,6 +69,7 @@ def paper(monkeypatch) -> Iterator[Paper]:
     for module in (panel, answers):
         monkeypatch.setattr(module, "small_wrapped", lambda text, colour: made.said.append(text))
     monkeypatch.setattr(style, "imgui", made)
+    monkeypatch.setattr(answers.cut, "draw", lambda viewer, query, result: None)
     return made
 
 

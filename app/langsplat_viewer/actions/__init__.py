@@ -4,11 +4,19 @@ Each takes the `Viewer` and changes its state; long work goes to the worker. Non
 something a user did: the reason appears in the messages area.
 """
 
+from langsplat_viewer.actions.asking import (
+    compare_with,
+    load_queries,
+    save_queries,
+    set_cut,
+    type_canonical,
+)
 from langsplat_viewer.actions.browsing import (
     ask_for_file,
     browse,
     choose,
     close_browser,
+    open_dropped,
     open_recent,
     open_typed,
     type_path,
@@ -28,7 +36,8 @@ from langsplat_viewer.actions.camera import (
     zoom_by,
 )
 from langsplat_viewer.actions.offers import ask_offered, offers, prepare_suggestions, recall
-from langsplat_viewer.actions.opening import cancel, open_dropped, open_scene
+from langsplat_viewer.actions.opening import cancel, open_scene
+from langsplat_viewer.actions.pointing import hover, toggle_pointing
 from langsplat_viewer.actions.queries import (
     ask,
     ask_typed,
@@ -71,6 +80,7 @@ __all__ = [
     "cancel",
     "choose",
     "close_browser",
+    "compare_with",
     "escape",
     "focus_pixel",
     "focus_result",
@@ -79,6 +89,8 @@ __all__ = [
     "glide_to",
     "go_to_camera",
     "hide",
+    "hover",
+    "load_queries",
     "move",
     "mute_letters",
     "note_panels",
@@ -95,8 +107,10 @@ __all__ = [
     "remove",
     "reset_view",
     "resize",
+    "save_queries",
     "select",
     "set_coarse_while_moving",
+    "set_cut",
     "set_display",
     "set_fly_speed",
     "set_level",
@@ -113,6 +127,8 @@ __all__ = [
     "tick",
     "toggle_help",
     "toggle_panel",
+    "toggle_pointing",
+    "type_canonical",
     "type_command",
     "type_path",
     "type_phrase",

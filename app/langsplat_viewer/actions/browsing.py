@@ -1,12 +1,19 @@
-"""The file browser: where it is, and what is chosen in it."""
+"""Which file is opened: chosen in the browser, typed, dropped onto the window, or open before."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
+from langsplat_core.formats import cameras_json, language
 from langsplat_core.formats.sog import META_NAME
+from langsplat_viewer.actions.asking import load_queries
 from langsplat_viewer.actions.opening import open_scene
-from langsplat_viewer.browsing import Entry, list_folder
+from langsplat_viewer.browsing import SCENE_SUFFIXES, Entry, list_folder
+from langsplat_viewer.querysets import SUFFIX as QUERIES
 from langsplat_viewer.viewer import Viewer
+
+COMPANIONS = (cameras_json.SUFFIX, language.SUFFIX)  # files beside a scene, read with it
+NAMED = 3  # files that a message names
 
 
 def ask_for_file(viewer: Viewer) -> None:
@@ -28,11 +35,42 @@ def browse(viewer: Viewer, folder: Path) -> None:
 
 def choose(viewer: Viewer, entry: Entry) -> None:
     """Go into a folder, or open a scene."""
-    if entry.is_scene:
+    if entry.is_file:
         close_browser(viewer)
-        open_scene(viewer, entry.path)
+        open_file(viewer, entry.path)
     else:
         browse(viewer, entry.path)
+
+
+def open_file(viewer: Viewer, path: Path) -> None:
+    """Open a scene, or ask a set of queries."""
+    if path.name.endswith(QUERIES):
+        load_queries(viewer, path)
+    else:
+        open_scene(viewer, path)
+
+
+def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
+    """Open the first scene among files that were dropped onto the window, ask the queries among them, and say
+    what became of the others: one scene is shown at a time, and what belongs to it lies beside it."""
+    sets = [path for path in paths if path.name.endswith(QUERIES)]
+    files = [path for path in paths if path not in sets]
+    scenes = [path for path in files if not path.name.endswith(COMPANIONS)] or files
+    if not scenes:
+        _ask_sets(viewer, sets)
+        return
+    first = next((path for path in scenes if path.suffix.lower() in SCENE_SUFFIXES), scenes[0])
+    others = [path.name for path in scenes if path != first]
+    if others:
+        more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
+        names = ", ".join(others[:NAMED]) + more
+        viewer.state.say(f"one scene at a time: {first.name} is opened, not {names}", is_error=True)
+    open_scene(viewer, first, lambda viewer: _ask_sets(viewer, sets))
+
+
+def _ask_sets(viewer: Viewer, sets: Sequence[Path]) -> None:
+    for path in sets:
+        load_queries(viewer, path)
 
 
 def open_recent(viewer: Viewer, path: str) -> None:
@@ -52,7 +90,7 @@ def open_typed(viewer: Viewer) -> None:
     if not text:
         return
     path = (listing.folder if listing else Path.cwd()) / os.path.expanduser(text)
-    choose(viewer, Entry(path, is_scene=not _is_plain_folder(path)))
+    choose(viewer, Entry(path, is_file=not _is_plain_folder(path)))
 
 
 def _is_plain_folder(path: Path) -> bool:

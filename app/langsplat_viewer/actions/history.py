@@ -13,7 +13,7 @@ LONGEST = 100  # steps that can be undone
 class Moment:
     """The queries and how they were looked at."""
 
-    queries: tuple[tuple[Query, int | None, int], ...]  # with slot and shown_since
+    queries: tuple[tuple[Query, int | None, int, float | None], ...]  # with slot, shown_since and cut
     selected: Query | None
     display: Display
     latent_level: int
@@ -22,7 +22,7 @@ class Moment:
 
 def now(state: ViewerState) -> Moment:
     """How things stand."""
-    queries = tuple((query, query.slot, query.shown_since) for query in state.queries)
+    queries = tuple((query, query.slot, query.shown_since, query.cut) for query in state.queries)
     return Moment(queries, state.selected, state.picture.display, state.latent_level, state.level)
 
 

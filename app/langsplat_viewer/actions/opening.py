@@ -1,6 +1,6 @@
 """Opening scenes, and stopping what is under way."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,7 +8,6 @@ from langsplat_core.arrays import Array
 from langsplat_core.compiled import is_compiled
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.display.latent_colours import latent_colours
-from langsplat_core.formats import cameras_json, language
 from langsplat_core.progress import Progress
 from langsplat_core.query import regions
 from langsplat_core.query.engine import no_field
@@ -16,14 +15,10 @@ from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions.camera import opening_view
 from langsplat_viewer.actions.history import forget
-from langsplat_viewer.browsing import SCENE_SUFFIXES
 from langsplat_viewer.controls import Extent, extent_of
 from langsplat_viewer.looking import why_undrawable
 from langsplat_viewer.preferences import with_recent
 from langsplat_viewer.viewer import Viewer
-
-COMPANIONS = (cameras_json.SUFFIX, language.SUFFIX)  # files beside a scene, read with it
-NAMED = 3  # files that a message names
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,22 +59,6 @@ def open_scene(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = lamb
     viewer.worker.submit(f"opening {path.name}", work, done, failed)
 
 
-def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
-    """Open the first scene among files that were dropped onto the window, and say what became of the others:
-    one scene is shown at a time, and what belongs to it lies beside it and is read with it."""
-    scenes = [path for path in paths if not path.name.endswith(COMPANIONS)] or list(paths)
-    if not scenes:
-        return
-    first = next((path for path in scenes if path.suffix.lower() in SCENE_SUFFIXES), scenes[0])
-    others = [path.name for path in scenes if path != first]
-    if others:
-        names = ", ".join(others[:NAMED]) + (
-            f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
-        )
-        viewer.state.say(f"one scene at a time: {first.name} is opened, not {names}", is_error=True)
-    open_scene(viewer, first)
-
-
 def cancel(viewer: Viewer) -> None:
     """Drop the work under way."""
     viewer.worker.cancel()
@@ -95,12 +74,14 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state.opening, state.path = None, path
     state.scene, state.extent, state.latent = scene, opened.extent, opened.latent
     state.queries, state.selected, state.glide = [], None, None
+    state.canonical, state.canonical_typed = (), ""
     state.camera_index = 0 if scene.cameras else None
     forget(viewer)
     state.preferences = with_recent(state.preferences, path.absolute())
     state.opening_camera = None
     state.view, state.nothing = opening_view(viewer), why_undrawable(scene.gaussians)
-    viewer.engine = viewer.services.engine(scene)
+    viewer.engine, viewer.describer, state.hover = viewer.services.engine(scene), None, None
+    state.pointing = state.pointing and scene.language is not None
     if scene.language is None and DISPLAYS[state.picture.display].needs_field:
         state.picture = replace(state.picture, display="rgb")
     reasons = ", ".join(f"{count:,} with {reason}" for reason, count in opened.unusable.items())

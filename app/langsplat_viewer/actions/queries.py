@@ -6,6 +6,7 @@ from langsplat_core.config import LevelChoice
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import UnknownWordError
 from langsplat_core.progress import Progress
+from langsplat_core.query.answers import recut
 from langsplat_core.query.compose import ComposedResult, run_phrase
 from langsplat_core.query.engine import no_field
 from langsplat_core.query.phrase_tree import Atom
@@ -21,12 +22,14 @@ def ask(viewer: Viewer, text: str) -> None:
     """Search the scene for a phrase, or for several between commas, and show where each is true."""
     phrases = split_phrases(text)
     for phrase in phrases:
-        _ask(viewer, phrase)
+        ask_one(viewer, phrase)
     if text.strip() and not phrases:
         viewer.state.say(f"'{text.strip()[:40]}' has no word to look for", is_error=True)
 
 
-def _ask(viewer: Viewer, phrase: str) -> None:
+def ask_one(viewer: Viewer, phrase: str, *, cut: float | None = None, then_show: bool = True) -> None:
+    """Search the scene for one phrase. cut: a relevancy of one's own at which the answer ends; then_show:
+    give it a colour if it may be there."""
     state = viewer.state
     if state.scene is None or viewer.engine is None:
         state.say("open a scene first, then search it", is_error=True)
@@ -40,8 +43,15 @@ def _ask(viewer: Viewer, phrase: str) -> None:
     state.queries = [*(q for q in state.queries if q is not query), query]  # in order of asking
     state.asked = [*(earlier for earlier in state.asked if phrase_key(earlier) != key), phrase]
     state.recalled = len(state.asked)
+    query.cut = cut
     select(viewer, query)
-    _answer(viewer, query, then_show=True)
+    _answer(viewer, query, then_show)
+
+
+def ask_again(viewer: Viewer) -> None:
+    """Answer every query of the list anew: what they depend on has changed."""
+    for query in viewer.state.queries:
+        _answer(viewer, query)
 
 
 def type_phrase(viewer: Viewer, text: str) -> None:
@@ -95,7 +105,8 @@ def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
             query.meant = corrected(query.phrase, composed.near) or ""
             failed(str(composed))
             return
-        query.result, query.problem, query.meant, query.pending = composed.answer, "", "", False
+        query.automatic, query.problem, query.meant, query.pending = composed.answer, "", "", False
+        query.result = composed.answer if query.cut is None else recut(composed.answer, query.cut)
         query.reading = "" if isinstance(composed.tree, Atom) else composed.reading
         if then_show and query in viewer.state.queries:
             if composed.answer.verdict != "not here":  # nothing is painted for it
@@ -161,5 +172,4 @@ def set_level(viewer: Viewer, level: LevelChoice) -> None:
         return
     remember(viewer)
     viewer.state.level = level
-    for query in viewer.state.queries:
-        _answer(viewer, query)
+    ask_again(viewer)

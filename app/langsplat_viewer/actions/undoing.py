@@ -1,5 +1,6 @@
 """Undo and redo of what was asked and shown. The camera is not undone: R leads back."""
 
+from langsplat_viewer.actions.asking import set_cut
 from langsplat_viewer.actions.history import Moment, now
 from langsplat_viewer.actions.queries import set_level
 from langsplat_viewer.actions.settings import set_display
@@ -30,9 +31,10 @@ def _restore(viewer: Viewer, moment: Moment) -> None:
     state, history = viewer.state, viewer.history
     for query in state.queries:
         query.slot = None
-    for query, slot, since in moment.queries:
+    for query, slot, since, cut in moment.queries:
         query.slot, query.shown_since = slot, since
-    state.queries, state.selected = [query for query, _, _ in moment.queries], moment.selected
+        set_cut(viewer, query, cut, is_new=False)
+    state.queries, state.selected = [query for query, *_ in moment.queries], moment.selected
     past, future = history.past, history.future
     set_level(viewer, moment.level)
     set_display(viewer, moment.display, moment.latent_level)

@@ -5,20 +5,22 @@ from imgui_bundle import ImVec2, ImVec4, imgui
 from langsplat_core.display.colour_maps import QUERY_COLOURS
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions
+from langsplat_viewer.panels import cut
 from langsplat_viewer.panels.style import bad, elided, good, muted, small_wrapped
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
 
 ROWS = 3.5  # that the list shows at a time: the half one says that there are more
-DETAIL_LINES = 3  # of text, beside the line of buttons
 HIDDEN = (0.25, 0.25, 0.25)
 
 
 def draw(viewer: Viewer) -> None:
-    """The list, newest first, and the chosen query. Both keep their height, so that nothing below them moves
-    under the mouse when an answer arrives."""
+    """The list, newest first, which grows when something is asked and not when an answer arrives; and below
+    it the chosen query."""
     row = imgui.get_frame_height_with_spacing()
-    if imgui.begin_child("queries", ImVec2(0, ROWS * row), imgui.ChildFlags_.none):
+    if imgui.begin_child(
+        "queries", ImVec2(0, min(len(viewer.state.queries) or 1, ROWS) * row), imgui.ChildFlags_.none
+    ):
         if not viewer.state.queries:
             imgui.text_colored(muted(), "what you search is listed here")
         for query in reversed(viewer.state.queries):
@@ -26,12 +28,9 @@ def draw(viewer: Viewer) -> None:
             _line(viewer, query)
             imgui.pop_id()
     imgui.end_child()
-    height = row + DETAIL_LINES * imgui.get_text_line_height_with_spacing()
-    if imgui.begin_child("details", ImVec2(0, height), imgui.ChildFlags_.none):
-        chosen = viewer.state.selected
-        if chosen is not None:
-            _details(viewer, chosen)
-    imgui.end_child()
+    chosen = viewer.state.selected
+    if chosen is not None:
+        _details(viewer, chosen)
 
 
 def _line(viewer: Viewer, query: Query) -> None:
@@ -106,5 +105,6 @@ def _details(viewer: Viewer, query: Query) -> None:
                 imgui.text(text)
             else:
                 imgui.text_colored(muted(), text)
+        cut.draw(viewer, query, result)
     if query.reading:
         small_wrapped(f"read as: {query.reading}", muted())

@@ -87,7 +87,7 @@ def _list(viewer: Viewer, listing: Listing) -> None:
 
 def _line(viewer: Viewer, entry: Entry) -> None:
     right = imgui.get_content_region_avail().x
-    name = entry.path.name if entry.is_scene else f"{entry.path.name}/"
+    name = entry.path.name if entry.is_file else f"{entry.path.name}/"
     if imgui.selectable(name, False)[0]:
         actions.choose(viewer, entry)
     if entry.size:

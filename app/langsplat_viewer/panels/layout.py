@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.panels import browser, help, legend, messages, palette, scene, search, view
+from langsplat_viewer.panels import browser, help, legend, messages, palette, pointing, scene, search, view
 from langsplat_viewer.panels.area import MAIN_DOCK, scene_area
 from langsplat_viewer.viewer import Viewer
 
 LEFT, MIDDLE, FOOT = "Left", "Middle", "Foot"  # docks of the column beside the scene
 COLUMN = 345.0  # its width at first, window units
-MOST_SHARE, MIDDLE_SHARE, FOOT_SHARE = 0.4, 0.42, 0.19
+MOST_SHARE, MIDDLE_SHARE, FOOT_SHARE = 0.4, 0.36, 0.15
 
 
 @dataclass(frozen=True)
@@ -98,6 +98,7 @@ def draw_over(viewer: Viewer) -> None:
         legend.say(said, area)
     else:
         legend.draw(viewer, area)
+        pointing.draw(viewer)
     browser.draw(viewer)
     help.draw(viewer)
     palette.draw(viewer)

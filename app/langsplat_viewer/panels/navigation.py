@@ -19,10 +19,21 @@ def handle(viewer: Viewer, area: Area) -> None:
     io = imgui.get_io()
     if viewer.state.view is not None and not io.want_capture_mouse:
         _mouse(viewer, area)
+    actions.hover(viewer, _pixel(area))
     keyboard.handle(viewer)
     letters = not (io.want_text_input or io.key_ctrl or viewer.state.letters_muted)
     if viewer.state.view is not None and letters:
         _fly(viewer)
+
+
+def _pixel(area: Area) -> tuple[int, int] | None:
+    """Where the mouse is in the scene's area, pixels; None where a panel has it, or a button is held."""
+    io = imgui.get_io()
+    if io.want_capture_mouse or any(imgui.is_mouse_down(button) for button in range(3)):
+        return None
+    scale = io.display_framebuffer_scale
+    x, y = (io.mouse_pos.x - area.left) * scale.x, (io.mouse_pos.y - area.top) * scale.y
+    return math.floor(x), math.floor(y)
 
 
 def _mouse(viewer: Viewer, area: Area) -> None:

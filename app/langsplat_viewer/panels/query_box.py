@@ -43,12 +43,13 @@ def hint(viewer: Viewer) -> str:
 
 
 def _offers(viewer: Viewer) -> None:
-    """Small buttons, as many in a row as fit, in a place of their own, so that nothing moves below."""
+    """Small buttons, as many in a row as fit, where there is anything to offer."""
+    title, phrases = actions.offers(viewer)
+    if not phrases:
+        return
     height = OFFER_LINES * imgui.get_text_line_height_with_spacing()
     if imgui.begin_child("offers", ImVec2(0, height), imgui.ChildFlags_.none):
-        title, phrases = actions.offers(viewer)
-        if phrases:
-            _buttons(viewer, title, phrases)
+        _buttons(viewer, title, phrases)
     imgui.end_child()
 
 

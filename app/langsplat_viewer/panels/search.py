@@ -6,6 +6,7 @@ from imgui_bundle import imgui
 
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.engine import no_field
+from langsplat_core.scene import CANONICAL_PHRASES
 from langsplat_viewer import actions
 from langsplat_viewer.panels import answers, query_box
 from langsplat_viewer.panels.style import muted, small_wrapped
@@ -30,6 +31,24 @@ def draw(viewer: Viewer) -> None:
     _level(viewer)
     imgui.end_disabled()
     answers.draw(viewer)
+    _canonical(viewer)
+
+
+def _canonical(viewer: Viewer) -> None:
+    """What everything is compared with."""
+    if not imgui.collapsing_header("Compared with"):
+        return
+    state = viewer.state
+    small_wrapped("a place is relevant where it is nearer to the phrase than to all of these", muted())
+    imgui.set_next_item_width(-1)
+    hint = ", ".join(state.canonical or CANONICAL_PHRASES)
+    flags = imgui.InputTextFlags_.enter_returns_true
+    entered, typed = imgui.input_text_with_hint("##canonical", hint, state.canonical_typed, flags)
+    actions.type_canonical(viewer, typed)
+    if entered:
+        actions.compare_with(viewer, typed)
+    if state.canonical and imgui.button("The scene's own"):
+        actions.compare_with(viewer, "")
 
 
 def _level(viewer: Viewer) -> None:

@@ -1,0 +1,81 @@
+"""What is said beside the cursor, without a window."""
+
+from pathlib import Path
+
+import pytest
+
+from langsplat_viewer import actions
+from langsplat_viewer.panels.pointing import figures, said
+from tests.support.fakes import CENTRES
+from tests.support.windowless import errors, settle
+
+
+@pytest.fixture
+def pointing(opened):
+    """The mug asked for, and the mouse asked about."""
+    actions.resize(opened, 160, 120)
+    actions.ask(opened, "mug")
+    settle(opened)
+    actions.toggle_pointing(opened)
+    return opened
+
+
+def at(viewer, thing: int) -> tuple[int, int]:
+    (x, y), _ = (part[0] for part in viewer.state.view.camera(160, 120).project(CENTRES[thing][None]))
+    return int(x), int(y)
+
+
+def rest(viewer, pixel, seconds: float = 0.5) -> None:
+    """The mouse lies still there."""
+    began = viewer.clock
+    for now in (began, began + seconds):
+        actions.tick(viewer, now)
+        actions.hover(viewer, pixel)
+    settle(viewer)
+
+
+def test_it_is_said_once_the_mouse_rests(pointing):
+    rest(pointing, at(pointing, 0), seconds=0.05)
+    assert pointing.state.hover.found is None
+    rest(pointing, at(pointing, 0))
+    found = pointing.state.hover
+    assert found.phrases == ("mug",)
+    assert found.found.relevancy[0] > 0.9
+    assert "mug" in said(found.found.words[2])
+    assert "away" in figures(found)[-1]
+    assert figures(found)[0].startswith("mug: ")
+
+
+def test_it_is_forgotten_when_the_mouse_or_the_camera_moves(pointing):
+    rest(pointing, at(pointing, 0))
+    actions.hover(pointing, (3, 4))
+    assert pointing.state.hover.found is None
+    rest(pointing, at(pointing, 1))
+    assert pointing.state.hover.found is not None
+    actions.step_camera(pointing, 1)
+    for now in (10.0, 11.0):
+        actions.tick(pointing, now)
+    actions.hover(pointing, at(pointing, 1))
+    assert pointing.state.hover.found is None
+    for elsewhere in (None, (-1, 5), (160, 5), (5, 120)):
+        actions.hover(pointing, elsewhere)
+        assert pointing.state.hover is None
+
+
+def test_the_words_are_read_once_for_a_scene(pointing):
+    rest(pointing, at(pointing, 0))
+    describer = pointing.describer
+    rest(pointing, at(pointing, 1))
+    assert pointing.describer is describer
+    actions.open_scene(pointing, Path("book.ply"))
+    settle(pointing)
+    assert (pointing.describer, pointing.state.hover, pointing.state.pointing) == (None, None, True)
+
+
+def test_a_scene_that_means_nothing_says_so(pointing):
+    actions.open_scene(pointing, Path("plain.ply"))
+    settle(pointing)
+    assert not pointing.state.pointing
+    actions.toggle_pointing(pointing)
+    assert not pointing.state.pointing
+    assert "langsplat train" in errors(pointing)[-1]
