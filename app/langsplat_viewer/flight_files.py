@@ -20,6 +20,7 @@ from langsplat_core.parsing.opening import read_json_file
 from langsplat_core.scene import FARTHEST
 from langsplat_viewer.flight import FOV_LIMITS, LONGEST, SAME_TIME, Flight, Keyframe, Pose
 
+SUFFIX = ".path.json"  # that ours have
 MARK, VERSION = "langsplat_flight", 1
 SIZE_LIMIT = 16 * 1024 * 1024  # bytes
 MOST = 10_000  # keyframes

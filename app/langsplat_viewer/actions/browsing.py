@@ -8,7 +8,9 @@ from langsplat_core.formats import cameras_json, language
 from langsplat_core.formats.sog import META_NAME
 from langsplat_viewer.actions.asking import load_queries
 from langsplat_viewer.actions.opening import open_scene
+from langsplat_viewer.actions.recording import load_path
 from langsplat_viewer.browsing import SCENE_SUFFIXES, Entry, list_folder
+from langsplat_viewer.flight_files import SUFFIX as PATHS
 from langsplat_viewer.querysets import SUFFIX as QUERIES
 from langsplat_viewer.viewer import Viewer
 
@@ -43,9 +45,11 @@ def choose(viewer: Viewer, entry: Entry) -> None:
 
 
 def open_file(viewer: Viewer, path: Path) -> None:
-    """Open a scene, or ask a set of queries."""
+    """Open a scene, ask a set of queries, or take a camera path."""
     if path.name.endswith(QUERIES):
         load_queries(viewer, path)
+    elif path.name.endswith(PATHS):
+        load_path(viewer, path)
     else:
         open_scene(viewer, path)
 
@@ -53,7 +57,7 @@ def open_file(viewer: Viewer, path: Path) -> None:
 def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
     """Open the first scene among files that were dropped onto the window, ask the queries among them, and say
     what became of the others: one scene is shown at a time, and what belongs to it lies beside it."""
-    sets = [path for path in paths if path.name.endswith(QUERIES)]
+    sets = [path for path in paths if path.name.endswith((QUERIES, PATHS))]
     files = [path for path in paths if path not in sets]
     scenes = [path for path in files if not path.name.endswith(COMPANIONS)] or files
     if not scenes:
@@ -70,7 +74,7 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
 
 def _ask_sets(viewer: Viewer, sets: Sequence[Path]) -> None:
     for path in sets:
-        load_queries(viewer, path)
+        open_file(viewer, path)
 
 
 def open_recent(viewer: Viewer, path: str) -> None:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from langsplat_core.config import Display, LevelChoice
+from langsplat_viewer.flight import Keyframe
 from langsplat_viewer.state import Query, ViewerState
 from langsplat_viewer.viewer import Viewer
 
@@ -18,12 +19,20 @@ class Moment:
     display: Display
     latent_level: int
     level: LevelChoice
+    keyframes: tuple[Keyframe, ...]
 
 
 def now(state: ViewerState) -> Moment:
     """How things stand."""
     queries = tuple((query, query.slot, query.shown_since, query.cut) for query in state.queries)
-    return Moment(queries, state.selected, state.picture.display, state.latent_level, state.level)
+    return Moment(
+        queries,
+        state.selected,
+        state.picture.display,
+        state.latent_level,
+        state.level,
+        state.record.keyframes,
+    )
 
 
 def remember(viewer: Viewer) -> None:

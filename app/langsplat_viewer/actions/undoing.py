@@ -8,7 +8,7 @@ from langsplat_viewer.viewer import Viewer
 
 
 def undo(viewer: Viewer) -> None:
-    """Go back to before the last query, removal, colour, level or display."""
+    """Go back to before the last query, removal, colour, level, display or keyframe."""
     history = viewer.history
     if not history.past:
         viewer.state.say("nothing to undo")
@@ -35,6 +35,7 @@ def _restore(viewer: Viewer, moment: Moment) -> None:
         query.slot, query.shown_since = slot, since
         set_cut(viewer, query, cut, is_new=False)
     state.queries, state.selected = [query for query, *_ in moment.queries], moment.selected
+    state.record.keyframes, state.record.chosen = moment.keyframes, None
     past, future = history.past, history.future
     set_level(viewer, moment.level)
     set_display(viewer, moment.display, moment.latent_level)

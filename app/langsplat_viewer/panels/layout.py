@@ -6,7 +6,19 @@ from dataclasses import dataclass
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.panels import browser, help, legend, messages, palette, pointing, scene, search, view
+from langsplat_viewer.panels import (
+    bookmarks,
+    browser,
+    help,
+    legend,
+    messages,
+    palette,
+    pointing,
+    record,
+    scene,
+    search,
+    view,
+)
 from langsplat_viewer.panels.area import MAIN_DOCK, scene_area
 from langsplat_viewer.viewer import Viewer
 
@@ -30,6 +42,8 @@ PANELS: tuple[Panel, ...] = (
     Panel("Scene", LEFT, scene.draw),
     Panel("Display", MIDDLE, view.draw_display),
     Panel("Camera", MIDDLE, view.draw_camera),
+    Panel("Record", MIDDLE, record.draw, is_open=False),
+    Panel("Bookmarks", MIDDLE, bookmarks.draw, is_open=False),
     Panel("Messages", FOOT, messages.draw),
 )
 
@@ -99,6 +113,9 @@ def draw_over(viewer: Viewer) -> None:
     else:
         legend.draw(viewer, area)
         pointing.draw(viewer)
+    copied = actions.take_clipboard(viewer)
+    if copied:
+        imgui.set_clipboard_text(copied)
     browser.draw(viewer)
     help.draw(viewer)
     palette.draw(viewer)
