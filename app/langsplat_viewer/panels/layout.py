@@ -42,8 +42,8 @@ PANELS: tuple[Panel, ...] = (
     Panel("Scene", LEFT, scene.draw),
     Panel("Display", MIDDLE, view.draw_display),
     Panel("Camera", MIDDLE, view.draw_camera),
-    Panel("Record", MIDDLE, record.draw, is_open=False),
-    Panel("Bookmarks", MIDDLE, bookmarks.draw, is_open=False),
+    Panel("Record", LEFT, record.draw, is_open=False),
+    Panel("Bookmarks", LEFT, bookmarks.draw, is_open=False),
     Panel("Messages", FOOT, messages.draw),
 )
 

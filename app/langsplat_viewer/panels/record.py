@@ -10,7 +10,7 @@ from langsplat_viewer.panels.style import muted, small_wrapped
 from langsplat_viewer.recording import FPS_CHOICES
 from langsplat_viewer.viewer import Viewer
 
-ROWS = 4.5  # of the list: the half one says that there are more
+ROWS = 3.5  # of the list: the half one says that there are more
 NUMBER_EM = 7.5
 
 
@@ -25,7 +25,9 @@ def draw(viewer: Viewer) -> None:
     _tip("Once around what the view turns around; F makes that the latest result")
     imgui.begin_disabled(viewer.state.view is None)
     _play(viewer)
-    if not record.turns:
+    if record.turns:
+        _duration(viewer)
+    else:
         _keyframes(viewer)
     _film(viewer)
     imgui.end_disabled()
@@ -48,6 +50,10 @@ def _play(viewer: Viewer) -> None:
     changed, loops = imgui.checkbox("Loop", record.loops)
     if changed:
         actions.set_looping(viewer, loops)
+
+
+def _duration(viewer: Viewer) -> None:
+    seconds = actions.path_seconds(viewer)
     imgui.begin_disabled(seconds <= 0)
     wanted = _number("Duration", seconds, 1.0)
     if wanted is not None:
@@ -73,6 +79,8 @@ def _keyframes(viewer: Viewer) -> None:
     if imgui.button("Clear"):
         actions.clear_path(viewer)
     imgui.end_disabled()
+    imgui.same_line()
+    _duration(viewer)
     height = ROWS * imgui.get_frame_height_with_spacing()
     if imgui.begin_child("keyframes", ImVec2(0, height), imgui.ChildFlags_.borders):
         if not record.keyframes:
