@@ -65,7 +65,14 @@ def test_without_a_folder_nothing_is_written(opened, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     "text",
-    ["{", "[]", '{"version": 2, "scenes": {}}', '{"version": 1, "scenes": 3}', "SCENE 3", 'SCENE [{"name": 1}]'],
+    [
+        "{",
+        "[]",
+        '{"version": 2, "scenes": {}}',
+        '{"version": 1, "scenes": 3}',
+        "SCENE 3",
+        'SCENE [{"name": 1}]',
+    ],
 )
 def test_a_file_that_makes_no_sense_is_said_and_kept(opened, tmp_path, text):
     if text.startswith("SCENE "):

@@ -45,6 +45,8 @@ def folder(tmp_path: Path) -> Path:
         "many_queries",
         "type_while_opening",
         "look_at_nothing",
+        "record_and_play",
+        "mark_and_return",
         "close_while_opening",
     ],
 )

@@ -25,6 +25,7 @@ from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest
 from tests.support.fakes import CENTRES, FakeEncoder
+from tests.viewer.scenarios_record import RECORD_SCENARIOS
 
 MUG, BOOK, PLANT = CENTRES
 PATIENCE = 240.0  # seconds: other tests may have the cores
@@ -508,6 +509,7 @@ SCENARIOS = {
     "many_queries": (many_queries, "blobs.ply", {}),
     "type_while_opening": (type_while_opening, "blobs.ply", {"load": slow_load}),
     "look_at_nothing": (look_at_nothing, "nothing.ply", {}),
+    **RECORD_SCENARIOS,
     "close_while_opening": (close_while_opening, "blobs.ply", {"load": slow_load}),
 }
 
