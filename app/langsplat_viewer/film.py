@@ -109,12 +109,11 @@ def make_film(shot: Shot, out: Path, progress: Progress = silent) -> list[str]:
     with in_one_line(out, f"{width}x{height}"), painter(shot.subject, shot.backend) as paint:
         roll = _Roll(shot, paint, progress)
         drawn = write_film(film, roll.draw)
-    if roll.empty:
-        log.warning("%d of %d pictures show nothing of the scene", roll.empty, film.count)
     kept = f", {film.count - drawn} of them kept" if drawn < film.count else ""
     name = f"{out}/" if is_folder(out) else str(out)
     pictures = "picture" if film.count == 1 else "pictures"
-    return [f"{name}: {width}x{height}, {film.count} {pictures}{kept}, {film.fps:g} a second"]
+    empty = [f"{roll.empty} of {film.count} pictures show nothing of the scene"] if roll.empty else []
+    return [f"{name}: {width}x{height}, {film.count} {pictures}{kept}, {film.fps:g} a second", *empty]
 
 
 class _Roll:

@@ -240,6 +240,13 @@ def test_a_film_of_nothing_is_refused(folder):
     assert not (folder / "a.gif").exists()
 
 
+def test_pictures_of_nothing_are_counted(folder):
+    keys = (*flight().keyframes, Keyframe(2.0, flight(1.0).keyframes[2].pose))
+    cameras = cameras_of(Flight(keys), 2.0, SIZE)
+    lines = make_film(Shot(Subject(blob_scene()), cameras, 2.0, "cpu"), folder / "a.gif")
+    assert lines[1].endswith("of 5 pictures show nothing of the scene")
+
+
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [

@@ -70,7 +70,7 @@ def save_film(viewer: Viewer, folder: Path) -> None:
 
     def work(progress: Progress) -> str:
         say_compiling(progress)
-        return make_film(shot, out, progress)[0]
+        return "; ".join(make_film(shot, out, progress))
 
     _submit(viewer, f"film {out.name}", work)
 
