@@ -170,6 +170,22 @@ PAPER = TrainConfig(
     lift=LiftConfig(mode="gradient", start="zeros-as-published"),
 )
 TrainProfile = Literal["default", "paper"]
+TrainPreset = Literal["quick", "good", "full"]
+
+
+def with_preset(config: TrainConfig, preset: TrainPreset) -> TrainConfig:
+    """How much is spent on a scene: "quick" takes minutes of a CPU, "full" is as published, for a GPU."""
+    if preset == "full":
+        return config
+    side, steps, most, size = (320, 500, 30_000, 512) if preset == "quick" else (480, 1_500, 60_000, 0)
+    return replace(
+        config,
+        dataset=replace(config.dataset, max_side=side),
+        radiance=replace(config.radiance, steps=steps, max_gaussians=most, sh_degree=1),
+        codec=replace(config.codec, size=size),
+    )
+
+
 TRAIN_PROFILES: Mapping[TrainProfile, TrainConfig] = MappingProxyType(
     {"default": TrainConfig(), "paper": PAPER}
 )

@@ -1,6 +1,7 @@
 """How long work reports where it is. Core functions take a `Progress`; the command line and the window
 supply one each. A `Progress` may raise to interrupt the work (Ctrl-C, the window's cancel button)."""
 
+import json
 import sys
 from collections.abc import Callable
 from types import TracebackType
@@ -22,6 +23,29 @@ class Cancelled(Exception):
 
 class Terminated(KeyboardInterrupt):
     """The system asked the process to end (SIGTERM); what was stored so far stays valid."""
+
+
+class LineProgress:
+    """A `Progress` for other programs: a line of JSON on stderr for every report that says anything new,
+    ``{"label": "matching photographs", "fraction": 0.25}``; use as a context manager."""
+
+    def __init__(self) -> None:
+        self._last: tuple[str, float] = ("", -1.0)
+
+    def __enter__(self) -> "LineProgress":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        pass
+
+    def __call__(self, label: str, fraction: float) -> None:
+        report = (label, round(min(max(fraction, 0.0), 1.0), 3))
+        if report != self._last:
+            self._last = report
+            line = json.dumps({"label": report[0], "fraction": report[1]})
+            print(line, file=sys.stderr, flush=True)
 
 
 class TerminalProgress:

@@ -77,11 +77,12 @@ SIDE_KEYS: tuple[tuple[Side, str], ...] = (
     ("top", "Keypad7"),
     ("bottom", "Ctrl+Keypad7"),
 )
-PANEL_TITLES = ("Search", "Scene", "Display", "Camera", "Record", "Bookmarks", "Messages")
+PANEL_TITLES = ("Search", "Scene", "Display", "Camera", "Train", "Record", "Bookmarks", "Messages")
 MENUS = ("File", "Edit", "View", "Camera", "Window", "Help")
 
 COMMANDS: tuple[Command, ...] = (
     Command("open a scene", actions.ask_for_file, ("Ctrl+O",), "File"),
+    Command("train a scene", lambda viewer: actions.open_panel(viewer, "Train"), menu="File"),
     Command(
         "save a picture", lambda viewer: saving.save_picture(viewer, Path.cwd()), ("Ctrl+S", "P"), "File"
     ),

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import LevelChoice, PictureConfig
+from langsplat_core.config import LevelChoice, PictureConfig, TrainPreset
 from langsplat_core.display.colour_maps import MAX_QUERIES
 from langsplat_core.display.compose import HeatRanges
 from langsplat_core.display.displays import DISPLAYS
@@ -79,6 +79,16 @@ class Hover:
     phrases: tuple[str, ...] = ()  # whose relevancies it has
 
 
+@dataclass(frozen=True)
+class TrainingForm:
+    """What is typed in the panel that trains scenes."""
+
+    dataset: str = ""
+    out: str = ""
+    preset: TrainPreset = "good"
+    encoder: str = "demo"
+
+
 @dataclass(eq=False)
 class ViewerState:
     """The viewer without its window."""
@@ -117,6 +127,7 @@ class ViewerState:
     suggestions_of: Scene | None = None  # the scene for which they were looked for
     focus_input: bool = False  # the query box takes the keyboard at the next frame
 
+    training_form: TrainingForm = field(default_factory=TrainingForm)
     path_typed: str = ""
     messages: list[Message] = field(default_factory=list)
     stats: FrameStats = field(default_factory=FrameStats)

@@ -13,6 +13,7 @@ from langsplat_core.scene import Scene
 from langsplat_viewer.bookmarks import Shelf
 from langsplat_viewer.jobs import Worker
 from langsplat_viewer.state import ViewerState
+from langsplat_viewer.training import Training
 
 
 class Surface(Protocol):
@@ -60,5 +61,6 @@ class Viewer:
     engine: QueryEngine | None = None  # of the scene shown; asked on the worker only
     describer: Describer | None = None  # of the same scene, once it was needed
     surface: Surface | None = None
+    training: Training | None = None  # under way
     history: History = field(default_factory=History)
     clock: float = 0.0  # seconds, as of the last `actions.tick`

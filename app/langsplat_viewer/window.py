@@ -209,6 +209,7 @@ class Window:
             hello_imgui.get_runner_params().app_shall_exit = True
             return
         actions.tick(viewer, imgui.get_time())
+        actions.watch_training(viewer)
         keyboard.muted_until_clicked(viewer)  # hello_imgui draws the panels after this
         self._hiding.apply(viewer)
         layout.show_wanted(viewer)
@@ -279,3 +280,5 @@ class Window:
         self._remembered.update()
         self.viewer.recorder.close(RECORDER_PATIENCE)
         self.viewer.worker.close()
+        if self.viewer.training is not None:
+            self.viewer.training.end()

@@ -1,17 +1,20 @@
 """`langsplat train`: photographs -> scene.ply with a language field."""
 
+import logging
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, get_args
 
 import tyro
 
 from langsplat_core.cli.checks import OutFile, OutFolder
-from langsplat_core.config import TRAIN_PROFILES, TrainConfig, TrainProfile
-from langsplat_core.progress import TerminalProgress, silent
+from langsplat_core.config import TRAIN_PROFILES, TrainConfig, TrainPreset, TrainProfile, with_preset
+from langsplat_core.progress import LineProgress, TerminalProgress, silent
+
+log = logging.getLogger("langsplat")
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,11 @@ class Train:
     """Folder for intermediate results (default: <out>.work)."""
     profile: TrainProfile = "default"
     """"paper" starts from the published method's settings; options beside it still count."""
+    preset: TrainPreset = "full"
+    """How much is spent: quick takes minutes on a CPU, good perhaps half an hour, full is as published and
+    for a GPU; options beside it still count."""
+    progress: Literal["bars", "lines"] = "bars"
+    """How progress is shown: as bars, or for other programs as lines of JSON, both on standard error."""
     gaussians: Path | None = None
     """Take the Gaussians of this scene, trained elsewhere from the same cameras, and give them a meaning."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
@@ -34,16 +42,22 @@ class Train:
     def run(self) -> None:
         # They import torch: seconds that --help need not pay.
         from langsplat_core.pipeline.crew import join_crew
+        from langsplat_core.pipeline.forecast import Forecast, count_photographs, forecast_in_words, plan
         from langsplat_core.pipeline.train import train_scene
 
         crew = join_crew()
-        with TerminalProgress() if crew.leads else nullcontext(silent) as progress:
+        shown = LineProgress() if self.progress == "lines" else TerminalProgress()
+        photographs, has_cameras = count_photographs(self.dataset)
+        stages = plan(self.config, photographs, has_cameras, self.gaussians is not None)
+        if crew.leads and photographs:
+            log.info("%d photographs: %s", photographs, forecast_in_words(stages))
+        with shown if crew.leads else nullcontext(silent) as progress:
             report = train_scene(
                 self.dataset,
                 self.out,
                 self.config,
                 self.work,
-                progress,
+                Forecast(stages, progress),
                 crew=crew,
                 gaussians_from=self.gaussians,
             )
@@ -62,10 +76,12 @@ class Train:
 
 
 def train_command(args: Sequence[str]) -> type[Train]:
-    """`Train` with the settings of the profile that `args` names as defaults."""
-    names = [word for option, word in pairwise([*args, ""]) if option == "--profile"]
-    names += [word.partition("=")[2] for word in args if word.startswith("--profile=")]
-    config = next((TRAIN_PROFILES[name] for name in TRAIN_PROFILES if name in names[-1:]), TrainConfig())
+    """`Train` with the settings of the profile and preset that `args` name as defaults."""
+    profile, preset = _named(args, "--profile"), _named(args, "--preset")
+    config = next((TRAIN_PROFILES[name] for name in TRAIN_PROFILES if name == profile), TrainConfig())
+    for known in get_args(TrainPreset):
+        if known == preset:
+            config = with_preset(config, known)
 
     @dataclass(frozen=True)
     class ProfiledTrain(Train):
@@ -73,3 +89,10 @@ def train_command(args: Sequence[str]) -> type[Train]:
 
     ProfiledTrain.__doc__ = Train.__doc__
     return ProfiledTrain
+
+
+def _named(args: Sequence[str], option: str) -> str:
+    """What `args` give for an option, the last time they do; "" where they do not."""
+    values = [word for before, word in pairwise([*args, ""]) if before == option]
+    values += [word.partition("=")[2] for word in args if word.startswith(f"{option}=")]
+    return values[-1] if values else ""

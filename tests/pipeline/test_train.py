@@ -17,13 +17,14 @@ from langsplat_core.config import (
     LiftConfig,
     RadianceConfig,
     TrainConfig,
+    with_preset,
 )
 from langsplat_core.errors import EncoderError, FormatError, InputError
 from langsplat_core.formats import load_scene
 from langsplat_core.pipeline import language, train
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import train_scene
-from langsplat_core.progress import Cancelled
+from langsplat_core.progress import Cancelled, LineProgress
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics import store
 from tests.support.tiny_room import tiny_room, tiny_settings
@@ -297,3 +298,21 @@ def test_the_papers_profile_runs_whole(room, tmp_path, capsys):
     field = load_scene(out).language
     assert field is not None
     assert field.latents.shape[2] == 3
+
+
+def test_presets_are_defaults_that_options_override():
+    words = ["train", "photos", "--out", "s.ply"]
+    assert parse([*words, "--preset", "full"]).config == TrainConfig()
+    quick = parse([*words, "--preset=quick", "--radiance.steps", "7"]).config
+    expected = with_preset(TrainConfig(), "quick")
+    assert quick == replace(expected, radiance=replace(expected.radiance, steps=7))
+    both = parse([*words, "--profile", "paper", "--preset", "good"]).config
+    assert both == with_preset(PAPER, "good")
+
+
+def test_progress_as_lines_for_other_programs(capsys):
+    with LineProgress() as progress:
+        for label, fraction in (("a\n", 0.25), ("a\n", 0.2501), ("b", 7.0)):
+            progress(label, fraction)
+    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    assert lines == [{"label": "a\n", "fraction": 0.25}, {"label": "b", "fraction": 1.0}]

@@ -108,6 +108,14 @@ from langsplat_viewer.actions.settings import (
     toggle_panel,
     type_command,
 )
+from langsplat_viewer.actions.training import (
+    choose_photographs,
+    fill_in,
+    look_at_training,
+    start_training,
+    stop_training,
+    watch_training,
+)
 from langsplat_viewer.actions.undoing import redo, undo
 
 __all__ = [
@@ -122,6 +130,7 @@ __all__ = [
     "cancel_film",
     "choose",
     "choose_keyframe",
+    "choose_photographs",
     "clear_path",
     "close_browser",
     "compare_with",
@@ -129,6 +138,7 @@ __all__ = [
     "delete_bookmark",
     "delete_keyframe",
     "escape",
+    "fill_in",
     "focus_pixel",
     "focus_result",
     "focus_search",
@@ -141,6 +151,7 @@ __all__ = [
     "load_path",
     "load_queries",
     "load_typed_path",
+    "look_at_training",
     "look_from",
     "move",
     "move_keyframe",
@@ -185,7 +196,9 @@ __all__ = [
     "show_help",
     "show_palette",
     "show_panel",
+    "start_training",
     "step_camera",
+    "stop_training",
     "take_clipboard",
     "take_search_focus",
     "take_wanted_panel",
@@ -203,5 +216,6 @@ __all__ = [
     "type_path_file",
     "type_phrase",
     "undo",
+    "watch_training",
     "zoom_by",
 ]

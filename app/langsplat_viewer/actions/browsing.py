@@ -6,9 +6,12 @@ from pathlib import Path
 
 from langsplat_core.formats import cameras_json, language
 from langsplat_core.formats.sog import META_NAME
+from langsplat_core.pipeline.forecast import count_photographs
 from langsplat_viewer.actions.asking import load_queries
 from langsplat_viewer.actions.opening import open_scene
 from langsplat_viewer.actions.recording import load_path
+from langsplat_viewer.actions.settings import open_panel
+from langsplat_viewer.actions.training import choose_photographs
 from langsplat_viewer.browsing import SCENE_SUFFIXES, Entry, list_folder
 from langsplat_viewer.flight_files import SUFFIX as PATHS
 from langsplat_viewer.querysets import SUFFIX as QUERIES
@@ -56,7 +59,12 @@ def open_file(viewer: Viewer, path: Path) -> None:
 
 def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
     """Open the first scene among files that were dropped onto the window, ask the queries among them, and say
-    what became of the others: one scene is shown at a time, and what belongs to it lies beside it."""
+    what became of the others: one scene is shown at a time, and what belongs to it lies beside it. A folder
+    of photographs is offered for training."""
+    if len(paths) == 1 and _is_plain_folder(paths[0]) and count_photographs(paths[0])[0]:
+        choose_photographs(viewer, paths[0])
+        open_panel(viewer, "Train")
+        return
     sets = [path for path in paths if path.name.endswith((QUERIES, PATHS))]
     files = [path for path in paths if path not in sets]
     scenes = [path for path in files if not path.name.endswith(COMPANIONS)] or files

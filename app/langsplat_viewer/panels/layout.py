@@ -17,6 +17,7 @@ from langsplat_viewer.panels import (
     record,
     scene,
     search,
+    train,
     view,
 )
 from langsplat_viewer.panels.area import MAIN_DOCK, scene_area
@@ -42,6 +43,7 @@ PANELS: tuple[Panel, ...] = (
     Panel("Scene", LEFT, scene.draw),
     Panel("Display", MIDDLE, view.draw_display),
     Panel("Camera", MIDDLE, view.draw_camera),
+    Panel("Train", LEFT, train.draw, is_open=False),
     Panel("Record", LEFT, record.draw, is_open=False),
     Panel("Bookmarks", LEFT, bookmarks.draw, is_open=False),
     Panel("Messages", FOOT, messages.draw),

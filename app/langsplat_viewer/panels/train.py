@@ -1,0 +1,72 @@
+"""From photographs to a scene, without leaving the window."""
+
+from dataclasses import replace
+from typing import get_args
+
+from imgui_bundle import ImVec2, imgui
+
+from langsplat_core.config import TrainPreset
+from langsplat_viewer import actions
+from langsplat_viewer.panels.style import muted, small_wrapped
+from langsplat_viewer.training import Training
+from langsplat_viewer.viewer import Viewer
+
+PRESETS: tuple[TrainPreset, ...] = get_args(TrainPreset)
+MEANS = {
+    "quick": "minutes on a CPU",
+    "good": "a quarter of an hour and more on a CPU",
+    "full": "as published: for a GPU",
+}
+
+
+def draw(viewer: Viewer) -> None:
+    """The form, or what a running training says."""
+    training = viewer.training
+    if training is None:
+        _form(viewer)
+    else:
+        _running(viewer, training)
+
+
+def _form(viewer: Viewer) -> None:
+    form = viewer.state.training_form
+    form = replace(
+        form, dataset=_box("Photographs", "a folder, a COLMAP project, transforms.json", form.dataset)
+    )
+    form = replace(form, out=_box("Scene", "scene.ply", form.out))
+    form = replace(form, encoder=_box("Encoder", '"demo", or a folder or hub id of CLIP', form.encoder))
+    for number, preset in enumerate(PRESETS):
+        if number:
+            imgui.same_line()
+        if imgui.radio_button(preset, form.preset == preset):
+            form = replace(form, preset=preset)
+        if imgui.is_item_hovered():
+            imgui.set_tooltip(MEANS[preset])
+    actions.fill_in(viewer, form)
+    if imgui.button("Train"):
+        actions.start_training(viewer)
+    small_wrapped("An interrupted training continues where it stopped.", muted())
+
+
+def _box(label: str, hint: str, text: str) -> str:
+    imgui.text(label)
+    imgui.set_next_item_width(-1)
+    return str(imgui.input_text_with_hint(f"##{label} to train", hint, text)[1])
+
+
+def _running(viewer: Viewer, training: Training) -> None:
+    progress = training.progress
+    imgui.text_unformatted(training.request.out.name)
+    for label, fraction in list(progress.stages.items()):
+        small_wrapped(f"{label}: done" if fraction >= 1 else label, muted())
+        if fraction < 1:
+            imgui.progress_bar(fraction, ImVec2(-1, 0))
+    imgui.separator()
+    imgui.progress_bar(progress.overall, ImVec2(-1, 0), progress.left or "starting")
+    if imgui.button("Stop"):
+        actions.stop_training(viewer)
+    imgui.same_line()
+    if imgui.button("Look at it so far"):
+        actions.look_at_training(viewer)
+    for line in progress.said[-3:]:
+        small_wrapped(line, muted())

@@ -1,0 +1,138 @@
+"""How long a training will take: said beforehand from measured costs, then from how fast this run is.
+
+The costs are seconds of two CPU cores, measured on photographs and rooms (docs/photographs.md,
+docs/encoders.md). They are rough; what a run has behind it corrects them by one factor, its pace.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from langsplat_core.config import MaskConfig, TrainConfig
+from langsplat_core.datasets.images import PHOTO_SUFFIXES
+from langsplat_core.progress import Progress
+
+ASPECT = 0.75  # height by width of an ordinary photograph
+SLOWEST, FASTEST = 20.0, 0.02  # limits of the pace: more is a sleeping machine, less a stage that was kept
+SURE = 0.05  # share of a stage from which its own speed is trusted
+ALL = "all stages"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One of the steps from photographs to a scene."""
+
+    name: str
+    begins: tuple[str, ...]  # how the labels begin that it reports under
+    seconds: float  # that it is expected to take
+
+
+def plan(config: TrainConfig, photographs: int, has_cameras: bool, has_gaussians: bool) -> tuple[Stage, ...]:
+    """The stages of a training from so many photographs, in their order."""
+    megapixels = ASPECT * config.dataset.max_side**2 / 1e6
+    per_photograph = _mask_seconds(config.masks, megapixels) + _encoder_seconds(config.clip.model)
+    gaussians = config.radiance.max_gaussians
+    # A step costs what it draws, and what it keeps: 0.03 s at 0.1 megapixels, 0.1 s at 100 000 Gaussians.
+    step = 0.5 * megapixels + 1e-6 * min(gaussians, 300_000)
+    codec = 3 + 0.02 * min(config.codec.size or 2500, 4096)
+    lifting = photographs * (0.2 + 0.5 * megapixels) + 1e-4 * gaussians * min(photographs, 100) / 50
+    if config.lift.mode == "gradient":
+        lifting += 0.02 * config.lift.steps
+    return (
+        Stage(
+            "photographs",
+            (
+                *("preparing photographs", "finding features", "matching photographs", "locating cameras"),
+                *("triangulating points", "reading photographs"),
+            ),
+            photographs * (0.05 if has_cameras else 6.0),
+        ),
+        Stage("masks and vectors", ("masks (",), photographs * per_photograph),
+        Stage("Gaussians", ("Training Gaussians",), 0.0 if has_gaussians else config.radiance.steps * step),
+        Stage("language field", ("",), lifting + codec),  # whatever follows
+    )
+
+
+def _mask_seconds(masks: MaskConfig, megapixels: float) -> float:
+    if not masks.sam or masks.source == "graph":
+        return 18 * megapixels
+    return 590.0 * (5 if masks.crop_layers else 1) if "huge" in masks.sam else 330.0
+
+
+def _encoder_seconds(model: str) -> float:
+    return 1.2 if model == "demo" else 130.0
+
+
+def count_photographs(dataset: Path) -> tuple[int, bool]:
+    """How many photographs lie in a dataset, and whether cameras come with them. Does not raise."""
+    try:
+        folder = dataset if dataset.is_dir() else dataset.parent
+        has_cameras = (folder / "transforms.json").is_file() or (folder / "sparse").is_dir()
+        images = folder / "images" if (folder / "images").is_dir() else folder
+        return sum(path.suffix.lower() in PHOTO_SUFFIXES for path in images.iterdir()), has_cameras
+    except OSError:
+        return 0, False
+
+
+def in_words(seconds: float) -> str:
+    """ "40 s", "12 min", "3 h": as exact as a forecast is."""
+    if seconds < 90:
+        return f"{max(10 * round(seconds / 10), 10):.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.0f} h"
+
+
+def forecast_in_words(stages: Sequence[Stage]) -> str:
+    """What a plan costs: "about 6 min on two CPU cores (photographs 80 s, ...)"."""
+    parts = ", ".join(f"{stage.name} {in_words(stage.seconds)}" for stage in stages if stage.seconds > 1)
+    return f"about {in_words(sum(stage.seconds for stage in stages))} on two CPU cores ({parts})"
+
+
+@dataclass(eq=False)
+class Forecast:
+    """A `Progress` that passes everything on and adds how far the whole is, and what is left of it."""
+
+    stages: tuple[Stage, ...]
+    inner: Progress
+    clock: Callable[[], float] = time.monotonic
+    _current: int = 0
+    _began: list[float] = field(default_factory=list)  # when each stage began, seconds
+
+    def __call__(self, label: str, fraction: float) -> None:
+        self.inner(label, fraction)
+        now, stage = self.clock(), self._stage_of(label)
+        while len(self._began) <= stage:
+            self._began.append(now)
+        self._current = max(self._current, stage)
+        if stage == self._current:
+            done, left = self._measure(now, fraction)
+            self.inner(f"{ALL}: about {in_words(left)} left", done)
+
+    def _stage_of(self, label: str) -> int:
+        """The stage that reports so; one does not go back."""
+        for number in range(self._current, len(self.stages)):
+            if label.startswith(self.stages[number].begins):
+                is_last = number == len(self.stages) - 1
+                known = any(label.startswith(stage.begins) for stage in self.stages[: self._current])
+                return self._current if is_last and known else number
+        return self._current
+
+    def _measure(self, now: float, fraction: float) -> tuple[float, float]:
+        """Share of the whole that is done, and seconds that are left."""
+        pace = self._pace()
+        stage = self.stages[self._current]
+        expected, spent = stage.seconds * pace, now - self._began[self._current]
+        if fraction > SURE and stage.begins != ("",) and len(stage.begins) == 1:  # it is that of the stage
+            expected = spent + (spent / fraction - spent + expected * (1 - fraction)) / 2
+        current = max(expected - spent, 0.0)
+        left = current + pace * sum(stage.seconds for stage in self.stages[self._current + 1 :])
+        before = now - self._began[0]
+        return (before / (before + left) if before + left > 0 else 1.0), left
+
+    def _pace(self) -> float:
+        """How many times longer than expected the stages behind took."""
+        expected = sum(stage.seconds for stage in self.stages[: self._current])
+        if expected <= 0:
+            return 1.0
+        taken = self._began[self._current] - self._began[0]
+        return min(max(taken / expected, FASTEST), SLOWEST)

@@ -1,0 +1,125 @@
+"""What a training is said to cost, and how much is said to be left, on a clock of the test's own."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from langsplat_core.config import PAPER, MaskConfig, TrainConfig, with_preset
+from langsplat_core.pipeline.forecast import (
+    ALL,
+    Forecast,
+    Stage,
+    count_photographs,
+    forecast_in_words,
+    in_words,
+    plan,
+)
+
+STAGES = (
+    Stage("photographs", ("reading", "finding"), 10.0),
+    Stage("masks and vectors", ("masks (",), 20.0),
+    Stage("Gaussians", ("Training Gaussians",), 60.0),
+    Stage("language field", ("",), 10.0),
+)
+
+
+class Run:
+    """A forecast that is told things at times."""
+
+    def __init__(self, stages: tuple[Stage, ...] = STAGES) -> None:
+        self.now, self.said = 0.0, []
+        self.forecast = Forecast(stages, self.hear, self.clock)
+
+    def hear(self, label: str, fraction: float) -> None:
+        self.said.append((label, fraction))
+
+    def clock(self) -> float:
+        return self.now
+
+    def at(self, now: float, label: str, fraction: float) -> tuple[str, float]:
+        self.now = now
+        self.forecast(label, fraction)
+        return self.said[-1]
+
+
+def test_a_run_as_fast_as_expected():
+    run = Run()
+    assert run.at(0, "reading photographs", 0.0) == (f"{ALL}: about 2 min left", 0.0)
+    assert run.at(5, "finding features", 0.5)[1] == pytest.approx(0.05)
+    assert run.at(10, "masks (graph) and vectors", 0.0)[1] == pytest.approx(0.1)
+    assert run.at(30, "Training Gaussians: 5 Gaussians", 0.0)[1] == pytest.approx(0.3)
+    label, done = run.at(60, "Training Gaussians: 9 Gaussians", 0.5)
+    assert (label, done) == (f"{ALL}: about 40 s left", pytest.approx(0.6))
+    assert run.at(90, "codebook: 16 codewords", 0.1)[1] == pytest.approx(0.9)
+    assert run.at(100, "finding things", 1.0) == (f"{ALL}: about 10 s left", 1.0)
+
+
+def test_what_was_slower_makes_the_rest_slower():
+    run = Run()
+    run.at(0, "reading photographs", 0.0)
+    run.at(20, "masks (graph) and vectors", 0.0)
+    assert run.at(60, "Training Gaussians", 0.0)[0] == f"{ALL}: about 2 min left"  # 70 s, twice
+
+
+def test_what_was_kept_from_before_takes_nothing_and_breaks_nothing():
+    run = Run()
+    assert run.at(0, "Training Gaussians", 0.5)[1] >= 0
+    assert run.at(0.001, "finding things", 0.5)[1] <= 1
+    fractions = [fraction for label, fraction in run.said if label.startswith(ALL)]
+    assert all(0 <= fraction <= 1 for fraction in fractions)
+
+
+def test_stages_never_go_back():
+    run = Run()
+    run.at(0, "masks (graph) and vectors", 0.5)
+    before = len(run.said)
+    run.at(1, "reading photographs", 1.0)
+    assert run.said[before:][0] == ("reading photographs", 1.0)
+    assert run.said[-1][1] < 0.5  # still among the masks
+
+
+def test_everything_that_is_reported_is_passed_on():
+    run = Run()
+    run.at(0, "reading photographs", 0.25)
+    assert run.said[0] == ("reading photographs", 0.25)
+
+
+def test_costs_grow_with_what_is_asked_for():
+    def cost(config: TrainConfig, photographs: int = 20) -> float:
+        return sum(stage.seconds for stage in plan(config, photographs, False, False))
+
+    quick, good, full = (with_preset(TrainConfig(), preset) for preset in ("quick", "good", "full"))
+    demo = replace(quick.clip, model="demo")
+    assert cost(replace(quick, clip=demo)) < 300
+    assert cost(quick) < cost(good) < cost(full) < cost(PAPER)
+    assert cost(quick, 10) < cost(quick, 40)
+    with_sam = replace(quick, masks=MaskConfig(sam="facebook/sam-vit-huge"))
+    assert cost(with_sam) > cost(quick) + 20 * 300
+    named = {stage.name: stage.seconds for stage in plan(full, 20, True, True)}
+    assert named["Gaussians"] == 0
+    assert named["photographs"] < 5
+
+
+def test_words():
+    assert [in_words(seconds) for seconds in (0, 44, 89, 100, 3000, 9000)] == [
+        "10 s",
+        "40 s",
+        "90 s",
+        "2 min",
+        "50 min",
+        "2 h",
+    ]
+    assert forecast_in_words(STAGES).startswith("about 2 min on two CPU cores (photographs 10 s, masks")
+
+
+def test_photographs_are_counted_where_they_lie(tmp_path: Path):
+    assert count_photographs(tmp_path / "gone") == (0, False)
+    for name in ("a.jpg", "b.PNG", "c.txt"):
+        (tmp_path / name).write_bytes(b"")
+    assert count_photographs(tmp_path) == (2, False)
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.jpg").write_bytes(b"")
+    (tmp_path / "transforms.json").write_text("{}")
+    assert count_photographs(tmp_path) == (1, True)
+    assert count_photographs(tmp_path / "transforms.json") == (1, True)

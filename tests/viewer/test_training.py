@@ -1,0 +1,132 @@
+"""Training from the window, with a process that only says it trains."""
+
+import signal
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from langsplat_core.cli.app import parse
+from langsplat_viewer import actions, training
+from langsplat_viewer.training import TrainingProgress, TrainingRequest, command
+from tests.support.windowless import SCENES, errors, settle
+
+SAYS = """
+import json, sys
+for label, fraction in (("reading photographs", 1.0), ("all stages: about 3 min left", 0.25)):
+    print(json.dumps({"label": label, "fraction": fraction}), file=sys.stderr, flush=True)
+"""
+GOOD = SAYS + "print('done: 3 Gaussians')"
+BAD = SAYS + "print('langsplat: photos: none can be located', file=sys.stderr); sys.exit(2)"
+SLOW = SAYS + "import time; time.sleep(60)"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Photographs."""
+    made = tmp_path / "photos"
+    made.mkdir()
+    for number in range(4):
+        (made / f"{number}.jpg").write_bytes(b"")
+    return made
+
+
+def trains(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
+    monkeypatch.setattr(training, "command", lambda request: [sys.executable, "-c", script])
+
+
+def finish(viewer, seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while viewer.training is not None and time.monotonic() < end:
+        actions.watch_training(viewer)
+        time.sleep(0.02)
+    assert viewer.training is None
+    settle(viewer)
+
+
+def test_a_folder_of_photographs_becomes_a_scene_that_opens(viewer, folder, monkeypatch):
+    trains(monkeypatch, GOOD)
+    actions.open_dropped(viewer, [folder])
+    form = viewer.state.training_form
+    assert (form.dataset, form.out) == (str(folder), str(folder.with_suffix(".ply")))
+    assert actions.take_wanted_panel(viewer) == "Train"
+    actions.fill_in(viewer, replace(form, out=str(folder.with_name("blobs.ply"))))
+    actions.start_training(viewer)
+    progress = viewer.training.progress
+    finish(viewer)
+    assert progress.stages == {"reading photographs": 1.0}
+    assert (progress.overall, progress.left) == (0.25, "about 3 min left")
+    assert any(message.text == "done: 3 Gaussians" for message in viewer.state.messages)
+    assert viewer.state.scene is SCENES["blobs.ply"]
+
+
+def test_what_goes_wrong_is_said(viewer, folder, monkeypatch):
+    trains(monkeypatch, BAD)
+    actions.choose_photographs(viewer, folder)
+    actions.start_training(viewer)
+    finish(viewer)
+    assert errors(viewer) == ["langsplat: photos: none can be located"]
+    assert viewer.state.scene is None
+
+
+def test_it_can_be_stopped_and_one_is_enough(viewer, folder, monkeypatch):
+    trains(monkeypatch, SLOW)
+    actions.choose_photographs(viewer, folder)
+    actions.start_training(viewer)
+    actions.start_training(viewer)
+    assert "under way" in errors(viewer)[-1]
+    actions.look_at_training(viewer)
+    assert "not trained yet" in viewer.state.messages[-1].text
+    process = viewer.training.process
+    actions.stop_training(viewer)
+    finish(viewer)
+    assert process.returncode == -signal.SIGTERM
+    assert "goes on" in viewer.state.messages[-1].text
+
+
+def test_the_gaussians_can_be_looked_at_before_the_end(viewer, folder, monkeypatch):
+    trains(monkeypatch, SLOW)
+    actions.choose_photographs(viewer, folder)
+    actions.start_training(viewer)
+    work = folder.with_name("photos.work")
+    work.mkdir()
+    (work / "radiance-0.ply").write_bytes(b"")
+    SCENES["radiance-0.ply"] = SCENES["plain.ply"]
+    try:
+        actions.look_at_training(viewer)
+        settle(viewer)
+    finally:
+        del SCENES["radiance-0.ply"]
+        viewer.training.end()
+    assert viewer.state.scene is SCENES["plain.ply"]
+
+
+@pytest.mark.parametrize("dataset", ["", "  ", "gone", "."])
+def test_a_folder_without_photographs_is_said(viewer, tmp_path, monkeypatch, dataset):
+    monkeypatch.chdir(tmp_path)
+    actions.fill_in(viewer, replace(viewer.state.training_form, dataset=dataset))
+    actions.start_training(viewer)
+    assert "no photographs" in errors(viewer)[-1]
+    assert viewer.training is None
+
+
+def test_the_command_is_one_that_the_program_understands():
+    request = TrainingRequest(Path("photos"), Path("s.ply"), "quick", "demo")
+    words = command(request)
+    assert words[1:3] == ["-m", "langsplat_core"]
+    parsed = parse(words[3:])
+    assert (parsed.dataset, parsed.out, parsed.progress) == (Path("photos"), Path("s.ply"), "lines")
+    assert (parsed.config.radiance.steps, parsed.config.clip.model) == (500, "demo")
+
+
+def test_what_is_no_progress_is_kept_as_words():
+    progress = TrainingProgress()
+    for line in ("plain words\n", '{"label": 3}', '"text"', "", "[1]", '{"label": "a: b", "fraction": 0.5}'):
+        progress.hear(line)
+    assert progress.said == ["plain words", '{"label": 3}', '"text"', "[1]"]
+    assert progress.stages == {"a": 0.5}
+    for number in range(100):
+        progress.hear(f"line {number}")
+    assert len(progress.said) < 30
