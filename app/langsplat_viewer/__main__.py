@@ -1,17 +1,19 @@
-"""`langsplat-viewer`: arguments -> window, or one picture without a window."""
+"""`langsplat-viewer`: arguments -> window, or a picture or film without a window."""
 
 import sys
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from langsplat_core.cli.run import main
-from langsplat_core.config import ColourMap, LevelChoice
+from langsplat_core.config import ColourMap, LevelChoice, PictureConfig, Share
+from langsplat_core.display.colour_maps import MAX_QUERIES
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, TerminalProgress, silent
+from langsplat_core.ranges import Range
 from langsplat_viewer.frame import Backend
 from langsplat_viewer.options import (
     DisplayChoice,
@@ -22,6 +24,10 @@ from langsplat_viewer.options import (
     services,
 )
 from langsplat_viewer.preferences import preferences_folder
+
+Seconds = Annotated[float, Range(0.1, 36_000.0)]
+PicturesPerSecond = Annotated[float, Range(0.1, 240.0)]
+Colours = tuple[Annotated[int, Range(1, MAX_QUERIES)], ...]
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,12 @@ class ViewerCommand:
     """Semantic level of the search; auto takes the one that answers best."""
     display: DisplayChoice = "auto"
     """What is shown; auto is relevancy with a query, else rgb."""
+    colour: Annotated[tyro.conf.UseAppendAction[Colours], tyro.conf.arg(metavar="N")] = ()
+    """Without a window: colour of a query, 1 to 3; repeat it for each --query (default: in their order)."""
+    heat_opacity: Share = PictureConfig.heat_opacity
+    """How much of the heat map covers the colours where relevancy is high."""
+    dim: Share = PictureConfig.dim
+    """Brightness of what a query does not find."""
     size: Annotated[str, tyro.conf.arg(metavar="WxH")] = ""
     """Size of the window or picture in pixels."""
     camera: Annotated[str, tyro.conf.arg(metavar="FILE|INDEX")] = ""
@@ -47,9 +59,17 @@ class ViewerCommand:
     fresh: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Neither use nor change the remembered layout, settings and recent files."""
     headless: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Draw one picture without a window and print the answers."""
+    """Draw a picture or a film without a window and print the answers."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE.png")] = None
-    """Where --headless writes."""
+    """Where --headless writes: a picture (.png); a film (.mp4, .webp, .gif) or a folder of its pictures."""
+    path: Annotated[Path | None, tyro.conf.arg(metavar="PATH.json")] = None
+    """A camera path: with --headless the film along it, else it is opened in the panel "Record"."""
+    turntable: Seconds | None = None
+    """With --headless: a film of so many seconds, once around what the camera sees in its middle."""
+    around: Literal["view", "answer"] = "view"
+    """What --turntable goes around; answer: the last query found, from near."""
+    fps: PicturesPerSecond = 30.0
+    """Pictures per second of a film."""
     colour_map: ColourMap | None = None
     """Colours of relevancy and depth in a picture of --headless (default: turbo)."""
     transparent: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -60,19 +80,33 @@ class ViewerCommand:
         path = scene_path(self.scene)
         camera_file(self.camera)  # a file that cannot be read is said before anything slow is done
         if self.headless:
-            self._still(path, size)
+            self._without_window(path, size)
         else:
             self._window(path, size)
 
-    def _still(self, path: Path, size: tuple[int, int] | None) -> None:
+    def _without_window(self, path: Path, size: tuple[int, int] | None) -> None:
+        from langsplat_viewer.film import FilmRequest, draw_film
+        from langsplat_viewer.film_files import check_film
         from langsplat_viewer.still import StillRequest, check_out, draw_still
 
+        if self.path is not None and self.turntable is not None:
+            raise InputError("--path and --turntable are two films; choose one")
+        is_film = self.path is not None or self.turntable is not None
+        if is_film and self.transparent:
+            raise InputError("--transparent is for pictures; films have a background")
+        if not is_film:
+            check_out(self.out)
+        else:
+            check_film(self.out, size)
         request = StillRequest(
             path=path,
-            out=check_out(self.out),
+            out=self.out or Path(),
             queries=self.query,
             level=self.level,
             display=chosen_display(self.display, self.query),
+            heat_opacity=self.heat_opacity,
+            dim=self.dim,
+            colours=self.colour,
             size=size,
             camera=self.camera,
             backend=self.backend,
@@ -83,7 +117,11 @@ class ViewerCommand:
         if sys.stderr.isatty():
             bars = TerminalProgress()
         with bars as progress:
-            lines = draw_still(request, services(self.encoder), progress)
+            if is_film:
+                film = FilmRequest(request, self.path, self.turntable, self.around == "answer", self.fps)
+                lines = draw_film(film, services(self.encoder), progress)
+            else:
+                lines = draw_still(request, services(self.encoder), progress)
         print("\n".join(lines))
 
     def _window(self, path: Path, size: tuple[int, int] | None) -> None:
@@ -95,6 +133,8 @@ class ViewerCommand:
                     f"{option} is for pictures without a window; choose it in the panel Display, "
                     "or add --headless"
                 )
+        if self.turntable is not None:
+            raise InputError("--turntable is a film without a window; add --headless --out film.mp4")
         from langsplat_viewer.window import WindowRequest, open_window
 
         open_window(
@@ -106,6 +146,9 @@ class ViewerCommand:
                 size=size,
                 camera=self.camera,
                 backend=self.backend,
+                path_file=self.path,
+                heat_opacity=self.heat_opacity,
+                dim=self.dim,
                 settings=None if self.fresh else preferences_folder(),
             ),
             services(self.encoder),

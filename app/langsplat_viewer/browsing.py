@@ -1,9 +1,10 @@
-"""What the file browser lists: folders, files that may be scenes, and sets of queries."""
+"""What the file browser lists: folders, files that may be scenes, sets of queries and camera paths."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from langsplat_core.formats.sog import META_NAME
+from langsplat_viewer.flight_files import SUFFIX as PATHS
 from langsplat_viewer.querysets import SUFFIX as QUERIES
 
 SCENE_SUFFIXES = (".ply", ".spz", ".splat", ".ksplat", ".sog")
@@ -46,7 +47,7 @@ def _entry(path: Path) -> Entry | None:
     try:
         if path.is_dir():
             return Entry(path, is_file=(path / META_NAME).is_file())
-        if path.suffix.lower() in SCENE_SUFFIXES or path.name.endswith(QUERIES):
+        if path.suffix.lower() in SCENE_SUFFIXES or path.name.endswith((QUERIES, PATHS)):
             return Entry(path, True, path.stat().st_size)
     except OSError:  # it may not be looked at
         pass

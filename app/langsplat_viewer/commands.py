@@ -10,7 +10,7 @@ from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions, saving
 from langsplat_viewer.actions.exporting import Part
-from langsplat_viewer.controls import adopt_up, level
+from langsplat_viewer.controls import Side, adopt_up, level
 from langsplat_viewer.seeing import Overlay
 from langsplat_viewer.selecting import TOOLS, Tool
 from langsplat_viewer.viewer import Viewer
@@ -90,7 +90,23 @@ def _export(does: str, part: Part, as_points: bool = False) -> Command:
     )
 
 
-PANEL_TITLES = ("Search", "Scene", "Display", "Camera", "Select", "Train", "Messages", "Overlays")
+def _side(side: Side, key: str) -> Command:
+    where = {"top": "above", "bottom": "below"}.get(side, f"the {side}")
+    return Command(f"look from {where}", lambda viewer: actions.look_from(viewer, side), (key,), "Camera")
+
+
+SIDE_KEYS: tuple[tuple[Side, str], ...] = (
+    ("front", "Keypad1"),
+    ("back", "Ctrl+Keypad1"),
+    ("right", "Keypad3"),
+    ("left", "Ctrl+Keypad3"),
+    ("top", "Keypad7"),
+    ("bottom", "Ctrl+Keypad7"),
+)
+PANEL_TITLES = (
+    *("Search", "Scene", "Display", "Camera", "Select", "Train"),
+    *("Record", "Bookmarks", "Messages", "Overlays"),
+)
 MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
 COMMANDS: tuple[Command, ...] = (
@@ -101,6 +117,19 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command("save the view", lambda viewer: saving.save_view(viewer, Path.cwd()), menu="File"),
     Command("save the queries", lambda viewer: actions.save_queries(viewer, Path.cwd()), menu="File"),
+    Command(
+        "copy the command of this picture",
+        lambda viewer: actions.copy_command(viewer, Path.cwd()),
+        ("Ctrl+Shift+C",),
+        "File",
+    ),
+    Command(
+        "save a picture of the size of the film",
+        lambda viewer: actions.save_sized_picture(viewer, Path.cwd()),
+        menu="File",
+    ),
+    Command("save a film of the path", lambda viewer: actions.save_film(viewer, Path.cwd()), menu="File"),
+    Command("save the camera path", lambda viewer: actions.save_path(viewer, Path.cwd()), menu="File"),
     Command("search", actions.focus_search, ("Ctrl+F", "/"), "Edit"),
     Command("undo", actions.undo, ("Ctrl+Z",), "Edit", repeats=True, is_edit=True),
     Command("redo", actions.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), "Edit", repeats=True, is_edit=True),
@@ -136,6 +165,11 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "take the picture's up as the world's", lambda viewer: actions.move(viewer, adopt_up), menu="Camera"
     ),
+    *(_side(side, key) for side, key in SIDE_KEYS),
+    Command("walk in place of flying, and back", actions.toggle_walking, menu="Camera"),
+    Command("bookmark this view", actions.add_bookmark, ("Ctrl+B",), "Camera"),
+    Command("add a keyframe here", actions.add_keyframe, ("K",), "Camera"),
+    Command("play the camera path, or stop", actions.toggle_playing, ("Shift+K",), "Camera"),
     Command("hide or show the panels", actions.toggle_panel, ("Tab",), "Window"),
     *(_panel(title) for title in PANEL_TITLES),
     Command("find a command", lambda viewer: actions.show_palette(viewer, True), ("Ctrl+Shift+P",), "Help"),

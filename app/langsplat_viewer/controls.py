@@ -6,6 +6,7 @@ so that a test can do and undo it.
 
 import math
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,6 +20,9 @@ DEFAULT_FOV = 50.0  # degrees, of the picture's shorter side
 FOV_RANGE = (10.0, 120.0)  # degrees
 FARTHEST = 12.0  # of the distance from the middle that holds the scene: it is still a spot that can be seen
 SURROUNDINGS = 1.8  # how much more than a thing itself a view of it shows
+
+
+Side = Literal["front", "back", "left", "right", "top", "bottom"]
 
 
 def symmetric_intrinsics(fov_degrees: float = DEFAULT_FOV) -> Intrinsics:
@@ -112,6 +116,37 @@ def fly(view: OrbitCamera, right: float, up: float, forward: float) -> OrbitCame
     """Move eye and target together: along the camera's right and forward axes and the world's up."""
     step = right * view.rotation[0] + up * view.up + forward * view.rotation[2]
     return replace(view, target=view.target + step)
+
+
+def walk(view: OrbitCamera, right: float, up: float, forward: float) -> OrbitCamera:
+    """As `fly`, but ahead is level; one who looks straight up or down goes where the picture's top or foot
+    points."""
+    ahead = view.rotation[2] - (view.rotation[2] @ view.up) * view.up
+    if np.linalg.norm(ahead) < 1e-3:
+        ahead = -view.rotation[1] if view.elevation < 0 else view.rotation[1]
+        ahead = ahead - (ahead @ view.up) * view.up
+    ahead = ahead / np.linalg.norm(ahead)
+    step = right * np.cross(ahead, view.up) + up * view.up + forward * ahead
+    return replace(view, target=view.target + step)
+
+
+def from_side(view: OrbitCamera, side: Side) -> OrbitCamera:
+    """The same target from the same distance, along an axis. The front looks along the world's z axis, or
+    along y where z is up; from the top and from below the picture's foot is the front."""
+    axes = np.eye(3)[[2, 1]]
+    front = axes[0] if abs(axes[0] @ view.up) < 0.9 else axes[1]
+    front = front - (front @ view.up) * view.up
+    front = front / np.linalg.norm(front)
+    right = np.cross(front, view.up)
+    forward, down = {
+        "front": (front, -view.up),
+        "back": (-front, -view.up),
+        "left": (right, -view.up),
+        "right": (-right, -view.up),
+        "top": (-view.up, -front),
+        "bottom": (view.up, front),
+    }[side]
+    return replace(view, rotation=np.array([np.cross(down, forward), down, forward]))
 
 
 def focus(view: OrbitCamera, point: Array, distance: float | None = None) -> OrbitCamera:

@@ -115,10 +115,13 @@ class Worker:
         """Whether some job has not come to its end yet, cancelled or not."""
         return any(not job.future.done() for job in self._jobs)
 
-    def close(self) -> None:
-        """Stop taking work; a job that runs ends by itself, or with the process."""
+    def close(self, patience: float = 0.0) -> None:
+        """Stop taking work; a job that runs has `patience` seconds to tidy up after itself, else it ends with
+        the process."""
         self.cancel()
         self._waiting.put(None)
+        if self._thread is not None and patience > 0:
+            self._thread.join(patience)
 
 
 def deliver(job: Job) -> None:

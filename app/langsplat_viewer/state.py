@@ -13,9 +13,11 @@ from langsplat_core.query.pointing import Pointed
 from langsplat_core.query.suggestions import Suggestions
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer import painting
+from langsplat_viewer.bookmarks import Bookmark
 from langsplat_viewer.browsing import Listing
 from langsplat_viewer.controls import Extent, OrbitCamera
 from langsplat_viewer.preferences import Preferences
+from langsplat_viewer.recording import Recording
 from langsplat_viewer.seeing import Seeing
 from langsplat_viewer.selecting import Selection
 
@@ -105,6 +107,10 @@ class ViewerState:
     nothing: str = ""  # why the picture shows nothing of the scene, where it does not
     camera_index: int | None = None  # training camera last jumped to
     fly_speed: float = 0.5  # scene radii per second
+    walks: bool = False  # the keys fly level, as one walks
+    bookmarks: tuple[Bookmark, ...] = ()  # of the scene shown
+    bookmark_typed: str = ""
+    record: Recording = field(default_factory=Recording)
 
     pointing: bool = False  # it is said what lies under the cursor
     hover: Hover | None = None

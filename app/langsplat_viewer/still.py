@@ -1,6 +1,8 @@
 """One picture without a window: `langsplat-viewer --headless --out picture.png`."""
 
 import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,9 +21,10 @@ from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.phrases import split_phrases
 from langsplat_viewer import painting
+from langsplat_viewer.channels import Layers
 from langsplat_viewer.controls import default_view, extent_of
 from langsplat_viewer.frame import Backend
-from langsplat_viewer.headless import render_picture
+from langsplat_viewer.headless import Subject, draw_something, painter
 from langsplat_viewer.looking import why_undrawable
 from langsplat_viewer.options import check_display, chosen_camera, latent_level, say_compiling
 from langsplat_viewer.saving import save_png
@@ -41,6 +44,9 @@ class StillRequest:
     queries: tuple[str, ...] = ()
     level: LevelChoice = "auto"
     display: Display = "rgb"
+    heat_opacity: float = PictureConfig.heat_opacity
+    dim: float = PictureConfig.dim
+    colours: tuple[int, ...] = ()  # of the queries, from 1; none: in their order
     size: tuple[int, int] | None = None  # pixels; None: the training camera's, else DEFAULT_SIZE
     camera: str = ""
     backend: Backend = "auto"
@@ -79,8 +85,18 @@ def describe(result: QueryResult) -> str:
     return f"'{result.phrase}': {verdict}, score {result.peak:.3f}, level {level}, place {place}"
 
 
-def draw_still(request: StillRequest, services: Services, progress: Progress = silent) -> list[str]:
-    """Draw and save the picture; returns the lines to print: the picture's, then one for each query."""
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """All that is done once, however many pictures are drawn."""
+
+    subject: Subject
+    camera: Camera
+    results: tuple[QueryResult, ...]
+    lines: tuple[str, ...]  # one for each query, for people and scripts
+
+
+def prepare(request: StillRequest, services: Services, progress: Progress = silent) -> Prepared:
+    """Open the scene, choose the camera, answer the queries. Raises InputError and what the services do."""
     progress("opening the scene", 0.1)
     scene = services.load_scene(request.path)
     reason = why_undrawable(scene.gaussians)
@@ -90,39 +106,82 @@ def draw_still(request: StillRequest, services: Services, progress: Progress = s
     camera = still_camera(scene, request.camera, request.size)
     engine = services.engine(scene)
     phrases = [phrase for text in request.queries for phrase in split_phrases(text) or [text]]
+    check_colours(request.colours, len(phrases))
     for phrase in phrases:  # before anything slow is done
         check_phrase(engine, phrase, camera, progress)
-    results = [run_phrase(engine, phrase, request.level, camera, progress).answer for phrase in phrases]
-    shown = results[-SLOTS:]  # as in the window, where a fourth query takes the oldest one's colour
+    results = tuple(run_phrase(engine, phrase, request.level, camera, progress).answer for phrase in phrases)
+    subject = _subject(scene, request, slots(results, request.colours))
+    return Prepared(subject, camera, results, tuple(describe(result) for result in results))
 
-    progress("drawing", 0.8)
-    if request.backend in ("auto", "cpu"):
-        say_compiling(progress)
+
+def check_colours(colours: tuple[int, ...], count: int) -> None:
+    """InputError unless there are none, or a different one for each of `count` queries."""
+    if colours and (len(colours) != count or len(set(colours)) != count):
+        raise InputError(f"--colour {colours[0]}: give each --query a colour of its own, or none any")
+
+
+def slots(results: Sequence[QueryResult], colours: tuple[int, ...]) -> tuple[QueryResult | None, ...]:
+    """The answers by colour. Without `colours` in their order and the last ones only, as in the window, where
+    a fourth query takes the oldest one's colour."""
+    if not colours:
+        return tuple(results[-SLOTS:])
+    by_colour = dict(zip(colours, results, strict=True))
+    return tuple(by_colour.get(number) for number in range(1, max(colours) + 1))
+
+
+def _subject(scene: Scene, request: StillRequest, shown: painting.Shown) -> Subject:
     picture = PictureConfig(
-        display=request.display, colour_map=request.colour_map, transparent=request.transparent
+        display=request.display,
+        heat_opacity=request.heat_opacity,
+        dim=request.dim,
+        colour_map=request.colour_map,
+        transparent=request.transparent,
     )
-    size = f"{camera.width}x{camera.height}"
+    relevancies = painting.columns(shown, request.display, len(scene.gaussians))
+    return Subject(
+        scene,
+        painting.fitted(picture, shown),
+        Layers(_latent(scene, request), relevancies),
+        painting.heat_ranges(shown, request.display),
+    )
+
+
+def draw_still(request: StillRequest, services: Services, progress: Progress = silent) -> list[str]:
+    """Draw and save the picture; returns the lines to print: the picture's, then one for each query."""
+    prepared = prepare(request, services, progress)
+    progress("drawing", 0.8)
+    say_drawing(request.backend, progress)
+    size = f"{prepared.camera.width}x{prepared.camera.height}"
+    with in_one_line(request.out, size), painter(prepared.subject, request.backend) as paint:
+        save_png(request.out, draw_something(prepared.subject, prepared.camera, paint))
+    say_unread(prepared.subject.scene)
+    return [f"{request.out}: {size}, {request.display}", *prepared.lines]
+
+
+def say_drawing(backend: Backend, progress: Progress) -> None:
+    """Before the first picture: say where the CPU's kernels will be compiled."""
+    if backend in ("auto", "cpu"):
+        say_compiling(progress)
+
+
+def say_unread(scene: Scene) -> None:
+    """After the last picture: say what lay beside the scene and could not be read."""
+    for reason in scene.unread:
+        if SUFFIX in reason:  # of the cameras it was said when they were read
+            log.warning("opened without its language field: %s", reason)
+
+
+@contextmanager
+def in_one_line(out: Path, size: str) -> Iterator[None]:
+    """What may go wrong while pictures are drawn and written, as a line for the user."""
     try:
-        image = render_picture(
-            scene,
-            camera,
-            painting.fitted(picture, shown),
-            backend=request.backend,
-            latent_rgb=_latent(scene, request),
-            relevancies=painting.columns(shown, request.display, len(scene.gaussians)),
-            heat_ranges=painting.heat_ranges(shown, request.display),
-        )
-        save_png(request.out, image)
+        yield
     except MemoryError:
         raise InputError(f"not enough memory for a picture of {size}; choose a smaller --size") from None
     except moderngl.Error as error:
         raise BackendError(f"OpenGL cannot draw {size} here ({error}); try --backend cpu") from None
     except OSError as error:
-        raise InputError(f"--out {request.out}: cannot be written ({error.strerror or error})") from None
-    for reason in scene.unread:
-        if SUFFIX in reason:  # of the cameras it was said when they were read
-            log.warning("opened without its language field: %s", reason)
-    return [f"{request.out}: {size}, {request.display}", *(describe(result) for result in results)]
+        raise InputError(f"--out {out}: cannot be written ({error.strerror or error})") from None
 
 
 def _latent(scene: Scene, request: StillRequest) -> Array | None:

@@ -10,6 +10,7 @@ from langsplat_core.progress import Progress
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.scene import Scene
+from langsplat_viewer.bookmarks import Shelf
 from langsplat_viewer.jobs import Worker
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.training import Training
@@ -60,6 +61,8 @@ class Viewer:
     services: Services
     state: ViewerState = field(default_factory=ViewerState)
     worker: Worker = field(default_factory=Worker)
+    recorder: Worker = field(default_factory=Worker)  # films: minutes, while one looks and searches on
+    shelf: Shelf = field(default_factory=Shelf)
     engine: QueryEngine | None = None  # of the scene shown; asked on the worker only
     describer: Describer | None = None  # of the same scene, once it was needed
     surface: Surface | None = None

@@ -4,7 +4,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 # imgui_bundle brings its own GLFW library and must be imported first, else the process holds two.
@@ -13,9 +13,10 @@ from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
 import moderngl
 
-from langsplat_core.config import Display, LevelChoice
+from langsplat_core.config import Display, LevelChoice, PictureConfig
 from langsplat_core.errors import BackendError, InputError, LangSplatError
 from langsplat_viewer import actions, fonts
+from langsplat_viewer.bookmarks import Shelf
 from langsplat_viewer.canvas import Canvas, Renderer
 from langsplat_viewer.frame import Backend, FrameRenderer
 from langsplat_viewer.jobs import one_line
@@ -46,6 +47,8 @@ DRAW_ERRORS = (
     ValueError,
 )
 
+RECORDER_PATIENCE = 5.0  # seconds for a film that is being drawn to leave nothing half written
+
 MakeRenderer = Callable[[moderngl.Context], Renderer]
 
 
@@ -60,6 +63,9 @@ class WindowRequest:
     size: tuple[int, int] | None = None  # of the window, pixels
     camera: str = ""
     backend: Backend = "auto"
+    path_file: Path | None = None  # a camera path
+    heat_opacity: float = PictureConfig.heat_opacity
+    dim: float = PictureConfig.dim
     settings: Path | None = None  # folder of what is remembered between windows; None: nothing is
 
 
@@ -69,7 +75,8 @@ def open_window(request: WindowRequest, services: Services) -> None:
     immapp.run(window.params())
     if window.failure is not None:
         raise window.failure
-    if window.viewer.worker.is_running:  # reading and encoding stop for nothing, and libraries wait for them
+    workers = (window.viewer.worker, window.viewer.recorder)
+    if any(worker.is_running for worker in workers):  # they stop for nothing, and libraries wait for them
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(0)
@@ -107,7 +114,7 @@ class Window:
     """Callbacks of one window."""
 
     def __init__(self, request: WindowRequest, services: Services, make_renderer: MakeRenderer) -> None:
-        self.viewer = Viewer(services)
+        self.viewer = Viewer(services, shelf=Shelf(request.settings))
         self.failure: LangSplatError | None = None  # why the window could not work
         self._request = request
         self._make_renderer = make_renderer
@@ -166,7 +173,7 @@ class Window:
             return
         self._screen = ctx.detect_framebuffer()
         self.viewer.surface = self._canvas
-        self.viewer.worker.wake = glfw.post_empty_event
+        self.viewer.worker.wake = self.viewer.recorder.wake = glfw.post_empty_event
         imgui.get_io().config_input_text_cursor_blink = False  # a blinking cursor would be drawn for ever
         glfw.set_drop_callback(glfw_window_hello_imgui(), self._dropped)  # type: ignore[arg-type]
         actions.open_scene(self.viewer, self._request.path, self._first_view)
@@ -181,6 +188,10 @@ class Window:
                 actions.open_at(viewer, camera)
         except InputError as error:
             state.say(str(error), is_error=True)
+        looks = replace(state.picture, heat_opacity=request.heat_opacity, dim=request.dim)
+        actions.set_picture(viewer, looks)
+        if request.path_file is not None:
+            actions.load_path(viewer, request.path_file)
         actions.set_level(viewer, request.level)
         for phrase in request.queries:
             actions.ask(viewer, phrase)
@@ -211,14 +222,17 @@ class Window:
     def _pace(self) -> None:
         """Say how soon the next frame is wanted: at once only while something moves or has just changed."""
         state, idling = self.viewer.state, hello_imgui.get_runner_params().fps_idling
+        news = (self.viewer.worker.delivered, self.viewer.recorder.delivered)
         asked = (state.selection.leaving, state.selection.may_close)
-        there = (state.view, self.viewer.worker.delivered, state.nothing, state.hover, *asked)
+        there = (state.view, *news, state.nothing, state.hover, *asked)
         changed = len(there) != len(self._last) or any(
             a is not b and a != b for a, b in zip(there, self._last, strict=True)
         )
         self._last = there
         self._frames = AWAKE_FRAMES if changed else max(self._frames - 1, 0)
-        busy = self.unfinished or state.glide is not None or self._frames > 0
+        busy = (
+            self.unfinished or state.glide is not None or state.record.began is not None or self._frames > 0
+        )
         idling.enable_idling = self.idles and (self.is_minimised() or not busy)
 
     def is_minimised(self) -> bool:
@@ -263,6 +277,7 @@ class Window:
     def _stop(self) -> None:
         actions.finish_writing(self.viewer)
         self._remembered.update()
+        self.viewer.recorder.close(RECORDER_PATIENCE)
         self.viewer.worker.close()
         if self.viewer.training is not None:
             self.viewer.training.end()

@@ -68,13 +68,13 @@ def _camera(entry: Any, what: str) -> Camera:
     if not isinstance(entry, dict):
         raise FormatError(f"{what}: expected an object with width, height, position, rotation, fx, fy")
     width, height = (_pixels(entry, key, what) for key in ("width", "height"))
-    position = _numbers(entry, "position", (3,), what)
+    position = numbers(entry, "position", (3,), what)
     if np.abs(position).max() > FARTHEST:
         raise FormatError(
             f"{what}: 'position' is more than {FARTHEST:g} units from the origin; move the world"
         )
-    rotation = _numbers(entry, "rotation", (3, 3), what)
-    if not _is_rotation(rotation):
+    rotation = numbers(entry, "rotation", (3, 3), what)
+    if not is_rotation(rotation):
         raise FormatError(f"{what}: 'rotation' is not a rotation matrix")
     matrix = np.eye(4)
     matrix[:3, :3] = rotation.T
@@ -86,10 +86,10 @@ def _camera(entry: Any, what: str) -> Camera:
         return Camera(
             width,
             height,
-            float(_numbers(entry, "fx", (), what)),
-            float(_numbers(entry, "fy", (), what)),
-            float(_numbers(entry, "cx", (), what)) if "cx" in entry else width / 2,
-            float(_numbers(entry, "cy", (), what)) if "cy" in entry else height / 2,
+            float(numbers(entry, "fx", (), what)),
+            float(numbers(entry, "fy", (), what)),
+            float(numbers(entry, "cx", (), what)) if "cx" in entry else width / 2,
+            float(numbers(entry, "cy", (), what)) if "cy" in entry else height / 2,
             matrix,
             _without_image_suffix(name),
         )
@@ -97,7 +97,8 @@ def _camera(entry: Any, what: str) -> Camera:
         raise FormatError(f"{what}: {error}") from None
 
 
-def _is_rotation(matrix: Array) -> bool:
+def is_rotation(matrix: Array) -> bool:
+    """Whether a finite (3, 3) matrix is a rotation, to `ROTATION_TOLERANCE`."""
     if np.abs(matrix).max() > 2:  # products of larger ones could overflow
         return False
     unlike = np.abs(matrix @ matrix.T - np.eye(3)).max()
@@ -112,21 +113,22 @@ def _without_image_suffix(name: str) -> str:
 
 
 def _pixels(entry: dict[str, Any], key: str, what: str) -> int:
-    value = float(_numbers(entry, key, (), what))
+    value = float(numbers(entry, key, (), what))
     if value != math.floor(value) or not 1 <= value <= MAX_PIXELS:
         raise FormatError(f"{what}: {key!r} is {value:g}; expected whole pixels, 1 to {MAX_PIXELS}")
     return int(value)
 
 
-def _numbers(entry: dict[str, Any], key: str, shape: tuple[int, ...], what: str) -> Array:
-    """Finite float64 numbers of the given shape under `key`."""
+def numbers(entry: dict[str, Any], key: str, shape: tuple[int, ...], what: str) -> Array:
+    """Finite float64 numbers of the given shape under `key`: (), (3,) or (3, 3). FormatError, beginning with
+    `what`, where there are none."""
     if key not in entry:
         raise FormatError(f"{what}: {key!r} is missing")
     kind = {(): "a number", (3,): "3 numbers", (3, 3): "3 rows of 3 numbers"}[shape]
     try:
-        numbers = np.array(entry[key])
+        found = np.array(entry[key])
     except ValueError:  # rows of unequal length
         raise FormatError(f"{what}: {key!r} is not {kind}") from None
-    if numbers.dtype.kind not in "iuf" or numbers.shape != shape or not np.isfinite(numbers).all():
+    if found.dtype.kind not in "iuf" or found.shape != shape or not np.isfinite(found).all():
         raise FormatError(f"{what}: {key!r} is not {kind}, all finite")
-    return numbers.astype(np.float64)
+    return found.astype(np.float64)

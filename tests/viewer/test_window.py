@@ -49,6 +49,8 @@ def folder(tmp_path: Path) -> Path:
         "ask_before_leaving",
         "type_while_opening",
         "look_at_nothing",
+        "record_and_play",
+        "mark_and_return",
         "close_while_opening",
         "split_the_view",
         "draw_over_the_scene",

@@ -26,6 +26,7 @@ from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest
 from tests.support.fakes import CENTRES, FakeEncoder
 from tests.viewer import scenarios_seeing, scenarios_select
+from tests.viewer.scenarios_record import RECORD_SCENARIOS
 
 MUG, BOOK, PLANT = CENTRES
 PATIENCE = 240.0  # seconds: other tests may have the cores
@@ -510,6 +511,7 @@ SCENARIOS = {
     "type_while_opening": (type_while_opening, "blobs.ply", {"load": slow_load}),
     "look_at_nothing": (look_at_nothing, "nothing.ply", {}),
     **scenarios_select.SCENARIOS,
+    **RECORD_SCENARIOS,
     "close_while_opening": (close_while_opening, "blobs.ply", {"load": slow_load}),
     **scenarios_seeing.SCENARIOS,
 }

@@ -9,9 +9,11 @@ from langsplat_core.formats.sog import META_NAME
 from langsplat_core.pipeline.forecast import count_photographs
 from langsplat_viewer.actions.asking import load_queries
 from langsplat_viewer.actions.opening import open_scene
+from langsplat_viewer.actions.recording import load_path
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.actions.training import choose_photographs
 from langsplat_viewer.browsing import SCENE_SUFFIXES, Entry, list_folder
+from langsplat_viewer.flight_files import SUFFIX as PATHS
 from langsplat_viewer.querysets import SUFFIX as QUERIES
 from langsplat_viewer.viewer import Viewer
 
@@ -46,9 +48,11 @@ def choose(viewer: Viewer, entry: Entry) -> None:
 
 
 def open_file(viewer: Viewer, path: Path) -> None:
-    """Open a scene, or ask a set of queries."""
+    """Open a scene, ask a set of queries, or take a camera path."""
     if path.name.endswith(QUERIES):
         load_queries(viewer, path)
+    elif path.name.endswith(PATHS):
+        load_path(viewer, path)
     else:
         open_scene(viewer, path)
 
@@ -61,7 +65,7 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
         choose_photographs(viewer, paths[0])
         open_panel(viewer, "Train")
         return
-    sets = [path for path in paths if path.name.endswith(QUERIES)]
+    sets = [path for path in paths if path.name.endswith((QUERIES, PATHS))]
     files = [path for path in paths if path not in sets]
     scenes = [path for path in files if not path.name.endswith(COMPANIONS)] or files
     if not scenes:
@@ -78,7 +82,7 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
 
 def _ask_sets(viewer: Viewer, sets: Sequence[Path]) -> None:
     for path in sets:
-        load_queries(viewer, path)
+        open_file(viewer, path)
 
 
 def open_recent(viewer: Viewer, path: str) -> None:

@@ -6,13 +6,16 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera
+from langsplat_viewer.actions.playback import advance, leave_path
 from langsplat_viewer.controls import (
     OrbitCamera,
+    Side,
     between,
     default_view,
     focus,
     frame_all,
     from_camera,
+    from_side,
     holding_distance,
     zoom,
 )
@@ -26,17 +29,20 @@ def tick(viewer: Viewer, now: float) -> None:
     """Start of a frame at `now` seconds: take what the worker finished and move a gliding camera on."""
     viewer.clock = now
     viewer.worker.poll()
+    viewer.recorder.poll()
     glide = viewer.state.glide
     if glide is not None:
         t = (now - glide.began) / GLIDE_SECONDS
         viewer.state.view = between(glide.start, glide.end, t)
         if t >= 1:
             viewer.state.glide = None
+    advance(viewer)
 
 
 def move(viewer: Viewer, step: Callable[[OrbitCamera], OrbitCamera]) -> None:
     """Apply one of the functions of `controls` at once; it ends a glide."""
     if viewer.state.view is not None:
+        leave_path(viewer)
         viewer.state.view, viewer.state.glide = step(viewer.state.view), None
 
 
@@ -57,6 +63,7 @@ def open_at(viewer: Viewer, camera: Camera) -> None:
 def glide_to(viewer: Viewer, end: OrbitCamera) -> None:
     """Move smoothly to a view."""
     if viewer.state.view is not None:
+        leave_path(viewer)
         viewer.state.glide = Glide(viewer.state.view, end, viewer.clock)
 
 
@@ -96,6 +103,23 @@ def frame_scene(viewer: Viewer) -> None:
     state = viewer.state
     if state.view is not None and state.extent is not None:
         glide_to(viewer, frame_all(state.view, state.extent, state.size))
+
+
+def look_from(viewer: Viewer, side: Side) -> None:
+    """Look at what the view turns around along one of the world's axes, from as far as now."""
+    if viewer.state.view is not None:
+        glide_to(viewer, from_side(viewer.state.view, side))
+
+
+def set_walking(viewer: Viewer, walks: bool) -> None:
+    """Whether the keys that fly ahead keep the height of the eye."""
+    viewer.state.walks = walks
+
+
+def toggle_walking(viewer: Viewer) -> None:
+    """Walk, or fly again."""
+    set_walking(viewer, not viewer.state.walks)
+    viewer.state.say("W A S D walk at one height" if viewer.state.walks else "W A S D fly")
 
 
 def go_to_camera(viewer: Viewer, index: int) -> None:

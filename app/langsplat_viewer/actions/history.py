@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from langsplat_core.config import Display, LevelChoice
+from langsplat_viewer.flight import Keyframe
 from langsplat_viewer.selecting import Marks
 from langsplat_viewer.state import Query, ViewerState
 from langsplat_viewer.viewer import Viewer
@@ -20,13 +21,22 @@ class Moment:
     latent_level: int
     level: LevelChoice
     marks: Marks
+    keyframes: tuple[Keyframe, ...]
 
 
 def now(state: ViewerState) -> Moment:
     """How things stand."""
     queries = tuple((query, query.slot, query.shown_since, query.cut) for query in state.queries)
     picture, marks = state.picture, state.selection.marks
-    return Moment(queries, state.selected, picture.display, state.latent_level, state.level, marks)
+    return Moment(
+        queries=queries,
+        selected=state.selected,
+        display=picture.display,
+        latent_level=state.latent_level,
+        level=state.level,
+        marks=marks,
+        keyframes=state.record.keyframes,
+    )
 
 
 def remember(viewer: Viewer) -> None:

@@ -13,12 +13,14 @@ from langsplat_core.query import regions
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoders import DEMO
+from langsplat_viewer.actions import bookmarks
 from langsplat_viewer.actions.camera import opening_view
 from langsplat_viewer.actions.history import forget
 from langsplat_viewer.actions.leaving import leave
 from langsplat_viewer.controls import Extent, extent_of
 from langsplat_viewer.looking import why_undrawable
 from langsplat_viewer.preferences import with_recent
+from langsplat_viewer.recording import Recording
 from langsplat_viewer.seeing import Ruler
 from langsplat_viewer.selecting import of_scene
 from langsplat_viewer.viewer import Viewer
@@ -89,6 +91,8 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     forget(viewer)
     state.preferences = with_recent(state.preferences, path.absolute())
     state.opening_camera = None
+    bookmarks.load(viewer)
+    state.record = Recording(size=state.record.size, fps=state.record.fps)
     state.view, state.nothing = opening_view(viewer), why_undrawable(scene.gaussians)
     viewer.engine, viewer.describer, state.hover = viewer.services.engine(scene), None, None
     state.pointing = state.pointing and scene.language is not None

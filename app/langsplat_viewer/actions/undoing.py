@@ -11,7 +11,8 @@ from langsplat_viewer.viewer import Viewer
 
 
 def undo(viewer: Viewer) -> None:
-    """Go back to before the last query, removal, colour, level, display, selection, hiding or deletion."""
+    """Go back to before the last query, removal, colour, level, display, keyframe, selection, hiding or
+    deletion."""
     history = viewer.history
     if not history.past:
         viewer.state.say("nothing to undo")
@@ -39,6 +40,7 @@ def _restore(viewer: Viewer, moment: Moment) -> None:
         set_cut(viewer, query, cut, is_new=False)
     state.queries, state.selected = [query for query, *_ in moment.queries], moment.selected
     state.selection = replace(state.selection, marks=moment.marks, stroke=None)
+    state.record.keyframes, state.record.chosen = moment.keyframes, None
     past, future = history.past, history.future
     set_level(viewer, moment.level)
     set_display(viewer, moment.display, moment.latent_level)

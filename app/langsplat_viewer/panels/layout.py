@@ -7,6 +7,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
 from langsplat_viewer.panels import (
+    bookmarks,
     browser,
     cube,
     help,
@@ -15,6 +16,7 @@ from langsplat_viewer.panels import (
     palette,
     pictures,
     pointing,
+    record,
     scene,
     search,
     select,
@@ -48,6 +50,8 @@ PANELS: tuple[Panel, ...] = (
     Panel("Camera", MIDDLE, view.draw_camera),
     Panel("Select", MIDDLE, select.draw, is_open=False),
     Panel("Train", LEFT, train.draw, is_open=False),
+    Panel("Record", LEFT, record.draw, is_open=False),
+    Panel("Bookmarks", LEFT, bookmarks.draw, is_open=False),
     Panel("Messages", FOOT, messages.draw),
     Panel("Overlays", MIDDLE, view.draw_overlays, is_open=False),
 )
@@ -122,6 +126,9 @@ def draw_over(viewer: Viewer) -> None:
     pictures.draw_grip(viewer, area)
     cube.draw(viewer, area)
     unsaved.draw(viewer)
+    copied = actions.take_clipboard(viewer)
+    if copied:
+        imgui.set_clipboard_text(copied)
     browser.draw(viewer)
     help.draw(viewer)
     palette.draw(viewer)

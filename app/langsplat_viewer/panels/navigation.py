@@ -78,7 +78,8 @@ def _fly(viewer: Viewer) -> None:
     if right or up or ahead:
         pace = 4.0 if io.key_shift else 0.25 if io.key_alt else 1.0
         step = pace * viewer.state.fly_speed * extent.radius * seconds
-        actions.move(viewer, lambda view: controls.fly(view, right * step, up * step, ahead * step))
+        go = controls.walk if viewer.state.walks else controls.fly
+        actions.move(viewer, lambda view: go(view, right * step, up * step, ahead * step))
     turn = held(key.right_bracket, key.left_bracket)
     if turn:
         actions.move(viewer, lambda view: controls.roll(view, turn * ROLL_SPEED * seconds))

@@ -1,0 +1,188 @@
+"""Films and pictures of any size, drawn by the CPU on a thread of their own; pictures as commands."""
+
+import os
+import shlex
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.config import PictureConfig
+from langsplat_core.display.displays import DISPLAYS
+from langsplat_core.errors import InputError
+from langsplat_core.progress import Progress
+from langsplat_core.scene import LEVELS
+from langsplat_viewer.actions.playback import path_seconds
+from langsplat_viewer.channels import Layers
+from langsplat_viewer.controls import from_camera
+from langsplat_viewer.film import Shot, cameras_of, make_film
+from langsplat_viewer.film_files import VIDEO, check_film, find_ffmpeg
+from langsplat_viewer.flight import Motion, turntable
+from langsplat_viewer.headless import Subject, draw_something, painter
+from langsplat_viewer.options import MAX_SIDE, say_compiling
+from langsplat_viewer.recording import flight_of
+from langsplat_viewer.saving import free_name, save_png, save_view
+from langsplat_viewer.state import ViewerState
+from langsplat_viewer.viewer import Viewer
+
+
+def set_film_size(viewer: Viewer, width: int, height: int) -> None:
+    """Of films and of pictures of any size, pixels."""
+    width, height = (min(max(side, 1), MAX_SIDE) for side in (width, height))
+    viewer.state.record.size = (width, height)
+
+
+def set_film_fps(viewer: Viewer, fps: float) -> None:
+    """Pictures per second of a film."""
+    viewer.state.record.fps = fps
+
+
+def type_film(viewer: Viewer, text: str) -> None:
+    """What stands in the box for where the film goes."""
+    viewer.state.record.film_typed = text
+
+
+def film_motion(viewer: Viewer) -> Motion | None:
+    """The path that is filmed; None without one."""
+    state, record = viewer.state, viewer.state.record
+    if state.view is None or path_seconds(viewer) <= 0:
+        return None
+    if record.turns:
+        return turntable(record.turn_from or state.view, record.turn_seconds)
+    return flight_of(record.keyframes)
+
+
+def save_film(viewer: Viewer, folder: Path) -> None:
+    """Have a film made along the path, to the typed place or to a new name in `folder`."""
+    state, record, motion = viewer.state, viewer.state.record, film_motion(viewer)
+    if motion is None:
+        state.say("a film needs a path: K adds a keyframe, or choose a turntable", is_error=True)
+        return
+    subject = subject_of(state)
+    try:
+        out = check_film(_film_out(viewer, folder), record.size)
+        cameras = cameras_of(motion, record.fps, record.size)
+    except (InputError, OSError) as error:
+        state.say(f"no film: {error}", is_error=True)
+        return
+    shot = Shot(subject, cameras, record.fps, "cpu")
+
+    def work(progress: Progress) -> str:
+        say_compiling(progress)
+        return "; ".join(make_film(shot, out, progress))
+
+    _submit(viewer, f"film {out.name}", work)
+
+
+def _film_out(viewer: Viewer, folder: Path) -> Path:
+    typed = viewer.state.record.film_typed.strip()
+    if typed:
+        return folder / typed
+    stem = f"{viewer.state.path.stem if viewer.state.path else 'scene'}-film"
+    return free_name(folder, stem, "" if find_ffmpeg() is None else VIDEO)
+
+
+def save_sized_picture(viewer: Viewer, folder: Path) -> None:
+    """Have the scene as shown drawn in the size of a film and saved under a new name in `folder`."""
+    state = viewer.state
+    if state.view is None:
+        state.say("open a scene first, then save a picture of it", is_error=True)
+        return
+    width, height = state.record.size
+    subject, camera = subject_of(state), state.view.camera(width, height)
+    stem = f"{state.path.stem if state.path else 'picture'}-{width}x{height}"
+
+    def work(progress: Progress) -> str:
+        say_compiling(progress)
+        path = free_name(folder, stem, ".png")
+        with painter(subject, "cpu") as paint:
+            save_png(path, draw_something(subject, camera, paint))
+        return f"saved {path}"
+
+    _submit(viewer, f"picture of {width} x {height}", work)
+
+
+def cancel_film(viewer: Viewer) -> None:
+    """Stop what is being drawn; a folder of pictures is continued by the same film."""
+    viewer.recorder.cancel()
+    viewer.state.say("film stopped")
+
+
+def _submit(viewer: Viewer, label: str, work: Callable[[Progress], str]) -> None:
+    state = viewer.state
+    viewer.recorder.submit(label, work, state.say, lambda reason: state.say(reason, is_error=True))
+
+
+def subject_of(state: ViewerState) -> Subject:
+    """What is shown now."""
+    assert state.scene is not None
+    layers = Layers(state.latent_rgb(), state.relevancies())
+    return Subject(state.scene, state.shown_picture(), layers, state.heat_ranges())
+
+
+def copy_command(viewer: Viewer, folder: Path) -> str:
+    """Put the command that draws this picture without a window on the clipboard, and return it; "" where that
+    failed. A view that is no training camera's is saved to a file in `folder` first."""
+    state = viewer.state
+    if state.view is None or state.path is None:
+        state.say("open a scene first, then copy the command of its picture", is_error=True)
+        return ""
+    camera = _training_camera(state)
+    if camera is None:
+        saved = save_view(viewer, folder)
+        if saved is None:
+            return ""
+        camera = str(saved.absolute())
+    words = ["langsplat-viewer", str(state.path.absolute()), "--headless", "--camera", camera]
+    words += ["--size", "{}x{}".format(*state.size), *_display_words(state)]
+    if viewer.services.encoder_id:
+        words += ["--encoder", viewer.services.encoder_id]
+    words += ["--out", f"{state.path.stem}.png"]
+    state.record.clipboard = subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
+    state.say(f"on the clipboard: {state.record.clipboard}")
+    return state.record.clipboard
+
+
+def take_clipboard(viewer: Viewer) -> str:
+    """What is put on the clipboard now, "" for nothing; said once."""
+    text, viewer.state.record.clipboard = viewer.state.record.clipboard, ""
+    return text
+
+
+def _training_camera(state: ViewerState) -> str | None:
+    """The number of the training camera that the view is, exactly."""
+    if state.view is None or state.scene is None or state.extent is None:
+        return None
+    here = state.view.camera(*state.size)
+    for number, own in enumerate(state.scene.cameras):
+        there = from_camera(own, state.extent).camera(*state.size)
+        same = np.allclose(there.world_to_camera, here.world_to_camera, rtol=0, atol=1e-9)
+        if same and there.intrinsics == here.intrinsics:
+            return str(number)
+    return None
+
+
+def _display_words(state: ViewerState) -> list[str]:
+    """What is shown, as options; queries only where the display shows them."""
+    row, picture = DISPLAYS[state.picture.display], state.picture
+    words = ["--display", picture.display]
+    if row.extra == "latent":
+        words += ["--level", LEVELS[state.latent_level]]
+    shown = [(slot, query) for slot, query in enumerate(state.shown()) if query is not None]
+    if not row.needs_query:
+        return words
+    if not shown:  # as the window shows it: plain colours
+        return ["--display", "rgb"]
+    words += ["--level", state.level]
+    for slot, query in shown:
+        words += ["--query", query.phrase, "--colour", str(slot + 1)]
+    for option, value, usual in (
+        ("--heat-opacity", picture.heat_opacity, PictureConfig.heat_opacity),
+        ("--dim", picture.dim, PictureConfig.dim),
+    ):
+        if value != usual:
+            words += [option, repr(value)]
+    if state.canonical or any(query.cut is not None for _, query in shown):
+        state.say("the command asks with the scene's own cut and canonical phrases", is_error=True)
+    return words

@@ -1,0 +1,211 @@
+"""Camera paths as plain maths: keyframes joined by a smooth curve, and one turn around a point.
+
+A path passes through its keyframes and is smooth in between: position and orientation have continuous
+velocities (Catmull and Rom 1974; for orientations the cumulative Bezier curve of Kim, Kim and Shin 1995, "A
+general construction scheme for unit quaternion curves with simple high order derivatives"). Each stretch
+depends on its two keyframes and their neighbours only, so that a change is not felt far away. Where two
+keyframes are equal, the camera rests between them.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
+from scipy.spatial.transform import Rotation
+
+from langsplat_core.arrays import Array
+from langsplat_core.scene import Camera
+from langsplat_viewer.controls import Extent, OrbitCamera, from_camera, symmetric_intrinsics
+
+SAME = 1e-9  # a step as small as this, of the largest coordinate or in radians, is none
+FOV_LIMITS = (0.01, 179.0)  # degrees
+LONGEST = 36_000.0  # seconds of a path
+SAME_TIME = 1e-3  # seconds: two keyframes are not nearer
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Where a camera stands, how it is turned, and how much it sees."""
+
+    position: Array  # (3,) world units
+    rotation: Array  # (3, 3) world to camera, rows are right, down and forward
+    fov_degrees: float  # across the picture's shorter side, within `FOV_LIMITS`
+
+    def camera(self, width: int, height: int) -> Camera:
+        """The pinhole camera of a picture of `width` x `height` pixels, its principal point in the centre."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.rotation
+        matrix[:3, 3] = -self.rotation @ self.position
+        inner = symmetric_intrinsics(self.fov_degrees).fitted(width, height)
+        return Camera(width, height, inner.fx, inner.fy, inner.cx, inner.cy, matrix)
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A pose at a time."""
+
+    seconds: float  # from the start of the path, 0 to `LONGEST`
+    pose: Pose
+
+
+class Motion(Protocol):
+    """A camera that moves."""
+
+    @property
+    def seconds(self) -> float:
+        """How long it takes."""
+
+    @property
+    def closed(self) -> bool:
+        """Whether it ends where it began."""
+
+    def poses(self, seconds: Array) -> tuple[Pose, ...]:
+        """Where the camera is at (T,) times; before the start and after the end it stands still."""
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """A path through keyframes. It lasts from 0 to the time of the last one; before the first one, the camera
+    stands there. ValueError without keyframes, or where their times do not rise."""
+
+    keyframes: tuple[Keyframe, ...]
+    closed: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.keyframes:
+            raise ValueError("a path needs a keyframe")
+        if (np.diff([key.seconds for key in self.keyframes]) <= 0).any():
+            raise ValueError("the times of keyframes must rise")
+
+    @property
+    def seconds(self) -> float:
+        """The time of the last keyframe."""
+        return self.keyframes[-1].seconds
+
+    @cached_property
+    def _curve(self) -> "_Curve":
+        return _Curve(self.keyframes)
+
+    def poses(self, seconds: Array) -> tuple[Pose, ...]:
+        """See `Motion`."""
+        if len(self.keyframes) == 1:
+            return (self.keyframes[0].pose,) * len(seconds)
+        return self._curve.poses(np.asarray(seconds, np.float64))
+
+
+@dataclass(frozen=True, eq=False)
+class Turntable:
+    """Once around a vertical axis, at an even pace; ends where it began."""
+
+    start: Pose
+    centre: Array  # (3,) world units, on the axis
+    up: Array  # (3,) unit, along the axis
+    seconds: float  # of the whole turn, > 0
+    closed: bool = True
+
+    def poses(self, seconds: Array) -> tuple[Pose, ...]:
+        """See `Motion`."""
+        angles = 2 * math.pi * np.clip(seconds, 0, self.seconds) / self.seconds
+        turns = Rotation.from_rotvec(angles[:, None] * self.up).as_matrix()
+        arm = self.start.position - self.centre
+        return tuple(
+            Pose(self.centre + turn.T @ arm, self.start.rotation @ turn, self.start.fov_degrees)
+            for turn in turns
+        )
+
+
+def turntable(view: OrbitCamera, seconds: float) -> Turntable:
+    """Around what `view` turns around, as a sideways drag does."""
+    return Turntable(pose_of(view), view.target, view.up, seconds)
+
+
+def pose_of(view: OrbitCamera) -> Pose:
+    """The eye of a view. A principal point that is off the centre moves there."""
+    return Pose(view.eye, view.rotation, view.intrinsics.fov_degrees)
+
+
+def view_of(pose: Pose, extent: Extent) -> OrbitCamera:
+    """A view from `pose`, turning around the depth at which it sees the scene's middle."""
+    return from_camera(pose.camera(1, 1), extent)
+
+
+def pose_at(motion: Motion, seconds: float) -> Pose:
+    """Where the camera is at one time."""
+    return motion.poses(np.array([seconds]))[0]
+
+
+def frame_times(motion: Motion, fps: float) -> Array:
+    """(T,) when a film of `fps` pictures a second is taken, T >= 1. A motion that ends where it began leaves
+    its last picture out: it would be there twice when the film is repeated."""
+    if motion.closed:
+        count = max(round(motion.seconds * fps), 1)
+    else:
+        count = math.floor(motion.seconds * fps + 1e-6) + 1
+    return np.arange(count) / fps
+
+
+def with_keyframe(keyframes: tuple[Keyframe, ...], added: Keyframe) -> tuple[Keyframe, ...]:
+    """In the order of time, `added` in place of one at the same time."""
+    others = [key for key in keyframes if abs(key.seconds - added.seconds) >= SAME_TIME]
+    return tuple(sorted((*others, added), key=lambda key: key.seconds))
+
+
+def stretched(keyframes: tuple[Keyframe, ...], seconds: float) -> tuple[Keyframe, ...]:
+    """The same path in another time: all of it, `seconds` > 0, in proportion. Paths of no duration stay."""
+    if not keyframes or keyframes[-1].seconds <= 0:
+        return keyframes
+    factor = seconds / keyframes[-1].seconds
+    return tuple(replace(key, seconds=key.seconds * factor) for key in keyframes)
+
+
+class _Curve:
+    """What is computed once for two or more keyframes."""
+
+    def __init__(self, keyframes: tuple[Keyframe, ...]) -> None:
+        self._times = np.array([key.seconds for key in keyframes], np.float64)
+        positions = np.array([key.pose.position for key in keyframes], np.float64)
+        least = SAME * (1 + np.abs(positions).max())
+        slopes = tangents(self._times, np.diff(positions, axis=0), least)
+        self._positions = CubicHermiteSpline(self._times, positions, slopes)
+        # Camera to world: a product from the right is then a turn as the camera feels it.
+        self._rotations = Rotation.from_matrix(np.array([key.pose.rotation.T for key in keyframes]))
+        steps = (self._rotations[:-1].inv() * self._rotations[1:]).as_rotvec()
+        rates = tangents(self._times, steps, SAME)
+        thirds = np.diff(self._times)[:, None] / 3
+        self._first, self._last = rates[:-1] * thirds, rates[1:] * thirds
+        ends = Rotation.from_rotvec(-self._first), Rotation.from_rotvec(-self._last)
+        self._middle = (ends[0] * Rotation.from_rotvec(steps) * ends[1]).as_rotvec()
+        # The focal length, which grows evenly when one zooms; its curve stays within the keyframes.
+        focal = [-math.log(math.tan(math.radians(key.pose.fov_degrees) / 2)) for key in keyframes]
+        self._focal = PchipInterpolator(self._times, focal)
+
+    def poses(self, seconds: Array) -> tuple[Pose, ...]:
+        times = np.clip(seconds, self._times[0], self._times[-1])
+        row = np.clip(np.searchsorted(self._times, times, "right") - 1, 0, len(self._times) - 2)
+        u = ((times - self._times[row]) / np.diff(self._times)[row])[:, None]
+        turned = (
+            self._rotations[row]
+            * Rotation.from_rotvec((1 - (1 - u) ** 3) * self._first[row])
+            * Rotation.from_rotvec((3 * u**2 - 2 * u**3) * self._middle[row])
+            * Rotation.from_rotvec(u**3 * self._last[row])
+        )
+        fov = np.degrees(2 * np.arctan(np.exp(-self._focal(times))))
+        found = zip(self._positions(times), turned.inv().as_matrix(), fov, strict=True)
+        return tuple(Pose(position, rotation, float(degrees)) for position, rotation, degrees in found)
+
+
+def tangents(times: Array, steps: Array, least: float) -> Array:
+    """(K, 3) velocities at K >= 2 keyframes of rising `times` (K,), whose differences are `steps` (K - 1, 3):
+    of the parabola through a keyframe and its two neighbours, at the ends of the straight line to the one
+    neighbour, and none beside a step shorter than `least`."""
+    spans = np.diff(times)[:, None]
+    slopes = steps / spans
+    inner = (spans[:-1] * slopes[1:] + spans[1:] * slopes[:-1]) / (spans[:-1] + spans[1:])
+    found = np.concatenate([slopes[:1], inner, slopes[-1:]])
+    rests = np.linalg.norm(steps, axis=1) <= least
+    found[:-1][rests] = 0
+    found[1:][rests] = 0
+    return np.asarray(found)

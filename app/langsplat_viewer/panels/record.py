@@ -1,0 +1,183 @@
+"""The camera path: its keyframes, playing it, and films of it."""
+
+from pathlib import Path
+
+from imgui_bundle import ImVec2, hello_imgui, imgui
+
+from langsplat_viewer import actions
+from langsplat_viewer.flight import Keyframe
+from langsplat_viewer.panels.style import muted, small_wrapped
+from langsplat_viewer.recording import FPS_CHOICES
+from langsplat_viewer.viewer import Viewer
+
+ROWS = 3.5  # of the list: the half one says that there are more
+NUMBER_EM = 7.5
+
+
+def draw(viewer: Viewer) -> None:
+    """From top to bottom: what the path is, playing it, saving it, films."""
+    record = viewer.state.record
+    if imgui.radio_button("Keyframes", not record.turns):
+        actions.set_turning(viewer, False)
+    imgui.same_line()
+    if imgui.radio_button("Turntable", record.turns):
+        actions.set_turning(viewer, True)
+    _tip("Once around what the view turns around; F makes that the latest result")
+    imgui.begin_disabled(viewer.state.view is None)
+    _play(viewer)
+    if record.turns:
+        _duration(viewer)
+    else:
+        _keyframes(viewer)
+    _film(viewer)
+    imgui.end_disabled()
+
+
+def _play(viewer: Viewer) -> None:
+    record, seconds = viewer.state.record, actions.path_seconds(viewer)
+    imgui.begin_disabled(seconds <= 0)
+    if imgui.button("Stop##path" if record.began is not None else "Play##path"):
+        actions.toggle_playing(viewer)
+    _tip("Shift + K")
+    imgui.same_line()
+    loop = imgui.calc_text_size("Loop").x + imgui.get_frame_height() + 2 * imgui.get_style().item_spacing.x
+    imgui.set_next_item_width(-loop)
+    changed, at = imgui.slider_float("##at", record.at, 0.0, max(seconds, 1e-3), "%.2f s")
+    if changed:
+        actions.scrub(viewer, at)
+    imgui.end_disabled()
+    imgui.same_line()
+    changed, loops = imgui.checkbox("Loop", record.loops)
+    if changed:
+        actions.set_looping(viewer, loops)
+
+
+def _duration(viewer: Viewer) -> None:
+    seconds = actions.path_seconds(viewer)
+    imgui.begin_disabled(seconds <= 0)
+    wanted = _number("Duration", seconds, 1.0)
+    if wanted is not None:
+        actions.set_path_seconds(viewer, wanted)
+    imgui.end_disabled()
+
+
+def _number(label: str, value: float, step: float) -> float | None:
+    """A time to type or to step; the new one once it is entered."""
+    imgui.set_next_item_width(hello_imgui.em_size(NUMBER_EM))
+    flags = imgui.InputTextFlags_.enter_returns_true
+    changed, new = imgui.input_float(label, value, step, 5 * step, "%.2f s", flags)
+    return new if changed and abs(new - value) > 1e-6 else None
+
+
+def _keyframes(viewer: Viewer) -> None:
+    record = viewer.state.record
+    if imgui.button("Add keyframe"):
+        actions.add_keyframe(viewer)
+    _tip("The current view (K)")
+    imgui.same_line()
+    imgui.begin_disabled(not record.keyframes)
+    if imgui.button("Clear"):
+        actions.clear_path(viewer)
+    imgui.end_disabled()
+    imgui.same_line()
+    _duration(viewer)
+    height = ROWS * imgui.get_frame_height_with_spacing()
+    if imgui.begin_child("keyframes", ImVec2(0, height), imgui.ChildFlags_.borders):
+        if not record.keyframes:
+            small_wrapped("K adds the current view; the path goes smoothly from one to the next", muted())
+        for number, key in enumerate(record.keyframes, 1):
+            imgui.push_id(number)
+            _line(viewer, number, key)
+            imgui.pop_id()
+    imgui.end_child()
+    if record.chosen is not None:
+        _chosen(viewer, record.chosen)
+    _file(viewer)
+
+
+def _line(viewer: Viewer, number: int, key: Keyframe) -> None:
+    side, spacing = imgui.get_frame_height(), imgui.get_style().item_spacing.x
+    right = imgui.get_content_region_avail().x
+    imgui.align_text_to_frame_padding()
+    size = ImVec2(right - side - spacing, 0)
+    if imgui.selectable(
+        f"{number}   {key.seconds:.2f} s##keyframe", key is viewer.state.record.chosen, size=size
+    )[0]:
+        actions.choose_keyframe(viewer, key)
+    imgui.same_line(imgui.get_cursor_start_pos().x + right - side)
+    if imgui.button("x", ImVec2(side, 0)):
+        actions.delete_keyframe(viewer, key)
+    _tip("Take it off the path")
+
+
+def _chosen(viewer: Viewer, key: Keyframe) -> None:
+    seconds = _number("##time of the keyframe", key.seconds, 0.5)
+    if seconds is not None:
+        actions.move_keyframe(viewer, key, seconds)
+    imgui.same_line()
+    if imgui.button("Set to this view"):
+        actions.replace_keyframe(viewer, key)
+    _tip("Put the current view in its place")
+
+
+def _file(viewer: Viewer) -> None:
+    imgui.set_next_item_width(hello_imgui.em_size(NUMBER_EM + 2))
+    hint = "file.path.json"
+    _, typed = imgui.input_text_with_hint("##path file", hint, viewer.state.record.path_typed)
+    actions.type_path_file(viewer, typed)
+    imgui.same_line()
+    if imgui.button("Save path"):
+        actions.save_path(viewer, Path.cwd())
+    imgui.same_line()
+    if imgui.button("Load"):
+        actions.load_typed_path(viewer, Path.cwd())
+
+
+def _film(viewer: Viewer) -> None:
+    record = viewer.state.record
+    imgui.separator()
+    imgui.set_next_item_width(hello_imgui.em_size(NUMBER_EM))
+    changed, size = imgui.input_int2("Size", list(record.size))
+    if changed:
+        actions.set_film_size(viewer, *size)
+    imgui.same_line()
+    imgui.set_next_item_width(hello_imgui.em_size(4.5))
+    if imgui.begin_combo("fps", f"{record.fps:g}"):
+        for fps in FPS_CHOICES:
+            if imgui.selectable(f"{fps:g}", fps == record.fps)[0]:
+                actions.set_film_fps(viewer, fps)
+        imgui.end_combo()
+    imgui.set_next_item_width(-1)
+    hint = "film.mp4, .webp, .gif or a folder; empty: a new name"
+    _, typed = imgui.input_text_with_hint("##film", hint, record.film_typed)
+    actions.type_film(viewer, typed)
+    work = viewer.recorder.current
+    if work is not None:
+        _progress(viewer, *work)
+        return
+    if imgui.button("Save film"):
+        actions.save_film(viewer, Path.cwd())
+    imgui.same_line()
+    if imgui.button("Save picture##sized"):
+        actions.save_sized_picture(viewer, Path.cwd())
+    _tip("What is shown now, in this size")
+    imgui.same_line()
+    if imgui.button("Copy as command"):
+        actions.copy_command(viewer, Path.cwd())
+    _tip("The command that draws this picture without a window")
+
+
+def _progress(viewer: Viewer, label: str, fraction: float) -> None:
+    cancel = imgui.calc_text_size("Cancel").x + 2 * imgui.get_style().frame_padding.x
+    width = -cancel - imgui.get_style().item_spacing.x
+    imgui.push_style_color(imgui.Col_.plot_histogram, imgui.get_style_color_vec4(imgui.Col_.button_active))
+    imgui.progress_bar(fraction, ImVec2(width, 0), label)
+    imgui.pop_style_color()
+    imgui.same_line()
+    if imgui.button("Cancel##film"):
+        actions.cancel_film(viewer)
+
+
+def _tip(text: str) -> None:
+    if imgui.is_item_hovered():
+        imgui.set_tooltip(text)

@@ -1,0 +1,282 @@
+"""Films without a window: as pictures, as files, by ffmpeg; begun again, stopped, refused."""
+
+import ast
+import json
+import os
+import shutil
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from langsplat_core.errors import InputError
+from langsplat_core.formats import save_scene
+from langsplat_core.progress import Cancelled
+from langsplat_viewer import __main__ as program
+from langsplat_viewer import film_files, options
+from langsplat_viewer.controls import extent_of, from_camera, orbit
+from langsplat_viewer.film import Shot, cameras_of, fingerprint, make_film
+from langsplat_viewer.film_files import find_ffmpeg
+from langsplat_viewer.flight import Flight, Keyframe, pose_of
+from langsplat_viewer.flight_files import write_flight
+from langsplat_viewer.headless import Subject, render_picture
+from tests.support.fakes import FakeEncoder, blob_scene
+
+SIZE = (32, 24)
+FRAMES = [f"frame-{number:05d}.png" for number in range(5)]
+
+FAKE_FFMPEG = f"""#!{sys.executable}
+import sys
+data = sys.stdin.buffer.read()
+open(sys.argv[-1], "wb").write(repr(sys.argv[1:]).encode() + b"|" + data)
+"""
+FAILING_FFMPEG = f"""#!{sys.executable}
+import sys
+sys.stdin.buffer.read(10)
+sys.stderr.write("Unknown encoder\\n 'libx264'\\n\\n")
+sys.exit(1)
+"""
+
+
+def flight(away: float = 0.0) -> Flight:
+    """A second around the blobs; `away`: turned by so much, radians, everything is behind the camera."""
+    view = from_camera(blob_scene().cameras[0], extent_of(blob_scene()))
+    keys = []
+    for seconds, yaw in ((0.0, 0.0), (0.5, 0.2), (1.0, 0.5)):
+        pose = pose_of(orbit(view, yaw, 0))
+        if away:
+            turned = pose.rotation * np.array([[-1.0], [1.0], [-1.0]])
+            pose = type(pose)(pose.position, turned, pose.fov_degrees)
+        keys.append(Keyframe(seconds, pose))
+    return Flight(tuple(keys))
+
+
+def shot(away: float = 0.0, **changed) -> Shot:
+    given = {"fps": 4.0, "backend": "cpu", **changed}
+    return Shot(Subject(blob_scene()), cameras_of(flight(away), given["fps"], SIZE), **given)
+
+
+def picture(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path).convert("RGB")).astype(int)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder, with a scene and two paths in it, on a system without ffmpeg."""
+    save_scene(tmp_path / "blobs.ply", blob_scene(phrasebook=True))
+    write_flight(tmp_path / "path.json", flight())
+    write_flight(tmp_path / "away.json", flight(1.0))
+    (tmp_path / "broken.json").write_text('{"langsplat_flight": 1}')
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(film_files, "find_ffmpeg", lambda: None)
+    return tmp_path
+
+
+@pytest.fixture
+def ffmpeg(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    """Puts a program of that name where it is found."""
+
+    def put(source: str) -> None:
+        path = folder / "bin" / "ffmpeg"
+        path.parent.mkdir()
+        path.write_text(source)
+        path.chmod(0o755)
+        monkeypatch.setenv("PATH", f"{path.parent}{os.pathsep}{os.environ['PATH']}")
+        monkeypatch.setattr(film_files, "find_ffmpeg", find_ffmpeg)
+
+    return put
+
+
+@pytest.fixture
+def viewer(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """Runs the console script's function; returns exit code, stdout lines, stderr lines."""
+    monkeypatch.setattr(options, "load_text_encoder", lambda encoder_id: FakeEncoder())
+
+    def run(*arguments: str) -> tuple[int, list[str], list[str]]:
+        given = ["langsplat-viewer", *arguments, "--headless", "--backend", "cpu"]
+        monkeypatch.setattr(sys, "argv", given)
+        with pytest.raises(SystemExit) as stop:
+            program.entry()
+        captured = capsys.readouterr()
+        return int(stop.value.code or 0), captured.out.splitlines(), captured.err.splitlines()
+
+    return run
+
+
+def test_a_film_is_a_folder_of_pictures(viewer, folder):
+    code, out, err = viewer(
+        "blobs.ply", "--path", "path.json", "--out", "film", "--fps", "4", "--size", "32x24", "--query", "mug"
+    )
+    assert (code, err) == (0, [])
+    assert out[0] == "film/: 32x24, 5 pictures, 4 a second"
+    assert out[1].startswith("'mug': found")
+    assert sorted(path.name for path in (folder / "film").iterdir()) == ["film.json", *FRAMES]
+    seen = [picture(folder / "film" / name) for name in FRAMES]
+    assert all(np.abs(a - b).max() > 30 for a, b in pairwise(seen))
+
+
+def test_every_picture_is_the_one_that_a_still_would_be(folder):
+    make_film(shot(), folder / "film")
+    for name, camera in zip(FRAMES, shot().cameras, strict=True):
+        expected = render_picture(blob_scene(), camera, Subject(blob_scene()).picture, backend="cpu")
+        np.testing.assert_array_equal(picture(folder / "film" / name), expected)
+
+
+def test_a_folder_is_filled_where_it_was_left(folder):
+    def stop(label: str, fraction: float) -> None:
+        if fraction > 0.5:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        make_film(shot(), folder / "film", stop)
+    assert sorted(path.name for path in (folder / "film").iterdir()) == ["film.json", *FRAMES[:3]]
+    before = (folder / "film" / FRAMES[1]).stat().st_mtime_ns
+    assert "3 of them kept" in make_film(shot(), folder / "film")[0]
+    assert (folder / "film" / FRAMES[1]).stat().st_mtime_ns == before
+    # Another film takes its place, all of it.
+    make_film(shot(fps=2.0), folder / "film")
+    assert sorted(path.name for path in (folder / "film").iterdir()) == ["film.json", *FRAMES[:3]]
+    assert (folder / "film" / FRAMES[1]).stat().st_mtime_ns > before
+
+
+def test_what_makes_a_film_the_same(folder):
+    assert fingerprint(shot()) == fingerprint(shot())
+    others = (shot(fps=3.0), shot(away=1.0), shot(backend="auto"))
+    assert len({fingerprint(one) for one in (shot(), *others)}) == 4
+
+
+def test_pictures_of_others_are_not_overwritten(viewer, folder):
+    (folder / "film").mkdir()
+    (folder / "film" / FRAMES[0]).write_bytes(b"mine")
+    code, _, err = viewer("blobs.ply", "--path", "path.json", "--out", "film")
+    assert (code, len(err)) == (2, 1)
+    assert "frame-00000.png of another program" in err[0]
+    assert (folder / "film" / FRAMES[0]).read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".gif"])
+def test_animations(viewer, folder, suffix):
+    out = f"film{suffix}"
+    arguments = ["--turntable", "1", "--fps", "5", "--size", "32x24", "--out", out]
+    code, lines, err = viewer("blobs.ply", *arguments)
+    assert (code, lines, err) == (0, [f"{out}: 32x24, 5 pictures, 5 a second"], [])
+    image = Image.open(folder / out)
+    assert (image.n_frames, image.size) == (5, SIZE)
+    assert sorted(path.suffix for path in folder.iterdir() if "film" in path.name) == [suffix]
+
+
+def test_a_turntable_around_the_answer_has_it_in_the_middle(viewer, folder):
+    arguments = ["--query", "plant", "--turntable", "1", "--fps", "4", "--size", "64x48", "--display", "rgb"]
+    assert viewer("blobs.ply", *arguments, "--around", "answer", "--out", "film")[0] == 0
+    for name in FRAMES[:4]:
+        middle = picture(folder / "film" / name)[20:28, 28:36].reshape(-1, 3).mean(0)
+        assert middle.argmax() == 2  # the plant is blue
+    code, _, err = viewer("blobs.ply", "--turntable", "1", "--around", "answer", "--out", "film")
+    assert code == 2
+    assert "nothing was found" in err[0]
+
+
+def test_without_ffmpeg_a_video_is_a_folder_and_that_is_said(viewer, folder, caplog):
+    code, out, _ = viewer("blobs.ply", "--turntable", "1", "--fps", "2", "--size", "32x24", "--out", "a.mp4")
+    assert (code, out) == (0, ["a/: 32x24, 2 pictures, 2 a second"])
+    assert ["no ffmpeg" in message for message in caplog.messages] == [True]
+    assert not (folder / "a.mp4").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the program is a script")
+def test_ffmpeg_is_given_the_pictures(ffmpeg, folder):
+    ffmpeg(FAKE_FFMPEG)
+    assert make_film(shot(), Path("a.mp4")) == ["a.mp4: 32x24, 5 pictures, 4 a second"]
+    command, _, data = (folder / "a.mp4").read_bytes().partition(b"|")
+    pictures = np.frombuffer(data, np.uint8).reshape(5, 24, 32, 3)
+    expected = render_picture(blob_scene(), shot().cameras[4], Subject(blob_scene()).picture, backend="cpu")
+    np.testing.assert_array_equal(pictures[4], expected)
+    words = ast.literal_eval(command.decode())
+    for option, value in (("-s", "32x24"), ("-r", "4"), ("-pix_fmt", "rgb24"), ("-i", "pipe:0")):
+        assert words[words.index(option) + 1] == value
+    assert "libx264" in words
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the program is a script")
+def test_what_ffmpeg_complains_of_is_one_line_and_the_old_film_stays(ffmpeg, viewer, folder):
+    ffmpeg(FAILING_FFMPEG)
+    (folder / "a.mp4").write_bytes(b"old")
+    code, out, err = viewer(
+        "blobs.ply", "--path", "path.json", "--fps", "30", "--size", "640x480", "--out", "a.mp4"
+    )
+    assert (code, out, len(err)) == (2, [], 1)
+    assert "ffmpeg failed ('libx264')" in err[0]
+    assert "--out folder/" in err[0]
+    assert (folder / "a.mp4").read_bytes() == b"old"
+    assert not [path for path in folder.iterdir() if path.name.startswith(".a")]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the program is a script")
+def test_a_stopped_video_leaves_nothing(ffmpeg, folder):
+    ffmpeg(FAKE_FFMPEG)
+
+    def stop(label: str, fraction: float) -> None:
+        if fraction > 0.5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_film(shot(), folder / "a.mp4", stop)
+    assert not [path for path in folder.iterdir() if path.suffix == ".mp4"]
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="this system has no ffmpeg")
+def test_the_systems_ffmpeg_makes_a_film(folder, monkeypatch):
+    monkeypatch.setattr(film_files, "find_ffmpeg", find_ffmpeg)
+    make_film(shot(), folder / "a.mp4")
+    assert (folder / "a.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_a_film_of_nothing_is_refused(folder):
+    with pytest.raises(InputError, match="no picture of the film shows anything"):
+        make_film(shot(away=1.0), folder / "a.gif")
+    assert not (folder / "a.gif").exists()
+
+
+def test_pictures_of_nothing_are_counted(folder):
+    keys = (*flight().keyframes, Keyframe(2.0, flight(1.0).keyframes[2].pose))
+    cameras = cameras_of(Flight(keys), 2.0, SIZE)
+    lines = make_film(Shot(Subject(blob_scene()), cameras, 2.0, "cpu"), folder / "a.gif")
+    assert lines[1].endswith("of 5 pictures show nothing of the scene")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--path", "path.json", "--turntable", "3", "--out", "a.gif"], "choose one"),
+        (["--path", "path.json"], "--out film.mp4"),
+        (["--path", "path.json", "--out", "a.png"], "a film is .mp4"),
+        (["--path", "broken.json", "--out", "a.gif"], "broken.json"),
+        (["--path", "nope.json", "--out", "a.gif"], "nope.json: no such file"),
+        (["--turntable", "0", "--out", "a.gif"], "--turntable 0"),
+        (["--turntable", "3", "--fps", "0", "--out", "a.gif"], "--fps 0"),
+        (["--turntable", "36000", "--fps", "240", "--out", "a.gif"], "lower --fps"),
+        (["--turntable", "1", "--out", "blobs.ply/film"], "is a file"),
+        (["--colour", "1", "--colour", "1", "--query", "mug", "--out", "a.png"], "--colour 1"),
+    ],
+)
+def test_what_cannot_work_is_one_line(viewer, folder, arguments, reason):
+    before = sorted(folder.rglob("*"))
+    code, out, err = viewer("blobs.ply", *arguments)
+    assert (code, out, len(err)) == (2, [], 1)
+    assert reason in err[0]
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_the_sides_of_a_video_are_even(ffmpeg, viewer, folder):
+    ffmpeg(FAKE_FFMPEG)
+    code, _, err = viewer("blobs.ply", "--turntable", "1", "--size", "33x24", "--out", "a.mp4")
+    assert code == 2
+    assert "choose 32x24" in err[0]
+
+
+def test_the_settings_of_a_folder_are_readable(folder):
+    make_film(shot(), folder / "film")
+    assert json.loads((folder / "film" / "film.json").read_text())["pictures"] == 5

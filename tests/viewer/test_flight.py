@@ -1,0 +1,191 @@
+"""Camera paths: through their keyframes, smooth between them, at rest where nothing changes."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from langsplat_viewer.controls import extent_of, from_camera, orbit
+from langsplat_viewer.flight import (
+    Flight,
+    Keyframe,
+    Pose,
+    frame_times,
+    pose_at,
+    pose_of,
+    stretched,
+    turntable,
+    view_of,
+    with_keyframe,
+)
+from tests.support.fakes import blob_scene
+
+STEP = 1e-6  # seconds, of numerical velocities
+
+
+def turned(*rotvec: float) -> np.ndarray:
+    return Rotation.from_rotvec(rotvec).as_matrix()
+
+
+def key(seconds: float, position=(0, 0, 0), rotvec=(0, 0, 0), fov: float = 50.0) -> Keyframe:
+    return Keyframe(seconds, Pose(np.array(position, float), turned(*rotvec), fov))
+
+
+def random_flight(seed: int, count: int) -> Flight:
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(rng.uniform(0.3, 2.0, count))
+    return Flight(
+        tuple(key(t, rng.normal(size=3), rng.normal(scale=1.0, size=3), rng.uniform(20, 110)) for t in times)
+    )
+
+
+def speeds(flight: Flight, at: float) -> np.ndarray:
+    """(2, 7) velocities before and after a time: of the position, the orientation, and the field of view."""
+    found = []
+    for first, second in ((at - STEP, at), (at, at + STEP)):
+        a, b = flight.poses(np.array([first, second]))
+        turn = Rotation.from_matrix(b.rotation.T @ a.rotation).as_rotvec()
+        change = np.concatenate([b.position - a.position, turn, [b.fov_degrees - a.fov_degrees]])
+        found.append(change / STEP)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8])
+def test_it_passes_through_its_keyframes(count):
+    flight = random_flight(count, count)
+    times = np.array([k.seconds for k in flight.keyframes])
+    for got, wanted in zip(flight.poses(times), flight.keyframes, strict=True):
+        assert_allclose(got.position, wanted.pose.position, atol=1e-12)
+        assert_allclose(got.rotation, wanted.pose.rotation, atol=1e-12)
+        assert got.fov_degrees == pytest.approx(wanted.pose.fov_degrees, abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_velocities_are_continuous(seed):
+    flight = random_flight(seed, 7)
+    for inner in flight.keyframes[1:-1]:
+        before, after = speeds(flight, inner.seconds)
+        assert_allclose(before, after, atol=5e-3)
+        assert np.abs(before[:6]).max() > 0.05  # and it does not stop there
+
+
+def test_two_keyframes_are_an_even_straight_way():
+    flight = Flight((key(1, (0, 0, 0)), key(3, (4, -2, 0), (0, 1, 0))))
+    for t in np.linspace(1, 3, 9):
+        pose = pose_at(flight, t)
+        assert_allclose(pose.position, np.array([4, -2, 0]) * (t - 1) / 2, atol=1e-12)
+        assert_allclose(pose.rotation, turned(0, (t - 1) / 2, 0), atol=1e-12)
+
+
+def test_before_the_first_and_after_the_last_it_stands_still():
+    flight = random_flight(1, 4)
+    first, last = flight.keyframes[0], flight.keyframes[-1]
+    for t, wanted in ((0, first), (-5, first), (last.seconds + 9, last)):
+        assert_allclose(pose_at(flight, t).position, wanted.pose.position, atol=1e-12)
+
+
+def test_an_even_turn_stays_even_and_agrees_with_scipys_spline():
+    axis = np.array([1.0, 2, -1]) / math.sqrt(6)
+    times = np.array([0.0, 1, 2.5, 3, 5])
+    flight = Flight(tuple(key(t, rotvec=0.7 * t * axis) for t in times))
+    spline = RotationSpline(times, Rotation.from_rotvec(0.7 * times[:, None] * axis))
+    for t in np.linspace(0, 5, 41):
+        assert_allclose(pose_at(flight, t).rotation, spline(t).as_matrix(), atol=1e-9)
+        assert_allclose(pose_at(flight, t).rotation, turned(*(0.7 * t * axis)), atol=1e-12)
+
+
+def test_it_rests_between_equal_keyframes():
+    """A plain spline would swing beyond and back."""
+    there = ((1, 2, 3), (0, 0.5, 0), 40)
+    flight = Flight((key(0), key(1, *there), key(4, *there), key(5, (2, 2, 2), (0.3, 0, 0))))
+    wanted = flight.keyframes[1].pose
+    for pose in flight.poses(np.linspace(1, 4, 31)):
+        assert_allclose(pose.position, wanted.position, atol=1e-12)
+        assert_allclose(pose.rotation, wanted.rotation, atol=1e-12)
+        assert pose.fov_degrees == pytest.approx(40, abs=1e-12)
+    before, after = speeds(flight, 4.0)
+    assert_allclose(before, after, atol=5e-3)
+
+
+@pytest.mark.parametrize("angle", [math.pi, math.pi - 1e-9, math.pi + 1e-9, 3.0])
+def test_half_turns(angle):
+    flight = Flight((key(0), key(1, rotvec=(0, angle, 0)), key(2, rotvec=(0, 0, angle)), key(3)))
+    poses = flight.poses(np.linspace(0, 3, 301))
+    for pose in poses:
+        assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-12)
+    steps = [np.abs(b.rotation - a.rotation).max() for a, b in pairwise(poses)]
+    assert max(steps) < 0.15  # no jump
+    before, after = speeds(flight, 1.0)
+    assert_allclose(before, after, atol=2e-2)
+
+
+def test_the_field_of_view_never_leaves_that_of_the_keyframes():
+    flight = Flight((key(0, fov=60), key(1, fov=61), key(1.1, fov=20), key(4, fov=20)))
+    found = [pose.fov_degrees for pose in flight.poses(np.linspace(0, 4, 400))]
+    assert 20 - 1e-9 <= min(found) <= max(found) <= 61 + 1e-9
+
+
+def test_a_far_keyframe_does_not_move_what_is_near():
+    keys = random_flight(3, 8).keyframes
+    other = (*keys[:-1], key(keys[-1].seconds, (9, 9, 9), (1, 1, 1)))
+    early = keys[4].seconds
+    for a, b in zip(*(Flight(k).poses(np.linspace(0, early, 50)) for k in (keys, other)), strict=True):
+        assert_allclose(a.position, b.position, atol=1e-12)
+        assert_allclose(a.rotation, b.rotation, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e9])
+def test_extreme_paths_stay_finite(scale):
+    rng = np.random.default_rng(5)
+    keys = tuple(key(t, scale * rng.normal(size=3), (3.1, 0, 0)) for t in (0, 1e-3, 1, 36_000))
+    for pose in Flight(keys).poses(np.linspace(0, 36_000, 500)):
+        assert np.isfinite(pose.position).all()
+        assert np.isfinite(pose.rotation).all()
+
+
+def test_times_must_rise():
+    for keys in ((), (key(1), key(1)), (key(2), key(1))):
+        with pytest.raises(ValueError, match="keyframe"):
+            Flight(keys)
+
+
+def test_keyframes_are_added_in_order_and_stretched():
+    keys = with_keyframe(with_keyframe((key(2),), key(0.5)), key(2, (1, 1, 1)))
+    assert [k.seconds for k in keys] == [0.5, 2]
+    assert_allclose(keys[1].pose.position, 1)
+    assert [k.seconds for k in stretched(keys, 6)] == [1.5, 6]
+    assert stretched((), 3) == ()
+    assert [k.seconds for k in stretched((key(0),), 3)] == [0]
+
+
+def test_a_turntable_goes_once_around_as_a_drag_does():
+    extent = extent_of(blob_scene())
+    view = from_camera(blob_scene().cameras[0], extent)
+    turn = turntable(view, 8.0)
+    for t in (0.0, 1.0, 5.5):
+        expected = pose_of(orbit(view, 2 * math.pi * t / 8, 0))
+        assert_allclose(pose_at(turn, t).position, expected.position, atol=1e-9)
+        assert_allclose(pose_at(turn, t).rotation, expected.rotation, atol=1e-9)
+    assert_allclose(pose_at(turn, 8.0).position, view.eye, atol=1e-9)
+
+
+def test_times_of_pictures():
+    assert_allclose(frame_times(Flight((key(0), key(1))), 4), [0, 0.25, 0.5, 0.75, 1])
+    assert_allclose(frame_times(Flight((key(0),)), 30), [0])
+    view = from_camera(blob_scene().cameras[0], extent_of(blob_scene()))
+    assert_allclose(frame_times(turntable(view, 1), 4), [0, 0.25, 0.5, 0.75])  # the last is the first again
+    assert len(frame_times(turntable(view, 0.1), 1)) == 1
+    assert len(frame_times(Flight((key(0), key(0.1 * 3))), 10)) == 4  # 0.3 is a little less than 3 tenths
+
+
+def test_a_pose_is_the_view_it_was_taken_from():
+    extent = extent_of(blob_scene())
+    view = orbit(from_camera(blob_scene().cameras[1], extent), 0.3, 0.1)
+    again = view_of(pose_of(view), extent)
+    for size in ((160, 120), (64, 64)):
+        a, b = view.camera(*size), again.camera(*size)
+        assert_allclose(b.world_to_camera, a.world_to_camera, atol=1e-9)
+    assert again.camera(160, 120).fx == pytest.approx(view.camera(160, 120).fx)

@@ -1,0 +1,267 @@
+"""The panel "Record" without its window: keyframes, playing, undo, files, films, commands."""
+
+import shlex
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from PIL import Image
+
+from langsplat_core.config import PictureConfig
+from langsplat_core.formats import save_scene
+from langsplat_viewer import __main__ as program
+from langsplat_viewer import actions, film_files, options
+from langsplat_viewer.actions.filming import subject_of
+from langsplat_viewer.controls import orbit, zoom
+from langsplat_viewer.flight_files import read_flight
+from langsplat_viewer.headless import Subject, draw_something, painter
+from langsplat_viewer.viewer import Viewer
+from tests.support.fakes import FakeEncoder, blob_scene
+from tests.support.windowless import arrive, errors, settle
+
+
+def turn(viewer: Viewer, yaw: float) -> None:
+    actions.move(viewer, lambda view: orbit(view, yaw, 0.05))
+
+
+def record_three(viewer: Viewer) -> list:
+    """Keyframes at 0, 2 and 4 seconds; returns the views."""
+    views = []
+    for _ in range(3):
+        views.append(viewer.state.view)
+        actions.add_keyframe(viewer)
+        turn(viewer, 0.3)
+    return views
+
+
+def drawn(viewer: Viewer, seconds: float = 60.0) -> None:
+    """Until the recorder has nothing left to do."""
+    end = time.monotonic() + seconds
+    while viewer.recorder.current is not None:
+        assert time.monotonic() < end, "never finished"
+        actions.tick(viewer, viewer.clock)
+        time.sleep(0.002)
+    actions.tick(viewer, viewer.clock)
+
+
+def times(viewer: Viewer) -> list[float]:
+    return [key.seconds for key in viewer.state.record.keyframes]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(film_files, "find_ffmpeg", lambda: None)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_played_path_goes_through_its_keyframes(opened):
+    views = record_three(opened)
+    assert times(opened) == [0, 2, 4]
+    actions.scrub(opened, 0)
+    actions.tick(opened, 100.0)
+    actions.toggle_playing(opened)
+    for seconds, view in zip((0, 2, 4), views, strict=True):
+        actions.tick(opened, 100.0 + seconds)
+        assert_allclose(opened.state.view.eye, view.eye, atol=1e-9)
+        assert_allclose(opened.state.view.rotation, view.rotation, atol=1e-9)
+    assert opened.state.record.began is None  # it has ended
+    assert opened.state.record.at == 4
+
+
+def test_a_loop_begins_again_and_a_drag_ends_it(opened):
+    views = record_three(opened)
+    actions.set_looping(opened, True)
+    actions.scrub(opened, 1.0)
+    actions.toggle_playing(opened)
+    actions.tick(opened, opened.clock + 5.0)  # at 6 of 4 seconds
+    assert opened.state.record.at == pytest.approx(2.0)
+    assert_allclose(opened.state.view.eye, views[1].eye, atol=1e-9)
+    turn(opened, 0.1)
+    view = opened.state.view
+    actions.tick(opened, opened.clock + 1.0)
+    assert opened.state.view is view
+
+
+def test_stopping_stays_and_playing_goes_on_from_there(opened):
+    record_three(opened)
+    actions.scrub(opened, 0)
+    actions.toggle_playing(opened)
+    actions.tick(opened, opened.clock + 1.5)
+    actions.toggle_playing(opened)
+    actions.tick(opened, opened.clock + 9)
+    assert opened.state.record.at == pytest.approx(1.5)
+    actions.toggle_playing(opened)
+    actions.tick(opened, opened.clock + 0.25)
+    assert opened.state.record.at == pytest.approx(1.75)
+
+
+def test_a_turntable_comes_back_and_begins_anew_after_a_drag(opened):
+    start = opened.state.view
+    actions.set_turning(opened, True)
+    actions.set_path_seconds(opened, 4.0)
+    actions.toggle_playing(opened)
+    began = opened.clock
+    actions.tick(opened, began + 2)
+    assert_allclose(opened.state.view.target, start.target)
+    flat = (opened.state.view.eye - start.target) + (start.eye - start.target)
+    assert_allclose(flat - (flat @ start.up) * start.up, 0, atol=1e-9)  # on the other side
+    actions.tick(opened, began + 4)
+    assert_allclose(opened.state.view.eye, start.eye, atol=1e-9)
+    actions.move(opened, lambda view: zoom(view, 0.5, 0.01))
+    assert opened.state.record.turn_from is None
+    assert opened.state.record.at == 0
+
+
+def test_keyframes_are_changed_and_changes_undone(opened):
+    record_three(opened)
+    first, second, third = opened.state.record.keyframes
+    actions.move_keyframe(opened, second, 5.0)
+    assert times(opened) == [0, 4, 5]
+    actions.move_keyframe(opened, opened.state.record.keyframes[2], 4.0)  # there is one
+    assert times(opened) == [0, 4, 4.01]
+    actions.delete_keyframe(opened, first)
+    assert times(opened) == [4, 4.01]
+    for expected in ([0, 4, 4.01], [0, 4, 5], [0, 2, 4], [0, 2]):
+        actions.undo(opened)
+        assert times(opened) == expected
+    assert opened.state.record.keyframes == (first, second)
+    actions.redo(opened)
+    assert opened.state.record.keyframes == (first, second, third)
+    actions.replace_keyframe(opened, first)
+    assert_allclose(opened.state.record.keyframes[0].pose.position, opened.state.view.eye)
+    actions.set_path_seconds(opened, 8)
+    assert times(opened) == [0, 4, 8]
+    actions.clear_path(opened)
+    assert times(opened) == []
+    actions.undo(opened)
+    assert times(opened) == [0, 4, 8]
+
+
+def test_choosing_a_keyframe_goes_there(opened):
+    views = record_three(opened)
+    actions.choose_keyframe(opened, opened.state.record.keyframes[1])
+    arrive(opened)
+    assert_allclose(opened.state.view.eye, views[1].eye, atol=1e-9)
+    assert opened.state.record.at == 2
+
+
+def test_a_path_is_saved_loaded_and_dropped(opened, folder):
+    record_three(opened)
+    path = actions.save_path(opened, folder)
+    assert path.name == "blobs-001.path.json"
+    assert len(read_flight(path).keyframes) == 3
+    actions.clear_path(opened)
+    actions.open_dropped(opened, [path])
+    assert times(opened) == [0, 2, 4]
+    assert opened.state.wanted_panel == "Record"
+    (folder / "bad.path.json").write_text("{}")
+    actions.type_path_file(opened, "bad.path.json")
+    actions.load_typed_path(opened, folder)
+    assert "no camera path" in errors(opened)[-1]
+    assert times(opened) == [0, 2, 4]
+
+
+def test_another_scene_has_no_path_of_this_one(opened):
+    record_three(opened)
+    actions.set_film_size(opened, 640, 0)
+    actions.open_scene(opened, Path("plain.ply"))
+    settle(opened)
+    assert times(opened) == []
+    assert opened.state.record.size == (640, 1)
+
+
+def test_what_cannot_be_done_is_said(viewer, opened, folder):
+    actions.toggle_playing(opened)
+    actions.save_film(opened, folder)
+    actions.save_path(opened, folder)
+    actions.load_typed_path(opened, folder)
+    record_three(opened)
+    actions.type_film(opened, "film.avi")
+    actions.save_film(opened, folder)
+    wanted = ["two keyframes", "needs a path", "needs a keyframe", "type the name", "a film is .mp4"]
+    assert [reason in text for reason, text in zip(wanted, errors(opened), strict=True)] == [True] * 5
+    assert list(folder.iterdir()) == []
+
+
+def test_a_film_is_made_beside_the_window(opened, folder):
+    record_three(opened)
+    actions.set_film_size(opened, 32, 24)
+    actions.set_film_fps(opened, 1.0)
+    actions.save_film(opened, folder)
+    actions.ask(opened, "mug")  # the other worker answers meanwhile
+    drawn(opened)
+    assert "blobs-film-001/: 32x24, 5 pictures" in " ".join(m.text for m in opened.state.messages)
+    seen = sorted((folder / "blobs-film-001").glob("*.png"))
+    assert len(seen) == 5
+    camera = opened.state.record.keyframes[1].pose.camera(32, 24)
+    with painter(Subject(opened.state.scene), "cpu") as paint:
+        np.testing.assert_array_equal(np.asarray(Image.open(seen[2])), paint(camera).image)
+
+
+def test_a_film_can_be_stopped(opened, folder):
+    record_three(opened)
+    actions.set_film_size(opened, 320, 240)
+    actions.save_film(opened, folder)
+    actions.cancel_film(opened)
+    drawn(opened)
+    opened.recorder.close(10.0)
+    assert len(list(folder.glob("blobs-film-001/*.png"))) < 121
+    assert not list(folder.glob("**/.*"))
+
+
+def test_a_picture_of_any_size(opened, folder):
+    actions.set_film_size(opened, 97, 41)
+    actions.save_sized_picture(opened, folder)
+    drawn(opened)
+    assert Image.open(folder / "blobs-97x41-001.png").size == (97, 41)
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """Runs a command as a shell would."""
+    monkeypatch.setattr(options, "load_text_encoder", lambda encoder_id: FakeEncoder())
+
+    def go(command: str) -> np.ndarray:
+        words = shlex.split(command)
+        monkeypatch.setattr(sys, "argv", [*words, "--backend", "cpu"])
+        with pytest.raises(SystemExit) as stop:
+            program.entry()
+        assert not stop.value.code, capsys.readouterr().err
+        return np.asarray(Image.open(words[words.index("--out") + 1])).astype(int)
+
+    return go
+
+
+@pytest.mark.parametrize("case", ["training camera", "elsewhere", "queries", "colours", "latent", "sliders"])
+def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run, case):
+    where = folder / "with a space"
+    where.mkdir()
+    save_scene(where / "blobs.ply", blob_scene(phrasebook=True))
+    opened.state.path = where / "blobs.ply"
+    actions.resize(opened, 200, 130)
+    if case != "training camera":
+        turn(opened, 0.2)
+    if case in ("queries", "colours", "sliders"):
+        for word in ("mug", "plant", "book"):
+            actions.ask(opened, word)
+        settle(opened)
+    if case == "colours":
+        actions.hide(opened, opened.state.queries[0])
+    if case == "sliders":
+        actions.set_picture(opened, PictureConfig(display="relevancy", heat_opacity=0.3, dim=0.9))
+    if case == "latent":
+        actions.set_display(opened, "latent", 1)
+    command = actions.copy_command(opened, folder)
+    assert actions.take_clipboard(opened) == command
+    assert actions.take_clipboard(opened) == ""
+    assert [path.suffix for path in folder.iterdir() if path.is_file()] == (
+        [] if case == "training camera" else [".json"]
+    )
+    with painter(subject_of(opened.state), "cpu") as paint:
+        expected = draw_something(subject_of(opened.state), opened.state.view.camera(200, 130), paint)
+    assert_allclose(run(command), expected.astype(int), atol=2)
+    assert expected.std() > 5
