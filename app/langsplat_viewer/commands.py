@@ -68,12 +68,14 @@ def _panel(title: str) -> Command:
 
 
 def _overlay(name: Overlay, title: str) -> Command:
+    keys = ("B",) if name == "things" else ()
     return Command(
-        f"show or hide the {title}", lambda viewer: actions.toggle_overlay(viewer, name), menu="View"
+        f"show or hide the {title}", lambda viewer: actions.toggle_overlay(viewer, name), keys, "View"
     )
 
 
 OVERLAY_TITLES: dict[Overlay, str] = {
+    "things": "boxes of what was found",
     "cameras": "training cameras",
     "cube": "view cube",
     "grid": "ground grid",

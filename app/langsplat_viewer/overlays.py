@@ -64,6 +64,13 @@ def frusta(cameras: Sequence[Camera], depth: float) -> Array:
     return edges
 
 
+def box_edges(corners: Array) -> Array:
+    """(8, 3) corners, in the order of `query.boxes.OrientedBox` -> (12, 2, 3) edges."""
+    pairs = [(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit]
+    edges: Array = corners[np.array(pairs)]
+    return edges
+
+
 def nearest_segment(segments: Array, point: tuple[float, float]) -> tuple[int, float]:
     """Of (K, 2, 2) segments on screen the row nearest to a point, and its distance in pixels; (-1, inf)
     without any."""

@@ -25,7 +25,7 @@ class Split:
     at: float = 0.5  # where the line is, of the area's width
 
 
-Overlay = Literal["cameras", "cube", "grid"]
+Overlay = Literal["things", "cameras", "cube", "grid"]
 OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
 Point = tuple[float, float, float]  # world units
 

@@ -9,6 +9,7 @@ from langsplat_core.display.colour_maps import MAX_QUERIES
 from langsplat_core.display.compose import HeatRanges
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.instances import Instance
 from langsplat_core.query.pointing import Pointed
 from langsplat_core.query.suggestions import Suggestions
 from langsplat_core.scene import Camera, Scene
@@ -35,6 +36,7 @@ class Query:
     shown_since: int = 0  # larger for a query shown later
     result: QueryResult | None = None  # as it is shown
     automatic: QueryResult | None = None  # the same where it ends by itself
+    things: tuple[Instance, ...] = ()  # what it found, one by one, where it ends by itself
     cut: float | None = None  # relevancy at which it ends instead
     reading: str = ""  # how the phrase was understood, where it has structure
     problem: str = ""  # why it has no result, one line

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
@@ -209,3 +210,12 @@ def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch,
     assert (viewer.state.queries[0].slot is None) == (verdict == "not here")
     said = f"'mug': {verdict} ({100 * result.probability:.0f} %), score "
     assert describe(result).startswith(said)
+
+
+def test_what_was_found_is_told_apart(opened):
+    for phrase in ("mug", "mug or plant"):
+        actions.ask(opened, phrase)
+    settle(opened)
+    one, both = opened.state.queries
+    assert (len(one.things), len(both.things)) == (1, 2)
+    assert np.linalg.norm(one.things[0].centre - CENTRES[0]) < 0.3

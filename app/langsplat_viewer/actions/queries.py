@@ -9,6 +9,7 @@ from langsplat_core.progress import Progress
 from langsplat_core.query.answers import recut
 from langsplat_core.query.compose import ComposedResult, run_phrase
 from langsplat_core.query.engine import no_field
+from langsplat_core.query.instances import Instance
 from langsplat_core.query.phrase_tree import Atom
 from langsplat_core.query.suggestions import corrected
 from langsplat_core.scene.phrases import phrase_key, split_phrases
@@ -16,6 +17,8 @@ from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.settings import mute_letters, open_panel
 from langsplat_viewer.state import SLOTS, Query
 from langsplat_viewer.viewer import Viewer
+
+MOST_THINGS = 20  # of one answer that are told apart
 
 
 def ask(viewer: Viewer, text: str) -> None:
@@ -94,17 +97,19 @@ def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
     view = viewer.state.view
     viewpoint = None if view is None else view.camera(*viewer.state.size)
 
-    def work(progress: Progress) -> ComposedResult | UnknownWordError:
+    def work(progress: Progress) -> tuple[ComposedResult, tuple[Instance, ...]] | UnknownWordError:
         try:
-            return run_phrase(engine, query.phrase, level, viewpoint, progress)
+            composed = run_phrase(engine, query.phrase, level, viewpoint, progress)
         except UnknownWordError as error:
             return error
+        return composed, engine.instances(composed.answer, MOST_THINGS) if composed.answer.found else ()
 
-    def done(composed: ComposedResult | UnknownWordError) -> None:
-        if isinstance(composed, UnknownWordError):
-            query.meant = corrected(query.phrase, composed.near) or ""
-            failed(str(composed))
+    def done(answered: tuple[ComposedResult, tuple[Instance, ...]] | UnknownWordError) -> None:
+        if isinstance(answered, UnknownWordError):
+            query.meant = corrected(query.phrase, answered.near) or ""
+            failed(str(answered))
             return
+        composed, query.things = answered
         query.automatic, query.problem, query.meant, query.pending = composed.answer, "", "", False
         query.result = composed.answer if query.cut is None else recut(composed.answer, query.cut)
         query.reading = "" if isinstance(composed.tree, Atom) else composed.reading

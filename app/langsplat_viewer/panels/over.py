@@ -4,6 +4,7 @@ import numpy as np
 from imgui_bundle import ImVec2, imgui
 
 from langsplat_core.arrays import Array
+from langsplat_core.display.colour_maps import QUERY_COLOURS
 from langsplat_core.scene import Camera
 from langsplat_viewer import actions, overlays, splitting
 from langsplat_viewer.panels.area import Area
@@ -29,6 +30,8 @@ def draw(viewer: Viewer, area: Area) -> None:
         camera = state.view.camera(max(round(part.width), 1), max(round(part.height), 1))
         low = ImVec2(part.left, part.top)
         paint.push_clip_rect(low, ImVec2(part.left + part.width, part.top + part.height), True)
+        if "things" in state.preferences.overlays:
+            _things(viewer, part, camera)
         if "grid" in state.preferences.overlays:
             _grid(viewer, part, camera)
         if "cameras" in state.preferences.overlays:
@@ -89,6 +92,24 @@ def _cameras(viewer: Viewer, area: Area, camera: Camera) -> None:
         text_on_shade(f"camera {under}  {name}", mouse.x + 14, mouse.y + 10, area)
         if clicked(area):
             actions.go_to_camera(viewer, under)
+
+
+def _things(viewer: Viewer, area: Area, camera: Camera) -> None:
+    """A box around each thing that a query shown has found, and the phrase beside it."""
+    for query in viewer.state.shown():
+        if query is None or query.slot is None:
+            continue
+        red, green, blue = QUERY_COLOURS[query.slot]
+        for number, thing in enumerate(query.things, start=1):
+            edges = overlays.box_edges(thing.oriented.corners)
+            segments, _ = overlays.clip_segments(camera, edges, _least_depth(viewer))
+            _lines(area, segments, (0.0, 0.0, 0.0, 0.5), 3.0)
+            _lines(area, segments, (red, green, blue, 1.0), 1.5)
+            if len(segments):
+                x, y = segments.reshape(-1, 2)[segments.reshape(-1, 2)[:, 1].argmin()].tolist()
+                text = query.phrase if len(query.things) == 1 else f"{query.phrase} {number}"
+                line = imgui.get_text_line_height()
+                text_on_shade(text, area.left + x + 4, area.top + max(y - 1.4 * line, 0), area)
 
 
 def _grid(viewer: Viewer, area: Area, camera: Camera) -> None:
