@@ -13,22 +13,21 @@ from langsplat_viewer.viewer import Viewer
 def undo(viewer: Viewer) -> None:
     """Go back to before the last query, removal, colour, level, display, keyframe, selection, hiding or
     deletion."""
-    history = viewer.history
-    if not history.past:
-        viewer.state.say("nothing to undo")
-        return
-    history.future.append(now(viewer.state))
-    _restore(viewer, history.past.pop())
+    _step(viewer, viewer.history.past, viewer.history.future, "nothing to undo")
 
 
 def redo(viewer: Viewer) -> None:
     """Do again what was undone last."""
-    history = viewer.history
-    if not history.future:
-        viewer.state.say("nothing to redo")
+    _step(viewer, viewer.history.future, viewer.history.past, "nothing to redo")
+
+
+def _step(viewer: Viewer, there: list[Moment], back: list[Moment], otherwise: str) -> None:
+    """Go to the nearest moment of `there`, and keep how things stand in `back`."""
+    if not there:
+        viewer.state.say(otherwise)
         return
-    history.past.append(now(viewer.state))
-    _restore(viewer, history.future.pop())
+    back.append(now(viewer.state))
+    _restore(viewer, there.pop())
 
 
 def _restore(viewer: Viewer, moment: Moment) -> None:
