@@ -5,10 +5,10 @@ from importlib.resources import files
 from types import MappingProxyType
 
 import numpy as np
-from PIL import Image
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import ColourMap
+from langsplat_core.parsing.pictures import opened
 
 # Turbo colour map: polynomial fit published by A. Mikhailov, Google (2019), coefficients by channel.
 _TURBO_COEFFICIENTS = np.array(
@@ -29,8 +29,9 @@ def _turbo() -> Array:
 def _published() -> dict[ColourMap, Array]:
     """Viridis and magma by N. Smith and S. van der Walt (2015) and cividis by J. Nunez, C. Anderton and
     R. Renslow (2018), as matplotlib has them: the rows of a small picture beside this file."""
-    with files(__package__).joinpath("colour_maps.png").open("rb") as source:
-        rows = np.asarray(Image.open(source).convert("RGB"))
+    table = files(__package__).joinpath("colour_maps.png").read_bytes()
+    with opened(table, "colour_maps.png") as picture:
+        rows = np.asarray(picture.convert("RGB"))
     return {"viridis": rows[0], "cividis": rows[1], "magma": rows[2]}
 
 
