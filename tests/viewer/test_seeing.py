@@ -24,7 +24,7 @@ def test_overlays_are_shown_and_remembered(opened, tmp_path):
     assert load_preferences(tmp_path).overlays == OVERLAYS
     actions.show_overlay(opened, "cube", False)
     actions.show_overlay(opened, "cube", False)
-    assert opened.state.preferences.overlays == ("cameras", "grid")
+    assert opened.state.preferences.overlays == tuple(name for name in OVERLAYS if name != "cube")
 
 
 def test_every_overlay_has_a_command(opened):
