@@ -15,17 +15,12 @@ from langsplat_core.datasets.album import Album
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.datasets.undistort import pinhole_for, resample, source_positions
 from langsplat_core.errors import InputError, printable_line
-from langsplat_core.parsing.pictures import PictureError, opened
+from langsplat_core.parsing.pictures import PHOTO_SUFFIXES, PictureError, opened
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
 
 log = logging.getLogger("langsplat")
 
-# HEIF is named where it cannot be read, too: the message then says why such photographs are left out
-PHOTO_SUFFIXES = (
-    *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif"),
-    *(".heic", ".heif"),
-)
 ASPECT_TOLERANCE = 0.02  # shrunk copies round their sizes
 WORKERS = 2  # decoding and resampling release the interpreter; more would only hold more pixels
 

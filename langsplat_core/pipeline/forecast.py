@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from langsplat_core.config import MaskConfig, TrainConfig
-from langsplat_core.datasets.images import PHOTO_SUFFIXES
+from langsplat_core.parsing.pictures import PHOTO_SUFFIXES
 from langsplat_core.progress import Progress
 
 ASPECT = 0.75  # height by width of an ordinary photograph

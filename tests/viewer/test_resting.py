@@ -42,3 +42,19 @@ def test_closing_does_not_wait_for_what_is_being_read(display, tmp_path):
     began = time.monotonic()
     run("leave", display, tmp_path)
     assert time.monotonic() - began < 45  # the reading takes 60
+
+
+def test_the_window_is_not_heavier_than_it_has_to_be():
+    heavy = ("torch", "transformers", "pycolmap", "open3d", "skimage", "matplotlib")
+    script = (
+        f"import sys, langsplat_viewer.window\nprint([name for name in {heavy!r} if name in sys.modules])"
+    )
+    paths = os.pathsep.join((str(ROOT), str(ROOT / "app")))
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env=os.environ | {"PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.stdout.strip() == "[]", done.stderr

@@ -9,9 +9,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.images import PHOTO_SUFFIXES
 from langsplat_core.errors import InputError
-from langsplat_core.parsing.pictures import opened
+from langsplat_core.parsing.pictures import PHOTO_SUFFIXES, opened
 
 Size = tuple[int, int]  # width and height, pixels
 SAME_SHAPE = 0.02  # relative difference of aspect up to which two sizes may be of one picture
