@@ -3,14 +3,14 @@
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.panels.style import bad, muted, small_wrapped
+from langsplat_viewer.panels.style import bad, muted, small_wrapped, stoppable
 from langsplat_viewer.viewer import Viewer
 
 
 def draw(viewer: Viewer) -> None:
     """What is being done, what was said (the latest first), and how fast pictures are made."""
-    if viewer.worker.current is not None:
-        _progress(viewer, *viewer.worker.current)
+    if viewer.worker.current is not None and stoppable(*viewer.worker.current):
+        actions.cancel(viewer)
     line = imgui.get_text_line_height_with_spacing()
     if imgui.begin_child("messages", ImVec2(0, -line)):
         for message in reversed(viewer.state.messages):
@@ -29,14 +29,3 @@ def figures(viewer: Viewer, frames_per_second: float | None) -> str:
     if stats.width:
         parts += [f"{stats.milliseconds:.0f} ms", f"{stats.width} x {stats.height}"]
     return "   ".join(part for part in parts if part)
-
-
-def _progress(viewer: Viewer, label: str, fraction: float) -> None:
-    cancel = imgui.calc_text_size("Cancel").x + 2 * imgui.get_style().frame_padding.x
-    width = -cancel - imgui.get_style().item_spacing.x
-    imgui.push_style_color(imgui.Col_.plot_histogram, imgui.get_style_color_vec4(imgui.Col_.button_active))
-    imgui.progress_bar(fraction, ImVec2(width, 0), label)
-    imgui.pop_style_color()
-    imgui.same_line()
-    if imgui.button("Cancel"):
-        actions.cancel(viewer)

@@ -6,7 +6,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
 from langsplat_viewer.flight import Keyframe
-from langsplat_viewer.panels.style import muted, small_wrapped
+from langsplat_viewer.panels.style import muted, small_wrapped, stoppable, tip
 from langsplat_viewer.recording import FPS_CHOICES
 from langsplat_viewer.viewer import Viewer
 
@@ -22,7 +22,7 @@ def draw(viewer: Viewer) -> None:
     imgui.same_line()
     if imgui.radio_button("Turntable", record.turns):
         actions.set_turning(viewer, True)
-    _tip("Once around what the view turns around; F makes that the latest result")
+    tip("Once around what the view turns around; F makes that the latest result")
     imgui.begin_disabled(viewer.state.view is None)
     _play(viewer)
     if record.turns:
@@ -38,7 +38,7 @@ def _play(viewer: Viewer) -> None:
     imgui.begin_disabled(seconds <= 0)
     if imgui.button("Stop##path" if record.began is not None else "Play##path"):
         actions.toggle_playing(viewer)
-    _tip("Shift + K")
+    tip("Shift + K")
     imgui.same_line()
     loop = imgui.calc_text_size("Loop").x + imgui.get_frame_height() + 2 * imgui.get_style().item_spacing.x
     imgui.set_next_item_width(-loop)
@@ -73,7 +73,7 @@ def _keyframes(viewer: Viewer) -> None:
     record = viewer.state.record
     if imgui.button("Add keyframe"):
         actions.add_keyframe(viewer)
-    _tip("The current view (K)")
+    tip("The current view (K)")
     imgui.same_line()
     imgui.begin_disabled(not record.keyframes)
     if imgui.button("Clear"):
@@ -107,7 +107,7 @@ def _line(viewer: Viewer, number: int, key: Keyframe) -> None:
     imgui.same_line(imgui.get_cursor_start_pos().x + right - side)
     if imgui.button("x", ImVec2(side, 0)):
         actions.delete_keyframe(viewer, key)
-    _tip("Take it off the path")
+    tip("Take it off the path")
 
 
 def _chosen(viewer: Viewer, key: Keyframe) -> None:
@@ -117,7 +117,7 @@ def _chosen(viewer: Viewer, key: Keyframe) -> None:
     imgui.same_line()
     if imgui.button("Set to this view"):
         actions.replace_keyframe(viewer, key)
-    _tip("Put the current view in its place")
+    tip("Put the current view in its place")
 
 
 def _file(viewer: Viewer) -> None:
@@ -153,31 +153,16 @@ def _film(viewer: Viewer) -> None:
     actions.type_film(viewer, typed)
     work = viewer.recorder.current
     if work is not None:
-        _progress(viewer, *work)
+        if stoppable(*work, tag="film"):
+            actions.cancel_film(viewer)
         return
     if imgui.button("Save film"):
         actions.save_film(viewer, Path.cwd())
     imgui.same_line()
     if imgui.button("Save picture##sized"):
         actions.save_sized_picture(viewer, Path.cwd())
-    _tip("What is shown now, in this size")
+    tip("What is shown now, in this size")
     imgui.same_line()
     if imgui.button("Copy as command"):
         actions.copy_command(viewer, Path.cwd())
-    _tip("The command that draws this picture without a window")
-
-
-def _progress(viewer: Viewer, label: str, fraction: float) -> None:
-    cancel = imgui.calc_text_size("Cancel").x + 2 * imgui.get_style().frame_padding.x
-    width = -cancel - imgui.get_style().item_spacing.x
-    imgui.push_style_color(imgui.Col_.plot_histogram, imgui.get_style_color_vec4(imgui.Col_.button_active))
-    imgui.progress_bar(fraction, ImVec2(width, 0), label)
-    imgui.pop_style_color()
-    imgui.same_line()
-    if imgui.button("Cancel##film"):
-        actions.cancel_film(viewer)
-
-
-def _tip(text: str) -> None:
-    if imgui.is_item_hovered():
-        imgui.set_tooltip(text)
+    tip("The command that draws this picture without a window")

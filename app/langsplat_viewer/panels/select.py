@@ -6,7 +6,7 @@ from pathlib import Path
 from imgui_bundle import hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.panels.style import elided, muted, small_wrapped
+from langsplat_viewer.panels.style import elided, muted, small_wrapped, tip
 from langsplat_viewer.selecting import BRUSHES, MODES, REACHES, TOOLS, Marks
 from langsplat_viewer.viewer import Viewer
 
@@ -86,7 +86,7 @@ def _tools(viewer: Viewer) -> None:
             actions.set_mode(viewer, mode)
     _, only = imgui.checkbox("Only what is visible", selection.only_visible)
     actions.set_only_visible(viewer, only)
-    _tip("Rectangle, lasso and brush leave out what lies behind something")
+    tip("Rectangle, lasso and brush leave out what lies behind something")
     if selection.tool == "brush":
         actions.set_brush(viewer, _slider("Brush", selection.brush, BRUSHES, "%.3f of the height"))
 
@@ -101,11 +101,11 @@ def _found(viewer: Viewer) -> None:
     name = elided(query.phrase, room - hello_imgui.em_size(4), lambda text: imgui.calc_text_size(text).x)
     if imgui.button(f"Found: {name}##found"):
         actions.select_query(viewer, query)
-    _tip("Select what the search has found")
+    tip("Select what the search has found")
     imgui.same_line()
     if imgui.button("Things"):
         actions.find_things(viewer, query)
-    _tip("Take it apart, to select one thing at a time")
+    tip("Take it apart, to select one thing at a time")
     things = viewer.state.selection.things
     if things is None or things.result is not query.result:
         return
@@ -113,16 +113,16 @@ def _found(viewer: Viewer) -> None:
         _same_line(number, str(number + 1))
         if imgui.button(f"{number + 1}##thing"):
             actions.select_thing(viewer, number)
-        _tip(f"{thing.count:,} Gaussians, {100 * thing.share:.0f} % of the answer, score {thing.score:.2f}")
+        tip(f"{thing.count:,} Gaussians, {100 * thing.share:.0f} % of the answer, score {thing.score:.2f}")
 
 
 def _buttons(viewer: Viewer, verbs: Sequence[Verb]) -> None:
     """As many in a row as fit."""
-    for place, (name, act, tip) in enumerate(verbs):
+    for place, (name, act, what) in enumerate(verbs):
         _same_line(place, name)
         if imgui.button(f"{name}##verb"):
             act(viewer)
-        _tip(tip)
+        tip(what)
 
 
 def _same_line(place: int, text: str, more: float = 0.0) -> None:
@@ -140,8 +140,3 @@ def _slider(label: str, value: float, limits: tuple[float, float], text: str) ->
     flags = imgui.SliderFlags_.always_clamp | imgui.SliderFlags_.logarithmic
     _, value = imgui.slider_float(label, value, *limits, text, flags)
     return value
-
-
-def _tip(text: str) -> None:
-    if imgui.is_item_hovered():
-        imgui.set_tooltip(text)

@@ -61,6 +61,24 @@ def small_wrapped(text: str, colour: ImVec4) -> None:
     imgui.pop_style_color()
 
 
+def tip(text: str) -> None:
+    """What is said while the mouse is over the last item."""
+    if imgui.is_item_hovered():
+        imgui.set_tooltip(text)
+
+
+def stoppable(label: str, fraction: float, tag: str = "") -> bool:
+    """A bar in the accent's colour, with a button beside it; whether that was clicked. `tag` tells the button
+    from others of its name."""
+    cancel = imgui.calc_text_size("Cancel").x + 2 * imgui.get_style().frame_padding.x
+    width = -cancel - imgui.get_style().item_spacing.x
+    imgui.push_style_color(imgui.Col_.plot_histogram, imgui.get_style_color_vec4(imgui.Col_.button_active))
+    imgui.progress_bar(fraction, ImVec2(width, 0), label)
+    imgui.pop_style_color()
+    imgui.same_line()
+    return bool(imgui.button(f"Cancel##{tag}" if tag else "Cancel"))
+
+
 def elided(text: str, room: float, width_of: Callable[[str], float]) -> str:
     """`text` in one line, cut with "..." where it is wider than `room`."""
     text = " ".join(text.split())

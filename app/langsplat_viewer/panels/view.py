@@ -12,7 +12,7 @@ from langsplat_viewer import actions, splitting
 from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of
 from langsplat_viewer.controls import FOV_RANGE, adopt_up, level, with_fov
 from langsplat_viewer.overlays import length_text
-from langsplat_viewer.panels.style import muted, small_wrapped
+from langsplat_viewer.panels.style import muted, small_wrapped, tip
 from langsplat_viewer.seeing import MOST_DEGREE, SIZE_RANGE, Splats
 from langsplat_viewer.viewer import Viewer
 
@@ -35,12 +35,12 @@ def draw_display(viewer: Viewer) -> None:
     _colour_map(viewer)
     picture = replace(picture, colour_map=viewer.state.picture.colour_map)
     actions.set_picture(viewer, replace(picture, background=_backdrop(picture.background)))
-    _tip("What shows where the scene is not")
+    tip("What shows where the scene is not")
     transparent = viewer.state.seeing.transparent
     changed, transparent = imgui.checkbox("Save without backdrop", transparent)
     if changed:
         actions.save_transparent(viewer, transparent)
-    _tip("Pictures are saved transparent where the scene is not")
+    tip("Pictures are saved transparent where the scene is not")
     _splats(viewer)
 
 
@@ -48,14 +48,14 @@ def _splats(viewer: Viewer) -> None:
     """How the Gaussians are drawn."""
     scene, splats = viewer.state.scene, viewer.state.seeing.splats
     size = _slider("Splat size", splats.size, *SIZE_RANGE)
-    _tip("Smaller, every Gaussian can be seen; answers and files do not change")
+    tip("Smaller, every Gaussian can be seen; answers and files do not change")
     degree, most = splats.sh_degree, MOST_DEGREE if scene is None else scene.gaussians.sh_degree
     if most > 0:
         imgui.set_next_item_width(hello_imgui.em_size(11))
         flags = imgui.SliderFlags_.always_clamp
         changed, chosen = imgui.slider_int("SH degree", min(degree, most), 0, most, "%d", flags)
         degree = (MOST_DEGREE if chosen == most else chosen) if changed else degree
-        _tip("Up to which degree colours change with the direction that they are seen from")
+        tip("Up to which degree colours change with the direction that they are seen from")
     actions.set_splats(viewer, Splats(size, degree))
 
 
@@ -149,7 +149,7 @@ def draw_overlays(viewer: Viewer) -> None:
     changed, measures = imgui.checkbox("Measure (M)", ruler.measures)
     if changed:
         actions.measure(viewer, measures)
-    _tip("Click two points on the surface; Esc ends it")
+    tip("Click two points on the surface; Esc ends it")
     imgui.end_disabled()
     if ruler.measures:
         words = ("click a first point", "click a second point")
@@ -170,21 +170,21 @@ def draw_camera(viewer: Viewer) -> None:
         _training_cameras(viewer)
     if imgui.button("Reset (R)"):
         actions.reset_view(viewer)
-    _tip("Return to the opening view")
+    tip("Return to the opening view")
     imgui.same_line()
     if imgui.button("Focus (F)"):
         actions.focus_result(viewer)
     imgui.same_line()
     if imgui.button("Frame all"):
         actions.frame_scene(viewer)
-    _tip("Show the whole scene from this side (Shift + F)")
+    tip("Show the whole scene from this side (Shift + F)")
     if imgui.button("Horizon"):
         actions.move(viewer, level)
-    _tip("Turn the picture until the horizon is level")
+    tip("Turn the picture until the horizon is level")
     imgui.same_line()
     if imgui.button("Up is up"):
         actions.move(viewer, adopt_up)
-    _tip("Take what is up in the picture as the world's up")
+    tip("Take what is up in the picture as the world's up")
     if state.view is not None:
         before = state.view.intrinsics.fov_degrees
         fov = _slider("Field of view", before, *FOV_RANGE, "%.0f deg")
@@ -194,11 +194,11 @@ def draw_camera(viewer: Viewer) -> None:
     actions.set_fly_speed(viewer, speed)
     _, walks = imgui.checkbox("Walk", state.walks)
     actions.set_walking(viewer, walks)
-    _tip("W A S D keep the height of the eye")
+    tip("W A S D keep the height of the eye")
     imgui.same_line()
     _, coarse = imgui.checkbox("Coarse while moving", state.coarse_while_moving)
     actions.set_coarse_while_moving(viewer, coarse)
-    _tip("Draw fewer pixels while the camera moves, where drawing is slow")
+    tip("Draw fewer pixels while the camera moves, where drawing is slow")
     imgui.end_disabled()
 
 
@@ -217,7 +217,7 @@ def _training_cameras(viewer: Viewer) -> None:
     changed, index = imgui.slider_int(
         "##camera", index, 0, len(state.scene.cameras) - 1, f"camera %d  {name}"
     )
-    _tip("Training cameras: stand where a photograph was taken")
+    tip("Training cameras: stand where a photograph was taken")
     if changed and index != state.camera_index:
         actions.go_to_camera(viewer, index)
 
@@ -231,8 +231,3 @@ def _slider(
         flags |= imgui.SliderFlags_.logarithmic
     _, value = imgui.slider_float(label, value, low, high, text, flags)
     return value
-
-
-def _tip(text: str) -> None:
-    if imgui.is_item_hovered():
-        imgui.set_tooltip(text)
