@@ -95,7 +95,9 @@ def test_pickled_weights_give_the_same_vectors(tmp_path: Path) -> None:
     before = load_encoder(str(tmp_path), "cpu").encode_images(crops(1))
     (tmp_path / "model.safetensors").unlink()
     torch.save(state, tmp_path / "pytorch_model.bin")
-    np.testing.assert_array_equal(load_encoder(str(tmp_path), "cpu").encode_images(crops(1)), before)
+    after = load_encoder(str(tmp_path), "cpu").encode_images(crops(1))
+    # equal weights at other addresses: torch may add up in another order
+    np.testing.assert_allclose(after, before, rtol=0, atol=1e-6)
 
 
 def test_pictures_of_the_wrong_size_are_refused(folder: Path) -> None:

@@ -125,7 +125,7 @@ def _by_patches(room: Room, variant: Variant) -> Measured:
     field, _, _ = room.field(replace(variant, name=OURS))
     patches = PatchField(vectors, field.canonical, field.reading.temperature)
     asked = ask(QueryEngine(Scene(room.gaussians, field), lambda _: room.encoder), room.texts)
-    asked = replace(asked, answers={text: reread(a, patches) for text, a in asked.answers.items()})
+    asked = replace(asked, answers=reread(asked.answers, patches))
     one = np.stack([answer.vector for answer in list(asked.answers.values())[:1]])
 
     def picture() -> Array:

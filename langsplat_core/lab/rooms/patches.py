@@ -6,11 +6,10 @@ are already there, `W^T y / W^T 1` at every scale, so that it is compared with m
 renderer. Scales are shares of the picture's height, as there.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import PictureConfig
@@ -45,11 +44,18 @@ def patch_vectors(image: Array, encoder: ImageEncoder, scale: float) -> Array:
     whole, size = np.ones((side, side), bool), encoder.image_size
     crops = [masked_crop(image[y : y + side, x : x + side], whole, size) for y in rows for x in columns]
     vectors = encoder.encode_images(np.stack(crops)).reshape(len(rows), len(columns), -1)
-    at_y = np.interp(np.arange(height), rows + (side - 1) / 2, np.arange(len(rows)))
-    at_x = np.interp(np.arange(width), columns + (side - 1) / 2, np.arange(len(columns)))
-    grid = np.meshgrid(at_y, at_x, indexing="ij")
-    planes = [map_coordinates(plane, grid, order=1) for plane in np.moveaxis(vectors, 2, 0)]
-    return np.stack(planes, 2)
+    down = _between(vectors, rows + (side - 1) / 2, height)
+    return np.asarray(_between(down.swapaxes(0, 1), columns + (side - 1) / 2, width).swapaxes(0, 1))
+
+
+def _between(values: Array, centres: Array, length: int) -> Array:
+    """(K, ...) values at K rising `centres` -> (length, ...) at every whole pixel, linear in between and
+    constant beyond the ends."""
+    at = np.interp(np.arange(length), centres, np.arange(len(centres)))
+    low = np.minimum(at.astype(int), len(centres) - 1)
+    high = np.minimum(low + 1, len(centres) - 1)
+    share = (at - low).astype(np.float32).reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray(values[low] + share * (values[high] - values[low]))
 
 
 def _starts(length: int, side: int) -> Array:
@@ -105,20 +111,26 @@ def _peaks(maps: Array) -> Array:
     return np.asarray(maps.max(axis=(1, 2), keepdims=True))
 
 
-def among_gaussians(field: PatchField, phrase: Array) -> Array:
-    """(D,) unit phrase vector -> (N,) relevancy at the best scale."""
-    values = [
-        relevancy(vectors, phrase[None], field.canonical, field.temperature)[:, 0]
-        for vectors in field.vectors
-    ]
-    for level, vectors in zip(values, field.vectors, strict=True):
-        level[~vectors.any(axis=1)] = 0
-    return np.asarray(max(values, key=lambda level: level.max()), np.float32)
+def among_gaussians(field: PatchField, phrases: Array) -> Array:
+    """(Q, D) unit phrase vectors -> (Q, N) float32 relevancy, each phrase at its best scale."""
+    best = np.zeros((len(phrases), field.vectors.shape[1]), np.float32)
+    for vectors in field.vectors:
+        values = relevancy(vectors, phrases, field.canonical, field.temperature).T
+        values[:, ~vectors.any(axis=1)] = 0
+        better = values.max(axis=1) > best.max(axis=1)
+        best[better] = values[better]
+    return best
 
 
-def reread(answer: Answer, field: PatchField) -> Answer:
-    """The answer to the same phrase by patches."""
-    values = among_gaussians(field, answer.vector)
+def reread(answers: Mapping[str, Answer], field: PatchField) -> dict[str, Answer]:
+    """The answers to the same phrases by patches."""
+    if not answers:
+        return {}
+    values = among_gaussians(field, np.stack([answer.vector for answer in answers.values()]))
+    return {name: _with_values(answers[name], row) for name, row in zip(answers, values, strict=True)}
+
+
+def _with_values(answer: Answer, values: Array) -> Answer:
     seen = values[values > 0]
     return replace(
         answer,

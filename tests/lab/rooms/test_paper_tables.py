@@ -80,7 +80,7 @@ def test_the_best_scale_is_the_one_with_the_highest_peak():
     canonical = unit(rng.normal(size=(2, 6))).astype(np.float32)
     field = PatchField(vectors, canonical, 10.0)
     phrase = vectors[1, 9]
-    found = among_gaussians(field, phrase)
+    found = among_gaussians(field, phrase[None])[0]
     want = relevancy(vectors[1], phrase[None], canonical)[:, 0]
     want[7] = 0
     np.testing.assert_allclose(found, want, atol=1e-6)
