@@ -11,12 +11,16 @@ import tyro
 from rich.table import Table
 
 from langsplat_core.cli.console import OutputConsole
+from langsplat_core.cli.instances import chosen, instance_json
 from langsplat_core.config import Count, CountOrZero
 from langsplat_core.errors import InputError
 from langsplat_core.formats import load_scene
 from langsplat_core.progress import Progress, TerminalProgress
+from langsplat_core.query.combined import combine
+from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.describe import Describer, Levels, Words
 from langsplat_core.query.engine import QueryEngine, no_field
+from langsplat_core.query.instances import Instance, find_instances
 from langsplat_core.query.inventory import Entry, Spot
 from langsplat_core.query.words import Word
 from langsplat_core.raster import load_lifting_rasterizer
@@ -30,7 +34,8 @@ WIDTH = 118  # characters of a table that is not written to a terminal
 
 @dataclass(frozen=True)
 class Describe:
-    """What is here? The best words of a vocabulary for a pixel or a Gaussian, or the scene's inventory."""
+    """What is here? The best words of a vocabulary for a pixel, a Gaussian or a thing that a phrase finds, or
+    the scene's inventory."""
 
     scene: tyro.conf.Positional[Path]
     """A trained scene, *.ply with its language field beside it."""
@@ -40,6 +45,10 @@ class Describe:
     """Column and row, counted from the top left pixel, 0 0."""
     gaussian: Annotated[CountOrZero | None, tyro.conf.arg(metavar="NUMBER")] = None
     """One Gaussian, by its row in the file, from 0."""
+    phrase: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
+    """A thing that this phrase finds."""
+    instance: Annotated[Count, tyro.conf.arg(metavar="NUMBER")] = 1
+    """Which of the things that --phrase finds, as `langsplat query` lists them; the best is 1."""
     level: Level | None = None
     """This semantic level alone."""
     top: Count = 5
@@ -76,14 +85,22 @@ class Describe:
 
     @property
     def _everything(self) -> bool:
-        return self.pixel is None and self.gaussian is None
+        return self._asked_of == []
+
+    @property
+    def _asked_of(self) -> list[str]:
+        """The options that name a place."""
+        given = {"--pixel": self.pixel, "--gaussian": self.gaussian, "--phrase": self.phrase}
+        return [option for option, value in given.items() if value is not None]
 
     def _check(self, scene: Scene) -> None:
         """InputError for arguments that do not go with the scene or each other, before anything is loaded."""
         if scene.language is None:
             raise InputError(f"{self.scene}: {no_field(scene)}")
-        if self.pixel is not None and self.gaussian is not None:
-            raise InputError("--pixel and --gaussian are two questions; ask one of them")
+        if len(self._asked_of) > 1:
+            raise InputError(f"{' and '.join(self._asked_of)} are several questions; ask one of them")
+        if self.phrase is None and self.instance != 1:
+            raise InputError(f"--instance {self.instance} needs a --phrase that finds it")
         count = len(scene.gaussians)
         if self.gaussian is not None and not 0 <= self.gaussian < count:
             raise InputError(f"--gaussian {self.gaussian}: the scene has Gaussians 0 to {count - 1}")
@@ -119,11 +136,20 @@ class Describe:
             camera = scene.cameras[self.camera]
             levels = describer.at_pixel(load_lifting_rasterizer("cpu"), camera, self.pixel, self.top)
             place: dict[str, Any] = {"camera": self.camera, "view": camera.name, "pixel": list(self.pixel)}
+        elif self.phrase is not None:
+            thing = self._thing(describer.engine, self.phrase)
+            levels = describer.at_gaussians(thing.members, top=self.top)
+            place = {"phrase": self.phrase, "thing": instance_json(thing, self.instance)}
         else:
             levels = describer.at_gaussians(np.array([self.gaussian]), np.ones(1), self.top)
             place = {"gaussian": self.gaussian}
         wanted = [words for words in levels if self.level in (None, LEVELS[words.level])]
         return place | _asked(describer) | {"levels": [_level(words) for words in wanted]}
+
+    def _thing(self, engine: QueryEngine, phrase: str) -> Instance:
+        answer = combine([run_phrase(engine, phrase, "auto").answer], "union")
+        found = find_instances(engine.surface, engine.scene.gaussians, answer.members, answer.relevancy)
+        return chosen(found, [self.instance])[0]
 
 
 def _asked(describer: Describer) -> dict[str, Any]:

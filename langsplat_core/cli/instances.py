@@ -72,3 +72,13 @@ def instance_json(instance: Instance, number: int) -> dict[str, Any]:
             "half_extents": box.half_extents.tolist(),
         },
     }
+
+
+def chosen(found: Sequence[Instance], numbers: Sequence[int]) -> Sequence[Instance]:
+    """The instances of these numbers, the best is 1; all without numbers. Raises InputError for another."""
+    if not found:
+        raise InputError("what was found lies nowhere on a surface: nothing to select")
+    for number in numbers:
+        if not 1 <= number <= len(found):
+            raise InputError(f"--instance {number}: there are {len(found)}, numbered from 1")
+    return [found[number - 1] for number in numbers] or found

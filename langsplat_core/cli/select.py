@@ -12,7 +12,7 @@ import tyro
 
 from langsplat_core.arrays import Array
 from langsplat_core.cli.checks import OutFile
-from langsplat_core.cli.instances import Unit, instance_json, table, unit_of
+from langsplat_core.cli.instances import Unit, chosen, instance_json, table, unit_of
 from langsplat_core.config import Count, LevelChoice, NotNegative, Positive
 from langsplat_core.errors import InputError
 from langsplat_core.formats import check_writable, load_scene, save_scene
@@ -151,13 +151,3 @@ class Select:
         what = {"scene": "Gaussians", "points": "points", "hull": "closed hulls"}[self.shape]
         of = f"all but the {selected} selected" if self.remove else f"of {selected} selected Gaussians"
         print(f"{self.out}: {written} {what}, {of}")
-
-
-def chosen(found: Sequence[Instance], numbers: Sequence[int]) -> Sequence[Instance]:
-    """The instances of these numbers, the best is 1; all without numbers. Raises InputError for another."""
-    if not found:
-        raise InputError("what was found lies nowhere on a surface: nothing to select")
-    for number in numbers:
-        if not 1 <= number <= len(found):
-            raise InputError(f"--instance {number}: there are {len(found)}, numbered from 1")
-    return [found[number - 1] for number in numbers] or found

@@ -42,6 +42,10 @@ def run(*words: str) -> int:
         (("a.ply", "--pixel", "-1", "1"), "--pixel -1 1"),
         (("a.ply", "--gaussian", "360"), "--gaussian 360: the scene has Gaussians 0 to 359"),
         (("a.ply", "--gaussian", "1", "--pixel", "1", "1"), "ask one of them"),
+        (("a.ply", "--phrase", "mug", "--pixel", "1", "1"), "ask one of them"),
+        (("a.ply", "--instance", "2"), "--instance 2 needs a --phrase"),
+        (("a.ply", "--phrase", "mug", "--instance", "9"), "--instance 9: there are 1"),
+        (("a.ply", "--phrase", "wall"), "'wall' was not found"),
         (("a.ply", "--camera", "1"), "needs a --pixel X Y"),
         (("a.ply", "--top", "0"), "--top 0"),
         (("a.ply", "--vocabulary", "empty.txt"), "empty.txt: the vocabulary is empty"),
@@ -102,3 +106,12 @@ def test_a_gaussian_and_a_pixel(folder, capsys):
     assert "subpart  nothing is known here" in said
     assert run("a.ply", "--pixel", "0", "0", "--vocabulary", "list.txt") == 0
     assert capsys.readouterr().out.count("nothing is known here") == 3
+
+
+def test_a_thing_that_a_phrase_finds(folder, capsys):
+    assert run("a.ply", "--phrase", "book", "--vocabulary", "list.txt", "--level", "whole", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["phrase"] == "book"
+    assert found["thing"]["gaussians"] > 50
+    (level,) = found["levels"]
+    assert level["words"][0]["phrase"] == "book"
