@@ -14,6 +14,8 @@ from langsplat_viewer.bookmarks import Shelf
 from langsplat_viewer.jobs import Worker
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.training import Training
+from langsplat_viewer.visits import Visit
+from langsplat_viewer.watching import Watch
 
 
 class Surface(Protocol):
@@ -62,6 +64,10 @@ class Viewer:
     state: ViewerState = field(default_factory=ViewerState)
     worker: Worker = field(default_factory=Worker)
     recorder: Worker = field(default_factory=Worker)  # films: minutes, while one looks and searches on
+    watch: Watch = field(default_factory=Watch)  # over the files of the scene shown
+    visits: dict[Path, Visit] = field(
+        default_factory=dict
+    )  # of scenes that were left
     shelf: Shelf = field(default_factory=Shelf)
     engine: QueryEngine | None = None  # of the scene shown; asked on the worker only
     describer: Describer | None = None  # of the same scene, once it was needed

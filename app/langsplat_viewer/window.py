@@ -174,6 +174,8 @@ class Window:
         self._screen = ctx.detect_framebuffer()
         self.viewer.surface = self._canvas
         self.viewer.worker.wake = self.viewer.recorder.wake = glfw.post_empty_event
+        self.viewer.watch.wake = glfw.post_empty_event
+        self.viewer.watch.start()
         imgui.get_io().config_input_text_cursor_blink = False  # a blinking cursor would be drawn for ever
         glfw.set_drop_callback(glfw_window_hello_imgui(), self._dropped)  # type: ignore[arg-type]
         actions.open_scene(self.viewer, self._request.path, self._first_view)
@@ -224,7 +226,7 @@ class Window:
         state, idling = self.viewer.state, hello_imgui.get_runner_params().fps_idling
         news = (self.viewer.worker.delivered, self.viewer.recorder.delivered)
         asked = (state.selection.leaving, state.selection.may_close)
-        there = (state.view, *news, state.nothing, state.hover, *asked)
+        there = (state.view, self.viewer.watch.changed, *news, state.nothing, state.hover, *asked)
         changed = len(there) != len(self._last) or any(
             a is not b and a != b for a, b in zip(there, self._last, strict=True)
         )
@@ -277,6 +279,7 @@ class Window:
     def _stop(self) -> None:
         actions.finish_writing(self.viewer)
         self._remembered.update()
+        self.viewer.watch.close()
         self.viewer.recorder.close(RECORDER_PATIENCE)
         self.viewer.worker.close()
         if self.viewer.training is not None:

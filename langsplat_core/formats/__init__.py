@@ -50,6 +50,7 @@ __all__ = [
     "read_spz_scene",
     "rematch_language",
     "save_scene",
+    "scene_files",
     "write_cameras",
     "write_features",
     "write_language",
@@ -208,6 +209,17 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
         return scene.with_name(scene.name + suffix)
     whole = scene.resolve()  # "." has no name of its own
     return whole.with_name(whole.name + suffix)
+
+
+def scene_files(path: Path | str) -> tuple[Path, ...]:
+    """The files that `load_scene` reads, the scene's own first (of a SOG folder its meta.json, then images),
+    then language field and cameras, whether these are there or not."""
+    path = Path(path)
+    own: tuple[Path, ...] = (path,)
+    if os.path.isdir(path) or path.name == META_NAME:  # which a name too long is not
+        folder = path if os.path.isdir(path) else path.parent
+        own = (folder / META_NAME, *sorted(folder.glob("*.webp")))
+    return (*own, companion_path(path, language.SUFFIX), _cameras_path(path))
 
 
 def _cameras_path(scene: Path) -> Path:

@@ -13,6 +13,7 @@ from langsplat_core.formats import (
     load_gaussians,
     load_scene,
     save_scene,
+    scene_files,
     write_language,
     write_ply,
 )
@@ -134,6 +135,17 @@ def test_companions_lie_beside_every_kind_of_scene(tmp_path):
         loaded = load_scene(path)
         assert loaded.language is not None
         assert_same_field(loaded.language, random_field(N))
+
+
+@pytest.mark.parametrize("inner", ["", "meta.json"])
+def test_the_files_of_a_scene_are_its_own_and_its_companions(tmp_path, inner):
+    folder = write_folder(tmp_path / "b", sog_files(random_gaussians(N)))
+    meta, *images, sidecar, cameras = scene_files(folder / inner)
+    assert meta == folder / "meta.json"
+    assert {path.name for path in images} == {path.name for path in folder.iterdir()} - {"meta.json"}
+    beside = (tmp_path / "b.langsplat.safetensors", tmp_path / "b.cameras.json")
+    assert (sidecar, cameras) == beside
+    assert scene_files(tmp_path / "b.ply") == (tmp_path / "b.ply", *beside)
 
 
 def test_cameras_of_an_inria_model(tmp_path):

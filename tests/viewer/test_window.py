@@ -54,6 +54,7 @@ def folder(tmp_path: Path) -> Path:
         "close_while_opening",
         "split_the_view",
         "draw_over_the_scene",
+        "reload_what_changed",
     ],
 )
 def test_window(scenario: str, display: str, folder: Path):

@@ -25,7 +25,7 @@ from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest
 from tests.support.fakes import CENTRES, FakeEncoder
-from tests.viewer import scenarios_seeing, scenarios_select
+from tests.viewer import scenarios_files, scenarios_seeing, scenarios_select
 from tests.viewer.scenarios_record import RECORD_SCENARIOS
 
 MUG, BOOK, PLANT = CENTRES
@@ -514,6 +514,7 @@ SCENARIOS = {
     **RECORD_SCENARIOS,
     "close_while_opening": (close_while_opening, "blobs.ply", {"load": slow_load}),
     **scenarios_seeing.SCENARIOS,
+    **scenarios_files.SCENARIOS,
 }
 
 

@@ -170,6 +170,7 @@ from langsplat_viewer.actions.training import (
     watch_training,
 )
 from langsplat_viewer.actions.undoing import redo, undo
+from langsplat_viewer.actions.visits import keep_old, reload
 
 __all__ = [
     "add_bookmark",
@@ -216,6 +217,7 @@ __all__ = [
     "hover",
     "invert_selection",
     "isolate_selected",
+    "keep_old",
     "leave_tool",
     "load_path",
     "load_queries",
@@ -243,6 +245,7 @@ __all__ = [
     "reach",
     "recall",
     "redo",
+    "reload",
     "remove",
     "replace_keyframe",
     "reset_view",

@@ -8,6 +8,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.compiled import is_compiled
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.display.latent_colours import latent_colours
+from langsplat_core.formats import scene_files
 from langsplat_core.progress import Progress
 from langsplat_core.query import regions
 from langsplat_core.query.engine import no_field
@@ -24,6 +25,8 @@ from langsplat_viewer.recording import Recording
 from langsplat_viewer.seeing import Ruler
 from langsplat_viewer.selecting import of_scene
 from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.visits import visit_of
+from langsplat_viewer.watching import Stamps, stamps
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,29 +37,37 @@ class _Opened:
     unusable: dict[str, int]  # reason -> Gaussians that are therefore not drawn
     extent: Extent
     latent: Array | None  # (3, N, 3) colours
+    read: Stamps  # its files as they were before they were read
 
 
-def open_scene(viewer: Viewer, path: Path, then: Callable[[Viewer], None] = lambda viewer: None) -> None:
+def open_scene(
+    viewer: Viewer,
+    path: Path,
+    then: Callable[[Viewer], None] = lambda viewer: None,
+    check: Callable[[Scene], None] = lambda scene: None,
+) -> None:
     """Read a scene in the background; `then` runs once it is on screen. The scene shown so far stays
     until the new one is there, and for good if that fails; what was deleted in it and not saved is asked
-    about first."""
-    leave(viewer, lambda viewer: _open(viewer, path, then), f"{path.name} is opened")
+    about first. `check` raises InputError for a scene that is not to be shown."""
+    leave(viewer, lambda viewer: _open(viewer, path, then, check), f"{path.name} is opened")
 
 
-def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None]) -> None:
+def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Callable[[Scene], None]) -> None:
     cancel(viewer)
     viewer.state.opening = path
     backend = viewer.state.backend
 
     def work(progress: Progress) -> _Opened:
         progress(f"opening {path.name}", 0.1)
+        read = stamps(scene_files(path))
         scene = viewer.services.load_scene(path)
+        check(scene)
         progress(f"preparing {path.name}", 0.6)
         viewer.services.warm_up(scene, backend, progress)
         progress(f"preparing {path.name}", 0.9)
         latent = None if scene.language is None else latent_colours(scene.language)
         unusable = scene.gaussians.invalid_rows()
-        return _Opened(scene, unusable, extent_of(scene), latent)
+        return _Opened(scene, unusable, extent_of(scene), latent, read)
 
     def done(opened: _Opened) -> None:
         _show_scene(viewer, path, opened)
@@ -81,7 +92,10 @@ def cancel(viewer: Viewer) -> None:
 
 def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state, scene = viewer.state, opened.scene
+    if state.path is not None:
+        viewer.visits[state.path] = visit_of(state)
     state.opening, state.path = None, path
+    viewer.watch.begin(opened.read)
     state.scene, state.extent, state.latent = scene, opened.extent, opened.latent
     state.queries, state.selected, state.glide = [], None, None
     state.canonical, state.canonical_typed = (), ""

@@ -9,6 +9,7 @@ from langsplat_viewer import actions
 from langsplat_viewer.panels import (
     bookmarks,
     browser,
+    changed,
     cube,
     help,
     legend,
@@ -125,6 +126,7 @@ def draw_over(viewer: Viewer) -> None:
         stroke.draw(viewer, area)
     pictures.draw_grip(viewer, area)
     cube.draw(viewer, area)
+    changed.draw(viewer, area)
     unsaved.draw(viewer)
     copied = actions.take_clipboard(viewer)
     if copied:
