@@ -15,9 +15,11 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.compose import HeatRanges
 from langsplat_core.scene import Camera, Scene
-from langsplat_viewer import splitting
+from langsplat_viewer import actions, splitting
 from langsplat_viewer.channels import Layers
+from langsplat_viewer.commands import with_key
 from langsplat_viewer.controls import OrbitCamera
+from langsplat_viewer.keys import Changed
 from langsplat_viewer.looking import drawn_scene, why_nothing, why_undrawable
 from langsplat_viewer.marked_scene import MarkedScene, marked_scene
 from langsplat_viewer.seeing import Splats
@@ -26,7 +28,7 @@ from langsplat_viewer.state import FrameStats, ViewerState
 SCALES = (1.0, 0.5, 0.25)
 MOVING_BUDGET = 80.0  # milliseconds per picture that still feel like motion
 REST_SECONDS = 0.15  # without a move, after which the fine picture is drawn
-NOTHING_LEFT = "all of the scene is hidden or deleted: U shows what is hidden, Ctrl+Z undoes"
+NOTHING_LEFT = "all of the scene is hidden or deleted"
 
 
 Key = tuple[int, int, int]  # which picture, width, height
@@ -125,16 +127,18 @@ class Canvas:
         if self._unsure and not moving and self._camera is not None:
             self._unsure = False  # asked at rest only: it reads the picture back
             if self._renderer.shows_nothing():
-                state.nothing = self._why_nothing(state.scene, self._camera)
+                state.nothing = self._why_nothing(state.scene, self._camera, state.preferences.keys)
         return moving
 
-    def _why_nothing(self, source: Scene, camera: Camera) -> str:
+    def _why_nothing(self, source: Scene, camera: Camera, keys: Changed) -> str:
         gaussians = source.gaussians if self._marked is None else self._marked.scene.gaussians
         if len(source.gaussians) and not len(gaussians):
-            return NOTHING_LEFT
+            shown = with_key("show what is hidden", actions.show_hidden, keys)
+            return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', actions.undo, keys)}"
         reason = why_nothing(gaussians, camera)
         elsewhere = not why_undrawable(gaussians)  # another view would show something
-        return f"{reason}: press R for the opening view" if elsewhere else reason
+        back = with_key("return to the opening view", actions.reset_view, keys)
+        return f"{reason}: {back}" if elsewhere else reason
 
     def _scale(self) -> float:
         """The largest scale at which a picture is expected within the budget."""

@@ -1,7 +1,7 @@
 """What a user chose once and wants again the next time: kept in the platform's folder for settings."""
 
 import json
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -10,6 +10,7 @@ import platformdirs
 from langsplat_core.config import ColourMap
 from langsplat_core.errors import InputError, printable_line
 from langsplat_core.files import atomic_path
+from langsplat_viewer.keys import problem
 
 Theme = Literal["dark", "light"]
 THEMES: tuple[Theme, ...] = get_args(Theme)
@@ -30,6 +31,7 @@ class Preferences:
     panels: tuple[str, ...] | None = None  # titles of those that are open; None: those that are at first
     colour_map: ColourMap = "turbo"  # of relevancy and depth
     overlays: tuple[str, ...] = ()  # of `seeing.OVERLAYS`, those that lie over the scene
+    keys: dict[str, tuple[str, ...]] = field(default_factory=dict)  # other than in the table of commands
 
     def __post_init__(self) -> None:
         if self.theme not in THEMES:
@@ -43,6 +45,9 @@ class Preferences:
         for name in _LISTS:
             if not all(isinstance(item, str) for item in getattr(self, name) or ()):
                 raise InputError(f"{name} is not a list of texts")
+        for text in (text for keys in self.keys.values() for text in keys):
+            if problem(text):
+                raise InputError(f"keys: {printable_line(problem(text), 60)}")
 
 
 def preferences_folder() -> Path:
@@ -66,14 +71,23 @@ def load_preferences(folder: Path) -> Preferences:
 def _from_json(top: Any) -> Preferences:
     if not isinstance(top, dict):
         raise InputError("no JSON object")
-    known = {field.name for field in fields(Preferences)}
+    known = {row.name for row in fields(Preferences)}
     values = {name: value for name, value in top.items() if name in known}  # a later version may add some
     for name in _LISTS & values.keys():
         if isinstance(values[name], list):
             values[name] = tuple(values[name])
         elif values[name] is not None or name != "panels":
             raise InputError(f"{name} is not a list of texts")
+    if "keys" in values:
+        values["keys"] = _keys(values["keys"])
     return Preferences(**values)
+
+
+def _keys(of_file: Any) -> dict[str, tuple[str, ...]]:
+    lists = list(of_file.values()) if isinstance(of_file, dict) else [None]
+    if not all(isinstance(keys, list) and all(isinstance(key, str) for key in keys) for keys in lists):
+        raise InputError("keys is not an object of lists of texts")
+    return {does: tuple(keys) for does, keys in of_file.items()}
 
 
 def save_preferences(folder: Path, preferences: Preferences) -> None:

@@ -17,6 +17,7 @@ from langsplat_viewer import painting
 from langsplat_viewer.bookmarks import Bookmark
 from langsplat_viewer.browsing import Listing
 from langsplat_viewer.controls import Extent, OrbitCamera
+from langsplat_viewer.keys import Keying
 from langsplat_viewer.preferences import Preferences
 from langsplat_viewer.recording import Recording
 from langsplat_viewer.seeing import Seeing
@@ -142,6 +143,7 @@ class ViewerState:
     wanted_panel: str = ""  # the title of one that is opened and brought to the front at the next frame
     show_panel: bool = True  # the panels, as many as are open
     show_help: bool = False
+    keying: Keying = field(default_factory=Keying)
     show_palette: bool = False
     palette_typed: str = ""
     browser: Listing | None = None  # the folder that the file browser shows, while it is open

@@ -65,9 +65,7 @@ class Viewer:
     worker: Worker = field(default_factory=Worker)
     recorder: Worker = field(default_factory=Worker)  # films: minutes, while one looks and searches on
     watch: Watch = field(default_factory=Watch)  # over the files of the scene shown
-    visits: dict[Path, Visit] = field(
-        default_factory=dict
-    )  # of scenes that were left
+    visits: dict[Path, Visit] = field(default_factory=dict)  # of scenes that were left
     shelf: Shelf = field(default_factory=Shelf)
     engine: QueryEngine | None = None  # of the scene shown; asked on the worker only
     describer: Describer | None = None  # of the same scene, once it was needed

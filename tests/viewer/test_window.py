@@ -55,6 +55,7 @@ def folder(tmp_path: Path) -> Path:
         "split_the_view",
         "draw_over_the_scene",
         "reload_what_changed",
+        "change_a_key",
     ],
 )
 def test_window(scenario: str, display: str, folder: Path):
@@ -172,7 +173,7 @@ def test_canvas_draws_what_is_marked_once(gl, state):
     renderer.shows_nothing = lambda: True
     state.selection = replace(state.selection, marks=replace(marks, deleted=np.ones(360, bool)))
     canvas.update(state, 9.0)
-    assert state.nothing == NOTHING_LEFT
+    assert state.nothing == f"{NOTHING_LEFT}: show what is hidden (U), or undo (Ctrl+Z)"
 
 
 @pytest.mark.parametrize(("fine_ms", "coarse"), [(10, (200, 120)), (150, (100, 60)), (5000, (50, 30))])

@@ -135,6 +135,7 @@ from langsplat_viewer.actions.selecting import (
     use_tool,
 )
 from langsplat_viewer.actions.settings import (
+    edit_keys,
     escape,
     mute_letters,
     note_panels,
@@ -152,6 +153,7 @@ from langsplat_viewer.actions.settings import (
     toggle_help,
     toggle_panel,
     type_command,
+    type_keys,
 )
 from langsplat_viewer.actions.strokes import (
     begin_stroke,
@@ -197,6 +199,7 @@ __all__ = [
     "delete_selected",
     "discard_and_leave",
     "drawn_stroke",
+    "edit_keys",
     "end_stroke",
     "escape",
     "export",
@@ -313,6 +316,7 @@ __all__ = [
     "type_canonical",
     "type_command",
     "type_film",
+    "type_keys",
     "type_path",
     "type_path_file",
     "type_phrase",

@@ -57,7 +57,7 @@ def save_film(viewer: Viewer, folder: Path) -> None:
     """Have a film made along the path, to the typed place or to a new name in `folder`."""
     state, record, motion = viewer.state, viewer.state.record, film_motion(viewer)
     if motion is None:
-        state.say("a film needs a path: K adds a keyframe, or choose a turntable", is_error=True)
+        state.say("a film needs a path: add a keyframe, or choose a turntable", is_error=True)
         return
     subject = subject_of(state)
     try:

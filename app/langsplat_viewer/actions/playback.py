@@ -24,7 +24,7 @@ def toggle_playing(viewer: Viewer) -> None:
     elif viewer.state.view is None:
         viewer.state.say("open a scene first, then play a path in it", is_error=True)
     elif path_seconds(viewer) <= 0:
-        viewer.state.say("a path needs two keyframes: K adds one at the current view", is_error=True)
+        viewer.state.say("a path needs two keyframes: add one at the current view", is_error=True)
     else:
         start = 0.0 if record.at >= path_seconds(viewer) else record.at
         scrub(viewer, start)

@@ -108,7 +108,7 @@ def save_path(viewer: Viewer, folder: Path) -> Path | None:
     """Save the path to the typed file, or to a new one in `folder`; None where that failed."""
     state, record = viewer.state, viewer.state.record
     if not record.keyframes:
-        state.say("a path to save needs a keyframe: K adds one at the current view", is_error=True)
+        state.say("a path to save needs a keyframe: add one at the current view", is_error=True)
         return None
     stem = state.path.stem if state.path else "camera"
     path = (

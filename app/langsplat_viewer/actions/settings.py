@@ -9,6 +9,7 @@ from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.leaving import stay
 from langsplat_viewer.actions.seeing import measure
 from langsplat_viewer.actions.strokes import leave_tool
+from langsplat_viewer.keys import Keying
 from langsplat_viewer.preferences import SCALES, Theme
 from langsplat_viewer.viewer import Viewer
 
@@ -81,13 +82,25 @@ def note_panels(viewer: Viewer, titles: tuple[str, ...]) -> None:
 
 
 def show_help(viewer: Viewer, shown: bool) -> None:
-    """Whether the list of keys is there."""
-    viewer.state.show_help = shown
+    """Whether the list of keys is there; it is only read at first."""
+    if shown != viewer.state.show_help:
+        viewer.state.show_help, viewer.state.keying = shown, Keying()
 
 
 def toggle_help(viewer: Viewer) -> None:
     """Show the list of keys, or hide it again."""
     show_help(viewer, not viewer.state.show_help)
+
+
+def edit_keys(viewer: Viewer, edits: bool) -> None:
+    """Whether the list of keys is there to change them."""
+    show_help(viewer, True)
+    viewer.state.keying = Keying(edits)
+
+
+def type_keys(viewer: Viewer, text: str) -> None:
+    """What stands in the box of that list."""
+    viewer.state.keying = replace(viewer.state.keying, typed=text)
 
 
 def show_palette(viewer: Viewer, shown: bool) -> None:

@@ -3,6 +3,7 @@
 from imgui_bundle import ImVec2, imgui
 
 from langsplat_viewer import actions
+from langsplat_viewer.commands import with_key
 from langsplat_viewer.panels.style import elided, muted, small_wrapped
 from langsplat_viewer.viewer import Viewer
 
@@ -22,7 +23,8 @@ def draw(viewer: Viewer) -> None:
     imgui.end_disabled()
     if imgui.begin_child("bookmarks"):
         if not state.bookmarks:
-            small_wrapped("views that you keep are listed here (Ctrl + B)", muted())
+            words = "views that you keep are listed here"
+            small_wrapped(with_key(words, actions.add_bookmark, state.preferences.keys), muted())
         for number, bookmark in enumerate(state.bookmarks):
             imgui.push_id(number)
             side, right = imgui.get_frame_height(), imgui.get_content_region_avail().x

@@ -5,11 +5,16 @@ from functools import cache
 
 from imgui_bundle import imgui
 
-from langsplat_viewer import actions
-from langsplat_viewer.commands import COMMANDS, Command
+from langsplat_viewer import actions, keying, keys
+from langsplat_viewer.commands import COMMANDS, Command, keys_of
 from langsplat_viewer.viewer import Viewer
 
-NAMED = {"Esc": "escape"}  # keys whose name in imgui is another
+NAMED = {  # keys whose name in imgui is another
+    "Esc": "escape",
+    "PageUp": "page_up",
+    "PageDown": "page_down",
+    **{name: f"{name.lower()}_arrow" for name in ("Left", "Right", "Up", "Down")},
+}
 WHILE_TYPING = ("F1", "Esc")  # beside those with Ctrl
 
 
@@ -31,18 +36,47 @@ def chord(text: str) -> Chord:
     *held, name = text.split("+")
     if not name.isalnum():
         return Chord(character=name)
-    key = imgui.Key[f"_{name}" if name.isdigit() else NAMED.get(name, name.lower())]
+    key = _key(name)
     ctrl, shift, alt = (name in held for name in ("Ctrl", "Shift", "Alt"))
     return Chord(key, "", ctrl, shift, alt, is_plain=not ctrl and name not in WHILE_TYPING)
 
 
+def _key(name: str) -> imgui.Key:
+    return imgui.Key[f"_{name}" if name.isdigit() else NAMED.get(name, name.lower())]
+
+
 def handle(viewer: Viewer) -> None:
     """Run the commands whose keys were pressed in this frame."""
-    typing = imgui.get_io().want_text_input
+    state, typing = viewer.state, imgui.get_io().want_text_input
+    if state.keying.waiting:
+        _take(viewer)
+        return
     for command in COMMANDS:
-        if any(_pressed(chord(text), command, typing, viewer.state.letters_muted) for text in command.keys):
+        texts = keys_of(command, state.preferences.keys)
+        if any(_pressed(chord(text), command, typing, state.letters_muted) for text in texts):
             command.act(viewer)
             return
+
+
+def _take(viewer: Viewer) -> None:
+    """Give the key that was pressed to the command that waits for one; Esc ends that."""
+    if imgui.is_key_pressed(imgui.Key.escape, False):
+        keying.wait_for_key(viewer, None)
+        return
+    key = pressed_key()
+    if key:
+        keying.press(viewer, key)
+
+
+def pressed_key() -> str:
+    """The key that was pressed in this frame, as `commands` writes keys; "" for none."""
+    io = imgui.get_io()
+    symbols = [symbol for symbol in map(chr, io.input_queue_characters) if keys.is_symbol(symbol)]
+    if symbols and not io.key_ctrl:
+        return symbols[0]
+    name = next((name for name in keys.NAMED if imgui.is_key_pressed(_key(name), False)), "")
+    down = zip(keys.HELD_WITH, (io.key_ctrl, io.key_shift, io.key_alt), strict=True)
+    return "+".join([*(key for key, is_down in down if is_down), name]) if name else ""
 
 
 def _pressed(wanted: Chord, command: Command, typing: bool, muted: bool) -> bool:

@@ -3,7 +3,8 @@
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.commands import Command, matching
+from langsplat_viewer.commands import Command, keys_of, matching
+from langsplat_viewer.keys import Changed
 from langsplat_viewer.panels.style import muted
 from langsplat_viewer.viewer import Viewer
 
@@ -28,7 +29,7 @@ def draw(viewer: Viewer) -> None:
     )
     actions.type_command(viewer, typed)
     found = matching(typed)
-    chosen = found[0] if entered and found else _clicked(found)
+    chosen = found[0] if entered and found else _clicked(found, viewer.state.preferences.keys)
     left = not imgui.is_window_focused(imgui.FocusedFlags_.root_and_child_windows)
     escaped = imgui.is_key_pressed(imgui.Key.escape)
     imgui.end()
@@ -38,7 +39,7 @@ def draw(viewer: Viewer) -> None:
         chosen.act(viewer)
 
 
-def _clicked(found: list[Command]) -> Command | None:
+def _clicked(found: list[Command], changed: Changed) -> Command | None:
     """The list; the command that was clicked."""
     chosen = None
     if imgui.begin_child("found"):
@@ -46,8 +47,8 @@ def _clicked(found: list[Command]) -> Command | None:
         for command in found:
             if imgui.selectable(command.does, False)[0]:
                 chosen = command
-            keys = ", ".join(command.keys)
+            keys = ", ".join(keys_of(command, changed))
             imgui.same_line(right - imgui.calc_text_size(keys).x)
-            imgui.text_colored(muted(), keys)
+            imgui.text_colored(muted(), keys.replace("%", "%%"))
     imgui.end_child()
     return chosen

@@ -5,6 +5,7 @@ from pathlib import Path
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
+from langsplat_viewer.commands import with_key
 from langsplat_viewer.flight import Keyframe
 from langsplat_viewer.panels.style import muted, small_wrapped, stoppable, tip
 from langsplat_viewer.recording import FPS_CHOICES
@@ -38,7 +39,7 @@ def _play(viewer: Viewer) -> None:
     imgui.begin_disabled(seconds <= 0)
     if imgui.button("Stop##path" if record.began is not None else "Play##path"):
         actions.toggle_playing(viewer)
-    tip("Shift + K")
+    tip(with_key("Play", actions.toggle_playing, viewer.state.preferences.keys))
     imgui.same_line()
     loop = imgui.calc_text_size("Loop").x + imgui.get_frame_height() + 2 * imgui.get_style().item_spacing.x
     imgui.set_next_item_width(-loop)
@@ -73,7 +74,7 @@ def _keyframes(viewer: Viewer) -> None:
     record = viewer.state.record
     if imgui.button("Add keyframe"):
         actions.add_keyframe(viewer)
-    tip("The current view (K)")
+    tip(with_key("The current view", actions.add_keyframe, viewer.state.preferences.keys))
     imgui.same_line()
     imgui.begin_disabled(not record.keyframes)
     if imgui.button("Clear"):
@@ -84,7 +85,7 @@ def _keyframes(viewer: Viewer) -> None:
     height = ROWS * imgui.get_frame_height_with_spacing()
     if imgui.begin_child("keyframes", ImVec2(0, height), imgui.ChildFlags_.borders):
         if not record.keyframes:
-            small_wrapped("K adds the current view; the path goes smoothly from one to the next", muted())
+            small_wrapped("Add the current view; the path goes smoothly from one to the next", muted())
         for number, key in enumerate(record.keyframes, 1):
             imgui.push_id(number)
             _line(viewer, number, key)

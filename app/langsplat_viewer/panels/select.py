@@ -6,6 +6,7 @@ from pathlib import Path
 from imgui_bundle import hello_imgui, imgui
 
 from langsplat_viewer import actions
+from langsplat_viewer.commands import with_key
 from langsplat_viewer.panels.style import elided, muted, small_wrapped, tip
 from langsplat_viewer.selecting import BRUSHES, MODES, REACHES, TOOLS, Marks
 from langsplat_viewer.viewer import Viewer
@@ -13,20 +14,20 @@ from langsplat_viewer.viewer import Viewer
 MOST_THINGS = 24  # of an answer that have a button
 Verb = tuple[str, Callable[[Viewer], object], str]  # button, action, tip
 CHANGES: tuple[Verb, ...] = (
-    ("All", actions.select_all, "Everything that is shown (Ctrl+A)"),
-    ("None", actions.select_none, "Nothing (Ctrl+D)"),
-    ("Invert", actions.invert_selection, "What was not selected (Ctrl+I)"),
+    ("All", actions.select_all, "Everything that is shown"),
+    ("None", actions.select_none, "Nothing"),
+    ("Invert", actions.invert_selection, "What was not selected"),
     ("Grow", actions.grow_selection, "And what is within reach along the surface"),
     ("Shrink", actions.shrink_selection, "Without what is within reach of the rest"),
 )
 FATES: tuple[Verb, ...] = (
-    ("Hide", actions.hide_selected, "Out of the picture (H)"),
-    ("Isolate", actions.isolate_selected, "Everything else out of the picture (Shift+H)"),
-    ("Show all", actions.show_hidden, "Everything that was hidden (U)"),
+    ("Hide", actions.hide_selected, "Out of the picture"),
+    ("Isolate", actions.isolate_selected, "Everything else out of the picture"),
+    ("Show all", actions.show_hidden, "Everything that was hidden"),
     (
         "Delete",
         actions.delete_selected,
-        "Out of the scene; its file stays as it is (Delete)",
+        "Out of the scene; its file stays as it is",
     ),
 )
 FILES: tuple[Verb, ...] = (
@@ -122,7 +123,7 @@ def _buttons(viewer: Viewer, verbs: Sequence[Verb]) -> None:
         _same_line(place, name)
         if imgui.button(f"{name}##verb"):
             act(viewer)
-        tip(what)
+        tip(with_key(what, act, viewer.state.preferences.keys))
 
 
 def _same_line(place: int, text: str, more: float = 0.0) -> None:

@@ -64,7 +64,7 @@ def small_wrapped(text: str, colour: ImVec4) -> None:
 def tip(text: str) -> None:
     """What is said while the mouse is over the last item."""
     if imgui.is_item_hovered():
-        imgui.set_tooltip(text)
+        imgui.set_tooltip(text.replace("%", "%%"))
 
 
 def stoppable(label: str, fraction: float, tag: str = "") -> bool:

@@ -9,7 +9,7 @@ from langsplat_core.display.colour_maps import COLOUR_MAPS
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions, splitting
-from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of
+from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of, with_key
 from langsplat_viewer.controls import FOV_RANGE, adopt_up, level, with_fov
 from langsplat_viewer.overlays import length_text
 from langsplat_viewer.panels.style import muted, small_wrapped, tip
@@ -145,8 +145,9 @@ def draw_overlays(viewer: Viewer) -> None:
         if changed:
             actions.show_overlay(viewer, name, shown)
     ruler, scene = state.seeing.ruler, state.scene
+    measure = with_key("Measure", actions.toggle_measuring, state.preferences.keys)
     imgui.begin_disabled(scene is None)
-    changed, measures = imgui.checkbox("Measure (M)", ruler.measures)
+    changed, measures = imgui.checkbox(f"{measure}###measure", ruler.measures)
     if changed:
         actions.measure(viewer, measures)
     tip("Click two points on the surface; Esc ends it")
@@ -168,16 +169,17 @@ def draw_camera(viewer: Viewer) -> None:
     imgui.begin_disabled(state.view is None)
     if state.scene is not None and state.scene.cameras:
         _training_cameras(viewer)
-    if imgui.button("Reset (R)"):
+    keys = state.preferences.keys
+    if imgui.button(with_key("Reset", actions.reset_view, keys)):
         actions.reset_view(viewer)
     tip("Return to the opening view")
     imgui.same_line()
-    if imgui.button("Focus (F)"):
+    if imgui.button(with_key("Focus", actions.focus_result, keys)):
         actions.focus_result(viewer)
     imgui.same_line()
     if imgui.button("Frame all"):
         actions.frame_scene(viewer)
-    tip("Show the whole scene from this side (Shift + F)")
+    tip(with_key("Show the whole scene from this side", actions.frame_scene, keys))
     if imgui.button("Horizon"):
         actions.move(viewer, level)
     tip("Turn the picture until the horizon is level")
