@@ -1,6 +1,7 @@
 """What a user chose once and wants again the next time: kept in the platform's folder for settings."""
 
 import json
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -16,6 +17,7 @@ Theme = Literal["dark", "light"]
 THEMES: tuple[Theme, ...] = get_args(Theme)
 SCALES = (0.75, 3.0)  # least and largest size of letters and widgets
 MOST_RECENT = 12
+MOST_FOLDERS = 100  # scenes whose folder of photographs is remembered
 FILE_NAME, LAYOUT_NAME = "preferences.json", "layout.ini"
 LARGEST = 1_000_000  # bytes of the file
 _LISTS = {"recent", "panels", "overlays"}
@@ -32,6 +34,7 @@ class Preferences:
     colour_map: ColourMap = "turbo"  # of relevancy and depth
     overlays: tuple[str, ...] = ()  # of `seeing.OVERLAYS`, those that lie over the scene
     keys: dict[str, tuple[str, ...]] = field(default_factory=dict)  # other than in the table of commands
+    photographs: dict[str, str] = field(default_factory=dict)  # scene -> folder; the latest chosen last
 
     def __post_init__(self) -> None:
         if self.theme not in THEMES:
@@ -43,11 +46,17 @@ class Preferences:
         if not (is_number and SCALES[0] <= self.ui_scale <= SCALES[1]):
             raise InputError(f"ui_scale is not a number from {SCALES[0]} to {SCALES[1]}")
         for name in _LISTS:
-            if not all(isinstance(item, str) for item in getattr(self, name) or ()):
+            if not _are_texts(getattr(self, name) or ()):
                 raise InputError(f"{name} is not a list of texts")
+        if not (isinstance(self.photographs, dict) and _are_texts(self.photographs.values())):
+            raise InputError("photographs is not an object of texts")
         for text in (text for keys in self.keys.values() for text in keys):
             if problem(text):
                 raise InputError(f"keys: {printable_line(problem(text), 60)}")
+
+
+def _are_texts(values: Iterable[object]) -> bool:
+    return all(isinstance(value, str) for value in values)
 
 
 def preferences_folder() -> Path:
@@ -85,7 +94,7 @@ def _from_json(top: Any) -> Preferences:
 
 def _keys(of_file: Any) -> dict[str, tuple[str, ...]]:
     lists = list(of_file.values()) if isinstance(of_file, dict) else [None]
-    if not all(isinstance(keys, list) and all(isinstance(key, str) for key in keys) for keys in lists):
+    if not all(isinstance(keys, list) and _are_texts(keys) for keys in lists):
         raise InputError("keys is not an object of lists of texts")
     return {does: tuple(keys) for does, keys in of_file.items()}
 
@@ -102,3 +111,10 @@ def with_recent(preferences: Preferences, path: Path) -> Preferences:
     name = str(path)
     others = tuple(other for other in preferences.recent if other != name)
     return replace(preferences, recent=(name, *others)[:MOST_RECENT])
+
+
+def with_photographs(preferences: Preferences, scene: Path, folder: Path) -> Preferences:
+    """With `folder` as the one that has the photographs of `scene`."""
+    others = {path: kept for path, kept in preferences.photographs.items() if path != str(scene)}
+    latest = list(others.items())[1 - MOST_FOLDERS :]
+    return replace(preferences, photographs={**dict(latest), str(scene): str(folder)})

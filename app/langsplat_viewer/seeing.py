@@ -67,3 +67,4 @@ class Seeing:
     ruler: Ruler = Ruler()
     splats: Splats = Splats()
     transparent: bool = False  # pictures are saved without a background
+    fade: float = 0.0  # how much of the photograph of a training camera lies over the picture, 0 to 1

@@ -18,6 +18,7 @@ from langsplat_viewer.bookmarks import Bookmark
 from langsplat_viewer.browsing import Listing
 from langsplat_viewer.controls import Extent, OrbitCamera
 from langsplat_viewer.keys import Keying
+from langsplat_viewer.photographs import Photograph
 from langsplat_viewer.preferences import Preferences
 from langsplat_viewer.recording import Recording
 from langsplat_viewer.seeing import Seeing
@@ -111,6 +112,7 @@ class ViewerState:
     camera_index: int | None = None  # training camera last jumped to
     fly_speed: float = 0.5  # scene radii per second
     walks: bool = False  # the keys fly level, as one walks
+    photograph: Photograph | None = None  # that was looked for last
     bookmarks: tuple[Bookmark, ...] = ()  # of the scene shown
     bookmark_typed: str = ""
     record: Recording = field(default_factory=Recording)
@@ -147,6 +149,7 @@ class ViewerState:
     show_palette: bool = False
     palette_typed: str = ""
     browser: Listing | None = None  # the folder that the file browser shows, while it is open
+    picks_folder: bool = False  # it is there to choose the folder of the photographs
     preferences: Preferences = field(default_factory=Preferences)
     selection: Selection = field(default_factory=Selection)
     letters_muted: bool = False  # letters are no keys: they were meant for a box that cannot be typed in

@@ -21,7 +21,7 @@ from langsplat_viewer.canvas import Canvas, Renderer
 from langsplat_viewer.frame import Backend, FrameRenderer
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import chosen_camera, latent_level
-from langsplat_viewer.panels import keyboard, layout, menu, navigation, over, pictures
+from langsplat_viewer.panels import keyboard, layout, menu, navigation, over, photograph, pictures
 from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.remembered import Remembered
 from langsplat_viewer.viewer import Services, Viewer
@@ -121,6 +121,7 @@ class Window:
         self._hiding = layout.Hiding()
         self._remembered = Remembered(request.settings, self.viewer.state)
         self._canvas: Canvas | None = None
+        self._photograph: photograph.Overlay | None = None
         self._screen: moderngl.Framebuffer | None = None
         self.unfinished = False  # a finer picture is due
         self.idles = True  # False for scripts that drive the window and count on its next frame
@@ -166,7 +167,7 @@ class Window:
         try:
             ctx = moderngl.get_context()
             renderer = self._make_renderer(ctx)
-            self._canvas = Canvas(ctx, renderer)
+            self._canvas, self._photograph = Canvas(ctx, renderer), photograph.Overlay(ctx)
             self.viewer.state.backend = renderer.backend
         except DRAW_ERRORS as error:
             self.failure = BackendError(one_line(error))
@@ -215,6 +216,7 @@ class Window:
             hello_imgui.get_runner_params().app_shall_exit = True
         actions.tick(viewer, imgui.get_time())
         actions.watch_training(viewer)
+        actions.fetch_photograph(viewer)
         keyboard.muted_until_clicked(viewer)  # hello_imgui draws the panels after this
         self._hiding.apply(viewer)
         layout.show_wanted(viewer)
@@ -269,6 +271,8 @@ class Window:
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
         pictures.draw(viewer, area, canvas.textures)
+        if self._photograph is not None:
+            self._photograph.draw(viewer, area)
         over.draw(viewer, area)
 
     def _may_close(self) -> bool:

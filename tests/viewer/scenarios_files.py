@@ -4,8 +4,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+from PIL import Image
+
 from imgui_bundle import imgui  # isort: skip
 from langsplat_core.formats import save_scene
+from langsplat_viewer import actions
+from langsplat_viewer.panels.area import scene_area
 from tests.support.fakes import CENTRES, blob_scene
 
 
@@ -84,6 +89,49 @@ def change_a_key(s: Any) -> None:
     assert s.state.picture.display == "alpha"
 
 
+def fade_in_a_photograph(s: Any) -> None:
+    """The slider lays it over the picture where the camera saw it; elsewhere there is none."""
+    s.wait(lambda: s.state.scene is not None)
+    s.settle()
+    viewer, folder = s.window.viewer, s.folder / "elsewhere"
+    folder.mkdir()
+    colours = np.full((240, 320, 3), (250, 120, 10), np.uint8)
+    colours[:, 160:] = (20, 60, 240)
+    Image.fromarray(colours).save(folder / "photo_1.png")
+    actions.open_panel(viewer, "Camera")
+    actions.go_to_camera(viewer, 1)
+    s.settle()
+    plain = s.shot("plain")
+    actions.fade_photograph(viewer, 1.0)
+    s.settle()
+    s.ctx.yield_(3)
+    assert "no photograph 'photo_1'" in s.state.photograph.reason
+    assert (s.shot("none")[100:500, 400:] == plain[100:500, 400:]).all()
+    s.ctx.item_click("//Camera/Folder of photographs ...")
+    s.ctx.yield_(4)
+    s.ctx.item_click("//**/elsewhere\\/")
+    s.ctx.yield_(4)
+    s.shot("browser")
+    s.ctx.item_click("//**/Take this folder")
+    s.wait(lambda: s.state.photograph.image is not None)
+    s.settle()
+    assert list(s.state.preferences.photographs.values()) == [str(folder.absolute())]
+    area, shot = scene_area(), s.shot("photograph")
+    middle, left = int(area.top + area.height / 2), int(area.left)
+    quarter = int(area.width / 4)
+    np.testing.assert_allclose(shot[middle, left + quarter], (250, 120, 10), atol=3)
+    np.testing.assert_allclose(shot[middle, left + 3 * quarter], (20, 60, 240), atol=3)
+    assert (shot[int(area.top) + 30, left + quarter] == plain[int(area.top) + 30, left + quarter]).all()
+    actions.fade_photograph(viewer, 0.5)
+    s.ctx.yield_(3)
+    half = s.shot("half")
+    place = middle, left + quarter
+    np.testing.assert_allclose(half[place], (shot[place] + plain[place]) / 2, atol=4)
+    s.drag((600, 300), (656, 279))
+    s.settle()
+    assert actions.photograph_here(s.state) is None
+
+
 def digit_key(digit: int) -> imgui.Key:
     return imgui.Key[f"_{digit}"]
 
@@ -91,5 +139,6 @@ def digit_key(digit: int) -> imgui.Key:
 Scenario = tuple[Callable[[Any], None], str, dict[str, Any]]
 SCENARIOS: dict[str, Scenario] = {
     "reload_what_changed": (reload_what_changed, "blobs.ply", {}),
+    "fade_in_a_photograph": (fade_in_a_photograph, "blobs.ply", {}),
     "change_a_key": (change_a_key, "blobs.ply", {}),
 }

@@ -56,6 +56,7 @@ def folder(tmp_path: Path) -> Path:
         "draw_over_the_scene",
         "reload_what_changed",
         "change_a_key",
+        "fade_in_a_photograph",
     ],
 )
 def test_window(scenario: str, display: str, folder: Path):

@@ -64,6 +64,13 @@ from langsplat_viewer.actions.leaving import (
 )
 from langsplat_viewer.actions.offers import ask_offered, offers, prepare_suggestions, recall
 from langsplat_viewer.actions.opening import cancel, open_scene
+from langsplat_viewer.actions.photographs import (
+    ask_for_photographs,
+    choose_photograph_folder,
+    fade_photograph,
+    fetch_photograph,
+    photograph_here,
+)
 from langsplat_viewer.actions.playback import (
     path_seconds,
     scrub,
@@ -179,6 +186,7 @@ __all__ = [
     "add_keyframe",
     "ask",
     "ask_for_file",
+    "ask_for_photographs",
     "ask_offered",
     "ask_typed",
     "begin_stroke",
@@ -188,6 +196,7 @@ __all__ = [
     "cancel_stroke",
     "choose",
     "choose_keyframe",
+    "choose_photograph_folder",
     "choose_photographs",
     "chosen_query",
     "clear_path",
@@ -204,6 +213,8 @@ __all__ = [
     "escape",
     "export",
     "extend_stroke",
+    "fade_photograph",
+    "fetch_photograph",
     "fill_in",
     "find_things",
     "finish_writing",
@@ -243,6 +254,7 @@ __all__ = [
     "open_scene",
     "open_typed",
     "path_seconds",
+    "photograph_here",
     "prepare_suggestions",
     "quit_viewer",
     "reach",

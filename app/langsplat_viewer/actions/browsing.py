@@ -25,7 +25,7 @@ def ask_for_file(viewer: Viewer) -> None:
     """Open the browser in the folder of the scene that is shown."""
     state = viewer.state
     folder = state.path.parent if state.path is not None else Path.cwd()
-    state.path_typed, state.browser = "", list_folder(folder.absolute())
+    state.path_typed, state.browser, state.picks_folder = "", list_folder(folder.absolute()), False
 
 
 def close_browser(viewer: Viewer) -> None:

@@ -84,6 +84,9 @@ def cancel(viewer: Viewer) -> None:
     """Drop the work under way."""
     viewer.worker.cancel()
     viewer.state.opening = None
+    photograph = viewer.state.photograph
+    if photograph is not None and photograph.image is None and not photograph.reason:
+        viewer.state.photograph = replace(photograph, reason="cancelled")
     waiting = [query for query in viewer.state.queries if query.pending]
     for query in waiting:
         query.pending = False

@@ -9,7 +9,7 @@ from langsplat_viewer.browsing import Entry, Listing
 from langsplat_viewer.panels.style import bad, muted, small_wrapped
 from langsplat_viewer.viewer import Viewer
 
-TITLE = "Open a scene"
+OPEN, PICK = "Open a scene", "Folder of the photographs"
 WIDTH_EM, HEIGHT_EM = 40.0, 30.0
 UNITS = ("bytes", "kB", "MB", "GB", "TB")
 
@@ -17,18 +17,21 @@ UNITS = ("bytes", "kB", "MB", "GB", "TB")
 def draw(viewer: Viewer) -> None:
     """A box for a path, the folders above, what is in this one, and what was open before."""
     listing = viewer.state.browser
-    if listing is not None and not imgui.is_popup_open(TITLE):
-        imgui.open_popup(TITLE)
+    title = PICK if viewer.state.picks_folder else OPEN
+    if listing is not None and not imgui.is_popup_open(title):
+        imgui.open_popup(title)
     centre = imgui.get_main_viewport().get_center()
     imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
     imgui.set_next_window_size(hello_imgui.em_to_vec2(WIDTH_EM, HEIGHT_EM), imgui.Cond_.appearing)
-    shown, stays = imgui.begin_popup_modal(TITLE, True, imgui.WindowFlags_.no_saved_settings)
+    shown, stays = imgui.begin_popup_modal(title, True, imgui.WindowFlags_.no_saved_settings)
     if not shown:
         return
     if listing is not None:
         _box(viewer)
         _above(viewer, listing.folder)
         _list(viewer, listing)
+        if viewer.state.picks_folder and imgui.button("Take this folder"):
+            actions.choose_photograph_folder(viewer, listing.folder)
     if not stays or imgui.is_key_pressed(imgui.Key.escape):
         actions.close_browser(viewer)
     if viewer.state.browser is None:
@@ -42,7 +45,8 @@ def _box(viewer: Viewer) -> None:
     if imgui.is_window_appearing():
         imgui.set_keyboard_focus_here()
     flags = imgui.InputTextFlags_.enter_returns_true
-    hint = "path of a scene or folder, or drop files onto the window"
+    picks = viewer.state.picks_folder
+    hint = "path of a folder" if picks else "path of a scene or folder, or drop files onto the window"
     entered, typed = imgui.input_text_with_hint("##path", hint, viewer.state.path_typed, flags)
     actions.type_path(viewer, typed)
     imgui.same_line()
@@ -64,14 +68,16 @@ def _above(viewer: Viewer, folder: Path) -> None:
 
 
 def _list(viewer: Viewer, listing: Listing) -> None:
-    recent = viewer.state.preferences.recent
+    picks = viewer.state.picks_folder
+    recent = () if picks else viewer.state.preferences.recent
     below = -(min(len(recent), 4) + 1) * imgui.get_text_line_height_with_spacing() - 8 if recent else 0.0
+    below = -imgui.get_frame_height_with_spacing() if picks else below
     if imgui.begin_child("entries", ImVec2(0, below), imgui.ChildFlags_.borders):
         if listing.problem:
             small_wrapped(listing.problem, bad())
         elif not listing.entries:
-            small_wrapped("no scenes and no folders here", muted())
-        for entry in listing.entries:
+            small_wrapped("no folders here" if picks else "no scenes and no folders here", muted())
+        for entry in (entry for entry in listing.entries if not (picks and entry.is_file)):
             _line(viewer, entry)
         if listing.left_out:
             small_wrapped(f"{listing.left_out:,} more: type a path", muted())

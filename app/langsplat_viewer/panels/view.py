@@ -12,6 +12,7 @@ from langsplat_viewer import actions, splitting
 from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of, with_key
 from langsplat_viewer.controls import FOV_RANGE, adopt_up, level, with_fov
 from langsplat_viewer.overlays import length_text
+from langsplat_viewer.panels import photograph
 from langsplat_viewer.panels.style import muted, small_wrapped, tip
 from langsplat_viewer.seeing import MOST_DEGREE, SIZE_RANGE, Splats
 from langsplat_viewer.viewer import Viewer
@@ -222,6 +223,7 @@ def _training_cameras(viewer: Viewer) -> None:
     tip("Training cameras: stand where a photograph was taken")
     if changed and index != state.camera_index:
         actions.go_to_camera(viewer, index)
+    photograph.draw_slider(viewer)
 
 
 def _slider(
