@@ -22,13 +22,14 @@ from langsplat_viewer.controls import OrbitCamera
 from langsplat_viewer.keys import Changed
 from langsplat_viewer.looking import drawn_scene, why_nothing, why_undrawable
 from langsplat_viewer.marked_scene import MarkedScene, marked_scene
-from langsplat_viewer.seeing import Splats
+from langsplat_viewer.seeing import UNCLIPPED, Clip, Splats
 from langsplat_viewer.state import FrameStats, ViewerState
 
 SCALES = (1.0, 0.5, 0.25)
 MOVING_BUDGET = 80.0  # milliseconds per picture that still feel like motion
 REST_SECONDS = 0.15  # without a move, after which the fine picture is drawn
 NOTHING_LEFT = "all of the scene is hidden or deleted"
+NOTHING_BETWEEN = "nothing of the scene in this picture lies between the cuts: move them in the panel Camera"
 
 
 Key = tuple[int, int, int]  # which picture, width, height
@@ -41,6 +42,9 @@ class Renderer(Protocol):
 
     def set_scene(self, scene: Scene) -> None:
         """Draw this scene from now on."""
+
+    def set_clip(self, clip: Clip) -> None:
+        """Draw what lies between other depths from now on."""
 
     def set_layers(self, latent_rgb: Array | None, relevancies: Array | None) -> None:
         """(N, 3) latent colours and (N, Q) relevancies, Q <= 3, of the scene's Gaussians."""
@@ -91,6 +95,7 @@ class Canvas:
         self._textures: dict[Key, moderngl.Texture] = {}
         self._state: ViewerState | None = None  # that was last shown
         self._scene: tuple[Scene, Splats] | None = None  # what the renderer has
+        self._clip = UNCLIPPED  # what the renderer has
         self._marked: MarkedScene | None = None  # whose it is
         self._layers: list[tuple[tuple[object, ...], Layers | None]] = []  # of each picture, with their key
         self._drawn: tuple[object, ...] | None = None  # what the texture shows
@@ -119,7 +124,14 @@ class Canvas:
         scale = self._scale() if moving and state.coarse_while_moving else 1.0
         shown = splitting.pictures(state)
         looks = tuple((one.layers_key(), one.shown_picture(), one.heat_ranges()) for one in shown)
-        key = (looks, state.seeing.splats, state.view, splitting.picture_size(state), scale)
+        key = (
+            looks,
+            state.seeing.splats,
+            state.seeing.clip,
+            state.view,
+            splitting.picture_size(state),
+            scale,
+        )
         if key != self._drawn:
             self._drawn = key
             self._draw(state, shown, scale)
@@ -135,6 +147,8 @@ class Canvas:
         if len(source.gaussians) and not len(gaussians):
             shown = with_key("show what is hidden", actions.show_hidden, keys)
             return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', actions.undo, keys)}"
+        if self._clip != UNCLIPPED and gaussians.valid().any():
+            return NOTHING_BETWEEN
         reason = why_nothing(gaussians, camera)
         elsewhere = not why_undrawable(gaussians)  # another view would show something
         back = with_key("return to the opening view", actions.reset_view, keys)
@@ -155,6 +169,9 @@ class Canvas:
         if self._scene is None or self._scene[0] is not marked.scene or self._scene[1] != splats:
             self._scene, self._layers = (marked.scene, splats), []
             self._renderer.set_scene(drawn_scene(marked.scene, splats))
+        if first.seeing.clip != self._clip:
+            self._clip = first.seeing.clip
+            self._renderer.set_clip(self._clip)
         if not self._layers or self._layers[0][0] != first.layers_key():
             self._layers[:1] = [(first.layers_key(), None)]
             layers = _layers(first, marked)

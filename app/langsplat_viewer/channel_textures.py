@@ -12,6 +12,7 @@ from langsplat_core.raster.opengl.rasterizer import GlRasterizer, GlView, Source
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.channels import ArrayChannels, Channel, surface_depths
 from langsplat_viewer.looking import looking_settings
+from langsplat_viewer.seeing import UNCLIPPED, Clip
 
 Textures = tuple[moderngl.Texture, ...]  # colours with alpha, then one for each channel that was wanted
 
@@ -21,6 +22,9 @@ class ChannelSource(Protocol):
 
     def set_scene(self, scene: Scene) -> None:
         """Show another scene."""
+
+    def set_clip(self, clip: Clip) -> None:
+        """Draw what lies between other depths."""
 
     def render(self, camera: Camera, wanted: Sequence[Channel]) -> Textures:
         """Colours, then the texture of each channel (the colours' for "none"), valid until the next call.
@@ -41,14 +45,19 @@ class GlSource:
 
     def __init__(self, ctx: moderngl.Context, precision: Literal["half", "single"]) -> None:
         self._rasterizer = GlRasterizer(ctx, precision)
+        self._clip = UNCLIPPED
         self._uploads: dict[int, tuple[Array, moderngl.Texture]] = {}  # by the id of the array, which is held
 
     def set_scene(self, scene: Scene) -> None:
         self._keep([])
         self._scene = scene
 
+    def set_clip(self, clip: Clip) -> None:
+        self._clip = clip
+
     def _view(self, camera: Camera) -> GlView:
-        return self._rasterizer.view(self._scene.gaussians, camera, looking_settings(self._scene, camera))
+        settings = looking_settings(self._scene, camera, self._clip)
+        return self._rasterizer.view(self._scene.gaussians, camera, settings)
 
     def render(self, camera: Camera, wanted: Sequence[Channel]) -> Textures:
         self._keep(wanted)
@@ -95,6 +104,9 @@ class ArraySource:
 
     def set_scene(self, scene: Scene) -> None:
         self._scene = scene
+
+    def set_clip(self, clip: Clip) -> None:
+        self._channels.clip = clip
 
     def render(self, camera: Camera, wanted: Sequence[Channel]) -> Textures:
         drawn = self._channels.render_all(self._scene, camera, wanted or [Channel()])

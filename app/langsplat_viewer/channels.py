@@ -15,6 +15,7 @@ from langsplat_core.raster.protocol import MedianDepth
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_viewer.looking import looking_settings
+from langsplat_viewer.seeing import UNCLIPPED, Clip
 
 _DEPTH_SAMPLE = 20_000  # Gaussians looked at for the depth range; quantiles need no more
 
@@ -66,13 +67,14 @@ class Layers:
         return {"latent": self.latent_rgb, "relevancies": self.relevancies}.get(extra)
 
 
-def depth_range(gaussians: Gaussians, camera: Camera) -> tuple[float, float]:
+def depth_range(gaussians: Gaussians, camera: Camera, clip: Clip = UNCLIPPED) -> tuple[float, float]:
     """Near and far end of the depth display: the 2 % and 98 % quantiles of the camera z of those
-    Gaussians whose centres are in the image. World units; (0, 1) where there are none."""
+    Gaussians whose centres are in the image and not cut away. World units; (0, 1) where there are none."""
     means = gaussians.means[:: max(len(gaussians) // _DEPTH_SAMPLE, 1)].astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
         pixels, depths = camera.project(means)
         inside = (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1) & (depths > 0)
+        inside &= clip.keeps(depths)
     if not inside.any():
         return 0.0, 1.0
     near, far = np.quantile(depths[inside], [0.02, 0.98])
@@ -105,12 +107,13 @@ class ArrayChannels:
 
     def __init__(self, rasterizer: Rasterizer) -> None:
         self._rasterizer = rasterizer
+        self.clip = UNCLIPPED  # what is drawn
         self._view: View | None = None
         self._shown: tuple[Gaussians, tuple[object, ...]] | None = None  # what `_view` is a view of
 
     def view(self, scene: Scene, camera: Camera) -> View:
         """The Gaussians of `scene` projected into `camera`."""
-        gaussians, settings = scene.gaussians, looking_settings(scene, camera)
+        gaussians, settings = scene.gaussians, looking_settings(scene, camera, self.clip)
         key = (settings, *camera_key(camera))
         if (
             self._view is None
@@ -141,7 +144,9 @@ class ArrayChannels:
                 latent=part if channel.extra == "latent" else None,
                 relevancies=part if channel.extra == "relevancies" else None,
                 depth_sum=part[..., 0] if channel.extra == "depth" else None,
-                depth_range=depth_range(gaussians, camera) if channel.extra == "depth" else (0.0, 1.0),
+                depth_range=depth_range(gaussians, camera, self.clip)
+                if channel.extra == "depth"
+                else (0.0, 1.0),
             )
             for channel, part in zip(wanted, parts, strict=True)
         ]

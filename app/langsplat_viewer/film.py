@@ -146,7 +146,10 @@ def fingerprint(shot: Shot) -> str:
     _add(digest.update, shot.subject.scene.gaussians)
     _add(digest.update, shot.subject.scene.raster_settings())
     subject = shot.subject
-    _add(digest.update, (subject.picture, subject.layers, subject.heat_ranges, shot.backend, shot.cameras))
+    _add(
+        digest.update,
+        (subject.picture, subject.layers, subject.heat_ranges, subject.clip, shot.backend, shot.cameras),
+    )
     return digest.hexdigest()
 
 

@@ -23,6 +23,7 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.channel_textures import ArraySource, ChannelSource, GlSource, Textures
 from langsplat_viewer.channels import Channel, Layers, camera_key, depth_range
 from langsplat_viewer.looking import VISIBLE_ALPHA
+from langsplat_viewer.seeing import UNCLIPPED, Clip
 
 Backend = Literal["auto", "opengl", "cpu", "cuda"]
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swr ", "software", "swiftshader", "basic render")
@@ -74,6 +75,7 @@ class FrameRenderer:
         self._maps = ctx.texture((tables.shape[1], len(tables)), 3, tables.tobytes(), alignment=1)
         self._scene: Scene | None = None
         self._layers = Layers()
+        self._clip = UNCLIPPED
         self._camera: Camera | None = None  # of the last draw
         self._drawn: tuple[object, ...] = ()  # camera whose channels are held
         self._channels: Sequence[Channel] = ()  # those of `_textures` after the colours
@@ -85,6 +87,11 @@ class FrameRenderer:
         self._source.set_scene(scene)
         self._scene, self._layers, self._camera = scene, Layers(), None
         self._drawn, self._channels = (), ()
+
+    def set_clip(self, clip: Clip) -> None:
+        """Draw what lies between other depths."""
+        self._source.set_clip(clip)
+        self._clip, self._drawn = clip, ()
 
     def set_layers(self, latent_rgb: Array | None, relevancies: Array | None) -> None:
         """What the displays "latent" and "relevancy" show: (N, 3) colours in [0, 1] of the level shown;
@@ -163,7 +170,9 @@ class FrameRenderer:
             "threshold": picture.threshold,
             "alpha_gate": picture.alpha_gate,
             "background": picture.background,
-            "depth_range": depth_range(self._scene.gaussians, camera) if extra == "depth" else (0.0, 1.0),
+            "depth_range": depth_range(self._scene.gaussians, camera, self._clip)
+            if extra == "depth"
+            else (0.0, 1.0),
         }
 
     def read(

@@ -16,6 +16,7 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.channels import ArrayChannels, Layers
 from langsplat_viewer.frame import Backend, FrameRenderer, suits_opengl
 from langsplat_viewer.looking import VISIBLE_ALPHA, why_nothing
+from langsplat_viewer.seeing import UNCLIPPED, Clip
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +27,7 @@ class Subject:
     picture: PictureConfig = field(default_factory=PictureConfig)
     layers: Layers = field(default_factory=Layers)
     heat_ranges: HeatRanges = ()
+    clip: Clip = UNCLIPPED
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,7 @@ def painter(subject: Subject, backend: Backend = "auto") -> Iterator[Callable[[C
     ctx = _context_for(backend)
     if ctx is None:
         channels = ArrayChannels(load_rasterizer("cpu" if backend == "auto" else backend))
+        channels.clip = subject.clip
 
         def by_arrays(camera: Camera) -> Drawn:
             found = channels.render(scene, layers, camera, layers.extra(subject.picture))
@@ -59,6 +62,7 @@ def painter(subject: Subject, backend: Backend = "auto") -> Iterator[Callable[[C
     try:
         frame = FrameRenderer(ctx, "opengl")
         frame.set_scene(scene)
+        frame.set_clip(subject.clip)
         frame.set_layers(layers.latent_rgb, layers.relevancies)
 
         def by_gl(camera: Camera) -> Drawn:

@@ -7,7 +7,7 @@ import numpy as np
 from langsplat_core.arrays import logit
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians, Scene
-from langsplat_viewer.seeing import Splats
+from langsplat_viewer.seeing import UNCLIPPED, Clip, Splats
 
 NEAR_SHARE = 0.25  # of the depth of what is nearest in the picture
 NEAREST_SHARE = 0.01  # of the Gaussians in the picture that count as the nearest
@@ -44,10 +44,11 @@ def drawn_scene(scene: Scene, splats: Splats) -> Scene:
     return scene if gaussians is scene.gaussians else replace(scene, gaussians=gaussians)
 
 
-def looking_settings(scene: Scene, camera: Camera) -> RasterSettings:
-    """The scene's own image formation, with the near plane of `near_plane`."""
+def looking_settings(scene: Scene, camera: Camera, clip: Clip = UNCLIPPED) -> RasterSettings:
+    """The scene's own image formation, with the near plane of `near_plane`, and what `clip` cuts away."""
     settings = scene.raster_settings()
-    return replace(settings, near=near_plane(scene.gaussians, camera, settings.near))
+    near = near_plane(scene.gaussians, camera, settings.near)
+    return replace(settings, near=max(near, clip.near), far=clip.far)
 
 
 def why_undrawable(gaussians: Gaussians) -> str:

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
+from langsplat_core.arrays import Array
 from langsplat_core.config import Display
 
 SplitMode = Literal["off", "wipe", "levels"]
@@ -60,11 +61,29 @@ class Splats:
 
 
 @dataclass(frozen=True)
+class Clip:
+    """Between which depths Gaussians are drawn, told by their centres; world units. For looking into things:
+    answers and files have all of them."""
+
+    near: float = 0.0
+    far: float = math.inf
+
+    def keeps(self, depths: Array) -> Array:
+        """(N,) bool, of (N,) camera z."""
+        kept: Array = (depths > self.near) & (depths <= self.far)
+        return kept
+
+
+UNCLIPPED = Clip()
+
+
+@dataclass(frozen=True)
 class Seeing:
     """How the scene is looked at."""
 
     split: Split = Split()
     ruler: Ruler = Ruler()
     splats: Splats = Splats()
+    clip: Clip = UNCLIPPED
     transparent: bool = False  # pictures are saved without a background
     fade: float = 0.0  # how much of the photograph of a training camera lies over the picture, 0 to 1

@@ -6,7 +6,7 @@ from langsplat_core.config import Display
 from langsplat_core.scene import Camera
 from langsplat_viewer.controls import OrbitCamera
 from langsplat_viewer.flight import Keyframe
-from langsplat_viewer.seeing import Ruler
+from langsplat_viewer.seeing import Clip, Ruler
 from langsplat_viewer.state import Query, ViewerState
 
 
@@ -24,6 +24,7 @@ class Visit:
     canonical: tuple[str, ...]
     keyframes: tuple[Keyframe, ...]
     ruler: Ruler
+    clip: Clip
 
 
 def visit_of(state: ViewerState) -> Visit:
@@ -40,6 +41,7 @@ def visit_of(state: ViewerState) -> Visit:
         canonical=state.canonical,
         keyframes=state.record.keyframes,
         ruler=state.seeing.ruler,
+        clip=state.seeing.clip,
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import PictureConfig
+from langsplat_core.config import PictureConfig, RasterSettings
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.describe import Describer, Levels
 from langsplat_core.raster.one_pixel import pixel_weights
@@ -31,14 +31,16 @@ def look_at_pixel(
     pixel: tuple[int, int],
     results: Sequence[QueryResult] = (),
     top: int = 3,
+    settings: RasterSettings | None = None,
 ) -> Pointed | None:
     """What `camera` sees at `pixel` (column, row) of its picture; None where that is mostly empty.
 
     Every Gaussian counts by its blending weight there; the surface is at the median of their depths, as the
-    rasterizers have it.
+    rasterizers have it. `settings` of image formation: by default the scene's own.
     """
     scene = describer.engine.scene
-    rows, weights = pixel_weights(rasterizer, scene.gaussians, camera, pixel, scene.raster_settings())
+    formed = settings or scene.raster_settings()
+    rows, weights = pixel_weights(rasterizer, scene.gaussians, camera, pixel, formed)
     total = float(weights.sum())
     if total <= PictureConfig().alpha_gate:
         return None

@@ -19,6 +19,8 @@ from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.scene import Camera, Gaussians, look_at
 
+FARTHEST = 1e10  # world units: where gsplat's far plane is when it is not told
+
 
 @dataclass(frozen=True, eq=False)
 class DeviceGaussians:
@@ -87,6 +89,7 @@ def draw(
         width=camera.width,
         height=camera.height,
         near_plane=settings.near,
+        far_plane=min(settings.far, FARTHEST),
         eps2d=settings.dilation,
         sh_degree=sh_degree,
         packed=False,
@@ -166,7 +169,7 @@ class GsplatRasterizer:
         require_device()
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> GsplatView:
-        """See `Rasterizer.view`. Of the settings near, dilation and antialiased apply; gsplat fixes the rest.
+        """See `Rasterizer.view`. Only near, far, dilation and antialiased apply; gsplat fixes the rest.
 
         Raises BackendError for other settings that are not the profiles'.
         """

@@ -53,7 +53,7 @@ def _may_reach(
             np.abs(camera.fx * x + np.float32(camera.cx - pixel[0] - 0.5)),
             np.abs(camera.fy * y + np.float32(camera.cy - pixel[1] - 0.5)),
         )
-        inside: Array = (z > 0.999 * settings.near) & ~(away > 1.01 * reach)
+        inside: Array = (z > 0.999 * settings.near) & (z < 1.001 * settings.far) & ~(away > 1.01 * reach)
     return inside
 
 

@@ -2,7 +2,7 @@
 
 Image formation, from top to bottom (constants in `config.RasterSettings`):
 
-1. Camera space: p = R x + t; Gaussians with p.z <= near are not drawn.
+1. Camera space: p = R x + t; Gaussians with p.z <= near or p.z > far are not drawn.
 2. Footprint: the perspective map is linearised at p, with p.x/p.z and p.y/p.z clamped to 1.3 times the
    half field of view on each side of the principal point. With A = J R rotation diag(scales) (2x3) the
    2D covariance is A A^T + 0.3 I, positive definite by construction.
@@ -40,7 +40,7 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INR
     means = np.where(valid[:, None], gaussians.means, 0).astype(np.float64)
     # Not a matrix product: BLAS may round equal rows differently, and equal depths tie by index.
     points = (means[:, None, :] * camera.rotation).sum(2) + camera.world_to_camera[:3, 3]
-    drawn = valid & (points[:, 2] > settings.near)
+    drawn = valid & (points[:, 2] > settings.near) & (points[:, 2] <= settings.far)
     x, y, z = np.where(drawn[:, None], points, (0.0, 0.0, 1.0)).T
 
     # Clamp where the Jacobian is taken, not where the mean goes (EWA splatting's linearisation

@@ -72,7 +72,7 @@ def render(
     transmittance = torch.ones(len(pixels), dtype=torch.float64)
     running = torch.ones(len(pixels), dtype=torch.bool)
     for n in torch.argsort(depth.detach(), stable=True).tolist():
-        if depth[n] <= settings.near:
+        if not settings.near < depth[n] <= settings.far:
             continue
         offset = pixels - means_px[n]
         power = -0.5 * (offset @ torch.linalg.inv(covariance[n]) * offset).sum(1)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from imgui_bundle import imgui  # isort: skip
+from langsplat_viewer import actions
 from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.panels.cube import EDGE
 from langsplat_viewer.view_cube import visible_faces
@@ -116,6 +117,26 @@ def draw_over_the_scene(s: Any) -> None:
     assert not s.state.seeing.ruler.measures
 
 
+def cut_by_depth(s: Any) -> None:
+    """The sliders of the panel leave out what is nearer or farther; undone at their ends."""
+    begin(s)
+    actions.open_panel(s.window.viewer, "Camera")
+    s.ctx.yield_(3)
+    actions.look_from(s.window.viewer, "left")
+    s.settle()
+    before = s.shot("whole")
+    depths = [float((thing - s.state.view.eye) @ s.state.view.rotation[2]) for thing in CENTRES]
+    s.ctx.item_input_value("//Camera/Near cut", max(min(depths), 0.1) + 0.6)
+    s.settle()
+    assert s.state.seeing.clip.near > 0.5
+    cut = s.shot("cut")
+    assert np.abs(cut - before)[100:, 400:].max() > 60
+    s.ctx.item_input_value("//Camera/Near cut", 0.0)
+    s.settle()
+    assert s.state.seeing.clip.near == 0
+    assert np.abs(s.shot("whole again") - before)[100:400, 400:].max() < 3
+
+
 def faces_on_screen(s: Any, side: Any) -> list[tuple[str, tuple[float, float]]]:
     """Name and middle of each face of the cube that is seen, in the window."""
     middle, scale = (
@@ -131,5 +152,6 @@ def faces_on_screen(s: Any, side: Any) -> list[tuple[str, tuple[float, float]]]:
 Scenario = tuple[Callable[[Any], None], str, dict[str, Any]]
 SCENARIOS: dict[str, Scenario] = {
     "split_the_view": (split_the_view, "blobs.ply", {}),
+    "cut_by_depth": (cut_by_depth, "blobs.ply", {}),
     "draw_over_the_scene": (draw_over_the_scene, "blobs.ply", {}),
 }

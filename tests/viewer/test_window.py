@@ -56,6 +56,7 @@ def folder(tmp_path: Path) -> Path:
         "draw_over_the_scene",
         "reload_what_changed",
         "change_a_key",
+        "cut_by_depth",
         "fade_in_a_photograph",
     ],
 )
@@ -100,6 +101,9 @@ class FakeRenderer:
 
     def set_scene(self, scene) -> None:
         self.calls.append(("scene", scene))
+
+    def set_clip(self, clip) -> None:
+        self.calls.append(("clip", clip))
 
     def set_layers(self, latent_rgb, relevancies) -> None:
         self.calls.append(("layers", latent_rgb is not None))

@@ -118,7 +118,7 @@ def subject_of(state: ViewerState) -> Subject:
     """What is shown now."""
     assert state.scene is not None
     layers = Layers(state.latent_rgb(), state.relevancies())
-    return Subject(state.scene, state.shown_picture(), layers, state.heat_ranges())
+    return Subject(state.scene, state.shown_picture(), layers, state.heat_ranges(), state.seeing.clip)
 
 
 def copy_command(viewer: Viewer, folder: Path) -> str:

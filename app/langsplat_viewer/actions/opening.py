@@ -22,7 +22,7 @@ from langsplat_viewer.controls import Extent, extent_of
 from langsplat_viewer.looking import why_undrawable
 from langsplat_viewer.preferences import with_recent
 from langsplat_viewer.recording import Recording
-from langsplat_viewer.seeing import Ruler
+from langsplat_viewer.seeing import UNCLIPPED, Ruler
 from langsplat_viewer.selecting import of_scene
 from langsplat_viewer.viewer import Viewer
 from langsplat_viewer.visits import visit_of
@@ -104,7 +104,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state.canonical, state.canonical_typed = (), ""
     state.selection = of_scene(state.selection, len(scene.gaussians))
     state.camera_index = 0 if scene.cameras else None
-    state.seeing = replace(state.seeing, ruler=Ruler())
+    state.seeing = replace(state.seeing, ruler=Ruler(), clip=UNCLIPPED)
     forget(viewer)
     state.preferences = with_recent(state.preferences, path.absolute())
     state.opening_camera = None

@@ -5,6 +5,7 @@ from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import no_field
 from langsplat_core.query.pointing import Pointed, look_at_pixel
 from langsplat_core.raster import load_lifting_rasterizer
+from langsplat_viewer.looking import looking_settings
 from langsplat_viewer.state import Hover
 from langsplat_viewer.viewer import Viewer
 
@@ -46,14 +47,16 @@ def _ask(viewer: Viewer, place: Hover) -> None:
         return
     camera = place.view.camera(*viewer.state.size)
     shown = [query for query in viewer.state.shown() if query is not None and query.result is not None]
+    settings = looking_settings(engine.scene, camera, viewer.state.seeing.clip)
     results = [query.result for query in shown if query.result is not None]
 
     def work(progress: Progress) -> tuple[Describer, Pointed | None]:
         describer = viewer.describer
         if describer is None or describer.engine is not engine:
             describer = Describer(engine, progress=progress)
+        rasterizer = load_lifting_rasterizer("cpu")
         return describer, look_at_pixel(
-            load_lifting_rasterizer("cpu"), describer, camera, place.pixel, results
+            rasterizer, describer, camera, place.pixel, results, settings=settings
         )
 
     def done(found: tuple[Describer, Pointed | None]) -> None:

@@ -6,7 +6,17 @@ from langsplat_core.config import ColourMap, Display
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
 from langsplat_viewer.actions.camera import glide_to
-from langsplat_viewer.seeing import AT_RANGE, MOST_DEGREE, OVERLAYS, SIZE_RANGE, Overlay, Ruler, Splats, Split
+from langsplat_viewer.seeing import (
+    AT_RANGE,
+    MOST_DEGREE,
+    OVERLAYS,
+    SIZE_RANGE,
+    Clip,
+    Overlay,
+    Ruler,
+    Splats,
+    Split,
+)
 from langsplat_viewer.view_cube import facing
 from langsplat_viewer.viewer import Viewer
 
@@ -67,6 +77,14 @@ def set_splats(viewer: Viewer, splats: Splats) -> None:
     kept = Splats(min(max(splats.size, low), high), degree)
     if kept != viewer.state.seeing.splats:
         viewer.state.seeing = replace(viewer.state.seeing, splats=kept)
+
+
+def set_clip(viewer: Viewer, clip: Clip) -> None:
+    """Between which depths Gaussians are drawn; the far one stays the farther."""
+    near = max(clip.near, 0.0)
+    kept = Clip(near, max(clip.far, near))
+    if kept != viewer.state.seeing.clip:
+        viewer.state.seeing = replace(viewer.state.seeing, clip=kept)
 
 
 def show_overlay(viewer: Viewer, overlay: Overlay, shown: bool) -> None:

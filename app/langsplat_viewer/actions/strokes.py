@@ -8,6 +8,7 @@ from langsplat_core.query.selection import at_point
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import strokes
 from langsplat_viewer.actions.selecting import find, reach, take, use_tool
+from langsplat_viewer.seeing import UNCLIPPED
 from langsplat_viewer.selecting import Mode, Stroke
 from langsplat_viewer.strokes import Drawn
 from langsplat_viewer.viewer import Viewer
@@ -55,7 +56,11 @@ def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
         return
     wanted = state.selection.only_visible and drawn.tool in strokes.ON_SCREEN and viewer.surface is not None
     depths = viewer.surface.depths() if wanted and viewer.surface is not None else None
-    take(viewer, strokes.caught(drawn, state.scene.gaussians.means, depths), mode)
+    means, clip = state.scene.gaussians.means, state.seeing.clip
+    found = strokes.caught(drawn, means, depths)
+    if clip != UNCLIPPED and drawn.tool in strokes.ON_SCREEN:  # what was cut away lies under no outline
+        found &= clip.keeps(means @ drawn.camera.rotation[2] + drawn.camera.world_to_camera[2, 3])
+    take(viewer, found, mode)
 
 
 def drawn_stroke(viewer: Viewer) -> Drawn | None:

@@ -21,7 +21,7 @@ def return_to(viewer: Viewer, visit: Visit) -> None:
     count = len(state.scene.cameras)
     if visit.camera_index is not None and visit.camera_index < count:
         state.camera_index = visit.camera_index
-    state.seeing = replace(state.seeing, ruler=visit.ruler)
+    state.seeing = replace(state.seeing, ruler=visit.ruler, clip=visit.clip)
     state.record.keyframes = visit.keyframes
     if state.scene.language is None and DISPLAYS[visit.display].needs_field:
         return

@@ -1,5 +1,6 @@
 """What is shown, and from where."""
 
+import math
 from dataclasses import replace
 from itertools import groupby
 
@@ -14,9 +15,10 @@ from langsplat_viewer.controls import FOV_RANGE, adopt_up, level, with_fov
 from langsplat_viewer.overlays import length_text
 from langsplat_viewer.panels import photograph
 from langsplat_viewer.panels.style import muted, small_wrapped, tip
-from langsplat_viewer.seeing import MOST_DEGREE, SIZE_RANGE, Splats
+from langsplat_viewer.seeing import MOST_DEGREE, SIZE_RANGE, Clip, Splats
 from langsplat_viewer.viewer import Viewer
 
+CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut can be chosen
 BACKDROPS = {"Black": 0.0, "Grey": 0.5, "White": 1.0}
 
 
@@ -193,6 +195,7 @@ def draw_camera(viewer: Viewer) -> None:
         fov = _slider("Field of view", before, *FOV_RANGE, "%.0f deg")
         if abs(fov - before) > 1e-3:
             actions.move(viewer, lambda view: with_fov(view, fov))
+    _cuts(viewer)
     speed = _slider("Fly speed", state.fly_speed, 0.05, 4.0, "%.2f", logarithmic=True)
     actions.set_fly_speed(viewer, speed)
     _, walks = imgui.checkbox("Walk", state.walks)
@@ -203,6 +206,25 @@ def draw_camera(viewer: Viewer) -> None:
     actions.set_coarse_while_moving(viewer, coarse)
     tip("Draw fewer pixels while the camera moves, where drawing is slow")
     imgui.end_disabled()
+
+
+def _cuts(viewer: Viewer) -> None:
+    """Near and far cut; at the ends of their sliders there is none."""
+    extent, clip = viewer.state.extent, viewer.state.seeing.clip
+    if extent is None:
+        return
+    low, high = (share * extent.radius for share in CUT_RANGE)
+    near = _slider(
+        "Near cut", max(clip.near, low), low, high, "%.3g" if clip.near else "off", logarithmic=True
+    )
+    tip("Nearer than this nothing is drawn, to look into things; world units")
+    far = _slider(
+        "Far cut", min(clip.far, high), low, high, "%.3g" if clip.far < high else "off", logarithmic=True
+    )
+    tip("Farther than this nothing is drawn; world units")
+    actions.set_clip(
+        viewer, Clip(0.0 if near < 1.001 * low else near, math.inf if far > 0.999 * high else far)
+    )
 
 
 def _training_cameras(viewer: Viewer) -> None:

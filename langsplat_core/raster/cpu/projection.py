@@ -69,6 +69,7 @@ class KernelCamera(NamedTuple):
     top: float
     bottom: float
     near: float
+    far: float
     dilation: float
     alpha_min: float
     antialiased: bool
@@ -92,6 +93,7 @@ def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
         top=camera.cy / camera.fy + margin_y,
         bottom=(camera.height - camera.cy) / camera.fy + margin_y,
         near=float(settings.near),
+        far=float(settings.far),
         dilation=float(settings.dilation),
         alpha_min=float(settings.alpha_min),
         antialiased=bool(settings.antialiased),
@@ -211,7 +213,7 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Footpr
         out.status[i] = UNDRAWN
         x, y, z = camera_point(rows.means[i], camera)
         opacity = opacity_of(rows.opacity_logits[i])
-        if not (z > camera.near and opacity >= camera.alpha_min):
+        if not (camera.near < z <= camera.far and opacity >= camera.alpha_min):
             continue
         fill_axes((x, y, z), rows.log_scales[i], rows.quats_wxyz[i], camera, work)
         xx, xy, yy, det, sharp = covariance(work[2], camera.dilation)

@@ -71,13 +71,13 @@ class GlRasterizer:
         if (
             last is not None
             and last.gaussians is gaussians
-            and last.settings.near == settings.near
+            and (last.settings.near, last.settings.far) == (settings.near, settings.far)
             and np.array_equal(last.camera.world_to_camera[2], camera.world_to_camera[2])
         ):
             order = last.order
         else:
             depths = scene.depths(camera)
-            ahead = np.flatnonzero(depths > settings.near)
+            ahead = np.flatnonzero((depths > settings.near) & (depths <= settings.far))
             order = ahead[front_to_back(depths[ahead])][::-1].astype(np.int32)
         return GlView(self, gaussians, camera, settings, order)
 

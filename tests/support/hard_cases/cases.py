@@ -293,6 +293,12 @@ def _near_plane_steps() -> Drawing:
     return Drawing(balls(steps, 0.5, 0.01), settings=replace(INRIA, near=0.25))
 
 
+def _far_plane_steps() -> Drawing:
+    far = np.float32(2.5)
+    steps = [np.nextafter(far, np.float32(0)), far, np.nextafter(far, np.float32(3))]
+    return Drawing(balls(steps, 0.5, 0.01), settings=replace(INRIA, far=2.5))
+
+
 def _logits() -> Drawing:
     values = np.tile([np.inf, -np.inf, 100.0, -100.0, 88.8, -88.8, 800.0, -800.0], 3)
     return altered("opacity_logits", np.s_[:], values)
@@ -345,6 +351,7 @@ CASES: tuple[Case, ...] = (
     Case("one ulp about the near plane", "drawn only beyond it", _near_plane_steps, _only(2)),
     Case("straddling the near plane", "drawn or not by the centre alone, finite",
          lambda: Drawing(balls([0.19, 0.21], 0.5, 1.0)), _only(1)),
+    Case("one ulp about the far plane", "drawn up to it", _far_plane_steps, _only(0, 1)),
     Case("straddling gsplat's near plane", "the same with its nearer plane",
          lambda: Drawing(balls([0.009, 0.011], 0.5, 1.0), settings=GSPLAT), _only(1)),
     Case("far outside the field of view", "the Jacobian is clamped at 1.3 of it, as in the reference",
