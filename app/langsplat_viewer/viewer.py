@@ -12,6 +12,7 @@ from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.scene import Scene
 from langsplat_viewer.bookmarks import Shelf
 from langsplat_viewer.jobs import Worker
+from langsplat_viewer.packed_marks import Pair
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.training import Training
 from langsplat_viewer.visits import Visit
@@ -54,6 +55,9 @@ class History:
 
     past: list[Any] = field(default_factory=list)
     future: list[Any] = field(default_factory=list)
+    marks: Pair | None = None  # as they were packed last
+    setting: str = ""  # that was changed by the last step, where others of it may join the step
+    set_at: float = 0.0  # when, seconds on the window's clock
 
 
 @dataclass(eq=False)

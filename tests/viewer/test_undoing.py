@@ -1,9 +1,17 @@
-"""Undo and redo of what was asked and shown."""
+"""Undo and redo of what was asked, shown and marked, and of how it was looked at."""
 
+import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import pytest
+
 from langsplat_viewer import actions
-from langsplat_viewer.actions.history import LONGEST
+from langsplat_viewer.actions.history import GESTURE, LONGEST
+from langsplat_viewer.actions.selecting import mark
+from langsplat_viewer.seeing import Clip, Splats
+from langsplat_viewer.selecting import Marks, hiding, unmarked
 from tests.support.windowless import settle
 
 
@@ -77,3 +85,139 @@ def test_another_scene_and_a_long_day(opened):
     actions.open_scene(opened, Path("bare.ply"))
     settle(opened)
     assert opened.history.past == []
+
+
+SETTINGS = {
+    "picture": lambda v: actions.set_picture(
+        v, replace(v.state.picture, dim=0.2, background=(1.0, 1.0, 1.0))
+    ),
+    "colour map": lambda v: actions.set_colour_map(v, "viridis"),
+    "wipe": actions.toggle_wipe,
+    "levels": actions.toggle_levels,
+    "line": lambda v: actions.move_line(v, 0.3),
+    "splats": lambda v: actions.set_splats(v, Splats(0.5, 0)),
+    "cut": lambda v: actions.set_clip(v, Clip(1.0, 2.0)),
+    "overlay": lambda v: actions.toggle_overlay(v, "grid"),
+    "backdrop": lambda v: actions.save_transparent(v, True),
+    "photograph": lambda v: actions.fade_photograph(v, 0.5),
+    "latents": lambda v: actions.set_display(v, "latent", 1),
+}
+
+
+def looks(viewer) -> tuple[object, ...]:
+    state = viewer.state
+    kept = (state.preferences.overlays, state.preferences.colour_map)
+    return state.picture, state.seeing, state.latent_level, kept
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_setting_of_what_is_seen_is_undone_in_one_step(opened, name):
+    before = looks(opened)
+    SETTINGS[name](opened)
+    after = looks(opened)
+    assert after != before
+    SETTINGS["wipe" if name == "levels" else "levels"](opened)
+    for wanted in (after, before):
+        actions.undo(opened)
+        assert looks(opened) == wanted
+    assert opened.history.past == []
+    actions.redo(opened)
+    assert looks(opened) == after
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_what_changes_nothing_is_no_step(opened, name):
+    SETTINGS[name](opened)
+    count = len(opened.history.past)
+    if name in ("wipe", "levels", "overlay"):  # which would go back
+        assert count == 1
+    else:
+        SETTINGS[name](opened)
+        assert len(opened.history.past) == count == 1
+
+
+def slide(viewer, seconds: float, dim: float) -> None:
+    viewer.clock = seconds
+    actions.set_picture(viewer, replace(viewer.state.picture, dim=dim))
+
+
+def test_a_slider_that_is_moved_is_one_step_and_another_time_another(opened):
+    for frame in range(10):
+        slide(opened, 5 + 0.1 * frame, 0.4 - 0.01 * frame)
+    assert len(opened.history.past) == 1
+    slide(opened, 5.9 + 1.1 * GESTURE, 0.9)
+    assert len(opened.history.past) == 2
+    actions.undo(opened)
+    assert opened.state.picture.dim == pytest.approx(0.31)
+    slide(opened, opened.clock, 0.8)  # after an undo a step of its own
+    actions.undo(opened)
+    assert opened.state.picture.dim == pytest.approx(0.31)
+    actions.undo(opened)
+    assert opened.state.picture.dim == 0.45
+
+
+def test_two_sliders_are_two_steps(opened):
+    slide(opened, 1.0, 0.2)
+    actions.set_picture(opened, replace(opened.state.picture, heat_opacity=0.3))
+    slide(opened, 1.0, 0.1)
+    assert len(opened.history.past) == 3
+
+
+def test_the_ruler_is_not_undone(opened):
+    actions.toggle_wipe(opened)
+    actions.measure(opened, True)
+    actions.undo(opened)
+    assert opened.state.seeing.ruler.measures
+    assert opened.state.seeing.split.mode == "off"
+
+
+def test_an_undone_setting_leaves_the_marks_the_same_objects(opened):
+    """Else the scene would be made anew for every slider."""
+    actions.select_all(opened)
+    actions.toggle_wipe(opened)
+    marks = opened.state.selection.marks
+    actions.undo(opened)
+    actions.redo(opened)
+    assert opened.state.selection.marks is marks
+    actions.hide_selected(opened)
+    hidden = opened.state.selection.marks.hidden
+    mark(opened, replace(opened.state.selection.marks, selected=~hidden | True))
+    actions.undo(opened)
+    assert opened.state.selection.marks.hidden is hidden
+
+
+def test_marks_come_back_bit_for_bit(opened):
+    rng, seen = np.random.default_rng(0), []
+    for _ in range(12):
+        seen.append(opened.state.selection.marks)
+        mark(opened, Marks(*(rng.uniform(size=360) < 0.4 for _ in range(3))))
+    for marks in reversed(seen):
+        actions.undo(opened)
+        assert opened.state.selection.marks.same(marks)
+    for marks in seen[1:]:
+        actions.redo(opened)
+        assert opened.state.selection.marks.same(marks)
+
+
+def changed(marks: Marks, rng: np.random.Generator, step: int) -> Marks:
+    """Selected and hidden in turn."""
+    if step % 2:
+        return hiding(marks)
+    return replace(marks, selected=(rng.uniform(size=len(marks.selected)) < 0.02) & marks.shown)
+
+
+def test_a_hundred_changes_of_a_million_gaussians_take_little_memory(viewer):
+    """At random, so that nothing could be shared."""
+    count, rng = 1_000_000, np.random.default_rng(0)
+    viewer.state.selection = replace(viewer.state.selection, marks=unmarked(count))
+    tracemalloc.start()
+    try:
+        for step in range(LONGEST):
+            mark(viewer, changed(viewer.state.selection.marks, rng, step))
+        held, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert len(viewer.history.past) == LONGEST
+    now = viewer.state.selection.marks
+    own = sum(mask.nbytes for mask in (now.selected, now.hidden))
+    assert held - own < 15e6

@@ -2,13 +2,15 @@
 
 from dataclasses import dataclass
 
-from langsplat_core.config import Display, LevelChoice
+from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_viewer.flight import Keyframe
-from langsplat_viewer.selecting import Marks
-from langsplat_viewer.state import Query, ViewerState
+from langsplat_viewer.packed_marks import PackedMarks, pack
+from langsplat_viewer.seeing import Seeing
+from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
 
 LONGEST = 100  # steps that can be undone
+GESTURE = 1.0  # seconds: changes of one setting that follow each other sooner are one step
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,35 +19,44 @@ class Moment:
 
     queries: tuple[tuple[Query, int | None, int, float | None], ...]  # with slot, shown_since and cut
     selected: Query | None
-    display: Display
+    picture: PictureConfig
     latent_level: int
     level: LevelChoice
-    marks: Marks
+    seeing: Seeing  # its ruler is not undone
+    overlays: tuple[str, ...]
+    marks: PackedMarks
     keyframes: tuple[Keyframe, ...]
 
 
-def now(state: ViewerState) -> Moment:
+def now(viewer: Viewer) -> Moment:
     """How things stand."""
-    queries = tuple((query, query.slot, query.shown_since, query.cut) for query in state.queries)
-    picture, marks = state.picture, state.selection.marks
+    state = viewer.state
+    viewer.history.marks = pack(state.selection.marks, viewer.history.marks)
     return Moment(
-        queries=queries,
+        queries=tuple((query, query.slot, query.shown_since, query.cut) for query in state.queries),
         selected=state.selected,
-        display=picture.display,
+        picture=state.picture,
         latent_level=state.latent_level,
         level=state.level,
-        marks=marks,
+        seeing=state.seeing,
+        overlays=state.preferences.overlays,
+        marks=viewer.history.marks.packed,
         keyframes=state.record.keyframes,
     )
 
 
-def remember(viewer: Viewer) -> None:
-    """What follows can be undone: to be called before a change."""
+def remember(viewer: Viewer, setting: str = "") -> None:
+    """What follows can be undone: to be called before a change. `setting` names one that is moved, as sliders
+    are: its changes in quick succession are one step."""
     history = viewer.history
-    history.past = [*history.past[1 - LONGEST :], now(viewer.state)]
-    history.future = []
+    goes_on = setting != "" and setting == history.setting and viewer.clock - history.set_at < GESTURE
+    history.setting, history.set_at = setting, viewer.clock
+    if not goes_on:
+        history.past = [*history.past[1 - LONGEST :], now(viewer)]
+        history.future = []
 
 
 def forget(viewer: Viewer) -> None:
     """Another scene: nothing of before can be undone."""
-    viewer.history.past, viewer.history.future = [], []
+    history = viewer.history
+    history.past, history.future, history.marks, history.setting = [], [], None, ""

@@ -9,6 +9,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
 from langsplat_viewer import photographs
+from langsplat_viewer.actions.history import remember
 from langsplat_viewer.browsing import list_folder
 from langsplat_viewer.photographs import Photograph
 from langsplat_viewer.preferences import with_photographs
@@ -38,6 +39,7 @@ def fade_photograph(viewer: Viewer, fade: float) -> None:
     """How much of the photograph is laid over the picture, 0 to 1."""
     fade = min(max(fade, 0.0), 1.0)
     if fade != viewer.state.seeing.fade:
+        remember(viewer, "fade")
         viewer.state.seeing = replace(viewer.state.seeing, fade=fade)
 
 

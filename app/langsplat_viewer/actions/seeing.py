@@ -6,6 +6,7 @@ from langsplat_core.config import ColourMap, Display
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
 from langsplat_viewer.actions.camera import glide_to
+from langsplat_viewer.actions.history import remember
 from langsplat_viewer.seeing import (
     AT_RANGE,
     MOST_DEGREE,
@@ -14,6 +15,7 @@ from langsplat_viewer.seeing import (
     Clip,
     Overlay,
     Ruler,
+    Seeing,
     Splats,
     Split,
 )
@@ -55,19 +57,21 @@ def show_one(viewer: Viewer) -> None:
 def move_line(viewer: Viewer, at: float) -> None:
     """Where the line is that divides the two pictures, as a fraction of the area's width."""
     low, high = AT_RANGE
-    _set_split(viewer, replace(viewer.state.seeing.split, at=min(max(at, low), high)))
+    _set_split(viewer, replace(viewer.state.seeing.split, at=min(max(at, low), high)), "line")
 
 
 def set_colour_map(viewer: Viewer, colour_map: ColourMap) -> None:
     """The colours of relevancy and depth; remembered."""
     state = viewer.state
+    if colour_map != state.picture.colour_map:
+        remember(viewer)
     state.picture = replace(state.picture, colour_map=colour_map)
     state.preferences = replace(state.preferences, colour_map=colour_map)
 
 
 def save_transparent(viewer: Viewer, transparent: bool) -> None:
     """Whether pictures are saved without their background."""
-    viewer.state.seeing = replace(viewer.state.seeing, transparent=transparent)
+    _see(viewer, replace(viewer.state.seeing, transparent=transparent))
 
 
 def set_splats(viewer: Viewer, splats: Splats) -> None:
@@ -75,16 +79,14 @@ def set_splats(viewer: Viewer, splats: Splats) -> None:
     low, high = SIZE_RANGE
     degree = min(max(splats.sh_degree, 0), MOST_DEGREE)
     kept = Splats(min(max(splats.size, low), high), degree)
-    if kept != viewer.state.seeing.splats:
-        viewer.state.seeing = replace(viewer.state.seeing, splats=kept)
+    _see(viewer, replace(viewer.state.seeing, splats=kept), "splats")
 
 
 def set_clip(viewer: Viewer, clip: Clip) -> None:
     """Between which depths Gaussians are drawn; the far one stays the farther."""
     near = max(clip.near, 0.0)
     kept = Clip(near, max(clip.far, near))
-    if kept != viewer.state.seeing.clip:
-        viewer.state.seeing = replace(viewer.state.seeing, clip=kept)
+    _see(viewer, replace(viewer.state.seeing, clip=kept), "clip")
 
 
 def show_overlay(viewer: Viewer, overlay: Overlay, shown: bool) -> None:
@@ -92,7 +94,9 @@ def show_overlay(viewer: Viewer, overlay: Overlay, shown: bool) -> None:
     preferences = viewer.state.preferences
     kept = {*preferences.overlays, overlay} if shown else {*preferences.overlays} - {overlay}
     overlays = tuple(name for name in OVERLAYS if name in kept)
-    viewer.state.preferences = replace(preferences, overlays=overlays)
+    if overlays != preferences.overlays:
+        remember(viewer)
+        viewer.state.preferences = replace(preferences, overlays=overlays)
 
 
 def toggle_overlay(viewer: Viewer, overlay: Overlay) -> None:
@@ -138,5 +142,12 @@ def _can_show(viewer: Viewer, needs_field: bool) -> bool:
     return True
 
 
-def _set_split(viewer: Viewer, split: Split) -> None:
-    viewer.state.seeing = replace(viewer.state.seeing, split=split)
+def _set_split(viewer: Viewer, split: Split, setting: str = "") -> None:
+    _see(viewer, replace(viewer.state.seeing, split=split), setting)
+
+
+def _see(viewer: Viewer, seeing: Seeing, setting: str = "") -> None:
+    """Look at the scene like that; `setting` as in `remember`."""
+    if seeing != viewer.state.seeing:
+        remember(viewer, setting)
+        viewer.state.seeing = seeing

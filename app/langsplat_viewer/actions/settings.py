@@ -1,6 +1,6 @@
 """What is shown and how; which parts of the window are."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 from langsplat_core.config import Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
@@ -28,7 +28,11 @@ def set_display(viewer: Viewer, display: Display, latent_level: int | None = Non
 
 def set_picture(viewer: Viewer, picture: PictureConfig) -> None:
     """Take other settings of the picture, as its sliders give them."""
-    viewer.state.picture = picture
+    before = viewer.state.picture
+    if picture != before:
+        names = (field.name for field in fields(picture))
+        remember(viewer, " ".join(name for name in names if getattr(picture, name) != getattr(before, name)))
+        viewer.state.picture = picture
 
 
 def set_coarse_while_moving(viewer: Viewer, coarse: bool) -> None:

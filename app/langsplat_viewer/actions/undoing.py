@@ -1,18 +1,18 @@
-"""Undo and redo of what was asked, shown, selected, hidden and deleted. The camera is not undone: R leads
-back."""
+"""Undo and redo of what was asked, shown, selected, hidden and deleted, and of the settings of what is seen.
+The camera is not undone: its reset leads back."""
 
 from dataclasses import replace
 
 from langsplat_viewer.actions.asking import set_cut
 from langsplat_viewer.actions.history import Moment, now
 from langsplat_viewer.actions.queries import set_level
-from langsplat_viewer.actions.settings import set_display
+from langsplat_viewer.packed_marks import pack, unpack
 from langsplat_viewer.viewer import Viewer
 
 
 def undo(viewer: Viewer) -> None:
-    """Go back to before the last query, removal, colour, level, display, keyframe, selection, hiding or
-    deletion."""
+    """Go back to before the last query, removal, colour, level, keyframe, selection, hiding or deletion, or
+    the last change of display, colours, sliders, split, cuts or overlays."""
     _step(viewer, viewer.history.past, viewer.history.future, "nothing to undo")
 
 
@@ -26,7 +26,8 @@ def _step(viewer: Viewer, there: list[Moment], back: list[Moment], otherwise: st
     if not there:
         viewer.state.say(otherwise)
         return
-    back.append(now(viewer.state))
+    viewer.history.setting = ""
+    back.append(now(viewer))
     _restore(viewer, there.pop())
 
 
@@ -38,9 +39,13 @@ def _restore(viewer: Viewer, moment: Moment) -> None:
         query.slot, query.shown_since = slot, since
         set_cut(viewer, query, cut, is_new=False)
     state.queries, state.selected = [query for query, *_ in moment.queries], moment.selected
-    state.selection = replace(state.selection, marks=moment.marks, stroke=None)
+    marks = unpack(moment.marks, pack(state.selection.marks, history.marks))
+    state.selection = replace(state.selection, marks=marks, stroke=None)
     state.record.keyframes, state.record.chosen = moment.keyframes, None
+    state.picture, state.latent_level = moment.picture, moment.latent_level
+    state.seeing = replace(moment.seeing, ruler=state.seeing.ruler)
+    looks = replace(state.preferences, colour_map=moment.picture.colour_map, overlays=moment.overlays)
+    state.preferences = looks
     past, future = history.past, history.future
     set_level(viewer, moment.level)
-    set_display(viewer, moment.display, moment.latent_level)
-    history.past, history.future = past, future  # what the two have remembered is no step of its own
+    history.past, history.future = past, future  # what that has remembered is no step of its own

@@ -16,8 +16,9 @@ def draw_slider(viewer: Viewer) -> None:
     state = viewer.state
     imgui.set_next_item_width(hello_imgui.em_size(11))
     flags = imgui.SliderFlags_.always_clamp
-    _, fade = imgui.slider_float("Photograph", state.seeing.fade, 0.0, 1.0, "%.2f", flags)
-    actions.fade_photograph(viewer, fade)
+    changed, fade = imgui.slider_float("Photograph", state.seeing.fade, 0.0, 1.0, "%.2f", flags)
+    if changed:
+        actions.fade_photograph(viewer, fade)
     tip("Lay the photograph of the training camera over the picture")
     if state.seeing.fade == 0:
         return

@@ -255,5 +255,5 @@ def _slider(
     flags = imgui.SliderFlags_.always_clamp
     if logarithmic:
         flags |= imgui.SliderFlags_.logarithmic
-    _, value = imgui.slider_float(label, value, low, high, text, flags)
-    return value
+    changed, new = imgui.slider_float(label, value, low, high, text, flags)
+    return new if changed else value  # what comes back unchanged has been rounded
