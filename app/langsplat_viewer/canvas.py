@@ -6,6 +6,7 @@ fraction of the window's resolution; as soon as it rests, once more at full reso
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from typing import Protocol
 
 import moderngl
@@ -15,13 +16,14 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.compose import HeatRanges
 from langsplat_core.scene import Camera, Scene
+from langsplat_core.stopwatch import watched
 from langsplat_viewer import actions, splitting
 from langsplat_viewer.channels import Layers
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.controls import OrbitCamera
 from langsplat_viewer.keys import Changed
 from langsplat_viewer.looking import drawn_scene, why_nothing, why_undrawable
-from langsplat_viewer.marked_scene import MarkedScene, marked_scene
+from langsplat_viewer.marked_scene import MarkedScene, layers_of, marked_scene
 from langsplat_viewer.seeing import UNCLIPPED, Clip, Splats
 from langsplat_viewer.state import FrameStats, ViewerState
 
@@ -174,12 +176,12 @@ class Canvas:
             self._renderer.set_clip(self._clip)
         if not self._layers or self._layers[0][0] != first.layers_key():
             self._layers[:1] = [(first.layers_key(), None)]
-            layers = _layers(first, marked)
+            layers = layers_of(first, marked)
             self._renderer.set_layers(layers.latent_rgb, layers.relevancies)
         del self._layers[len(shown) :]
         for place, one in enumerate(shown[1:], 1):
             if len(self._layers) == place or self._layers[place][0] != one.layers_key():
-                self._layers[place : place + 1] = [(one.layers_key(), _layers(one, marked))]
+                self._layers[place : place + 1] = [(one.layers_key(), layers_of(one, marked))]
 
     def _prepare(self, shown: Sequence[ViewerState], camera: Camera) -> list[Layers | None]:
         """Have the renderer ready to draw all pictures; returns the layers of each."""
@@ -197,10 +199,14 @@ class Canvas:
         keys = [(place, width, height) for place in range(len(shown))]
         targets = [self._target(key, len(shown)) for key in keys]
         began = self._clock()
-        for target, one, layers in zip(targets, shown, self._prepare(shown, camera), strict=True):
-            self._renderer.draw(target, camera, one.shown_picture(), one.heat_ranges(), layers)
+        with watched() if state.timing.wanted else nullcontext(dict[str, float]()) as laps:
+            for target, one, layers in zip(targets, shown, self._prepare(shown, camera), strict=True):
+                self._renderer.draw(target, camera, one.shown_picture(), one.heat_ranges(), layers)
         self._ctx.finish()
         milliseconds = 1e3 * (self._clock() - began)
+        if state.timing.wanted and scale == 1:
+            for name, taken in (*laps.items(), ("picture", milliseconds)):
+                state.timing.add(name, taken)
         if scale == 1:
             self._fine_ms = milliseconds
         self._camera = camera
@@ -239,14 +245,11 @@ class Canvas:
         """See `viewer.Surface`."""
         assert state.view is not None
         shown = splitting.pictures(state)
+        if state is not self._state:  # of another size: what is on screen is drawn again
+            self._drawn = None
         self._camera = camera = state.view.camera(*splitting.picture_size(state))
         images = [
             np.asarray(self._renderer.read(camera, one.shown_picture(), one.heat_ranges(), layers))
             for one, layers in zip(shown, self._prepare(shown, camera), strict=True)
         ]
         return splitting.joined(state.seeing.split, images)
-
-
-def _layers(state: ViewerState, marked: MarkedScene) -> Layers:
-    """What one picture shows beside colours, of the Gaussians that are drawn."""
-    return Layers(marked.layer(state.latent_rgb(), is_colour=True), marked.layer(state.relevancies()))

@@ -7,9 +7,11 @@ import moderngl
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.display.compose import Channels
 from langsplat_core.raster import Rasterizer
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer, GlView, Source
 from langsplat_core.scene import Camera, Scene
+from langsplat_core.stopwatch import lap
 from langsplat_viewer.channels import ArrayChannels, Channel, surface_depths
 from langsplat_viewer.looking import looking_settings
 from langsplat_viewer.seeing import UNCLIPPED, Clip
@@ -44,7 +46,7 @@ class GlSource:
     """Channels by the graphics pipeline."""
 
     def __init__(self, ctx: moderngl.Context, precision: Literal["half", "single"]) -> None:
-        self._rasterizer = GlRasterizer(ctx, precision)
+        self._ctx, self._rasterizer = ctx, GlRasterizer(ctx, precision)
         self._clip = UNCLIPPED
         self._uploads: dict[int, tuple[Array, moderngl.Texture]] = {}  # by the id of the array, which is held
 
@@ -74,7 +76,8 @@ class GlSource:
 
     def _upload(self, values: Array) -> moderngl.Texture:
         if id(values) not in self._uploads:
-            texture = self._rasterizer.scene(self._scene.gaussians).upload(values)
+            with lap("upload", self._ctx.finish):
+                texture = self._rasterizer.scene(self._scene.gaussians).upload(values)
             self._uploads[id(values)] = values, texture
         return self._uploads[id(values)][1]
 
@@ -110,9 +113,13 @@ class ArraySource:
 
     def render(self, camera: Camera, wanted: Sequence[Channel]) -> Textures:
         drawn = self._channels.render_all(self._scene, camera, wanted or [Channel()])
+        with lap("upload", self._ctx.finish):
+            return self._uploaded(drawn, len(wanted))
+
+    def _uploaded(self, drawn: Sequence[Channels], wanted: int) -> Textures:
         colours = self._upload(0, 4, drawn[0].rgb, drawn[0].alpha)
         textures = [colours]
-        for place, channels in enumerate(drawn[: len(wanted)], 1):
+        for place, channels in enumerate(drawn[:wanted], 1):
             image = channels.latent if channels.latent is not None else channels.relevancies
             if channels.depth_sum is not None:
                 textures.append(self._upload(place, 2, channels.depth_sum[..., None], channels.alpha))

@@ -108,7 +108,7 @@ SIDE_KEYS: tuple[tuple[Side, str], ...] = (
 )
 PANEL_TITLES = (
     *("Search", "Scene", "Display", "Camera", "Select", "Train"),
-    *("Record", "Bookmarks", "Messages", "Overlays"),
+    *("Record", "Bookmarks", "Messages", "Overlays", "Timing"),
 )
 MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
@@ -157,6 +157,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("compare two displays", actions.toggle_wipe, ("V",), "View"),
     Command("three levels side by side", actions.toggle_levels, menu="View"),
     *(_overlay(name, title) for name, title in OVERLAY_TITLES.items()),
+    Command("compare the picture with the reference", actions.compare_with_reference, menu="View"),
     Command("measure a distance", actions.toggle_measuring, ("M",), "View"),
     Command("return to the opening view", actions.reset_view, ("R", "Home"), "Camera"),
     Command("frame everything", actions.frame_scene, ("Shift+F",), "Camera"),

@@ -20,6 +20,7 @@ from langsplat_core.display.displays import DISPLAYS, NUMBERS, Extra
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.opengl.draw import drawing, set_uniforms, shader
 from langsplat_core.scene import Camera, Scene
+from langsplat_core.stopwatch import lap
 from langsplat_viewer.channel_textures import ArraySource, ChannelSource, GlSource, Textures
 from langsplat_viewer.channels import Channel, Layers, camera_key, depth_range
 from langsplat_viewer.looking import VISIBLE_ALPHA
@@ -145,7 +146,7 @@ class FrameRenderer:
         set_uniforms(self._program, self._uniforms(camera, picture, heat_ranges, channel.extra))
         for unit, texture in enumerate((self._textures[0], self._texture_of(channel), self._maps)):
             texture.use(unit)
-        with drawing(self._ctx, target, moderngl.NOTHING):
+        with lap("compose", self._ctx.finish), drawing(self._ctx, target, moderngl.NOTHING):
             self._vao.render(moderngl.TRIANGLES, vertices=3)
         target.use()
 

@@ -11,7 +11,9 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.formats.inria_layout import SH_C0
 from langsplat_core.scene import Scene
+from langsplat_viewer.channels import Layers
 from langsplat_viewer.selecting import Marks
+from langsplat_viewer.state import ViewerState
 
 TINT = np.array([1.0, 0.15, 0.85], np.float32)  # unlike the colours of queries, and rare in photographs
 STRENGTH = 0.6  # of the tint; the rest is the thing's own colour, so that its shape stays readable
@@ -51,6 +53,11 @@ def marked_scene(source: Scene, marks: Marks, before: MarkedScene | None = None)
     selected = marks.selected if rows is None else marks.selected[rows]
     scene = tinted(untinted, selected) if selected.any() else untinted
     return MarkedScene(source, marks, scene, rows, selected, untinted)
+
+
+def layers_of(state: ViewerState, marked: MarkedScene) -> Layers:
+    """What one picture shows beside colours, of the Gaussians that are drawn."""
+    return Layers(marked.layer(state.latent_rgb(), is_colour=True), marked.layer(state.relevancies()))
 
 
 def _shown(source: Scene, marks: Marks, before: MarkedScene | None) -> tuple[Array | None, Scene]:

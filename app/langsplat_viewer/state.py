@@ -23,6 +23,7 @@ from langsplat_viewer.preferences import Preferences
 from langsplat_viewer.recording import Recording
 from langsplat_viewer.seeing import Seeing
 from langsplat_viewer.selecting import Selection
+from langsplat_viewer.timing import Timing
 
 SLOTS = MAX_QUERIES  # queries shown at a time: one colour each
 MAX_MESSAGES = 50
@@ -138,6 +139,7 @@ class ViewerState:
     training_form: TrainingForm = field(default_factory=TrainingForm)
     path_typed: str = ""
     messages: list[Message] = field(default_factory=list)
+    timing: Timing = field(default_factory=Timing)
     stats: FrameStats = field(default_factory=FrameStats)
     backend: str = ""
     size: tuple[int, int] = (1, 1)  # pixels of the scene's area

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -125,6 +126,7 @@ class Window:
         self._screen: moderngl.Framebuffer | None = None
         self.unfinished = False  # a finer picture is due
         self.idles = True  # False for scripts that drive the window and count on its next frame
+        self._began = 0.0  # this frame, seconds
         self._frames = AWAKE_FRAMES  # to be drawn whatever happens
         self._last: tuple[object, ...] = ()  # what was there in the last frame
         self._titled: Path | None = None  # the scene that the window's title names
@@ -214,6 +216,7 @@ class Window:
             return
         if viewer.state.selection.may_close:
             hello_imgui.get_runner_params().app_shall_exit = True
+        self._began = time.perf_counter()
         actions.tick(viewer, imgui.get_time())
         actions.watch_training(viewer)
         actions.fetch_photograph(viewer)
@@ -261,6 +264,8 @@ class Window:
         actions.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))
         self._pace()
         canvas, state = self._canvas, viewer.state
+        if state.timing.wanted:
+            state.timing.add("panels", 1e3 * (time.perf_counter() - self._began))
         if canvas is None or self._screen is None or self.is_minimised():
             return
         try:
@@ -274,6 +279,7 @@ class Window:
         if self._photograph is not None:
             self._photograph.draw(viewer, area)
         over.draw(viewer, area)
+        state.timing.wanted = False  # the panel says so again, if it is still seen
 
     def _may_close(self) -> bool:
         """The window is asked to close."""

@@ -137,6 +137,32 @@ def cut_by_depth(s: Any) -> None:
     assert np.abs(s.shot("whole again") - before)[100:400, 400:].max() < 3
 
 
+def time_and_compare(s: Any) -> None:
+    """The panel tells medians while it is seen, and the error of what is shown."""
+    begin(s)
+    actions.open_panel(s.window.viewer, "Timing")
+    s.ctx.yield_(3)
+    for key in (imgui.Key["_2"], imgui.Key["_1"]):
+        s.ctx.key_press(key)
+        s.settle()
+    actions.ask(s.window.viewer, "mug")
+    s.settle()
+    told = dict(s.state.timing.medians())
+    assert {"Blend", "Picture, all of it", "Panels", "Search"} <= set(told)
+    s.ctx.item_click("//Timing/Compare with the reference")
+    s.wait(lambda: s.state.timing.comparison is not None)
+    assert s.state.timing.comparison.psnr > 40
+    s.shot("timing")
+    count = len(s.state.timing.laps["panels"])
+    assert count > 2
+    s.menu("Window", "Timing")
+    s.ctx.yield_(3)
+    drawn = len(s.state.timing.laps["blend"])
+    s.ctx.key_press(imgui.Key["_2"])
+    s.settle()
+    assert len(s.state.timing.laps["blend"]) == drawn
+
+
 def faces_on_screen(s: Any, side: Any) -> list[tuple[str, tuple[float, float]]]:
     """Name and middle of each face of the cube that is seen, in the window."""
     middle, scale = (
@@ -153,5 +179,6 @@ Scenario = tuple[Callable[[Any], None], str, dict[str, Any]]
 SCENARIOS: dict[str, Scenario] = {
     "split_the_view": (split_the_view, "blobs.ply", {}),
     "cut_by_depth": (cut_by_depth, "blobs.ply", {}),
+    "time_and_compare": (time_and_compare, "blobs.ply", {}),
     "draw_over_the_scene": (draw_over_the_scene, "blobs.ply", {}),
 }

@@ -171,6 +171,7 @@ from langsplat_viewer.actions.strokes import (
     extend_stroke,
     leave_tool,
 )
+from langsplat_viewer.actions.timing import compare_with_reference, measure_frame, stop_comparing
 from langsplat_viewer.actions.training import (
     choose_photographs,
     fill_in,
@@ -203,6 +204,7 @@ __all__ = [
     "clear_path",
     "close_browser",
     "compare_with",
+    "compare_with_reference",
     "copy_command",
     "delete_bookmark",
     "delete_keyframe",
@@ -242,6 +244,7 @@ __all__ = [
     "may_close",
     "measure",
     "measure_at",
+    "measure_frame",
     "move",
     "move_keyframe",
     "move_line",
@@ -311,6 +314,7 @@ __all__ = [
     "start_training",
     "stay",
     "step_camera",
+    "stop_comparing",
     "stop_training",
     "take_clipboard",
     "take_search_focus",

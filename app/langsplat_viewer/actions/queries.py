@@ -1,6 +1,7 @@
 """Searching: the box, the list of queries, their colours and their level."""
 
 from dataclasses import replace
+from time import perf_counter
 
 from langsplat_core.config import LevelChoice
 from langsplat_core.display.displays import DISPLAYS
@@ -96,12 +97,15 @@ def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
         return
     view = viewer.state.view
     viewpoint = None if view is None else view.camera(*viewer.state.size)
+    took: list[float] = []  # milliseconds
 
     def work(progress: Progress) -> tuple[ComposedResult, tuple[Instance, ...]] | UnknownWordError:
+        began = perf_counter()
         try:
             composed = run_phrase(engine, query.phrase, level, viewpoint, progress)
         except UnknownWordError as error:
             return error
+        took.append(1e3 * (perf_counter() - began))
         return composed, engine.instances(composed.answer, MOST_THINGS) if composed.answer.found else ()
 
     def done(answered: tuple[ComposedResult, tuple[Instance, ...]] | UnknownWordError) -> None:
@@ -110,6 +114,7 @@ def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
             failed(str(answered))
             return
         composed, query.things = answered
+        viewer.state.timing.add("search", took[0])
         query.automatic, query.problem, query.meant, query.pending = composed.answer, "", "", False
         query.result = composed.answer if query.cut is None else recut(composed.answer, query.cut)
         query.reading = "" if isinstance(composed.tree, Atom) else composed.reading

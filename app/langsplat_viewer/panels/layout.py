@@ -22,6 +22,7 @@ from langsplat_viewer.panels import (
     search,
     select,
     stroke,
+    timing,
     train,
     unsaved,
     view,
@@ -55,6 +56,7 @@ PANELS: tuple[Panel, ...] = (
     Panel("Bookmarks", LEFT, bookmarks.draw, is_open=False),
     Panel("Messages", FOOT, messages.draw),
     Panel("Overlays", MIDDLE, view.draw_overlays, is_open=False),
+    Panel("Timing", LEFT, timing.draw, is_open=False),
 )
 
 

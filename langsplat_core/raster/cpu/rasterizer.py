@@ -22,6 +22,7 @@ from langsplat_core.raster.cpu.tiles import bin_tiles, depth_order
 from langsplat_core.raster.cpu.walk import make_cutoffs
 from langsplat_core.raster.memory import check_picture
 from langsplat_core.scene import Camera, Gaussians
+from langsplat_core.stopwatch import lap
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +54,14 @@ class CpuView(TileOperator):
             plain(gaussians.sh).reshape(n, gaussians.sh.shape[1] * 3).view(np.uint32),
         )
         found = projection.Footprints(np.empty((n, projection.COLUMNS)), np.empty(n), np.empty(n, np.uint8))
-        workers.run(projection.project, n, self._rows, self._kernel_camera, found)
-        order = depth_order(found.status, found.depths.view(np.uint64))
-        self._geometry = _aligned((len(order), projection.COLUMNS))
-        np.take(found.geometry, order, axis=0, out=self._geometry, mode="clip")
-        self._depths = found.depths[order]
-        tiles = bin_tiles(self._geometry, camera.width, camera.height, workers)
+        with lap("projection"):
+            workers.run(projection.project, n, self._rows, self._kernel_camera, found)
+        with lap("sort"):
+            order = depth_order(found.status, found.depths.view(np.uint64))
+            self._geometry = _aligned((len(order), projection.COLUMNS))
+            np.take(found.geometry, order, axis=0, out=self._geometry, mode="clip")
+            self._depths = found.depths[order]
+            tiles = bin_tiles(self._geometry, camera.width, camera.height, workers)
         super().__init__(camera, n, order, tiles, workers)
         self.dropped = int(np.count_nonzero(found.status == projection.INVALID))
 
@@ -71,7 +74,8 @@ class CpuView(TileOperator):
         return radii
 
     def _splat_part(self, values: Array, image: Array, alpha: Array) -> None:
-        self._over_tiles(blend.splat, values, self._cutoffs, image, alpha)
+        with lap("blend"):
+            self._over_tiles(blend.splat, values, self._cutoffs, image, alpha)
 
     def _gather_part(self, image: Array, partial: Array) -> None:
         self._over_tiles(blend.gather, image, self._cutoffs, partial)

@@ -18,6 +18,7 @@ from langsplat_core.errors import BackendError
 from langsplat_core.raster.opengl.draw import Targets, drawing, set_uniforms, shader
 from langsplat_core.raster.opengl.scene_textures import HALF_MAX, SceneTextures, front_to_back
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
+from langsplat_core.stopwatch import lap
 
 MAX_TARGETS = 4  # colour attachments of one pass, three values each
 NOT_CURRENT = "its context is not current in this thread: render inside `with ctx:`"
@@ -76,9 +77,10 @@ class GlRasterizer:
         ):
             order = last.order
         else:
-            depths = scene.depths(camera)
-            ahead = np.flatnonzero((depths > settings.near) & (depths <= settings.far))
-            order = ahead[front_to_back(depths[ahead])][::-1].astype(np.int32)
+            with lap("sort"):
+                depths = scene.depths(camera)
+                ahead = np.flatnonzero((depths > settings.near) & (depths <= settings.far))
+                order = ahead[front_to_back(depths[ahead])][::-1].astype(np.int32)
         return GlView(self, gaussians, camera, settings, order)
 
     def scene(self, gaussians: Gaussians) -> SceneTextures:
@@ -105,7 +107,8 @@ class GlRasterizer:
         RGBA, premultiplied, row 0 on top. Depth comes last, as (sum of weight * camera z, alpha) in
         single precision. The images belong to the rasterizer and hold until its next `draw`.
         """
-        scene = self.project(view)
+        with lap("projection", self.ctx.finish):
+            scene = self.project(view)
         program = self._splat_program(len(sources), with_depth)
         targets = self._targets_for(view.camera, len(sources), with_depth)
         set_uniforms(
@@ -124,7 +127,7 @@ class GlRasterizer:
         for unit, texture in enumerate((scene.placement, scene.shape, *textures)):
             texture.use(unit)
         vao = self.ctx.vertex_array(program, [(scene.order, "1i/i", "gaussian")])
-        with drawing(self.ctx, targets.framebuffer, moderngl.BLEND):
+        with lap("blend", self.ctx.finish), drawing(self.ctx, targets.framebuffer, moderngl.BLEND):
             targets.framebuffer.clear()
             self.ctx.blend_equation = moderngl.FUNC_ADD, moderngl.FUNC_ADD
             self.ctx.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
