@@ -3,7 +3,6 @@
 A number's range is part of its field's type; `ranges.check_settings` refuses what lies outside.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -32,7 +31,7 @@ class RasterSettings:
     """
 
     near: Positive = 0.2  # Gaussians with camera z <= near are not drawn, world units
-    far: Annotated[float, Range(0.0, math.inf, above=True)] = math.inf  # nor those with camera z > far
+    far: Positive | None = None  # nor those with camera z > far; None: none is too far
     fov_clamp: Positive = 1.3  # Jacobian taken at most at this multiple of the half field of view
     dilation: NotNegative = 0.3  # added to both diagonal entries of the 2D covariance, px^2
     alpha_max: Share = 0.99  # cap of one Gaussian's alpha

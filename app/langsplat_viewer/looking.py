@@ -1,5 +1,6 @@
 """Image formation for looking round: what training would clip is shown, a picture of nothing explained."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -48,7 +49,7 @@ def looking_settings(scene: Scene, camera: Camera, clip: Clip = UNCLIPPED) -> Ra
     """The scene's own image formation, with the near plane of `near_plane`, and what `clip` cuts away."""
     settings = scene.raster_settings()
     near = near_plane(scene.gaussians, camera, settings.near)
-    return replace(settings, near=max(near, clip.near), far=clip.far)
+    return replace(settings, near=max(near, clip.near), far=None if math.isinf(clip.far) else clip.far)
 
 
 def why_undrawable(gaussians: Gaussians) -> str:

@@ -17,6 +17,7 @@ from torch import Tensor
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
+from langsplat_core.raster.protocol import farthest
 from langsplat_core.scene import Camera, Gaussians, look_at
 
 FARTHEST = 1e10  # world units: where gsplat's far plane is when it is not told
@@ -89,7 +90,7 @@ def draw(
         width=camera.width,
         height=camera.height,
         near_plane=settings.near,
-        far_plane=min(settings.far, FARTHEST),
+        far_plane=min(farthest(settings), FARTHEST),
         eps2d=settings.dilation,
         sh_degree=sh_degree,
         packed=False,

@@ -4,7 +4,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster.protocol import LiftingRasterizer
+from langsplat_core.raster.protocol import LiftingRasterizer, farthest
 from langsplat_core.scene import Camera, Gaussians
 
 
@@ -53,7 +53,9 @@ def _may_reach(
             np.abs(camera.fx * x + np.float32(camera.cx - pixel[0] - 0.5)),
             np.abs(camera.fy * y + np.float32(camera.cy - pixel[1] - 0.5)),
         )
-        inside: Array = (z > 0.999 * settings.near) & (z < 1.001 * settings.far) & ~(away > 1.01 * reach)
+        inside: Array = (
+            (z > 0.999 * settings.near) & (z < 1.001 * farthest(settings)) & ~(away > 1.01 * reach)
+        )
     return inside
 
 

@@ -5,6 +5,7 @@ blending weights alpha_i T_i of the view. A backend projects a view once and the
 (``W x``) and, where it can lift, `gather` (``W^T y``, the exact adjoint).
 """
 
+import math
 from typing import Protocol, runtime_checkable
 
 from scipy import sparse
@@ -12,6 +13,11 @@ from scipy import sparse
 from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.scene import Camera, Gaussians
+
+
+def farthest(settings: RasterSettings) -> float:
+    """The largest camera z at which Gaussians are drawn, world units."""
+    return math.inf if settings.far is None else settings.far
 
 
 class View(Protocol):

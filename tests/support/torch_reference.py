@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from langsplat_core.config import INRIA, RasterSettings
+from langsplat_core.raster.protocol import farthest
 from langsplat_core.scene import Camera, Gaussians
 
 
@@ -72,7 +73,7 @@ def render(
     transmittance = torch.ones(len(pixels), dtype=torch.float64)
     running = torch.ones(len(pixels), dtype=torch.bool)
     for n in torch.argsort(depth.detach(), stable=True).tolist():
-        if not settings.near < depth[n] <= settings.far:
+        if not settings.near < depth[n] <= farthest(settings):
             continue
         offset = pixels - means_px[n]
         power = -0.5 * (offset @ torch.linalg.inv(covariance[n]) * offset).sum(1)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.config import PictureConfig
+from langsplat_core.raster.protocol import farthest
 from langsplat_core.scene import look_at
 from langsplat_viewer import actions
 from langsplat_viewer.actions.filming import subject_of
@@ -56,7 +57,7 @@ def test_the_near_cut_never_comes_nearer_than_the_near_plane_and_the_far_one_is_
     plain = looking_settings(scene, SIDE)
     assert looking_settings(scene, SIDE, Clip(0.01, 7.0)) == replace(plain, far=7.0)
     assert looking_settings(scene, SIDE, Clip(3.0)) == replace(plain, near=3.0)
-    assert plain.far == math.inf
+    assert (plain.far, farthest(plain)) == (None, math.inf)
 
 
 def test_the_scale_of_depth_is_that_of_what_is_left():

@@ -19,6 +19,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import helper, kernel
 from langsplat_core.config import RasterSettings
+from langsplat_core.raster.protocol import farthest
 from langsplat_core.scene import Camera
 from langsplat_core.scene.gaussians import LARGEST_COEFFICIENT
 
@@ -93,7 +94,7 @@ def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
         top=camera.cy / camera.fy + margin_y,
         bottom=(camera.height - camera.cy) / camera.fy + margin_y,
         near=float(settings.near),
-        far=float(settings.far),
+        far=float(farthest(settings)),
         dilation=float(settings.dilation),
         alpha_min=float(settings.alpha_min),
         antialiased=bool(settings.antialiased),

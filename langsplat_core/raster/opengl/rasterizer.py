@@ -17,6 +17,7 @@ from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.raster.opengl.draw import Targets, drawing, set_uniforms, shader
 from langsplat_core.raster.opengl.scene_textures import HALF_MAX, SceneTextures, front_to_back
+from langsplat_core.raster.protocol import farthest
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 from langsplat_core.stopwatch import lap
 
@@ -72,14 +73,14 @@ class GlRasterizer:
         if (
             last is not None
             and last.gaussians is gaussians
-            and (last.settings.near, last.settings.far) == (settings.near, settings.far)
+            and (last.settings.near, farthest(last.settings)) == (settings.near, farthest(settings))
             and np.array_equal(last.camera.world_to_camera[2], camera.world_to_camera[2])
         ):
             order = last.order
         else:
             with lap("sort"):
                 depths = scene.depths(camera)
-                ahead = np.flatnonzero((depths > settings.near) & (depths <= settings.far))
+                ahead = np.flatnonzero((depths > settings.near) & (depths <= farthest(settings)))
                 order = ahead[front_to_back(depths[ahead])][::-1].astype(np.int32)
         return GlView(self, gaussians, camera, settings, order)
 
