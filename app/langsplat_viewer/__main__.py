@@ -1,5 +1,6 @@
 """`langsplat-viewer`: arguments -> window, or a picture or film without a window."""
 
+import math
 import sys
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from langsplat_core.cli.run import main
-from langsplat_core.config import ColourMap, LevelChoice, PictureConfig, Share
+from langsplat_core.config import ColourMap, LevelChoice, NotNegative, PictureConfig, Positive, Share
 from langsplat_core.display.colour_maps import MAX_QUERIES
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, TerminalProgress, silent
@@ -24,9 +25,11 @@ from langsplat_viewer.options import (
     services,
 )
 from langsplat_viewer.preferences import preferences_folder
+from langsplat_viewer.seeing import Clip
 
 Seconds = Annotated[float, Range(0.1, 36_000.0)]
 PicturesPerSecond = Annotated[float, Range(0.1, 240.0)]
+Cuts = tuple[Share, ...]
 Colours = tuple[Annotated[int, Range(1, MAX_QUERIES)], ...]
 
 
@@ -44,6 +47,15 @@ class ViewerCommand:
     """What is shown; auto is relevancy with a query, else rgb."""
     colour: Annotated[tyro.conf.UseAppendAction[Colours], tyro.conf.arg(metavar="N")] = ()
     """Without a window: colour of a query, 1 to 3; repeat it for each --query (default: in their order)."""
+    cut: Annotated[tyro.conf.UseAppendAction[Cuts], tyro.conf.arg(metavar="RELEVANCY")] = ()
+    """Without a window: relevancy from 0 to 1 at which an answer ends, 0 where it ends by itself; repeat it
+    for each --query."""
+    canonical: Annotated[str, tyro.conf.arg(metavar="PHRASES")] = ""
+    """Without a window: what everything is compared with, phrases between commas (default: the scene's)."""
+    near_cut: NotNegative = 0.0
+    """Without a window: depth up to which nothing is drawn, world units."""
+    far_cut: Positive | None = None
+    """Without a window: depth beyond which nothing is drawn, world units (default: everything is)."""
     heat_opacity: Share = PictureConfig.heat_opacity
     """How much of the heat map covers the colours where relevancy is high."""
     dim: Share = PictureConfig.dim
@@ -112,6 +124,9 @@ class ViewerCommand:
             backend=self.backend,
             colour_map=self.colour_map or "turbo",
             transparent=self.transparent,
+            cuts=self.cut,
+            canonical=self.canonical,
+            clip=Clip(self.near_cut, math.inf if self.far_cut is None else self.far_cut),
         )
         bars: AbstractContextManager[Progress] = nullcontext(silent)
         if sys.stderr.isatty():
@@ -127,10 +142,17 @@ class ViewerCommand:
     def _window(self, path: Path, size: tuple[int, int] | None) -> None:
         if self.out is not None:
             raise InputError("--out is for pictures without a window; add --headless")
-        for option, given in (("--colour-map", self.colour_map), ("--transparent", self.transparent)):
+        for option, given, panel in (
+            ("--colour-map", self.colour_map, "Display"),
+            ("--transparent", self.transparent, "Display"),
+            ("--cut", self.cut, "Search"),
+            ("--canonical", self.canonical, "Search"),
+            ("--near-cut", self.near_cut, "Camera"),
+            ("--far-cut", self.far_cut, "Camera"),
+        ):
             if given:
                 raise InputError(
-                    f"{option} is for pictures without a window; choose it in the panel Display, "
+                    f"{option} is for pictures without a window; choose it in the panel {panel}, "
                     "or add --headless"
                 )
         if self.turntable is not None:

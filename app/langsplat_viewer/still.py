@@ -16,8 +16,9 @@ from langsplat_core.errors import BackendError, InputError
 from langsplat_core.files import check_output_file
 from langsplat_core.formats.language import SUFFIX
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.answers import QueryResult, recut
 from langsplat_core.query.compose import check_phrase, run_phrase
+from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.phrases import split_phrases
 from langsplat_viewer import painting
@@ -28,6 +29,7 @@ from langsplat_viewer.headless import Subject, draw_something, painter
 from langsplat_viewer.looking import why_undrawable
 from langsplat_viewer.options import check_display, chosen_camera, latent_level, say_compiling
 from langsplat_viewer.saving import save_png
+from langsplat_viewer.seeing import UNCLIPPED, Clip
 from langsplat_viewer.state import SLOTS
 from langsplat_viewer.viewer import Services
 
@@ -52,6 +54,11 @@ class StillRequest:
     backend: Backend = "auto"
     colour_map: ColourMap = "turbo"
     transparent: bool = False
+    cuts: tuple[
+        float, ...
+    ] = ()  # relevancies at which the answers end, 0: by itself; none: all by themselves
+    canonical: str = ""  # phrases between commas; empty: the scene's own
+    clip: Clip = UNCLIPPED
 
 
 def check_out(out: Path | None) -> Path:
@@ -107,11 +114,26 @@ def prepare(request: StillRequest, services: Services, progress: Progress = sile
     engine = services.engine(scene)
     phrases = [phrase for text in request.queries for phrase in split_phrases(text) or [text]]
     check_colours(request.colours, len(phrases))
+    if request.cuts and len(request.cuts) != len(phrases):
+        raise InputError(f"--cut {request.cuts[0]:g}: give each --query a cut, 0 for its own, or none any")
+    if request.canonical:
+        _compare_with(engine, request.canonical, progress)
     for phrase in phrases:  # before anything slow is done
         check_phrase(engine, phrase, camera, progress)
     results = tuple(run_phrase(engine, phrase, request.level, camera, progress).answer for phrase in phrases)
+    if request.cuts:
+        pairs = zip(results, request.cuts, strict=True)
+        results = tuple(recut(result, cut) if cut > 0 else result for result, cut in pairs)
     subject = _subject(scene, request, slots(results, request.colours))
     return Prepared(subject, camera, results, tuple(describe(result) for result in results))
+
+
+def _compare_with(engine: QueryEngine, text: str, progress: Progress) -> None:
+    """Take other canonical phrases."""
+    phrases = split_phrases(text)
+    if engine.scene.language is None or not phrases:
+        raise InputError(f"--canonical {text}: needs a phrase, and a scene with a language field")
+    engine.compare_with(phrases, progress)
 
 
 def check_colours(colours: tuple[int, ...], count: int) -> None:
@@ -143,6 +165,7 @@ def _subject(scene: Scene, request: StillRequest, shown: painting.Shown) -> Subj
         painting.fitted(picture, shown),
         Layers(_latent(scene, request), relevancies),
         painting.heat_ranges(shown, request.display),
+        request.clip,
     )
 
 

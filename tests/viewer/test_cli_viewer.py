@@ -122,11 +122,50 @@ def test_a_transparent_picture_in_another_colour_map(viewer, folder):
     assert np.abs(clear[..., :3][inside] - plain[inside]).max() > 60
 
 
-@pytest.mark.parametrize("option", [("--transparent",), ("--colour-map", "grey")])
-def test_options_of_pictures_say_where_the_window_has_them(viewer, folder, option):
+@pytest.mark.parametrize(
+    ("option", "panel"),
+    [
+        (("--transparent",), "Display"),
+        (("--colour-map", "grey"), "Display"),
+        (("--cut", "0.6"), "Search"),
+        (("--canonical", "book"), "Search"),
+        (("--near-cut", "1"), "Camera"),
+        (("--far-cut", "1"), "Camera"),
+    ],
+)
+def test_options_of_pictures_say_where_the_window_has_them(viewer, folder, option, panel):
     code, _, errors = viewer("blobs.ply", *option)
     assert code == 2
-    assert "panel Display" in errors[0]
+    assert f"panel {panel}" in errors[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--query", "mug", "--query", "book", "--cut", "0.6"), "--cut 0.6: give each --query a cut"),
+        (("--query", "mug", "--cut", "1.5"), "--cut 1.5: must be 0 to 1"),
+        (("--query", "mug", "--canonical", ", "), "--canonical"),
+        (("--query", "mug", "--canonical", "sofa"), "sofa"),
+        (("--near-cut", "-1"), "--near-cut -1: must be 0"),
+        (("--far-cut", "0"), "--far-cut 0: must be above 0"),
+        (("--near-cut", "30"), "nothing of the scene"),
+    ],
+)
+def test_cuts_and_canonical_phrases_that_cannot_be_are_one_line(viewer, folder, options, said):
+    code, _, errors = viewer("blobs.ply", "--headless", "--out", "a.png", *options)
+    assert (code, len(errors)) == (2, 1)
+    assert said in errors[0]
+    assert not (folder / "a.png").exists()
+
+
+def test_a_cut_of_zero_is_the_answers_own(viewer, folder):
+    asked = ("blobs.ply", "--headless", "--display", "segmentation", "--query", "mug", "--query", "plant")
+    for out, cuts in (("a.png", ()), ("b.png", ("0", "0")), ("c.png", ("0", "0.2"))):
+        words = [word for cut in cuts for word in ("--cut", cut)]
+        assert viewer(*asked, "--out", out, *words)[0] == 0
+    own, zero, cut = (picture(folder / name) for name in ("a.png", "b.png", "c.png"))
+    assert (own == zero).all()
+    assert np.abs(own - cut).max() > 30
 
 
 def test_a_size_holds_the_whole_photograph(viewer, folder):

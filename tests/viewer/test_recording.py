@@ -18,6 +18,7 @@ from langsplat_viewer.actions.filming import subject_of
 from langsplat_viewer.controls import orbit, zoom
 from langsplat_viewer.flight_files import read_flight
 from langsplat_viewer.headless import Subject, draw_something, painter
+from langsplat_viewer.seeing import Clip, Splats
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import FakeEncoder, blob_scene
 from tests.support.windowless import arrive, errors, settle
@@ -236,7 +237,30 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     return go
 
 
-@pytest.mark.parametrize("case", ["training camera", "elsewhere", "queries", "colours", "latent", "sliders"])
+def see_depth(viewer) -> None:
+    actions.set_display(viewer, "depth")
+    actions.set_colour_map(viewer, "viridis")
+
+
+def cut_by_hand(viewer) -> None:
+    actions.set_display(viewer, "segmentation")
+    query = viewer.state.queries[1]
+    actions.set_cut(viewer, query, float(np.median(query.automatic.even[query.automatic.members])))
+
+
+QUERIES = ("queries", "colours", "sliders", "cuts", "canonical")
+SLIDERS = PictureConfig(display="relevancy", heat_opacity=0.3, dim=0.9)
+LOOKS = {
+    "colours": lambda viewer: actions.hide(viewer, viewer.state.queries[0]),
+    "sliders": lambda viewer: actions.set_picture(viewer, SLIDERS),
+    "cuts": cut_by_hand,
+    "depth": see_depth,
+    "clip": lambda viewer: actions.set_clip(viewer, Clip(4.4, 5.1)),
+    "latent": lambda viewer: actions.set_display(viewer, "latent", 1),
+}
+
+
+@pytest.mark.parametrize("case", ["training camera", "elsewhere", *QUERIES, "latent", "depth", "clip"])
 def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run, case):
     where = folder / "with a space"
     where.mkdir()
@@ -245,16 +269,13 @@ def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run
     actions.resize(opened, 200, 130)
     if case != "training camera":
         turn(opened, 0.2)
-    if case in ("queries", "colours", "sliders"):
+    if case == "canonical":
+        actions.set_canonical(opened, "book, plant")
+    if case in QUERIES:
         for word in ("mug", "plant", "book"):
             actions.ask(opened, word)
         settle(opened)
-    if case == "colours":
-        actions.hide(opened, opened.state.queries[0])
-    if case == "sliders":
-        actions.set_picture(opened, PictureConfig(display="relevancy", heat_opacity=0.3, dim=0.9))
-    if case == "latent":
-        actions.set_display(opened, "latent", 1)
+    LOOKS.get(case, lambda viewer: None)(opened)
     command = actions.copy_command(opened, folder)
     assert actions.take_clipboard(opened) == command
     assert actions.take_clipboard(opened) == ""
@@ -265,3 +286,14 @@ def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run
         expected = draw_something(subject_of(opened.state), opened.state.view.camera(200, 130), paint)
     assert_allclose(run(command), expected.astype(int), atol=2)
     assert expected.std() > 5
+    assert errors(opened) == []
+
+
+def test_what_the_command_cannot_say_is_said(opened, folder):
+    actions.set_splats(opened, Splats(0.5))
+    actions.toggle_wipe(opened)
+    actions.copy_command(opened, folder)
+    (said,) = errors(opened)
+    assert "the size of splats" in said
+    assert "the picture beside it" in said
+    assert "backdrop" not in said

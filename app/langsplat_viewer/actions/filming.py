@@ -1,5 +1,6 @@
 """Films and pictures of any size, drawn by the CPU on a thread of their own; pictures as commands."""
 
+import math
 import os
 import shlex
 import subprocess
@@ -23,6 +24,7 @@ from langsplat_viewer.headless import Subject, draw_something, painter
 from langsplat_viewer.options import MAX_SIDE, say_compiling
 from langsplat_viewer.recording import flight_of
 from langsplat_viewer.saving import free_name, save_png, save_view
+from langsplat_viewer.seeing import Splats
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Viewer
 
@@ -135,7 +137,7 @@ def copy_command(viewer: Viewer, folder: Path) -> str:
             return ""
         camera = str(saved.absolute())
     words = ["langsplat-viewer", str(state.path.absolute()), "--headless", "--camera", camera]
-    words += ["--size", "{}x{}".format(*state.size), *_display_words(state)]
+    words += ["--size", "{}x{}".format(*state.size), *_display_words(state), *_look_words(state)]
     if viewer.services.encoder_id:
         words += ["--encoder", viewer.services.encoder_id]
     words += ["--out", f"{state.path.stem}.png"]
@@ -183,6 +185,31 @@ def _display_words(state: ViewerState) -> list[str]:
     ):
         if value != usual:
             words += [option, repr(value)]
-    if state.canonical or any(query.cut is not None for _, query in shown):
-        state.say("the command asks with the scene's own cut and canonical phrases", is_error=True)
+    if any(query.cut is not None for _, query in shown):
+        words += [word for _, query in shown for word in ("--cut", repr(float(query.cut or 0.0)))]
+    if state.canonical:
+        words += ["--canonical", ", ".join(state.canonical)]
+    return words
+
+
+def _look_words(state: ViewerState) -> list[str]:
+    """How it is shown, as options; what has none is said."""
+    clip, picture = state.seeing.clip, state.picture
+    words = []
+    if picture.colour_map != PictureConfig.colour_map:
+        words += ["--colour-map", picture.colour_map]
+    if clip.near > 0:
+        words += ["--near-cut", repr(clip.near)]
+    if not math.isinf(clip.far):
+        words += ["--far-cut", repr(clip.far)]
+    marks = state.selection.marks
+    left_out = {
+        "what is hidden or selected": not marks.shown.all() or bool(marks.selected.any()),
+        "the size of splats and their SH degree": state.seeing.splats != Splats(),
+        "the backdrop": picture.background != PictureConfig.background,
+        "the picture beside it": state.seeing.split.mode != "off",
+    }
+    names = ", ".join(name for name, is_there in left_out.items() if is_there)
+    if names:
+        state.say(f"no option of the command says {names}: it draws without", is_error=True)
     return words
