@@ -41,6 +41,11 @@ def list_folder(folder: Path) -> Listing:
     return Listing(folder, tuple(entries[:MOST]), max(len(entries) - MOST, 0))
 
 
+def is_scene(path: Path) -> bool:
+    """Whether a file or folder is named as scenes are."""
+    return path.suffix.lower() in SCENE_SUFFIXES or path.name == META_NAME or (path / META_NAME).is_file()
+
+
 def _entry(path: Path) -> Entry | None:
     if path.name.startswith("."):
         return None

@@ -115,6 +115,12 @@ MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 COMMANDS: tuple[Command, ...] = (
     Command("open a scene", actions.ask_for_file, ("Ctrl+O",), "File"),
     Command("reload the scene", actions.reload, ("F5",), "File"),
+    Command(
+        "next scene of the list", lambda viewer: actions.step_scene(viewer, 1), ("Ctrl+PageDown",), "File"
+    ),
+    Command(
+        "previous scene of the list", lambda viewer: actions.step_scene(viewer, -1), ("Ctrl+PageUp",), "File"
+    ),
     Command("train a scene", lambda viewer: actions.open_panel(viewer, "Train"), menu="File"),
     Command(
         "save a picture", lambda viewer: saving.save_picture(viewer, Path.cwd()), ("Ctrl+S", "P"), "File"

@@ -102,6 +102,7 @@ class ViewerState:
 
     scene: Scene | None = None
     path: Path | None = None
+    scenes: tuple[Path, ...] = ()  # to switch between, absolute
     opening: Path | None = None  # the file being read, until it is open or has failed
     extent: Extent | None = None  # there whenever a scene is
     latent: Array | None = None  # (3, N, 3) latent colours per level, None without a language field

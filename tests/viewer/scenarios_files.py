@@ -132,6 +132,35 @@ def fade_in_a_photograph(s: Any) -> None:
     assert actions.photograph_here(s.state) is None
 
 
+def switch_between_scenes(s: Any) -> None:
+    """Dropped together; the list in the panel shows one after the other, as it was left."""
+    s.wait(lambda: s.state.scene is not None)
+    s.settle()
+    s.window.drop([str(s.folder / name) for name in ("blobs.ply", "plain.ply")])
+    s.ctx.yield_(2)
+    s.settle()
+    assert [path.name for path in s.state.scenes] == ["blobs.ply", "plain.ply"]
+    s.drag((600, 300), (656, 279))
+    s.settle()
+    view = s.state.view
+    s.shot("listed")
+    s.ctx.item_click("//**/plain.ply##scene")
+    s.wait(lambda: s.state.path.name == "plain.ply")
+    s.settle()
+    assert s.state.view is not view
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.page_up)
+    s.wait(lambda: s.state.path.name == "blobs.ply")
+    s.settle()
+    assert s.state.view is view
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.o)
+    s.ctx.yield_(4)
+    s.shot("all of them")
+    s.ctx.item_click("//**/Open all scenes here")
+    s.ctx.yield_(3)
+    s.settle()
+    assert s.state.path.name == "blobs.ply"
+
+
 def digit_key(digit: int) -> imgui.Key:
     return imgui.Key[f"_{digit}"]
 
@@ -140,5 +169,6 @@ Scenario = tuple[Callable[[Any], None], str, dict[str, Any]]
 SCENARIOS: dict[str, Scenario] = {
     "reload_what_changed": (reload_what_changed, "blobs.ply", {}),
     "fade_in_a_photograph": (fade_in_a_photograph, "blobs.ply", {}),
+    "switch_between_scenes": (switch_between_scenes, "blobs.ply", {}),
     "change_a_key": (change_a_key, "blobs.ply", {}),
 }

@@ -10,9 +10,10 @@ from langsplat_core.pipeline.forecast import count_photographs
 from langsplat_viewer.actions.asking import load_queries
 from langsplat_viewer.actions.opening import open_scene
 from langsplat_viewer.actions.recording import load_path
+from langsplat_viewer.actions.scenes import add_scenes, open_scenes
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.actions.training import choose_photographs
-from langsplat_viewer.browsing import SCENE_SUFFIXES, Entry, list_folder
+from langsplat_viewer.browsing import Entry, is_scene, list_folder
 from langsplat_viewer.flight_files import SUFFIX as PATHS
 from langsplat_viewer.querysets import SUFFIX as QUERIES
 from langsplat_viewer.viewer import Viewer
@@ -58,9 +59,9 @@ def open_file(viewer: Viewer, path: Path) -> None:
 
 
 def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
-    """Open the first scene among files that were dropped onto the window, ask the queries among them, and say
-    what became of the others: one scene is shown at a time, and what belongs to it lies beside it. A folder
-    of photographs is offered for training."""
+    """Open the first scene among files that were dropped onto the window, list the others, ask the queries
+    among them, and say what is none of these; what belongs to a scene lies beside it. A folder of photographs
+    is offered for training."""
     if len(paths) == 1 and _is_plain_folder(paths[0]) and count_photographs(paths[0])[0]:
         choose_photographs(viewer, paths[0])
         open_panel(viewer, "Train")
@@ -71,13 +72,27 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
     if not scenes:
         _ask_sets(viewer, sets)
         return
-    first = next((path for path in scenes if path.suffix.lower() in SCENE_SUFFIXES), scenes[0])
-    others = [path.name for path in scenes if path != first]
+    known = [path for path in scenes if is_scene(path)] or scenes[:1]
+    others = [path.name for path in scenes if path not in known]
     if others:
         more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
-        names = ", ".join(others[:NAMED]) + more
-        viewer.state.say(f"one scene at a time: {first.name} is opened, not {names}", is_error=True)
+        viewer.state.say(f"not opened: {', '.join(others[:NAMED])}{more}", is_error=True)
+    add_scenes(viewer, known)
+    if len(known) > 1:
+        viewer.state.say(f"{len(known)} scenes: the panel Scene lists them")
+        open_panel(viewer, "Scene")
+    first = known[0]
     open_scene(viewer, first, lambda viewer: _ask_sets(viewer, sets))
+
+
+def open_all(viewer: Viewer) -> None:
+    """List the scenes of the folder that the browser shows, and open the first."""
+    listing = viewer.state.browser
+    if listing is not None:
+        open_scenes(
+            viewer, [entry.path for entry in listing.entries if entry.is_file and is_scene(entry.path)]
+        )
+        open_panel(viewer, "Scene")
 
 
 def _ask_sets(viewer: Viewer, sets: Sequence[Path]) -> None:

@@ -96,8 +96,10 @@ def cancel(viewer: Viewer) -> None:
 def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state, scene = viewer.state, opened.scene
     if state.path is not None:
-        viewer.visits[state.path] = visit_of(state)
+        viewer.visits[state.path.absolute()] = visit_of(state)
     state.opening, state.path = None, path
+    if path.absolute() not in state.scenes:
+        state.scenes = (*state.scenes, path.absolute())
     viewer.watch.begin(opened.read)
     state.scene, state.extent, state.latent = scene, opened.extent, opened.latent
     state.queries, state.selected, state.glide = [], None, None

@@ -54,7 +54,7 @@ def reload(viewer: Viewer) -> None:
         if new:  # half written, or not written yet
             raise InputError(f"not read again, the scene stays as it was: {new[0]}")
 
-    open_scene(viewer, path, lambda viewer: return_to(viewer, viewer.visits[path]), check)
+    open_scene(viewer, path, lambda viewer: return_to(viewer, viewer.visits[path.absolute()]), check)
 
 
 def keep_old(viewer: Viewer) -> None:

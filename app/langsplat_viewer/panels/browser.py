@@ -5,7 +5,7 @@ from pathlib import Path
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.browsing import Entry, Listing
+from langsplat_viewer.browsing import Entry, Listing, is_scene
 from langsplat_viewer.panels.style import bad, muted, small_wrapped
 from langsplat_viewer.viewer import Viewer
 
@@ -30,13 +30,26 @@ def draw(viewer: Viewer) -> None:
         _box(viewer)
         _above(viewer, listing.folder)
         _list(viewer, listing)
-        if viewer.state.picks_folder and imgui.button("Take this folder"):
-            actions.choose_photograph_folder(viewer, listing.folder)
+        _foot(viewer, listing)
     if not stays or imgui.is_key_pressed(imgui.Key.escape):
         actions.close_browser(viewer)
     if viewer.state.browser is None:
         imgui.close_current_popup()
     imgui.end_popup()
+
+
+def _foot(viewer: Viewer, listing: Listing) -> None:
+    """What can be done with the whole folder."""
+    if viewer.state.picks_folder:
+        if imgui.button("Take this folder"):
+            actions.choose_photograph_folder(viewer, listing.folder)
+    elif has_several(listing) and imgui.button("Open all scenes here"):
+        actions.open_all(viewer)
+
+
+def has_several(listing: Listing) -> bool:
+    """Whether there is more than one scene to open."""
+    return sum(entry.is_file and is_scene(entry.path) for entry in listing.entries) > 1
 
 
 def _box(viewer: Viewer) -> None:
@@ -70,9 +83,10 @@ def _above(viewer: Viewer, folder: Path) -> None:
 def _list(viewer: Viewer, listing: Listing) -> None:
     picks = viewer.state.picks_folder
     recent = () if picks else viewer.state.preferences.recent
-    below = -(min(len(recent), 4) + 1) * imgui.get_text_line_height_with_spacing() - 8 if recent else 0.0
-    below = -imgui.get_frame_height_with_spacing() if picks else below
-    if imgui.begin_child("entries", ImVec2(0, below), imgui.ChildFlags_.borders):
+    lines = min(len(recent), 4) + 1 if recent else 0
+    below = lines * imgui.get_text_line_height_with_spacing() + 8 * bool(recent)
+    below += imgui.get_frame_height_with_spacing() * (picks or has_several(listing))
+    if imgui.begin_child("entries", ImVec2(0, -below), imgui.ChildFlags_.borders):
         if listing.problem:
             small_wrapped(listing.problem, bad())
         elif not listing.entries:
@@ -84,7 +98,8 @@ def _list(viewer: Viewer, listing: Listing) -> None:
     imgui.end_child()
     if recent:
         imgui.text_colored(muted(), "Recent")
-        if imgui.begin_child("recent"):
+        foot = imgui.get_frame_height_with_spacing() * has_several(listing)
+        if imgui.begin_child("recent", ImVec2(0, -foot)):
             for path in recent:
                 if imgui.selectable(f"{path}##recent", False)[0]:
                     actions.open_recent(viewer, path)

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from imgui_bundle import imgui
+from imgui_bundle import ImVec2, imgui
 
 from langsplat_viewer import actions, saving
-from langsplat_viewer.panels.style import muted, small_wrapped
+from langsplat_viewer.panels.style import elided, muted, small_wrapped, tip
 from langsplat_viewer.viewer import Viewer
 
 DIALOG_PROGRAMS = ("zenity", "kdialog", "matedialog", "qarma")  # one of them draws the dialog on Linux
@@ -30,6 +30,33 @@ def draw(viewer: Viewer) -> None:
     imgui.same_line()
     if imgui.button("Keys"):
         actions.toggle_help(viewer)
+    if len(state.scenes) > 1:
+        _list(viewer)
+
+
+def _list(viewer: Viewer) -> None:
+    """The scenes to switch between; the folder is named too where two have one name."""
+    state, side = viewer.state, imgui.get_frame_height()
+    imgui.separator_text("Scenes")
+    if imgui.begin_child("scenes"):
+        shown = None if state.path is None else (state.opening or state.path).absolute()
+        names = [path.name for path in state.scenes]
+        for number, path in enumerate(state.scenes):
+            imgui.push_id(number)
+            room = imgui.get_content_region_avail().x - side - imgui.get_style().item_spacing.x
+            name = path.name if names.count(path.name) == 1 else f"{path.parent.name}/{path.name}"
+            name = elided(name, room, lambda text: imgui.calc_text_size(text).x)
+            imgui.align_text_to_frame_padding()
+            if imgui.selectable(f"{name}##scene", path == shown, size=ImVec2(room, 0))[0]:
+                actions.switch_scene(viewer, path)
+            tip(str(path))
+            imgui.same_line(room + imgui.get_style().item_spacing.x)
+            imgui.begin_disabled(path == shown)
+            if imgui.button("x", ImVec2(side, 0)):
+                actions.unlist_scene(viewer, path)
+            imgui.end_disabled()
+            imgui.pop_id()
+    imgui.end_child()
 
 
 def _figures(viewer: Viewer) -> str:

@@ -1,0 +1,152 @@
+"""Several scenes to switch between, without a window."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from langsplat_viewer import actions
+from langsplat_viewer.actions.scenes import MOST
+from langsplat_viewer.browsing import list_folder
+from langsplat_viewer.panels.browser import has_several
+from langsplat_viewer.seeing import UNCLIPPED, Clip
+from tests.support.windowless import SCENES, arrive, errors, settle
+
+BLOBS, PLAIN, BARE = (Path(f"{name}.ply").absolute() for name in ("blobs", "plain", "bare"))
+
+
+@pytest.fixture
+def three(viewer):
+    """Three scenes were dropped; the first is shown."""
+    actions.open_dropped(viewer, [Path("blobs.ply"), Path("plain.ply"), Path("bare.ply")])
+    settle(viewer)
+    return viewer
+
+
+def switch(viewer, path: Path) -> None:
+    actions.switch_scene(viewer, path)
+    settle(viewer)
+
+
+def test_of_several_the_first_is_opened_and_all_are_listed(three):
+    assert three.state.scene is SCENES["blobs.ply"]
+    assert three.state.scenes == (BLOBS, PLAIN, BARE)
+    assert errors(three) == []
+    assert actions.take_wanted_panel(three) == "Scene"
+
+
+def test_camera_and_queries_of_each_are_found_again(three):
+    for word in ("mug", "book"):
+        actions.ask(three, word)
+    settle(three)
+    actions.set_canonical(three, "plant")
+    settle(three)
+    mug, book = three.state.queries
+    actions.hide(three, mug)
+    actions.set_cut(three, book, 0.7)
+    actions.go_to_camera(three, 2)
+    arrive(three)
+    actions.set_clip(three, Clip(1.0, 9.0))
+    actions.add_keyframe(three)
+    view = three.state.view
+    switch(three, BARE)
+    assert three.state.scene is SCENES["bare.ply"]
+    assert three.state.queries == []
+    assert three.state.canonical == ()
+    assert three.state.seeing.clip == UNCLIPPED
+    actions.ask(three, "plant")
+    settle(three)
+    actions.zoom_by(three, 2.0)
+    bare = three.state.view
+
+    switch(three, BLOBS)
+    state = three.state
+    assert state.view is view
+    assert [(q.phrase, q.slot, q.cut) for q in state.queries] == [("mug", None, None), ("book", 1, 0.7)]
+    assert state.queries[1].result.own_cut == 0.7
+    assert state.canonical == three.engine.canonical_phrases == ("plant",)
+    assert (state.camera_index, len(state.record.keyframes)) == (2, 1)
+    assert state.seeing.clip == Clip(1.0, 9.0)
+    switch(three, BARE)
+    assert three.state.view is bare
+    assert [query.phrase for query in three.state.queries] == ["plant"]
+    assert three.state.shown_results()[0].found
+    assert three.engine.canonical_phrases != ("plant",)
+
+
+def test_a_display_of_answers_comes_back_after_a_scene_without(three):
+    actions.ask(three, "mug")
+    settle(three)
+    switch(three, PLAIN)
+    assert three.state.picture.display == "rgb"
+    switch(three, BLOBS)
+    assert three.state.picture.display == "relevancy"
+
+
+def test_nothing_of_a_scene_that_was_left_is_kept_in_memory(three):
+    actions.ask(three, "mug")
+    settle(three)
+    switch(three, BARE)
+    (visit,) = three.visits.values()
+    assert [query.result for query in visit.queries] == [None]
+    assert not any(isinstance(value, np.ndarray) and value.size > 16 for value in vars(visit).values())
+
+
+def test_steps_go_round(three):
+    seen = []
+    for by in (1, 1, 1, -1):
+        actions.step_scene(three, by)
+        settle(three)
+        seen.append(three.state.path.absolute())
+    assert seen == [PLAIN, BARE, BLOBS, BARE]
+
+
+def test_one_scene_has_no_next(opened):
+    assert opened.state.scenes == (BLOBS,)
+    actions.step_scene(opened, 1)
+    assert "no other scene" in errors(opened)[-1]
+
+
+def test_a_scene_that_is_opened_joins_the_list_once(three):
+    actions.open_scene(three, Path("book.ply"))
+    settle(three)
+    assert three.state.scenes[-1].name == "book.ply"
+    actions.add_scenes(three, [Path("book.ply"), PLAIN])
+    assert len(three.state.scenes) == 4
+
+
+def test_a_scene_is_taken_off_the_list(three):
+    switch(three, PLAIN)
+    actions.unlist_scene(three, BLOBS)
+    assert three.state.scenes == (PLAIN, BARE)
+    assert three.visits == {}
+    actions.step_scene(three, 1)
+    settle(three)
+    assert three.state.path == BARE
+
+
+def test_a_broken_scene_leaves_the_shown_one(three):
+    actions.add_scenes(three, [Path("broken.ply")])
+    switch(three, Path("broken.ply").absolute())
+    assert three.state.scene is SCENES["blobs.ply"]
+    assert "broken" in errors(three)[-1]
+
+
+def test_the_list_ends(viewer):
+    actions.add_scenes(viewer, [Path(f"{number}.ply") for number in range(MOST + 5)])
+    assert len(viewer.state.scenes) == MOST
+
+
+def test_all_scenes_of_a_folder_are_opened_together(viewer, tmp_path):
+    for name in ("blobs.ply", "plain.ply", "a.queries.json"):
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "folder").mkdir()
+    viewer.state.browser = list_folder(tmp_path)
+    assert has_several(viewer.state.browser)
+    actions.open_all(viewer)
+    settle(viewer)
+    assert viewer.state.browser is None
+    assert viewer.state.scenes == (tmp_path / "blobs.ply", tmp_path / "plain.ply")
+    assert viewer.state.path.name == "blobs.ply"
+    (tmp_path / "plain.ply").unlink()
+    assert not has_several(list_folder(tmp_path))
