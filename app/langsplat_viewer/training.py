@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from langsplat_core.config import TrainPreset
 from langsplat_core.errors import printable_line
 
 ALL = "all stages"  # the label under which the whole is reported
+LOSS = re.compile(r"\bloss (\d+\.\d+)")  # behind a stage's colon
 KEPT = 20  # lines of what it says that are kept
 
 
@@ -35,7 +37,10 @@ class TrainingProgress:
     stages: dict[str, float] = field(default_factory=dict)  # label -> fraction in [0, 1], in their order
     overall: float = 0.0
     left: str = ""  # "about 3 min left"
+    losses: list[float] = field(default_factory=list)  # of the Gaussians, as far as they are trained
     said: list[str] = field(default_factory=list)  # lines that are no progress, the latest last
+
+    _heard: str = ""  # the last one, as it was said
 
     def hear(self, line: str) -> None:
         """Take one line of what the process writes."""
@@ -52,6 +57,10 @@ class TrainingProgress:
             self.overall, self.left = fraction, detail.strip()
         else:
             self.stages[stage] = fraction
+            loss = LOSS.search(detail)
+            if loss is not None and loss[0] != self._heard:
+                self._heard = loss[0]
+                self.losses = [*self.losses, float(loss[1])]
 
 
 def command(request: TrainingRequest) -> list[str]:

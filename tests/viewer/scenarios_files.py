@@ -1,5 +1,6 @@
 """Scenarios of `window_driver` about files: those that change while they are shown."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -9,7 +10,7 @@ from PIL import Image
 
 from imgui_bundle import imgui  # isort: skip
 from langsplat_core.formats import save_scene
-from langsplat_viewer import actions
+from langsplat_viewer import actions, training
 from langsplat_viewer.panels.area import scene_area
 from tests.support.fakes import CENTRES, blob_scene
 
@@ -161,6 +162,39 @@ def switch_between_scenes(s: Any) -> None:
     assert s.state.path.name == "blobs.ply"
 
 
+TRAINS = """
+import json, sys, time
+for step in range(60):
+    label = f"Training Gaussians: {300 + step} Gaussians, loss {0.04 + 0.2 / (1 + step):.4f}"
+    print(json.dumps({"label": label, "fraction": step / 60}), file=sys.stderr, flush=True)
+time.sleep(60)
+"""
+
+
+def watch_a_training(s: Any) -> None:
+    """The panel plots what the process says of its loss."""
+    s.wait(lambda: s.state.scene is not None)
+    s.settle()
+    viewer, photographs = s.window.viewer, s.folder / "photos"
+    photographs.mkdir()
+    for number in range(3):
+        (photographs / f"{number}.jpg").write_bytes(b"")
+    training.command = lambda request: [sys.executable, "-c", TRAINS]
+    actions.choose_photographs(viewer, photographs)
+    actions.open_panel(viewer, "Train")
+    s.ctx.yield_(3)
+    s.ctx.item_click("//Train/Train")
+    s.wait(lambda: viewer.training is not None and len(viewer.training.progress.losses) > 50)
+    s.ctx.yield_(3)
+    before = s.shot("loss")
+    plot = s.ctx.item_info("//Train/##loss").rect_full
+    inside = before[int(plot.min.y) : int(plot.max.y), int(plot.min.x) : int(plot.max.x)]
+    assert inside.max() - inside.min() > 60
+    s.ctx.item_click("//Train/Stop")
+    s.wait(lambda: viewer.training is None)
+    assert "training stopped" in s.state.messages[-1].text
+
+
 def digit_key(digit: int) -> imgui.Key:
     return imgui.Key[f"_{digit}"]
 
@@ -170,5 +204,6 @@ SCENARIOS: dict[str, Scenario] = {
     "reload_what_changed": (reload_what_changed, "blobs.ply", {}),
     "fade_in_a_photograph": (fade_in_a_photograph, "blobs.ply", {}),
     "switch_between_scenes": (switch_between_scenes, "blobs.ply", {}),
+    "watch_a_training": (watch_a_training, "blobs.ply", {}),
     "change_a_key": (change_a_key, "blobs.ply", {}),
 }

@@ -1,5 +1,6 @@
 """Training from the window, with a process that only says it trains."""
 
+import json
 import signal
 import sys
 import time
@@ -130,3 +131,18 @@ def test_what_is_no_progress_is_kept_as_words():
     for number in range(100):
         progress.hear(f"line {number}")
     assert len(progress.said) < 30
+
+
+def test_the_loss_is_heard_once_for_every_time_that_it_is_said():
+    progress = TrainingProgress()
+    for label, fraction in (
+        ("Training Gaussians: 300 Gaussians", 0.0),
+        ("Training Gaussians: 300 Gaussians, loss 0.2500", 0.1),
+        ("Training Gaussians: 310 Gaussians, loss 0.2500", 0.11),
+        ("Training Gaussians: 320 Gaussians, loss 0.1250", 0.2),
+        ("all stages: about 3 min left", 0.5),
+        ("fitting: loss of something", 0.5),
+    ):
+        progress.hear(json.dumps({"label": label, "fraction": fraction}))
+    assert progress.losses == [0.25, 0.125]
+    assert progress.stages["Training Gaussians"] == 0.2

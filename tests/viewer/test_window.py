@@ -57,6 +57,7 @@ def folder(tmp_path: Path) -> Path:
         "reload_what_changed",
         "change_a_key",
         "cut_by_depth",
+        "watch_a_training",
         "switch_between_scenes",
         "time_and_compare",
         "fade_in_a_photograph",

@@ -3,15 +3,17 @@
 from dataclasses import replace
 from typing import get_args
 
-from imgui_bundle import ImVec2, imgui
+import numpy as np
+from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.config import TrainPreset
 from langsplat_viewer import actions
-from langsplat_viewer.panels.style import muted, small_wrapped
+from langsplat_viewer.panels.style import muted, small_wrapped, tip
 from langsplat_viewer.training import Training
 from langsplat_viewer.viewer import Viewer
 
 PRESETS: tuple[TrainPreset, ...] = get_args(TrainPreset)
+LOSS_EM = 5.0  # height of its plot
 MEANS = {
     "quick": "minutes on a CPU",
     "good": "a quarter of an hour and more on a CPU",
@@ -61,6 +63,12 @@ def _running(viewer: Viewer, training: Training) -> None:
         small_wrapped(f"{label}: done" if fraction >= 1 else label, muted())
         if fraction < 1:
             imgui.progress_bar(fraction, ImVec2(-1, 0))
+    if len(progress.losses) > 1:
+        values = np.array(progress.losses, np.float32)
+        size = ImVec2(-1, hello_imgui.em_size(LOSS_EM))
+        imgui.plot_lines("##loss", values, scale_min=0.0, graph_size=size)
+        tip("How far the pictures are from the photographs, on average: lower is better")
+        imgui.text_colored(muted(), f"loss {values[-1]:.4f}, at first {values[0]:.4f}")
     imgui.separator()
     imgui.progress_bar(progress.overall, ImVec2(-1, 0), progress.left or "starting")
     if imgui.button("Stop"):

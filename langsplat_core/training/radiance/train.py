@@ -33,6 +33,7 @@ from langsplat_core.training.radiance.renderers import Backend, renderer_for
 from langsplat_core.training.radiance.schedule import Schedule, schedule_for
 from langsplat_core.training.radiance.state import TrainingState, adam_step, clean_gradients, start
 
+LOSSES_SAID = 200  # how often in a run its loss is said
 COARSE_MIN_SIDE = 64  # px: smaller pictures are never halved
 SMALLEST_EXTENT = 0.05  # of the distance to the scene: one camera, or cameras in one place, have no extent
 
@@ -86,6 +87,22 @@ class _Run:
     extent: float  # world units
 
 
+class _Losses:
+    """The loss as it is said: its mean over a share of the steps, since every photograph has another."""
+
+    def __init__(self, steps: int) -> None:
+        self._steps = steps
+        self._latest: list[float] = []  # since it was said last
+        self.said = ""
+
+    def add(self, step: int, loss: float) -> None:
+        """That of one step, counted from 1."""
+        self._latest.append(loss)
+        if step * LOSSES_SAID // self._steps > (step - 1) * LOSSES_SAID // self._steps:
+            self.said = f", loss {np.mean(self._latest):.4f}"
+            self._latest = []
+
+
 def train_radiance(
     capture: Capture,
     config: RadianceConfig,
@@ -119,11 +136,15 @@ def train_radiance(
         if checkpoint:
             save_checkpoint(checkpoint, state, made_from)
 
+    losses = _Losses(config.steps)
     with _one_torch_thread(), _interrupts_between_steps() as raise_if_interrupted:
         try:
             while state.step < config.steps:
                 loss = _step(run, state)
-                progress(f"Training Gaussians: {len(state)} Gaussians", state.step / config.steps)
+                losses.add(state.step, loss)
+                progress(
+                    f"Training Gaussians: {len(state)} Gaussians{losses.said}", state.step / config.steps
+                )
                 if on_step:
                     on_step(state, loss)
                 raise_if_interrupted()

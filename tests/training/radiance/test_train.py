@@ -127,6 +127,23 @@ def test_training_learns_the_scene() -> None:
 
 
 @pytest.mark.long
+def test_the_loss_is_said_as_the_mean_since_it_was_said_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("langsplat_core.training.radiance.train.LOSSES_SAID", 3)
+    labels: list[str] = []
+    losses: list[float] = []
+    train_radiance(
+        capture(),
+        replace(SHORT, steps=6, reference_steps=6),
+        [0, 1],
+        progress=lambda label, fraction: labels.append(label),
+        on_step=lambda state, loss: losses.append(loss),
+    )
+    said = [label.partition(", loss ")[2] for label in labels]
+    means = [f"{np.mean(losses[start : start + 2]):.4f}" for start in (0, 2, 4)]
+    assert said == ["", means[0], means[0], means[1], means[1], means[2]]
+
+
+@pytest.mark.long
 def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     straight_path, path = tmp_path / "straight.safetensors", tmp_path / "resumed.safetensors"
     straight = train_radiance(capture(), SHORT, [0, 1, 2], straight_path)
