@@ -14,9 +14,11 @@ from typing import IO
 
 from langsplat_core.config import TrainPreset
 from langsplat_core.errors import printable_line
+from langsplat_viewer.watching import Stamps
 
 ALL = "all stages"  # the label under which the whole is reported
 LOSS = re.compile(r"\bloss (\d+\.\d+)")  # behind a stage's colon
+PREVIEW_EVERY = 100  # steps between the checkpoints that can be looked at
 KEPT = 20  # lines of what it says that are kept
 
 
@@ -68,6 +70,7 @@ def command(request: TrainingRequest) -> list[str]:
     return [
         *(sys.executable, "-m", "langsplat_core", "train", str(request.dataset), "--out", str(request.out)),
         *("--preset", request.preset, "--clip.model", request.encoder, "--progress", "lines"),
+        *("--radiance.checkpoint-every", str(PREVIEW_EVERY)),
     ]
 
 
@@ -79,6 +82,7 @@ class Training:
         self.request = request
         self.progress = TrainingProgress()
         self.interrupted = False
+        self.previewed: Stamps = ()  # the checkpoint that is looked at
         self._wake = wake
         # Ctrl-C in the terminal is the window's; the process gets its own signal from `interrupt`.
         self.process = subprocess.Popen(

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from langsplat_core.config import TrainConfig
+from langsplat_core.config import RadianceConfig, TrainConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
@@ -164,8 +164,9 @@ def trained_gaussians(
     capture: Capture, train: list[int], config: TrainConfig, work: Path, progress: Progress
 ) -> Gaussians:
     """The Gaussians of the photographs at `train`, from `work` where they were trained before."""
-    # The backend changes who computes, not what: a run may move between machines.
-    settings = replace(config.radiance, backend="auto")
+    # The backend changes who computes, not what, so that a run may move between machines; nor do checkpoints.
+    every = RadianceConfig.checkpoint_every
+    settings = replace(config.radiance, backend="auto", checkpoint_every=every)
     done = work / f"{stage_key('radiance', 2, settings, capture.digest(train))}.ply"
     if done.exists():
         return read_ply(done)

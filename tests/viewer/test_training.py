@@ -4,14 +4,21 @@ import json
 import signal
 import sys
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from langsplat_core.cli.app import parse
+from langsplat_core.formats import load_scene
+from langsplat_core.scene import Scene
 from langsplat_viewer import actions, training
-from langsplat_viewer.training import TrainingProgress, TrainingRequest, command
+from langsplat_viewer.preview import IN_TRAINING, NAME, write_preview
+from langsplat_viewer.training import PREVIEW_EVERY, TrainingProgress, TrainingRequest, command
+from tests.support.fakes import blob_scene
+from tests.support.scenes import random_gaussians
 from tests.support.windowless import SCENES, errors, settle
 
 SAYS = """
@@ -79,7 +86,7 @@ def test_it_can_be_stopped_and_one_is_enough(viewer, folder, monkeypatch):
     actions.start_training(viewer)
     assert "under way" in errors(viewer)[-1]
     actions.look_at_training(viewer)
-    assert "not trained yet" in viewer.state.messages[-1].text
+    assert "no Gaussians to look at yet" in viewer.state.messages[-1].text
     process = viewer.training.process
     actions.stop_training(viewer)
     finish(viewer)
@@ -120,6 +127,7 @@ def test_the_command_is_one_that_the_program_understands():
     parsed = parse(words[3:])
     assert (parsed.dataset, parsed.out, parsed.progress) == (Path("photos"), Path("s.ply"), "lines")
     assert (parsed.config.radiance.steps, parsed.config.clip.model) == (500, "demo")
+    assert parsed.config.radiance.checkpoint_every == PREVIEW_EVERY
 
 
 def test_what_is_no_progress_is_kept_as_words():
@@ -146,3 +154,89 @@ def test_the_loss_is_heard_once_for_every_time_that_it_is_said():
         progress.hear(json.dumps({"label": label, "fraction": fraction}))
     assert progress.losses == [0.25, 0.125]
     assert progress.stages["Training Gaussians"] == 0.2
+
+
+def checkpoint(folder: Path, scene: Scene) -> Path:
+    """As training writes it, with what the window does not read."""
+    gaussians = scene.gaussians
+    rest = np.zeros((len(gaussians), 3, 3), np.float32)
+    values = {
+        "means": gaussians.means,
+        "log_scales": gaussians.log_scales,
+        "quats_wxyz": gaussians.quats_wxyz,
+        "opacity_logits": gaussians.opacity_logits,
+        "sh_dc": gaussians.sh[:, :1],
+        "sh_rest": rest,
+    }
+    tensors = {f"values.{name}": np.ascontiguousarray(array) for name, array in values.items()}
+    path = folder / "photos.work" / "radiance-1.checkpoint.safetensors"
+    path.parent.mkdir(exist_ok=True)
+    save_file(tensors | {"seen": rest}, path)
+    return path
+
+
+@pytest.fixture
+def training_now(viewer, folder, monkeypatch):
+    """A training is under way."""
+    viewer.services = replace(viewer.services, load_scene=load_scene)
+    trains(monkeypatch, SLOW)
+    actions.choose_photographs(viewer, folder)
+    actions.start_training(viewer)
+    yield viewer
+    viewer.training.end()
+
+
+def test_gaussians_in_training_are_looked_at_and_followed(training_now, folder):
+    viewer = training_now
+    actions.look_at_training(viewer)
+    assert "no Gaussians to look at yet" in viewer.state.messages[-1].text
+    whole = blob_scene()
+    checkpoint(folder.parent, whole.take(np.arange(0, 360, 2)))
+    actions.look_at_training(viewer)
+    settle(viewer)
+    assert viewer.state.path == folder.parent / "photos.work" / NAME
+    seen = viewer.state.scene.gaussians
+    assert (len(seen), seen.sh_degree) == (180, 1)
+    np.testing.assert_array_equal(seen.means, whole.gaussians.means[::2])
+    actions.zoom_by(viewer, 1.5)
+    view = viewer.state.view
+    actions.watch_training(viewer)
+    assert viewer.worker.current is None  # nothing new
+
+    checkpoint(folder.parent, whole)
+    actions.watch_training(viewer)
+    settle(viewer)
+    assert len(viewer.state.scene.gaussians) == 360
+    assert viewer.state.view is view
+    assert errors(viewer) == []
+
+
+@pytest.mark.long
+def test_a_checkpoint_of_training_itself_is_read(tmp_path):
+    import torch
+
+    from langsplat_core.training.radiance.checkpoint import save_checkpoint
+    from langsplat_core.training.radiance.state import start
+
+    gaussians = random_gaussians(40, sh_degree=2)
+    path = tmp_path / f"radiance-0{IN_TRAINING}"
+    save_checkpoint(path, start(gaussians, 0, torch.device("cpu")), "a run")
+    seen = load_scene(write_preview(path)).gaussians
+    for field in fields(gaussians):
+        np.testing.assert_array_equal(getattr(seen, field.name), getattr(gaussians, field.name))
+
+
+def test_another_scene_is_left_alone_while_a_training_goes_on(training_now, folder):
+    viewer = training_now
+    checkpoint(folder.parent, blob_scene())
+    actions.watch_training(viewer)
+    assert viewer.worker.current is None
+
+
+def test_a_damaged_checkpoint_is_one_line(training_now, folder):
+    path = checkpoint(folder.parent, blob_scene())
+    path.write_bytes(path.read_bytes()[:100])
+    actions.look_at_training(training_now)
+    settle(training_now)
+    assert "no Gaussians in training" in errors(training_now)[-1]
+    assert training_now.state.scene is None

@@ -4,11 +4,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from langsplat_core.pipeline.forecast import count_photographs
+from langsplat_viewer import preview
 from langsplat_viewer.actions.opening import open_scene
+from langsplat_viewer.actions.visits import reload
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.training import Training, TrainingRequest
 from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.watching import Stamps
 
 
 def fill_in(viewer: Viewer, form: TrainingForm) -> None:
@@ -51,22 +54,56 @@ def stop_training(viewer: Viewer) -> None:
 
 
 def look_at_training(viewer: Viewer) -> None:
-    """Open the Gaussians that a training under way has finished, before they have a meaning."""
+    """Open the Gaussians of a training under way, before they have a meaning; while they are still trained,
+    as they were at the last checkpoint, and from then on at the next ones."""
     training = viewer.training
     if training is None:
         return
-    work = training.request.out.with_name(f"{training.request.out.stem}.work")
-    finished = sorted(work.glob("radiance-*.ply"), key=lambda path: path.stat().st_mtime)
-    if finished:
-        open_scene(viewer, finished[-1])
+    written = preview.newest(training.request.out)
+    if not written:
+        viewer.state.say("there are no Gaussians to look at yet")
+    elif written[0][0].name.endswith(preview.IN_TRAINING):
+        _show_checkpoint(viewer, training, written)
     else:
-        viewer.state.say("the Gaussians are not trained yet")
+        open_scene(viewer, written[0][0])
+
+
+def _show_checkpoint(viewer: Viewer, training: Training, checkpoint: Stamps) -> None:
+    """Open it as a scene, or in place of the one before, where that is still shown."""
+    training.previewed = checkpoint
+    ((path, _),) = checkpoint
+
+    def done(written: Path) -> None:
+        if viewer.state.path == written:
+            reload(viewer)
+        else:
+            open_scene(viewer, written)
+
+    viewer.worker.submit(
+        "reading the Gaussians so far",
+        lambda progress: preview.write_preview(path),
+        done,
+        lambda reason: viewer.state.say(reason, is_error=True),
+    )
+
+
+def _follow(viewer: Viewer, training: Training) -> None:
+    """While its Gaussians are looked at, take the next checkpoint when it is there."""
+    folder = preview.work_folder(training.request.out)
+    if viewer.state.path != folder / preview.NAME or viewer.worker.current is not None:
+        return
+    written = preview.newest(training.request.out)
+    if written != training.previewed and written and written[0][0].name.endswith(preview.IN_TRAINING):
+        _show_checkpoint(viewer, training, written)
 
 
 def watch_training(viewer: Viewer) -> None:
     """Once per frame: open the scene when it is finished, or say why there is none."""
     training, state = viewer.training, viewer.state
-    if training is None or training.exit_code is None:
+    if training is None:
+        return
+    if training.exit_code is None:
+        _follow(viewer, training)
         return
     viewer.training = None
     last = training.progress.said[-1] if training.progress.said else "no reason given"
