@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 # One file of tests is one worker's: its fixtures are made once.
 PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: help demo quick test slow check format bench pictures app clean
+.PHONY: help demo quick test slow check format bench pictures app bundle desktop clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -54,5 +54,20 @@ pictures: system  ## make the README's pictures again (on a display, or on Xvfb)
 app: system  ## open the viewer
 	$(BIN)/langsplat-viewer
 
+bundle: system  ## the programs with their own Python in one folder, dist/langsplat-viewer, and try it
+	$(BIN)/pip install --quiet --constraint packaging/constraints.txt --editable '.[bundle]'
+	$(BIN)/pyinstaller --noconfirm --log-level ERROR --workpath dist/work packaging/bundle/langsplat-viewer.spec
+	dist/langsplat-viewer/langsplat-viewer --headless --query keyboard --out dist/tried.png
+
+DATA := $(or $(XDG_DATA_HOME),$(HOME)/.local/share)
+desktop: $(STAMP)  ## show the viewer among this user's programs, and open scenes with it
+	install -d $(DATA)/applications $(DATA)/icons/hicolor/256x256/apps $(DATA)/mime/packages
+	sed 's|^\(Try\)\?Exec=|&$(CURDIR)/$(BIN)/|' packaging/desktop/langsplat-viewer.desktop \
+	  > $(DATA)/applications/langsplat-viewer.desktop
+	install -m 644 packaging/desktop/langsplat-viewer.png $(DATA)/icons/hicolor/256x256/apps/
+	install -m 644 packaging/desktop/langsplat-viewer.xml $(DATA)/mime/packages/
+	-update-mime-database $(DATA)/mime
+	-update-desktop-database $(DATA)/applications
+
 clean:  ## remove what these targets made
-	rm -rf $(VENV) demo_out bench_out .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) demo_out bench_out dist .pytest_cache .mypy_cache .ruff_cache

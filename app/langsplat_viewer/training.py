@@ -66,9 +66,13 @@ class TrainingProgress:
 
 
 def command(request: TrainingRequest) -> list[str]:
-    """The command line of a request, for the interpreter that runs this."""
+    """The command line of a request, for the interpreter that runs this, or the program beside it that a
+    one-folder build has."""
+    program = [sys.executable, "-m", "langsplat_core"]
+    if getattr(sys, "frozen", False):
+        program = [str(Path(sys.executable).with_stem("langsplat"))]
     return [
-        *(sys.executable, "-m", "langsplat_core", "train", str(request.dataset), "--out", str(request.out)),
+        *(*program, "train", str(request.dataset), "--out", str(request.out)),
         *("--preset", request.preset, "--clip.model", request.encoder, "--progress", "lines"),
         *("--radiance.checkpoint-every", str(PREVIEW_EVERY)),
     ]

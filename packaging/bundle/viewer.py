@@ -1,0 +1,5 @@
+"""`langsplat-viewer` of the one-folder build."""
+
+from langsplat_viewer.__main__ import entry
+
+entry()

@@ -1,0 +1,65 @@
+"""What a desktop is told of the viewer, and what the one-folder build is made of."""
+
+from configparser import ConfigParser
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from langsplat_viewer.browsing import SCENE_SUFFIXES
+from langsplat_viewer.training import TrainingRequest, command
+
+PACKAGING = Path(__file__).resolve().parents[1] / "packaging"
+DESKTOP = PACKAGING / "desktop"
+NAMESPACE = "{http://www.freedesktop.org/standards/shared-mime-info}"
+
+
+def desktop_entry() -> dict[str, str]:
+    parser = ConfigParser(interpolation=None)
+    parser.optionxform = str  # type: ignore[method-assign, assignment]
+    parser.read(DESKTOP / "langsplat-viewer.desktop", encoding="utf-8")
+    return dict(parser["Desktop Entry"])
+
+
+def mime_globs() -> dict[str, list[str]]:
+    root = ElementTree.parse(DESKTOP / "langsplat-viewer.xml").getroot()
+    types = root.findall(f"{NAMESPACE}mime-type")
+    return {
+        kind.attrib["type"]: [g.attrib["pattern"] for g in kind.findall(f"{NAMESPACE}glob")] for kind in types
+    }
+
+
+def test_the_desktop_entry_starts_the_program_with_a_file():
+    entry = desktop_entry()
+    assert entry["Type"] == "Application"
+    assert entry["Exec"].split() == ["langsplat-viewer", "%f"]
+    assert entry["TryExec"] == "langsplat-viewer"
+    assert all(
+        entry["MimeType"].endswith(";") and entry[key].endswith(";") for key in ("Categories", "Keywords")
+    )
+
+
+def test_every_type_of_the_entry_is_described_and_every_kind_of_scene_has_one():
+    globs = mime_globs()
+    assert set(desktop_entry()["MimeType"].strip(";").split(";")) == set(globs)
+    patterns = {pattern for some in globs.values() for pattern in some}
+    assert {f"*{suffix}" for suffix in SCENE_SUFFIXES} <= patterns
+
+
+def test_the_icon_is_a_square_with_a_transparent_corner_and_a_full_middle():
+    icon = np.asarray(Image.open(DESKTOP / f"{desktop_entry()['Icon']}.png"))
+    assert icon.shape == (256, 256, 4)
+    assert icon[0, 0, 3] == 0
+    assert icon[128, 128, 3] > 128
+
+
+def test_a_one_folder_build_trains_by_the_program_beside_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    request = TrainingRequest(tmp_path / "photographs", tmp_path / "scene.ply")
+    plain = command(request)
+    monkeypatch.setattr("sys.frozen", True, raising=False)
+    monkeypatch.setattr("sys.executable", str(tmp_path / "langsplat-viewer"))
+    frozen = command(request)
+    assert frozen[0] == str(tmp_path / "langsplat")
+    assert frozen[1:] == plain[3:]
