@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from langsplat_core.datasets.colmap_library import pycolmap
-from langsplat_core.datasets.sfm import store_model
+from langsplat_core.datasets.sfm import check_room, store_model
 from langsplat_core.files import atomic_path
 from langsplat_core.progress import Progress
 
@@ -34,6 +34,7 @@ def map_cameras(folder: Path, count: int, progress: Progress) -> None:
     """
     best: Model | None = None
     for number, way in enumerate(WAYS):
+        check_room(folder)
         attempts = folder / "attempts" / str(number)
         attempts.mkdir(parents=True, exist_ok=True)
         best = best_model(best, way(folder, attempts, _counted(count, progress)))

@@ -7,8 +7,10 @@ what was computed, so an interrupted run goes on, and ends with the same cameras
 are numbered in the order of their names, every random choice has its seed, and the mapper runs on one thread.
 """
 
+import errno
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.datasets.colmap_library import pycolmap
+from langsplat_core.datasets.colmap_model import read_model
+from langsplat_core.errors import FormatError
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
 
@@ -26,7 +30,8 @@ FEATURES = 8192  # per photograph
 SMALL_SIDE = 1000  # px; smaller photographs are doubled before features are sought, as SIFT proposes
 EXTRACT_BATCH = 8  # photographs per step: a step is the unit of progress and of resuming
 MATCH_BATCH = 64  # pairs per step
-FAILURES = (RuntimeError, ValueError, IndexError, OSError)  # what pycolmap raises
+FAILURES = (RuntimeError, ValueError, IndexError)  # what pycolmap raises
+ROOM = 64_000_000  # bytes that a step may write: 8 photographs of 8192 features take 20 MB, with the journal
 
 Pair = tuple[str, str]
 
@@ -51,6 +56,16 @@ def open_workspace(work: Path, inputs: object) -> Path:
     return folder
 
 
+def check_room(folder: Path) -> None:
+    """OSError where the disk is about full: pycolmap would end the whole process there."""
+    if shutil.disk_usage(folder).free < ROOM:
+        raise _disk_full(folder)
+
+
+def _disk_full(folder: Path) -> OSError:
+    return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+
+
 def extract_features(folder: Path, groups: Sequence[Group], progress: Progress) -> None:
     """SIFT features of every photograph of `groups` into the database; those it has are kept."""
     database = folder / "database.db"
@@ -60,6 +75,7 @@ def extract_features(folder: Path, groups: Sequence[Group], progress: Progress) 
     for group in groups:
         for start in range(0, len(group.names), EXTRACT_BATCH):
             progress("finding features", done / total)
+            check_room(folder)
             names = group.names[start : start + EXTRACT_BATCH]
             _extract(database, folder / "images", group, names)
             done += len(names)
@@ -127,6 +143,7 @@ def match_features(folder: Path, pairs: Sequence[Pair], progress: Progress) -> N
     done = len(pairs) - len(lacking)
     for start in range(0, len(lacking), MATCH_BATCH):
         progress("matching photographs", (done + start) / len(pairs))
+        check_room(folder)
         batch = lacking[start : start + MATCH_BATCH]
         listing = folder / "pairs.txt"
         listing.write_text("".join(f"{first} {second}\n" for first, second in batch))
@@ -177,11 +194,20 @@ def triangulate(folder: Path, names: Sequence[str], cameras: Sequence[Camera]) -
 
 
 def store_model(model: "pycolmap.Reconstruction", folder: Path) -> None:
-    """Write the model as ``sparse``, which exists only when it is whole, and drop what led to it."""
+    """Write the model as ``sparse``, which exists only when it is whole, and drop what led to it.
+
+    pycolmap says nothing where the disk takes only a part, so that what was written is read. OSError then.
+    """
     unfinished = folder / "sparse.part"
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir()
     model.write_binary(unfinished)
+    try:
+        written = read_model(unfinished)
+    except FormatError:
+        raise _disk_full(folder) from None
+    if len(written.points) != model.num_points3D():
+        raise _disk_full(folder)
     shutil.rmtree(folder / "sparse", ignore_errors=True)
     unfinished.rename(folder / "sparse")
     for name in ("database.db", "pairs.txt"):

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -14,6 +15,7 @@ from langsplat_core.datasets.images import find_photos
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled
+from tests.support.full_disk import files_of_at_most
 from tests.support.photographed import poses, write_photos
 from tests.support.street import walk
 
@@ -137,3 +139,35 @@ def test_two_views_are_refused_although_they_are_half(
     for _ in range(2):
         with pytest.raises(InputError, match="only 2 of 4 photographs"):
             load_capture(tmp_path, CONFIG, tmp_path / "work")
+
+
+@pytest.mark.parametrize("label", ["finding features", "matching photographs", "locating cameras"])
+def test_a_full_disk_is_said_before_pycolmap_ends_the_process(
+    label: str, mostly_noise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill(reported: str, fraction: float) -> None:
+        if reported == label:
+            monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
+
+    told = DatasetConfig(max_side=64, allow_few_cameras=True)
+    with pytest.raises(OSError, match="No space left") as caught:
+        load_capture(mostly_noise, told, tmp_path, fill)
+    assert Path(caught.value.filename).parent == tmp_path
+    monkeypatch.undo()
+    assert len(load_capture(mostly_noise, told, tmp_path)) == 4
+
+
+def test_a_model_that_was_cut_off_is_not_kept(tmp_path: Path) -> None:
+    """pycolmap writes what fits and says nothing."""
+    model = synthetic(4, 100)
+    (tmp_path / "whole").mkdir()
+    model.write_binary(tmp_path / "whole")
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        with (
+            files_of_at_most((tmp_path / "whole" / name).stat().st_size - 1),
+            pytest.raises(OSError, match="No space"),
+        ):
+            mapping.store_model(model, tmp_path)
+        assert not (tmp_path / "sparse").exists()
+    mapping.store_model(model, tmp_path)
+    assert (tmp_path / "sparse").is_dir()
