@@ -21,9 +21,10 @@ SETTINGS = (
 
 @dataclass(frozen=True)
 class Moment:
-    """When a process is killed: so many seconds after a stage began."""
+    """When a process is killed: some seconds after a stage has come so far, or is over."""
 
     stage: str
+    fraction: float
     seconds: float
 
 
@@ -48,43 +49,45 @@ def train(data: Path, encoder: Path, folder: Path, kill: Moment | None = None) -
         stderr=subprocess.PIPE,
         text=True,
     ) as process:
-        timers = [_killer(process, kill, START)]
+        killer = threading.Timer(kill.seconds if kill else 0, process.send_signal, (signal.SIGKILL,))
+        if kill is not None and kill.stage == START:
+            killer.start()
         assert process.stderr is not None
         for line in process.stderr:
-            stage = _stage(line)
-            if stage is None:
+            report = _report(line)
+            if report is None:
                 said.append(line)
-            elif stage not in began:
-                began[stage] = time.monotonic() - start
-                timers.append(_killer(process, kill, stage))
+                continue
+            stage, fraction = report
+            began.setdefault(stage, time.monotonic() - start)
+            passed = kill is not None and kill.stage in began
+            passed = passed and (stage != kill.stage or fraction >= kill.fraction)
+            if passed and not killer.is_alive() and not killer.finished.is_set():
+                killer.start()
         code = process.wait()
-    for timer in timers:
-        timer.cancel()
+    killer.cancel()
     return Ended(code, "".join(said), began, time.monotonic() - start)
 
 
-def _killer(process: "subprocess.Popen[str]", kill: Moment | None, stage: str) -> threading.Timer:
-    timer = threading.Timer(kill.seconds if kill else 0.0, process.send_signal, (signal.SIGKILL,))
-    if kill is not None and kill.stage == stage:
-        timer.start()
-    return timer
-
-
-def _stage(line: str) -> str | None:
-    """That a line of progress reports; None for other lines."""
+def _report(line: str) -> tuple[str, float] | None:
+    """Stage and fraction of a line of progress; None for other lines and for what is said of the whole."""
     try:
-        label = str(json.loads(line)["label"])
+        report = json.loads(line)
+        label = str(report["label"])
     except ValueError:
         return None
-    return START if label.startswith("all stages") else label.partition(":")[0].partition(" (")[0]
+    known = not label.startswith("all stages")
+    return (label.partition(":")[0].partition(" (")[0], float(report["fraction"])) if known else None
 
 
 def moments(whole: Ended, seed: int) -> list[Moment]:
-    """One in every stage of a run, in their order, anywhere within the time that it took."""
-    stages = sorted(whole.began, key=whole.began.__getitem__)
-    ends = [whole.began[stage] for stage in stages[1:]] + [whole.seconds]
+    """One in every stage of a run, in their order: anywhere in its progress, and where there is none to see,
+    before the first report and after the last, anywhere in its time."""
+    first, *stages, last = sorted(whole.began, key=whole.began.__getitem__)
     generator = random.Random(seed)
+    before, after = whole.began[stages[0]], whole.seconds - whole.began[last]
     return [
-        Moment(stage, generator.uniform(0, end - whole.began[stage]))
-        for stage, end in zip(stages, ends, strict=True)
+        Moment(first, 0, generator.uniform(0, before)),
+        *(Moment(stage, generator.random(), 0) for stage in stages),
+        Moment(last, 0, generator.uniform(0, after)),
     ]
