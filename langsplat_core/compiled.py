@@ -20,7 +20,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,25 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     """
     folder = kernel_folder(Path(function.__code__.co_filename))
     with _cache_folder(folder) if folder else nullcontext():
-        return numba.njit(cache=folder is not None, nogil=True, error_model="numpy", **options)(function)
+        made = numba.njit(cache=folder is not None, nogil=True, error_model="numpy", **options)(function)
+    if folder:
+        cache_of_it = made._cache  # noqa: SLF001  numba has no other way to it
+        cache_of_it.save_overload = partial(_kept_if_there_is_room, cache_of_it.save_overload)
+    return made
+
+
+def _kept_if_there_is_room(save: Callable[..., None], *overload: Any) -> None:
+    """Keep a kernel's machine code; on a full disk the next process compiles it again. numba renames what it
+    wrote, so that nothing is left half."""
+    try:
+        save(*overload)
+    except OSError as error:
+        _say_once(f"kernels are compiled for this run only, which takes some seconds: {error.strerror}")
+
+
+@cache
+def _say_once(text: str) -> None:
+    log.warning(text)
 
 
 def kernel_folder(source: Path) -> Path | None:
@@ -166,7 +184,10 @@ class Workers:
     def __init__(self, threads: int | None = None) -> None:
         """`threads` defaults to the number of cores this process may use."""
         self.threads = threads or _cores()
-        self._pool = ThreadPoolExecutor(self.threads, "kernels")
+        self._begin()
+
+    def _begin(self) -> None:
+        self._pool, self._process = ThreadPoolExecutor(self.threads, "kernels"), os.getpid()
 
     def run(self, compiled: Callable[..., None], count: int, *arguments: Any) -> None:
         """compiled(first, last, *arguments) for pieces [first, last) that cover range(count)."""
@@ -174,6 +195,8 @@ class Workers:
         if pieces <= 1:
             compiled(0, count, *arguments)
             return
+        if self._process != os.getpid():  # after a fork, which takes no threads along
+            self._begin()
         edges = [count * i // pieces for i in range(pieces + 1)]
         jobs = [self._pool.submit(compiled, edges[i], edges[i + 1], *arguments) for i in range(pieces)]
         for job in jobs:

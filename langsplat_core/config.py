@@ -53,6 +53,8 @@ class DatasetConfig:
     test_every: CountOrZero = 8  # every n-th view, in name order, is held out from training; 0 holds out none
     metres_per_unit: Positive | None = None
     """Of the dataset's world; None: as transforms.json says, if it does."""
+    # go on where fewer than half of the photographs, or fewer than three, have a camera
+    allow_few_cameras: bool = False
 
 
 @dataclass(frozen=True)

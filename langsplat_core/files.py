@@ -1,16 +1,19 @@
 """Writing files so that a reader never sees half of one, and saying beforehand where none can be written."""
 
+import errno
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from langsplat_core.errors import InputError
+from langsplat_core.errors import InputError, LangSplatError
 
 NAME_MAX, PATH_MAX = 255, 4_096  # bytes, where the system does not say
 RANDOM = 8  # characters that `tempfile` puts into a name
 LONGEST_SUFFIX = 64  # bytes of a suffix that a temporary name keeps
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # where a disk is full, or broken
+PROBE = 1 << 16  # bytes that are written to find out
 # Where files are none: what is written there is read by the system or by nobody, and is gone afterwards.
 _SYSTEM, _MEMORY = ("/proc", "/sys", "/dev"), "/dev/shm"
 
@@ -20,7 +23,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     """Yield a temporary name beside `path`; on a clean exit it is renamed to `path`, else removed.
 
     The temporary name keeps the suffix, because some writers choose the format by it; it is no longer than
-    `path` may be.
+    `path` may be. Where the disk takes no more, an OSError with `path` comes out, whatever the writer said.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -36,8 +39,30 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)  # mkstemp makes private files; ours are ordinary ones
         temporary.replace(target)
+    except Exception as error:
+        cause = _no_room(error, temporary)
+        if cause is None:
+            raise
+        raise OSError(cause.errno, cause.strerror, str(target)) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _no_room(error: Exception, temporary: Path) -> OSError | None:
+    """What the system says where `error`, of whoever writes `temporary`, comes from a full or broken disk.
+
+    Libraries say so in their own words and classes, or give no cause at all: then the system is asked again.
+    """
+    if isinstance(error, LangSplatError):
+        return None
+    if isinstance(error, OSError) and error.errno is not None:
+        return error if error.errno in NO_ROOM else None
+    try:
+        with temporary.open("ab") as file:
+            file.write(bytes(PROBE))
+    except OSError as found:
+        return found if found.errno in NO_ROOM else None
+    return None
 
 
 def name_max(folder: Path) -> int:

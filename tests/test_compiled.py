@@ -13,6 +13,7 @@ from langsplat_core import compiled
 from langsplat_core.compiled import Workers, digest_of_sources, kernel_folder
 from langsplat_core.raster.cpu import blend, planes, tiles
 from tests.support.another_user import bound_by_permissions
+from tests.support.full_disk import files_of_at_most
 
 PACKAGE = Path(compiled.__file__).parent
 KERNEL = """
@@ -113,3 +114,24 @@ def test_pieces_cover_a_range_once() -> None:
             out = np.zeros(count, int)
             Workers(threads).run(mark, count, out)
             assert (out == 1).all()
+
+
+def test_a_full_disk_keeps_no_machine_code_and_stops_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(compiled, "kernel_folder", lambda _: tmp_path)
+
+    def doubled(value: float) -> float:
+        return value + value
+
+    for size in (0, 500):
+        double = compiled.kernel(doubled)
+        with files_of_at_most(size), caplog.at_level("WARNING", "langsplat"):
+            assert double(2.5) == 5
+    assert [record.getMessage().partition(":")[0] for record in caplog.records] == [
+        "kernels are compiled for this run only, which takes some seconds"
+    ]
+    assert not list(tmp_path.rglob("*.nbc"))
+    again = compiled.kernel(doubled)
+    assert again(2.5) == 5
+    assert list(tmp_path.rglob("*.nbc"))

@@ -21,12 +21,13 @@ from typing import Protocol
 from langsplat_core import __version__
 from langsplat_core.cli.checks import check_arguments
 from langsplat_core.errors import LangSplatError, printable_line
-from langsplat_core.files import shown
+from langsplat_core.files import NO_ROOM, shown
 from langsplat_core.progress import Terminated
 
 _LOG_LIMIT = 2000  # characters of a warning
 # What writing to an open file or standard output ends in where there is no room or no file.
-_UNWRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF)
+_UNWRITTEN = (*NO_ROOM, errno.EBADF)
+_ROOM = "make room, or choose another place; what was finished is kept"
 _FRAME = re.compile(r"[│╭╮╰╯]|─+")
 
 
@@ -144,10 +145,11 @@ def _system_complaint(error: OSError) -> str:
     """What the system said of a file, or of standard output."""
     reason = error.strerror or str(error) or type(error).__name__
     if isinstance(error.filename, str | bytes):
-        return f"{shown(os.fsdecode(error.filename))}: {reason}"
+        remedy = f"; {_ROOM}" if error.errno in NO_ROOM else ""
+        return f"{shown(os.fsdecode(error.filename))}: {reason}{remedy}"
     if error.errno in _UNWRITTEN:
         _drop_standard_output()  # perhaps the culprit, which would complain again at exit
-        return f"a file or standard output cannot be written ({reason}); what was finished is kept"
+        return f"a file or standard output cannot be written ({reason}); {_ROOM}"
     return reason
 
 

@@ -87,7 +87,8 @@ def ring_cameras(scene: Scene, count: int) -> list[Camera]:
 
 def _photographed(scene: Scene, photos: Path, config: CompactConfig, progress: Progress) -> Views:
     with tempfile.TemporaryDirectory() as work:  # for points that may have to be found, and that are not used
-        capture = load_capture(photos, DatasetConfig(max_side=config.max_side), Path(work), progress)
+        settings = DatasetConfig(max_side=config.max_side, allow_few_cameras=True)  # only looked through
+        capture = load_capture(photos, settings, Path(work), progress)
     check_same_world(scene.cameras, capture.cameras, photos)
     trained = {camera.name for camera in scene.cameras}
     seen = [i for i, camera in enumerate(capture.cameras) if camera.name in trained]

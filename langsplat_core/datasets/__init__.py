@@ -37,7 +37,7 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
     if not os.path.exists(path):  # unlike Path.exists, also no for names that no file system could hold
         raise InputError(f"{shown(path)} does not exist; expected {ACCEPTED}")
     try:
-        capture = _load(path, config.max_side, work, progress)
+        capture = _load(path, config, work, progress)
     except PermissionError as error:
         raise InputError(f"{error.filename}: may not be read ({error.strerror}); see to its rights") from None
     if config.metres_per_unit is not None:
@@ -45,7 +45,8 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
     return capture if len(capture.points) else add_points(capture, work, progress)
 
 
-def _load(path: Path, max_side: int, work: Path, progress: Progress) -> Capture:
+def _load(path: Path, config: DatasetConfig, work: Path, progress: Progress) -> Capture:
+    max_side = config.max_side
     if path.is_file() and path.suffix.lower() == ".json":
         return load_nerfstudio(path, max_side, progress)
     if (path / "transforms.json").is_file():
@@ -56,4 +57,4 @@ def _load(path: Path, max_side: int, work: Path, progress: Progress) -> Capture:
     photos = photo_folder(path)
     if photos is None:
         raise InputError(f"{path} is no dataset; expected {ACCEPTED}")
-    return load_photos(photos, max_side, work, progress)
+    return load_photos(photos, max_side, config.allow_few_cameras, work, progress)

@@ -21,8 +21,11 @@ class Album:
         self._left -= picture.nbytes
         if self._left >= 0:
             return picture
-        with tempfile.TemporaryFile(prefix="langsplat-") as file:
-            filed = np.memmap(file, np.uint8, "w+", shape=picture.shape)
-        filed[:] = picture
-        filed.flush()
-        return filed
+        try:
+            with tempfile.TemporaryFile(prefix="langsplat-") as file:
+                # Written, not mapped and filled: on a full disk that would kill the process without a word.
+                file.write(np.ascontiguousarray(picture).data)
+                file.flush()
+                return np.memmap(file, np.uint8, "c", shape=picture.shape)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, tempfile.gettempdir()) from error

@@ -9,7 +9,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.datasets.capture import Capture, tell_of_lost_points
 from langsplat_core.datasets.colmap_model import ModelCamera, SparseModel, has_model, read_model
-from langsplat_core.datasets.images import Photo, develop, shortened
+from langsplat_core.datasets.images import Photo, develop, find_photos, shortened
 from langsplat_core.datasets.intrinsics import (
     BrownDistortion,
     ColmapDistortion,
@@ -69,6 +69,14 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
             shortened(missing),
         )
     there = [photo for photo in photos if photo.label not in missing]
+    present = len(find_photos(_photo_folder(folder, model)))
+    if 2 * len(there) < present:
+        log.warning(
+            "%s has cameras for only %d of the %d photographs beside it; another model may have more",
+            shown(model_folder),
+            len(there),
+            present,
+        )
     cameras, images = develop(there, max_side, progress)
     return Capture(cameras, images, *good_points(model))
 

@@ -44,11 +44,11 @@ def find_photos(folder: Path) -> list[Path]:
     return sorted(p for p in found if p.is_file())
 
 
-def shortened(names: Iterable[str], limit: int = 5) -> str:
-    """``a, b, c and 4 more``; long names lose their middle."""
+def shortened(names: Iterable[str], limit: int = 5, width: int = 200) -> str:
+    """``a, b, c and 4 more``, about `width` characters at most; long names lose their middle."""
     listed = sorted(names)
     rest = len(listed) - limit
-    shown = printable_line(", ".join(printable_line(name, 80) for name in listed[:limit]), 200)
+    shown = printable_line(", ".join(printable_line(name, 80) for name in listed[:limit]), width)
     return shown + (f" and {rest} more" if rest > 0 else "")
 
 

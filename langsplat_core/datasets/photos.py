@@ -7,11 +7,12 @@ from pathlib import Path
 
 from PIL import Image
 
-from langsplat_core.datasets import sfm
+from langsplat_core.datasets import mapping, sfm
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.colmap import good_points, located_photos
 from langsplat_core.datasets.colmap_model import SparseModel, has_model, read_model
 from langsplat_core.datasets.images import Photo, develop, find_photos, read_photo, shortened
+from langsplat_core.datasets.optics import optics, tags
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
 from langsplat_core.parsing.pictures import PictureError, opened
@@ -21,9 +22,8 @@ log = logging.getLogger("langsplat")
 
 SFM_SIDE = 1600  # px, longer side of the copies that features are sought in
 MIN_PHOTOS = 3
+FEWEST = 0.5  # share of the photographs: a scene of fewer is not of what was photographed
 UNREAD = "cannot be read"
-# EXIF tags from which COLMAP guesses the focal length: maker, model; focal length, same for 35 mm film.
-_MAIN_TAGS, _EXIF_IFD, _EXIF_TAGS = (0x010F, 0x0110), 0x8769, (0x920A, 0xA405)
 _ADVICE = "take more photographs, each sharing at least two thirds of its view with the next"
 
 
@@ -42,7 +42,9 @@ def photo_folder(folder: Path) -> Path | None:
     return next((candidate for candidate in candidates if find_photos(candidate)), None)
 
 
-def load_photos(folder: Path, max_side: int, work: Path, progress: Progress) -> Capture:
+def load_photos(
+    folder: Path, max_side: int, allow_few_cameras: bool, work: Path, progress: Progress
+) -> Capture:
     """Locate the photographs in `folder` (kept in ``work/sfm-*``) and load them; see `load_capture`."""
     paths = find_photos(folder)
     if len(paths) < MIN_PHOTOS:
@@ -50,12 +52,26 @@ def load_photos(folder: Path, max_side: int, work: Path, progress: Progress) -> 
             f"{folder} has {len(paths)} photographs; at least {MIN_PHOTOS} are needed: {_ADVICE}"
         )
     contents = [(path.name, _content(path)) for path in paths]
-    workspace = sfm.open_workspace(work, ["photographs", 2, SFM_SIDE, contents])
+    workspace = sfm.open_workspace(work, ["photographs", 3, SFM_SIDE, contents])
     numbered = {f"{index:05d}.jpg": path for index, path in enumerate(paths)}
     if not has_model(workspace / "sparse"):
-        _reconstruct(workspace, numbered, _twins(numbered, dict(contents)), progress)
-    model = read_model(workspace / "sparse")
-    _report_left_out(model, numbered, sfm.left_out(workspace))
+        _reconstruct(workspace, numbered, progress)
+    model = read_model(workspace / "sparse") if has_model(workspace / "sparse") else None
+    lost = _left_out(workspace, model, numbered, _twins(numbered, dict(contents)))
+    found = len(numbered) - sum(map(len, lost.values()))
+    if model is None or (found < max(MIN_PHOTOS, FEWEST * len(numbered)) and not allow_few_cameras):
+        anyway = "" if model is None else ", or go on without these with --dataset.allow-few-cameras"
+        raise InputError(
+            f"only {found} of {len(numbered)} photographs could be located together "
+            f"({_listed(lost, 50, 500)}); {_ADVICE}{anyway}"
+        )
+    if lost:
+        log.warning(
+            "%d of %d photographs could not be located and are left out (%s)",
+            len(numbered) - found,
+            len(numbered),
+            _listed(lost),
+        )
     located = located_photos(model, workspace / "images", workspace / "sparse")
     photos = [
         Photo(numbered[p.label], numbered[p.label].name, p.intrinsics, p.world_to_camera, upright=True)
@@ -85,47 +101,36 @@ def _twins(numbered: dict[str, Path], contents: dict[str, str]) -> dict[str, str
     }
 
 
-def _why(reasons: dict[str, str], numbered: dict[str, Path], twins: dict[str, str]) -> str:
-    """Reasons and their photographs: ``no features: a.jpg, b.jpg; no matches with any other: c.jpg``."""
+def _left_out(
+    workspace: Path, model: SparseModel | None, numbered: dict[str, Path], twins: dict[str, str]
+) -> dict[str, list[str]]:
+    """Photographs without a camera by the reason: ``{"no features": ["a.jpg", "b.jpg"]}``."""
+    located = {image.name for image in model.images} if model else set()
+    reasons = mapping.left_out(workspace)
+    reasons |= {name: f"the same picture as {twin}" for name, twin in twins.items()}
     groups: dict[str, list[str]] = {}
     for name, path in numbered.items():
-        if name in twins:
-            groups.setdefault(f"the same picture as {twins[name]}", []).append(path.name)
-        elif name in reasons:
-            groups.setdefault(reasons[name], []).append(path.name)
-    return "; ".join(f"{reason}: {shortened(names)}" for reason, names in groups.items())
+        if name not in located:
+            groups.setdefault(reasons.get(name, UNREAD), []).append(path.name)
+    return groups
 
 
-def _reconstruct(
-    workspace: Path, numbered: dict[str, Path], twins: dict[str, str], progress: Progress
-) -> None:
+def _listed(lost: dict[str, list[str]], limit: int = 5, width: int = 200) -> str:
+    """``no features: a.jpg, b.jpg; no matches with any other: c.jpg``; see `shortened`."""
+    return "; ".join(f"{reason}: {shortened(names, limit, width)}" for reason, names in lost.items())
+
+
+def _reconstruct(workspace: Path, numbered: dict[str, Path], progress: Progress) -> None:
     copies = _small_copies(workspace / "images", numbered, progress)
     try:
         sfm.extract_features(workspace, _groups(copies), progress)
         sfm.match_features(workspace, sfm.pairs_by_name([copy.name for copy in copies]), progress)
-        found = sfm.map_cameras(workspace, len(copies), progress)
+        mapping.map_cameras(workspace, len(copies), progress)
     except sfm.FAILURES as error:
         reason = str(error).partition("\n")[0]
         raise InputError(
             f"structure from motion failed ({reason}); remove {workspace} and try again"
         ) from None
-    if found < MIN_PHOTOS:
-        why = _why(sfm.left_out(workspace), numbered, twins)
-        raise InputError(
-            f"only {found} of {len(copies)} photographs could be located together ({why}); {_ADVICE}"
-        )
-
-
-def _report_left_out(model: SparseModel, numbered: dict[str, Path], reasons: dict[str, str]) -> None:
-    located = {image.name for image in model.images}
-    lost = {name: path for name, path in numbered.items() if name not in located}
-    if lost:
-        log.warning(
-            "%d of %d photographs could not be located and are left out (%s)",
-            len(lost),
-            len(numbered),
-            _why(dict.fromkeys(lost, UNREAD) | reasons, lost, {}),
-        )
 
 
 def _small_copies(folder: Path, numbered: dict[str, Path], progress: Progress) -> list[_Copy]:
@@ -137,7 +142,7 @@ def _small_copies(folder: Path, numbered: dict[str, Path], progress: Progress) -
             if not (folder / name).is_file():
                 _write_copy(path, folder / name)
             with opened(folder / name) as copy:
-                copies.append(_Copy(name, copy.size, str(_tags(copy.getexif()))))
+                copies.append(_Copy(name, copy.size, str(tags(copy.getexif()))))
         except PictureError as error:
             broken.append(f"{path.name} ({error.reason})")
     progress("preparing photographs", 1.0)
@@ -152,26 +157,7 @@ def _write_copy(path: Path, copy: Path) -> None:
     picture = read_photo(path, upright=True)
     picture.thumbnail((SFM_SIDE, SFM_SIDE), Image.Resampling.LANCZOS)
     with atomic_path(copy) as temporary:
-        picture.save(temporary, quality=95, exif=_optics(path))
-
-
-def _optics(path: Path) -> Image.Exif:
-    """Only what tells the focal length: other tags, orientation first of all, would be wrong for a copy."""
-    kept = Image.Exif()
-    try:
-        with opened(path) as picture:
-            source = picture.getexif()
-            kept.update({tag: source[tag] for tag in _MAIN_TAGS if tag in source})
-            inner = source.get_ifd(_EXIF_IFD)
-            kept.get_ifd(_EXIF_IFD).update({tag: inner[tag] for tag in _EXIF_TAGS if tag in inner})
-            kept.tobytes()
-    except PictureError:
-        return Image.Exif()
-    return kept
-
-
-def _tags(exif: Image.Exif) -> dict[int, object]:
-    return dict(exif) | dict(exif.get_ifd(_EXIF_IFD))
+        picture.save(temporary, quality=95, exif=optics(path))
 
 
 def _groups(copies: list[_Copy]) -> list[sfm.Group]:

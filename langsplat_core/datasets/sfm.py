@@ -1,4 +1,5 @@
-"""pycolmap, wrapped: features, matches, mapping and triangulation, in steps that report and resume.
+"""pycolmap, wrapped: features, matches and triangulation, in steps that report and resume; mapping is in
+`mapping.py`.
 
 A *workspace* is a folder with small copies of the photographs (``images``), COLMAP's ``database.db`` and,
 in the end, the model (``sparse``). It is named by a digest of all that it is made from; the database keeps
@@ -6,17 +7,20 @@ what was computed, so an interrupted run goes on, and ends with the same cameras
 are numbered in the order of their names, every random choice has its seed, and the mapper runs on one thread.
 """
 
+import errno
 import hashlib
 import json
+import os
 import shutil
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from langsplat_core.datasets.colmap_library import pycolmap
-from langsplat_core.files import atomic_path
+from langsplat_core.datasets.colmap_model import read_model
+from langsplat_core.errors import FormatError
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
 
@@ -26,10 +30,8 @@ FEATURES = 8192  # per photograph
 SMALL_SIDE = 1000  # px; smaller photographs are doubled before features are sought, as SIFT proposes
 EXTRACT_BATCH = 8  # photographs per step: a step is the unit of progress and of resuming
 MATCH_BATCH = 64  # pairs per step
-FEWEST_MATCHES = 15  # that COLMAP's mapper works with
-FEWEST_FEATURES = 50  # fewer rarely give that many matches
-LEFT_OUT = "left_out.json"  # in the workspace: which photographs have no camera, and why
-FAILURES = (RuntimeError, ValueError, IndexError, OSError)  # what pycolmap raises
+FAILURES = (RuntimeError, ValueError, IndexError)  # what pycolmap raises
+ROOM = 64_000_000  # bytes that a step may write: 8 photographs of 8192 features take 20 MB, with the journal
 
 Pair = tuple[str, str]
 
@@ -54,6 +56,16 @@ def open_workspace(work: Path, inputs: object) -> Path:
     return folder
 
 
+def check_room(folder: Path) -> None:
+    """OSError where the disk is about full: pycolmap would end the whole process there."""
+    if shutil.disk_usage(folder).free < ROOM:
+        raise _disk_full(folder)
+
+
+def _disk_full(folder: Path) -> OSError:
+    return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+
+
 def extract_features(folder: Path, groups: Sequence[Group], progress: Progress) -> None:
     """SIFT features of every photograph of `groups` into the database; those it has are kept."""
     database = folder / "database.db"
@@ -63,6 +75,7 @@ def extract_features(folder: Path, groups: Sequence[Group], progress: Progress) 
     for group in groups:
         for start in range(0, len(group.names), EXTRACT_BATCH):
             progress("finding features", done / total)
+            check_room(folder)
             names = group.names[start : start + EXTRACT_BATCH]
             _extract(database, folder / "images", group, names)
             done += len(names)
@@ -130,6 +143,7 @@ def match_features(folder: Path, pairs: Sequence[Pair], progress: Progress) -> N
     done = len(pairs) - len(lacking)
     for start in range(0, len(lacking), MATCH_BATCH):
         progress("matching photographs", (done + start) / len(pairs))
+        check_room(folder)
         batch = lacking[start : start + MATCH_BATCH]
         listing = folder / "pairs.txt"
         listing.write_text("".join(f"{first} {second}\n" for first, second in batch))
@@ -150,79 +164,6 @@ def _unmatched(database: Path, pairs: Sequence[Pair]) -> list[Pair]:
     with pycolmap.Database.open(database) as opened:
         ids = {image.name: image.image_id for image in opened.read_all_images()}
         return [(a, b) for a, b in pairs if not opened.exists_two_view_geometry(ids[a], ids[b])]
-
-
-def map_cameras(folder: Path, count: int, progress: Progress) -> int:
-    """Incremental structure from motion of `count` photographs; the model with most of them becomes
-    ``sparse``. Returns how many it holds; with 0 there is no ``sparse``."""
-    options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size = 3
-    options.max_num_models = 5
-    options.random_seed = 0
-    options.triangulation.random_seed = 0
-    options.num_threads = 1  # sums of several threads differ from run to run
-    registered = 0
-
-    def advance() -> None:
-        nonlocal registered
-        registered += 1
-        progress("locating cameras", min(registered / count, 0.99))
-
-    progress("locating cameras", 0.0)
-    attempts = folder / "attempts"
-    attempts.mkdir(exist_ok=True)
-    models = pycolmap.incremental_mapping(
-        database_path=folder / "database.db",
-        image_path=folder / "images",
-        output_path=attempts,
-        options=options,
-        next_image_callback=advance,
-    )
-    best = max(
-        models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None
-    )
-    located = set() if best is None else {image.name for image in best.images.values() if image.has_pose}
-    _write_left_out(folder, located)
-    if best is not None:
-        _store(best, folder)
-    progress("locating cameras", 1.0)
-    return 0 if best is None else int(best.num_reg_images())
-
-
-def left_out(folder: Path) -> dict[str, str]:
-    """Why photographs have no camera, by their names in the workspace, after `map_cameras`."""
-    why: dict[str, str] = json.loads((folder / LEFT_OUT).read_text())
-    return why
-
-
-def _write_left_out(folder: Path, located: Collection[str]) -> None:
-    with pycolmap.Database.open(folder / "database.db") as database:
-        names = {image.image_id: image.name for image in database.read_all_images()}
-        features = {number: database.num_keypoints_for_image(number) for number in names}
-        pairs, inliers = database.read_two_view_geometry_num_inliers()
-    friends: dict[int, int] = dict.fromkeys(names, 0)
-    for pair, count in zip(pairs, inliers, strict=True):
-        if count >= FEWEST_MATCHES:
-            for number in pycolmap.pair_id_to_image_pair(pair):
-                friends[number] += 1
-    why = {
-        name: _reason(features[number], friends[number])
-        for number, name in names.items()
-        if name not in located
-    }
-    with atomic_path(folder / LEFT_OUT) as temporary:
-        temporary.write_text(json.dumps(why, sort_keys=True))
-
-
-def _reason(features: int, friends: int) -> str:
-    """In words, from the number of features and of photographs that share enough of them."""
-    if features == 0:
-        return "no features (nothing but plain areas, or blurred)"
-    if features < FEWEST_FEATURES:
-        return "too few features (plain, dark, blurred or tiny)"
-    if friends == 0:
-        return "no matches with any other"
-    return "matched, but from one and the same place, or without enough overlap"
 
 
 def triangulate(folder: Path, names: Sequence[str], cameras: Sequence[Camera]) -> None:
@@ -249,15 +190,24 @@ def triangulate(folder: Path, names: Sequence[str], cameras: Sequence[Camera]) -
         output_path=attempts,
         options=options,
     )
-    _store(result, folder)
+    store_model(result, folder)
 
 
-def _store(model: "pycolmap.Reconstruction", folder: Path) -> None:
-    """Write the model as ``sparse``, which exists only when it is whole, and drop what led to it."""
+def store_model(model: "pycolmap.Reconstruction", folder: Path) -> None:
+    """Write the model as ``sparse``, which exists only when it is whole, and drop what led to it.
+
+    pycolmap says nothing where the disk takes only a part, so that what was written is read. OSError then.
+    """
     unfinished = folder / "sparse.part"
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir()
     model.write_binary(unfinished)
+    try:
+        written = read_model(unfinished)
+    except FormatError:
+        raise _disk_full(folder) from None
+    if len(written.points) != model.num_points3D():
+        raise _disk_full(folder)
     shutil.rmtree(folder / "sparse", ignore_errors=True)
     unfinished.rename(folder / "sparse")
     for name in ("database.db", "pairs.txt"):

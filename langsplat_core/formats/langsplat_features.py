@@ -13,8 +13,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import FormatError
-from langsplat_core.files import atomic_path
-from langsplat_core.parsing.npy import read_npy
+from langsplat_core.parsing.npy import read_npy, write_npy
 
 MAP_COUNT = 4
 NO_MASK = -1
@@ -52,8 +51,7 @@ def write_features(folder: Path | str, stem: str, vectors: Array, maps: Array) -
     if maps.size and not (maps.min() >= NO_MASK and maps.max() < len(vectors)):
         raise ValueError(f"maps: ids beyond the {len(vectors)} vectors")
     for path, array in zip(_paths(folder, stem), (vectors, maps), strict=True):
-        with atomic_path(path) as temporary:
-            np.save(temporary, array, allow_pickle=False)
+        write_npy(path, array)
 
 
 def _paths(folder: Path | str, stem: str) -> tuple[Path, Path]:

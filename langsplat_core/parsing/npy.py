@@ -1,5 +1,5 @@
 """Files of plain NumPy arrays of numbers or texts, .npy and .npz, read without pickles and without belief in
-their headers."""
+their headers; and .npy written."""
 
 import io
 import math
@@ -11,6 +11,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, quoted
+from langsplat_core.files import atomic_path
 from langsplat_core.parsing.archives import opened_archive
 from langsplat_core.parsing.opening import open_for_reading
 
@@ -24,6 +25,18 @@ _HEADER = re.compile(
     rb"'fortran_order': (?P<order>True|False), "
     rb"'shape': \((?P<shape>(?:\d{1,18}(?:, ?)?){0,8})\), ?\} *\n?$"
 )
+
+
+def write_npy(path: Path, array: Array) -> None:
+    """Write an array of numbers, whole or not at all.
+
+    `np.save` hands the numbers to C's library, and where the disk takes all but the end nobody is told.
+    """
+    whole = np.asarray(array, order="C")
+    header = np.lib.format.header_data_from_array_1_0(whole)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+        file.write(whole.reshape(-1).view(np.uint8).data)
 
 
 def read_npy(path: Path) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError
 from langsplat_core.files import atomic_path
+from langsplat_core.parsing.npy import write_npy
 from langsplat_core.scene import Gaussians
 from langsplat_core.semantics.store import ImageFeatures
 
@@ -46,9 +47,7 @@ def kept(path: Path, make: Callable[[], T], pack: Callable[[T], Arrays], unpack:
 def kept_array(path: Path, make: Callable[[], Array]) -> None:
     """See to it that `path` (*.npy) holds what `make` gives, which is not called where the file is there."""
     if not path.exists():
-        array = make()
-        with atomic_path(path) as temporary:
-            np.save(temporary, array, allow_pickle=False)
+        write_npy(path, make())
 
 
 def open_array(path: Path) -> Array:

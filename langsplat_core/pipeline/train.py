@@ -18,7 +18,7 @@ from langsplat_core.config import RadianceConfig, TrainConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
-from langsplat_core.files import atomic_path, check_output_folder
+from langsplat_core.files import atomic_path, check_output_folder, shown
 from langsplat_core.formats import check_writable, load_scene, read_ply, save_scene, write_ply
 from langsplat_core.pipeline.crew import Crew
 from langsplat_core.pipeline.doubts import doubts
@@ -36,6 +36,7 @@ from langsplat_core.semantics.store import FeatureStore, StoredFeatures, describ
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 
 REPORT = "report.json"  # in the work folder
+FEWEST_VIEWS = 3
 
 log = logging.getLogger("langsplat")
 
@@ -107,6 +108,11 @@ def _train(
     named = None if masks_of else load_mask_source(config.masks, config.clip.device)
     # One process solves for cameras, the others find them in the work folder.
     capture = crew.once(lambda: load_capture(dataset, config.dataset, work, progress))
+    if len(capture) < FEWEST_VIEWS and not config.dataset.allow_few_cameras:
+        raise InputError(
+            f"{shown(dataset)}: only {len(capture)} photographs have cameras, and a scene needs "
+            f"{FEWEST_VIEWS}; take more, or go on with --dataset.allow-few-cameras"
+        )
     mask_source = named or masks_of(capture)  # type: ignore[misc]  # one of them is there
     log.info("masks: %s, encoder: %s", mask_source.name, encoder.id)
     train, held_out = capture.split(config.dataset.test_every)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
+from threading import RLock
 from typing import Protocol
 
 import numpy as np
@@ -51,7 +52,8 @@ LoadEncoder = Callable[[str], TextEncoder]  # from a hub id, a folder or "demo";
 
 class QueryEngine:
     """Queries against one scene. What depends on the scene alone is computed at the first query, and the text
-    encoder is loaded when a phrase first needs it. Not for use by two threads at once."""
+    encoder is loaded when a phrase first needs it. Several threads may ask at once, and take turns at the
+    encoder; none may call `compare_with` meanwhile."""
 
     def __init__(
         self,
@@ -71,6 +73,7 @@ class QueryEngine:
         self._load_encoder = load_encoder
         self._encoder_id = encoder_id
         self._encoder: TextEncoder | None = None
+        self._turn = RLock()  # at the encoder, whose tokenizer is not made for two at once
         self._encoded: dict[str, Array] = {}  # phrases asked so far, 2 KB each at D = 512
         self._encoder_checked = False
         self._canonical: Array | None = None  # (C, D) in place of the scene's own
@@ -107,15 +110,16 @@ class QueryEngine:
 
         Raises EncoderError where it cannot be loaded, or where the engine was given no way to.
         """
-        if self._encoder is None:
-            if self._load_encoder is None:
-                raise EncoderError(
-                    "without a text encoder only the phrases in the scene's phrasebook can be asked; "
-                    f"the scene was made with {self.field.encoder_id}"
-                )
-            progress("loading the text encoder", 0.1)
-            self._encoder = self._load_encoder(self._encoder_id or self.field.encoder_id)
-        return self._encoder
+        with self._turn:
+            if self._encoder is None:
+                if self._load_encoder is None:
+                    raise EncoderError(
+                        "without a text encoder only the phrases in the scene's phrasebook can be asked; "
+                        f"the scene was made with {self.field.encoder_id}"
+                    )
+                progress("loading the text encoder", 0.1)
+                self._encoder = self._load_encoder(self._encoder_id or self.field.encoder_id)
+            return self._encoder
 
     @cached_property
     def surface(self) -> Surface:
@@ -155,10 +159,11 @@ class QueryEngine:
             check_names(key.split())
         if fresh:
             encoder = self.load_encoder(progress)
-            _check_words(encoder, fresh)
-            for start in range(0, len(fresh), BATCH):
-                batch = fresh[start : start + BATCH]
-                self._encoded.update(zip(batch, self._encode(encoder, batch), strict=True))
+            with self._turn:
+                _check_words(encoder, fresh)
+                for start in range(0, len(fresh), BATCH):
+                    batch = fresh[start : start + BATCH]
+                    self._encoded.update(zip(batch, self._encode(encoder, batch), strict=True))
         return np.stack([book[key] if key in book else self._encoded[key] for key in keys])
 
     def known_vectors(
@@ -184,7 +189,8 @@ class QueryEngine:
 
     def _encode(self, encoder: TextEncoder, keys: list[str]) -> Array:
         """(M, D) of phrases that `encoder` knows; EncoderError where it is not the scene's."""
-        vectors = np.asarray(encoder.encode_texts(keys), np.float32)
+        with self._turn:
+            vectors = np.asarray(encoder.encode_texts(keys), np.float32)
         if vectors.shape[1:] != (self.field.codec.vector_dim,):
             raise EncoderError(
                 f"the encoder gives {vectors.shape[1]} numbers, the scene was made with "

@@ -115,6 +115,16 @@ def test_missing_photographs_are_reported_once(tmp_path: Path, caplog: pytest.Lo
     ]
 
 
+def test_a_model_of_few_of_the_photographs_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_dataset(tmp_path)
+    for index in range(4):
+        Image.new("RGB", (8, 8)).save(tmp_path / "images" / f"other_{index}.png")
+    with caplog.at_level(logging.WARNING, "langsplat"):
+        assert len(load_capture(tmp_path, CONFIG, tmp_path / "work")) == 3
+    (message,) = [record.getMessage() for record in caplog.records]
+    assert "cameras for only 3 of the 7 photographs" in message
+
+
 def test_no_photograph_at_all_is_an_error(tmp_path: Path) -> None:
     write_dataset(tmp_path)
     for photo in (tmp_path / "images").iterdir():

@@ -1,6 +1,7 @@
 """The whole path on a tiny scene: photographs in, searchable scene out, interrupted and resumed."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -204,6 +205,19 @@ def test_what_cannot_be_used_is_said_before_anything_is_made(room, tmp_path):
     with pytest.raises(InputError):
         train_scene(tmp_path / "missing", tmp_path / "scene.ply", tiny_settings(room))
     assert not list(tmp_path.glob("**/*.ply"))
+
+
+def test_two_views_are_no_scene_unless_told_otherwise(room, tmp_path):
+    pair = tmp_path / "pair"
+    shutil.copytree(room, pair)
+    transforms = json.loads((pair / "transforms.json").read_text())
+    transforms["frames"] = transforms["frames"][:2]
+    (pair / "transforms.json").write_text(json.dumps(transforms))
+    config = tiny_settings(room)
+    with pytest.raises(InputError, match=r"only 2 photographs have cameras.*--dataset\.allow-few-cameras"):
+        train_scene(pair, tmp_path / "scene.ply", config)
+    told = replace(config, dataset=replace(config.dataset, allow_few_cameras=True))
+    assert train_scene(pair, tmp_path / "scene.ply", told).views == 1
 
 
 def test_stage_keys_follow_settings():

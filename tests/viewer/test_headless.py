@@ -52,9 +52,19 @@ print([name for name in ("glfw", "imgui_bundle") if name in sys.modules])
 
 @pytest.mark.long
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="hides EGL's drivers from its loader")
-def test_without_any_driver_the_cpu_still_makes_pictures():
-    hidden = {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent.json"}
+@pytest.mark.parametrize(
+    "driver",
+    [
+        {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent.json"},
+        {"MESA_GL_VERSION_OVERRIDE": "2.1", "MESA_GLSL_VERSION_OVERRIDE": "120"},
+        {"MESA_GL_VERSION_OVERRIDE": "3.3FC", "MESA_GLSL_VERSION_OVERRIDE": "330"},
+    ],
+    ids=["none", "2.1", "3.3"],
+)
+def test_without_a_driver_that_suffices_the_cpu_still_makes_pictures(gl, driver):
+    if "MESA_GL_VERSION_OVERRIDE" in driver and "llvmpipe" not in gl.info["GL_RENDERER"]:
+        pytest.skip("only Mesa can pretend to be an older OpenGL")
     run = subprocess.run(
-        [sys.executable, "-c", NO_DRIVER], env=os.environ | hidden, capture_output=True, text=True
+        [sys.executable, "-c", NO_DRIVER], env=os.environ | driver, capture_output=True, text=True
     )
     assert run.stdout.split("\n")[:2] == ["refused", "[]"], run.stderr

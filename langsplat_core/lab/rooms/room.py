@@ -23,7 +23,6 @@ from langsplat_core.config import (
 )
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.files import atomic_path
 from langsplat_core.formats.language import means_checksum
 from langsplat_core.lab.config import BenchmarkConfig, MaskOrigin, Tier
 from langsplat_core.lab.rooms.oracles import (
@@ -48,6 +47,7 @@ from langsplat_core.lab.rooms.truth import Truth, read_truth
 from langsplat_core.lab.rooms.variants import Variant, variants
 from langsplat_core.lab.world.objects.catalogue import EVERYTHING
 from langsplat_core.lab.world.photographs import write_dataset
+from langsplat_core.parsing.npy import write_npy
 from langsplat_core.pipeline.language import Views, language_field
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import trained_gaussians
@@ -144,8 +144,7 @@ class Room:
             start = time.perf_counter()
             views = [(camera, self.truth.labels(camera.name)) for camera in self.capture.cameras]
             labels = true_labels(CpuRasterizer(), self.gaussians, views, self.progress)
-            with atomic_path(path) as temporary:
-                np.save(temporary, labels, allow_pickle=False)
+            write_npy(path, labels)
             self._lap("labels of the Gaussians", start)
         stored: Array = np.load(path, allow_pickle=False)
         return stored
