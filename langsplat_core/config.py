@@ -72,6 +72,9 @@ class RadianceConfig:
     sh_degree_every: Count = 1_000  # steps after which the degree grows by one
     max_gaussians: Count = 1_000_000  # never more than so many
     lambda_dssim: Share = 0.2  # share of 1 - SSIM in the loss; the rest is L1
+    # times the mean opacity, added to the loss (Kheradmand et al. 2024: 0.01; INRIA: 0): what the photographs
+    # do not need fades
+    opacity_decay: NotNegative = 0.0
     position_lr_init: Rate = 1.6e-4  # times the cameras' extent
     position_lr_final: Rate = 1.6e-6  # at the last step, times the cameras' extent
     feature_lr: Rate = 2.5e-3  # higher SH coefficients: a twentieth
@@ -176,6 +179,9 @@ TrainProfile = Literal["default", "paper"]
 TrainPreset = Literal["quick", "good", "full"]
 
 
+OPACITY_DECAY = 0.01  # of quick and good: few photographs gain a third of a decibel, see docs/photographs.md
+
+
 def with_preset(config: TrainConfig, preset: TrainPreset) -> TrainConfig:
     """How much is spent on a scene: "quick" takes minutes of a CPU, "full" is as published, for a GPU."""
     if preset == "full":
@@ -184,7 +190,9 @@ def with_preset(config: TrainConfig, preset: TrainPreset) -> TrainConfig:
     return replace(
         config,
         dataset=replace(config.dataset, max_side=side),
-        radiance=replace(config.radiance, steps=steps, max_gaussians=most, sh_degree=1),
+        radiance=replace(
+            config.radiance, steps=steps, max_gaussians=most, sh_degree=1, opacity_decay=OPACITY_DECAY
+        ),
         codec=replace(config.codec, size=size),
     )
 

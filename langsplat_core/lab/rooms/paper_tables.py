@@ -164,21 +164,35 @@ def plot(rows: Sequence[PaperRow], path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, panels = pyplot.subplots(1, 2, figsize=(12, 4.6), layout="constrained", sharex=True)
+    figure, panels = pyplot.subplots(1, 2, figsize=(10, 5.6), layout="constrained", sharex=True)
+    names = list(dict.fromkeys(row.measured.name for row in rows))
     for panel, (title, column) in zip(panels, (("mIoU in pictures %", 1), ("IoU in 3D %", 3)), strict=True):
-        for number, name in enumerate(dict.fromkeys(row.measured.name for row in rows)):
+        for number, name in enumerate(names, 1):
             same = [row for row in rows if row.measured.name == name]
             shares = np.array([100 * of_kind(row.measured, "all")[column] for row in same])
             at = float(np.mean([row.picture_ms for row in same])), float(shares.mean())
             colour = "#0072b2" if name.startswith(OURS) else "#d55e00"
+            # Ways that are equally fast stand above each other: their numbers go to both sides in turn.
+            side = 1 if number % 2 else -1
             panel.errorbar(*at, yerr=shares.std(), fmt="o", color=colour, capsize=2)
-            above = 4 if number % 2 == 0 else -9
-            panel.annotate(name, at, fontsize=7, xytext=(5, above), textcoords="offset points")
+            panel.annotate(
+                str(number),
+                at,
+                fontsize=9,
+                ha="left" if side > 0 else "right",
+                va="center",
+                xytext=(7 * side, 0),
+                textcoords="offset points",
+            )
         panel.set_xscale("log")
         panel.set_xlabel("milliseconds from a phrase to its picture")
         panel.set_ylabel(title)
         panel.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+    legend = [pyplot.Line2D([], [], linestyle="", label=f"{k}  {name}") for k, name in enumerate(names, 1)]
+    figure.legend(
+        handles=legend, loc="outside lower center", ncols=2, fontsize=8, handlelength=0, frameon=False
+    )
+    figure.savefig(path, dpi=90)
     pyplot.close(figure)
 
 

@@ -95,6 +95,14 @@ def clean_gradients(state: TrainingState) -> None:
         value.grad[bad] = 0
 
 
+def add_opacity_decay(state: TrainingState, strength: float) -> None:
+    """Add the gradient of `strength` times the mean opacity, as Kheradmand et al. 2024."""
+    logits = state.values["opacity_logits"]
+    raw = logits.detach()
+    slope = torch.sigmoid(raw) * torch.sigmoid(-raw) * (strength / max(len(state), 1))
+    logits.grad = slope if logits.grad is None else logits.grad + slope
+
+
 def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
     """One Adam update (Kingma and Ba 2015) of every parameter that has a gradient; gradients are dropped.
 

@@ -31,7 +31,13 @@ from langsplat_core.training.radiance.initialise import initial_gaussians
 from langsplat_core.training.radiance.losses import radiance_loss, ssim
 from langsplat_core.training.radiance.renderers import Backend, renderer_for
 from langsplat_core.training.radiance.schedule import Schedule, schedule_for
-from langsplat_core.training.radiance.state import TrainingState, adam_step, clean_gradients, start
+from langsplat_core.training.radiance.state import (
+    TrainingState,
+    adam_step,
+    add_opacity_decay,
+    clean_gradients,
+    start,
+)
 
 LOSSES_SAID = 200  # how often in a run its loss is said
 COARSE_MIN_SIDE = 64  # px: smaller pictures are never halved
@@ -190,6 +196,8 @@ def _step(run: _Run, state: TrainingState) -> float:
     rendered = run.renderer.render(state.values, camera, schedule.active_sh_degree(step))
     loss = radiance_loss(rendered.image, target, run.config.lambda_dssim)
     loss.backward()
+    if run.config.opacity_decay > 0:
+        add_opacity_decay(state, run.config.opacity_decay)
     clean_gradients(state)
     if step < schedule.densify_until:
         accumulate(state, rendered.means_px_grad(), rendered.visible, (camera.width, camera.height))

@@ -11,7 +11,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.config import INRIA, RadianceConfig, RasterSettings
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError, InputError
@@ -22,7 +22,7 @@ from langsplat_core.scene import Camera, Gaussians, look_at
 from langsplat_core.training.radiance.differentiable import CpuRenderer
 from langsplat_core.training.radiance.initialise import initial_gaussians
 from langsplat_core.training.radiance.renderers import renderer_for
-from langsplat_core.training.radiance.state import PARAMETERS, TrainingState, start
+from langsplat_core.training.radiance.state import PARAMETERS, TrainingState, add_opacity_decay, start
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 
 SIZE = (48, 48)
@@ -108,6 +108,27 @@ def test_gradients_are_those_of_the_reference_picture() -> None:
         assert grad is not None
         ours = float((grad.double() * (places[0] - places[1])).sum())  # rounded to float32, both ways
         assert ours == pytest.approx(ends[0] - ends[1], rel=1e-3, abs=1e-6), name
+
+
+def test_opacity_decay_is_the_gradient_of_the_mean_opacity() -> None:
+    state = start(truth(), 0, torch.device("cpu"))
+    logits = state.values["opacity_logits"]
+    logits.data = torch.linspace(-80, 80, len(state))  # saturated at both ends
+    (0.25 * torch.sigmoid(logits.double()).mean()).backward()
+    assert logits.grad is not None
+    want, logits.grad = logits.grad.clone(), None
+    add_opacity_decay(state, 0.25)
+    torch.testing.assert_close(logits.grad, want, rtol=1e-5, atol=1e-12)
+    add_opacity_decay(state, 0.25)  # on top of what is there
+    torch.testing.assert_close(logits.grad, 2 * want, rtol=1e-5, atol=1e-12)
+
+
+def test_opacity_decay_leaves_a_scene_with_less_light_stopped() -> None:
+    plain, faded = (
+        train_radiance(capture(), replace(SHORT, opacity_decay=strength), [0, 1, 2])
+        for strength in (0.0, 1.0)
+    )
+    assert sigmoid(faded.opacity_logits).mean() < sigmoid(plain.opacity_logits).mean()
 
 
 @pytest.mark.long
