@@ -32,6 +32,7 @@ from langsplat_viewer.preferences import Preferences, save_preferences
 from langsplat_viewer.querysets import QuerySet, SavedQuery, write_queries
 from langsplat_viewer.saving import save_png
 from tests.support.file_samples import random_codec, random_field
+from tests.support.flights import flight as some_flight
 from tests.support.full_disk import files_of_at_most
 from tests.support.scenes import random_camera, random_gaussians
 
@@ -71,15 +72,11 @@ def features(folder: Path) -> None:
 
 
 def flight(folder: Path) -> None:
-    from tests.viewer.test_film import flight as some
-
-    write_flight(folder / "f.path.json", some())
+    write_flight(folder / "f.path.json", some_flight())
 
 
 def bookmarks(folder: Path) -> None:
-    from tests.viewer.test_film import flight as some
-
-    pose = some().keyframes[0].pose
+    pose = some_flight().keyframes[0].pose
     Shelf(folder).write(Path("s.ply"), (Bookmark("door", pose, 1.0),))
 
 

@@ -17,13 +17,13 @@ from langsplat_core.formats import save_scene
 from langsplat_core.progress import Cancelled
 from langsplat_viewer import __main__ as program
 from langsplat_viewer import film_files, options
-from langsplat_viewer.controls import extent_of, from_camera, orbit
 from langsplat_viewer.film import Shot, cameras_of, fingerprint, make_film
 from langsplat_viewer.film_files import find_ffmpeg
-from langsplat_viewer.flight import Flight, Keyframe, pose_of
+from langsplat_viewer.flight import Flight, Keyframe
 from langsplat_viewer.flight_files import write_flight
 from langsplat_viewer.headless import Subject, render_picture
 from tests.support.fakes import FakeEncoder, blob_scene
+from tests.support.flights import flight
 
 SIZE = (32, 24)
 FRAMES = [f"frame-{number:05d}.png" for number in range(5)]
@@ -39,19 +39,6 @@ sys.stdin.buffer.read(10)
 sys.stderr.write("Unknown encoder\\n 'libx264'\\n\\n")
 sys.exit(1)
 """
-
-
-def flight(away: float = 0.0) -> Flight:
-    """A second around the blobs; `away`: turned by so much, radians, everything is behind the camera."""
-    view = from_camera(blob_scene().cameras[0], extent_of(blob_scene()))
-    keys = []
-    for seconds, yaw in ((0.0, 0.0), (0.5, 0.2), (1.0, 0.5)):
-        pose = pose_of(orbit(view, yaw, 0))
-        if away:
-            turned = pose.rotation * np.array([[-1.0], [1.0], [-1.0]])
-            pose = type(pose)(pose.position, turned, pose.fov_degrees)
-        keys.append(Keyframe(seconds, pose))
-    return Flight(tuple(keys))
 
 
 def shot(away: float = 0.0, **changed) -> Shot:

@@ -192,7 +192,7 @@ def plot(rows: Sequence[PaperRow], path: Path) -> None:
     figure.legend(
         handles=legend, loc="outside lower center", ncols=2, fontsize=8, handlelength=0, frameon=False
     )
-    figure.savefig(path, dpi=90)
+    figure.savefig(path, dpi=100)
     pyplot.close(figure)
 
 
