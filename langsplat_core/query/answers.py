@@ -12,7 +12,7 @@ from langsplat_core.query.extent import find_extent, to_margin
 from langsplat_core.query.places import locate
 from langsplat_core.query.regions import Regions
 from langsplat_core.query.surface import Surface
-from langsplat_core.query.vocabulary import names_part
+from langsplat_core.query.vocabulary import named
 from langsplat_core.scene import LEVELS, Margins, Odds, Reading
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN
 
@@ -73,7 +73,7 @@ def by_regions(
     phrase: str, relevancy: Array, surface: Surface, regions: Regions, reading: Reading, level: LevelChoice
 ) -> QueryResult:
     """Whole regions, cut at a share of the best one's margin (`extent`)."""
-    extent = find_extent(relevancy, regions, reading.temperature, level)
+    extent = find_extent(relevancy, regions, reading.temperature, level, named(phrase))
     even = regions.spread(extent.level, extent.even, relevancy[extent.level])
     peak = extent.peaks[extent.level]
     lowest = float(extent.even[extent.inside].min(initial=1.0))
@@ -127,7 +127,7 @@ def _odds(phrase: str, reading: Reading) -> Odds | None:
     """A part asked for alone answers at the finer levels, where its margins are others than a thing's."""
     if reading.calibration is None:
         return None
-    return reading.calibration.part if names_part(phrase) else reading.calibration.thing
+    return reading.calibration.thing if named(phrase) == "thing" else reading.calibration.part
 
 
 def _judged(phrase: str, margins: Margins, reading: Reading, level: LevelChoice) -> tuple[float | None, bool]:

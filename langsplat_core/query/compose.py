@@ -27,7 +27,7 @@ from langsplat_core.query.phrase_tree import (
     reading,
 )
 from langsplat_core.query.standing import Body, body, most, separate, stands, upright, viewer
-from langsplat_core.query.vocabulary import names_part
+from langsplat_core.query.vocabulary import named
 from langsplat_core.scene import Camera
 from langsplat_core.scene.phrases import phrase_key, tidy
 from langsplat_core.semantics.relevancy import FLOOR
@@ -146,7 +146,7 @@ class _Asking:
 
     def _thing(self, text: str, level: LevelChoice) -> QueryResult:
         """A thing is looked for among wholes, unless it is a part, or fits none of them."""
-        if level != "auto" or names_part(text):
+        if level != "auto" or named(text) != "thing":
             return self._ask(text, level)
         whole = self._ask(text, "whole")
         return whole if whole.peak >= FLOOR else self._ask(text, "auto")

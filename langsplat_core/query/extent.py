@@ -5,6 +5,7 @@ canonical phrase: relevancy without its temperature, so that one rule fits all e
 and differences were chosen on the rooms that the demo encoder is calibrated on, never on those that measure.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,9 +13,16 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.regions import SMALLEST, Regions
+from langsplat_core.query.vocabulary import Named
 from langsplat_core.scene import LEVELS
 
-COARSER = 0.06  # of margin that a coarser level may be worse by and still be taken: things are asked for most
+# Of margin that each level is given before the best is chosen, by what a phrase names. A thing is one whole,
+# whatever some part of it looks like; the best of a part asked for alone may stand for the thing it is on.
+ADVANTAGE: Mapping[Named, tuple[float, float, float]] = {
+    "thing": (0.0, 0.0, 0.12),
+    "part": (0.0, 0.0, 0.03),
+    "part of a thing": (0.0, 0.03, -0.03),
+}
 SHARES = (0.4, 0.4, 0.3)  # of the best margin at each level from which a region belongs to the answer
 FAINT = 0.03  # a best margin below this is no scale to take shares of
 NARROWEST = 1e-6  # distance of a relevancy from 0 and 1, so that its margin is finite
@@ -32,13 +40,18 @@ class Extent:
 
 
 def find_extent(
-    relevancy: Array, regions: Regions, temperature: float, level: LevelChoice = "auto"
+    relevancy: Array,
+    regions: Regions,
+    temperature: float,
+    level: LevelChoice = "auto",
+    named: Named = "thing",
 ) -> Extent:
-    """From the (3, N) relevancy of a phrase. level: "auto", or the one that is wanted."""
+    """From the (3, N) relevancy of a phrase. level: "auto", which depends on what is `named`, or the one that
+    is wanted."""
     means = regions.means(relevancy)
     peaks = [_best(values, sizes) for values, sizes in zip(means, regions.sizes, strict=True)]
     best = to_margin(np.array(peaks), temperature)
-    chosen = _level(best) if level == "auto" else LEVELS.index(level)
+    chosen = _level(best, named) if level == "auto" else LEVELS.index(level)
     return Extent(
         level=chosen,
         margins=(float(best[0]), float(best[1]), float(best[2])),
@@ -65,6 +78,7 @@ def _best(means: Array, sizes: Array) -> float:
     return float((solid if len(solid) else means).max(initial=0))
 
 
-def _level(best: Array) -> int:
-    """The coarsest that is nearly as good as the best."""
-    return int(np.flatnonzero(best >= best.max() - COARSER)[-1])
+def _level(best: Array, named: Named) -> int:
+    """The best after its advantage; of equal ones the coarsest."""
+    given = best + ADVANTAGE[named]
+    return int(np.flatnonzero(given == given.max())[-1])

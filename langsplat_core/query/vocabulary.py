@@ -1,8 +1,11 @@
 """The plain word lists by which the grammar of phrases tells a part from a thing; see `query.grammar`."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 from langsplat_core.errors import InputError
+
+Named = Literal["thing", "part", "part of a thing"]
 
 
 def _words(text: str) -> frozenset[str]:
@@ -70,10 +73,13 @@ def is_part(word: str) -> bool:
     return any(form in PARTS for form in forms(word))
 
 
-def names_part(phrase: str) -> bool:
-    """Whether what a phrase without structure names is a part of things: "red handle", "the keyboard"."""
-    words = phrase.split()
-    return bool(words) and is_part(words[-1])
+def named(phrase: str) -> Named:
+    """What a phrase without structure names: "red mug" a thing, "red handle" and "keyboard" a part, "mug
+    handle" a part of a thing."""
+    *before, last = phrase.split() or [""]
+    if not is_part(last):
+        return "thing"
+    return "part" if only(ADJECTIVES | ARTICLES, before) else "part of a thing"
 
 
 def is_measure(word: str) -> bool:

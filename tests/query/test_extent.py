@@ -1,14 +1,16 @@
 """How far an answer reaches, against the rule written out region by region."""
 
 import math
+from itertools import product
 
 import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array, sigmoid
-from langsplat_core.query.extent import COARSER, FAINT, NARROWEST, SHARES, cut, find_extent, to_margin
+from langsplat_core.query.extent import ADVANTAGE, FAINT, NARROWEST, SHARES, cut, find_extent, to_margin
 from langsplat_core.query.regions import SMALLEST, Regions, regions_from
 from langsplat_core.query.surface import Surface, build_surface
+from langsplat_core.query.vocabulary import Named
 from langsplat_core.scene import LEVELS
 from tests.support.scenes import random_gaussians
 
@@ -35,21 +37,20 @@ def spread_out(surface: Surface, regions: Regions, margins) -> Array:
     return relevancy
 
 
-def plain_extent(margins, sizes, level: str) -> tuple[int, list[bool]]:
+def plain_extent(margins, sizes, level: str, named: Named) -> tuple[int, list[bool]]:
     """The level and the regions that answer."""
     solid = [n for n, size in enumerate(sizes) if size >= SMALLEST] or list(range(len(sizes)))
     best = [max(row[n] for n in solid) for row in margins]
-    chosen = LEVELS.index(level) if level != "auto" else max(
-        index for index in range(3) if best[index] >= max(best) - COARSER
-    )  # fmt: skip
+    given = [value + more for value, more in zip(best, ADVANTAGE[named], strict=True)]
+    chosen = given.index(max(given)) if level == "auto" else LEVELS.index(level)
     top, share = best[chosen], SHARES[chosen]
     limit = share * top if top > FAINT else top - (1 - share) * FAINT
     return chosen, [value > limit for value in margins[chosen]]
 
 
-@pytest.mark.parametrize("level", ["auto", *LEVELS])
+@pytest.mark.parametrize(("level", "named"), [*product(["auto"], ADVANTAGE), *product(LEVELS, ["part"])])
 @pytest.mark.parametrize("middle", [-0.3, 0.0, 0.15])
-def test_the_extent_is_that_of_the_plain_rule(surface, level, middle):
+def test_the_extent_is_that_of_the_plain_rule(surface, level, named, middle):
     rng = np.random.default_rng(0)
     count = len(surface.rows)
     for _ in range(30):
@@ -57,8 +58,8 @@ def test_the_extent_is_that_of_the_plain_rule(surface, level, middle):
         sizes = (*sizes, count - sum(sizes))
         margins = middle + 0.1 * rng.normal(size=(3, len(sizes)))
         regions = regions_of(surface, sizes)
-        got = find_extent(spread_out(surface, regions, margins), regions, T, level)
-        chosen, answering = plain_extent(margins, sizes, level)
+        got = find_extent(spread_out(surface, regions, margins), regions, T, level, named)
+        chosen, answering = plain_extent(margins, sizes, level, named)
         assert got.level == chosen
         np.testing.assert_array_equal(got.inside, answering)
         solid = np.array(sizes) >= SMALLEST
@@ -70,20 +71,23 @@ def test_the_extent_is_that_of_the_plain_rule(surface, level, middle):
 
 
 @pytest.mark.parametrize(
-    ("best", "level"),
+    ("best", "named", "level"),
     [
-        ((0.2, 0.2, 0.2), 2),
-        ((0.2, 0.2, 0.15), 2),
-        ((0.2, 0.2, 0.13), 1),
-        ((0.2, 0.1, 0.13), 0),
-        ((-0.5, -0.3, -0.35), 2),
-        ((-0.1, -0.3, -0.35), 0),
+        ((0.2, 0.2, 0.2), "thing", 2),
+        ((0.2, 0.2, 0.09), "thing", 2),
+        ((0.2, 0.1, 0.07), "thing", 0),
+        ((-0.5, -0.3, -0.4), "thing", 2),
+        ((0.2, 0.2, 0.18), "part", 2),
+        ((0.21, 0.2, 0.15), "part", 0),
+        ((0.2, 0.18, 0.2), "part of a thing", 1),
+        ((0.2, 0.16, 0.2), "part of a thing", 0),
+        ((-0.5, -0.3, -0.2), "part of a thing", 2),
     ],
 )
-def test_the_coarsest_of_the_levels_that_answer_nearly_best(surface, best, level):
+def test_the_level_is_the_best_one_after_what_speaks_for_it(surface, best, named, level):
     regions = regions_of(surface, (100, len(surface.rows) - 100))
     margins = [(value, value - 0.4) for value in best]
-    assert find_extent(spread_out(surface, regions, margins), regions, T).level == level
+    assert find_extent(spread_out(surface, regions, margins), regions, T, named=named).level == level
 
 
 def test_crumbs_set_no_scale_unless_there_is_nothing_else(surface):
