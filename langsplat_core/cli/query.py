@@ -37,7 +37,7 @@ class QueryScene:
     """Phrases, each in quotes if it has several words; "," and ";" separate them too. What cannot be asked
     is named on stderr, and the rest is answered; with nothing left the exit code is 2."""
     level: LevelChoice = "auto"
-    """Semantic level; auto takes the coarsest of those that answer nearly best."""
+    """Semantic level; auto takes the one that answers best, for a thing rather the whole."""
     whole: bool = False
     """Ask every phrase whole, without looking for structure such as "handle of the red mug"."""
     mode: Literal["splat", "paper"] = "splat"
