@@ -18,6 +18,7 @@ from langsplat_core.display.colour_maps import COLOUR_MAPS, MAX_QUERIES, QUERY_C
 from langsplat_core.display.compose import HeatRanges, full_ranges, shader_defines
 from langsplat_core.display.displays import DISPLAYS, NUMBERS, Extra
 from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.opengl.context import is_software
 from langsplat_core.raster.opengl.draw import drawing, set_uniforms, shader
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.stopwatch import lap
@@ -27,14 +28,7 @@ from langsplat_viewer.looking import VISIBLE_ALPHA
 from langsplat_viewer.seeing import UNCLIPPED, Clip
 
 Backend = Literal["auto", "opengl", "cpu", "cuda"]
-SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swr ", "software", "swiftshader", "basic render")
 PICK_ALPHA = 0.1  # a pixel with less alpha shows nothing that could be picked
-
-
-def is_software(ctx: moderngl.Context) -> bool:
-    """Whether the driver draws on the CPU."""
-    renderer = ctx.info["GL_RENDERER"].lower()
-    return any(name in renderer for name in SOFTWARE_RENDERERS)
 
 
 def suits_opengl(ctx: moderngl.Context) -> bool:

@@ -29,7 +29,8 @@ from langsplat_viewer.viewer import Services, Viewer
 
 TITLE = "LangSplat viewer"
 DEFAULT_SIZE = (1280, 800)
-GL_VERSIONS = ((4, 1), (3, 3))  # 4.1 draws splats on every system; 3.3 still shows the CPU's pictures
+# 4.3 sorts splats, 4.1 draws them on every system; 3.3 still shows the CPU's pictures.
+GL_VERSIONS = ((4, 3), (4, 1), (3, 3))
 IDLE_FPS = 0.01  # frames per second while nothing happens: an event, or the worker, wakes the window at once
 AWAKE_SECONDS = 0.4  # after an event: tooltips come, and widgets take their places in a few frames
 AWAKE_FRAMES = 4  # after news from the worker, for the same reason

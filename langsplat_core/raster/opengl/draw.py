@@ -15,7 +15,7 @@ def shader(name: str, version: int = 410, package: str = SHADERS, **defines: int
     return "\n".join([*head, files(package).joinpath(f"{name}.glsl").read_text(encoding="utf-8")])
 
 
-def set_uniforms(program: moderngl.Program, values: dict[str, object]) -> None:
+def set_uniforms(program: moderngl.Program | moderngl.ComputeShader, values: dict[str, object]) -> None:
     """Set uniforms by name; names that the compiler removed as unused are passed over."""
     for name, value in values.items():
         uniform = program.get(name, None)

@@ -1,9 +1,9 @@
 """Gaussians through the graphics pipeline: OpenGL 4.1 core, so that it also runs on macOS.
 
 A view is projected once, in a fragment pass with one fragment per Gaussian; a splat then draws one quad
-per Gaussian, sorted on the CPU, and the fixed-function blender composes back to front. The image
-formation is that of `raster/reference.py` but for one thing: blending back to front cannot stop at
-T <= 1e-4, so a pixel may differ by up to 1e-4 of the largest value behind.
+per Gaussian, sorted on the device from OpenGL 4.3 on and else on the CPU, and the fixed-function blender
+composes back to front. The image formation is that of `raster/reference.py` but for one thing: blending back
+to front cannot stop at T <= 1e-4, so a pixel may differ by up to 1e-4 of the largest value behind.
 """
 
 from collections.abc import Sequence
@@ -15,8 +15,10 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
+from langsplat_core.raster.opengl.depth_sort import Sort, chosen_sorter
 from langsplat_core.raster.opengl.draw import Targets, drawing, set_uniforms, shader
-from langsplat_core.raster.opengl.scene_textures import HALF_MAX, SceneTextures, front_to_back
+from langsplat_core.raster.opengl.draw_order import DrawOrder, draw_order
+from langsplat_core.raster.opengl.scene_textures import HALF_MAX, SceneTextures
 from langsplat_core.raster.protocol import farthest
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 from langsplat_core.stopwatch import lap
@@ -35,13 +37,20 @@ class GlRasterizer:
     suits measurements: but for the cut-offs within 2e-5 in images of 400 pixels a side, 1e-4 in those of
     1920 and for needles across the image, as pixel positions are float32.
 
+    `sort`: who finds the draw order, the same either way; see `depth_sort.chosen_sorter`.
+
     Blending goes back to front and cannot stop: behind layers that would end a pixel more is drawn, with the
     weight that was left, at most 1e-2 and mostly below 1e-3.
     """
 
     name = "opengl"
 
-    def __init__(self, ctx: moderngl.Context, precision: Literal["half", "single"] = "half") -> None:
+    def __init__(
+        self,
+        ctx: moderngl.Context,
+        precision: Literal["half", "single"] = "half",
+        sort: Sort = "auto",
+    ) -> None:
         if ctx.version_code < 410:
             raise BackendError(
                 f"rasterizer 'opengl' needs OpenGL 4.1, this driver offers {ctx.version_code / 100:.1f}; "
@@ -49,6 +58,7 @@ class GlRasterizer:
             )
         self.ctx = ctx
         self.precision = precision
+        self._sorter = chosen_sorter(ctx, sort)
         self._project = ctx.program(
             vertex_shader=shader("fullscreen.vert"), fragment_shader=shader("project.frag")
         )
@@ -78,10 +88,7 @@ class GlRasterizer:
         ):
             order = last.order
         else:
-            with lap("sort"):
-                depths = scene.depths(camera)
-                ahead = np.flatnonzero((depths > settings.near) & (depths <= farthest(settings)))
-                order = ahead[front_to_back(depths[ahead])][::-1].astype(np.int32)
+            order = draw_order(scene, camera, settings, self._sorter)
         return GlView(self, gaussians, camera, settings, order)
 
     def scene(self, gaussians: Gaussians) -> SceneTextures:
@@ -91,7 +98,7 @@ class GlRasterizer:
                 self._scene.release()
             self._scene, self._current = None, None  # stays so if the upload fails
             try:
-                self._scene = SceneTextures(self.ctx, gaussians, self.precision == "half")
+                self._scene = SceneTextures(self.ctx, gaussians, self.precision == "half", self._sorter)
             except moderngl.Error as error:
                 raise BackendError(
                     f"rasterizer 'opengl': {error}; the scene is too large for the device "
@@ -108,8 +115,7 @@ class GlRasterizer:
         RGBA, premultiplied, row 0 on top. Depth comes last, as (sum of weight * camera z, alpha) in
         single precision. The images belong to the rasterizer and hold until its next `draw`.
         """
-        with lap("projection", self.ctx.finish):
-            scene = self.project(view)
+        scene = self.project(view)
         program = self._splat_program(len(sources), with_depth)
         targets = self._targets_for(view.camera, len(sources), with_depth)
         set_uniforms(
@@ -132,8 +138,7 @@ class GlRasterizer:
             targets.framebuffer.clear()
             self.ctx.blend_equation = moderngl.FUNC_ADD, moderngl.FUNC_ADD
             self.ctx.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
-            if len(view.order):
-                vao.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(view.order))
+            view.order.draw(scene, vao)
         vao.release()
         return targets.images
 
@@ -174,10 +179,11 @@ class GlRasterizer:
         )
         scene.geometry.use(0)
         scene.sh.use(1)
-        with drawing(self.ctx, scene.projected, moderngl.NOTHING):
+        with lap("projection", self.ctx.finish), drawing(self.ctx, scene.projected, moderngl.NOTHING):
             self._project_vao.render(moderngl.TRIANGLES, vertices=3)
         if self._current is None or self._current.order is not view.order:
-            scene.order.write(view.order)
+            with lap("sort", self.ctx.finish):
+                view.order.write(scene)
         self._current = view
 
     def _splat_program(self, values: int, depth: bool) -> moderngl.Program:
@@ -208,6 +214,8 @@ class GlRasterizer:
         for program in self._splats.values():
             program.release()
         self._splats.clear()
+        if self._sorter is not None:
+            self._sorter.release()
         self._project_vao.release()
         self._project.release()
 
@@ -222,11 +230,11 @@ class GlView:
         gaussians: Gaussians,
         camera: Camera,
         settings: RasterSettings,
-        order: Array,
+        order: DrawOrder,
     ) -> None:
         self.rasterizer = rasterizer
         self.gaussians, self.camera, self.settings = gaussians, camera, settings
-        self.order = order  # (n,) int32 texels of the Gaussians ahead of the camera, back to front
+        self.order = order
 
     @property
     def dropped(self) -> int:
@@ -275,7 +283,7 @@ class GlView:
         alpha-weighted mean; camera z in world units, 0 where nothing is drawn.
         """
         scene = self.rasterizer.project(self)
-        order = self.order[::-1]
+        order = self.order.rows(scene)[::-1]
         x, y, z, opacity = np.frombuffer(scene.placement.read(), "f4").reshape(-1, 4)[order].T
         along_x, along_y, *inverse = np.frombuffer(scene.shape.read(), "f4").reshape(-1, 4)[order].T
         dx, dy = column + 0.5 - x, row + 0.5 - y

@@ -11,6 +11,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.errors import BackendError
+from langsplat_core.raster.opengl.depth_sort import DepthSorter, SortBuffers
 from langsplat_core.scene import Camera, Gaussians
 
 COLUMNS = 4096  # texels per row; 16384 rows, which every 4.1 device allows, then hold 67 million
@@ -18,25 +19,13 @@ HALF_MAX = 65504.0
 LARGEST_SCALE = 1e20  # world units; beyond it products overflow float32 and nothing looks different
 
 
-def front_to_back(depths: Array) -> Array:
-    """(n,) float64 depths -> (n,) indices by ascending depth, ties by index.
-
-    NumPy's default sort is vectorised and about six times faster than its stable one, so equal depths
-    are put right afterwards: they are few, and already neighbours.
-    """
-    order = np.argsort(depths)
-    ascending = depths[order]
-    equal = ascending[1:] == ascending[:-1]
-    if equal.any():
-        tied = np.flatnonzero(np.concatenate([[False], equal]) | np.concatenate([equal, [False]]))
-        order[tied] = order[tied][np.lexsort((order[tied], ascending[tied]))]
-    return order
-
-
 class SceneTextures:
     """The textures of one scene, and those into which `project.frag.glsl` writes one view of it."""
 
-    def __init__(self, ctx: moderngl.Context, gaussians: Gaussians, half: bool) -> None:
+    def __init__(
+        self, ctx: moderngl.Context, gaussians: Gaussians, half: bool, sorter: DepthSorter | None
+    ) -> None:
+        """half: colours in half precision; `sorter` for scenes that its buffers hold."""
         self.gaussians = gaussians
         self.rows = np.flatnonzero(gaussians.valid())  # (n,) kept rows
         kept = gaussians.take(self.rows)
@@ -55,6 +44,9 @@ class SceneTextures:
         self.placement, self.shape, self.colours = (ctx.texture(self.size, 4, dtype="f4") for _ in range(3))
         self.projected = ctx.framebuffer([self.placement, self.shape, self.colours])
         self.order = ctx.buffer(reserve=4 * max(len(kept), 1), dynamic=True)
+        self.sort = (
+            SortBuffers(ctx, self._means.T, self.order) if sorter and sorter.holds(len(kept)) else None
+        )
 
     def depths(self, camera: Camera) -> Array:
         """(n,) float64 camera z. Term by term, as in the reference: a matrix product may round equal rows
@@ -99,3 +91,5 @@ class SceneTextures:
         for resource in (self.projected, self.geometry, self.sh, self.placement, self.shape, self.colours):
             resource.release()
         self.order.release()
+        if self.sort is not None:
+            self.sort.release()
