@@ -146,7 +146,7 @@ def working_sorter(ctx: moderngl.Context) -> DepthSorter | None:
 
 
 def chosen_sorter(ctx: moderngl.Context, sort: Sort) -> DepthSorter | None:
-    """None where the CPU is to sort. "auto": a sorter that works, but none on a driver that computes on the CPU,
+    """None where the CPU is to sort. "auto": a sorter that works, but none on a driver that runs on the CPU,
     where NumPy is faster. BackendError for "device" where there is none."""
     if sort == "cpu" or (sort == "auto" and is_software(ctx)):
         return None
