@@ -72,6 +72,7 @@ class FrameStats:
     width: int = 0  # pixels
     height: int = 0
     scale: float = 1.0  # of the window's resolution, below 1 while the camera moves on a slow machine
+    merged: bool = False  # drawn from fewer, merged Gaussians, then, too
 
 
 @dataclass(eq=False)

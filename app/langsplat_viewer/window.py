@@ -18,13 +18,14 @@ from langsplat_core.config import Display, LevelChoice, PictureConfig
 from langsplat_core.errors import BackendError, InputError, LangSplatError
 from langsplat_viewer import actions, fonts
 from langsplat_viewer.bookmarks import Shelf
-from langsplat_viewer.canvas import Canvas, Renderer
+from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.frame import Backend, FrameRenderer
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import chosen_camera, latent_level
 from langsplat_viewer.panels import keyboard, layout, menu, navigation, over, photograph, pictures
 from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.remembered import Remembered
+from langsplat_viewer.renderer import Renderer
 from langsplat_viewer.viewer import Services, Viewer
 
 TITLE = "LangSplat viewer"
@@ -170,7 +171,10 @@ class Window:
         try:
             ctx = moderngl.get_context()
             renderer = self._make_renderer(ctx)
-            self._canvas, self._photograph = Canvas(ctx, renderer), photograph.Overlay(ctx)
+            # A graphics device draws large scenes as they are.
+            quick = self._make_renderer(ctx) if renderer.backend == "cpu" else None
+            self._canvas = Canvas(ctx, renderer, quick=quick)
+            self._photograph = photograph.Overlay(ctx)
             self.viewer.state.backend = renderer.backend
         except DRAW_ERRORS as error:
             self.failure = BackendError(one_line(error))
@@ -291,6 +295,8 @@ class Window:
         actions.finish_writing(self.viewer)
         self._remembered.update()
         self.viewer.watch.close()
+        if self._canvas is not None:
+            self._canvas.close()
         self.viewer.recorder.close(RECORDER_PATIENCE)
         self.viewer.worker.close()
         if self.viewer.training is not None:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -198,6 +199,61 @@ def test_canvas_is_coarse_only_while_a_slow_camera_moves(gl, state, fine_ms, coa
     assert drawn(renderer) == []
     assert not canvas.update(state, 10.0 + 2 * REST_SECONDS)
     assert drawn(renderer) == ([] if coarse == (200, 120) else [(200, 120)])
+
+
+def test_canvas_draws_merged_gaussians_while_a_large_scene_moves(gl, state):
+    """As soon as they are there; at rest all of them again. What is found under the cursor is what was drawn."""
+    renderer, quick = FakeRenderer(seconds=0.6), FakeRenderer(seconds=0.05)
+    quick.depth_at = lambda *_: 3.0
+    canvas = Canvas(gl, renderer, lambda: renderer.now + quick.now, quick)
+    canvas.update(state, 0.0)
+    assert quick.calls == []
+    drawn(renderer)
+    for step in range(1, 2000):  # the thread that merges them may take a while
+        state.view = orbit(state.view, 0.1, 0)
+        assert canvas.update(state, float(step))
+        if quick.calls:
+            break
+        assert drawn(renderer) == [(50, 30)]
+        time.sleep(0.01)
+    (kind, scene), (layers, _), draw = quick.calls
+    assert (kind, layers, draw) == ("scene", "layers", ("draw", (100, 60)))
+    assert len(scene.gaussians) < len(state.scene.gaussians) == 360
+    away = np.linalg.norm(canvas.point_at(0.5, 0.5) - state.view.camera(200, 120).position)
+    assert away == pytest.approx(3, rel=1e-3)
+    quick.calls.clear()
+    assert not canvas.update(state, step + 1.0)
+    assert (drawn(renderer), quick.calls) == ([(200, 120)], [])
+    assert canvas.point_at(0.2, 0.25) is None  # the fine renderer's answer
+    state.view = orbit(state.view, 0.1, 0)
+    canvas.update(state, step + 2.0)
+    assert quick.calls == [("draw", (100, 60))]
+    canvas.close()
+
+
+def test_canvas_merges_what_is_shown(gl, state):
+    """Layers too; after a change of what is hidden the merged scene is made anew."""
+    renderer, quick = FakeRenderer(seconds=0.6), FakeRenderer()
+    given: list[np.ndarray] = []
+    quick.set_layers = lambda latent, _: given.append(latent)
+    canvas = Canvas(gl, renderer, renderer.clock, quick)
+    state.latent, state.picture = np.ones((3, 360, 3), np.float32), replace(state.picture, display="latent")
+    hidden = np.arange(360) < 120
+    counts, now = [], 0.0
+    for marks in (unmarked(360), replace(unmarked(360), hidden=hidden)):
+        state.selection = replace(state.selection, marks=marks)
+        canvas.update(state, now := now + 1.0)
+        quick.calls.clear()
+        while not quick.calls:
+            assert now < 3000
+            time.sleep(0.01)
+            state.view = orbit(state.view, 0.1, 0)
+            canvas.update(state, now := now + 1.0)
+        counts.append(len(dict(quick.calls)["scene"].gaussians))
+        assert given[-1].shape == (counts[-1], 3)
+        np.testing.assert_allclose(given[-1], 1, rtol=1e-6)
+    assert 0 < counts[1] < counts[0] < 360
+    canvas.close()
 
 
 def test_canvas_stays_fine_if_told_so(gl, state):

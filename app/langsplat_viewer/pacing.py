@@ -1,0 +1,56 @@
+"""How coarse a picture has to be while the camera moves, learned from what pictures took."""
+
+from dataclasses import dataclass
+
+MOVING_BUDGET = 50.0  # milliseconds: with the panels, some fifteen pictures a second
+MERGED_SHARE = 0.25  # of a picture's time, guessed, when four Gaussians are drawn as one
+FORGET = 0.8  # what was learned is lowered by this with every fine picture, so that better is tried again
+
+
+@dataclass(frozen=True)
+class Level:
+    """One way to draw."""
+
+    scale: float = 1.0  # of the window's resolution
+    merged: bool = False  # see `langsplat_core.scene.merging`
+
+    @property
+    def guess(self) -> float:
+        """Time, as a share of a fine picture's."""
+        return self.scale**2 * (MERGED_SHARE if self.merged else 1)
+
+
+FINE = Level()
+PLAIN = (FINE, Level(0.5), Level(0.25))
+# Merged at half the resolution is nearer to the fine picture than all of it at a quarter, and cheaper.
+WITH_MERGED = (FINE, Level(0.5), Level(0.5, merged=True), Level(0.25, merged=True))
+
+
+class Pace:
+    """Times of pictures, in milliseconds."""
+
+    def __init__(self) -> None:
+        self._fine = 0.0
+        self._shares: dict[Level, float] = {}  # of the fine picture's time, measured
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether fine pictures are too slow to follow a movement."""
+        return self._fine > MOVING_BUDGET
+
+    def drew(self, level: Level, milliseconds: float) -> None:
+        """A picture took so long."""
+        if level == FINE:
+            self._fine = milliseconds
+            self._shares = {other: FORGET * share for other, share in self._shares.items()}
+        elif self._fine > 0:
+            self._shares[level] = (self._share(level) + milliseconds / self._fine) / 2
+
+    def level(self, has_merged: bool) -> Level:
+        """The finest at which a picture is expected within the budget, or the coarsest of all."""
+        levels = WITH_MERGED if has_merged else PLAIN
+        within = (level for level in levels if self._fine * self._share(level) <= MOVING_BUDGET)
+        return next(within, levels[-1])
+
+    def _share(self, level: Level) -> float:
+        return 1.0 if level == FINE else self._shares.get(level, level.guess)

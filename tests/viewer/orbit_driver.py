@@ -1,0 +1,142 @@
+"""Orbits in the real window, as the program opens it, and says how fast; run by test_orbiting.py and by hand:
+
+    python -m tests.viewer.orbit_driver [--scene SCENE.ply] [--count 500000] [--seconds 10] [--size 1280 800]
+
+Prints JSON: pictures per second while the camera moves, seconds from the last move to the full picture, and the
+processor time of both, which other work on the machine changes little. Needs a display (xvfb-run).
+"""
+
+import argparse
+import json
+import statistics
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import psutil
+from imgui_bundle import immapp
+from imgui_bundle.glfw_utils import glfw_window_hello_imgui
+
+import glfw  # isort: skip
+from langsplat_core.formats import load_scene
+from langsplat_core.lab.speed.queries import repeated
+from langsplat_core.scene import Scene
+from langsplat_viewer import actions
+from langsplat_viewer.controls import orbit
+from langsplat_viewer.frame import FrameRenderer
+from langsplat_viewer.viewer import Services
+from langsplat_viewer.window import Window, WindowRequest
+from tests.support.fakes import FakeEncoder
+
+DEMO = Path(__file__).parents[2] / "assets" / "demo" / "scene.ply"
+STEP = 0.02  # radians a picture
+ROUNDS = 3  # of moving and resting
+
+
+@dataclass
+class Orbiting:
+    """What was seen; times in seconds."""
+
+    gaussians: int = 0
+    backend: str = ""
+    pictures_per_second: list[float] = field(default_factory=list)
+    cpu_per_picture: list[float] = field(default_factory=list)  # of the whole process
+    picture: list[float] = field(default_factory=list)  # median of the canvas's own times
+    sizes: list[tuple[int, int]] = field(default_factory=list)  # of the last picture while moving
+    merged: list[bool] = field(default_factory=list)  # whether its Gaussians were
+    sharp_after: list[float] = field(default_factory=list)
+    cpu_to_sharp: list[float] = field(default_factory=list)
+
+
+class Rider:
+    """Moves the camera once a frame and keeps time."""
+
+    def __init__(self, window: Window, seconds: float) -> None:
+        self.window, self.seconds = window, seconds
+        self.seen = Orbiting()
+        self._process = psutil.Process()
+        self._moving_since: float | None = None
+        self._resting_since: float | None = None
+        self._started = self._waited = 0.0
+        self._pictures: list[float] = []
+
+    def _cpu(self) -> float:
+        times = self._process.cpu_times()
+        return times.user + times.system
+
+    def frame(self) -> None:
+        viewer, now = self.window.viewer, time.monotonic()
+        state = viewer.state
+        if state.scene is None or viewer.worker.current is not None or state.stats.width == 0:
+            self._waited = now
+        elif now - self._waited < self.seconds and not self._pictures:
+            return  # while the scene is merged
+        elif self._resting_since is not None:
+            self._rest(now)
+        elif self._moving_since is None:
+            self._moving_since, self._started, self._pictures = now, self._cpu(), [0.0]
+            self._turn()
+        elif now - self._moving_since < self.seconds:
+            self._pictures.append(state.stats.milliseconds / 1e3)
+            self._turn()
+        else:
+            self._stop(now)
+
+    def _turn(self) -> None:
+        actions.move(self.window.viewer, lambda view: orbit(view, STEP, 0.0))
+
+    def _stop(self, now: float) -> None:
+        stats, count = self.window.viewer.state.stats, len(self._pictures)
+        assert self._moving_since is not None
+        self.seen.pictures_per_second.append(count / (now - self._moving_since))
+        self.seen.cpu_per_picture.append((self._cpu() - self._started) / count)
+        self.seen.picture.append(statistics.median(self._pictures))
+        self.seen.sizes.append((stats.width, stats.height))
+        self.seen.merged.append(stats.merged)
+        self._resting_since, self._started = now, self._cpu()
+
+    def _rest(self, now: float) -> None:
+        if self.window.viewer.state.stats.scale < 1 or self.window.unfinished:
+            return
+        assert self._resting_since is not None
+        self.seen.sharp_after.append(now - self._resting_since)
+        self.seen.cpu_to_sharp.append(self._cpu() - self._started)
+        self._moving_since = self._resting_since = None
+        if len(self.seen.sharp_after) == ROUNDS:
+            glfw.set_window_should_close(glfw_window_hello_imgui(), True)
+
+
+def ride(scene: Path, count: int, seconds: float, size: tuple[int, int]) -> Orbiting:
+    def load(path: Path) -> Scene:
+        found = load_scene(path)
+        return repeated(found, count) if count else found
+
+    window = Window(
+        WindowRequest(scene, size=size), Services(load, lambda encoder_id: FakeEncoder()), FrameRenderer
+    )
+    window.idles = False
+    rider = Rider(window, seconds)
+    params = window.params()
+    gui = params.callbacks.show_gui
+
+    def ridden() -> None:
+        rider.frame()
+        gui()
+
+    params.callbacks.show_gui = ridden
+    params.fps_idling.vsync_to_monitor = False
+    immapp.run(params)
+    state = window.viewer.state
+    assert state.scene is not None
+    rider.seen.gaussians, rider.seen.backend = len(state.scene.gaussians), state.backend
+    return rider.seen
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--scene", type=Path, default=DEMO)
+    parser.add_argument("--count", type=int, default=500_000, help="Gaussians; 0: as the file has")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of moving, three times")
+    parser.add_argument("--size", type=int, nargs=2, default=(1280, 800))
+    asked = parser.parse_args()
+    print(json.dumps(asdict(ride(asked.scene, asked.count, asked.seconds, tuple(asked.size)))))
