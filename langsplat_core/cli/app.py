@@ -12,6 +12,7 @@ from langsplat_core.cli.bench_gains import BenchGains
 from langsplat_core.cli.bench_lift import BenchLift
 from langsplat_core.cli.bench_load import BenchLoad
 from langsplat_core.cli.bench_memory import BenchMemory
+from langsplat_core.cli.bench_moving import BenchMoving
 from langsplat_core.cli.bench_paper import BenchPaper
 from langsplat_core.cli.bench_phrases import BenchPhrases
 from langsplat_core.cli.bench_query import BenchQuery
@@ -72,6 +73,7 @@ GROUPS: Mapping[str, tuple[str, Mapping[str, type[Command]]]] = MappingProxyType
                 "lift": BenchLift,
                 "paper": BenchPaper,
                 "load": BenchLoad,
+                "moving": BenchMoving,
                 "memory": BenchMemory,
                 "phrases": BenchPhrases,
                 "query": BenchQuery,

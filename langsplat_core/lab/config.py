@@ -191,3 +191,15 @@ class QueryBenchConfig:
     """Of every timing of a view and a picture, of which the median is taken."""
     codec_steps: Count = 3_000
     """Of the training of the autoencoder that stands beside the codebook."""
+
+
+@dataclass(frozen=True)
+class MovingBenchConfig:
+    """Pictures while the camera moves (`langsplat bench moving`)."""
+
+    count: CountOrZero = 500_000
+    """Gaussians; the scene's are repeated, each beside itself, until there are so many. 0: as they are."""
+    size: Size = (1280, 800)
+    """Width and height of the full picture, pixels."""
+    views: Count = 12
+    """Cameras of the scene, evenly chosen."""

@@ -2,8 +2,8 @@
 
     python -m tests.viewer.orbit_driver [--scene SCENE.ply] [--count 500000] [--seconds 10] [--size 1280 800]
 
-Prints JSON: pictures per second while the camera moves, seconds from the last move to the full picture, and the
-processor time of both, which other work on the machine changes little. Needs a display (xvfb-run).
+Prints JSON: pictures per second while the camera moves, seconds from the last move to the full picture, and
+the processor time of both, which other work on the machine changes little. Needs a display (xvfb-run).
 """
 
 import argparse

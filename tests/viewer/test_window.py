@@ -202,7 +202,7 @@ def test_canvas_is_coarse_only_while_a_slow_camera_moves(gl, state, fine_ms, coa
 
 
 def test_canvas_draws_merged_gaussians_while_a_large_scene_moves(gl, state):
-    """As soon as they are there; at rest all of them again. What is found under the cursor is what was drawn."""
+    """As soon as they are there; at rest all of them again. Under the cursor is what was drawn last."""
     renderer, quick = FakeRenderer(seconds=0.6), FakeRenderer(seconds=0.05)
     quick.depth_at = lambda *_: 3.0
     canvas = Canvas(gl, renderer, lambda: renderer.now + quick.now, quick)
