@@ -1,7 +1,8 @@
 """What the CPU rasterizer's pictures take while a camera moves, and how far they are from the full one.
 
-The viewer draws large scenes with fewer pixels while the camera moves, and with fewer, merged Gaussians. Every
-picture here is of another camera; a coarse one is enlarged as a screen does and compared with the full one.
+The viewer draws large scenes with fewer pixels while the camera moves, and with fewer, merged Gaussians.
+Every picture here is of another camera; a coarse one is enlarged as a screen does and compared with the full
+one.
 """
 
 import time
@@ -102,20 +103,17 @@ def _picture(
 def _enlarged(picture: Array, size: tuple[int, ...]) -> Array:
     """To (width, height), between pixels as a texture is."""
     width, height = size
-    channels = [
-        Image.fromarray(np.ascontiguousarray(picture[..., c])).resize(
-            (width, height), Image.Resampling.BILINEAR
-        )
-        for c in range(3)
-    ]
-    return np.stack([np.asarray(channel) for channel in channels], -1)
+    channels = (Image.fromarray(np.ascontiguousarray(channel)) for channel in np.moveaxis(picture, -1, 0))
+    enlarged = (channel.resize((width, height), Image.Resampling.BILINEAR) for channel in channels)
+    return np.stack([np.asarray(channel) for channel in enlarged], -1)
 
 
 def moving_table(report: MovingReport) -> str:
     """Markdown."""
     width, height = report.size
     lines = [
-        f"{report.costs[0].gaussians} Gaussians, {width}x{height}, CPU rasterizer; merging once: {report.merging:.1f} s",
+        f"{report.costs[0].gaussians} Gaussians, {width}x{height}, CPU rasterizer; merged once, "
+        f"in {report.merging:.1f} s",
         "",
         "| resolution | Gaussians | picture, ms | a second | processor, ms | PSNR, dB | mean error |",
         "|---|---|---|---|---|---|---|",
