@@ -18,7 +18,7 @@ from langsplat_core.scene.gaussians import Gaussians
 
 GROUP = 4  # that become one
 SPREAD = 2.0  # the largest ratio of the variance of the mixture to that of its members
-_BLOCK = 1 << 15  # groups handled at a time, some 40 MB
+BLOCK = 1 << 15  # groups handled at a time, some 40 MB
 _OPAQUE = 0.999  # more would be an infinite optical depth
 _TINY = 1e-30
 _GRID_BITS = 20  # of each coordinate on the curve that orders the Gaussians
@@ -52,9 +52,9 @@ def merged(gaussians: Gaussians, progress: Progress = silent) -> Merged:
     rows = rows[np.argsort(_along_curve(gaussians.means[rows]))]
     grouped = rows[: len(rows) // GROUP * GROUP].reshape(-1, GROUP)
     parts = [_kept(gaussians, rows[grouped.size :])]
-    for start in range(0, len(grouped), _BLOCK):
+    for start in range(0, len(grouped), BLOCK):
         progress("merging", start / len(grouped))
-        parts += _merge(gaussians, grouped[start : start + _BLOCK])
+        parts += _merge(gaussians, grouped[start : start + BLOCK])
     names = [field.name for field in fields(Gaussians)]
     joined = (np.concatenate([getattr(part.gaussians, name) for part in parts]) for name in names)
     weights = np.concatenate([part.weights for part in parts])

@@ -87,7 +87,7 @@ def test_every_row_counts_once(dense):
 
 def test_blocks_do_not_show(dense, monkeypatch):
     whole = merged(dense)
-    monkeypatch.setattr("langsplat_core.scene.merging._BLOCK", 37)
+    monkeypatch.setattr("langsplat_core.scene.merging.BLOCK", 37)
     blocks = merged(dense)
     order = np.lexsort(whole.gaussians.means.T), np.lexsort(blocks.gaussians.means.T)
     for name in ("means", "log_scales", "sh"):

@@ -204,7 +204,7 @@ def draw_camera(viewer: Viewer) -> None:
     imgui.same_line()
     _, coarse = imgui.checkbox("Coarse while moving", state.coarse_while_moving)
     actions.set_coarse_while_moving(viewer, coarse)
-    tip("Draw fewer pixels while the camera moves, where drawing is slow")
+    tip("Draw fewer pixels and merged Gaussians while the camera moves, where drawing is slow")
     imgui.end_disabled()
 
 
