@@ -19,7 +19,7 @@ NAMES = (
     pytest.param("opengl-half", marks=pytest.mark.long),
     "opengl-single",
     "cuda",
-    pytest.param("cuda-twin", marks=pytest.mark.long),
+    pytest.param("cuda-twin", marks=pytest.mark.slow),
 )
 
 

@@ -63,7 +63,13 @@ def _rotations(quats: Tensor) -> Tensor:
 
 
 def _project(
-    means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, size: tuple[int, int], eps2d: float
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    size: tuple[int, int],
+    eps2d: float,
 ) -> tuple[Tensor, ...]:
     """Centres in camera space, projected means, blurred 2D covariances (N, 2, 2) and det before / after blur."""
     turn, shift = viewmats[0, :3, :3], viewmats[0, :3, 3]
@@ -218,7 +224,10 @@ def _tiles(
             continue
         top, left = tile // columns * tile_size, tile % columns * tile_size
         place = (slice(top, min(top + tile_size, height)), slice(left, min(left + tile_size, width)))
-        rows, across = torch.arange(place[0].start, place[0].stop), torch.arange(place[1].start, place[1].stop)
+        rows, across = (
+            torch.arange(place[0].start, place[0].stop),
+            torch.arange(place[1].start, place[1].stop),
+        )
         y, x = torch.meshgrid(rows + 0.5, across + 0.5, indexing="ij")
         yield flatten_ids[start:end].long(), torch.stack([x, y], -1).reshape(-1, 2), place, start
 
@@ -233,8 +242,13 @@ def rasterize_to_pixels_3dgs_fwd(  # noqa: PLR0913  gsplat's signature
     assert backgrounds is None and masks is None
     assert colors.shape[-1] in KERNEL_CHANNELS
     images = torch.zeros(1, image_height, image_width, colors.shape[-1])
-    alphas, last = torch.zeros(1, image_height, image_width, 1), torch.zeros(1, image_height, image_width).int()
-    for ids, pixels, place, start in _tiles(tile_offsets, flatten_ids, (image_width, image_height), tile_size):
+    alphas, last = (
+        torch.zeros(1, image_height, image_width, 1),
+        torch.zeros(1, image_height, image_width).int(),
+    )
+    for ids, pixels, place, start in _tiles(
+        tile_offsets, flatten_ids, (image_width, image_height), tile_size
+    ):
         found = _blend(pixels, *(part[0, ids] for part in (means2d, conics, colors, opacities)))
         images[0][place] = found[0].reshape(images[0][place].shape)
         alphas[0][place] = found[1].reshape(alphas[0][place].shape)
@@ -263,7 +277,9 @@ def rasterize_to_pixels_3dgs_bwd(  # noqa: PLR0913  gsplat's signature
     return None, *sums
 
 
-def spherical_harmonics_fwd(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None) -> Tensor:
+def spherical_harmonics_fwd(
+    degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None
+) -> Tensor:
     _check(dirs, coeffs)
     assert masks is not None
     colours = _unwritten(*dirs.shape)
@@ -280,7 +296,9 @@ def spherical_harmonics_bwd(  # noqa: PLR0913  gsplat's signature
     leaves = [dirs[masks].requires_grad_(), coeffs[masks].requires_grad_()]
     with torch.enable_grad():
         colours = _harmonics()(degrees_to_use, *leaves)
-        found = torch.autograd.grad(colours, leaves, v_colors[masks], allow_unused=True, materialize_grads=True)
+        found = torch.autograd.grad(
+            colours, leaves, v_colors[masks], allow_unused=True, materialize_grads=True
+        )
     by_dirs, by_coeffs = torch.zeros_like(dirs), torch.zeros_like(coeffs)
     by_dirs[masks], by_coeffs[masks] = found
     return by_coeffs, by_dirs if compute_v_dirs else None

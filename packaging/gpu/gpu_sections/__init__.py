@@ -20,9 +20,12 @@ class Plan:
     channels: tuple[int, ...]  # values per Gaussian
     gradients: tuple[int, tuple[int, int]]  # a scene whose gradients are compared
     steps: int  # of training
+    most: int  # Gaussians of the bundled scene, where it is lifted onto or drawn
     pictures: int  # drawn from the bundled scene: to train on, and to lift from
     size: tuple[int, int]  # of those
     models: tuple[str, ...]  # of `tests.support.full_size.MODELS`
+    crops: int  # shown to an encoder at once
+    batches: int  # of 64 points that a segmenter is asked at
     million: int  # Gaussians of the larger OpenGL scene
     tests: tuple[str, ...]  # arguments of pytest
 
@@ -32,9 +35,12 @@ FULL = Plan(
     channels=(3, 12, 32),
     gradients=(2_000, (128, 96)),
     steps=300,
+    most=1_000_000,
     pictures=16,
     size=(400, 300),
     models=("clip", "sam-vit-huge"),
+    crops=64,
+    batches=16,
     million=1_000_000,
     tests=("tests/raster", "-k", "(cuda or opengl) and not twin"),
 )
@@ -43,9 +49,12 @@ TINY = Plan(
     channels=(3,),
     gradients=(60, (32, 24)),
     steps=4,
+    most=400,
     pictures=3,
     size=(40, 30),
     models=("clip",),
+    crops=1,
+    batches=1,
     million=500,
     tests=("tests/raster/test_one_pixel.py", "-k", "reference"),
 )

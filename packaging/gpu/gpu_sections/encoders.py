@@ -14,10 +14,9 @@ from langsplat_core.raster import gsplat
 from langsplat_core.semantics.encoders import load_encoder
 from langsplat_core.semantics.sam import grid_points
 from langsplat_core.semantics.segmenters import load_segmenter
-from tests.support.full_size import CROPS, MODELS, PHOTOGRAPH
+from tests.support.full_size import MODELS, PHOTOGRAPH
 
-REGIONS = 320  # of a photograph, whose crops an encoder is shown
-BATCHES = 16  # of 64 points: the grid of 32 x 32 that a segmenter is asked at
+REPEATS = 5  # of a batch of crops: 320, about as many regions as a photograph has
 ENLARGED = 16  # masks at once
 
 
@@ -31,33 +30,39 @@ def measure(plan: Plan) -> Iterator[str]:
             MODELS[name].make(Path(folder))
             compare = _segmenter if MODELS[name].segments else _encoder
             yield f"## {MODELS[name].id}, {MODELS[name].million:g} million weights\n"
-            yield compare(folder)
+            yield compare(folder, plan)
 
 
-def _encoder(folder: str) -> str:
+def _encoder(folder: str, plan: Plan) -> str:
     """The crops of a photograph on the device; vectors of some beside the CPU's."""
     forget_peak()
     start = time.perf_counter()
     encoder = load_encoder(folder, gsplat.DEVICE)
     loaded = time.perf_counter() - start
     side = encoder.image_size
-    crops = np.random.default_rng(0).integers(0, 256, (CROPS, side, side, 3), dtype=np.uint8)
+    crops = np.random.default_rng(0).integers(0, 256, (plan.crops, side, side, 3), dtype=np.uint8)
     vectors = encoder.encode_images(crops)
     start = time.perf_counter()
-    for _ in range(REGIONS // CROPS):
+    for _ in range(REPEATS):
         encoder.encode_images(crops)
     seconds = time.perf_counter() - start
     memory = peak_mib()
     there = load_encoder(folder, "cpu")
     start = time.perf_counter()
     wanted = there.encode_images(crops)
-    slow = (time.perf_counter() - start) * REGIONS / CROPS
-    head = ("loading, s", f"{REGIONS} crops, s", "on the CPU, s", "largest error of a vector", "device MiB")
+    slow = (time.perf_counter() - start) * REPEATS
+    head = (
+        "loading, s",
+        f"{REPEATS * plan.crops} crops, s",
+        "on the CPU, s",
+        "largest error of a vector",
+        "device MiB",
+    )
     return table(head, [(loaded, seconds, slow, _largest(vectors, wanted), memory)])
 
 
-def _segmenter(folder: str) -> str:
-    """A photograph, asked at 1024 points, all masks enlarged; one batch of points beside the CPU's."""
+def _segmenter(folder: str, plan: Plan) -> str:
+    """A photograph, asked at its points, all masks enlarged; one batch of points beside the CPU's."""
     forget_peak()
     start = time.perf_counter()
     segmenter = load_segmenter(folder, gsplat.DEVICE)
@@ -70,7 +75,7 @@ def _segmenter(folder: str) -> str:
             laps = [_now()]
             look = segmenter.look(image)
             laps.append(_now())
-            answers = [look.ask(points) for _ in range(BATCHES)]
+            answers = [look.ask(points) for _ in range(plan.batches)]
             laps.append(_now())
             for _, logits in answers:
                 for some in logits.flatten(0, 1).split(ENLARGED):
@@ -85,7 +90,7 @@ def _segmenter(folder: str) -> str:
         slow = time.perf_counter() - start
     errors = (_largest(ious, wanted[0]), _largest(logits, wanted[1]) / float(np.abs(wanted[1]).max()))
     head = (
-        "loading, s", "picture, s", "1024 points, s", "3072 masks enlarged, s", "photograph, s",
+        "loading, s", "picture, s", f"{64 * plan.batches} points, s", f"{192 * plan.batches} masks enlarged, s", "photograph, s",
         "CPU: loading, picture, 64 points, s", "error of a quality", "relative error of a mask", "device MiB",
     )  # fmt: skip
     return table(head, [(loaded, *rows[1], sum(rows[1]), slow, *errors, memory)])

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 
 from gpu_sections import Plan, need_cuda
+from langsplat_core.errors import BackendError
 from langsplat_core.lab.speed.raster import describe_machine
 from langsplat_core.raster.gsplat import require_device
 
@@ -22,7 +23,10 @@ def measure(plan: Plan) -> Iterator[str]:
     need_cuda()
     yield "\n".join(f"- {name}: {value}" for name, value in machine().items()) + "\n"
     start = time.perf_counter()
-    require_device()
+    try:
+        require_device()
+    except BackendError as error:  # its one line leaves out what the compiler said
+        raise RuntimeError(f"{str(error.__cause__)[-3_000:]}\n{error}") from None
     yield f"- gsplat's first picture and its gradients: {time.perf_counter() - start:.0f} s (with compiling)\n"
 
 
@@ -48,7 +52,6 @@ def machine() -> dict[str, object]:
 
 def renderer() -> str:
     """Of the driver that EGL finds."""
-    from langsplat_core.errors import BackendError
     from langsplat_core.raster.opengl.context import create_egl_context
 
     try:

@@ -15,7 +15,7 @@ from langsplat_core.training.language.memberships import find_memberships
 def measure(plan: Plan) -> Iterator[str]:
     """Seconds of both, and how far apart they are."""
     need_cuda()
-    scene = bundled_scene()
+    scene = bundled_scene(plan)
     views = masked_views(scene, plan)
     masks = sum(len(features.vectors) for _, features in views)
     yield f"# Lifting: {masks} masks of {len(views)} pictures onto {len(scene.gaussians)} Gaussians\n"

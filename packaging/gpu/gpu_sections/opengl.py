@@ -37,7 +37,7 @@ def tables(plan: Plan, context: moderngl.Context) -> Iterator[str]:
     """On any driver."""
     yield f"# OpenGL through EGL: {context.info['GL_RENDERER']}\n"
     yield "Errors against the float64 reference without its early stop, which OpenGL has not.\n"
-    scene = bundled_scene()
+    scene = bundled_scene(plan)
     cases = [
         Case("bundled", scene.gaussians, scene.cameras[0].resized(*SIZE)),
         Case("random", random_scene(plan.million), default_camera(*SIZE)),

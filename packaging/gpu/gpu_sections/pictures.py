@@ -17,9 +17,11 @@ from langsplat_core.semantics.store import ImageFeatures
 POINTS = 10_000  # of the scene's own centres, shaken, in place of structure from motion's
 
 
-def bundled_scene() -> Scene:
-    """The demo."""
-    return load_scene(Path(str(files("langsplat_assets"))) / "demo" / "scene.ply")
+def bundled_scene(plan: Plan) -> Scene:
+    """The demo, at most so many of its Gaussians, without what they mean."""
+    whole = load_scene(Path(str(files("langsplat_assets"))) / "demo" / "scene.ply")
+    rows = np.arange(min(len(whole.gaussians), plan.most))
+    return Scene(whole.gaussians.take(rows), cameras=whole.cameras)
 
 
 def cameras(scene: Scene, plan: Plan) -> list[Camera]:

@@ -20,7 +20,9 @@ def measure(plan: Plan) -> Iterator[str]:
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--measured", *plan.tests]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     said = done.stdout.splitlines()
-    start = next((n for n, line in enumerate(said) if "measured" in line or "short test summary" in line), -10)
+    start = next(
+        (n for n, line in enumerate(said) if "measured" in line or "short test summary" in line), -10
+    )
     yield "```\n" + "\n".join(said[start:]) + "\n```\n"
     if done.returncode:
         raise RuntimeError(f"pytest: {said[-1] if said else done.stderr.strip()[-300:]}")

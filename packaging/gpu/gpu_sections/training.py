@@ -17,7 +17,7 @@ BACKENDS: tuple[Literal["cuda", "cpu"], ...] = ("cuda", "cpu")
 def measure(plan: Plan) -> Iterator[str]:
     """One row a backend."""
     need_cuda()
-    photographs = capture(bundled_scene(), plan)
+    photographs = capture(bundled_scene(plan), plan)
     seen, held_out = photographs.split(8)
     said = f"{plan.steps} steps on {len(seen)} pictures of {plan.size[0]}x{plan.size[1]} of the bundled scene"
     yield f"# Training: {said}\n"
