@@ -2,8 +2,8 @@
 
 gsplat (1.5 or newer) is an optional dependency and compiles its kernels at first use. What differs from the
 reference, all of it gsplat's own: float32 throughout, the covariance formed in 3D first, so that long thin
-footprints lose digits, alpha capped at 0.999 in 1.5, at 0.99 from 1.6 on, and `gather` sums with atomics, so its
-last digits vary between runs.
+footprints lose digits, alpha capped at 0.999 in 1.5, at 0.99 from 1.6 on, and `gather` sums with atomics, so
+its last digits vary between runs.
 """
 
 import subprocess
@@ -51,7 +51,7 @@ def has_device() -> bool:
 
 
 def drawn_settings(settings: RasterSettings) -> RasterSettings:
-    """What the installed gsplat draws with where `settings` are asked for: it caps alpha at a value of its own."""
+    """What the installed gsplat draws with where `settings` are asked for: its cap of alpha is its own."""
     release = tuple(int(part) for part in version("gsplat").split(".")[:2])
     return replace(settings, alpha_max=0.999 if release < (1, 6) else 0.99)
 

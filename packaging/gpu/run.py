@@ -2,9 +2,9 @@
 
     python packaging/gpu/run.py [--out docs/benchmarks/gpu] [--only raster,training] [--minutes 10]
 
-Every section runs in a process of its own and within a time of its own; one that fails does not stop the others.
-Needs nothing but Python itself: what a section lacks, it says. Exit code 0 where all that could run ran, 1 where
-a section failed, 2 with one line where none could run; then nothing is written.
+Every section runs in a process of its own and within a time of its own; one that fails does not stop the
+others. Needs nothing but Python itself: what a section lacks, it says. Exit code 0 where all that could run
+ran, 1 where a section failed, 2 with one line where none could run; then nothing is written.
 """
 
 import argparse

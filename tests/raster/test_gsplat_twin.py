@@ -1,6 +1,6 @@
-"""The CUDA backend's own code, and gsplat's above it, over the twin of gsplat's kernels: what is drawn, gathered,
-differentiated, lifted and trained is what the reference and the CPU kernels say. The slow tier runs the twin on all
-tests of rasterizers."""
+"""The CUDA backend's own code, and gsplat's above it, over the twin of gsplat's kernels: what is drawn,
+gathered, differentiated, lifted and trained is what the reference and the CPU kernels say. The slow tier runs
+the twin on all tests of rasterizers."""
 
 from dataclasses import replace
 from typing import Any
@@ -122,7 +122,6 @@ def test_a_kernel_that_fails_is_one_line(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_no_kernel_takes_what_the_real_ones_refuse() -> None:
     with pytest.raises(RuntimeError, match="contiguous: False"):
         twin.intersect_offset(torch.zeros(4, 2, dtype=torch.int64)[:, 0], 1, 1, 1)
+    kept = gsplat.DeviceGaussians(*(torch.ones(1, n).double() for n in (3, 3, 4)), torch.ones(1).double())
     with pytest.raises(RuntimeError, match=r"torch\.float64"):
-        load_rasterizer("cuda")
-        kept = gsplat.DeviceGaussians(*(torch.ones(1, n).double() for n in (3, 3, 4)), torch.ones(1).double())
         gsplat.draw(kept, torch.ones(1, 1), random_camera(0, 16, 16), INRIA)

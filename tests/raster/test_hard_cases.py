@@ -18,8 +18,8 @@ from tests.support.measured import Measure
 # What rounding can decide in a pixel: two alphas of 1/255, or one last weight alpha T before T reaches 1e-4,
 # which is largest for alpha = 0.99.
 MOST_AT_A_CUT_OFF = 2 / 255 + 0.99 * 1e-4 / (1 - 0.99)
-# Where gsplat draws something else by design: it forms covariances in 3D in float32, which overflow or lose their
-# digits, caps alpha at a value of its own and draws a Gaussian that lies in the near plane itself.
+# Where gsplat draws something else by design: it forms covariances in 3D in float32, which overflow or lose
+# their digits, caps alpha at a value of its own and draws a Gaussian that lies in the near plane itself.
 BEYOND_GSPLAT = frozenset(
     {
         "scale e^40",

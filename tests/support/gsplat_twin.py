@@ -1,9 +1,9 @@
-"""gsplat's compiled kernels (`gsplat.cuda._backend._C` as of 1.5.3) in plain PyTorch, so that they run on a CPU.
+"""gsplat's compiled kernels (`gsplat.cuda._backend._C` as of 1.5.3) in plain PyTorch, for the CPU.
 
 gsplat's own Python code runs unchanged above them: its signatures, checks of shapes, padding of channels and
-chunks are the real ones. Arguments and results below are those of its `Ops.h`, arithmetic and its order those
-of its CUDA code, in float32. Where a kernel leaves its result unwritten (`at::empty`), NaN stands here, so that
-whoever reads it is found out. One camera, no batches, no packing: what `raster.gsplat` asks for.
+chunks are the real ones. Arguments and results below are those of its `Ops.h`, arithmetic and its order
+those of its CUDA code, in float32. Where a kernel leaves its result unwritten (`at::empty`), NaN stands here,
+so that whoever reads it is found out. One camera, no batches, no packing: what `raster.gsplat` asks for.
 
 What this cannot show: whether the real kernels compile, the digits that `-use_fast_math` costs, the order of
 their atomic sums, and everything about time and memory.
@@ -12,6 +12,7 @@ their atomic sums, and everything about time and memory.
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from types import ModuleType
 from typing import Any
 from unittest.mock import patch
@@ -32,13 +33,17 @@ KERNEL_CHANNELS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33, 64, 65, 128, 129, 256, 2
 def gsplat_on_cpu() -> Iterator[None]:
     """Within, `raster.gsplat` works, with these kernels on the CPU."""
     backend = ModuleType("gsplat.cuda._backend")
-    backend._C = sys.modules[__name__]  # type: ignore[attr-defined]  # noqa: SLF001  the name gsplat looks for
-    with (
-        patch.dict(sys.modules, {"gsplat.cuda._backend": backend}),
-        patch.object(gsplat, "DEVICE", "cpu"),
-        patch.object(gsplat, "has_device", lambda: True),
-    ):
-        yield
+    backend._C = sys.modules[__name__]  # type: ignore[attr-defined]  # noqa: SLF001  gsplat's name
+    name = backend.__name__
+    before = sys.modules.get(name)
+    sys.modules[name] = backend  # not patch.dict, which would forget what else is imported meanwhile
+    try:
+        with patch.object(gsplat, "DEVICE", "cpu"), patch.object(gsplat, "has_device", lambda: True):
+            yield
+    finally:
+        del sys.modules[name]
+        if before is not None:
+            sys.modules[name] = before
 
 
 def _check(*tensors: Tensor | None, kind: torch.dtype = torch.float32) -> None:
@@ -71,7 +76,7 @@ def _project(
     size: tuple[int, int],
     eps2d: float,
 ) -> tuple[Tensor, ...]:
-    """Centres in camera space, projected means, blurred 2D covariances (N, 2, 2) and det before / after blur."""
+    """Centres in camera space, pixels, blurred 2D covariances (N, 2, 2), det before / after the blur."""
     turn, shift = viewmats[0, :3, :3], viewmats[0, :3, 3]
     focal, centre = torch.stack([Ks[0, 0, 0], Ks[0, 1, 1]]), Ks[0, :2, 2]
     points = means @ turn.T + shift
@@ -111,7 +116,8 @@ def projection_ewa_3dgs_fused_fwd(  # noqa: PLR0913  gsplat's signature
     _check(means, covars, quats, scales, opacities, viewmats, Ks)
     count = len(means)
     assert (means.shape, viewmats.shape, Ks.shape) == ((count, 3), (1, 4, 4), (1, 3, 3))
-    assert covars is None and camera_model == PINHOLE
+    assert covars is None
+    assert camera_model == PINHOLE
     points, pixels, blurred, ratio = _project(
         means, quats, scales, viewmats, Ks, (image_width, image_height), eps2d
     )
@@ -144,7 +150,9 @@ def projection_ewa_3dgs_fused_bwd(  # noqa: PLR0913  gsplat's signature
 ) -> tuple[Tensor | None, ...]:  # fmt: skip
     _check(means, quats, scales, viewmats, Ks, conics, compensations)
     _check(v_means2d, v_depths, v_conics, v_compensations)
-    assert covars is None and camera_model == PINHOLE and not viewmats_requires_grad
+    assert covars is None
+    assert camera_model == PINHOLE
+    assert not viewmats_requires_grad
     rows = (radii[0] > 0).all(1).nonzero()[:, 0]
     leaves = [leaf[rows].clone().requires_grad_() for leaf in (means, quats, scales)]
     with torch.enable_grad():
@@ -198,7 +206,7 @@ def intersect_offset(isect_ids: Tensor, I: int, tile_width: int, tile_height: in
 def _blend(
     pixels: Tensor, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(P, 2) pixels of a tile and its G Gaussians, front to back -> (P, C), (P,) alphas, (P,) last in range."""
+    """(P, 2) pixels of a tile, G Gaussians front to back -> (P, C) colours, (P,) alphas, (P,) last."""
     x, y = (means2d[None] - pixels[:, None]).unbind(2)
     sigma = 0.5 * (conics[:, 0] * x * x + conics[:, 2] * y * y) + conics[:, 1] * x * y
     alphas = (opacities * (-sigma).exp()).clamp(max=ALPHA_MAX)
@@ -219,7 +227,7 @@ def _tiles(
     width, height = size
     starts = [*tile_offsets.flatten().tolist(), len(flatten_ids)]
     columns = tile_offsets.shape[-1]
-    for tile, (start, end) in enumerate(zip(starts[:-1], starts[1:], strict=True)):
+    for tile, (start, end) in enumerate(pairwise(starts)):
         if start == end:
             continue
         top, left = tile // columns * tile_size, tile % columns * tile_size
@@ -239,7 +247,8 @@ def rasterize_to_pixels_3dgs_fwd(  # noqa: PLR0913  gsplat's signature
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     _check(means2d, conics, colors, opacities)
     _check(tile_offsets, flatten_ids, kind=torch.int32)
-    assert backgrounds is None and masks is None
+    assert backgrounds is None
+    assert masks is None
     assert colors.shape[-1] in KERNEL_CHANNELS
     images = torch.zeros(1, image_height, image_width, colors.shape[-1])
     alphas, last = (
@@ -265,7 +274,9 @@ def rasterize_to_pixels_3dgs_bwd(  # noqa: PLR0913  gsplat's signature
     parts = (means2d, conics, colors, opacities)
     _check(*parts, render_alphas, v_render_colors, v_render_alphas)
     _check(tile_offsets, flatten_ids, last_ids, kind=torch.int32)
-    assert backgrounds is None and masks is None and not absgrad
+    assert backgrounds is None
+    assert masks is None
+    assert not absgrad
     sums = [torch.zeros_like(part) for part in parts]
     for ids, pixels, place, _ in _tiles(tile_offsets, flatten_ids, (image_width, image_height), tile_size):
         leaves = [part[0, ids].clone().requires_grad_() for part in parts]
@@ -287,12 +298,13 @@ def spherical_harmonics_fwd(
     return colours
 
 
-def spherical_harmonics_bwd(  # noqa: PLR0913  gsplat's signature
+def spherical_harmonics_bwd(  # gsplat's signature
     K: int, degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None, v_colors: Tensor,
     compute_v_dirs: bool,
 ) -> tuple[Tensor, Tensor | None]:  # fmt: skip
     _check(dirs, coeffs, v_colors)
-    assert masks is not None and coeffs.shape[-2] == K
+    assert masks is not None
+    assert coeffs.shape[-2] == K
     leaves = [dirs[masks].requires_grad_(), coeffs[masks].requires_grad_()]
     with torch.enable_grad():
         colours = _harmonics()(degrees_to_use, *leaves)

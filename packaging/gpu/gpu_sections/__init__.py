@@ -1,4 +1,4 @@
-"""What a machine with a GPU is asked, section by section; `packaging/gpu/run.py` runs each in its own process.
+"""What a machine with a GPU is asked, section by section; `packaging/gpu/run.py` gives each its own process.
 
 Every section is a module with `measure(plan)`, which yields pieces of Markdown as they are found, so that a
 section that is stopped leaves what it had. It raises `Missing` where the machine lacks what it is about.

@@ -3,12 +3,13 @@
 import tempfile
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import torch
-from gpu_sections import Plan, forget_peak, need_cuda, peak_mib, table, wait
 
+from gpu_sections import Plan, forget_peak, need_cuda, peak_mib, table, wait
 from langsplat_core.arrays import Array
 from langsplat_core.raster import gsplat
 from langsplat_core.semantics.encoders import load_encoder
@@ -79,9 +80,9 @@ def _segmenter(folder: str, plan: Plan) -> str:
             laps.append(_now())
             for _, logits in answers:
                 for some in logits.flatten(0, 1).split(ENLARGED):
-                    look.enlarge(some) > 0  # noqa: B015  what a mask is made by
+                    torch.gt(look.enlarge(some), 0)  # what a mask is made by
             laps.append(_now())
-            rows.append([after - before for before, after in zip(laps[:-1], laps[1:], strict=True)])
+            rows.append([after - before for before, after in pairwise(laps)])
         memory = peak_mib()
         ious, logits = (part.cpu().numpy() for part in answers[0])
         start = time.perf_counter()
@@ -89,10 +90,10 @@ def _segmenter(folder: str, plan: Plan) -> str:
         wanted = [part.numpy() for part in there.ask(points)]
         slow = time.perf_counter() - start
     errors = (_largest(ious, wanted[0]), _largest(logits, wanted[1]) / float(np.abs(wanted[1]).max()))
-    head = (
-        "loading, s", "picture, s", f"{64 * plan.batches} points, s", f"{192 * plan.batches} masks enlarged, s", "photograph, s",
-        "CPU: loading, picture, 64 points, s", "error of a quality", "relative error of a mask", "device MiB",
-    )  # fmt: skip
+    steps = ("picture", f"{64 * plan.batches} points", f"{192 * plan.batches} masks enlarged", "photograph")
+    named = ("loading", *steps, "CPU: loading, picture, 64 points")
+    quality = ("error of a quality", "relative error of a mask", "device MiB")
+    head = (*(f"{name}, s" for name in named), *quality)
     return table(head, [(loaded, *rows[1], sum(rows[1]), slow, *errors, memory)])
 
 

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
+
 from gpu_sections import Plan, need_cuda, table
 from gpu_sections.raster import device_gaussians
-
 from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA
 from langsplat_core.lab.speed.cases import Case, default_camera, random_scene
@@ -36,7 +36,8 @@ def measure(plan: Plan) -> Iterator[str]:
     cpu = vars(on_cpu.backward(values, image))  # type: ignore[attr-defined]
     cuda = gradients(case, values, image)
     rows = [(name, _error(cpu[name], exact[name]), _error(cuda[name], exact[name])) for name in NAMES]
-    yield f"# Gradients: {count} Gaussians at {size[0]}x{size[1]}, {int(band.sum())} pixels at cut-offs left out\n"
+    yield f"# Gradients: {count} Gaussians at {size[0]}x{size[1]}\n"
+    yield f"{int(band.sum())} pixels at cut-offs are left out.\n"
     yield "Largest error of each gradient, relative to its greatest entry, against float64 autograd:\n"
     yield table(("gradient by", "CPU kernels", "gsplat"), rows)
     yield "Relative difference of <W x, y> and <x, W^T y>:\n"

@@ -4,9 +4,9 @@ import time
 from collections.abc import Iterator
 
 import numpy as np
+
 from gpu_sections import Plan, need_cuda, table
 from gpu_sections.pictures import bundled_scene, masked_views
-
 from langsplat_core.config import INRIA
 from langsplat_core.raster import gsplat, load_lifting_rasterizer
 from langsplat_core.training.language.memberships import find_memberships
@@ -29,7 +29,7 @@ def measure(plan: Plan) -> Iterator[str]:
         found[name] = members.pairs
     yield table(("backend", "seconds", "pairs of Gaussian and mask"), rows)
     largest = max(_difference(*both, len(scene.gaussians)) for both in zip(*found.values(), strict=True))
-    yield f"Largest difference of a weight: {largest:.2g} pixels; the largest weight is {_largest(found):.4g}.\n"
+    yield f"Largest difference of a weight: {largest:.2g} pixels, of weights up to {_largest(found):.4g}.\n"
 
 
 def _difference(one: np.ndarray, two: np.ndarray, count: int) -> float:

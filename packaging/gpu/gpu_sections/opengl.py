@@ -4,13 +4,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import moderngl
+
 from gpu_sections import Missing, Plan
 from gpu_sections.pictures import bundled_scene
-
 from langsplat_core.config import INRIA
 from langsplat_core.errors import BackendError
 from langsplat_core.lab.speed.cases import Case, default_camera, random_scene
-from langsplat_core.lab.speed.measure import Foresight, measure as measure_backend, warm_up
+from langsplat_core.lab.speed.measure import Foresight, warm_up
+from langsplat_core.lab.speed.measure import measure as measure_backend
 from langsplat_core.lab.speed.report import table as speed_table
 from langsplat_core.lab.speed.truth import make_truth
 from langsplat_core.raster import load_rasterizer

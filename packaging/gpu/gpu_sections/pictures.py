@@ -5,8 +5,8 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-from gpu_sections import Plan
 
+from gpu_sections import Plan
 from langsplat_core import load_scene, render
 from langsplat_core.arrays import unit
 from langsplat_core.datasets.capture import Capture

@@ -1,13 +1,14 @@
-"""gsplat beside the compiled CPU rasterizer: time and error of every operation, against the float64 reference."""
+"""gsplat beside the CPU rasterizer: time of every operation, and its error against the float64 reference."""
 
 from collections.abc import Iterator
 
 import torch
-from gpu_sections import Plan, forget_peak, milliseconds, need_cuda, peak_mib, table
 
+from gpu_sections import Plan, forget_peak, milliseconds, need_cuda, peak_mib, table
 from langsplat_core.config import INRIA
 from langsplat_core.lab.speed.cases import Case, default_camera, random_scene
-from langsplat_core.lab.speed.measure import Foresight, measure as measure_backend, warm_up
+from langsplat_core.lab.speed.measure import Foresight, warm_up
+from langsplat_core.lab.speed.measure import measure as measure_backend
 from langsplat_core.lab.speed.report import table as speed_table
 from langsplat_core.lab.speed.truth import make_truth
 from langsplat_core.raster import gsplat, load_rasterizer
@@ -15,8 +16,8 @@ from langsplat_core.raster import gsplat, load_rasterizer
 LONGEST_S = 10.0  # what is likely to take the CPU longer is not begun
 
 NOTES = """- Through the interface, arrays in and out of NumPy: every `frame` copies the scene to the device.
-- Errors against the float64 reference on three windows of 64x64 pixels, values in [0, 1); the reference caps one
-  Gaussian's alpha where the backend does: the CPU at 0.99, gsplat 1.5 at 0.999.
+- Errors against the float64 reference on three windows of 64x64 pixels, values in [0, 1); the reference caps
+  one Gaussian's alpha where the backend does: the CPU at 0.99, gsplat 1.5 at 0.999.
 - MiB: of the process's memory, not the device's.
 """
 

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
+
 from gpu_sections import Plan, forget_peak, need_cuda, peak_mib, table
 from gpu_sections.pictures import bundled_scene, capture
-
 from langsplat_core.config import RadianceConfig
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 
