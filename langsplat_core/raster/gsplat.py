@@ -2,8 +2,8 @@
 
 gsplat (1.5 or newer) is an optional dependency and compiles its kernels at first use. What differs from the
 reference, all of it gsplat's own: float32 throughout, the covariance formed in 3D first, so that long thin
-footprints lose digits, alpha capped at 0.999 in 1.5, at 0.99 from 1.6 on, and `gather` sums with atomics, so
-its last digits vary between runs.
+footprints lose digits, alpha capped at 0.999 in 1.5, at 0.99 from 1.6 on, antialiasing without INRIA's floor
+of 0.005, and `gather` sums with atomics, so its last digits vary between runs.
 """
 
 import subprocess

@@ -56,7 +56,8 @@ def run_case(case: Case, drawing: Drawing, backend: Backend, measured: Measure) 
     assert seen.alpha.min() >= 0
     assert seen.alpha.max() <= 1
     assert seen.view.dropped == case.dropped == sum(seen.drawing.gaussians.invalid_rows().values())
-    if case.compare and backend.name != "reference":
+    antialiased_by_gsplat = backend.gsplat and drawing.settings.antialiased  # compared in test_gsplat_twin
+    if case.compare and backend.name != "reference" and not antialiased_by_gsplat:
         compare(seen, measured)
     if hasattr(seen.view, "gather"):
         check_adjoint(seen)

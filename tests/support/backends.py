@@ -4,12 +4,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from langsplat_core.config import RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.gsplat import drawn_settings
+from langsplat_core.scene import Gaussians
 from tests.support.gsplat_twin import gsplat_on_cpu
 
 # "cuda-twin": the CUDA backend over gsplat's kernels in plain PyTorch, see `gsplat_twin`.
@@ -41,6 +43,12 @@ class Backend:
     def gsplat(self) -> bool:
         """Whether gsplat's own Python code draws, over its kernels or over their twin."""
         return self.name.startswith("cuda")
+
+    def promises(self, gaussians: Gaussians, settings: RasterSettings) -> bool:
+        """Whether `tolerance` holds. Not for gsplat's needles, whose covariances are formed in 3D in float32,
+        nor for its antialiasing of whatever is far smaller than a pixel, which has no floor."""
+        spread = np.ptp(gaussians.log_scales, axis=1).max(initial=0)
+        return not self.gsplat or bool(spread < np.log(100) and not settings.antialiased)
 
     def expected_settings(self, settings: RasterSettings) -> RasterSettings:
         """With these the reference forms the image that this backend means to form."""

@@ -17,7 +17,7 @@ def measure(plan: Plan) -> Iterator[str]:
     if find_spec("pytest") is None or find_spec("hypothesis") is None:
         raise Missing("no pytest or no hypothesis")
     yield f"# Tests: pytest {' '.join(plan.tests)}\n"
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--measured", *plan.tests]
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--measured", *plan.tests]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     said = done.stdout.splitlines()
     start = next(
