@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import GSPLAT, INRIA, RasterSettings
+from langsplat_core.config import GSPLAT, INRIA, RadianceConfig, RasterSettings
+from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import gsplat, load_lifting_rasterizer, load_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
@@ -22,7 +23,6 @@ from langsplat_core.training.radiance.train import evaluate_views, train_radianc
 from tests.support import gsplat_twin as twin
 from tests.support.lifting import make_views
 from tests.support.scenes import random_camera, random_gaussians
-from tests.training.radiance.test_train import SHORT, capture
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("gsplat_twin")]
 
@@ -98,13 +98,26 @@ def test_gradients_are_the_cpus(degree: int, antialiased: bool) -> None:
         np.testing.assert_allclose(cuda[name], want, atol=1e-4 * np.abs(want).max(), err_msg=name)
 
 
+def capture() -> Capture:
+    """Six pictures of a random scene, its centres as points."""
+    truth = random_gaussians(60, 7)
+    cameras = tuple(random_camera(seed, 40, 32) for seed in range(6))
+    values = np.random.default_rng(2).random((60, 3))
+    pictures = [ReferenceRasterizer().view(truth, camera).splat(values)[0] for camera in cameras]
+    images = tuple(np.round(255 * picture.clip(0, 1)).astype(np.uint8) for picture in pictures)
+    return Capture(cameras, images, truth.means.astype(np.float64), np.full((60, 3), 128, np.uint8))
+
+
 def test_training_ends_where_the_cpus_does() -> None:
-    config = replace(SHORT, steps=12, reference_steps=12, opacity_reset_every=100)
-    scores = []
+    config = RadianceConfig(
+        steps=12, reference_steps=12, sh_degree=1, sh_degree_every=5, densify_from=3, densify_until=10,
+        densify_every=4, max_gaussians=1_200,
+    )  # fmt: skip
+    photographs, scores = capture(), []
     for backend in ("cpu", "cuda"):
-        found = train_radiance(capture(), replace(config, backend=backend), [0, 1, 2, 3, 4])
+        found = train_radiance(photographs, replace(config, backend=backend), [0, 1, 2, 3, 4])
         assert len(found) > 100
-        scores.append(evaluate_views(found, capture(), [5], backend)[0].psnr)
+        scores.append(evaluate_views(found, photographs, [5], backend)[0].psnr)
     assert scores[0] == pytest.approx(scores[1], abs=0.3)
     assert min(scores) > 10
 

