@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 # One file of tests is one worker's: its fixtures are made once.
 PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: help demo quick test slow check format bench pictures app bundle desktop clean
+.PHONY: help demo quick test slow check format bench gpu pictures app bundle desktop clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -47,6 +47,17 @@ format: $(STAMP)  ## put every file into ruff's format
 bench: system  ## speed against error, on this machine
 	$(BIN)/langsplat bench raster --out bench_out
 
+# WHEELS=folder installs from there without a network; SITE=1 keeps the packages that PYTHON has, torch among them.
+# PYTHON may be that of a virtual environment: then --system-site-packages alone would not see its packages.
+GPU := .venv-gpu
+PURELIB := "import sysconfig; print(sysconfig.get_path('purelib'))"
+gpu:  ## on a machine with CUDA: run what never ran without, write docs/benchmarks/gpu (see docs/gpu.md)
+	$(PYTHON) -m venv --clear $(if $(SITE),--system-site-packages) $(GPU)
+	$(if $(SITE),$(PYTHON) -c $(PURELIB) > $$($(GPU)/bin/python -c $(PURELIB))/site.pth)
+	$(GPU)/bin/pip install --quiet $(if $(WHEELS),--no-index --find-links $(WHEELS)) \
+	  --requirement packaging/gpu/$(if $(SITE),beside_torch,requirements).txt
+	MAX_JOBS=$${MAX_JOBS:-$$(nproc)} $(GPU)/bin/python packaging/gpu/run.py $(if $(ONLY),--only $(ONLY))
+
 pictures: system  ## make the README's pictures again (on a display, or on Xvfb)
 	if [ -n "$$DISPLAY" ]; then $(BIN)/python packaging/pictures.py; \
 	else xvfb-run -a -s "-screen 0 1280x800x24" $(BIN)/python packaging/pictures.py; fi
@@ -70,4 +81,4 @@ desktop: $(STAMP)  ## show the viewer among this user's programs, and open scene
 	-update-desktop-database $(DATA)/applications
 
 clean:  ## remove what these targets made
-	rm -rf $(VENV) demo_out bench_out dist .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(GPU) demo_out bench_out dist .pytest_cache .mypy_cache .ruff_cache

@@ -9,12 +9,21 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 
-from tests.support.backends import backend, fast_backend, gl_rasterizers
+from tests.support.backends import backend, fast_backend, gl_rasterizers, gsplat_twin
 from tests.support.gl_context import gl, gl_session
 from tests.support.measured import measured, print_measured
 from tests.support.parallel import own_kernel_cache
 
-__all__ = ["backend", "fast_backend", "gl", "gl_rasterizers", "gl_session", "measured", "real_data"]
+__all__ = [
+    "backend",
+    "fast_backend",
+    "gl",
+    "gl_rasterizers",
+    "gl_session",
+    "gsplat_twin",
+    "measured",
+    "real_data",
+]
 
 own_kernel_cache()
 

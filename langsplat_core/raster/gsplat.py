@@ -1,13 +1,14 @@
 """The CUDA backend: gsplat's rasterizer behind our interfaces. This is the only file that knows gsplat.
 
 gsplat (1.5 or newer) is an optional dependency and compiles its kernels at first use. What differs from the
-reference, all of it gsplat's own: float32 throughout, alpha capped at 0.999 in 1.5, at 0.99 from 1.6 on,
-`gather` sums with atomics, so its last digits vary between runs, and view directions do not contribute to the
-gradient by the means.
+reference, all of it gsplat's own: float32 throughout, the covariance formed in 3D first, so that long thin
+footprints lose digits, alpha capped at 0.999 in 1.5, at 0.99 from 1.6 on, antialiasing without INRIA's floor
+of 0.005, and `gather` sums with atomics, so its last digits vary between runs.
 """
 
 import subprocess
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from langsplat_core.errors import BackendError
 from langsplat_core.raster.protocol import farthest
 from langsplat_core.scene import Camera, Gaussians, look_at
 
+DEVICE = "cuda"
 FARTHEST = 1e10  # world units: where gsplat's far plane is when it is not told
 
 
@@ -43,18 +45,29 @@ class Drawn:
     visible: Tensor  # (N,) bool
 
 
+def has_device() -> bool:
+    """Whether torch finds the device that gsplat draws on."""
+    return torch.cuda.is_available()
+
+
+def drawn_settings(settings: RasterSettings) -> RasterSettings:
+    """What the installed gsplat draws with where `settings` are asked for: its cap of alpha is its own."""
+    release = tuple(int(part) for part in version("gsplat").split(".")[:2])
+    return replace(settings, alpha_max=0.999 if release < (1, 6) else 0.99)
+
+
 def require_device() -> None:
     """Raises BackendError unless gsplat draws, forwards and backwards, on a CUDA device of this machine.
 
     The first use on a machine may compile for some minutes.
     """
-    if not torch.cuda.is_available():
+    if not has_device():
         raise BackendError("torch finds no CUDA device")
     shapes = {"means": (1, 3), "log_scales": (1, 3), "quats_wxyz": (1, 4), "opacity_logits": (1,)}
-    one = DeviceGaussians(**{n: torch.ones(*s, device="cuda").requires_grad_() for n, s in shapes.items()})
+    one = DeviceGaussians(**{n: torch.ones(*s, device=DEVICE).requires_grad_() for n, s in shapes.items()})
     camera = look_at(np.array([5.0, 5.0, 5.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]), (16, 16))
     try:  # an import alone does not prove that there are kernels
-        draw(one, torch.ones(1, 1, device="cuda"), camera, INRIA).image.sum().backward()
+        draw(one, torch.ones(1, 1, device=DEVICE), camera, INRIA).image.sum().backward()
     except (ImportError, RuntimeError, OSError, AttributeError, subprocess.SubprocessError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BackendError(
@@ -86,7 +99,7 @@ def draw(
         opacities=gaussians.opacity_logits.sigmoid(),
         colors=values,
         viewmats=to_device(view[None]),
-        Ks=torch.tensor([intrinsics], dtype=torch.float32, device="cuda"),
+        Ks=torch.tensor([intrinsics], dtype=torch.float32, device=DEVICE),
         width=camera.width,
         height=camera.height,
         near_plane=settings.near,
@@ -105,7 +118,7 @@ def draw(
 
 def to_device(array: Array) -> Tensor:
     """As a float32 tensor on the device."""
-    return torch.tensor(np.asarray(array), dtype=torch.float32, device="cuda")
+    return torch.tensor(np.asarray(array), dtype=torch.float32, device=DEVICE)
 
 
 class GsplatView:
@@ -144,7 +157,7 @@ class GsplatView:
         channels = check_array("image", image, (self.camera.height, self.camera.width, "C"))["C"]
         gathered = np.zeros((self._count, channels), np.float32)
         if len(self._rows) > 0:
-            values = torch.zeros(len(self._rows), channels, device="cuda", requires_grad=True)
+            values = torch.zeros(len(self._rows), channels, device=DEVICE, requires_grad=True)
             (grad,) = torch.autograd.grad(self._draw(values)[0], values, to_device(image))
             gathered[self._rows] = grad.cpu().numpy()
         return gathered

@@ -18,6 +18,21 @@ from tests.support.measured import Measure
 # What rounding can decide in a pixel: two alphas of 1/255, or one last weight alpha T before T reaches 1e-4,
 # which is largest for alpha = 0.99.
 MOST_AT_A_CUT_OFF = 2 / 255 + 0.99 * 1e-4 / (1 - 0.99)
+# Where gsplat draws something else by design: it forms covariances in 3D in float32, which overflow or lose
+# their digits, caps alpha at a value of its own and draws a Gaussian that lies in the near plane itself.
+BEYOND_GSPLAT = frozenset(
+    {
+        "scale e^40",
+        "scale e^80",
+        "needles longer than the world",
+        "all scales e^(79, 79, 79)",
+        "all scales e^(-inf, 79, 79)",
+        "all scales e^(40, 0, -40)",
+        "all scales e^(7, -5, -6)",
+        "one opaque Gaussian",
+        "one ulp about the near plane",
+    }
+)
 NAMED = [pytest.param(case, id=case.name) for case in CASES]
 
 
@@ -25,10 +40,12 @@ def run_case(case: Case, drawing: Drawing, backend: Backend, measured: Measure) 
     """Everything the table's docstring promises of every case."""
     if case.only and backend.name not in case.only:
         pytest.skip("too long for this backend")
+    if backend.gsplat and case.name in BEYOND_GSPLAT:
+        pytest.skip("gsplat draws something else by design")
     try:
         seen = draw(backend, drawing)
     except BackendError as error:
-        if backend.name != "cuda":
+        if not backend.gsplat:
             raise
         pytest.skip(str(error))  # gsplat fixes some settings
     camera, channels = seen.drawing.camera, seen.drawing.features().shape[1]
@@ -39,7 +56,8 @@ def run_case(case: Case, drawing: Drawing, backend: Backend, measured: Measure) 
     assert seen.alpha.min() >= 0
     assert seen.alpha.max() <= 1
     assert seen.view.dropped == case.dropped == sum(seen.drawing.gaussians.invalid_rows().values())
-    if case.compare and backend.name != "reference":
+    antialiased_by_gsplat = backend.gsplat and drawing.settings.antialiased  # compared in test_gsplat_twin
+    if case.compare and backend.name != "reference" and not antialiased_by_gsplat:
         compare(seen, measured)
     if hasattr(seen.view, "gather"):
         check_adjoint(seen)

@@ -115,6 +115,8 @@ def test_equal_to_the_reference(fast_backend: Backend, slow: bool) -> None:
     def law(case: Case) -> None:
         nonlocal flipped, pixels
         gaussians, camera, raster_settings = case
+        if not fast_backend.promises(gaussians, raster_settings):
+            return
         x = random_values(len(gaussians), 3)
         expected = fast_backend.expected_settings(raster_settings)
         reference = ReferenceRasterizer().view(gaussians, camera, expected)

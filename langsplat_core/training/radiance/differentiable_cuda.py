@@ -14,7 +14,7 @@ class CudaRenderer:
     """Draws with gsplat; how it differs from the CPU kernels says `raster.gsplat`."""
 
     def __init__(self, settings: RasterSettings = INRIA) -> None:
-        self.device = torch.device("cuda")
+        self.device = torch.device(gsplat.DEVICE)
         self._settings = settings
         try:
             gsplat.require_device()
