@@ -4,350 +4,167 @@ Each takes the `Viewer` and changes its state; long work goes to the worker. Non
 something a user did: the reason appears in the messages area.
 """
 
-from langsplat_viewer.actions.asking import (
-    load_queries,
-    save_queries,
-    set_canonical,
-    set_cut,
-    type_canonical,
-)
-from langsplat_viewer.actions.bookmarks import (
-    add_bookmark,
-    delete_bookmark,
-    go_to_bookmark,
-    type_bookmark,
-)
-from langsplat_viewer.actions.browsing import (
-    ask_for_file,
-    browse,
-    choose,
-    close_browser,
-    open_all,
-    open_dropped,
-    open_recent,
-    open_typed,
-    type_path,
-)
-from langsplat_viewer.actions.camera import (
-    focus_pixel,
-    focus_result,
-    frame_scene,
-    glide_to,
-    go_to_camera,
-    look_from,
-    move,
-    open_at,
-    reset_view,
-    set_fly_speed,
-    set_walking,
-    step_camera,
-    tick,
-    toggle_walking,
-    zoom_by,
-)
-from langsplat_viewer.actions.exporting import export, finish_writing
-from langsplat_viewer.actions.filming import (
-    cancel_film,
-    copy_command,
-    save_film,
-    save_sized_picture,
-    set_film_fps,
-    set_film_size,
-    take_clipboard,
-    type_film,
-)
-from langsplat_viewer.actions.leaving import (
-    discard_and_leave,
-    may_close,
-    quit_viewer,
-    save_and_leave,
-    stay,
-)
-from langsplat_viewer.actions.offers import ask_offered, offers, prepare_suggestions, recall
-from langsplat_viewer.actions.opening import cancel, open_scene
-from langsplat_viewer.actions.photographs import (
-    ask_for_photographs,
-    choose_photograph_folder,
-    fade_photograph,
-    fetch_photograph,
-    photograph_here,
-)
-from langsplat_viewer.actions.playback import (
-    path_seconds,
-    scrub,
-    toggle_playing,
-)
-from langsplat_viewer.actions.pointing import hover, toggle_pointing
-from langsplat_viewer.actions.queries import (
-    ask,
-    ask_typed,
-    focus_search,
-    hide,
-    remove,
-    select,
-    set_level,
-    show,
-    take_search_focus,
-    type_phrase,
-)
-from langsplat_viewer.actions.recording import (
-    add_keyframe,
-    choose_keyframe,
-    clear_path,
-    delete_keyframe,
-    load_path,
-    load_typed_path,
-    move_keyframe,
-    replace_keyframe,
-    save_path,
-    set_looping,
-    set_path_seconds,
-    set_turning,
-    type_path_file,
-)
-from langsplat_viewer.actions.scenes import add_scenes, open_scenes, step_scene, switch_scene, unlist_scene
-from langsplat_viewer.actions.seeing import (
-    compare_with,
-    measure,
-    measure_at,
-    move_line,
-    save_transparent,
-    set_clip,
-    set_colour_map,
-    set_splats,
-    show_one,
-    show_overlay,
-    toggle_levels,
-    toggle_measuring,
-    toggle_overlay,
-    toggle_wipe,
-    turn_to_face,
-)
-from langsplat_viewer.actions.selecting import (
-    chosen_query,
-    delete_selected,
-    find_things,
-    grow_selection,
-    hide_selected,
-    invert_selection,
-    isolate_selected,
-    reach,
-    select_all,
-    select_none,
-    select_query,
-    select_thing,
-    set_brush,
-    set_mode,
-    set_only_visible,
-    set_reach,
-    show_hidden,
-    shrink_selection,
-    use_tool,
-)
-from langsplat_viewer.actions.settings import (
-    edit_keys,
-    escape,
-    mute_letters,
-    note_panels,
-    open_panel,
-    resize,
-    set_coarse_while_moving,
-    set_display,
-    set_picture,
-    set_theme,
-    set_ui_scale,
-    show_help,
-    show_palette,
-    show_panel,
-    take_wanted_panel,
-    toggle_help,
-    toggle_panel,
-    type_command,
-    type_keys,
-)
-from langsplat_viewer.actions.strokes import (
-    begin_stroke,
-    cancel_stroke,
-    drawn_stroke,
-    end_stroke,
-    extend_stroke,
-    leave_tool,
-)
-from langsplat_viewer.actions.timing import compare_with_reference, measure_frame, stop_comparing
-from langsplat_viewer.actions.training import (
-    choose_photographs,
-    fill_in,
-    look_at_training,
-    start_training,
-    stop_training,
-    watch_training,
-)
-from langsplat_viewer.actions.undoing import redo, undo
-from langsplat_viewer.actions.visits import keep_old, reload
-
-__all__ = [
-    "add_bookmark",
-    "add_keyframe",
-    "add_scenes",
-    "ask",
-    "ask_for_file",
-    "ask_for_photographs",
-    "ask_offered",
-    "ask_typed",
-    "begin_stroke",
-    "browse",
-    "cancel",
-    "cancel_film",
-    "cancel_stroke",
-    "choose",
-    "choose_keyframe",
-    "choose_photograph_folder",
-    "choose_photographs",
-    "chosen_query",
-    "clear_path",
-    "close_browser",
-    "compare_with",
-    "compare_with_reference",
-    "copy_command",
-    "delete_bookmark",
-    "delete_keyframe",
-    "delete_selected",
-    "discard_and_leave",
-    "drawn_stroke",
-    "edit_keys",
-    "end_stroke",
-    "escape",
-    "export",
-    "extend_stroke",
-    "fade_photograph",
-    "fetch_photograph",
-    "fill_in",
-    "find_things",
-    "finish_writing",
-    "focus_pixel",
-    "focus_result",
-    "focus_search",
-    "frame_scene",
-    "glide_to",
-    "go_to_bookmark",
-    "go_to_camera",
-    "grow_selection",
-    "hide",
-    "hide_selected",
-    "hover",
-    "invert_selection",
-    "isolate_selected",
-    "keep_old",
-    "leave_tool",
-    "load_path",
-    "load_queries",
-    "load_typed_path",
-    "look_at_training",
-    "look_from",
-    "may_close",
-    "measure",
-    "measure_at",
-    "measure_frame",
-    "move",
-    "move_keyframe",
-    "move_line",
-    "mute_letters",
-    "note_panels",
-    "offers",
-    "open_all",
-    "open_at",
-    "open_dropped",
-    "open_panel",
-    "open_recent",
-    "open_scene",
-    "open_scenes",
-    "open_typed",
-    "path_seconds",
-    "photograph_here",
-    "prepare_suggestions",
-    "quit_viewer",
-    "reach",
-    "recall",
-    "redo",
-    "reload",
-    "remove",
-    "replace_keyframe",
-    "reset_view",
-    "resize",
-    "save_and_leave",
-    "save_film",
-    "save_path",
-    "save_queries",
-    "save_sized_picture",
-    "save_transparent",
-    "scrub",
-    "select",
-    "select_all",
-    "select_none",
-    "select_query",
-    "select_thing",
-    "set_brush",
-    "set_canonical",
-    "set_clip",
-    "set_coarse_while_moving",
-    "set_colour_map",
-    "set_cut",
-    "set_display",
-    "set_film_fps",
-    "set_film_size",
-    "set_fly_speed",
-    "set_level",
-    "set_looping",
-    "set_mode",
-    "set_only_visible",
-    "set_path_seconds",
-    "set_picture",
-    "set_reach",
-    "set_splats",
-    "set_theme",
-    "set_turning",
-    "set_ui_scale",
-    "set_walking",
-    "show",
-    "show_help",
-    "show_hidden",
-    "show_one",
-    "show_overlay",
-    "show_palette",
-    "show_panel",
-    "shrink_selection",
-    "start_training",
-    "stay",
-    "step_camera",
-    "step_scene",
-    "stop_comparing",
-    "stop_training",
-    "switch_scene",
-    "take_clipboard",
-    "take_search_focus",
-    "take_wanted_panel",
-    "tick",
-    "toggle_help",
-    "toggle_levels",
-    "toggle_measuring",
-    "toggle_overlay",
-    "toggle_panel",
-    "toggle_playing",
-    "toggle_pointing",
-    "toggle_walking",
-    "toggle_wipe",
-    "turn_to_face",
-    "type_bookmark",
-    "type_canonical",
-    "type_command",
-    "type_film",
-    "type_keys",
-    "type_path",
-    "type_path_file",
-    "type_phrase",
-    "undo",
-    "unlist_scene",
-    "use_tool",
-    "watch_training",
-    "zoom_by",
-]
+from langsplat_viewer.actions.asking import load_queries as load_queries
+from langsplat_viewer.actions.asking import save_queries as save_queries
+from langsplat_viewer.actions.asking import set_canonical as set_canonical
+from langsplat_viewer.actions.asking import set_cut as set_cut
+from langsplat_viewer.actions.asking import type_canonical as type_canonical
+from langsplat_viewer.actions.bookmarks import add_bookmark as add_bookmark
+from langsplat_viewer.actions.bookmarks import delete_bookmark as delete_bookmark
+from langsplat_viewer.actions.bookmarks import go_to_bookmark as go_to_bookmark
+from langsplat_viewer.actions.bookmarks import type_bookmark as type_bookmark
+from langsplat_viewer.actions.browsing import ask_for_file as ask_for_file
+from langsplat_viewer.actions.browsing import browse as browse
+from langsplat_viewer.actions.browsing import choose as choose
+from langsplat_viewer.actions.browsing import close_browser as close_browser
+from langsplat_viewer.actions.browsing import open_all as open_all
+from langsplat_viewer.actions.browsing import open_dropped as open_dropped
+from langsplat_viewer.actions.browsing import open_recent as open_recent
+from langsplat_viewer.actions.browsing import open_typed as open_typed
+from langsplat_viewer.actions.browsing import type_path as type_path
+from langsplat_viewer.actions.camera import focus_pixel as focus_pixel
+from langsplat_viewer.actions.camera import focus_result as focus_result
+from langsplat_viewer.actions.camera import frame_scene as frame_scene
+from langsplat_viewer.actions.camera import glide_to as glide_to
+from langsplat_viewer.actions.camera import go_to_camera as go_to_camera
+from langsplat_viewer.actions.camera import look_from as look_from
+from langsplat_viewer.actions.camera import move as move
+from langsplat_viewer.actions.camera import open_at as open_at
+from langsplat_viewer.actions.camera import reset_view as reset_view
+from langsplat_viewer.actions.camera import set_fly_speed as set_fly_speed
+from langsplat_viewer.actions.camera import set_walking as set_walking
+from langsplat_viewer.actions.camera import step_camera as step_camera
+from langsplat_viewer.actions.camera import tick as tick
+from langsplat_viewer.actions.camera import toggle_walking as toggle_walking
+from langsplat_viewer.actions.camera import zoom_by as zoom_by
+from langsplat_viewer.actions.exporting import export as export
+from langsplat_viewer.actions.exporting import finish_writing as finish_writing
+from langsplat_viewer.actions.filming import cancel_film as cancel_film
+from langsplat_viewer.actions.filming import copy_command as copy_command
+from langsplat_viewer.actions.filming import save_film as save_film
+from langsplat_viewer.actions.filming import save_sized_picture as save_sized_picture
+from langsplat_viewer.actions.filming import set_film_fps as set_film_fps
+from langsplat_viewer.actions.filming import set_film_size as set_film_size
+from langsplat_viewer.actions.filming import take_clipboard as take_clipboard
+from langsplat_viewer.actions.filming import type_film as type_film
+from langsplat_viewer.actions.leaving import discard_and_leave as discard_and_leave
+from langsplat_viewer.actions.leaving import may_close as may_close
+from langsplat_viewer.actions.leaving import quit_viewer as quit_viewer
+from langsplat_viewer.actions.leaving import save_and_leave as save_and_leave
+from langsplat_viewer.actions.leaving import stay as stay
+from langsplat_viewer.actions.offers import ask_offered as ask_offered
+from langsplat_viewer.actions.offers import offers as offers
+from langsplat_viewer.actions.offers import prepare_suggestions as prepare_suggestions
+from langsplat_viewer.actions.offers import recall as recall
+from langsplat_viewer.actions.opening import cancel as cancel
+from langsplat_viewer.actions.opening import open_scene as open_scene
+from langsplat_viewer.actions.photographs import ask_for_photographs as ask_for_photographs
+from langsplat_viewer.actions.photographs import choose_photograph_folder as choose_photograph_folder
+from langsplat_viewer.actions.photographs import fade_photograph as fade_photograph
+from langsplat_viewer.actions.photographs import fetch_photograph as fetch_photograph
+from langsplat_viewer.actions.photographs import photograph_here as photograph_here
+from langsplat_viewer.actions.playback import path_seconds as path_seconds
+from langsplat_viewer.actions.playback import scrub as scrub
+from langsplat_viewer.actions.playback import toggle_playing as toggle_playing
+from langsplat_viewer.actions.pointing import hover as hover
+from langsplat_viewer.actions.pointing import toggle_pointing as toggle_pointing
+from langsplat_viewer.actions.queries import ask as ask
+from langsplat_viewer.actions.queries import ask_typed as ask_typed
+from langsplat_viewer.actions.queries import focus_search as focus_search
+from langsplat_viewer.actions.queries import hide as hide
+from langsplat_viewer.actions.queries import remove as remove
+from langsplat_viewer.actions.queries import select as select
+from langsplat_viewer.actions.queries import set_level as set_level
+from langsplat_viewer.actions.queries import show as show
+from langsplat_viewer.actions.queries import take_search_focus as take_search_focus
+from langsplat_viewer.actions.queries import type_phrase as type_phrase
+from langsplat_viewer.actions.recording import add_keyframe as add_keyframe
+from langsplat_viewer.actions.recording import choose_keyframe as choose_keyframe
+from langsplat_viewer.actions.recording import clear_path as clear_path
+from langsplat_viewer.actions.recording import delete_keyframe as delete_keyframe
+from langsplat_viewer.actions.recording import load_path as load_path
+from langsplat_viewer.actions.recording import load_typed_path as load_typed_path
+from langsplat_viewer.actions.recording import move_keyframe as move_keyframe
+from langsplat_viewer.actions.recording import replace_keyframe as replace_keyframe
+from langsplat_viewer.actions.recording import save_path as save_path
+from langsplat_viewer.actions.recording import set_looping as set_looping
+from langsplat_viewer.actions.recording import set_path_seconds as set_path_seconds
+from langsplat_viewer.actions.recording import set_turning as set_turning
+from langsplat_viewer.actions.recording import type_path_file as type_path_file
+from langsplat_viewer.actions.scenes import add_scenes as add_scenes
+from langsplat_viewer.actions.scenes import open_scenes as open_scenes
+from langsplat_viewer.actions.scenes import step_scene as step_scene
+from langsplat_viewer.actions.scenes import switch_scene as switch_scene
+from langsplat_viewer.actions.scenes import unlist_scene as unlist_scene
+from langsplat_viewer.actions.seeing import compare_with as compare_with
+from langsplat_viewer.actions.seeing import measure as measure
+from langsplat_viewer.actions.seeing import measure_at as measure_at
+from langsplat_viewer.actions.seeing import move_line as move_line
+from langsplat_viewer.actions.seeing import save_transparent as save_transparent
+from langsplat_viewer.actions.seeing import set_clip as set_clip
+from langsplat_viewer.actions.seeing import set_colour_map as set_colour_map
+from langsplat_viewer.actions.seeing import set_splats as set_splats
+from langsplat_viewer.actions.seeing import show_one as show_one
+from langsplat_viewer.actions.seeing import show_overlay as show_overlay
+from langsplat_viewer.actions.seeing import toggle_levels as toggle_levels
+from langsplat_viewer.actions.seeing import toggle_measuring as toggle_measuring
+from langsplat_viewer.actions.seeing import toggle_overlay as toggle_overlay
+from langsplat_viewer.actions.seeing import toggle_wipe as toggle_wipe
+from langsplat_viewer.actions.seeing import turn_to_face as turn_to_face
+from langsplat_viewer.actions.selecting import chosen_query as chosen_query
+from langsplat_viewer.actions.selecting import delete_selected as delete_selected
+from langsplat_viewer.actions.selecting import find_things as find_things
+from langsplat_viewer.actions.selecting import grow_selection as grow_selection
+from langsplat_viewer.actions.selecting import hide_selected as hide_selected
+from langsplat_viewer.actions.selecting import invert_selection as invert_selection
+from langsplat_viewer.actions.selecting import isolate_selected as isolate_selected
+from langsplat_viewer.actions.selecting import reach as reach
+from langsplat_viewer.actions.selecting import select_all as select_all
+from langsplat_viewer.actions.selecting import select_none as select_none
+from langsplat_viewer.actions.selecting import select_query as select_query
+from langsplat_viewer.actions.selecting import select_thing as select_thing
+from langsplat_viewer.actions.selecting import set_brush as set_brush
+from langsplat_viewer.actions.selecting import set_mode as set_mode
+from langsplat_viewer.actions.selecting import set_only_visible as set_only_visible
+from langsplat_viewer.actions.selecting import set_reach as set_reach
+from langsplat_viewer.actions.selecting import show_hidden as show_hidden
+from langsplat_viewer.actions.selecting import shrink_selection as shrink_selection
+from langsplat_viewer.actions.selecting import use_tool as use_tool
+from langsplat_viewer.actions.settings import edit_keys as edit_keys
+from langsplat_viewer.actions.settings import escape as escape
+from langsplat_viewer.actions.settings import mute_letters as mute_letters
+from langsplat_viewer.actions.settings import note_panels as note_panels
+from langsplat_viewer.actions.settings import open_panel as open_panel
+from langsplat_viewer.actions.settings import resize as resize
+from langsplat_viewer.actions.settings import set_coarse_while_moving as set_coarse_while_moving
+from langsplat_viewer.actions.settings import set_display as set_display
+from langsplat_viewer.actions.settings import set_picture as set_picture
+from langsplat_viewer.actions.settings import set_theme as set_theme
+from langsplat_viewer.actions.settings import set_ui_scale as set_ui_scale
+from langsplat_viewer.actions.settings import show_help as show_help
+from langsplat_viewer.actions.settings import show_palette as show_palette
+from langsplat_viewer.actions.settings import show_panel as show_panel
+from langsplat_viewer.actions.settings import take_wanted_panel as take_wanted_panel
+from langsplat_viewer.actions.settings import toggle_help as toggle_help
+from langsplat_viewer.actions.settings import toggle_panel as toggle_panel
+from langsplat_viewer.actions.settings import type_command as type_command
+from langsplat_viewer.actions.settings import type_keys as type_keys
+from langsplat_viewer.actions.strokes import begin_stroke as begin_stroke
+from langsplat_viewer.actions.strokes import cancel_stroke as cancel_stroke
+from langsplat_viewer.actions.strokes import drawn_stroke as drawn_stroke
+from langsplat_viewer.actions.strokes import end_stroke as end_stroke
+from langsplat_viewer.actions.strokes import extend_stroke as extend_stroke
+from langsplat_viewer.actions.strokes import leave_tool as leave_tool
+from langsplat_viewer.actions.timing import compare_with_reference as compare_with_reference
+from langsplat_viewer.actions.timing import measure_frame as measure_frame
+from langsplat_viewer.actions.timing import stop_comparing as stop_comparing
+from langsplat_viewer.actions.training import choose_photographs as choose_photographs
+from langsplat_viewer.actions.training import fill_in as fill_in
+from langsplat_viewer.actions.training import look_at_training as look_at_training
+from langsplat_viewer.actions.training import start_training as start_training
+from langsplat_viewer.actions.training import stop_training as stop_training
+from langsplat_viewer.actions.training import watch_training as watch_training
+from langsplat_viewer.actions.undoing import redo as redo
+from langsplat_viewer.actions.undoing import undo as undo
+from langsplat_viewer.actions.visits import keep_old as keep_old
+from langsplat_viewer.actions.visits import reload as reload
