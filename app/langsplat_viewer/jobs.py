@@ -86,6 +86,7 @@ class Worker:
     def _run(self) -> None:
         while (job := self._waiting.get()) is not None:
             job.run()
+            del job  # and with it what it has found, however long the next one takes to come
 
     def poll(self) -> None:
         """Deliver what has finished, in the order of submission. Call once per frame."""

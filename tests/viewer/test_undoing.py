@@ -1,6 +1,8 @@
 """Undo and redo of what was asked, shown and marked, and of how it was looked at."""
 
+import gc
 import tracemalloc
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,6 +34,7 @@ def test_a_query_is_undone_and_done_again(opened):
     assert "nothing to undo" in opened.state.messages[-1].text
     actions.redo(opened)
     actions.redo(opened)
+    settle(opened)
     assert phrases(opened) == ["mug", "book"]
     assert [query.slot for query in opened.state.queries] == [0, 1]
     assert opened.state.picture.display == "relevancy"
@@ -45,10 +48,53 @@ def test_a_removed_query_comes_back_with_its_answer_and_colour(opened):
         actions.ask(opened, word)
     settle(opened)
     mug = opened.state.queries[0]
+    actions.set_cut(opened, mug, 0.6)
+    count = mug.result.members.sum()
     actions.remove(opened, mug)
     actions.undo(opened)
+    settle(opened)
     assert opened.state.queries[0] is mug
     assert mug.slot == 0
+    assert mug.cut == 0.6
+    assert mug.result.found
+    assert mug.result.members.sum() == count
+    assert len(mug.things) == 1
+
+
+def leave_by_removing(viewer) -> None:
+    actions.remove(viewer, viewer.state.queries[-1])
+
+
+@pytest.mark.parametrize("leave", [leave_by_removing, actions.undo])
+def test_history_keeps_no_answers_of_queries_that_are_gone(opened, leave):
+    """Each has a number for every Gaussian and level."""
+    actions.ask(opened, "mug")
+    settle(opened)
+    stays, gone = opened.state.queries[0].result, []
+    for word in ("book", "plant"):
+        actions.ask(opened, word)
+        settle(opened)
+        gone.append(weakref.ref(opened.state.queries[-1].result))
+        opened.state.relevancies()
+        leave(opened)
+    gc.collect()
+    assert [there() for there in gone] == [None, None]
+    assert opened.state.queries[0].result is stays
+    (actions.redo if leave is actions.undo else actions.undo)(opened)
+    settle(opened)
+    assert opened.state.queries[-1].phrase == "plant"
+    assert opened.state.queries[-1].result.found
+
+
+def test_an_answer_that_comes_after_its_query_was_taken_off_is_dropped(opened):
+    actions.ask(opened, "mug")
+    mug = opened.state.queries[0]
+    actions.remove(opened, mug)
+    settle(opened)
+    assert (mug.result, mug.pending) == (None, False)
+    actions.undo(opened)
+    assert mug.pending
+    settle(opened)
     assert mug.result.found
 
 

@@ -56,6 +56,17 @@ def remember(viewer: Viewer, setting: str = "") -> None:
         history.future = []
 
 
+def let_go(viewer: Viewer) -> None:
+    """Drop the answers of queries that are in no list any more but in what can be undone: numbers for every
+    Gaussian. They are asked anew when they come back."""
+    listed = {id(query) for query in viewer.state.queries}
+    for moment in (*viewer.history.past, *viewer.history.future):
+        for query, *_ in moment.queries:
+            if id(query) not in listed:
+                query.result = query.automatic = None
+                query.things, query.pending = (), False
+
+
 def forget(viewer: Viewer) -> None:
     """Another scene: nothing of before can be undone."""
     history = viewer.history

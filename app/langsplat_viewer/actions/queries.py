@@ -7,14 +7,14 @@ from langsplat_core.config import LevelChoice
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import UnknownWordError
 from langsplat_core.progress import Progress
-from langsplat_core.query.answers import recut
+from langsplat_core.query.answers import QueryResult, recut
 from langsplat_core.query.compose import ComposedResult, run_phrase
 from langsplat_core.query.engine import no_field
 from langsplat_core.query.instances import Instance
 from langsplat_core.query.phrase_tree import Atom
 from langsplat_core.query.suggestions import corrected
 from langsplat_core.scene.phrases import phrase_key, split_phrases
-from langsplat_viewer.actions.history import remember
+from langsplat_viewer.actions.history import let_go, remember
 from langsplat_viewer.actions.settings import mute_letters, open_panel
 from langsplat_viewer.state import SLOTS, Query
 from langsplat_viewer.viewer import Viewer
@@ -58,6 +58,13 @@ def ask_again(viewer: Viewer) -> None:
         _answer(viewer, query)
 
 
+def ask_unanswered(viewer: Viewer) -> None:
+    """Answer the queries of the list that have neither an answer nor a reason why not, nor wait for one."""
+    for query in viewer.state.queries:
+        if query.automatic is None and not query.problem and not query.pending:
+            _answer(viewer, query)
+
+
 def type_phrase(viewer: Viewer, text: str) -> None:
     """What stands in the search box."""
     viewer.state.typed = text
@@ -90,6 +97,9 @@ def take_search_focus(viewer: Viewer) -> bool:
     return wanted
 
 
+Answered = tuple[ComposedResult, tuple[Instance, ...]] | UnknownWordError
+
+
 def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
     """Have the worker answer `query` at the current level choice; only what may be there takes a colour."""
     engine, level = viewer.engine, viewer.state.level
@@ -99,7 +109,7 @@ def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
     viewpoint = None if view is None else view.camera(*viewer.state.size)
     took: list[float] = []  # milliseconds
 
-    def work(progress: Progress) -> tuple[ComposedResult, tuple[Instance, ...]] | UnknownWordError:
+    def work(progress: Progress) -> Answered:
         began = perf_counter()
         try:
             composed = run_phrase(engine, query.phrase, level, viewpoint, progress)
@@ -108,33 +118,38 @@ def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
         took.append(1e3 * (perf_counter() - began))
         return composed, engine.instances(composed.answer, MOST_THINGS) if composed.answer.found else ()
 
-    def done(answered: tuple[ComposedResult, tuple[Instance, ...]] | UnknownWordError) -> None:
+    def done(answered: Answered) -> None:
+        if query not in viewer.state.queries:  # it was taken off meanwhile
+            return
         if isinstance(answered, UnknownWordError):
             query.meant = corrected(query.phrase, answered.near) or ""
             failed(str(answered))
             return
-        composed, query.things = answered
         viewer.state.timing.add("search", took[0])
-        query.automatic, query.problem, query.meant, query.pending = composed.answer, "", "", False
-        query.result = composed.answer if query.cut is None else recut(composed.answer, query.cut)
-        query.reading = "" if isinstance(composed.tree, Atom) else composed.reading
-        if then_show and query in viewer.state.queries:
-            if composed.answer.verdict != "not here":  # nothing is painted for it
-                _give_slot(viewer, query)
-            if not DISPLAYS[viewer.state.picture.display].needs_query:
-                viewer.state.picture = replace(viewer.state.picture, display="relevancy")
+        _take(query, *answered)
+        if then_show:
+            _show_answer(viewer, query, answered[0].answer)
 
     def failed(reason: str) -> None:
         query.problem, query.pending = reason, False
         viewer.state.say(reason, is_error=True)
 
     query.pending = True
-    viewer.worker.submit(
-        f"searching '{query.phrase}'",
-        work,
-        done,
-        failed,
-    )
+    viewer.worker.submit(f"searching '{query.phrase}'", work, done, failed)
+
+
+def _take(query: Query, composed: ComposedResult, things: tuple[Instance, ...]) -> None:
+    query.automatic, query.things = composed.answer, things
+    query.problem, query.meant, query.pending = "", "", False
+    query.result = composed.answer if query.cut is None else recut(composed.answer, query.cut)
+    query.reading = "" if isinstance(composed.tree, Atom) else composed.reading
+
+
+def _show_answer(viewer: Viewer, query: Query, answer: QueryResult) -> None:
+    if answer.verdict != "not here":  # nothing is painted for it
+        _give_slot(viewer, query)
+    if not DISPLAYS[viewer.state.picture.display].needs_query:
+        viewer.state.picture = replace(viewer.state.picture, display="relevancy")
 
 
 def select(viewer: Viewer, query: Query | None) -> None:
@@ -174,6 +189,7 @@ def remove(viewer: Viewer, query: Query) -> None:
         state.queries = [q for q in state.queries if q is not query]
         if state.selected is query:
             select(viewer, state.queries[-1] if state.queries else None)
+        let_go(viewer)
 
 
 def set_level(viewer: Viewer, level: LevelChoice) -> None:

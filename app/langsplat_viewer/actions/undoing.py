@@ -4,8 +4,8 @@ The camera is not undone: its reset leads back."""
 from dataclasses import replace
 
 from langsplat_viewer.actions.asking import set_cut
-from langsplat_viewer.actions.history import Moment, now
-from langsplat_viewer.actions.queries import set_level
+from langsplat_viewer.actions.history import Moment, let_go, now
+from langsplat_viewer.actions.queries import ask_unanswered, set_level
 from langsplat_viewer.packed_marks import pack, unpack
 from langsplat_viewer.viewer import Viewer
 
@@ -37,6 +37,8 @@ def _restore(viewer: Viewer, moment: Moment) -> None:
         query.slot = None
     for query, slot, since, cut in moment.queries:
         query.slot, query.shown_since = slot, since
+        if query.automatic is None:  # it is asked anew
+            query.cut = cut
         set_cut(viewer, query, cut, is_new=False)
     state.queries, state.selected = [query for query, *_ in moment.queries], moment.selected
     marks = unpack(moment.marks, pack(state.selection.marks, history.marks))
@@ -49,3 +51,5 @@ def _restore(viewer: Viewer, moment: Moment) -> None:
     past, future = history.past, history.future
     set_level(viewer, moment.level)
     history.past, history.future = past, future  # what that has remembered is no step of its own
+    let_go(viewer)
+    ask_unanswered(viewer)
