@@ -13,13 +13,14 @@ import moderngl
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.scene import Camera, Scene
+from langsplat_core.scene import Camera
 from langsplat_core.scene.merging import Merged
 from langsplat_core.stopwatch import watched
 from langsplat_viewer import actions, splitting
 from langsplat_viewer.channels import Layers
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.controls import OrbitCamera
+from langsplat_viewer.depiction import Depiction, depiction
 from langsplat_viewer.keys import Changed
 from langsplat_viewer.looking import why_nothing, why_undrawable
 from langsplat_viewer.marked_scene import MarkedScene, marked_scene
@@ -61,11 +62,12 @@ class Canvas:
         self._textures: dict[Key, moderngl.Texture] = {}
         self._state: ViewerState | None = None  # that was last shown
         self._marked: MarkedScene | None = None  # what is drawn
-        self._drawn: tuple[object, ...] | None = None  # what the textures show
+        self._drawn: Depiction | None = None  # what the textures show
         self._drawn_at = FINE
         self._view: OrbitCamera | None = None
         self._moved = -1e9  # when the view last changed, seconds
         self._camera: Camera | None = None
+        self._timed = False  # the steps of the pictures are measured
         self._unsure = False  # whether the picture shows anything is not known yet
         # Of `splitting.pictures`; RGBA8, first row at the bottom, as GL has it.
         self.textures: tuple[moderngl.Texture, ...] = ()
@@ -86,31 +88,36 @@ class Canvas:
         moving = now - self._moved < REST_SECONDS
         coarse = moving and state.coarse_while_moving
         shown = splitting.pictures(state)
-        looks = tuple((one.layers_key(), one.shown_picture(), one.heat_ranges()) for one in shown)
-        key = (
-            looks,
-            state.seeing.splats,
-            state.seeing.clip,
-            state.view,
-            splitting.picture_size(state),
-        )
-        if key != self._drawn or (self._drawn_at != FINE and not coarse):
-            self._drawn = key
+        wanted = depiction(state, shown)
+        if self._begins_timing(state, moving):
+            self._drawn = None
+            self._fine.renderer.forget()
+        if wanted != self._drawn or (self._drawn_at != FINE and not coarse):
+            self._drawn = wanted
             self._drawn_at = self._pace.level(self._merged() is not None) if coarse else FINE
-            self._draw(state, shown, self._drawn_at)
+            self._draw(state, shown, wanted, self._drawn_at)
             state.nothing, self._unsure = "", True
         if self._unsure and not moving and self._camera is not None:
             self._unsure = False  # asked at rest only: it reads the picture back
             if self._renderer.shows_nothing():
-                state.nothing = self._why_nothing(state.scene, self._camera, state.preferences.keys)
+                state.nothing = self._why_nothing(wanted, self._camera, state.preferences.keys)
         return moving
 
-    def _why_nothing(self, source: Scene, camera: Camera, keys: Changed) -> str:
+    def _begins_timing(self, state: ViewerState, moving: bool) -> bool:
+        """Whether this is the first frame whose steps are measured: what was kept of earlier ones would have
+        taken no time."""
+        if state.timing.wanted and moving:
+            return False  # once it rests
+        before, self._timed = self._timed, state.timing.wanted
+        return self._timed and not before
+
+    def _why_nothing(self, wanted: Depiction, camera: Camera, keys: Changed) -> str:
+        source = wanted.model.scene
         gaussians = source.gaussians if self._marked is None else self._marked.scene.gaussians
         if len(source.gaussians) and not len(gaussians):
             shown = with_key("show what is hidden", actions.show_hidden, keys)
             return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', actions.undo, keys)}"
-        if self._fine.clip != UNCLIPPED and gaussians.valid().any():
+        if wanted.clip != UNCLIPPED and gaussians.valid().any():
             return NOTHING_BETWEEN
         reason = why_nothing(gaussians, camera)
         elsewhere = not why_undrawable(gaussians)  # another view would show something
@@ -123,26 +130,28 @@ class Canvas:
             return None
         return self._merger.made_of(self._marked.scene.gaussians)
 
-    def _prepare(self, shown: Sequence[ViewerState], camera: Camera, level: Level) -> list[Layers | None]:
+    def _prepare(
+        self, wanted: Depiction, shown: Sequence[ViewerState], camera: Camera, level: Level
+    ) -> list[Layers | None]:
         """Choose the renderer and have it ready to draw all pictures; returns the layers of each."""
-        source = shown[0].scene
-        assert source is not None
-        marked = self._marked = marked_scene(source, shown[0].selection.marks, self._marked)
+        marked = self._marked = marked_scene(wanted.model.scene, wanted.model.marks, self._marked)
         instead = self._merged() if level.merged else None
         stage = self._fine if instead is None or self._quick is None else self._quick
         self._renderer = stage.renderer
-        return stage.prepare(shown, marked, camera, instead)
+        return stage.prepare(wanted, shown, marked, camera, instead)
 
-    def _draw(self, state: ViewerState, shown: Sequence[ViewerState], level: Level) -> None:
-        assert state.view is not None
-        width, height = (max(1, round(side * level.scale)) for side in splitting.picture_size(state))
-        camera = state.view.camera(width, height)
+    def _draw(
+        self, state: ViewerState, shown: Sequence[ViewerState], wanted: Depiction, level: Level
+    ) -> None:
+        width, height = (max(1, round(side * level.scale)) for side in wanted.size)
+        camera = wanted.view.camera(width, height)
         keys = [(place, width, height) for place in range(len(shown))]
         targets = [self._target(key, len(shown)) for key in keys]
         began = self._clock()
         with watched() if state.timing.wanted else nullcontext(dict[str, float]()) as laps:
-            for target, one, layers in zip(targets, shown, self._prepare(shown, camera, level), strict=True):
-                self._renderer.draw(target, camera, one.shown_picture(), one.heat_ranges(), layers)
+            prepared = self._prepare(wanted, shown, camera, level)
+            for target, look, layers in zip(targets, wanted.looks, prepared, strict=True):
+                self._renderer.draw(target, camera, look.picture, look.heat_ranges, layers)
         self._ctx.finish()
         milliseconds = 1e3 * (self._clock() - began)
         if state.timing.wanted and level == FINE:
@@ -189,13 +198,14 @@ class Canvas:
 
     def capture(self, state: ViewerState) -> Array:
         """See `viewer.Surface`."""
-        assert state.view is not None
         shown = splitting.pictures(state)
+        wanted = depiction(state, shown)
         if state is not self._state:  # of another size: what is on screen is drawn again
             self._drawn = None
-        self._camera = camera = state.view.camera(*splitting.picture_size(state))
+        self._camera = camera = wanted.view.camera(*wanted.size)
+        prepared = self._prepare(wanted, shown, camera, FINE)
         images = [
-            np.asarray(self._renderer.read(camera, one.shown_picture(), one.heat_ranges(), layers))
-            for one, layers in zip(shown, self._prepare(shown, camera, FINE), strict=True)
+            np.asarray(self._renderer.read(camera, look.picture, look.heat_ranges, layers))
+            for look, layers in zip(wanted.looks, prepared, strict=True)
         ]
         return splitting.joined(state.seeing.split, images)

@@ -10,11 +10,10 @@ from langsplat_core.arrays import Array
 from langsplat_core.display.compose import Channels
 from langsplat_core.raster import Rasterizer
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer, GlView, Source
-from langsplat_core.scene import Camera, Scene
+from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.stopwatch import lap
 from langsplat_viewer.channels import ArrayChannels, Channel, surface_depths
-from langsplat_viewer.looking import looking_settings
-from langsplat_viewer.seeing import UNCLIPPED, Clip
+from langsplat_viewer.sight import LastView, Sight
 
 Textures = tuple[moderngl.Texture, ...]  # colours with alpha, then one for each channel that was wanted
 
@@ -22,21 +21,18 @@ Textures = tuple[moderngl.Texture, ...]  # colours with alpha, then one for each
 class ChannelSource(Protocol):
     """Where channel textures come from."""
 
-    def set_scene(self, scene: Scene) -> None:
-        """Show another scene."""
-
-    def set_clip(self, clip: Clip) -> None:
-        """Draw what lies between other depths."""
-
-    def render(self, camera: Camera, wanted: Sequence[Channel]) -> Textures:
+    def render(self, sight: Sight, wanted: Sequence[Channel]) -> Textures:
         """Colours, then the texture of each channel (the colours' for "none"), valid until the next call.
         At most three with values, none of them twice."""
 
-    def depth_at(self, camera: Camera, column: int, row: int) -> tuple[float, float]:
+    def depth_at(self, sight: Sight, column: int, row: int) -> tuple[float, float]:
         """Surface depth (world units, 0: nothing) and alpha of one pixel."""
 
-    def depth_map(self, camera: Camera) -> Array:
+    def depth_map(self, sight: Sight) -> Array:
         """(H, W) surface depth, 0 where less than half the light is stopped. It ends `render`'s textures."""
+
+    def forget(self) -> None:
+        """Do every step anew the next time."""
 
     def release(self) -> None:
         """Give the device memory back."""
@@ -47,24 +43,20 @@ class GlSource:
 
     def __init__(self, ctx: moderngl.Context, precision: Literal["half", "single"]) -> None:
         self._ctx, self._rasterizer = ctx, GlRasterizer(ctx, precision)
-        self._clip = UNCLIPPED
+        self._views = LastView(self._rasterizer)
         self._uploads: dict[int, tuple[Array, moderngl.Texture]] = {}  # by the id of the array, which is held
+        self._of: Scene | None = None  # whose Gaussians have them
 
-    def set_scene(self, scene: Scene) -> None:
-        self._keep([])
-        self._scene = scene
+    def _view(self, sight: Sight) -> GlView:
+        view = self._views.of(sight)
+        assert isinstance(view, GlView)
+        return view
 
-    def set_clip(self, clip: Clip) -> None:
-        self._clip = clip
-
-    def _view(self, camera: Camera) -> GlView:
-        settings = looking_settings(self._scene, camera, self._clip)
-        return self._rasterizer.view(self._scene.gaussians, camera, settings)
-
-    def render(self, camera: Camera, wanted: Sequence[Channel]) -> Textures:
-        self._keep(wanted)
-        view = self._view(camera)
-        sources: list[Source] = ["colour", *(self._upload(c.values) for c in wanted if c.values is not None)]
+    def render(self, sight: Sight, wanted: Sequence[Channel]) -> Textures:
+        self._keep(wanted if sight.scene is self._of else [])
+        self._of, view = sight.scene, self._view(sight)
+        uploads = [self._upload(view.gaussians, c.values) for c in wanted if c.values is not None]
+        sources: list[Source] = ["colour", *uploads]
         images = self._rasterizer.draw(view, sources, with_depth=any(c.extra == "depth" for c in wanted))
         colours, *layers = images[: len(sources)]
         valued = iter(layers)
@@ -74,10 +66,10 @@ class GlSource:
         )
         return (colours, *by_channel)
 
-    def _upload(self, values: Array) -> moderngl.Texture:
+    def _upload(self, gaussians: Gaussians, values: Array) -> moderngl.Texture:
         if id(values) not in self._uploads:
             with lap("upload", self._ctx.finish):
-                texture = self._rasterizer.scene(self._scene.gaussians).upload(values)
+                texture = self._rasterizer.scene(gaussians).upload(values)
             self._uploads[id(values)] = values, texture
         return self._uploads[id(values)][1]
 
@@ -86,11 +78,16 @@ class GlSource:
         for key in set(self._uploads) - {id(channel.values) for channel in wanted}:
             self._uploads.pop(key)[1].release()
 
-    def depth_at(self, camera: Camera, column: int, row: int) -> tuple[float, float]:
-        return self._view(camera).depth_at(column, row)
+    def depth_at(self, sight: Sight, column: int, row: int) -> tuple[float, float]:
+        return self._view(sight).depth_at(column, row)
 
-    def depth_map(self, camera: Camera) -> Array:
-        return surface_depths(self._view(camera), len(self._scene.gaussians))
+    def depth_map(self, sight: Sight) -> Array:
+        return surface_depths(self._view(sight), len(sight.scene.gaussians))
+
+    def forget(self) -> None:
+        self._keep([])
+        self._views.forget()
+        self._rasterizer.forget()
 
     def release(self) -> None:
         self._keep([])
@@ -105,14 +102,8 @@ class ArraySource:
         self._channels = ArrayChannels(rasterizer)
         self._textures: dict[tuple[int, int], moderngl.Texture] = {}  # by place and number of components
 
-    def set_scene(self, scene: Scene) -> None:
-        self._scene = scene
-
-    def set_clip(self, clip: Clip) -> None:
-        self._channels.clip = clip
-
-    def render(self, camera: Camera, wanted: Sequence[Channel]) -> Textures:
-        drawn = self._channels.render_all(self._scene, camera, wanted or [Channel()])
+    def render(self, sight: Sight, wanted: Sequence[Channel]) -> Textures:
+        drawn = self._channels.render_all(sight, wanted or [Channel()])
         with lap("upload", self._ctx.finish):
             return self._uploaded(drawn, len(wanted))
 
@@ -144,11 +135,14 @@ class ArraySource:
         texture.write(packed)
         return texture
 
-    def depth_at(self, camera: Camera, column: int, row: int) -> tuple[float, float]:
-        return self._channels.depth_at(self._scene, camera, column, row)
+    def depth_at(self, sight: Sight, column: int, row: int) -> tuple[float, float]:
+        return self._channels.depth_at(sight, column, row)
 
-    def depth_map(self, camera: Camera) -> Array:
-        return surface_depths(self._channels.view(self._scene, camera), len(self._scene.gaussians))
+    def depth_map(self, sight: Sight) -> Array:
+        return surface_depths(self._channels.views.of(sight), len(sight.scene.gaussians))
+
+    def forget(self) -> None:
+        self._channels.views.forget()
 
     def release(self) -> None:
         for texture in self._textures.values():

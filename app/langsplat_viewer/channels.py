@@ -13,9 +13,9 @@ from langsplat_core.display.displays import DISPLAYS, Extra
 from langsplat_core.raster import Rasterizer, View
 from langsplat_core.raster.protocol import MedianDepth
 from langsplat_core.raster.render import splat_colours
-from langsplat_core.scene import Camera, Gaussians, Scene
-from langsplat_viewer.looking import looking_settings
+from langsplat_core.scene import Camera, Gaussians
 from langsplat_viewer.seeing import UNCLIPPED, Clip
+from langsplat_viewer.sight import LastView, Sight
 
 _DEPTH_SAMPLE = 20_000  # Gaussians looked at for the depth range; quantiles need no more
 
@@ -88,11 +88,6 @@ def camera_depths(gaussians: Gaussians, camera: Camera) -> Array:
         return np.nan_to_num(depths.astype(np.float32))[:, None]
 
 
-def camera_key(camera: Camera) -> tuple[object, ...]:
-    """Equal for cameras that give the same picture."""
-    return camera.intrinsics, camera.world_to_camera.tobytes()
-
-
 def surface_depths(view: View, count: int) -> Array:
     """(H, W) depth of the surface as a view of `count` Gaussians has it: the median where the rasterizer
     knows it, else the mean; world units, 0 where less than half of the light is stopped."""
@@ -106,35 +101,19 @@ class ArrayChannels:
     """Channels by a rasterizer that returns arrays; the projection is kept while the camera rests."""
 
     def __init__(self, rasterizer: Rasterizer) -> None:
-        self._rasterizer = rasterizer
-        self.clip = UNCLIPPED  # what is drawn
-        self._view: View | None = None
-        self._shown: tuple[Gaussians, tuple[object, ...]] | None = None  # what `_view` is a view of
+        self.views = LastView(rasterizer)
 
-    def view(self, scene: Scene, camera: Camera) -> View:
-        """The Gaussians of `scene` projected into `camera`."""
-        gaussians, settings = scene.gaussians, looking_settings(scene, camera, self.clip)
-        key = (settings, *camera_key(camera))
-        if (
-            self._view is None
-            or self._shown is None
-            or self._shown[0] is not gaussians
-            or self._shown[1] != key
-        ):
-            self._view, self._shown = self._rasterizer.view(gaussians, camera, settings), (gaussians, key)
-        return self._view
-
-    def render(self, scene: Scene, layers: Layers, camera: Camera, extra: Extra) -> Channels:
+    def render(self, sight: Sight, layers: Layers, extra: Extra) -> Channels:
         """Colours, alpha and `extra`, in one pass."""
-        return self.render_all(scene, camera, [Channel(extra, layers.values(extra))])[0]
+        return self.render_all(sight, [Channel(extra, layers.values(extra))])[0]
 
-    def render_all(self, scene: Scene, camera: Camera, wanted: Sequence[Channel]) -> list[Channels]:
+    def render_all(self, sight: Sight, wanted: Sequence[Channel]) -> list[Channels]:
         """For each of `wanted` the colours, alpha and that channel; all of them in one pass."""
-        gaussians = scene.gaussians
+        gaussians, camera = sight.scene.gaussians, sight.camera
         columns = [camera_depths(gaussians, camera) if c.extra == "depth" else c.values for c in wanted]
         present = [column for column in columns if column is not None]
         values = np.concatenate(present, 1) if len(present) > 1 else next(iter(present), None)
-        drawn = splat_colours(self.view(scene, camera), gaussians, camera, values)
+        drawn = splat_colours(self.views.of(sight), gaussians, camera, values)
         ends = np.cumsum([0 if column is None else column.shape[1] for column in columns])
         parts = np.split(drawn.values, ends[:-1], axis=2)
         return [
@@ -144,17 +123,17 @@ class ArrayChannels:
                 latent=part if channel.extra == "latent" else None,
                 relevancies=part if channel.extra == "relevancies" else None,
                 depth_sum=part[..., 0] if channel.extra == "depth" else None,
-                depth_range=depth_range(gaussians, camera, self.clip)
+                depth_range=depth_range(gaussians, camera, sight.clip)
                 if channel.extra == "depth"
                 else (0.0, 1.0),
             )
             for channel, part in zip(wanted, parts, strict=True)
         ]
 
-    def depth_at(self, scene: Scene, camera: Camera, column: int, row: int) -> tuple[float, float]:
+    def depth_at(self, sight: Sight, column: int, row: int) -> tuple[float, float]:
         """Depth of the surface in a pixel (the median where the rasterizer knows it, else the mean, as where
         the scene is transparent there), world units, 0 where there is nothing, and alpha."""
-        view = self.view(scene, camera)
-        _, alpha = view.splat(np.empty((len(scene.gaussians), 0), np.float32))
+        view = self.views.of(sight)
+        _, alpha = view.splat(np.empty((len(sight.scene.gaussians), 0), np.float32))
         median = view.median_depth()[row, column] if isinstance(view, MedianDepth) else 0
         return float(median or view.depth()[row, column]), float(alpha[row, column])

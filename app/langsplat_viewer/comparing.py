@@ -10,6 +10,7 @@ from langsplat_viewer import splitting
 from langsplat_viewer.channels import ArrayChannels
 from langsplat_viewer.looking import drawn_scene
 from langsplat_viewer.marked_scene import layers_of, marked_scene
+from langsplat_viewer.sight import Sight
 from langsplat_viewer.state import ViewerState
 
 LONGEST_SIDE = 160  # pixels: the reference takes as long for more, but what is shown is drawn in the window
@@ -30,17 +31,16 @@ def reference_of(state: ViewerState) -> Callable[[], Array]:
     shown = splitting.pictures(state)
     marked = marked_scene(state.scene, state.selection.marks)
     scene = drawn_scene(marked.scene, state.seeing.splats)
-    camera = state.view.camera(*splitting.picture_size(state))
+    sight = Sight(scene, state.view.camera(*splitting.picture_size(state)), state.seeing.clip)
     pictures = [(one.shown_picture(), one.heat_ranges()) for one in shown]
     layers = [layers_of(one, marked) for one in shown]
-    seeing = state.seeing
+    split = state.seeing.split
 
     def draw() -> Array:
         channels = ArrayChannels(load_rasterizer("reference"))
-        channels.clip = seeing.clip
         wanted = [held.channel(picture) for held, (picture, _) in zip(layers, pictures, strict=True)]
-        drawn = channels.render_all(scene, camera, wanted)
+        drawn = channels.render_all(sight, wanted)
         images = [compose(found, *look) for found, look in zip(drawn, pictures, strict=True)]
-        return splitting.joined(seeing.split, images)
+        return splitting.joined(split, images)
 
     return draw

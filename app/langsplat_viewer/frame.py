@@ -23,9 +23,10 @@ from langsplat_core.raster.opengl.draw import drawing, set_uniforms, shader
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.stopwatch import lap
 from langsplat_viewer.channel_textures import ArraySource, ChannelSource, GlSource, Textures
-from langsplat_viewer.channels import Channel, Layers, camera_key, depth_range
+from langsplat_viewer.channels import Channel, Layers, depth_range
 from langsplat_viewer.looking import VISIBLE_ALPHA
 from langsplat_viewer.seeing import UNCLIPPED, Clip
+from langsplat_viewer.sight import Sight
 
 Backend = Literal["auto", "opengl", "cpu", "cuda"]
 PICK_ALPHA = 0.1  # a pixel with less alpha shows nothing that could be picked
@@ -71,22 +72,25 @@ class FrameRenderer:
         self._scene: Scene | None = None
         self._layers = Layers()
         self._clip = UNCLIPPED
-        self._camera: Camera | None = None  # of the last draw
-        self._drawn: tuple[object, ...] = ()  # camera whose channels are held
+        self._last: Sight | None = None  # of the last draw
+        self._held: Sight | None = None  # of the channels
         self._channels: Sequence[Channel] = ()  # those of `_textures` after the colours
         self._textures: Textures = ()
         self._own: moderngl.Framebuffer | None = None
 
     def set_scene(self, scene: Scene) -> None:
         """Show another scene, without layers."""
-        self._source.set_scene(scene)
-        self._scene, self._layers, self._camera = scene, Layers(), None
-        self._drawn, self._channels = (), ()
+        self._scene, self._layers, self._last = scene, Layers(), None
+        self._held, self._channels = None, ()
 
     def set_clip(self, clip: Clip) -> None:
         """Draw what lies between other depths."""
-        self._source.set_clip(clip)
-        self._clip, self._drawn = clip, ()
+        self._clip = clip
+
+    def forget(self) -> None:
+        """Do every step of the next picture anew."""
+        self._held, self._channels = None, ()
+        self._source.forget()
 
     def set_layers(self, latent_rgb: Array | None, relevancies: Array | None) -> None:
         """What the displays "latent" and "relevancy" show: (N, 3) colours in [0, 1] of the level shown;
@@ -99,17 +103,23 @@ class FrameRenderer:
         """Rasterize in one pass what several pictures of one camera need, at most three, unless it is all
         there; their `draw` or `read` then only composes. Layers of a picture as in `draw`."""
         if self._scene is not None:
-            self._rasterize(camera, [(layers or self._layers).channel(p) for p, layers in pictures])
+            self._rasterize(
+                self._sight(self._scene, camera),
+                [(layers or self._layers).channel(p) for p, layers in pictures],
+            )
 
-    def _rasterize(self, camera: Camera, wanted: Sequence[Channel]) -> None:
+    def _sight(self, scene: Scene, camera: Camera) -> Sight:
+        return Sight(scene, camera, self._clip)
+
+    def _rasterize(self, sight: Sight, wanted: Sequence[Channel]) -> None:
         """Have `wanted` among the channels that are held."""
         held = {channel.key for channel in self._channels}
         needed = {channel.key: channel for channel in wanted if channel.extra != "none"}
-        if self._drawn == camera_key(camera) and needed.keys() <= held:
+        if self._held == sight and needed.keys() <= held:
             return
-        self._drawn, self._channels = (), ()
-        self._textures = self._source.render(camera, list(needed.values()))
-        self._drawn, self._channels = camera_key(camera), tuple(needed.values())
+        self._held, self._channels = None, ()
+        self._textures = self._source.render(sight, list(needed.values()))
+        self._held, self._channels = sight, tuple(needed.values())
 
     def _texture_of(self, channel: Channel) -> moderngl.Texture:
         """The one that holds a channel; the colours where it is none."""
@@ -135,9 +145,9 @@ class FrameRenderer:
             target.use()
             return
         channel = (layers or self._layers).channel(picture)
-        self._rasterize(camera, [channel])
-        self._camera = camera
-        set_uniforms(self._program, self._uniforms(camera, picture, heat_ranges, channel.extra))
+        self._last = self._sight(self._scene, camera)
+        self._rasterize(self._last, [channel])
+        set_uniforms(self._program, self._uniforms(self._last, picture, heat_ranges, channel.extra))
         for unit, texture in enumerate((self._textures[0], self._texture_of(channel), self._maps)):
             texture.use(unit)
         with lap("compose", self._ctx.finish), drawing(self._ctx, target, moderngl.NOTHING):
@@ -145,9 +155,8 @@ class FrameRenderer:
         target.use()
 
     def _uniforms(
-        self, camera: Camera, picture: PictureConfig, heat_ranges: HeatRanges, extra: Extra
+        self, sight: Sight, picture: PictureConfig, heat_ranges: HeatRanges, extra: Extra
     ) -> dict[str, object]:
-        assert self._scene is not None
         # Without its layer a display shows the plain colours.
         display = picture.display if extra == DISPLAYS[picture.display].extra else "rgb"
         return {
@@ -165,7 +174,7 @@ class FrameRenderer:
             "threshold": picture.threshold,
             "alpha_gate": picture.alpha_gate,
             "background": picture.background,
-            "depth_range": depth_range(self._scene.gaussians, camera, self._clip)
+            "depth_range": depth_range(sight.scene.gaussians, sight.camera, sight.clip)
             if extra == "depth"
             else (0.0, 1.0),
         }
@@ -194,7 +203,7 @@ class FrameRenderer:
 
     def shows_nothing(self) -> bool:
         """Whether the last drawn image, if there was one, holds nothing of the scene."""
-        if self._scene is None or not self._drawn:
+        if self._held is None:
             return False
         colours = self._textures[0]
         alpha = np.frombuffer(colours.read(), colours.dtype).reshape(-1, colours.components)[:, -1]
@@ -207,19 +216,19 @@ class FrameRenderer:
         The surface is where half the light is stopped, so that neither a floater in front nor a wall
         behind is picked; where the scene is more transparent than that, the mean depth.
         """
-        camera = self._camera
-        if camera is None or not (0 <= x_px < camera.width and 0 <= y_px < camera.height):
+        sight = self._last
+        if sight is None or not (0 <= x_px < sight.camera.width and 0 <= y_px < sight.camera.height):
             return None
-        depth, alpha = self._source.depth_at(camera, int(x_px), int(y_px))
+        depth, alpha = self._source.depth_at(sight, int(x_px), int(y_px))
         return depth if alpha > PICK_ALPHA and depth > 0 else None
 
     def depth_map(self) -> Array | None:
         """(H, W) camera z of the surface in every pixel of the last drawn image, world units, 0 where nothing
         stops half the light; None before anything was drawn."""
-        if self._camera is None:
+        if self._last is None:
             return None
-        self._drawn = ()  # the rasterizer draws, and its textures hold until then
-        return self._source.depth_map(self._camera)
+        self._held = None  # the rasterizer draws, and its textures hold until then
+        return self._source.depth_map(self._last)
 
     def _release_own(self) -> None:
         if self._own is not None:

@@ -17,6 +17,7 @@ from langsplat_viewer.channels import ArrayChannels, Layers
 from langsplat_viewer.frame import Backend, FrameRenderer, suits_opengl
 from langsplat_viewer.looking import VISIBLE_ALPHA, why_nothing
 from langsplat_viewer.seeing import UNCLIPPED, Clip
+from langsplat_viewer.sight import Sight
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +51,9 @@ def painter(subject: Subject, backend: Backend = "auto") -> Iterator[Callable[[C
     ctx = _context_for(backend)
     if ctx is None:
         channels = ArrayChannels(load_rasterizer("cpu" if backend == "auto" else backend))
-        channels.clip = subject.clip
 
         def by_arrays(camera: Camera) -> Drawn:
-            found = channels.render(scene, layers, camera, layers.extra(subject.picture))
+            found = channels.render(Sight(scene, camera, subject.clip), layers, layers.extra(subject.picture))
             nothing = bool(found.alpha.max(initial=0) < VISIBLE_ALPHA)
             return Drawn(compose(found, subject.picture, subject.heat_ranges), nothing)
 

@@ -100,10 +100,11 @@ def warm_up(scene: Scene, backend: str, progress: Progress = silent) -> None:
         say_compiling(progress)
         from langsplat_core.raster import load_rasterizer
         from langsplat_viewer.channels import ArrayChannels, Layers
+        from langsplat_viewer.sight import Sight
 
-        channels, camera = ArrayChannels(load_rasterizer("cpu")), scene.framing_camera((16, 16))
-        channels.render(scene, Layers(), camera, "none")
-        channels.depth_at(scene, camera, 8, 8)
+        channels, sight = ArrayChannels(load_rasterizer("cpu")), Sight(scene, scene.framing_camera((16, 16)))
+        channels.render(sight, Layers(), "none")
+        channels.depth_at(sight, 8, 8)
 
 
 def say_compiling(progress: Progress) -> None:

@@ -24,6 +24,9 @@ class Renderer(Protocol):
     def set_clip(self, clip: Clip) -> None:
         """Draw what lies between other depths from now on."""
 
+    def forget(self) -> None:
+        """Do every step of the next picture anew."""
+
     def set_layers(self, latent_rgb: Array | None, relevancies: Array | None) -> None:
         """(N, 3) latent colours and (N, Q) relevancies, Q <= 3, of the scene's Gaussians."""
 

@@ -6,68 +6,76 @@ from dataclasses import replace
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.merging import Merged, merged
 from langsplat_viewer.channels import Layers
+from langsplat_viewer.depiction import Depiction
 from langsplat_viewer.jobs import Worker
 from langsplat_viewer.looking import drawn_scene
 from langsplat_viewer.marked_scene import MarkedScene, layers_of
 from langsplat_viewer.renderer import Renderer
-from langsplat_viewer.seeing import UNCLIPPED, Splats
 from langsplat_viewer.state import ViewerState
 
 
 class Stage:
-    """One renderer and what it has."""
+    """One renderer and what it has: the scene, cuts and layers of a depiction."""
 
     def __init__(self, renderer: Renderer) -> None:
         self.renderer = renderer
-        self.clip = UNCLIPPED
-        self._scene: tuple[Scene | Merged, Splats] | None = None
-        self._layers: list[tuple[tuple[object, ...], Layers | None]] = []  # of each picture, with their key
+        self._given: tuple[Depiction, Merged | None] | None = None
+        self._layers: tuple[Layers, ...] = ()  # of each of its pictures
 
     def prepare(
         self,
+        wanted: Depiction,
         shown: Sequence[ViewerState],
         marked: MarkedScene,
         camera: Camera,
         instead: Merged | None = None,
     ) -> list[Layers | None]:
-        """Have the renderer ready to draw all pictures; returns the layers of each. `instead`: what is drawn
-        in place of `marked.scene`, of which it was made."""
-        self._set_scene(marked, shown[0].seeing.splats, instead)
-        if shown[0].seeing.clip != self.clip:
-            self.clip = shown[0].seeing.clip
-            self.renderer.set_clip(self.clip)
-        self._set_layers(shown, marked, instead)
-        layers = [layers for _, layers in self._layers]
+        """Have the renderer ready to draw all pictures, the states `shown`; returns their layers,
+        None for those that it has. `instead`: what is drawn in place of `marked.scene`, of which it was made.
+        """
+        self._hand_over(wanted, shown, marked, instead)
+        layers = [None, *self._layers[1:]]
         if len(shown) > 1:
-            looks = [one.shown_picture() for one in shown]
+            looks = [look.picture for look in wanted.looks]
             self.renderer.prepare(camera, list(zip(looks, layers, strict=True)))
         return layers
 
-    def _set_scene(self, marked: MarkedScene, splats: Splats, instead: Merged | None) -> None:
-        source = marked.scene if instead is None else instead
-        if self._scene is not None and self._scene[0] is source and self._scene[1] == splats:
-            return
-        self._scene, self._layers = (source, splats), []
-        scene = marked.scene
-        if instead is not None:
-            scene = replace(scene, gaussians=instead.gaussians, language=None, extras={})
-        self.renderer.set_scene(drawn_scene(scene, splats))
+    def _hand_over(
+        self, wanted: Depiction, shown: Sequence[ViewerState], marked: MarkedScene, instead: Merged | None
+    ) -> None:
+        """What is another than what the renderer has; layers are kept, as their arrays stay the same objects
+        while nothing changes."""
+        given, self._given = self._given, None  # stays so if the renderer fails
+        before = None if given is None or given[1] is not instead else given[0]
+        is_new = before is None or before.model != wanted.model
+        if is_new:
+            self.renderer.set_scene(_scene_of(marked, wanted, instead))
+        if before is None or before.clip != wanted.clip:
+            self.renderer.set_clip(wanted.clip)
+        kept = () if before is None else tuple(zip(before.looks, self._layers, strict=True))
+        layers = tuple(
+            kept[place][1]
+            if place < len(kept) and kept[place][0].layers == look.layers
+            else _layers_for(one, marked, instead)
+            for place, (look, one) in enumerate(zip(wanted.looks, shown, strict=True))
+        )
+        if is_new or layers[0] is not self._layers[0]:
+            self.renderer.set_layers(layers[0].latent_rgb, layers[0].relevancies)
+        self._layers, self._given = layers, (wanted, instead)
 
-    def _set_layers(self, shown: Sequence[ViewerState], marked: MarkedScene, instead: Merged | None) -> None:
-        """Those of the first picture are the renderer's; those of the others are kept here, as their arrays
-        stay the same objects while nothing changes."""
-        del self._layers[len(shown) :]
-        for place, one in enumerate(shown):
-            if place < len(self._layers) and self._layers[place][0] == one.layers_key():
-                continue
-            layers: Layers | None = layers_of(one, marked)
-            assert layers is not None
-            if instead is not None:
-                layers = Layers(instead.values(layers.latent_rgb), instead.values(layers.relevancies))
-            if place == 0:
-                self.renderer.set_layers(layers.latent_rgb, layers.relevancies)
-                layers = None
-            self._layers[place : place + 1] = [(one.layers_key(), layers)]
+
+def _scene_of(marked: MarkedScene, wanted: Depiction, instead: Merged | None) -> Scene:
+    scene = marked.scene
+    if instead is not None:
+        scene = replace(scene, gaussians=instead.gaussians, language=None, extras={})
+    return drawn_scene(scene, wanted.model.splats)
+
+
+def _layers_for(state: ViewerState, marked: MarkedScene, instead: Merged | None) -> Layers:
+    layers = layers_of(state, marked)
+    if instead is None:
+        return layers
+    return Layers(instead.values(layers.latent_rgb), instead.values(layers.relevancies))
 
 
 class Merger:

@@ -68,6 +68,21 @@ def test_the_steps_of_a_picture_are_measured_while_the_panel_is_seen(drawn):
     assert sum(laps[name][0] for name in steps) <= laps["picture"][0]
 
 
+def test_the_panel_has_a_picture_measured_when_it_opens(drawn):
+    """All of its steps, though nothing has changed; once."""
+    for now in (10.0, 11.0):
+        actions.measure_frame(drawn)
+        drawn.surface.update(drawn.state, now)
+        counts = {name: len(measured) for name, measured in drawn.state.timing.laps.items()}
+        assert counts.keys() >= {"projection", "sort", "blend", "compose", "picture"}
+        assert set(counts.values()) == {1}
+    drawn.state.timing.wanted = False  # closed, and opened again
+    drawn.surface.update(drawn.state, 12.0)
+    actions.measure_frame(drawn)
+    drawn.surface.update(drawn.state, 13.0)
+    assert {len(measured) for measured in drawn.state.timing.laps.values()} == {2}
+
+
 def test_a_search_is_measured(opened):
     actions.ask(opened, "mug")
     settle(opened)

@@ -109,6 +109,9 @@ class FakeRenderer:
     def set_clip(self, clip) -> None:
         self.calls.append(("clip", clip))
 
+    def forget(self) -> None:
+        self.calls.append(("forget", None))
+
     def set_layers(self, latent_rgb, relevancies) -> None:
         self.calls.append(("layers", latent_rgb is not None))
 
@@ -149,7 +152,7 @@ def test_canvas_draws_only_changes(gl, state):
     renderer = FakeRenderer()
     canvas = Canvas(gl, renderer)
     assert not canvas.update(state, 0.0)
-    assert [kind for kind, _ in renderer.calls] == ["scene", "layers", "draw"]
+    assert [kind for kind, _ in renderer.calls] == ["scene", "clip", "layers", "draw"]
     renderer.calls.clear()
     for second in range(1, 5):
         canvas.update(state, float(second))
@@ -216,7 +219,7 @@ def test_canvas_draws_merged_gaussians_while_a_large_scene_moves(gl, state):
             break
         assert drawn(renderer) == [(50, 30)]
         time.sleep(0.01)
-    (kind, scene), (layers, _), draw = quick.calls
+    (kind, scene), _, (layers, _), draw = quick.calls
     assert (kind, layers, draw) == ("scene", "layers", ("draw", (100, 60)))
     assert len(scene.gaussians) < len(state.scene.gaussians) == 360
     away = np.linalg.norm(canvas.point_at(0.5, 0.5) - state.view.camera(200, 120).position)

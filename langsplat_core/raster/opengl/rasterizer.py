@@ -106,6 +106,10 @@ class GlRasterizer:
                 ) from error
         return self._scene
 
+    def forget(self) -> None:
+        """Project and sort anew the next time."""
+        self._current = None
+
     def draw(
         self, view: "GlView", sources: Sequence[Source], with_depth: bool = False
     ) -> tuple[moderngl.Texture, ...]:

@@ -1,0 +1,118 @@
+"""What pictures depend on: one value, and another one for every change that is seen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from langsplat_viewer import actions, splitting
+from langsplat_viewer.canvas import Canvas
+from langsplat_viewer.depiction import Depiction, depiction
+from langsplat_viewer.frame import FrameRenderer
+from langsplat_viewer.seeing import Clip, Splats
+from langsplat_viewer.sight import LastView, Sight
+from langsplat_viewer.viewer import Viewer
+from tests.support.fakes import blob_scene
+from tests.support.windowless import settle
+
+
+def depicted(viewer: Viewer) -> Depiction:
+    return depiction(viewer.state, splitting.pictures(viewer.state))
+
+
+CHANGES = {
+    "display": lambda v: actions.set_display(v, "depth"),
+    "slider": lambda v: actions.set_picture(v, replace(v.state.picture, dim=0.1)),
+    "hidden query": lambda v: actions.hide(v, v.state.queries[0]),
+    "cut": lambda v: actions.set_cut(v, v.state.queries[0], 0.7),
+    "split": actions.toggle_wipe,
+    "splats": lambda v: actions.set_splats(v, Splats(0.5)),
+    "near cut": lambda v: actions.set_clip(v, Clip(1.0)),
+    "marks": actions.select_all,
+    "size": lambda v: actions.resize(v, 300, 200),
+    "view": lambda v: actions.look_from(v, "left"),
+}
+UNSEEN = {
+    "line": lambda v: actions.move_line(v, 0.3),
+    "ruler": actions.toggle_measuring,
+    "tool": lambda v: actions.use_tool(v, "brush"),
+    "word": lambda v: actions.type_phrase(v, "plant"),
+    "chosen query": lambda v: actions.select(v, None),
+}
+
+
+@pytest.fixture
+def asked(opened: Viewer) -> Viewer:
+    actions.ask(opened, "mug")
+    settle(opened)
+    actions.resize(opened, 240, 180)
+    return opened
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_is_seen_is_in_it(asked, name):
+    before = depicted(asked)
+    assert depicted(asked) == before
+    CHANGES[name](asked)
+    actions.tick(asked, asked.clock + 10)
+    actions.tick(asked, asked.clock + 10)
+    assert depicted(asked) != before
+
+
+@pytest.mark.parametrize("name", UNSEEN)
+def test_what_is_not_seen_is_not_in_it(asked, name):
+    before = depicted(asked)
+    UNSEEN[name](asked)
+    assert depicted(asked) == before
+
+
+def test_a_sight_is_equal_where_the_picture_is():
+    scene = blob_scene()
+    first, second, _ = scene.cameras
+    sight = Sight(scene, first)
+    assert sight == Sight(scene, replace(first, name="again"))
+    assert hash(sight) == hash(Sight(scene, replace(first, name="again")))
+    others = (
+        Sight(scene, second),
+        Sight(scene, first, Clip(1.0)),
+        Sight(replace(scene), first),
+        Sight(scene, replace(first, width=80)),
+    )
+    assert all(sight != other for other in others)
+
+
+class CountingRasterizer:
+    name = "counting"
+
+    def __init__(self) -> None:
+        self.views = 0
+
+    def view(self, gaussians, camera, settings=None):
+        self.views += 1
+        return self.views
+
+
+def test_a_view_is_kept_while_the_sight_is_the_same():
+    scene, rasterizer = blob_scene(), CountingRasterizer()
+    views = LastView(rasterizer)
+    sights = [Sight(scene, scene.cameras[place]) for place in (0, 0, 1, 1, 0)]
+    assert [views.of(sight) for sight in sights] == [1, 1, 2, 2, 3]
+    views.forget()
+    assert views.of(sights[0]) == 4
+
+
+@pytest.mark.parametrize("backend", ["opengl", "cpu"])
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_is_kept_gives_the_picture_that_a_new_renderer_gives(gl, asked, name, backend):
+    kept, fresh = FrameRenderer(gl, backend), FrameRenderer(gl, backend)
+    canvas = Canvas(gl, kept)
+    canvas.update(asked.state, 0.0)
+    CHANGES[name](asked)
+    actions.tick(asked, asked.clock + 10)
+    actions.tick(asked, asked.clock + 10)
+    canvas.update(asked.state, 20.0)
+    canvas.update(asked.state, 30.0)
+    expected = Canvas(gl, fresh).capture(asked.state)
+    np.testing.assert_array_equal(canvas.capture(asked.state), expected)
+    kept.release()
+    fresh.release()
