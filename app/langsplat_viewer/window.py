@@ -121,7 +121,7 @@ class Window:
         self.failure: LangSplatError | None = None  # why the window could not work
         self._request = request
         self._make_renderer = make_renderer
-        self._hiding = layout.Hiding()
+        self._hiding, self._column = layout.Hiding(), layout.Column()
         self._remembered = Remembered(request.settings, self.viewer.state)
         self._canvas: Canvas | None = None
         self._photograph: photograph.Overlay | None = None
@@ -227,6 +227,7 @@ class Window:
         actions.fetch_photograph(viewer)
         keyboard.muted_until_clicked(viewer)  # hello_imgui draws the panels after this
         self._hiding.apply(viewer)
+        self._column.apply(viewer)
         layout.show_wanted(viewer)
         self._title()
         self._remembered.update()

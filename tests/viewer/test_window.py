@@ -62,6 +62,7 @@ def folder(tmp_path: Path) -> Path:
         "switch_between_scenes",
         "time_and_compare",
         "fade_in_a_photograph",
+        "large_letters",
     ],
 )
 def test_window(scenario: str, display: str, folder: Path):

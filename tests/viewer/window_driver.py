@@ -25,7 +25,7 @@ from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest
 from tests.support.fakes import CENTRES, FakeEncoder
-from tests.viewer import scenarios_files, scenarios_seeing, scenarios_select
+from tests.viewer import scenarios_files, scenarios_layout, scenarios_seeing, scenarios_select
 from tests.viewer.scenarios_record import RECORD_SCENARIOS
 
 MUG, BOOK, PLANT = CENTRES
@@ -51,12 +51,14 @@ class CountingRenderer(FrameRenderer):
 class Session:
     """A window under test."""
 
-    def __init__(self, folder: Path, scene: str, load=load_scene, **request) -> None:
+    patience = PATIENCE
+
+    def __init__(self, folder: Path, scene: str, load=load_scene, size=(860, 620), **request) -> None:
         self.folder = folder
         self.renderer: CountingRenderer | None = None
         services = Services(load, lambda encoder_id: FakeEncoder())
         self.window = Window(
-            WindowRequest(folder / scene, size=(860, 620), **request), services, self._make_renderer
+            WindowRequest(folder / scene, size=size, **request), services, self._make_renderer
         )
         self.window.idles = False
         self.state = self.window.viewer.state
@@ -69,10 +71,14 @@ class Session:
         def body(ctx) -> None:
             self.ctx = ctx
             engine = imgui.test_engine.get_io(hello_imgui.get_imgui_test_engine())
-            engine.config_watchdog_warning = engine.config_watchdog_kill_test = PATIENCE
+            engine.config_watchdog_warning = engine.config_watchdog_kill_test = self.patience
             test(self)
 
-        testing.run(test_function=body, runner_params=self.window.params())
+        testing.run(test_function=body, runner_params=self.params())
+
+    def params(self) -> hello_imgui.RunnerParams:
+        """Of the window."""
+        return self.window.params()
 
     def wait(self, condition: Callable[[], bool]) -> None:
         for _ in range(3000):
@@ -515,6 +521,7 @@ SCENARIOS = {
     "close_while_opening": (close_while_opening, "blobs.ply", {"load": slow_load}),
     **scenarios_seeing.SCENARIOS,
     **scenarios_files.SCENARIOS,
+    **scenarios_layout.SCENARIOS,
 }
 
 

@@ -6,7 +6,7 @@ from langsplat_core.display.colour_maps import QUERY_COLOURS
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions
 from langsplat_viewer.panels import cut
-from langsplat_viewer.panels.style import bad, elided, good, muted, small_wrapped
+from langsplat_viewer.panels.style import bad, elided, good, muted, small_wrapped, width_of
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
 
@@ -42,7 +42,7 @@ def _line(viewer: Viewer, query: Query) -> None:
     _swatch(viewer, query, side)
     imgui.same_line()
     chosen = viewer.state.selected is query
-    name = elided(query.phrase, room, lambda text: imgui.calc_text_size(text).x)
+    name = elided(query.phrase, room, width_of)
     if imgui.selectable(f"{name}##phrase of list", chosen, size=ImVec2(room, 0))[0]:
         actions.select(viewer, query)
     if name != query.phrase and imgui.is_item_hovered():

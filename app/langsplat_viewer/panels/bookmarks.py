@@ -4,7 +4,7 @@ from imgui_bundle import ImVec2, imgui
 
 from langsplat_viewer import actions
 from langsplat_viewer.commands import with_key
-from langsplat_viewer.panels.style import elided, muted, small_wrapped
+from langsplat_viewer.panels.style import elided, muted, small_wrapped, width_of
 from langsplat_viewer.viewer import Viewer
 
 
@@ -29,7 +29,7 @@ def draw(viewer: Viewer) -> None:
             imgui.push_id(number)
             side, right = imgui.get_frame_height(), imgui.get_content_region_avail().x
             room = right - side - imgui.get_style().item_spacing.x
-            name = elided(bookmark.name, room, lambda text: imgui.calc_text_size(text).x)
+            name = elided(bookmark.name, room, width_of)
             imgui.align_text_to_frame_padding()
             if imgui.selectable(f"{name}##bookmark", False, size=ImVec2(room, 0))[0]:
                 actions.go_to_bookmark(viewer, bookmark)

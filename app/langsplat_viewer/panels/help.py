@@ -9,6 +9,8 @@ from langsplat_viewer.panels.style import bad, tip
 from langsplat_viewer.viewer import Viewer
 
 KEYS_EM, DOES_EM, ROWS = 14.0, 20.0, 16  # widths, and commands that are seen at a time while they are changed
+OTHER_ROWS = 5  # title, box and what lies below the commands
+MOST_SHARE = 0.94  # of the window's height
 
 
 def rows(changed: Changed) -> tuple[tuple[str, str], ...]:
@@ -23,6 +25,8 @@ def draw(viewer: Viewer) -> None:
         return
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_collapse
     centre = imgui.get_main_viewport().get_center()
+    room = imgui.get_main_viewport().work_size
+    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, MOST_SHARE * room.y))
     imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.35, 0.5))
     imgui.set_next_window_bg_alpha(1.0)
     _, still_open = imgui.begin("Keys", True, flags)
@@ -63,7 +67,9 @@ def _change(viewer: Viewer) -> None:
     imgui.set_next_item_width(-1)
     typed = imgui.input_text_with_hint("##words", "which command", viewer.state.keying.typed)[1]
     actions.type_keys(viewer, typed)
-    size = ImVec2(hello_imgui.em_size(KEYS_EM + DOES_EM + 2), ROWS * imgui.get_frame_height_with_spacing())
+    row = imgui.get_frame_height_with_spacing()
+    high = min(ROWS * row, MOST_SHARE * imgui.get_main_viewport().work_size.y - OTHER_ROWS * row)
+    size = ImVec2(hello_imgui.em_size(KEYS_EM + DOES_EM + 2), high)
     if imgui.begin_child("changeable", size) and imgui.begin_table("keys", 2):
         _columns()
         for command in matching(typed):

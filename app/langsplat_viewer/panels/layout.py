@@ -63,8 +63,9 @@ PANELS: tuple[Panel, ...] = (
 def params(viewer: Viewer, width: float) -> hello_imgui.DockingParams:
     """The docks of a window `width` units wide, and the panels in them, for hello_imgui to draw."""
     docking = hello_imgui.DockingParams()
+    share = min(COLUMN * viewer.state.preferences.ui_scale / width, MOST_SHARE)
     docking.docking_splits = [
-        hello_imgui.DockingSplit(MAIN_DOCK, LEFT, imgui.Dir.left, min(COLUMN / width, MOST_SHARE)),
+        hello_imgui.DockingSplit(MAIN_DOCK, LEFT, imgui.Dir.left, share),
         hello_imgui.DockingSplit(LEFT, FOOT, imgui.Dir.down, FOOT_SHARE),
         hello_imgui.DockingSplit(LEFT, MIDDLE, imgui.Dir.down, MIDDLE_SHARE),
     ]
@@ -92,6 +93,37 @@ def show_wanted(viewer: Viewer) -> None:
         docking = hello_imgui.get_runner_params().docking_params
         docking.dockable_window_of_name(title).is_visible = True
         docking.focus_dockable_window(title)
+
+
+class Column:
+    """Makes the column beside the scene wider when letters grow, and narrower when they shrink."""
+
+    def __init__(self) -> None:
+        self._scale: float | None = None  # of the letters, in the last frame
+        self._wanted = self._given = 0.0  # width for these letters, and the one that there was room for
+
+    def apply(self, viewer: Viewer) -> None:
+        """Once per frame."""
+        scale = viewer.state.preferences.ui_scale
+        before, self._scale = self._scale, scale
+        node = _column() if before is not None and before != scale else None
+        if node is not None and before is not None:
+            most = max(MOST_SHARE * imgui.get_main_viewport().size.x, node.size.x)
+            dragged = abs(node.size.x - self._given) > 1
+            self._wanted = (node.size.x if dragged else self._wanted) * scale / before
+            self._given = min(self._wanted, most)
+            imgui.internal.dock_builder_set_node_size(node.id_, ImVec2(self._given, node.size.y))
+
+
+def _column() -> imgui.internal.DockNode | None:
+    """The node of the docks beside the scene, as long as it lies there."""
+    docking = hello_imgui.get_runner_params().docking_params
+    root = docking.dock_space_id_from_name(MAIN_DOCK)
+    node = imgui.internal.dock_builder_get_node(docking.dock_space_id_from_name(LEFT) or 0)
+    while node is not None and node.parent_node is not None and node.parent_node.id_ != root:
+        node = node.parent_node
+    beside_scene = node is not None and node.parent_node is not None
+    return node if beside_scene and node.parent_node.split_axis == imgui.internal.Axis.x else None
 
 
 class Hiding:

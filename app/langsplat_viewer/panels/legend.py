@@ -11,7 +11,7 @@ from langsplat_core.display.colour_maps import QUERY_COLOURS, mapped
 from langsplat_core.query.answers import QueryResult
 from langsplat_viewer import painting, splitting
 from langsplat_viewer.panels.area import Area
-from langsplat_viewer.panels.style import elided
+from langsplat_viewer.panels.style import elided, width_of
 from langsplat_viewer.viewer import Viewer
 
 STEPS = 32  # of a colour bar
@@ -73,7 +73,7 @@ def bar_colours(slot: int, strength: float, alone: bool, colour_map: ColourMap =
 def _bar(result: QueryResult, colours: Array) -> None:
     """Phrase, bar, and the relevancies at its ends and in its middle."""
     width, height = hello_imgui.em_size(BAR_EM), hello_imgui.em_size(HEIGHT_EM)
-    imgui.text_unformatted(elided(result.phrase, width, lambda text: imgui.calc_text_size(text).x))
+    imgui.text_unformatted(elided(result.phrase, width, width_of))
     start, paint = imgui.get_cursor_screen_pos(), imgui.get_window_draw_list()
     for step, colour in enumerate(colours):
         left, right = (round(start.x + width * edge / STEPS) for edge in (step, step + 1))  # no seams

@@ -6,13 +6,16 @@ from langsplat_viewer import actions
 from langsplat_viewer.panels.style import bad, muted, small_wrapped, stoppable
 from langsplat_viewer.viewer import Viewer
 
+LEAST_LINES = 2  # of messages, however low the panel is
+
 
 def draw(viewer: Viewer) -> None:
     """What is being done, what was said (the latest first), and how fast pictures are made."""
     if viewer.worker.current is not None and stoppable(*viewer.worker.current):
         actions.cancel(viewer)
     line = imgui.get_text_line_height_with_spacing()
-    if imgui.begin_child("messages", ImVec2(0, -line)):
+    height = max(imgui.get_content_region_avail().y - line, LEAST_LINES * line)
+    if imgui.begin_child("messages", ImVec2(0, height)):
         for message in reversed(viewer.state.messages):
             small_wrapped(message.text, bad() if message.is_error else muted())
     imgui.end_child()

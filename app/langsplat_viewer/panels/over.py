@@ -30,12 +30,12 @@ def draw(viewer: Viewer, area: Area) -> None:
         camera = state.view.camera(max(round(part.width), 1), max(round(part.height), 1))
         low = ImVec2(part.left, part.top)
         paint.push_clip_rect(low, ImVec2(part.left + part.width, part.top + part.height), True)
-        if "things" in state.preferences.overlays:
-            _things(viewer, part, camera)
         if "grid" in state.preferences.overlays:
-            _grid(viewer, part, camera)
+            _grid(viewer, part, camera, is_named=column == 0)
         if "cameras" in state.preferences.overlays:
             _cameras(viewer, part, camera)
+        if "things" in state.preferences.overlays:  # after the lines, so that its words are readable
+            _things(viewer, part, camera)
         _ruler(viewer, part, camera)
         paint.pop_clip_rect()
     if state.seeing.ruler.measures and not imgui.get_io().want_capture_mouse:
@@ -112,8 +112,8 @@ def _things(viewer: Viewer, area: Area, camera: Camera) -> None:
                 text_on_shade(text, area.left + x + 4, area.top + max(y - 1.4 * line, 0), area)
 
 
-def _grid(viewer: Viewer, area: Area, camera: Camera) -> None:
-    """On the ground, with the distance of its lines from the world's origin."""
+def _grid(viewer: Viewer, area: Area, camera: Camera, is_named: bool) -> None:
+    """On the ground, with the distance of its lines from the world's origin; named in the corner, or not."""
     state = viewer.state
     assert state.scene is not None
     assert state.extent is not None
@@ -127,6 +127,8 @@ def _grid(viewer: Viewer, area: Area, camera: Camera) -> None:
         place = _place(camera, point, _least_depth(viewer))
         if place is not None:
             paint.add_text(ImVec2(area.left + place[0] + 3, area.top + place[1]), packed, text)
+    if not is_named:
+        return
     spacing = overlays.length_text(grid.spacing, scale)
     line = imgui.get_text_line_height()
     text_on_shade(f"grid {spacing}", area.left + 0.6 * line, area.top + area.height - 1.6 * line, area)

@@ -1,12 +1,12 @@
 """The photograph of a training camera over the picture of the scene, and the slider that fades it in."""
 
 import moderngl
-from imgui_bundle import ImVec2, hello_imgui, imgui
+from imgui_bundle import ImVec2, imgui
 
 from langsplat_core.arrays import Array
 from langsplat_viewer import actions, splitting
 from langsplat_viewer.panels.area import Area
-from langsplat_viewer.panels.style import muted, small_wrapped, tip
+from langsplat_viewer.panels.style import leave_room, muted, small_wrapped, tip
 from langsplat_viewer.photographs import corners
 from langsplat_viewer.viewer import Viewer
 
@@ -14,7 +14,7 @@ from langsplat_viewer.viewer import Viewer
 def draw_slider(viewer: Viewer) -> None:
     """How much of it is seen, and why it is not."""
     state = viewer.state
-    imgui.set_next_item_width(hello_imgui.em_size(11))
+    leave_room("Photograph", 11)
     flags = imgui.SliderFlags_.always_clamp
     changed, fade = imgui.slider_float("Photograph", state.seeing.fade, 0.0, 1.0, "%.2f", flags)
     if changed:

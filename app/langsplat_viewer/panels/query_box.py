@@ -3,7 +3,7 @@
 from imgui_bundle import ImVec2, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.panels.style import muted
+from langsplat_viewer.panels.style import elided, muted, tip, width_of
 from langsplat_viewer.viewer import Viewer
 
 HINT = "what to look for"
@@ -55,10 +55,13 @@ def _offers(viewer: Viewer) -> None:
 
 def _buttons(viewer: Viewer, title: str, phrases: tuple[str, ...]) -> None:
     imgui.text_colored(muted(), title)
-    style = imgui.get_style()
+    margins = 2 * imgui.get_style().frame_padding.x
     for number, phrase in enumerate(phrases):
         imgui.same_line()
-        if imgui.get_content_region_avail().x < imgui.calc_text_size(phrase).x + 2 * style.frame_padding.x:
+        if imgui.get_content_region_avail().x < width_of(phrase) + margins:
             imgui.new_line()
-        if imgui.small_button(f"{phrase}##offer {number}"):
+        shown = elided(phrase, imgui.get_content_region_avail().x - margins, width_of)
+        if imgui.small_button(f"{shown}###offer {number}"):
             actions.ask_offered(viewer, phrase)
+        if shown != phrase:
+            tip(phrase)

@@ -7,12 +7,20 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 from langsplat_viewer import actions
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.flight import Keyframe
-from langsplat_viewer.panels.style import muted, small_wrapped, stoppable, tip
+from langsplat_viewer.panels.style import (
+    beside,
+    beside_boxed,
+    leave_room,
+    muted,
+    small_wrapped,
+    stoppable,
+    tip,
+)
 from langsplat_viewer.recording import FPS_CHOICES
 from langsplat_viewer.viewer import Viewer
 
 ROWS = 3.5  # of the list: the half one says that there are more
-NUMBER_EM = 7.5
+NUMBER_EM, FPS_EM = 7.5, 4.5
 
 
 def draw(viewer: Viewer) -> None:
@@ -20,7 +28,7 @@ def draw(viewer: Viewer) -> None:
     record = viewer.state.record
     if imgui.radio_button("Keyframes", not record.turns):
         actions.set_turning(viewer, False)
-    imgui.same_line()
+    beside_boxed("Turntable")
     if imgui.radio_button("Turntable", record.turns):
         actions.set_turning(viewer, True)
     tip("Once around what the view turns around; F makes that the latest result")
@@ -75,12 +83,12 @@ def _keyframes(viewer: Viewer) -> None:
     if imgui.button("Add keyframe"):
         actions.add_keyframe(viewer)
     tip(with_key("The current view", actions.add_keyframe, viewer.state.preferences.keys))
-    imgui.same_line()
+    beside("Clear")
     imgui.begin_disabled(not record.keyframes)
     if imgui.button("Clear"):
         actions.clear_path(viewer)
     imgui.end_disabled()
-    imgui.same_line()
+    beside("Duration", hello_imgui.em_size(NUMBER_EM))
     _duration(viewer)
     height = ROWS * imgui.get_frame_height_with_spacing()
     if imgui.begin_child("keyframes", ImVec2(0, height), imgui.ChildFlags_.borders):
@@ -115,21 +123,21 @@ def _chosen(viewer: Viewer, key: Keyframe) -> None:
     seconds = _number("##time of the keyframe", key.seconds, 0.5)
     if seconds is not None:
         actions.move_keyframe(viewer, key, seconds)
-    imgui.same_line()
+    beside("Set to this view")
     if imgui.button("Set to this view"):
         actions.replace_keyframe(viewer, key)
     tip("Put the current view in its place")
 
 
 def _file(viewer: Viewer) -> None:
-    imgui.set_next_item_width(hello_imgui.em_size(NUMBER_EM + 2))
+    leave_room("", NUMBER_EM + 2)
     hint = "file.path.json"
     _, typed = imgui.input_text_with_hint("##path file", hint, viewer.state.record.path_typed)
     actions.type_path_file(viewer, typed)
-    imgui.same_line()
+    beside("Save path")
     if imgui.button("Save path"):
         actions.save_path(viewer, Path.cwd())
-    imgui.same_line()
+    beside("Load")
     if imgui.button("Load"):
         actions.load_typed_path(viewer, Path.cwd())
 
@@ -141,8 +149,8 @@ def _film(viewer: Viewer) -> None:
     changed, size = imgui.input_int2("Size", list(record.size))
     if changed:
         actions.set_film_size(viewer, *size)
-    imgui.same_line()
-    imgui.set_next_item_width(hello_imgui.em_size(4.5))
+    beside("fps", hello_imgui.em_size(FPS_EM))
+    imgui.set_next_item_width(hello_imgui.em_size(FPS_EM))
     if imgui.begin_combo("fps", f"{record.fps:g}"):
         for fps in FPS_CHOICES:
             if imgui.selectable(f"{fps:g}", fps == record.fps)[0]:
@@ -159,11 +167,11 @@ def _film(viewer: Viewer) -> None:
         return
     if imgui.button("Save film"):
         actions.save_film(viewer, Path.cwd())
-    imgui.same_line()
+    beside("Save picture")
     if imgui.button("Save picture##sized"):
         actions.save_sized_picture(viewer, Path.cwd())
     tip("What is shown now, in this size")
-    imgui.same_line()
+    beside("Copy as command")
     if imgui.button("Copy as command"):
         actions.copy_command(viewer, Path.cwd())
     tip("The command that draws this picture without a window")

@@ -5,7 +5,7 @@ from pathlib import Path
 from imgui_bundle import ImVec2, imgui
 
 from langsplat_viewer import actions, saving
-from langsplat_viewer.panels.style import elided, muted, small_wrapped, tip
+from langsplat_viewer.panels.style import beside, elided, muted, small_wrapped, tip, width_of
 from langsplat_viewer.viewer import Viewer
 
 DIALOG_PROGRAMS = ("zenity", "kdialog", "matedialog", "qarma")  # one of them draws the dialog on Linux
@@ -21,13 +21,13 @@ def draw(viewer: Viewer) -> None:
         small_wrapped(_figures(viewer), muted())
     if imgui.button("Open ..."):
         actions.ask_for_file(viewer)
-    imgui.same_line()
+    beside("Save picture")
     if imgui.button("Save picture"):
         saving.save_picture(viewer, Path.cwd())
-    imgui.same_line()
+    beside("Save view")
     if imgui.button("Save view"):
         saving.save_view(viewer, Path.cwd())
-    imgui.same_line()
+    beside("Keys")
     if imgui.button("Keys"):
         actions.toggle_help(viewer)
     if len(state.scenes) > 1:
@@ -45,7 +45,7 @@ def _list(viewer: Viewer) -> None:
             imgui.push_id(number)
             room = imgui.get_content_region_avail().x - side - imgui.get_style().item_spacing.x
             name = path.name if names.count(path.name) == 1 else f"{path.parent.name}/{path.name}"
-            name = elided(name, room, lambda text: imgui.calc_text_size(text).x)
+            name = elided(name, room, width_of)
             imgui.align_text_to_frame_padding()
             if imgui.selectable(f"{name}##scene", path == shown, size=ImVec2(room, 0))[0]:
                 actions.switch_scene(viewer, path)

@@ -9,7 +9,7 @@ from langsplat_core.query.engine import no_field
 from langsplat_core.scene import CANONICAL_PHRASES
 from langsplat_viewer import actions
 from langsplat_viewer.panels import answers, query_box
-from langsplat_viewer.panels.style import muted, small_wrapped
+from langsplat_viewer.panels.style import beside_boxed, muted, small_wrapped
 from langsplat_viewer.viewer import Viewer
 
 CHOICES: tuple[LevelChoice, ...] = get_args(LevelChoice)
@@ -55,7 +55,7 @@ def _level(viewer: Viewer) -> None:
     imgui.align_text_to_frame_padding()
     imgui.text("Level")
     for choice in CHOICES:
-        imgui.same_line()
+        beside_boxed(choice)
         if imgui.radio_button(choice, viewer.state.level == choice):
             actions.set_level(viewer, choice)
     if imgui.is_item_hovered():

@@ -7,7 +7,16 @@ from imgui_bundle import hello_imgui, imgui
 
 from langsplat_viewer import actions
 from langsplat_viewer.commands import with_key
-from langsplat_viewer.panels.style import elided, muted, small_wrapped, tip
+from langsplat_viewer.panels.style import (
+    beside,
+    beside_boxed,
+    elided,
+    leave_room,
+    muted,
+    small_wrapped,
+    tip,
+    width_of,
+)
 from langsplat_viewer.selecting import BRUSHES, MODES, REACHES, TOOLS, Marks
 from langsplat_viewer.viewer import Viewer
 
@@ -75,14 +84,16 @@ def _tools(viewer: Viewer) -> None:
     selection = viewer.state.selection
     for place, tool in enumerate(TOOLS):
         active = selection.tool == tool
-        _same_line(place, tool.capitalize())
+        if place:
+            beside(tool)
         colour = imgui.Col_.button_active if active else imgui.Col_.button
         imgui.push_style_color(imgui.Col_.button, imgui.get_style_color_vec4(colour))
         if imgui.button(f"{tool.capitalize()}##tool"):
             actions.use_tool(viewer, None if active else tool)
         imgui.pop_style_color()
     for place, mode in enumerate(MODES):
-        _same_line(place, mode.capitalize(), imgui.get_frame_height())
+        if place:
+            beside_boxed(mode)
         if imgui.radio_button(mode.capitalize(), selection.mode == mode):
             actions.set_mode(viewer, mode)
     _, only = imgui.checkbox("Only what is visible", selection.only_visible)
@@ -99,7 +110,7 @@ def _found(viewer: Viewer) -> None:
         return
     button = imgui.calc_text_size("Things").x + 2 * imgui.get_style().frame_padding.x
     room = imgui.get_content_region_avail().x - button - imgui.get_style().item_spacing.x
-    name = elided(query.phrase, room - hello_imgui.em_size(4), lambda text: imgui.calc_text_size(text).x)
+    name = elided(query.phrase, room - hello_imgui.em_size(4), width_of)
     if imgui.button(f"Found: {name}##found"):
         actions.select_query(viewer, query)
     tip("Select what the search has found")
@@ -111,7 +122,8 @@ def _found(viewer: Viewer) -> None:
     if things is None or things.result is not query.result:
         return
     for number, thing in enumerate(things.found[:MOST_THINGS]):
-        _same_line(number, str(number + 1))
+        if number:
+            beside(str(number + 1))
         if imgui.button(f"{number + 1}##thing"):
             actions.select_thing(viewer, number)
         tip(f"{thing.count:,} Gaussians, {100 * thing.share:.0f} % of the answer, score {thing.score:.2f}")
@@ -120,24 +132,15 @@ def _found(viewer: Viewer) -> None:
 def _buttons(viewer: Viewer, verbs: Sequence[Verb]) -> None:
     """As many in a row as fit."""
     for place, (name, act, what) in enumerate(verbs):
-        _same_line(place, name)
+        if place:
+            beside(name)
         if imgui.button(f"{name}##verb"):
             act(viewer)
         tip(with_key(what, act, viewer.state.preferences.keys))
 
 
-def _same_line(place: int, text: str, more: float = 0.0) -> None:
-    """Go on beside the last widget, unless this one begins a row or does not fit there."""
-    if place == 0:
-        return
-    imgui.same_line()
-    wide = imgui.calc_text_size(text).x + 2 * imgui.get_style().frame_padding.x + more
-    if imgui.get_content_region_avail().x < wide:
-        imgui.new_line()
-
-
 def _slider(label: str, value: float, limits: tuple[float, float], text: str) -> float:
-    imgui.set_next_item_width(hello_imgui.em_size(12))
+    leave_room(label, 12)
     flags = imgui.SliderFlags_.always_clamp | imgui.SliderFlags_.logarithmic
     _, value = imgui.slider_float(label, value, *limits, text, flags)
     return value

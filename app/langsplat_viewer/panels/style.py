@@ -79,6 +79,32 @@ def stoppable(label: str, fraction: float, tag: str = "") -> bool:
     return bool(imgui.button(f"Cancel##{tag}" if tag else "Cancel"))
 
 
+def width_of(text: str) -> float:
+    """Of one line, window units."""
+    return float(imgui.calc_text_size(text).x)
+
+
+def beside(label: str, more: float = 0.0) -> None:
+    """Go on in the row of the last widget, unless the next one, with this label and `more` window units, does
+    not fit there."""
+    imgui.same_line()
+    wide = width_of(label.partition("##")[0]) + 2 * imgui.get_style().frame_padding.x + more
+    if imgui.get_content_region_avail().x < wide:
+        imgui.new_line()
+
+
+def beside_boxed(label: str) -> None:
+    """`beside`, for a radio button or a check box."""
+    beside(label, imgui.get_frame_height())
+
+
+def leave_room(label: str, ems: float) -> None:
+    """The next widget is `ems` wide, or what is left of the row beside its label."""
+    label_width = width_of(label) + imgui.get_style().item_inner_spacing.x
+    room = imgui.get_content_region_avail().x - label_width
+    imgui.set_next_item_width(max(min(hello_imgui.em_size(ems), room), hello_imgui.em_size(2)))
+
+
 def elided(text: str, room: float, width_of: Callable[[str], float]) -> str:
     """`text` in one line, cut with "..." where it is wider than `room`."""
     text = " ".join(text.split())

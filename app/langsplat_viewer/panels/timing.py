@@ -1,6 +1,6 @@
 """Where the time goes, how much memory is held, and how right the picture is."""
 
-from imgui_bundle import hello_imgui, imgui
+from imgui_bundle import imgui
 
 from langsplat_viewer import actions
 from langsplat_viewer.panels.browser import in_words
@@ -17,8 +17,8 @@ def draw(viewer: Viewer) -> None:
     if memory is not None:
         rows.append(("Memory", in_words(memory)))
     if imgui.begin_table("timing", 2):
-        imgui.table_setup_column("step", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(10))
-        imgui.table_setup_column("time", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(6))
+        imgui.table_setup_column("step", imgui.TableColumnFlags_.width_stretch, 5)
+        imgui.table_setup_column("time", imgui.TableColumnFlags_.width_stretch, 4)
         for title, text in rows:
             imgui.table_next_row()
             imgui.table_next_column()

@@ -8,7 +8,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.config import TrainPreset
 from langsplat_viewer import actions
-from langsplat_viewer.panels.style import muted, small_wrapped, tip
+from langsplat_viewer.panels.style import beside, beside_boxed, muted, small_wrapped, tip
 from langsplat_viewer.training import Training
 from langsplat_viewer.viewer import Viewer
 
@@ -39,7 +39,7 @@ def _form(viewer: Viewer) -> None:
     form = replace(form, encoder=_box("Encoder", '"demo", or a folder or hub id of CLIP', form.encoder))
     for number, preset in enumerate(PRESETS):
         if number:
-            imgui.same_line()
+            beside_boxed(preset)
         if imgui.radio_button(preset, form.preset == preset):
             form = replace(form, preset=preset)
         if imgui.is_item_hovered():
@@ -73,7 +73,7 @@ def _running(viewer: Viewer, training: Training) -> None:
     imgui.progress_bar(progress.overall, ImVec2(-1, 0), progress.left or "starting")
     if imgui.button("Stop"):
         actions.stop_training(viewer)
-    imgui.same_line()
+    beside("Look at it so far")
     if imgui.button("Look at it so far"):
         actions.look_at_training(viewer)
     for line in progress.said[-3:]:

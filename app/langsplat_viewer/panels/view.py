@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 from itertools import groupby
 
-from imgui_bundle import hello_imgui, imgui
+from imgui_bundle import imgui
 
 from langsplat_core.display.colour_maps import COLOUR_MAPS
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
@@ -14,11 +14,12 @@ from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_o
 from langsplat_viewer.controls import FOV_RANGE, adopt_up, level, with_fov
 from langsplat_viewer.overlays import length_text
 from langsplat_viewer.panels import photograph
-from langsplat_viewer.panels.style import muted, small_wrapped, tip
+from langsplat_viewer.panels.style import beside, beside_boxed, leave_room, muted, small_wrapped, tip
 from langsplat_viewer.seeing import MOST_DEGREE, SIZE_RANGE, Clip, Splats
 from langsplat_viewer.viewer import Viewer
 
 CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut can be chosen
+WIDTH_EM = 11.0  # of sliders and lists, where there is room
 BACKDROPS = {"Black": 0.0, "Grey": 0.5, "White": 1.0}
 
 
@@ -54,7 +55,7 @@ def _splats(viewer: Viewer) -> None:
     tip("Smaller, every Gaussian can be seen; answers and files do not change")
     degree, most = splats.sh_degree, MOST_DEGREE if scene is None else scene.gaussians.sh_degree
     if most > 0:
-        imgui.set_next_item_width(hello_imgui.em_size(11))
+        leave_room("SH degree", WIDTH_EM)
         flags = imgui.SliderFlags_.always_clamp
         changed, chosen = imgui.slider_int("SH degree", min(degree, most), 0, most, "%d", flags)
         degree = (MOST_DEGREE if chosen == most else chosen) if changed else degree
@@ -66,10 +67,10 @@ def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, flo
     """Three to choose from, and one's own."""
     for place, (name, grey) in enumerate(BACKDROPS.items()):
         if place:
-            imgui.same_line()
+            beside_boxed(name)
         if imgui.radio_button(name, background == (grey,) * 3):
             return (grey,) * 3
-    imgui.same_line()
+    beside_boxed("Backdrop")
     flags = imgui.ColorEditFlags_.no_inputs | imgui.ColorEditFlags_.uint8
     changed, colour = imgui.color_edit3("Backdrop", list(background), flags)
     red, green, blue = (min(max(float(part), 0.0), 1.0) for part in colour)
@@ -82,7 +83,7 @@ def _colour_map(viewer: Viewer) -> None:
     if not shown & {"relevancy", "depth"}:
         return
     names = list(COLOUR_MAPS)
-    imgui.set_next_item_width(hello_imgui.em_size(11))
+    leave_room("Colour map", WIDTH_EM)
     changed, chosen = imgui.combo("Colour map", names.index(viewer.state.picture.colour_map), list(names))
     if changed:
         actions.set_colour_map(viewer, names[chosen])
@@ -97,7 +98,7 @@ def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
         imgui.same_line()
     for place, button in enumerate(buttons):
         if place:
-            imgui.same_line()
+            beside_boxed(button.label)
         _display_button(viewer, button)
 
 
@@ -116,7 +117,7 @@ def _compared(viewer: Viewer) -> None:
     state, split = viewer.state, viewer.state.seeing.split
     second = Button("", split.second, split.second_level if split.second == "latent" else None)
     shown = {"off": "nothing", "levels": "three levels", "wipe": compared_name(second)}[split.mode]
-    imgui.set_next_item_width(hello_imgui.em_size(11))
+    leave_room("Beside it", WIDTH_EM)
     if not imgui.begin_combo("Beside it", shown):
         return
     if imgui.selectable("nothing", split.mode == "off")[0]:
@@ -176,17 +177,18 @@ def draw_camera(viewer: Viewer) -> None:
     if imgui.button(with_key("Reset", actions.reset_view, keys)):
         actions.reset_view(viewer)
     tip("Return to the opening view")
-    imgui.same_line()
-    if imgui.button(with_key("Focus", actions.focus_result, keys)):
+    focus = with_key("Focus", actions.focus_result, keys)
+    beside(focus)
+    if imgui.button(focus):
         actions.focus_result(viewer)
-    imgui.same_line()
+    beside("Frame all")
     if imgui.button("Frame all"):
         actions.frame_scene(viewer)
     tip(with_key("Show the whole scene from this side", actions.frame_scene, keys))
     if imgui.button("Horizon"):
         actions.move(viewer, level)
     tip("Turn the picture until the horizon is level")
-    imgui.same_line()
+    beside("Up is up")
     if imgui.button("Up is up"):
         actions.move(viewer, adopt_up)
     tip("Take what is up in the picture as the world's up")
@@ -201,7 +203,7 @@ def draw_camera(viewer: Viewer) -> None:
     _, walks = imgui.checkbox("Walk", state.walks)
     actions.set_walking(viewer, walks)
     tip("W A S D keep the height of the eye")
-    imgui.same_line()
+    beside_boxed("Coarse while moving")
     _, coarse = imgui.checkbox("Coarse while moving", state.coarse_while_moving)
     actions.set_coarse_while_moving(viewer, coarse)
     tip("Draw fewer pixels and merged Gaussians while the camera moves, where drawing is slow")
@@ -251,7 +253,7 @@ def _training_cameras(viewer: Viewer) -> None:
 def _slider(
     label: str, value: float, low: float, high: float, text: str = "%.2f", *, logarithmic: bool = False
 ) -> float:
-    imgui.set_next_item_width(hello_imgui.em_size(11))
+    leave_room(label, WIDTH_EM)
     flags = imgui.SliderFlags_.always_clamp
     if logarithmic:
         flags |= imgui.SliderFlags_.logarithmic
