@@ -31,7 +31,8 @@ def large_letters(s: Any) -> None:
     s.settle()
     keys = s.ctx.window_info("//Keys").window
     assert keys.scroll_max.y == 0  # the list in it scrolls, the window does not
-    assert keys.size.y < 720
+    assert 0 <= keys.pos.x <= keys.pos.x + keys.size.x <= 1280
+    assert 0 <= keys.pos.y <= keys.pos.y + keys.size.y <= 720
     s.shot("large letters")
     actions.escape(s.window.viewer)
     actions.set_ui_scale(s.window.viewer, 1.0)

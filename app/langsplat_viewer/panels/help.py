@@ -27,7 +27,7 @@ def draw(viewer: Viewer) -> None:
     centre = imgui.get_main_viewport().get_center()
     room = imgui.get_main_viewport().work_size
     imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, MOST_SHARE * room.y))
-    imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.35, 0.5))
+    imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
     imgui.set_next_window_bg_alpha(1.0)
     _, still_open = imgui.begin("Keys", True, flags)
     actions.show_help(viewer, bool(still_open))
