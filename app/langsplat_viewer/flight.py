@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from langsplat_core.arrays import Array
@@ -168,9 +169,6 @@ class _Curve:
         positions = np.array([key.pose.position for key in keyframes], np.float64)
         least = SAME * (1 + np.abs(positions).max())
         slopes = tangents(self._times, np.diff(positions, axis=0), least)
-        # 12 MB of memory, and only a path needs it.
-        from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
-
         self._positions = CubicHermiteSpline(self._times, positions, slopes)
         # Camera to world: a product from the right is then a turn as the camera feels it.
         self._rotations = Rotation.from_matrix(np.array([key.pose.rotation.T for key in keyframes]))

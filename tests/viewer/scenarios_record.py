@@ -49,7 +49,7 @@ def record_and_play(s) -> None:
     actions.set_film_size(s.window.viewer, 32, 24)
     actions.set_film_fps(s.window.viewer, 4.0)
     actions.type_film(s.window.viewer, "film")
-    s.ctx.item_click("//**/Save film")
+    s.ctx.item_click("//Record/Save film")
     s.wait(lambda: s.window.viewer.recorder.current is None)
     s.ctx.yield_(3)
     assert len(list((s.folder / "film").glob("frame-*.png"))) == 5

@@ -45,7 +45,7 @@ def test_closing_does_not_wait_for_what_is_being_read(display, tmp_path):
 
 
 def test_the_window_is_not_heavier_than_it_has_to_be():
-    heavy = ("torch", "transformers", "pycolmap", "open3d", "skimage", "matplotlib", "scipy.interpolate")
+    heavy = ("torch", "transformers", "pycolmap", "open3d", "skimage", "matplotlib")
     script = (
         f"import sys, langsplat_viewer.window\nprint([name for name in {heavy!r} if name in sys.modules])"
     )
