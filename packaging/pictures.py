@@ -11,7 +11,7 @@ from imgui_bundle.immapp import testing  # isort: skip
 
 from langsplat_core.parsing.pictures import opened
 from langsplat_viewer import actions
-from langsplat_viewer.frame import FrameRenderer
+from langsplat_viewer.drawing.frame import FrameRenderer
 from langsplat_viewer.options import scene_path, services
 from langsplat_viewer.window import Window, WindowRequest
 

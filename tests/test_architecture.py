@@ -12,7 +12,22 @@ import pytest
 ROOT = Path(__file__).parent.parent
 # From top to bottom; packages of one row never import each other.
 LAYERS = [
-    ["langsplat_viewer"],
+    ["langsplat_viewer.__main__"],
+    ["langsplat_viewer.window"],
+    ["langsplat_viewer.remembered"],
+    ["langsplat_viewer.panels"],
+    ["langsplat_viewer.canvas", "langsplat_viewer.keying"],
+    ["langsplat_viewer.commands"],
+    ["langsplat_viewer.actions"],
+    ["langsplat_viewer.output"],
+    ["langsplat_viewer.options"],
+    ["langsplat_viewer.viewer"],
+    ["langsplat_viewer.pictures", "langsplat_viewer.visits"],
+    ["langsplat_viewer.state"],
+    ["langsplat_viewer.recording", "langsplat_viewer.training"],
+    ["langsplat_viewer.files"],
+    ["langsplat_viewer.camera", "langsplat_viewer.drawing", "langsplat_viewer.marks"],
+    ["langsplat_viewer.jobs", "langsplat_viewer.keys", "langsplat_viewer.timing", "langsplat_viewer.fonts"],
     ["langsplat_core.__main__"],
     ["langsplat_core.cli"],
     ["langsplat_core.lab"],

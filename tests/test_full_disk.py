@@ -25,12 +25,12 @@ from langsplat_core.pipeline.stages import kept, kept_array
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from langsplat_core.training.radiance.checkpoint import save_checkpoint
-from langsplat_viewer.bookmarks import Bookmark, Shelf
-from langsplat_viewer.film_files import Film, write_film
-from langsplat_viewer.flight_files import write_flight
-from langsplat_viewer.preferences import Preferences, save_preferences
-from langsplat_viewer.querysets import QuerySet, SavedQuery, write_queries
-from langsplat_viewer.saving import save_png
+from langsplat_viewer.files.bookmarks import Bookmark, Shelf
+from langsplat_viewer.files.flight_files import write_flight
+from langsplat_viewer.files.preferences import Preferences, save_preferences
+from langsplat_viewer.files.querysets import QuerySet, SavedQuery, write_queries
+from langsplat_viewer.output.film_files import Film, write_film
+from langsplat_viewer.output.saving import save_png
 from tests.support.file_samples import random_codec, random_field
 from tests.support.flights import flight as some_flight
 from tests.support.full_disk import files_of_at_most

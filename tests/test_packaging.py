@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from langsplat_viewer.browsing import SCENE_SUFFIXES
+from langsplat_viewer.files.browsing import SCENE_SUFFIXES
 from langsplat_viewer.training import TrainingRequest, command
 
 PACKAGING = Path(__file__).resolve().parents[1] / "packaging"

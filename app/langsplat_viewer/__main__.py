@@ -15,7 +15,9 @@ from langsplat_core.display.colour_maps import MAX_QUERIES
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.ranges import Range
-from langsplat_viewer.frame import Backend
+from langsplat_viewer.drawing.frame import Backend
+from langsplat_viewer.drawing.seeing import Clip
+from langsplat_viewer.files.preferences import preferences_folder
 from langsplat_viewer.options import (
     DisplayChoice,
     camera_file,
@@ -24,8 +26,6 @@ from langsplat_viewer.options import (
     scene_path,
     services,
 )
-from langsplat_viewer.preferences import preferences_folder
-from langsplat_viewer.seeing import Clip
 
 Seconds = Annotated[float, Range(0.1, 36_000.0)]
 PicturesPerSecond = Annotated[float, Range(0.1, 240.0)]
@@ -97,9 +97,9 @@ class ViewerCommand:
             self._window(path, size)
 
     def _without_window(self, path: Path, size: tuple[int, int] | None) -> None:
-        from langsplat_viewer.film import FilmRequest, draw_film
-        from langsplat_viewer.film_files import check_film
-        from langsplat_viewer.still import StillRequest, check_out, draw_still
+        from langsplat_viewer.output.film import FilmRequest, draw_film
+        from langsplat_viewer.output.film_files import check_film
+        from langsplat_viewer.output.still import StillRequest, check_out, draw_still
 
         if self.path is not None and self.turntable is not None:
             raise InputError("--path and --turntable are two films; choose one")

@@ -16,18 +16,19 @@ from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera
 from langsplat_core.scene.merging import Merged
 from langsplat_core.stopwatch import watched
-from langsplat_viewer import actions, splitting
-from langsplat_viewer.channels import Layers
+from langsplat_viewer import actions
+from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.commands import with_key
-from langsplat_viewer.controls import OrbitCamera
-from langsplat_viewer.depiction import Depiction, depiction
+from langsplat_viewer.drawing.channels import Layers
+from langsplat_viewer.drawing.looking import why_nothing, why_undrawable
+from langsplat_viewer.drawing.pacing import FINE, Level, Pace
+from langsplat_viewer.drawing.renderer import Renderer
+from langsplat_viewer.drawing.seeing import UNCLIPPED
 from langsplat_viewer.keys import Changed
-from langsplat_viewer.looking import why_nothing, why_undrawable
-from langsplat_viewer.marked_scene import MarkedScene, marked_scene
-from langsplat_viewer.pacing import FINE, Level, Pace
-from langsplat_viewer.renderer import Renderer
-from langsplat_viewer.seeing import UNCLIPPED
-from langsplat_viewer.staging import Merger, Stage
+from langsplat_viewer.pictures import splitting
+from langsplat_viewer.pictures.depiction import Depiction, depiction
+from langsplat_viewer.pictures.marked_scene import MarkedScene, marked_scene
+from langsplat_viewer.pictures.staging import Merger, Stage
 from langsplat_viewer.state import FrameStats, ViewerState
 
 REST_SECONDS = 0.1  # without a move, after which the fine picture is drawn

@@ -99,8 +99,8 @@ def warm_up(scene: Scene, backend: str, progress: Progress = silent) -> None:
     if backend == "cpu":
         say_compiling(progress)
         from langsplat_core.raster import load_rasterizer
-        from langsplat_viewer.channels import ArrayChannels, Layers
-        from langsplat_viewer.sight import Sight
+        from langsplat_viewer.drawing.channels import ArrayChannels, Layers
+        from langsplat_viewer.drawing.sight import Sight
 
         channels, sight = ArrayChannels(load_rasterizer("cpu")), Sight(scene, scene.framing_camera((16, 16)))
         channels.render(sight, Layers(), "none")

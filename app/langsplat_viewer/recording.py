@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from functools import lru_cache
 
-from langsplat_viewer.controls import OrbitCamera
-from langsplat_viewer.flight import Flight, Keyframe
+from langsplat_viewer.camera.controls import OrbitCamera
+from langsplat_viewer.camera.flight import Flight, Keyframe
 
 SPACING = 2.0  # seconds from the last keyframe to one that is added
 TURN_SECONDS = 8.0

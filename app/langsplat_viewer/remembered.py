@@ -6,9 +6,9 @@ from pathlib import Path
 from imgui_bundle import hello_imgui
 
 from langsplat_core.errors import InputError
+from langsplat_viewer.files.preferences import LAYOUT_NAME, Preferences, load_preferences, save_preferences
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.panels import style
-from langsplat_viewer.preferences import LAYOUT_NAME, Preferences, load_preferences, save_preferences
 from langsplat_viewer.state import ViewerState
 
 

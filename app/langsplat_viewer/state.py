@@ -13,16 +13,16 @@ from langsplat_core.query.instances import Instance
 from langsplat_core.query.pointing import Pointed
 from langsplat_core.query.suggestions import Suggestions
 from langsplat_core.scene import Camera, Scene
-from langsplat_viewer import painting
-from langsplat_viewer.bookmarks import Bookmark
-from langsplat_viewer.browsing import Listing
-from langsplat_viewer.controls import Extent, OrbitCamera
+from langsplat_viewer.camera.controls import Extent, OrbitCamera
+from langsplat_viewer.drawing import painting
+from langsplat_viewer.drawing.seeing import Seeing
+from langsplat_viewer.files.bookmarks import Bookmark
+from langsplat_viewer.files.browsing import Listing
+from langsplat_viewer.files.photographs import Photograph
+from langsplat_viewer.files.preferences import Preferences
 from langsplat_viewer.keys import Keying
-from langsplat_viewer.photographs import Photograph
-from langsplat_viewer.preferences import Preferences
+from langsplat_viewer.marks.selecting import Selection
 from langsplat_viewer.recording import Recording
-from langsplat_viewer.seeing import Seeing
-from langsplat_viewer.selecting import Selection
 from langsplat_viewer.timing import Timing
 
 SLOTS = MAX_QUERIES  # queries shown at a time: one colour each

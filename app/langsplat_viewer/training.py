@@ -14,7 +14,7 @@ from typing import IO
 
 from langsplat_core.config import TrainPreset
 from langsplat_core.errors import printable_line
-from langsplat_viewer.watching import Stamps
+from langsplat_viewer.files.watching import Stamps
 
 ALL = "all stages"  # the label under which the whole is reported
 LOSS = re.compile(r"\bloss (\d+\.\d+)")  # behind a stage's colon

@@ -10,13 +10,13 @@ from langsplat_core.progress import Progress
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.scene import Scene
-from langsplat_viewer.bookmarks import Shelf
+from langsplat_viewer.files.bookmarks import Shelf
+from langsplat_viewer.files.watching import Watch
 from langsplat_viewer.jobs import Worker
-from langsplat_viewer.packed_marks import Pair
+from langsplat_viewer.marks.packed_marks import Pair
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.training import Training
 from langsplat_viewer.visits import Visit
-from langsplat_viewer.watching import Watch
 
 
 class Surface(Protocol):

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 from langsplat_core.config import Display
 from langsplat_core.scene import Camera
-from langsplat_viewer.controls import OrbitCamera
-from langsplat_viewer.flight import Keyframe
-from langsplat_viewer.seeing import Clip, Ruler
+from langsplat_viewer.camera.controls import OrbitCamera
+from langsplat_viewer.camera.flight import Keyframe
+from langsplat_viewer.drawing.seeing import Clip, Ruler
 from langsplat_viewer.state import Query, ViewerState
 
 

@@ -17,15 +17,15 @@ import moderngl
 from langsplat_core.config import Display, LevelChoice, PictureConfig
 from langsplat_core.errors import BackendError, InputError, LangSplatError
 from langsplat_viewer import actions, fonts
-from langsplat_viewer.bookmarks import Shelf
 from langsplat_viewer.canvas import Canvas
-from langsplat_viewer.frame import Backend, FrameRenderer
+from langsplat_viewer.drawing.frame import Backend, FrameRenderer
+from langsplat_viewer.drawing.renderer import Renderer
+from langsplat_viewer.files.bookmarks import Shelf
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import chosen_camera, latent_level
 from langsplat_viewer.panels import keyboard, layout, menu, navigation, over, photograph, pictures
 from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.remembered import Remembered
-from langsplat_viewer.renderer import Renderer
 from langsplat_viewer.viewer import Services, Viewer
 
 TITLE = "LangSplat viewer"

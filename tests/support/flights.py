@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from langsplat_viewer.controls import extent_of, from_camera, orbit
-from langsplat_viewer.flight import Flight, Keyframe, pose_of
+from langsplat_viewer.camera.controls import extent_of, from_camera, orbit
+from langsplat_viewer.camera.flight import Flight, Keyframe, pose_of
 from tests.support.fakes import blob_scene
 
 

@@ -22,8 +22,8 @@ from langsplat_core.formats import load_scene
 from langsplat_core.lab.speed.queries import repeated
 from langsplat_core.scene import Scene
 from langsplat_viewer import actions
-from langsplat_viewer.controls import orbit
-from langsplat_viewer.frame import FrameRenderer
+from langsplat_viewer.camera.controls import orbit
+from langsplat_viewer.drawing.frame import FrameRenderer
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest
 from tests.support.fakes import FakeEncoder

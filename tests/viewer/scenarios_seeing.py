@@ -7,9 +7,9 @@ import numpy as np
 
 from imgui_bundle import imgui  # isort: skip
 from langsplat_viewer import actions
+from langsplat_viewer.camera.view_cube import visible_faces
 from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.panels.cube import EDGE
-from langsplat_viewer.view_cube import visible_faces
 from tests.support.fakes import CENTRES
 
 MUG, BOOK, PLANT = CENTRES

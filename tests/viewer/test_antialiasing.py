@@ -13,8 +13,8 @@ from langsplat_core.formats import (
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Scene
-from langsplat_viewer.channels import ArrayChannels, Layers
-from langsplat_viewer.frame import FrameRenderer
+from langsplat_viewer.drawing.channels import ArrayChannels, Layers
+from langsplat_viewer.drawing.frame import FrameRenderer
 from tests.support.scenes import random_camera, random_gaussians
 
 PICTURE = PictureConfig(display="alpha")

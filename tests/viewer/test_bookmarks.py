@@ -8,8 +8,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from langsplat_viewer import actions
-from langsplat_viewer.bookmarks import FILE_NAME, MOST, MOST_SCENES, Shelf
-from langsplat_viewer.controls import OrbitCamera, from_side, look, orbit, symmetric_intrinsics, walk
+from langsplat_viewer.camera.controls import OrbitCamera, from_side, look, orbit, symmetric_intrinsics, walk
+from langsplat_viewer.files.bookmarks import FILE_NAME, MOST, MOST_SCENES, Shelf
 from tests.support.windowless import arrive, errors, settle
 
 

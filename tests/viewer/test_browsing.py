@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from langsplat_viewer import actions
-from langsplat_viewer.browsing import MOST, Entry, list_folder
+from langsplat_viewer.files.browsing import MOST, Entry, list_folder
 from langsplat_viewer.panels.browser import in_words
 from tests.support.windowless import SCENES, errors, settle
 
@@ -45,7 +45,7 @@ def _file(folder: Path) -> Path:
 
 
 def test_a_crowded_folder_is_cut(tmp_path, monkeypatch):
-    monkeypatch.setattr("langsplat_viewer.browsing.MOST", 3)
+    monkeypatch.setattr("langsplat_viewer.files.browsing.MOST", 3)
     for number in range(5):
         (tmp_path / f"{number}.ply").write_bytes(b"")
     listing = list_folder(tmp_path)

@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from langsplat_viewer import actions
-from langsplat_viewer.controls import focus
+from langsplat_viewer.camera.controls import focus
 from langsplat_viewer.state import GLIDE_SECONDS
 from langsplat_viewer.viewer import Viewer
 from tests.support.windowless import arrive, errors, settle

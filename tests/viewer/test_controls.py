@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from langsplat_core.scene import Camera, Gaussians, Intrinsics, Scene
-from langsplat_viewer.controls import (
+from langsplat_viewer.camera.controls import (
     FOV_RANGE,
     MAX_ELEVATION,
     OrbitCamera,

@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from langsplat_viewer import actions, splitting
+from langsplat_viewer import actions
 from langsplat_viewer.canvas import Canvas
-from langsplat_viewer.depiction import Depiction, depiction
-from langsplat_viewer.frame import FrameRenderer
-from langsplat_viewer.seeing import Clip, Splats
-from langsplat_viewer.sight import LastView, Sight
+from langsplat_viewer.drawing.frame import FrameRenderer
+from langsplat_viewer.drawing.seeing import Clip, Splats
+from langsplat_viewer.drawing.sight import LastView, Sight
+from langsplat_viewer.pictures import splitting
+from langsplat_viewer.pictures.depiction import Depiction, depiction
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
 from tests.support.windowless import settle

@@ -16,12 +16,13 @@ from langsplat_core.errors import InputError
 from langsplat_core.formats import save_scene
 from langsplat_core.progress import Cancelled
 from langsplat_viewer import __main__ as program
-from langsplat_viewer import film_files, options
-from langsplat_viewer.film import Shot, cameras_of, fingerprint, make_film
-from langsplat_viewer.film_files import find_ffmpeg
-from langsplat_viewer.flight import Flight, Keyframe
-from langsplat_viewer.flight_files import write_flight
-from langsplat_viewer.headless import Subject, render_picture
+from langsplat_viewer import options
+from langsplat_viewer.camera.flight import Flight, Keyframe
+from langsplat_viewer.files.flight_files import write_flight
+from langsplat_viewer.output import film_files
+from langsplat_viewer.output.film import Shot, cameras_of, fingerprint, make_film
+from langsplat_viewer.output.film_files import find_ffmpeg
+from langsplat_viewer.output.headless import Subject, render_picture
 from tests.support.fakes import FakeEncoder, blob_scene
 from tests.support.flights import flight
 

@@ -8,8 +8,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from langsplat_viewer.controls import extent_of, from_camera, orbit
-from langsplat_viewer.flight import (
+from langsplat_viewer.camera.controls import extent_of, from_camera, orbit
+from langsplat_viewer.camera.flight import (
     Flight,
     Keyframe,
     Pose,

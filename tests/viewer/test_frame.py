@@ -15,9 +15,9 @@ from langsplat_core.display.compose import Channels, compose
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Gaussians, Scene, look_at
-from langsplat_viewer.channel_textures import ArraySource, GlSource
-from langsplat_viewer.channels import ArrayChannels, Layers, depth_range
-from langsplat_viewer.frame import FrameRenderer, suits_opengl
+from langsplat_viewer.drawing.channel_textures import ArraySource, GlSource
+from langsplat_viewer.drawing.channels import ArrayChannels, Layers, depth_range
+from langsplat_viewer.drawing.frame import FrameRenderer, suits_opengl
 from tests.support.gl_context import gl_state
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
@@ -68,7 +68,7 @@ def test_the_shader_composes_as_numpy_does(gl, monkeypatch, display, queries):
     others = {"latent", "relevancies", "depth_sum"} - set(fields)
     shown = replace(channels, **dict.fromkeys(others))
     monkeypatch.setattr(ArrayChannels, "render_all", lambda *_: [shown])
-    monkeypatch.setattr("langsplat_viewer.frame.depth_range", lambda *_: channels.depth_range)
+    monkeypatch.setattr("langsplat_viewer.drawing.frame.depth_range", lambda *_: channels.depth_range)
     renderer = FrameRenderer(gl, "cpu")
     renderer.set_scene(SCENE)
     renderer.set_layers(LATENT, random_values(COUNT, queries))
@@ -97,7 +97,7 @@ def check_composition(gl, monkeypatch, picture: PictureConfig) -> None:
     field = {"latent": "latent", "relevancies": "relevancies", "depth": "depth_sum"}.get(extra, "")
     shown = replace(channels, **dict.fromkeys({"latent", "relevancies", "depth_sum"} - {field}))
     monkeypatch.setattr(ArrayChannels, "render_all", lambda *_: [shown])
-    monkeypatch.setattr("langsplat_viewer.frame.depth_range", lambda *_: channels.depth_range)
+    monkeypatch.setattr("langsplat_viewer.drawing.frame.depth_range", lambda *_: channels.depth_range)
     renderer = FrameRenderer(gl, "cpu")
     renderer.set_scene(SCENE)
     renderer.set_layers(LATENT, random_values(COUNT, 1))
@@ -299,7 +299,7 @@ import moderngl
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import BackendError
 from langsplat_core.scene import Scene
-from langsplat_viewer.frame import FrameRenderer
+from langsplat_viewer.drawing.frame import FrameRenderer
 from tests.support.scenes import random_camera, random_gaussians
 ctx = moderngl.create_context(standalone=True, backend="egl", require=330)
 assert ctx.version_code == 330, ctx.version_code

@@ -8,11 +8,11 @@ import pytest
 from langsplat_core.errors import InputError
 from langsplat_viewer import actions, keying
 from langsplat_viewer.commands import COMMANDS, keys_of, with_key
+from langsplat_viewer.files.preferences import FILE_NAME, Preferences, load_preferences, save_preferences
 from langsplat_viewer.keying import command_of
 from langsplat_viewer.keys import NAMED, Keying, problem
 from langsplat_viewer.panels.help import rows
 from langsplat_viewer.panels.keyboard import chord
-from langsplat_viewer.preferences import FILE_NAME, Preferences, load_preferences, save_preferences
 from tests.support.windowless import errors
 
 RESET, FRAME, RELOAD = "return to the opening view", "frame everything", "reload the scene"

@@ -16,7 +16,7 @@ def test_pictures_are_coarse_while_moving_and_sharp_afterwards(display: str, tmp
     environment = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}
     paths = os.pathsep.join((str(ROOT), str(ROOT / "app")))
     script = (
-        "import sys, langsplat_viewer.pacing as pacing\n"
+        "import sys, langsplat_viewer.drawing.pacing as pacing\n"
         "pacing.MOVING_BUDGET = 0.0\n"  # however fast the machine is
         "from pathlib import Path\n"
         "from dataclasses import asdict\n"

@@ -7,8 +7,8 @@ import pytest
 
 from langsplat_core.query import boxes
 from langsplat_core.scene import look_at
-from langsplat_viewer import overlays
-from langsplat_viewer.controls import extent_of
+from langsplat_viewer.camera import overlays
+from langsplat_viewer.camera.controls import extent_of
 from tests.support.fakes import blob_scene, cameras
 
 SIZE = (120, 80)

@@ -10,9 +10,10 @@ from langsplat_core.config import PictureConfig
 from langsplat_core.display.colour_maps import QUERY_COLOURS
 from langsplat_core.display.compose import SEGMENT_OPACITY, Channels, compose
 from langsplat_core.query.answers import QueryResult
-from langsplat_viewer import actions, painting
+from langsplat_viewer import actions
+from langsplat_viewer.drawing import painting
+from langsplat_viewer.output.still import describe
 from langsplat_viewer.panels.legend import STEPS, bar_colours
-from langsplat_viewer.still import describe
 from tests.support.windowless import settle
 
 

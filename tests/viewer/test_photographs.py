@@ -9,8 +9,8 @@ from PIL import Image
 
 from langsplat_core.errors import InputError
 from langsplat_viewer import actions
-from langsplat_viewer.photographs import LONGEST_SIDE, corners, find, read
-from langsplat_viewer.preferences import (
+from langsplat_viewer.files.photographs import LONGEST_SIDE, corners, find, read
+from langsplat_viewer.files.preferences import (
     MOST_FOLDERS,
     Preferences,
     load_preferences,

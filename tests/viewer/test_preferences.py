@@ -7,7 +7,7 @@ import pytest
 
 from langsplat_core.errors import InputError
 from langsplat_viewer import actions
-from langsplat_viewer.preferences import (
+from langsplat_viewer.files.preferences import (
     FILE_NAME,
     MOST_RECENT,
     SCALES,

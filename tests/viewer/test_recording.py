@@ -13,12 +13,13 @@ from PIL import Image
 from langsplat_core.config import PictureConfig
 from langsplat_core.formats import save_scene
 from langsplat_viewer import __main__ as program
-from langsplat_viewer import actions, film_files, options
+from langsplat_viewer import actions, options
 from langsplat_viewer.actions.filming import subject_of
-from langsplat_viewer.controls import orbit, zoom
-from langsplat_viewer.flight_files import read_flight
-from langsplat_viewer.headless import Subject, draw_something, painter
-from langsplat_viewer.seeing import Clip, Splats
+from langsplat_viewer.camera.controls import orbit, zoom
+from langsplat_viewer.drawing.seeing import Clip, Splats
+from langsplat_viewer.files.flight_files import read_flight
+from langsplat_viewer.output import film_files
+from langsplat_viewer.output.headless import Subject, draw_something, painter
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import FakeEncoder, blob_scene
 from tests.support.windowless import arrive, errors, settle

@@ -11,7 +11,7 @@ import pytest
 
 from langsplat_core.formats import load_scene, save_scene
 from langsplat_viewer import actions
-from langsplat_viewer.watching import Watch, stamps
+from langsplat_viewer.files.watching import Watch, stamps
 from tests.support.fakes import blob_scene
 from tests.support.windowless import errors, settle
 
@@ -178,7 +178,7 @@ def test_there_is_nothing_to_reload_before_a_scene_is_open(viewer):
 
 
 def test_a_watch_looks_by_itself_and_stops(tmp_path, monkeypatch):
-    monkeypatch.setattr("langsplat_viewer.watching.EVERY", 0.005)
+    monkeypatch.setattr("langsplat_viewer.files.watching.EVERY", 0.005)
     file: Path = tmp_path / "a.ply"
     file.write_bytes(b"a")
     woken = threading.Event()

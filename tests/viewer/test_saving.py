@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from PIL import Image
 
 from langsplat_core.formats.cameras_json import read_cameras
-from langsplat_viewer import saving
+from langsplat_viewer.output import saving
 from tests.support.windowless import errors
 
 

@@ -7,9 +7,9 @@ import pytest
 
 from langsplat_viewer import actions
 from langsplat_viewer.actions.scenes import MOST
-from langsplat_viewer.browsing import list_folder
+from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
+from langsplat_viewer.files.browsing import list_folder
 from langsplat_viewer.panels.browser import has_several
-from langsplat_viewer.seeing import UNCLIPPED, Clip
 from tests.support.windowless import SCENES, arrive, errors, settle
 
 BLOBS, PLAIN, BARE = (Path(f"{name}.ply").absolute() for name in ("blobs", "plain", "bare"))

@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose
 
 from langsplat_core.scene import Calibration, Odds, Reading
 from langsplat_viewer import actions
-from langsplat_viewer.painting import NO_HEAT
+from langsplat_viewer.drawing.painting import NO_HEAT
+from langsplat_viewer.output.still import describe
 from langsplat_viewer.panels.query_box import hint
-from langsplat_viewer.still import describe
 from tests.support.fakes import CENTRES, blob_scene, language
 from tests.support.windowless import SCENES, errors, settle
 

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_viewer import actions, selecting
+from langsplat_viewer import actions
 from langsplat_viewer.actions.selecting import NOTHING, take
+from langsplat_viewer.marks import selecting
 from langsplat_viewer.panels.select import counts
 from tests.support.selected import blob, marked, marks_of, names
 from tests.support.windowless import errors, settle

@@ -8,14 +8,15 @@ import pytest
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.scene import Scene
-from langsplat_viewer import actions, splitting
+from langsplat_viewer import actions
 from langsplat_viewer.canvas import Canvas
-from langsplat_viewer.channel_textures import ArraySource, GlSource
-from langsplat_viewer.channels import Layers
 from langsplat_viewer.commands import COMMANDS
-from langsplat_viewer.frame import FrameRenderer
+from langsplat_viewer.drawing.channel_textures import ArraySource, GlSource
+from langsplat_viewer.drawing.channels import Layers
+from langsplat_viewer.drawing.frame import FrameRenderer
+from langsplat_viewer.drawing.seeing import AT_RANGE, Split
 from langsplat_viewer.panels.view import compared_name
-from langsplat_viewer.seeing import AT_RANGE, Split
+from langsplat_viewer.pictures import splitting
 from tests.support.scenes import random_camera, random_gaussians, random_values
 from tests.support.windowless import errors, settle
 

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from langsplat_core.scene import look_at
-from langsplat_viewer import actions, strokes
-from langsplat_viewer.controls import from_camera
-from langsplat_viewer.selecting import Stroke
-from langsplat_viewer.strokes import Drawn, caught, outlines
+from langsplat_viewer import actions
+from langsplat_viewer.camera.controls import from_camera
+from langsplat_viewer.marks import strokes
+from langsplat_viewer.marks.selecting import Stroke
+from langsplat_viewer.marks.strokes import Drawn, caught, outlines
 from tests.support.fakes import CENTRES, PER_BLOB
 from tests.support.selected import marked, marks_of
 from tests.support.windowless import FakeSurface, errors, settle

@@ -15,7 +15,7 @@ from langsplat_core.cli.app import parse
 from langsplat_core.formats import load_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer import actions, training
-from langsplat_viewer.preview import IN_TRAINING, NAME, write_preview
+from langsplat_viewer.files.preview import IN_TRAINING, NAME, write_preview
 from langsplat_viewer.training import PREVIEW_EVERY, TrainingProgress, TrainingRequest, command
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_gaussians

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from langsplat_viewer import actions
-from langsplat_viewer.controls import default_view, extent_of, orbit
-from langsplat_viewer.view_cube import FACES, face_at, facing, visible_faces, world_axes
+from langsplat_viewer.camera.controls import default_view, extent_of, orbit
+from langsplat_viewer.camera.view_cube import FACES, face_at, facing, visible_faces, world_axes
 from tests.support.fakes import blob_scene
 from tests.support.windowless import arrive
 

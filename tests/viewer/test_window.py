@@ -13,9 +13,9 @@ import pytest
 
 from langsplat_core.formats import save_scene
 from langsplat_core.scene import Scene
+from langsplat_viewer.camera.controls import default_view, extent_of, orbit
 from langsplat_viewer.canvas import NOTHING_LEFT, REST_SECONDS, Canvas
-from langsplat_viewer.controls import default_view, extent_of, orbit
-from langsplat_viewer.selecting import unmarked
+from langsplat_viewer.marks.selecting import unmarked
 from langsplat_viewer.state import ViewerState
 from tests.support.fakes import blob_scene
 

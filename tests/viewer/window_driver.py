@@ -20,7 +20,7 @@ from langsplat_core.errors import BackendError
 from langsplat_core.formats import load_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer import actions
-from langsplat_viewer.frame import FrameRenderer
+from langsplat_viewer.drawing.frame import FrameRenderer
 from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest

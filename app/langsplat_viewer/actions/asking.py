@@ -8,9 +8,9 @@ from langsplat_core.query.answers import recut
 from langsplat_core.scene.phrases import split_phrases
 from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.queries import ask_again, ask_one, set_level
+from langsplat_viewer.files.querysets import SUFFIX, QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.jobs import one_line
-from langsplat_viewer.querysets import SUFFIX, QuerySet, SavedQuery, read_queries, write_queries
-from langsplat_viewer.saving import free_name
+from langsplat_viewer.output.saving import free_name
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 from langsplat_core.errors import InputError
 from langsplat_viewer.actions.camera import glide_to
-from langsplat_viewer.bookmarks import MOST, Bookmark, named
-from langsplat_viewer.flight import pose_of, view_of
+from langsplat_viewer.camera.flight import pose_of, view_of
+from langsplat_viewer.files.bookmarks import MOST, Bookmark, named
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.viewer import Viewer
 

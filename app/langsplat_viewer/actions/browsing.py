@@ -13,9 +13,9 @@ from langsplat_viewer.actions.recording import load_path
 from langsplat_viewer.actions.scenes import add_scenes, open_scenes
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.actions.training import choose_photographs
-from langsplat_viewer.browsing import Entry, is_scene, list_folder
-from langsplat_viewer.flight_files import SUFFIX as PATHS
-from langsplat_viewer.querysets import SUFFIX as QUERIES
+from langsplat_viewer.files.browsing import Entry, is_scene, list_folder
+from langsplat_viewer.files.flight_files import SUFFIX as PATHS
+from langsplat_viewer.files.querysets import SUFFIX as QUERIES
 from langsplat_viewer.viewer import Viewer
 
 COMPANIONS = (cameras_json.SUFFIX, language.SUFFIX)  # files beside a scene, read with it

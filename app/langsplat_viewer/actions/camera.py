@@ -7,7 +7,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera
 from langsplat_viewer.actions.playback import advance, leave_path
-from langsplat_viewer.controls import (
+from langsplat_viewer.camera.controls import (
     OrbitCamera,
     Side,
     between,

@@ -14,8 +14,8 @@ from langsplat_core.formats.shapes import write_points
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions.selecting import has_scene, has_selection
-from langsplat_viewer.saving import free_name
-from langsplat_viewer.selecting import Marks
+from langsplat_viewer.marks.selecting import Marks
+from langsplat_viewer.output.saving import free_name
 from langsplat_viewer.viewer import Viewer
 
 Part = Literal["selection", "rest", "edited"]

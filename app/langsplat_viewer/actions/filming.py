@@ -15,16 +15,16 @@ from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress
 from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions.playback import path_seconds
-from langsplat_viewer.channels import Layers
-from langsplat_viewer.controls import from_camera
-from langsplat_viewer.film import Shot, cameras_of, make_film
-from langsplat_viewer.film_files import VIDEO, check_film, find_ffmpeg
-from langsplat_viewer.flight import Motion, turntable
-from langsplat_viewer.headless import Subject, draw_something, painter
+from langsplat_viewer.camera.controls import from_camera
+from langsplat_viewer.camera.flight import Motion, turntable
+from langsplat_viewer.drawing.channels import Layers
+from langsplat_viewer.drawing.seeing import Splats
 from langsplat_viewer.options import MAX_SIDE, say_compiling
+from langsplat_viewer.output.film import Shot, cameras_of, make_film
+from langsplat_viewer.output.film_files import VIDEO, check_film, find_ffmpeg
+from langsplat_viewer.output.headless import Subject, draw_something, painter
+from langsplat_viewer.output.saving import free_name, save_png, save_view
 from langsplat_viewer.recording import flight_of
-from langsplat_viewer.saving import free_name, save_png, save_view
-from langsplat_viewer.seeing import Splats
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Viewer
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from langsplat_viewer.actions.exporting import export
-from langsplat_viewer.selecting import Leaving
+from langsplat_viewer.marks.selecting import Leaving
 from langsplat_viewer.viewer import Viewer
 
 

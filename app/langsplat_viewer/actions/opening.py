@@ -18,15 +18,15 @@ from langsplat_viewer.actions import bookmarks
 from langsplat_viewer.actions.camera import opening_view
 from langsplat_viewer.actions.history import forget
 from langsplat_viewer.actions.leaving import leave
-from langsplat_viewer.controls import Extent, extent_of
-from langsplat_viewer.looking import why_undrawable
-from langsplat_viewer.preferences import with_recent
+from langsplat_viewer.camera.controls import Extent, extent_of
+from langsplat_viewer.drawing.looking import why_undrawable
+from langsplat_viewer.drawing.seeing import UNCLIPPED, Ruler
+from langsplat_viewer.files.preferences import with_recent
+from langsplat_viewer.files.watching import Stamps, stamps
+from langsplat_viewer.marks.selecting import of_scene
 from langsplat_viewer.recording import Recording
-from langsplat_viewer.seeing import UNCLIPPED, Ruler
-from langsplat_viewer.selecting import of_scene
 from langsplat_viewer.viewer import Viewer
 from langsplat_viewer.visits import visit_of
-from langsplat_viewer.watching import Stamps, stamps
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,11 +8,11 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
-from langsplat_viewer import photographs
 from langsplat_viewer.actions.history import remember
-from langsplat_viewer.browsing import list_folder
-from langsplat_viewer.photographs import Photograph
-from langsplat_viewer.preferences import with_photographs
+from langsplat_viewer.files import photographs
+from langsplat_viewer.files.browsing import list_folder
+from langsplat_viewer.files.photographs import Photograph
+from langsplat_viewer.files.preferences import with_photographs
 from langsplat_viewer.state import ViewerState
 from langsplat_viewer.viewer import Viewer
 

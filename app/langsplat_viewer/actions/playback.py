@@ -2,8 +2,8 @@
 
 import math
 
-from langsplat_viewer.controls import OrbitCamera, orbit
-from langsplat_viewer.flight import pose_at, view_of
+from langsplat_viewer.camera.controls import OrbitCamera, orbit
+from langsplat_viewer.camera.flight import pose_at, view_of
 from langsplat_viewer.recording import flight_of
 from langsplat_viewer.viewer import Viewer
 

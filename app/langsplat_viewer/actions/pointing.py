@@ -5,7 +5,7 @@ from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import no_field
 from langsplat_core.query.pointing import Pointed, look_at_pixel
 from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_viewer.looking import looking_settings
+from langsplat_viewer.drawing.looking import looking_settings
 from langsplat_viewer.state import Hover
 from langsplat_viewer.viewer import Viewer
 

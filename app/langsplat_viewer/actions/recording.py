@@ -8,11 +8,19 @@ from langsplat_viewer.actions.camera import glide_to
 from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.playback import leave_path, path_seconds
 from langsplat_viewer.actions.settings import open_panel
-from langsplat_viewer.flight import LONGEST, SAME_TIME, Keyframe, pose_of, stretched, view_of, with_keyframe
-from langsplat_viewer.flight_files import MOST, SUFFIX, read_flight, write_flight
+from langsplat_viewer.camera.flight import (
+    LONGEST,
+    SAME_TIME,
+    Keyframe,
+    pose_of,
+    stretched,
+    view_of,
+    with_keyframe,
+)
+from langsplat_viewer.files.flight_files import MOST, SUFFIX, read_flight, write_flight
 from langsplat_viewer.jobs import one_line
+from langsplat_viewer.output.saving import free_name
 from langsplat_viewer.recording import SPACING, flight_of
-from langsplat_viewer.saving import free_name
 from langsplat_viewer.viewer import Viewer
 
 

@@ -7,7 +7,8 @@ from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
 from langsplat_viewer.actions.camera import glide_to
 from langsplat_viewer.actions.history import remember
-from langsplat_viewer.seeing import (
+from langsplat_viewer.camera.view_cube import facing
+from langsplat_viewer.drawing.seeing import (
     AT_RANGE,
     MOST_DEGREE,
     OVERLAYS,
@@ -19,7 +20,6 @@ from langsplat_viewer.seeing import (
     Splats,
     Split,
 )
-from langsplat_viewer.view_cube import facing
 from langsplat_viewer.viewer import Viewer
 
 

@@ -14,9 +14,9 @@ from langsplat_core.progress import Progress
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.instances import Instance
 from langsplat_core.query.selection import grow, of_rows, shrink
-from langsplat_viewer import selecting
 from langsplat_viewer.actions.history import remember
-from langsplat_viewer.selecting import Marks, Mode, Things, Tool
+from langsplat_viewer.marks import selecting
+from langsplat_viewer.marks.selecting import Marks, Mode, Things, Tool
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
 

@@ -9,8 +9,8 @@ from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.leaving import stay
 from langsplat_viewer.actions.seeing import measure
 from langsplat_viewer.actions.strokes import leave_tool
+from langsplat_viewer.files.preferences import SCALES, Theme
 from langsplat_viewer.keys import Keying
-from langsplat_viewer.preferences import SCALES, Theme
 from langsplat_viewer.viewer import Viewer
 
 

@@ -2,7 +2,7 @@
 
 from langsplat_core.arrays import Array
 from langsplat_core.progress import Progress
-from langsplat_viewer.comparing import reference_of, small
+from langsplat_viewer.pictures.comparing import reference_of, small
 from langsplat_viewer.timing import compared
 from langsplat_viewer.viewer import Viewer
 

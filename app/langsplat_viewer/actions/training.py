@@ -4,14 +4,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from langsplat_core.pipeline.forecast import count_photographs
-from langsplat_viewer import preview
 from langsplat_viewer.actions.opening import open_scene
 from langsplat_viewer.actions.visits import reload
+from langsplat_viewer.files import preview
+from langsplat_viewer.files.watching import Stamps
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.training import Training, TrainingRequest
 from langsplat_viewer.viewer import Viewer
-from langsplat_viewer.watching import Stamps
 
 
 def fill_in(viewer: Viewer, form: TrainingForm) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.browsing import Entry, Listing, is_scene
+from langsplat_viewer.files.browsing import Entry, Listing, is_scene
 from langsplat_viewer.panels.style import bad, muted, small_wrapped
 from langsplat_viewer.viewer import Viewer
 

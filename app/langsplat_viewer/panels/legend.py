@@ -9,9 +9,10 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import ColourMap
 from langsplat_core.display.colour_maps import QUERY_COLOURS, mapped
 from langsplat_core.query.answers import QueryResult
-from langsplat_viewer import painting, splitting
+from langsplat_viewer.drawing import painting
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.panels.style import elided, width_of
+from langsplat_viewer.pictures import splitting
 from langsplat_viewer.viewer import Viewer
 
 STEPS = 32  # of a colour bar

@@ -6,7 +6,7 @@ from imgui_bundle import hello_imgui, imgui
 
 from langsplat_viewer import actions
 from langsplat_viewer.commands import MENUS, in_menu, keys_of
-from langsplat_viewer.preferences import SCALES, THEMES
+from langsplat_viewer.files.preferences import SCALES, THEMES
 from langsplat_viewer.viewer import Viewer
 
 UI_SCALES = (0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)

@@ -4,7 +4,8 @@ import math
 
 from imgui_bundle import imgui
 
-from langsplat_viewer import actions, controls
+from langsplat_viewer import actions
+from langsplat_viewer.camera import controls
 from langsplat_viewer.panels import keyboard, stroke
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.viewer import Viewer

@@ -6,9 +6,11 @@ from imgui_bundle import ImVec2, imgui
 from langsplat_core.arrays import Array
 from langsplat_core.display.colour_maps import QUERY_COLOURS
 from langsplat_core.scene import Camera
-from langsplat_viewer import actions, overlays, splitting
+from langsplat_viewer import actions
+from langsplat_viewer.camera import overlays
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.panels.pictures import text_on_shade
+from langsplat_viewer.pictures import splitting
 from langsplat_viewer.viewer import Viewer
 
 REACH = 7.0  # window units from a line at which a click means it

@@ -4,10 +4,11 @@ import moderngl
 from imgui_bundle import ImVec2, imgui
 
 from langsplat_core.arrays import Array
-from langsplat_viewer import actions, splitting
+from langsplat_viewer import actions
+from langsplat_viewer.files.photographs import corners
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.panels.style import leave_room, muted, small_wrapped, tip
-from langsplat_viewer.photographs import corners
+from langsplat_viewer.pictures import splitting
 from langsplat_viewer.viewer import Viewer
 
 

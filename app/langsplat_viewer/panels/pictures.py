@@ -5,8 +5,9 @@ from typing import Any
 import moderngl
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_viewer import actions, splitting
+from langsplat_viewer import actions
 from langsplat_viewer.panels.area import Area
+from langsplat_viewer.pictures import splitting
 from langsplat_viewer.viewer import Viewer
 
 GRIP = 12.0  # width of what can be taken hold of, window units

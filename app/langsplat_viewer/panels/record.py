@@ -5,8 +5,8 @@ from pathlib import Path
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
+from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.commands import with_key
-from langsplat_viewer.flight import Keyframe
 from langsplat_viewer.panels.style import (
     beside,
     beside_boxed,

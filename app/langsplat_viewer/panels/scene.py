@@ -4,7 +4,8 @@ from pathlib import Path
 
 from imgui_bundle import ImVec2, imgui
 
-from langsplat_viewer import actions, saving
+from langsplat_viewer import actions
+from langsplat_viewer.output import saving
 from langsplat_viewer.panels.style import beside, elided, muted, small_wrapped, tip, width_of
 from langsplat_viewer.viewer import Viewer
 

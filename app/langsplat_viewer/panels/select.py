@@ -7,6 +7,7 @@ from imgui_bundle import hello_imgui, imgui
 
 from langsplat_viewer import actions
 from langsplat_viewer.commands import with_key
+from langsplat_viewer.marks.selecting import BRUSHES, MODES, REACHES, TOOLS, Marks
 from langsplat_viewer.panels.style import (
     beside,
     beside_boxed,
@@ -17,7 +18,6 @@ from langsplat_viewer.panels.style import (
     tip,
     width_of,
 )
-from langsplat_viewer.selecting import BRUSHES, MODES, REACHES, TOOLS, Marks
 from langsplat_viewer.viewer import Viewer
 
 MOST_THINGS = 24  # of an answer that have a button

@@ -5,11 +5,12 @@ from typing import Any
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
-from langsplat_viewer import actions, strokes
-from langsplat_viewer.marked_scene import TINT
+from langsplat_viewer import actions
+from langsplat_viewer.marks import strokes
+from langsplat_viewer.marks.selecting import Mode, Tool
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.panels.legend import QUIET
-from langsplat_viewer.selecting import Mode, Tool
+from langsplat_viewer.pictures.marked_scene import TINT
 from langsplat_viewer.viewer import Viewer
 
 HINTS: dict[Tool, str] = {

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
-from langsplat_viewer.preferences import Preferences
+from langsplat_viewer.files.preferences import Preferences
 
 # Window units at a scale of 1.
 SPACES = {

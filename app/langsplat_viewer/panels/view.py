@@ -9,13 +9,14 @@ from imgui_bundle import imgui
 from langsplat_core.display.colour_maps import COLOUR_MAPS
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
-from langsplat_viewer import actions, splitting
+from langsplat_viewer import actions
+from langsplat_viewer.camera.controls import FOV_RANGE, adopt_up, level, with_fov
+from langsplat_viewer.camera.overlays import length_text
 from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of, with_key
-from langsplat_viewer.controls import FOV_RANGE, adopt_up, level, with_fov
-from langsplat_viewer.overlays import length_text
+from langsplat_viewer.drawing.seeing import MOST_DEGREE, SIZE_RANGE, Clip, Splats
 from langsplat_viewer.panels import photograph
 from langsplat_viewer.panels.style import beside, beside_boxed, leave_room, muted, small_wrapped, tip
-from langsplat_viewer.seeing import MOST_DEGREE, SIZE_RANGE, Clip, Splats
+from langsplat_viewer.pictures import splitting
 from langsplat_viewer.viewer import Viewer
 
 CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut can be chosen

@@ -12,14 +12,21 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Camera
-from langsplat_viewer.controls import extent_of, focus, from_camera, holding_distance
-from langsplat_viewer.film_files import MOST_FRAMES, VIDEO, Film, check_film, is_folder, write_film
-from langsplat_viewer.flight import Motion, frame_times, turntable
-from langsplat_viewer.flight_files import read_flight
-from langsplat_viewer.frame import Backend
-from langsplat_viewer.headless import Drawn, Subject, painter
-from langsplat_viewer.looking import why_nothing
-from langsplat_viewer.still import Prepared, StillRequest, in_one_line, prepare, say_drawing, say_unread
+from langsplat_viewer.camera.controls import extent_of, focus, from_camera, holding_distance
+from langsplat_viewer.camera.flight import Motion, frame_times, turntable
+from langsplat_viewer.drawing.frame import Backend
+from langsplat_viewer.drawing.looking import why_nothing
+from langsplat_viewer.files.flight_files import read_flight
+from langsplat_viewer.output.film_files import MOST_FRAMES, VIDEO, Film, check_film, is_folder, write_film
+from langsplat_viewer.output.headless import Drawn, Subject, painter
+from langsplat_viewer.output.still import (
+    Prepared,
+    StillRequest,
+    in_one_line,
+    prepare,
+    say_drawing,
+    say_unread,
+)
 from langsplat_viewer.viewer import Services
 
 log = logging.getLogger("langsplat")

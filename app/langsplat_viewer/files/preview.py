@@ -12,7 +12,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
 from langsplat_core.formats import write_ply
 from langsplat_core.scene import Gaussians
-from langsplat_viewer.watching import Stamps, stamps
+from langsplat_viewer.files.watching import Stamps, stamps
 
 PARTS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh_dc", "sh_rest")
 IN_TRAINING = ".checkpoint.safetensors"

@@ -12,8 +12,8 @@ from langsplat_core.raster import Rasterizer
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer, GlView, Source
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.stopwatch import lap
-from langsplat_viewer.channels import ArrayChannels, Channel, surface_depths
-from langsplat_viewer.sight import LastView, Sight
+from langsplat_viewer.drawing.channels import ArrayChannels, Channel, surface_depths
+from langsplat_viewer.drawing.sight import LastView, Sight
 
 Textures = tuple[moderngl.Texture, ...]  # colours with alpha, then one for each channel that was wanted
 

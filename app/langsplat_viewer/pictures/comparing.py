@@ -6,11 +6,11 @@ from copy import copy
 from langsplat_core.arrays import Array
 from langsplat_core.display.compose import compose
 from langsplat_core.raster import load_rasterizer
-from langsplat_viewer import splitting
-from langsplat_viewer.channels import ArrayChannels
-from langsplat_viewer.looking import drawn_scene
-from langsplat_viewer.marked_scene import layers_of, marked_scene
-from langsplat_viewer.sight import Sight
+from langsplat_viewer.drawing.channels import ArrayChannels
+from langsplat_viewer.drawing.looking import drawn_scene
+from langsplat_viewer.drawing.sight import Sight
+from langsplat_viewer.pictures import splitting
+from langsplat_viewer.pictures.marked_scene import layers_of, marked_scene
 from langsplat_viewer.state import ViewerState
 
 LONGEST_SIDE = 160  # pixels: the reference takes as long for more, but what is shown is drawn in the window

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera
-from langsplat_viewer.controls import Extent, OrbitCamera, from_camera, symmetric_intrinsics
+from langsplat_viewer.camera.controls import Extent, OrbitCamera, from_camera, symmetric_intrinsics
 
 SAME = 1e-9  # a step as small as this, of the largest coordinate or in radians, is none
 FOV_LIMITS = (0.01, 179.0)  # degrees

@@ -9,8 +9,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.compose import HeatRanges
 from langsplat_core.scene import Camera, Scene
-from langsplat_viewer.channels import Layers
-from langsplat_viewer.seeing import Clip
+from langsplat_viewer.drawing.channels import Layers
+from langsplat_viewer.drawing.seeing import Clip
 
 
 class Renderer(Protocol):

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from langsplat_core.formats.sog import META_NAME
-from langsplat_viewer.flight_files import SUFFIX as PATHS
-from langsplat_viewer.querysets import SUFFIX as QUERIES
+from langsplat_viewer.files.flight_files import SUFFIX as PATHS
+from langsplat_viewer.files.querysets import SUFFIX as QUERIES
 
 SCENE_SUFFIXES = (".ply", ".spz", ".splat", ".ksplat", ".sog")
 MOST = 2000  # entries of a folder that are listed

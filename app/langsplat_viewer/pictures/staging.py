@@ -5,12 +5,12 @@ from dataclasses import replace
 
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.merging import Merged, merged
-from langsplat_viewer.channels import Layers
-from langsplat_viewer.depiction import Depiction
+from langsplat_viewer.drawing.channels import Layers
+from langsplat_viewer.drawing.looking import drawn_scene
+from langsplat_viewer.drawing.renderer import Renderer
 from langsplat_viewer.jobs import Worker
-from langsplat_viewer.looking import drawn_scene
-from langsplat_viewer.marked_scene import MarkedScene, layers_of
-from langsplat_viewer.renderer import Renderer
+from langsplat_viewer.pictures.depiction import Depiction
+from langsplat_viewer.pictures.marked_scene import MarkedScene, layers_of
 from langsplat_viewer.state import ViewerState
 
 

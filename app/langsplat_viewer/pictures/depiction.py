@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.compose import HeatRanges
 from langsplat_core.scene import Scene
-from langsplat_viewer import splitting
-from langsplat_viewer.controls import OrbitCamera
-from langsplat_viewer.seeing import Clip, Splats
-from langsplat_viewer.selecting import Marks
+from langsplat_viewer.camera.controls import OrbitCamera
+from langsplat_viewer.drawing.seeing import Clip, Splats
+from langsplat_viewer.marks.selecting import Marks
+from langsplat_viewer.pictures import splitting
 from langsplat_viewer.state import ViewerState
 
 

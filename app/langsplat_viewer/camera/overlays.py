@@ -9,8 +9,8 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera
-from langsplat_viewer.controls import Extent
-from langsplat_viewer.framing import Sample
+from langsplat_viewer.camera.controls import Extent
+from langsplat_viewer.camera.framing import Sample
 
 LEAST_DEPTH = 1e-3  # of the scene's radius: lines end this far in front of the eye
 FRUSTUM_DEPTH = 0.12  # of the scene's radius: how deep a camera is drawn

@@ -18,7 +18,7 @@ from langsplat_core.files import atomic_path
 from langsplat_core.formats.cameras_json import is_rotation, numbers
 from langsplat_core.parsing.opening import read_json_file
 from langsplat_core.scene import FARTHEST
-from langsplat_viewer.flight import FOV_LIMITS, LONGEST, SAME_TIME, Flight, Keyframe, Pose
+from langsplat_viewer.camera.flight import FOV_LIMITS, LONGEST, SAME_TIME, Flight, Keyframe, Pose
 
 SUFFIX = ".path.json"  # that ours have
 MARK, VERSION = "langsplat_flight", 1

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from langsplat_core.config import RasterSettings
 from langsplat_core.raster import Rasterizer, View
 from langsplat_core.scene import Camera, Scene
-from langsplat_viewer.looking import looking_settings
-from langsplat_viewer.seeing import UNCLIPPED, Clip
+from langsplat_viewer.drawing.looking import looking_settings
+from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,15 +21,15 @@ from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.phrases import split_phrases
-from langsplat_viewer import painting
-from langsplat_viewer.channels import Layers
-from langsplat_viewer.controls import default_view, extent_of
-from langsplat_viewer.frame import Backend
-from langsplat_viewer.headless import Subject, draw_something, painter
-from langsplat_viewer.looking import why_undrawable
+from langsplat_viewer.camera.controls import default_view, extent_of
+from langsplat_viewer.drawing import painting
+from langsplat_viewer.drawing.channels import Layers
+from langsplat_viewer.drawing.frame import Backend
+from langsplat_viewer.drawing.looking import why_undrawable
+from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
 from langsplat_viewer.options import check_display, chosen_camera, latent_level, say_compiling
-from langsplat_viewer.saving import save_png
-from langsplat_viewer.seeing import UNCLIPPED, Clip
+from langsplat_viewer.output.headless import Subject, draw_something, painter
+from langsplat_viewer.output.saving import save_png
 from langsplat_viewer.state import SLOTS
 from langsplat_viewer.viewer import Services
 

@@ -10,8 +10,8 @@ from langsplat_core.errors import FormatError, InputError, printable_line
 from langsplat_core.files import atomic_path
 from langsplat_core.formats.cameras_json import numbers
 from langsplat_core.parsing.opening import read_json_file
-from langsplat_viewer.flight import Pose
-from langsplat_viewer.flight_files import pose_entry, pose_from
+from langsplat_viewer.camera.flight import Pose
+from langsplat_viewer.files.flight_files import pose_entry, pose_from
 
 FILE_NAME = "bookmarks.json"
 MOST, MOST_SCENES = 50, 200  # of a scene; scenes, those that were marked last

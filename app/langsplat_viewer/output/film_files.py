@@ -19,7 +19,7 @@ from PIL import Image
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError, printable_line
 from langsplat_core.files import atomic_path, check_output_file, check_output_folder
-from langsplat_viewer.saving import save_png
+from langsplat_viewer.output.saving import save_png
 
 VIDEO, ANIMATIONS = ".mp4", (".webp", ".gif")
 SETTINGS = "film.json"  # in a folder of pictures: what they are pictures of

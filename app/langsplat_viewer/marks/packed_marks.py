@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_viewer.selecting import Marks
+from langsplat_viewer.marks.selecting import Marks
 
 NAMES = tuple(field.name for field in fields(Marks))
 

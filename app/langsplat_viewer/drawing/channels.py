@@ -14,8 +14,8 @@ from langsplat_core.raster import Rasterizer, View
 from langsplat_core.raster.protocol import MedianDepth
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Camera, Gaussians
-from langsplat_viewer.seeing import UNCLIPPED, Clip
-from langsplat_viewer.sight import LastView, Sight
+from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
+from langsplat_viewer.drawing.sight import LastView, Sight
 
 _DEPTH_SAMPLE = 20_000  # Gaussians looked at for the depth range; quantiles need no more
 

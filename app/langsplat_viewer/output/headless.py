@@ -13,11 +13,11 @@ from langsplat_core.errors import BackendError, InputError
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.opengl.context import create_egl_context
 from langsplat_core.scene import Camera, Scene
-from langsplat_viewer.channels import ArrayChannels, Layers
-from langsplat_viewer.frame import Backend, FrameRenderer, suits_opengl
-from langsplat_viewer.looking import VISIBLE_ALPHA, why_nothing
-from langsplat_viewer.seeing import UNCLIPPED, Clip
-from langsplat_viewer.sight import Sight
+from langsplat_viewer.drawing.channels import ArrayChannels, Layers
+from langsplat_viewer.drawing.frame import Backend, FrameRenderer, suits_opengl
+from langsplat_viewer.drawing.looking import VISIBLE_ALPHA, why_nothing
+from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
+from langsplat_viewer.drawing.sight import Sight
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,11 +22,11 @@ from langsplat_core.raster.opengl.context import is_software
 from langsplat_core.raster.opengl.draw import drawing, set_uniforms, shader
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.stopwatch import lap
-from langsplat_viewer.channel_textures import ArraySource, ChannelSource, GlSource, Textures
-from langsplat_viewer.channels import Channel, Layers, depth_range
-from langsplat_viewer.looking import VISIBLE_ALPHA
-from langsplat_viewer.seeing import UNCLIPPED, Clip
-from langsplat_viewer.sight import Sight
+from langsplat_viewer.drawing.channel_textures import ArraySource, ChannelSource, GlSource, Textures
+from langsplat_viewer.drawing.channels import Channel, Layers, depth_range
+from langsplat_viewer.drawing.looking import VISIBLE_ALPHA
+from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
+from langsplat_viewer.drawing.sight import Sight
 
 Backend = Literal["auto", "opengl", "cpu", "cuda"]
 PICK_ALPHA = 0.1  # a pixel with less alpha shows nothing that could be picked

@@ -11,8 +11,8 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.formats.inria_layout import SH_C0
 from langsplat_core.scene import Scene
-from langsplat_viewer.channels import Layers
-from langsplat_viewer.selecting import Marks
+from langsplat_viewer.drawing.channels import Layers
+from langsplat_viewer.marks.selecting import Marks
 from langsplat_viewer.state import ViewerState
 
 TINT = np.array([1.0, 0.15, 0.85], np.float32)  # unlike the colours of queries, and rare in photographs

@@ -16,7 +16,7 @@ from langsplat_core.config import Display
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.seeing import Split
+from langsplat_viewer.drawing.seeing import Split
 from langsplat_viewer.state import ViewerState
 
 _AT_LEVEL: WeakKeyDictionary[QueryResult, tuple[QueryResult, ...]] = WeakKeyDictionary()

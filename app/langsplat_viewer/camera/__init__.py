@@ -1,0 +1,1 @@
+"""Where one stands, as plain maths: no window, no graphics device."""

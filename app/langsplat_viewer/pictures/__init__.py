@@ -1,0 +1,1 @@
+"""Which pictures the state asks for, and what they depend on."""
