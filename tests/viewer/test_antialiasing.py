@@ -15,6 +15,7 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Scene
 from langsplat_viewer.drawing.channels import ArrayChannels, Layers
 from langsplat_viewer.drawing.frame import FrameRenderer
+from langsplat_viewer.drawing.sight import Sight
 from tests.support.scenes import random_camera, random_gaussians
 
 PICTURE = PictureConfig(display="alpha")
@@ -40,11 +41,11 @@ def test_a_marked_file_is_drawn_as_the_reference_draws_it(tmp_path, gl, antialia
     )
     assert np.abs(want - other).max() > 0.05  # the mark is worth something
     channels = ArrayChannels(load_rasterizer("cpu"))
-    drawn = channels.render(scene, Layers(), camera, "none")
+    drawn = channels.render(Sight(scene, camera), Layers(), "none")
     np.testing.assert_allclose(drawn.alpha, want, atol=1e-4)
     row, column = np.unravel_index(np.argmax(want), want.shape)
     np.testing.assert_allclose(
-        channels.depth_at(scene, camera, int(column), int(row))[1], want.max(), atol=1e-4
+        channels.depth_at(Sight(scene, camera), int(column), int(row))[1], want.max(), atol=1e-4
     )
     frame = FrameRenderer(gl, "opengl", "single")
     frame.set_scene(scene)
@@ -58,6 +59,6 @@ def test_a_marked_file_is_drawn_as_the_reference_draws_it(tmp_path, gl, antialia
 def test_the_same_gaussians_with_another_mark_are_projected_anew(tmp_path):
     scene, camera = small_scene(tmp_path, True), random_camera(1)
     channels = ArrayChannels(load_rasterizer("cpu"))
-    first = channels.render(scene, Layers(), camera, "none").alpha
-    second = channels.render(replace(scene, antialiased=False), Layers(), camera, "none").alpha
+    first = channels.render(Sight(scene, camera), Layers(), "none").alpha
+    second = channels.render(Sight(replace(scene, antialiased=False), camera), Layers(), "none").alpha
     assert np.abs(first - second).max() > 0.05
