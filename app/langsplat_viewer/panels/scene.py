@@ -5,7 +5,7 @@ from pathlib import Path
 from imgui_bundle import ImVec2, imgui
 
 from langsplat_viewer import actions, saving
-from langsplat_viewer.panels.style import elided, muted, small_wrapped, tip
+from langsplat_viewer.panels.style import bad, elided, muted, small_wrapped, tip
 from langsplat_viewer.viewer import Viewer
 
 DIALOG_PROGRAMS = ("zenity", "kdialog", "matedialog", "qarma")  # one of them draws the dialog on Linux
@@ -19,6 +19,9 @@ def draw(viewer: Viewer) -> None:
     else:
         imgui.text(state.path.name if state.path else "scene")
         small_wrapped(_figures(viewer), muted())
+        for doubt in state.doubts:
+            small_wrapped(doubt.partition(":")[0], bad())
+            tip(doubt)
     if imgui.button("Open ..."):
         actions.ask_for_file(viewer)
     imgui.same_line()
