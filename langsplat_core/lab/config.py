@@ -191,3 +191,17 @@ class QueryBenchConfig:
     """Of every timing of a view and a picture, of which the median is taken."""
     codec_steps: Count = 3_000
     """Of the training of the autoencoder that stands beside the codebook."""
+
+
+@dataclass(frozen=True)
+class EnduranceConfig:
+    """What one process is put through (`langsplat bench endurance`)."""
+
+    count: Count = 5_000_000
+    """Gaussians; the scene's are repeated, each beside itself, until there are so many."""
+    size: Size = (7680, 4320)
+    """Width and height of the pictures, pixels."""
+    pictures: Count = 8
+    """That are drawn behind the first one."""
+    phrases: Count = 1_000
+    """That are asked, one after the other; none twice."""
