@@ -111,6 +111,7 @@ class ViewerState:
     view: OrbitCamera | None = None
     glide: Glide | None = None
     opening_camera: Camera | None = None  # what R returns to, where that is not the scene's own choice
+    doubts: tuple[str, ...] = ()  # what its training says against the scene, with the remedies
     nothing: str = ""  # why the picture shows nothing of the scene, where it does not
     camera_index: int | None = None  # training camera last jumped to
     fly_speed: float = 0.5  # scene radii per second

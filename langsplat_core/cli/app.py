@@ -8,6 +8,7 @@ from types import MappingProxyType
 from tyro.extras import SubcommandApp
 
 from langsplat_core.cli.bench import BenchRaster
+from langsplat_core.cli.bench_endurance import BenchEndurance
 from langsplat_core.cli.bench_gains import BenchGains
 from langsplat_core.cli.bench_lift import BenchLift
 from langsplat_core.cli.bench_load import BenchLoad
@@ -69,6 +70,7 @@ GROUPS: Mapping[str, tuple[str, Mapping[str, type[Command]]]] = MappingProxyType
             "Speed against error, measured in one run.",
             {
                 "raster": BenchRaster,
+                "endurance": BenchEndurance,
                 "gains": BenchGains,
                 "lift": BenchLift,
                 "paper": BenchPaper,

@@ -47,8 +47,8 @@ class Train:
 
         crew = join_crew()
         shown = LineProgress() if self.progress == "lines" else TerminalProgress()
-        photographs, has_cameras = count_photographs(self.dataset)
-        stages = plan(self.config, photographs, has_cameras, self.gaussians is not None)
+        photographs, given = count_photographs(self.dataset)
+        stages = plan(self.config, photographs, given, self.gaussians is not None)
         if crew.leads and photographs:
             log.info("%d photographs: %s", photographs, forecast_in_words(stages))
         with shown if crew.leads else nullcontext(silent) as progress:

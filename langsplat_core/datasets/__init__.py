@@ -28,9 +28,9 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
 
     Recognises, in this order, a nerfstudio ``transforms.json``, a COLMAP model, and plain photographs,
     whose cameras are then found by structure from motion. A dataset with cameras but without points gets
-    triangulated ones. Whatever had to be computed is kept in ``work/sfm-*`` and not computed again for the
-    same photographs. The world is the dataset's own. What had to be left out is reported once, by a
-    warning of the logger "langsplat". Raises InputError where nothing usable remains.
+    ones that are triangulated from its training views. Whatever had to be computed is kept in ``work/sfm-*``
+    and not computed again for the same photographs. The world is the dataset's own. What had to be left out
+    is reported once, by a warning of the logger "langsplat". Raises InputError where nothing usable remains.
     """
     path = Path(path)
     check_settings(config, "--dataset.")
@@ -42,7 +42,9 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
         raise InputError(f"{error.filename}: may not be read ({error.strerror}); see to its rights") from None
     if config.metres_per_unit is not None:
         capture = replace(capture, metres_per_unit=config.metres_per_unit)
-    return capture if len(capture.points) else add_points(capture, work, progress)
+    if len(capture.points):
+        return capture
+    return add_points(capture, capture.split(config.test_every)[0], work, progress)
 
 
 def _load(path: Path, config: DatasetConfig, work: Path, progress: Progress) -> Capture:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array
+from langsplat_core.datasets.images import Photo
 from langsplat_core.scene import Camera
 
 log = logging.getLogger("langsplat")
@@ -34,6 +35,7 @@ class Capture:
     points: Array  # (M, 3) float64 structure-from-motion points; M may be 0
     colours: Array  # (M, 3) uint8
     metres_per_unit: float | None = None  # > 0, how long a unit of its world is; None: unknown
+    photos: tuple[Photo, ...] = ()  # the files, in the same order; none for pictures made otherwise
 
     def __post_init__(self) -> None:
         if len(self.cameras) != len(self.images):
@@ -42,6 +44,8 @@ class Capture:
             check_array(f"photograph {camera.name}", image, (camera.height, camera.width, 3), dtype=np.uint8)
         dims = check_array("points", self.points, ("M", 3))
         check_array("colours", self.colours, ("M", 3), dims)
+        if self.photos and len(self.photos) != len(self.images):
+            raise ValueError(f"{len(self.photos)} files for {len(self.images)} photographs")
 
     def __len__(self) -> int:
         return len(self.cameras)

@@ -1,4 +1,4 @@
-"""Datasets with a COLMAP model: ``sparse/0`` or ``sparse`` beside ``images``."""
+"""Datasets with a COLMAP model: ``sparse/0`` (or another number) or ``sparse``, beside ``images``."""
 
 import logging
 import os
@@ -8,7 +8,13 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.datasets.capture import Capture, tell_of_lost_points
-from langsplat_core.datasets.colmap_model import ModelCamera, SparseModel, has_model, read_model
+from langsplat_core.datasets.colmap_model import (
+    ModelCamera,
+    SparseModel,
+    has_model,
+    read_images,
+    read_model,
+)
 from langsplat_core.datasets.images import Photo, develop, find_photos, shortened
 from langsplat_core.datasets.intrinsics import (
     BrownDistortion,
@@ -31,8 +37,37 @@ _INTRINSICS = ("fx", "fy", "cx", "cy")
 
 
 def find_model(folder: Path) -> Path | None:
-    """The folder of the COLMAP model of a dataset, if it has one."""
-    return next((f for f in (folder / "sparse" / "0", folder / "sparse") if has_model(f)), None)
+    """The folder of the COLMAP model of a dataset, if it has one.
+
+    Photographs that COLMAP cannot place together end in several models, of which the first is not always the
+    largest: that with most photographs is taken, of equal ones the first, and a warning says which.
+    """
+    sparse = folder / "sparse"
+    inside = sorted(sparse.iterdir(), key=lambda f: (len(f.name), f.name)) if sparse.is_dir() else []
+    found = [f for f in inside if has_model(f)]
+    if len(found) < 2:
+        return next((f for f in (*found, sparse) if has_model(f)), None)
+    counts = [_photographs_of(f) for f in found]
+    best = found[counts.index(max(counts))]
+    if max(counts):
+        each = ", ".join(f"{f.name}: {count}" for f, count in zip(found[:5], counts, strict=False))
+        log.warning(
+            "%s has %d models; %s is taken, which has most photographs (%s%s)",
+            shown(sparse),
+            len(found),
+            printable_line(best.name, 60),
+            printable_line(each, 200),
+            ", ..." if len(found) > 5 else "",
+        )
+    return best
+
+
+def _photographs_of(model_folder: Path) -> int:
+    """How many a model has cameras for; none if it is damaged."""
+    try:
+        return len({image.name for image in read_images(model_folder)})
+    except FormatError:
+        return 0
 
 
 def intrinsics_of(camera: ModelCamera) -> PhotoIntrinsics:
@@ -77,8 +112,8 @@ def load_colmap(folder: Path, model_folder: Path, max_side: int, progress: Progr
             len(there),
             present,
         )
-    cameras, images = develop(there, max_side, progress)
-    return Capture(cameras, images, *good_points(model))
+    cameras, images, files = develop(there, max_side, progress)
+    return Capture(cameras, images, *good_points(model), photos=files)
 
 
 def _photo_folder(folder: Path, model: SparseModel) -> Path:

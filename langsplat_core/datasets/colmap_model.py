@@ -87,6 +87,14 @@ def has_model(folder: Path) -> bool:
     return _suffix(folder) is not None
 
 
+def _suffix_of(folder: Path) -> str:
+    """InputError where there is no model."""
+    suffix = _suffix(folder)
+    if suffix is None:
+        raise InputError(f"{folder} holds no cameras.bin and images.bin (or .txt)")
+    return suffix
+
+
 def _suffix(folder: Path) -> str | None:
     for suffix in (".bin", ".txt"):
         if all((folder / f"{part}{suffix}").is_file() for part in ("cameras", "images")):
@@ -94,14 +102,18 @@ def _suffix(folder: Path) -> str | None:
     return None
 
 
+def read_images(folder: Path) -> list[ModelImage]:
+    """Those of the model in `folder`, alone. FormatError where they are damaged."""
+    suffix = _suffix_of(folder)
+    return _guarded((_BINARY if suffix == ".bin" else _TEXT)[1], folder / f"images{suffix}")
+
+
 def read_model(folder: Path) -> SparseModel:
     """Read the model in `folder`; binary is preferred. FormatError names the file that is broken."""
-    suffix = _suffix(folder)
-    if suffix is None:
-        raise InputError(f"{folder} holds no cameras.bin and images.bin (or .txt)")
-    read_cameras, read_images, read_points = _BINARY if suffix == ".bin" else _TEXT
+    suffix = _suffix_of(folder)
+    read_cameras, _, read_points = _BINARY if suffix == ".bin" else _TEXT
     cameras = _guarded(read_cameras, folder / f"cameras{suffix}")
-    images = _guarded(read_images, folder / f"images{suffix}")
+    images = read_images(folder)
     for image in images:
         if image.camera_id not in cameras:
             raise FormatError(

@@ -1,7 +1,7 @@
 """Photographs: finding them, reading them whatever their kind, and making pinhole pictures of them."""
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -120,17 +120,9 @@ def _fits(size: tuple[int, int], intrinsics: PhotoIntrinsics) -> bool:
     )
 
 
-def develop(
-    photos: Sequence[Photo], max_side: int, progress: Progress
-) -> tuple[tuple[Camera, ...], tuple[Array, ...]]:
-    """Pinhole cameras and (H, W, 3) uint8 pictures of `photos`, sorted by name.
-
-    Files that cannot be read are reported once and left out; InputError when none is left.
-    """
-    if not photos:
-        raise InputError("the dataset lists no photographs")
-    names = unique_names([photo.label for photo in photos])
-    order = sorted(range(len(photos)), key=names.__getitem__)
+def developer(max_side: int) -> Callable[[Photo], tuple[Camera, Array]]:
+    """What makes a pinhole camera, yet without a name, and a (H, W, 3) uint8 picture of at most `max_side`
+    pixels of a photograph. It raises PictureError for a file that cannot be read."""
 
     # Photographs of one lens share its pinhole and its map; a few maps are kept, not one per photograph.
     @lru_cache(maxsize=4)
@@ -138,29 +130,50 @@ def develop(
         camera = pinhole_for(intrinsics, max_side)
         return camera, None if intrinsics.distortion is None else source_positions(intrinsics, camera)
 
-    def one(index: int) -> tuple[Camera, Array] | str:
-        photo = photos[index]
-        try:
-            picture, intrinsics = _read_for(photo)
-        except PictureError as error:
-            return f"{photo.label} ({error.reason})"
+    def one(photo: Photo) -> tuple[Camera, Array]:
+        picture, intrinsics = _read_for(photo)
         camera, positions = plan(intrinsics)
-        pose = replace(camera, world_to_camera=photo.world_to_camera, name=names[index])
+        pose = replace(camera, world_to_camera=photo.world_to_camera)
         return pose, resample(picture, intrinsics, camera, positions)
 
+    return one
+
+
+def develop(
+    photos: Sequence[Photo], max_side: int, progress: Progress
+) -> tuple[tuple[Camera, ...], tuple[Array, ...], tuple[Photo, ...]]:
+    """Pinhole cameras and (H, W, 3) uint8 pictures of `photos`, sorted by name, and what each is made from.
+
+    Files that cannot be read are reported once and left out; InputError when none is left.
+    """
+    if not photos:
+        raise InputError("the dataset lists no photographs")
+    names = unique_names([photo.label for photo in photos])
+    order = sorted(range(len(photos)), key=names.__getitem__)
+    read = developer(max_side)
+
+    def one(index: int) -> tuple[Camera, Array, Photo] | str:
+        photo = photos[index]
+        try:
+            camera, picture = read(photo)
+        except PictureError as error:
+            return f"{photo.label} ({error.reason})"
+        return replace(camera, name=names[index]), picture, photo
+
     album = Album()
-    done: list[tuple[Camera, Array]] = []
+    done: list[tuple[Camera, Array, Photo]] = []
     broken: list[str] = []
     with ThreadPoolExecutor(WORKERS) as pool:
         for count, result in enumerate(pool.map(one, order), 1):
             if isinstance(result, str):
                 broken.append(result)
             else:
-                done.append((result[0], album.keep(result[1])))
+                camera, picture, photo = result
+                done.append((camera, album.keep(picture), photo))
             progress("reading photographs", count / len(order))
     if not done:
         raise InputError(f"no photograph can be read: {shortened(broken)}")
     if broken:
         log.warning("%d photographs cannot be read and are left out: %s", len(broken), shortened(broken))
-    cameras, images = zip(*done, strict=True)
-    return cameras, images
+    cameras, images, files = zip(*done, strict=True)
+    return cameras, images, files

@@ -56,8 +56,9 @@ def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
         except ValueError as error:
             raise FormatError(f"{where} ({printable_line(label, 60)}): {error}") from None
     _report_missing(file, missing, len(frames))
-    cameras, images = develop(list(photos.values()), max_side, progress)
-    return Capture(cameras, images, *_points(file, top.get("ply_file_path")), _metres_per_unit(file, top))
+    cameras, images, files = develop(list(photos.values()), max_side, progress)
+    points, colours = _points(file, top.get("ply_file_path"))
+    return Capture(cameras, images, points, colours, _metres_per_unit(file, top), files)
 
 
 def _metres_per_unit(file: Path, top: Json) -> float | None:

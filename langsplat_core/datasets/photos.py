@@ -77,8 +77,8 @@ def load_photos(
         Photo(numbered[p.label], numbered[p.label].name, p.intrinsics, p.world_to_camera, upright=True)
         for p in located
     ]
-    cameras, images = develop(photos, max_side, progress)
-    return Capture(cameras, images, *good_points(model))
+    cameras, images, files = develop(photos, max_side, progress)
+    return Capture(cameras, images, *good_points(model), photos=files)
 
 
 def _content(path: Path) -> str:

@@ -203,3 +203,17 @@ class MovingBenchConfig:
     """Width and height of the full picture, pixels."""
     views: Count = 12
     """Cameras of the scene, evenly chosen."""
+
+
+@dataclass(frozen=True)
+class EnduranceConfig:
+    """What one process is put through (`langsplat bench endurance`)."""
+
+    count: Count = 5_000_000
+    """Gaussians; the scene's are repeated, each beside itself, until there are so many."""
+    size: Size = (7680, 4320)
+    """Width and height of the pictures, pixels."""
+    pictures: Count = 8
+    """That are drawn behind the first one."""
+    phrases: Count = 1_000
+    """That are asked, one after the other; none twice."""

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from langsplat_core.config import MaskConfig, TrainConfig
 from langsplat_core.parsing.pictures import PHOTO_SUFFIXES
@@ -17,6 +18,7 @@ ASPECT = 0.75  # height by width of an ordinary photograph
 SLOWEST, FASTEST = 20.0, 0.02  # limits of the pace: more is a sleeping machine, less a stage that was kept
 SURE = 0.05  # share of a stage from which its own speed is trusted
 ALL = "all stages"
+Given = Literal["nothing", "cameras", "points"]  # what photographs come with: cameras, or cameras and points
 
 
 @dataclass(frozen=True)
@@ -28,13 +30,13 @@ class Stage:
     seconds: float  # that it is expected to take
 
 
-def plan(config: TrainConfig, photographs: int, has_cameras: bool, has_gaussians: bool) -> tuple[Stage, ...]:
+def plan(config: TrainConfig, photographs: int, given: Given, has_gaussians: bool) -> tuple[Stage, ...]:
     """The stages of a training from so many photographs, in their order."""
     megapixels = ASPECT * config.dataset.max_side**2 / 1e6
     per_photograph = _mask_seconds(config.masks, megapixels) + _encoder_seconds(config.clip.model)
     gaussians = config.radiance.max_gaussians
-    # A step costs what it draws, and what it keeps: 0.03 s at 0.1 megapixels, 0.1 s at 100 000 Gaussians.
-    step = 0.5 * megapixels + 1e-6 * min(gaussians, 300_000)
+    # A step costs what it draws, and what it keeps: 0.02 s at 0.1 megapixels, 0.1 s at 100 000 Gaussians.
+    step = 0.2 * megapixels + 1e-6 * min(gaussians, 300_000)
     codec = 3 + 0.02 * min(config.codec.size or 2500, 4096)
     lifting = photographs * (0.2 + 0.5 * megapixels) + 1e-4 * gaussians * min(photographs, 100) / 50
     if config.lift.mode == "gradient":
@@ -46,7 +48,7 @@ def plan(config: TrainConfig, photographs: int, has_cameras: bool, has_gaussians
                 *("preparing photographs", "finding features", "matching photographs", "locating cameras"),
                 *("triangulating points", "reading photographs"),
             ),
-            photographs * (0.05 if has_cameras else 6.0),
+            photographs * {"nothing": 5.0, "cameras": 2.5, "points": 0.05}[given],
         ),
         Stage("masks and vectors", ("masks (",), photographs * per_photograph),
         Stage("Gaussians", ("Training Gaussians",), 0.0 if has_gaussians else config.radiance.steps * step),
@@ -56,7 +58,7 @@ def plan(config: TrainConfig, photographs: int, has_cameras: bool, has_gaussians
 
 def _mask_seconds(masks: MaskConfig, megapixels: float) -> float:
     if not masks.sam or masks.source == "graph":
-        return 18 * megapixels
+        return 0.4 + megapixels
     return 590.0 * (5 if masks.crop_layers else 1) if "huge" in masks.sam else 330.0
 
 
@@ -64,15 +66,22 @@ def _encoder_seconds(model: str) -> float:
     return 1.2 if model == "demo" else 130.0
 
 
-def count_photographs(dataset: Path) -> tuple[int, bool]:
-    """How many photographs lie in a dataset, and whether cameras come with them. Does not raise."""
+def count_photographs(dataset: Path) -> tuple[int, Given]:
+    """How many photographs lie in a dataset, and what comes with them. Does not raise."""
     try:
         folder = dataset if dataset.is_dir() else dataset.parent
-        has_cameras = (folder / "transforms.json").is_file() or (folder / "sparse").is_dir()
         images = folder / "images" if (folder / "images").is_dir() else folder
-        return sum(path.suffix.lower() in PHOTO_SUFFIXES for path in images.iterdir()), has_cameras
+        return sum(path.suffix.lower() in PHOTO_SUFFIXES for path in images.iterdir()), _given(folder)
     except OSError:
-        return 0, False
+        return 0, "nothing"
+
+
+def _given(folder: Path) -> Given:
+    """COLMAP's models have points as a rule; a transforms.json has cameras, and may name a file of points."""
+    frames = folder / "transforms.json"
+    if frames.is_file():
+        return "points" if b'"ply_file_path"' in frames.read_bytes() else "cameras"
+    return "points" if (folder / "sparse").is_dir() else "nothing"
 
 
 def in_words(seconds: float) -> str:

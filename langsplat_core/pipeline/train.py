@@ -4,12 +4,11 @@ Every stage keeps its result in the work folder under a key of its settings, so 
 continues where it stopped and a changed setting recomputes only what depends on it.
 """
 
-import json
 import logging
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +17,13 @@ from langsplat_core.config import RadianceConfig, TrainConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
-from langsplat_core.files import atomic_path, check_output_folder, shown
+from langsplat_core.files import check_output_folder, shown
 from langsplat_core.formats import check_writable, load_scene, read_ply, save_scene, write_ply
 from langsplat_core.pipeline.crew import Crew
 from langsplat_core.pipeline.doubts import doubts
 from langsplat_core.pipeline.language import language_field
 from langsplat_core.pipeline.lock import sole_use
+from langsplat_core.pipeline.report import TrainReport, read_report, work_folder, write_report
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.views import StoredViews
 from langsplat_core.progress import Progress, silent
@@ -35,31 +35,9 @@ from langsplat_core.semantics.sources import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, StoredFeatures, describe_capture
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 
-REPORT = "report.json"  # in the work folder
 FEWEST_VIEWS = 3
 
 log = logging.getLogger("langsplat")
-
-
-@dataclass(frozen=True)
-class TrainReport:
-    """What a run did, as written to `report.json` in its work folder."""
-
-    views: int
-    held_out: int
-    gaussians: int
-    psnr: float | None  # mean over held-out views, dB; None without held-out views
-    masks: str  # name of the mask source
-    encoder: str
-    mask_count: int
-    codec: str  # its kind
-    codec_size: int  # codewords of a codebook, numbers per latent of other kinds
-    codec_cosine: float  # mean, of a Gaussian's vector with what the codec makes of it
-    relevancy_error: float  # mean absolute, of what the codec makes of it, over everyday phrases
-    relevancy_error_p99: float
-    observed: float  # fraction of Gaussians with a meaning at the whole level
-    doubts: tuple[str, ...]  # what speaks against the scene, with the remedy
-    seconds: dict[str, float]  # per stage, of this run: a stage that was already done takes almost none
 
 
 def train_scene(
@@ -81,7 +59,7 @@ def train_scene(
     check_settings(config)
     if out.suffix.lower() != ".ply":
         raise InputError(f"{out}: the scene must be named *.ply, for example --out {out.with_suffix('.ply')}")
-    work = work or out.with_name(out.stem + ".work")
+    work = work or work_folder(out)
     check_writable(out)
     check_output_folder(work)
     # First: a scene that cannot be read should not cost an hour.
@@ -159,11 +137,9 @@ def _train(
             doubts=doubts(scores, cameras),
             seconds=clock.laps,
         )
-        with atomic_path(work / REPORT) as temporary:
-            temporary.write_text(json.dumps(asdict(report), indent=1))
+        write_report(work, report)
     crew.meet()
-    stated = json.loads((work / REPORT).read_text())
-    return TrainReport(**stated | {"doubts": tuple(stated["doubts"])})
+    return read_report(work)
 
 
 def trained_gaussians(

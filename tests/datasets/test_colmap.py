@@ -10,7 +10,7 @@ from PIL import Image
 
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture
-from langsplat_core.datasets.colmap import good_points
+from langsplat_core.datasets.colmap import find_model, good_points
 from langsplat_core.datasets.colmap_model import read_model
 from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
 from langsplat_core.errors import InputError
@@ -88,6 +88,26 @@ def test_a_capture_shows_what_its_cameras_see(tmp_path: Path, form: str, subfold
     assert capture.points.shape == (10, 3)
     assert set(labels) == {"reading photographs"}
     assert not (tmp_path / "work").exists()  # nothing had to be computed
+
+
+def test_of_several_models_the_one_with_most_photographs_is_taken(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name, views in (("0", 2), ("1", 4), ("2", 4), ("10", 3)):
+        write_dataset(tmp_path, subfolder=f"sparse/{name}", views=views)
+    (tmp_path / "sparse/other").mkdir()
+    with caplog.at_level(logging.WARNING, "langsplat"):
+        assert len(load_capture(tmp_path, CONFIG, tmp_path / "work")) == 4
+    (said,) = [record.getMessage() for record in caplog.records if "models" in record.getMessage()]
+    assert "4 models; 1 is taken, which has most photographs (0: 2, 1: 4, 2: 4, 10: 3)" in said
+
+    images = tmp_path / "sparse/1/images.bin"
+    images.write_bytes(images.read_bytes()[:100])
+    assert find_model(tmp_path) == tmp_path / "sparse/2"
+    for path in tmp_path.glob("sparse/*/images.bin"):
+        path.write_bytes(b"\xff" * 20)
+    with pytest.raises(InputError, match=r"sparse/0/images\.bin is no readable COLMAP file"):
+        load_capture(tmp_path, CONFIG, tmp_path / "work")
 
 
 def test_photographs_in_subfolders_keep_apart(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import logging
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,13 @@ from langsplat_core.datasets.sfm import pairs_by_name
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled, silent
 from langsplat_core.scene import Camera, look_at
-from tests.support.photographed import distance_to_room, photograph, poses, write_photos
+from tests.support.photographed import (
+    colmap_reconstruction,
+    distance_to_room,
+    photograph,
+    poses,
+    write_photos,
+)
 
 pytestmark = pytest.mark.long
 
@@ -167,8 +174,8 @@ def known(count: int = VIEWS, size: tuple[int, int] = (320, 240)) -> Capture:
 def test_known_poses_give_points_in_their_own_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = known(4)
     labels: list[str] = []
-    found = add_points(capture, tmp_path, lambda label, _: labels.append(label))
-    assert list(dict.fromkeys(labels)) == ["finding features", "matching photographs", "triangulating points"]
+    found = add_points(capture, range(4), tmp_path, lambda label, _: labels.append(label))
+    assert list(dict.fromkeys(labels)) == [STAGES[0], *STAGES[1:3], "triangulating points"]
     assert found.cameras is capture.cameras
     assert len(found.points) > 200
     assert np.median(distance_to_room(found.points)) < 0.01  # no fitting here: the very same world
@@ -179,7 +186,37 @@ def test_known_poses_give_points_in_their_own_world(tmp_path: Path, monkeypatch:
     assert np.median(np.abs(image[y, x].astype(float) - found.colours[seen])) < 12
 
     monkeypatch.setattr(pycolmap, "extract_features", _never)
-    np.testing.assert_array_equal(add_points(capture, tmp_path, silent).points, found.points)
+    np.testing.assert_array_equal(add_points(capture, range(4), tmp_path, silent).points, found.points)
+
+
+def write_located(folder: Path, count: int) -> None:
+    """Photographs through `LENS` with a COLMAP model of true cameras that has no points."""
+    names = write_photos(folder / "images", LENS, poses(count))
+    params = [LENS.fx, LENS.cx, LENS.cy, -0.06]
+    model = colmap_reconstruction("SIMPLE_RADIAL", (400, 300), params, names, poses(count))
+    (folder / "sparse").mkdir()
+    model.write_binary(folder / "sparse")
+
+
+def test_points_come_from_larger_pictures_of_the_training_views(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pictures of 120 px lack what is found at 400; a photograph that is held out gives no point."""
+    write_located(tmp_path, 5)
+    small = DatasetConfig(max_side=120, test_every=4)  # views 0 and 4 are held out
+    capture = load_capture(tmp_path, small, tmp_path / "work")
+    assert max(capture.images[0].shape) <= 120
+    assert np.median(distance_to_room(capture.points)) < 0.01
+    blind = replace(capture, photos=())
+    few = add_points(blind, [1, 2, 3], tmp_path / "other", silent)
+    assert len(capture.points) > 3 * len(few.points)
+
+    black = tuple(np.zeros_like(image) if i in (0, 4) else image for i, image in enumerate(capture.images))
+    for name in ("view_0.png", "view_4.png"):
+        Image.new("RGB", (400, 300)).save(tmp_path / "images" / name)
+    again = load_capture(tmp_path, small, tmp_path / "third")
+    np.testing.assert_array_equal(again.images[4], black[4])
+    np.testing.assert_array_equal(again.points, capture.points)
 
 
 def test_featureless_views_start_from_random_points(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -187,7 +224,7 @@ def test_featureless_views_start_from_random_points(tmp_path: Path, caplog: pyte
     flat = [np.full_like(image, 90) for image in capture.images]
     blank = Capture(capture.cameras, tuple(flat), capture.points, capture.colours)
     with caplog.at_level(logging.WARNING, "langsplat"):
-        found = add_points(blank, tmp_path, silent)
+        found = add_points(blank, range(3), tmp_path, silent)
     assert "random" in caplog.text
     assert len(found.points) == 20_000
     assert (found.colours == 90).all()

@@ -1,9 +1,13 @@
 """A scene that nobody wants to see is said to be one."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from langsplat_core.pipeline.doubts import APART, camera_groups, doubts
+from langsplat_core.pipeline.report import REPORT, stated_doubts, work_folder
 from langsplat_core.scene import Camera, look_at
 from langsplat_core.training.radiance.train import ViewScore
 
@@ -59,3 +63,16 @@ def test_a_wide_step_is_not_yet_a_gap(factor):
 @pytest.mark.parametrize("positions", [np.zeros((0, 3)), np.zeros((1, 3)), np.ones((7, 3)), np.eye(3) * 1e9])
 def test_positions_that_say_nothing(positions):
     assert camera_groups(positions) == (len(positions),)
+
+
+def test_a_report_beside_a_scene_says_its_doubts_and_a_strange_one_nothing(tmp_path: Path) -> None:
+    scene = tmp_path / "s.ply"
+    assert stated_doubts(scene, 3) == ()
+    report = work_folder(scene) / REPORT
+    report.parent.mkdir()
+    report.write_text(json.dumps({"gaussians": 3, "doubts": ["dim: look\nagain", 4]}))
+    assert stated_doubts(scene, 3) == ("dim: look again",)
+    assert stated_doubts(scene, 4) == ()  # of another scene, or of an earlier state of it
+    for text in ("[]", "{", '{"gaussians": 3}', '{"gaussians": 3, "doubts": "all"}', "\udcff", "[" * 10_000):
+        report.write_bytes(text.encode("utf-8", "surrogateescape"))
+        assert stated_doubts(scene, 3) == ()

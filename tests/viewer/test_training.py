@@ -13,6 +13,7 @@ from safetensors.numpy import save_file
 
 from langsplat_core.cli.app import parse
 from langsplat_core.formats import load_scene
+from langsplat_core.pipeline.report import REPORT
 from langsplat_core.scene import Scene
 from langsplat_viewer import actions, training
 from langsplat_viewer.files.preview import IN_TRAINING, NAME, write_preview
@@ -68,6 +69,30 @@ def test_a_folder_of_photographs_becomes_a_scene_that_opens(viewer, folder, monk
     assert (progress.overall, progress.left) == (0.25, "about 3 min left")
     assert any(message.text == "done: 3 Gaussians" for message in viewer.state.messages)
     assert viewer.state.scene is SCENES["blobs.ply"]
+
+
+def test_what_speaks_against_the_scene_is_said(viewer, folder, monkeypatch):
+    doubts = [
+        "held-out photographs are reproduced at 9.1 dB, below 16: take more",
+        "two groups",
+        "few pixels",
+    ]
+    report = folder.with_name("blobs.work") / REPORT
+    report.parent.mkdir()
+    report.write_text(json.dumps({"gaussians": 360, "doubts": doubts}))
+    trains(monkeypatch, GOOD + "".join(f"; print('warning: {doubt}')" for doubt in doubts))
+    actions.choose_photographs(viewer, folder)
+    actions.fill_in(viewer, replace(viewer.state.training_form, out=str(folder.with_name("blobs.ply"))))
+    actions.start_training(viewer)
+    finish(viewer)
+    assert viewer.state.doubts == tuple(doubts)
+    assert errors(viewer) == doubts
+    said = [message.text for message in viewer.state.messages]
+    assert "done: 3 Gaussians" in said  # not pushed out by the warnings, which are not said twice
+    assert not any(text.startswith("warning") for text in said)
+    actions.open_scene(viewer, folder.with_name("plain.ply"))
+    settle(viewer)
+    assert viewer.state.doubts == ()
 
 
 def test_what_goes_wrong_is_said(viewer, folder, monkeypatch):

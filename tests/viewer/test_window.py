@@ -59,6 +59,7 @@ def folder(tmp_path: Path) -> Path:
         "change_a_key",
         "cut_by_depth",
         "watch_a_training",
+        "read_what_speaks_against",
         "switch_between_scenes",
         "time_and_compare",
         "fade_in_a_photograph",

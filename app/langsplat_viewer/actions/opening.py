@@ -9,6 +9,7 @@ from langsplat_core.compiled import is_compiled
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.display.latent_colours import latent_colours
 from langsplat_core.formats import scene_files
+from langsplat_core.pipeline.report import stated_doubts
 from langsplat_core.progress import Progress
 from langsplat_core.query import regions
 from langsplat_core.query.engine import no_field
@@ -38,6 +39,7 @@ class _Opened:
     extent: Extent
     latent: Array | None  # (3, N, 3) colours
     read: Stamps  # its files as they were before they were read
+    doubts: tuple[str, ...]  # what the report of its training says against it
 
 
 def open_scene(
@@ -67,7 +69,8 @@ def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Cal
         progress(f"preparing {path.name}", 0.9)
         latent = None if scene.language is None else latent_colours(scene.language)
         unusable = scene.gaussians.invalid_rows()
-        return _Opened(scene, unusable, extent_of(scene), latent, read)
+        doubts = stated_doubts(path, len(scene.gaussians))
+        return _Opened(scene, unusable, extent_of(scene), latent, read, doubts)
 
     def done(opened: _Opened) -> None:
         _show_scene(viewer, path, opened)
@@ -102,6 +105,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
         state.scenes = (*state.scenes, path.absolute())
     viewer.watch.begin(opened.read)
     state.scene, state.extent, state.latent = scene, opened.extent, opened.latent
+    state.doubts = opened.doubts
     state.queries, state.selected, state.glide = [], None, None
     state.canonical, state.canonical_typed = (), ""
     state.selection = of_scene(state.selection, len(scene.gaussians))
@@ -122,6 +126,8 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state.say(f"{path.name}: {len(scene.gaussians):,} Gaussians{not_drawn}")
     for reason in scene.unread:
         state.say(f"opened without what lies beside it: {reason}", is_error=True)
+    for doubt in opened.doubts:
+        state.say(doubt, is_error=True)
     if scene.language is None:
         state.say(no_field(scene))
     else:

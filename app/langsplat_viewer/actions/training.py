@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from langsplat_core.pipeline.forecast import count_photographs
+from langsplat_core.pipeline.report import work_folder
 from langsplat_viewer.actions.opening import open_scene
 from langsplat_viewer.actions.visits import reload
 from langsplat_viewer.files import preview
@@ -12,6 +13,8 @@ from langsplat_viewer.jobs import one_line
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.training import Training, TrainingRequest
 from langsplat_viewer.viewer import Viewer
+
+WARNING = "warning: "  # before each doubt that `langsplat train` ends with
 
 
 def fill_in(viewer: Viewer, form: TrainingForm) -> None:
@@ -89,7 +92,7 @@ def _show_checkpoint(viewer: Viewer, training: Training, checkpoint: Stamps) -> 
 
 def _follow(viewer: Viewer, training: Training) -> None:
     """While its Gaussians are looked at, take the next checkpoint when it is there."""
-    folder = preview.work_folder(training.request.out)
+    folder = work_folder(training.request.out)
     if viewer.state.path != folder / preview.NAME or viewer.worker.current is not None:
         return
     written = preview.newest(training.request.out)
@@ -108,7 +111,8 @@ def watch_training(viewer: Viewer) -> None:
     viewer.training = None
     last = training.progress.said[-1] if training.progress.said else "no reason given"
     if training.exit_code == 0:
-        for line in training.progress.said[-3:]:
+        told = [line for line in training.progress.said if not line.startswith(WARNING)]
+        for line in told[-3:]:  # what speaks against the scene is said with it, from its report
             state.say(line)
         open_scene(viewer, training.request.out)
     elif training.interrupted:

@@ -11,17 +11,13 @@ from safetensors import SafetensorError, safe_open
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
 from langsplat_core.formats import write_ply
+from langsplat_core.pipeline.report import work_folder
 from langsplat_core.scene import Gaussians
 from langsplat_viewer.files.watching import Stamps, stamps
 
 PARTS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh_dc", "sh_rest")
 IN_TRAINING = ".checkpoint.safetensors"
 NAME = "so-far.ply"  # in the work folder of a training
-
-
-def work_folder(out: Path) -> Path:
-    """Where the training of `out` keeps its stages."""
-    return out.with_name(f"{out.stem}.work")
 
 
 def newest(out: Path) -> Stamps:

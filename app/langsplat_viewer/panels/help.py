@@ -83,7 +83,7 @@ def _change(viewer: Viewer) -> None:
         imgui.text_disabled("Click a key, then press another; Esc leaves it as it is")
         return
     imgui.push_text_wrap_pos(hello_imgui.em_size(KEYS_EM + DOES_EM))
-    imgui.text_colored(bad(), f"{conflict.key} is the key of '{conflict.owner}'".replace("%", "%%"))
+    imgui.text_colored(bad(), f"{conflict.key} is the key of '{conflict.owner}'")
     imgui.pop_text_wrap_pos()
     if imgui.button("Swap"):
         keying.swap(viewer)

@@ -37,7 +37,7 @@ def _recent(viewer: Viewer) -> None:
             if imgui.menu_item(f"{name.parent.name}/{name.name}##{number}", "", False)[0]:
                 actions.open_recent(viewer, path)
             if imgui.is_item_hovered():
-                imgui.set_tooltip(path.replace("%", "%%"))
+                imgui.set_tooltip(path)
         imgui.end_menu()
     imgui.separator()
     if imgui.menu_item("Quit", "", False)[0]:

@@ -49,6 +49,6 @@ def _clicked(found: list[Command], changed: Changed) -> Command | None:
                 chosen = command
             keys = ", ".join(keys_of(command, changed))
             imgui.same_line(right - imgui.calc_text_size(keys).x)
-            imgui.text_colored(muted(), keys.replace("%", "%%"))
+            imgui.text_colored(muted(), keys)
     imgui.end_child()
     return chosen

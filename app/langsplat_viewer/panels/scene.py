@@ -6,7 +6,7 @@ from imgui_bundle import ImVec2, imgui
 
 from langsplat_viewer import actions
 from langsplat_viewer.output import saving
-from langsplat_viewer.panels.style import beside, elided, muted, small_wrapped, tip, width_of
+from langsplat_viewer.panels.style import bad, beside, elided, muted, small_wrapped, tip, width_of
 from langsplat_viewer.viewer import Viewer
 
 DIALOG_PROGRAMS = ("zenity", "kdialog", "matedialog", "qarma")  # one of them draws the dialog on Linux
@@ -20,6 +20,9 @@ def draw(viewer: Viewer) -> None:
     else:
         imgui.text(state.path.name if state.path else "scene")
         small_wrapped(_figures(viewer), muted())
+        for doubt in state.doubts:
+            small_wrapped(doubt.partition(":")[0], bad())
+            tip(doubt)
     if imgui.button("Open ..."):
         actions.ask_for_file(viewer)
     beside("Save picture")

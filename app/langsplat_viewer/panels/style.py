@@ -57,14 +57,14 @@ def _is_dark() -> bool:
 def small_wrapped(text: str, colour: ImVec4) -> None:
     """Text of any length, wrapped at the panel's edge."""
     imgui.push_style_color(imgui.Col_.text, colour)
-    imgui.text_wrapped(text.replace("%", "%%"))
+    imgui.text_wrapped(text)
     imgui.pop_style_color()
 
 
 def tip(text: str) -> None:
     """What is said while the mouse is over the last item."""
     if imgui.is_item_hovered():
-        imgui.set_tooltip(text.replace("%", "%%"))
+        imgui.set_tooltip(text)
 
 
 def stoppable(label: str, fraction: float, tag: str = "") -> bool:

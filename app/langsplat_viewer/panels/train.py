@@ -8,7 +8,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.config import TrainPreset
 from langsplat_viewer import actions
-from langsplat_viewer.panels.style import beside, beside_boxed, muted, small_wrapped, tip
+from langsplat_viewer.panels.style import bad, beside, beside_boxed, muted, small_wrapped, tip
 from langsplat_viewer.training import Training
 from langsplat_viewer.viewer import Viewer
 
@@ -48,6 +48,16 @@ def _form(viewer: Viewer) -> None:
     if imgui.button("Train"):
         actions.start_training(viewer)
     small_wrapped("An interrupted training continues where it stopped.", muted())
+    _doubts(viewer)
+
+
+def _doubts(viewer: Viewer) -> None:
+    """What speaks against the scene that is shown, as its training found."""
+    state = viewer.state
+    if state.doubts and state.path is not None:
+        imgui.separator_text(f"What speaks against {state.path.name}")
+        for doubt in state.doubts:
+            small_wrapped(doubt, bad())
 
 
 def _box(label: str, hint: str, text: str) -> str:

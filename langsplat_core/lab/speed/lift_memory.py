@@ -21,7 +21,7 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CodecConfig, TrainConfig
 from langsplat_core.errors import InputError
 from langsplat_core.lab.speed.cases import random_scene
-from langsplat_core.lab.speed.load import peak_memory
+from langsplat_core.lab.speed.resident import peak_memory
 from langsplat_core.pipeline.language import language_field
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Camera, Reading, look_at

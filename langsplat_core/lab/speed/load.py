@@ -7,7 +7,6 @@ peak memory is that of the whole process. The file has just been written, so it 
 
 import hashlib
 import json
-import re
 import subprocess
 import sys
 import tempfile
@@ -23,6 +22,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.formats import read_ply
 from langsplat_core.formats.inria_layout import BASE_COLOUR, NORMAL, POSITION, ROTATION, SCALE
+from langsplat_core.lab.speed.resident import peak_memory
 from langsplat_core.progress import Progress, silent
 
 Reader = Literal["langsplat", "plyfile"]
@@ -142,16 +142,6 @@ def _plyfile(path: Path) -> list[Array]:
     rest = columns(REST).reshape(-1, 3, 15).transpose(0, 2, 1)
     sh = np.concatenate([columns(BASE_COLOUR)[:, None], rest], axis=1)
     return [columns(POSITION), columns(SCALE), columns(ROTATION), columns(("opacity",))[:, 0], sh]
-
-
-def peak_memory() -> int | None:
-    """Bytes. Not getrusage: its maximum is inherited from the parent process on Linux."""
-    try:
-        status = Path("/proc/self/status").read_text()
-    except OSError:
-        return None
-    found = re.search(r"VmHWM:\s*(\d+) kB", status)
-    return int(found[1]) * 1024 if found else None
 
 
 def _report(reader: str, path: Path) -> dict[str, object]:

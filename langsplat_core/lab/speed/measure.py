@@ -8,12 +8,10 @@
   software OpenGL driver holds. Linux only; elsewhere unknown.
 """
 
-import ctypes
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +19,7 @@ import torch
 
 from langsplat_core.arrays import Array
 from langsplat_core.lab.speed.cases import Case, default_camera, random_scene
+from langsplat_core.lab.speed.resident import peak_memory, restart_peak
 from langsplat_core.lab.speed.torch_baseline import TorchRasterizer
 from langsplat_core.lab.speed.truth import Error, Truth
 from langsplat_core.raster.protocol import FreezableView, LabelView, Rasterizer
@@ -29,7 +28,7 @@ from langsplat_core.scene import Camera
 GRIDS = ((16, 12), (8, 6), (4, 3))  # cells of subparts, parts and wholes: 252 labels in all
 _CALLS, _BUDGET_S = 15, 0.3  # at most this many calls, begun within this time
 _ONCE_S = 2.0  # a call that takes longer is its own measurement
-_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+MIB = 2**20
 
 
 @dataclass(frozen=True)
@@ -227,11 +226,12 @@ def _gradient_error(view: Any, case: Case, values: Array, masked: Array, truth: 
 
 def _timed(call: Callable[[], Any]) -> tuple[list[float], float | None]:
     """Seconds of each call, and the first call's rise of the resident set in MiB."""
-    before = _start_of_peak()
+    before = restart_peak()
     start = time.perf_counter()
     kept = call()
     first = time.perf_counter() - start
-    peak = None if before is None else max(_resident("VmHWM") - before, 0.0)
+    highest = peak_memory()
+    peak = None if before is None or highest is None else max(highest - before, 0) / MIB
     del kept
     if first > _ONCE_S:
         return [first], peak
@@ -242,24 +242,3 @@ def _timed(call: Callable[[], Any]) -> tuple[list[float], float | None]:
         times.append(time.perf_counter() - start)
         del kept
     return times, peak
-
-
-def _start_of_peak() -> float | None:
-    """Give free pages back and forget the highest resident set; returns the one now, MiB."""
-    if not (sys.platform.startswith("linux") and _CLEAR.exists()):
-        return None
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc has it
-    try:
-        if trim is not None:
-            trim(0)
-        _CLEAR.write_text("5")
-    except OSError:
-        return None
-    return _resident("VmRSS")
-
-
-def _resident(key: str) -> float:
-    for line in _STATUS.read_text().splitlines():
-        if line.startswith(key):
-            return int(line.split()[1]) / 1024
-    return 0.0

@@ -57,13 +57,16 @@ class ViewScore:
 
 
 class _Pictures:
-    """Photographs and cameras of the training views, whole and at half size."""
+    """Photographs and cameras of the training views, whole and at half size. On a GPU they are copied to it;
+    else they stay as they are, which for many is in files (`datasets.album`)."""
 
     def __init__(self, capture: Capture, indices: Sequence[int], device: torch.device) -> None:
+        def kept(image: Array) -> Array | Tensor:
+            return image if device.type == "cpu" else torch.tensor(image, device=device)
+
         views = [(capture.cameras[index], capture.images[index]) for index in indices]
-        self._fine = [(camera, torch.tensor(image, device=device)) for camera, image in views]
-        halves = [_halved(camera, image) for camera, image in views]
-        self._coarse = [(camera, torch.tensor(image, device=device)) for camera, image in halves]
+        self._fine = [(camera, kept(image)) for camera, image in views]
+        self._coarse = [(camera, kept(image)) for camera, image in (_halved(*view) for view in views)]
 
     def __len__(self) -> int:
         return len(self._fine)
@@ -71,7 +74,8 @@ class _Pictures:
     def at(self, index: int, coarse: bool) -> tuple[Camera, Tensor]:
         """The camera and its (H, W, 3) float picture in [0, 1]."""
         camera, picture = (self._coarse if coarse else self._fine)[index]
-        return camera, picture.float().div_(255)
+        copy = picture if isinstance(picture, Tensor) else torch.tensor(picture)
+        return camera, copy.float().div_(255)
 
 
 def _halved(camera: Camera, image: Array) -> tuple[Camera, Array]:

@@ -233,16 +233,16 @@ def test_asking_for_cuda_where_there_is_none_is_one_line() -> None:
 
 def test_initial_gaussians_sit_on_the_points() -> None:
     rng = np.random.default_rng(5)
-    grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 11)] * 3), -1).reshape(-1, 3)
+    grid = np.stack(np.meshgrid(*[np.linspace(-0.7, 0.7, 15)] * 3), -1).reshape(-1, 3)
     # not finite; a repetition; behind all cameras; far from every other point; and a good one
-    bad = np.array([[np.nan, 0, 0], grid[7], [0, 0, -40.0], [0.1, 0.1, 3.0], [0.7, 0.5, 0.5]])
+    bad = np.array([[np.nan, 0, 0], grid[7], [0, 0, -40.0], [0.1, 0.1, 3.0], [0.7, 0.7, 0.8]])
     points = np.concatenate([grid, bad])
     rgb = rng.integers(0, 255, points.shape, dtype=np.uint8)
     made = initial_gaussians(replace(capture(), points=points, colours=rgb), [0, 1, 2], 3, 10**6, 0)
-    assert made.sh.shape == (11**3 + 1, 16, 3)
-    np.testing.assert_allclose(made.means[: 11**3], grid, atol=1e-6)
-    np.testing.assert_allclose(np.exp(made.log_scales[: 11**3]), 0.1, rtol=1e-5)  # the grid's spacing
-    np.testing.assert_allclose(made.sh[: 11**3, 0] * C0 + 0.5, rgb[: 11**3] / 255, atol=1e-6)
+    assert made.sh.shape == (15**3 + 1, 16, 3)
+    np.testing.assert_allclose(made.means[: 15**3], grid, atol=1e-6)
+    np.testing.assert_allclose(np.exp(made.log_scales[: 15**3]), 0.1, rtol=1e-5)  # the grid's spacing
+    np.testing.assert_allclose(made.sh[: 15**3, 0] * C0 + 0.5, rgb[: 15**3] / 255, atol=1e-6)
     np.testing.assert_allclose(1 / (1 + np.exp(-made.opacity_logits)), 0.1, rtol=1e-5)
     few = initial_gaussians(replace(capture(), points=points, colours=rgb), [0, 1, 2], 0, 500, 0)
     assert len(few) == 500
@@ -252,7 +252,7 @@ def test_initial_gaussians_sit_on_the_points() -> None:
 def test_too_few_points_are_topped_up_inside_the_view_volume(known: int) -> None:
     few = replace(capture(), points=capture().points[:known], colours=capture().colours[:known])
     made = initial_gaussians(few, range(5), 0, 10**6, 0)
-    assert len(made) == (1_000 if known >= 50 else 10_000)
+    assert len(made) == (3_000 if known >= 50 else 10_000)
     new = made.means[known:].astype(np.float64)
     seen = np.zeros(len(new))
     for camera in few.cameras[:5]:
