@@ -139,6 +139,8 @@ class Canvas:
         instead = self._merged() if level.merged else None
         stage = self._fine if instead is None or self._quick is None else self._quick
         self._renderer = stage.renderer
+        if self._quick is not None:
+            self._quick.let_go(wanted.model.scene)
         return stage.prepare(wanted, shown, marked, camera, instead)
 
     def _draw(

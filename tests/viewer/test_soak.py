@@ -18,9 +18,9 @@ from tests.support.measured import Measure
 ROOT = Path(__file__).parents[2]
 COPIES = 40  # of each Gaussian: a scene that is kept is megabytes
 MOST_GROWTH = 80.0  # MB; forty scenes that are kept would be some 200
-# The scene as it was read and as it is drawn; answers of seven phrases at their levels; pictures of
+# The scene as it was read, marked, drawn and merged; answers of seven phrases at their levels; pictures of
 # the three sizes that moving and resting take.
-MOST_ALIVE = {"Scene": 5, "QueryEngine": 1, "QueryResult": 60}
+MOST_ALIVE = {"Scene": 8, "QueryEngine": 1, "QueryResult": 60}
 MOST_HELD = MOST_ALIVE | {"texture": 30, "buffer": 8, "framebuffer": 20, "vertexarray": 8, "program": 16}
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name == "nt", reason="reads /proc and libGL.so")]
 

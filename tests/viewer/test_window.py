@@ -1,9 +1,11 @@
 """The window itself, on a virtual display, driven like a person would; and the canvas behind it."""
 
+import gc
 import os
 import subprocess
 import sys
 import time
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -258,6 +260,26 @@ def test_canvas_merges_what_is_shown(gl, state):
         assert given[-1].shape == (counts[-1], 3)
         np.testing.assert_allclose(given[-1], 1, rtol=1e-6)
     assert 0 < counts[1] < counts[0] < 360
+    canvas.close()
+
+
+def test_the_quick_renderer_s_stage_lets_go_of_a_scene_that_was_left(gl, state):
+    left = weakref.ref(state.scene)
+    renderer, quick = FakeRenderer(seconds=0.6), FakeRenderer(seconds=0.05)
+    canvas = Canvas(gl, renderer, lambda: renderer.now + quick.now, quick)
+    now = 0.0
+    while not quick.calls:
+        assert now < 3000
+        time.sleep(0.01)
+        state.view = orbit(state.view, 0.1, 0)
+        canvas.update(state, now := now + 1.0)
+    state.scene = blob_scene()
+    canvas.update(state, now + 1.0)
+    canvas.update(state, now + 2.0)
+    renderer.calls.clear()  # which note the scenes
+    quick.calls.clear()
+    gc.collect()
+    assert left() is None
     canvas.close()
 
 

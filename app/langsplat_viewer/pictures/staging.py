@@ -40,6 +40,11 @@ class Stage:
             self.renderer.prepare(camera, list(zip(looks, layers, strict=True)))
         return layers
 
+    def let_go(self, scene: Scene) -> None:
+        """Hold nothing of another scene than this one."""
+        if self._given is not None and self._given[0].model.scene is not scene:
+            self._given, self._layers = None, ()
+
     def _hand_over(
         self, wanted: Depiction, shown: Sequence[ViewerState], marked: MarkedScene, instead: Merged | None
     ) -> None:
