@@ -2,13 +2,14 @@
 
     python -m tests.viewer.soak_driver BACKEND FOLDER
 
-FOLDER holds SCENES and is the working folder. Prints one line of JSON for each of `MARKS`: what the process
-holds when so many scenes have been opened.
+FOLDER holds SCENES; what is saved goes to a new folder in it. Prints one line of JSON for each of `MARKS`:
+what the process holds when so many scenes have been opened.
 """
 
 import ctypes
 import gc
 import json
+import os
 import random
 import sys
 from collections.abc import Callable
@@ -198,6 +199,9 @@ class Soak:
 
 if __name__ == "__main__":
     session = SoakSession(Path(sys.argv[2]), sys.argv[1])
+    saved = Path(sys.argv[2]) / "saved"  # the list of scenes stays short enough to be seen whole
+    saved.mkdir()
+    os.chdir(saved)
     soak = Soak(session)
     session.run(soak.run)
     print("PASSED")
