@@ -189,7 +189,7 @@ def _points(file: Path, name: object) -> tuple[Array, Array]:
         return none
     path = file.parent / name
     if not os.path.isfile(path):
-        log.warning("%s names the points %s, which do not exist", file.name, name)
+        log.warning("%s names the points %s, which do not exist", file.name, quoted(name))
         return none
     try:
         points, colours = read_cloud(path)

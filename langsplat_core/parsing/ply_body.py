@@ -15,7 +15,7 @@ from typing import BinaryIO
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import FormatError
+from langsplat_core.errors import FormatError, printable_line
 from langsplat_core.parsing.ply_header import PlyElement, PlyHeader
 
 CHUNK_ROWS = 2048  # about 0.5 MB of a degree-3 scene: the columns are then picked out of the cache
@@ -136,7 +136,8 @@ def _ascii_rows(
                 warnings.simplefilter("ignore", UserWarning)  # "input contained no data": reported below
                 rows = np.loadtxt(file, comments=None, max_rows=count, ndmin=2, encoding="latin-1")
         except ValueError as error:
-            raise FormatError(f"{path}: unreadable row near {start} of {element.name}: {error}") from None
+            reason = printable_line(error, 80)  # NumPy tells its own options too
+            raise FormatError(f"{path}: unreadable row near {start} of {element.name}: {reason}") from None
         if len(rows) < count:
             raise FormatError(
                 f"{path}: truncated: element {element.name} has {start + len(rows)} rows, "

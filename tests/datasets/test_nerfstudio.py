@@ -149,6 +149,17 @@ def test_points_stay_in_the_cameras_world(tmp_path: Path) -> None:
     np.testing.assert_allclose(capture.cameras[0].world_to_camera, poses(3)[0], atol=1e-9)
 
 
+def test_points_that_are_not_there_are_named_in_short(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_dataset(tmp_path, {**GLOBAL, "ply_file_path": "a" * 2000 + ".ply"})
+    with caplog.at_level(logging.WARNING, "langsplat"):
+        assert len(load(tmp_path).points) == 0
+    (said,) = (record.getMessage() for record in caplog.records if "do not exist" in record.getMessage())
+    assert "aaa" in said
+    assert len(said) < 300
+
+
 def test_colours_may_be_fractions_or_absent(tmp_path: Path) -> None:
     write_dataset(tmp_path, {**GLOBAL, "ply_file_path": "cloud.ply"})
     xyz = {axis: np.ones(2, np.float64) for axis in "xyz"}
