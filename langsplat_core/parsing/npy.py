@@ -19,11 +19,12 @@ MAGIC = b"\x93NUMPY"
 HEADER_LIMIT = 10_000  # bytes; NumPy writes 118
 MEMBER_LIMIT = 2**31  # bytes of one array in an .npz: packed ones may be a thousand times their file
 # What NumPy writes, to the letter. Its own reader evaluates the text as a Python literal, and on damaged
-# headers raises tokenizer errors and warnings.
+# headers raises tokenizer errors and warnings. A comma stands between two sizes: were it optional, a run of a
+# hundred digits could be divided in so many ways that trying them takes minutes.
 _HEADER = re.compile(
     rb"\{'descr': '(?P<dtype>[<>|](?:[iu][1248]|f[248]|U[1-9]\d{0,3}))', "
     rb"'fortran_order': (?P<order>True|False), "
-    rb"'shape': \((?P<shape>(?:\d{1,18}(?:, ?)?){0,8})\), ?\} *\n?$"
+    rb"'shape': \((?P<shape>(?:\d{1,18}(?:, ?\d{1,18}){0,7},?)?)\), ?\} *\n?$"
 )
 
 
