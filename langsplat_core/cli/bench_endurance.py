@@ -19,7 +19,7 @@ from langsplat_core.semantics.encoders import load_text_encoder
 @dataclass(frozen=True)
 class BenchEndurance:
     """Draw pictures of a scene made large and ask it phrase after phrase, in one process: time, peak memory,
-    and whether memory grows. A quarter of an hour and 10 GB as it stands."""
+    and whether memory grows. Some ten minutes of the processor and 8 GB as it stands."""
 
     scene: tyro.conf.Positional[Path]
     """A scene with a language field, and its cameras beside it."""
