@@ -10,6 +10,7 @@ import pytest
 
 from langsplat_core.formats import save_scene
 from tests.support.fakes import blob_scene
+from tests.support.on_display import play
 
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.long
@@ -18,18 +19,8 @@ pytestmark = pytest.mark.long
 def run(scenario: str, display: str, folder: Path, **environment: str) -> str:
     """The output of one scenario of `resting_driver`."""
     save_scene(folder / "blobs.ply", blob_scene())
-    inherited = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}
-    paths = os.pathsep.join((str(ROOT), str(ROOT / "app")))
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.viewer.resting_driver", scenario, str(folder / "blobs.ply")],
-        env=inherited | {"DISPLAY": display, "PYTHONPATH": paths} | environment,
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, (done.stdout + done.stderr)[-3000:]
-    return done.stdout
+    arguments = ["-m", "tests.viewer.resting_driver", scenario, str(folder / "blobs.ply")]
+    return play(display, arguments, folder, 120, **environment)
 
 
 def test_at_rest_no_frame_is_drawn_and_no_time_is_used(display, tmp_path):

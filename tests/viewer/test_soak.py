@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,8 +12,8 @@ from langsplat_core.formats import save_scene
 from langsplat_core.scene import Scene
 from tests.support.fakes import blob_scene
 from tests.support.measured import Measure
+from tests.support.on_display import play
 
-ROOT = Path(__file__).parents[2]
 COPIES = 40  # of each Gaussian: a scene that is kept is megabytes
 MOST_GROWTH = 80.0  # MB; forty scenes that are kept would be some 200
 # The scene as it was read, marked, drawn and merged; answers of seven phrases at their levels; pictures of
@@ -51,19 +49,9 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("backend", ["opengl", "cpu"])
 def test_fifty_scenes_and_a_thousand_actions(backend: str, display: str, folder: Path, measured: Measure):
-    environment = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}
-    environment |= {"DISPLAY": display, "PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "app")))}
-    run = subprocess.run(
-        [sys.executable, "-m", "tests.viewer.soak_driver", backend, str(folder)],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=3000,
-    )
-    said = run.stdout.splitlines()
-    assert run.returncode == 0, (run.stdout + run.stderr)[-4000:]
-    assert said[-1].endswith("PASSED"), (run.stdout + run.stderr)[-4000:]
+    arguments = ["-m", "tests.viewer.soak_driver", backend, str(folder)]
+    said = play(display, arguments, folder, timeout=3000).splitlines()
+    assert said[-1].endswith("PASSED"), "\n".join(said)[-4000:]
     first, *later = [json.loads(line[line.index("{") :]) for line in said if '"scenes"' in line]
     assert (later[-1]["scenes"], later[-1]["actions"]) == (50, 1000)
     measured(f"soak, {backend}", "MB after 10 scenes and 200 actions", first["MB"])

@@ -1,9 +1,6 @@
 """The window itself, on a virtual display, driven like a person would; and the canvas behind it."""
 
 import gc
-import os
-import subprocess
-import sys
 import time
 import weakref
 from dataclasses import replace
@@ -20,8 +17,7 @@ from langsplat_viewer.canvas import NOTHING_LEFT, REST_SECONDS, Canvas
 from langsplat_viewer.marks.selecting import unmarked
 from langsplat_viewer.state import ViewerState
 from tests.support.fakes import blob_scene
-
-ROOT = Path(__file__).parents[2]
+from tests.support.on_display import play
 
 
 @pytest.fixture
@@ -80,18 +76,9 @@ def test_what_was_arranged_is_found_again(display: str, folder: Path):
 
 def drive(scenario: str, display: str, folder: Path) -> None:
     """Play one scenario of `window_driver`."""
-    environment = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}
-    environment |= {"DISPLAY": display, "PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "app")))}
-    run = subprocess.run(
-        [sys.executable, "-m", "tests.viewer.window_driver", scenario, str(folder)],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert run.returncode == 0, (run.stdout + run.stderr)[-4000:]
-    assert run.stdout.rstrip().endswith("PASSED"), (run.stdout + run.stderr)[-4000:]
+    arguments = ["-m", "tests.viewer.window_driver", scenario, str(folder)]
+    said = play(display, arguments, folder, timeout=300)
+    assert said.rstrip().endswith("PASSED"), said[-4000:]
 
 
 class FakeRenderer:
