@@ -191,5 +191,6 @@ class _Asking:
 
     def _bodies(self, answer: QueryResult) -> list[tuple[Array, Body]]:
         """Every single thing of an answer, as surface numbers and as the place it takes."""
-        parts = separate(self.surface, answer.members[self.surface.rows])
+        inside = answer.members[self.surface.rows]
+        parts = separate(self.surface, inside, self.engine.field.things)
         return [(numbers, body(self.surface.positions[numbers], self._frame)) for numbers in parts]

@@ -13,7 +13,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.query.instances import connected_parts
 from langsplat_core.query.phrase_tree import Extreme, Side
 from langsplat_core.query.surface import Surface
-from langsplat_core.scene import Camera
+from langsplat_core.scene import NO_THING, Camera
 
 FEWEST = 8  # Gaussians; what has fewer is a speck
 SPECK = 0.1  # of the largest instance's Gaussians; so is what has fewer
@@ -89,9 +89,18 @@ def body(positions: Array, frame: Array) -> Body:
     return Body(points, low, high)
 
 
-def separate(surface: Surface, inside: Array) -> list[Array]:
-    """(M,) bool -> surface numbers of each connected thing in it, the largest first, without specks."""
-    parts = sorted(connected_parts(surface, np.flatnonzero(inside)).each(), key=len, reverse=True)
+def separate(surface: Surface, inside: Array, things: Array | None = None) -> list[Array]:
+    """(M,) bool -> surface numbers of each single thing in it, the largest first, without specks.
+
+    things: (N,) uint16, see `LanguageField.things`: what tells apart things that touch, and keeps together one
+    that is half hidden. Gaussians that are of none, or all of them where nothing is known of things, are taken
+    apart where the surface is.
+    """
+    numbers = np.flatnonzero(inside)
+    owner = np.full(len(numbers), NO_THING) if things is None else things[surface.rows[numbers]]
+    parts = connected_parts(surface, numbers[owner == NO_THING]).each()
+    parts += [numbers[owner == one] for one in np.unique(owner[owner != NO_THING])]
+    parts.sort(key=len, reverse=True)
     return [part for part in parts if len(part) >= max(FEWEST, SPECK * len(parts[0]))]
 
 

@@ -6,7 +6,7 @@ import pytest
 from langsplat_core.arrays import Array
 from langsplat_core.query.standing import Body, body, gap, most, separate, stands, upright, viewer
 from langsplat_core.query.surface import build_surface
-from langsplat_core.scene import look_at
+from langsplat_core.scene import NO_THING, look_at
 from tests.support.laid_table import UP, laid_table
 
 FRAME = upright(UP)
@@ -95,3 +95,19 @@ def test_single_things_are_connected_and_no_specks():
     parts = separate(surface, inside)
     assert [len(part) for part in parts] == [blocks["far mug"].sum()]  # the book has less than a tenth of it
     assert separate(surface, np.zeros(len(surface.rows), bool)) == []
+
+
+def test_what_is_known_of_things_tells_apart_what_touches_and_keeps_together_what_is_hidden():
+    """A mug and the table under it are one connected surface, and two things; of what is of no thing, the
+    surface decides."""
+    scene, blocks = laid_table()
+    surface = build_surface(scene.gaussians)
+    mugs = blocks["far mug"] | blocks["red mug"]
+    inside: Array = (mugs | blocks["table"])[surface.rows]
+    things = np.full(len(scene.gaussians), NO_THING, np.uint16)
+    things[mugs] = 3  # as if one thing, half hidden by what stands before it
+    counts = sorted(len(part) for part in separate(surface, inside, things))
+    assert counts == sorted([int(mugs.sum()), int(blocks["table"].sum())])
+    apart = separate(surface, mugs[surface.rows], np.full(len(things), NO_THING, np.uint16))
+    assert [list(part) for part in apart] == [list(part) for part in separate(surface, mugs[surface.rows])]
+    assert len(apart) == 2
