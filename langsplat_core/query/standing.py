@@ -92,9 +92,9 @@ def body(positions: Array, frame: Array) -> Body:
 def separate(surface: Surface, inside: Array, things: Array | None = None) -> list[Array]:
     """(M,) bool -> surface numbers of each single thing in it, the largest first, without specks.
 
-    things: (N,) uint16, see `LanguageField.things`: what tells apart things that touch, and keeps together one
-    that is half hidden. Gaussians that are of none, or all of them where nothing is known of things, are taken
-    apart where the surface is.
+    things: (N,) uint16, see `LanguageField.things`: what tells apart things that touch, and keeps together
+    one that is half hidden. Gaussians that are of none, or all of them where nothing is known of things, are
+    taken apart where the surface is.
     """
     numbers = np.flatnonzero(inside)
     owner = np.full(len(numbers), NO_THING) if things is None else things[surface.rows[numbers]]
