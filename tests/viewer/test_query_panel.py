@@ -106,3 +106,11 @@ def test_without_a_calibration_nothing_is_said_to_be_likely(viewer, paper):
 def test_structure_is_said_as_it_was_read(viewer, paper):
     panel.draw(searched(viewer, "mug or book"))
     assert "read as: mug  or  book" in paper.said
+
+
+def test_the_list_takes_the_room_that_the_details_leave_it():
+    assert answers.rows_shown(0, 40.0) == 1  # a line says what will be there
+    assert answers.rows_shown(3, 12.0) == 3
+    assert answers.rows_shown(9, 12.0) == 3.5  # as much as a low window has
+    assert answers.rows_shown(9, 17.3) == 7.5
+    assert answers.rows_shown(9, 40.0) == 9

@@ -1,5 +1,7 @@
 """What was searched: one line each in an area of its own, and the details of the one that was chosen."""
 
+import math
+
 from imgui_bundle import ImVec2, ImVec4, imgui
 
 from langsplat_core.display.colour_maps import QUERY_COLOURS
@@ -10,7 +12,8 @@ from langsplat_viewer.panels.style import bad, elided, good, muted, small_wrappe
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
 
-ROWS = 3.5  # that the list shows at a time: the half one says that there are more
+ROWS = 3.5  # that the list shows at least: the half one says that there are more
+BELOW = 10  # rows that the details of a query take, and what follows them in the panel
 HIDDEN = (0.25, 0.25, 0.25)
 
 
@@ -18,9 +21,8 @@ def draw(viewer: Viewer) -> None:
     """The list, newest first, which grows when something is asked and not when an answer arrives; and below
     it the chosen query."""
     row = imgui.get_frame_height_with_spacing()
-    if imgui.begin_child(
-        "queries", ImVec2(0, min(len(viewer.state.queries) or 1, ROWS) * row), imgui.ChildFlags_.none
-    ):
+    rows = rows_shown(len(viewer.state.queries), imgui.get_content_region_avail().y / row)
+    if imgui.begin_child("queries", ImVec2(0, rows * row), imgui.ChildFlags_.none):
         if not viewer.state.queries:
             imgui.text_colored(muted(), "what you search is listed here")
         for query in reversed(viewer.state.queries):
@@ -31,6 +33,11 @@ def draw(viewer: Viewer) -> None:
     chosen = viewer.state.selected
     if chosen is not None:
         _details(viewer, chosen)
+
+
+def rows_shown(count: int, room: float) -> float:
+    """Of `count` queries in a panel that has `room` for so many rows: all where the details still fit below."""
+    return min(count or 1, max(ROWS, math.floor(room - BELOW) + 0.5))
 
 
 def _line(viewer: Viewer, query: Query) -> None:
