@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from langsplat_core.parsing.pictures import opened
 from langsplat_viewer import actions
 from langsplat_viewer.drawing.frame import FrameRenderer
 from langsplat_viewer.options import scene_path, services
+from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.window import Window, WindowRequest
 
 OUT = Path(__file__).parent.parent / "docs" / "pictures"
@@ -63,12 +65,94 @@ def _side_by_side(ctx: Any, window: Window) -> None:
     actions.toggle_overlay(viewer, "grid")
 
 
+def _palette(ctx: Any, window: Window) -> None:
+    actions.show_palette(window.viewer, True)
+    actions.type_command(window.viewer, "sel")
+
+
+def _with_structure(ctx: Any, window: Window) -> None:
+    actions.toggle_overlay(window.viewer, "things")
+
+
+def _light(ctx: Any, window: Window) -> None:
+    viewer = window.viewer
+    actions.set_theme(viewer, "light")
+    actions.set_colour_map(viewer, "cividis")
+
+
+def _three_levels(ctx: Any, window: Window) -> None:
+    actions.set_display(window.viewer, "latent")
+    actions.toggle_levels(window.viewer)
+
+
+def _overlays(ctx: Any, window: Window) -> None:
+    viewer = window.viewer
+    actions.open_panel(viewer, "Overlays")
+    for overlay in ("cameras", "cube", "grid"):
+        actions.show_overlay(viewer, overlay, True)
+    actions.set_display(viewer, "rgb")
+    actions.step_camera(viewer, 6)
+    actions.zoom_by(viewer, 2.2)
+    actions.measure(viewer, True)
+    ctx.yield_(30)
+    for place in ((0.35, 0.55), (0.6, 0.62)):
+        actions.measure_at(viewer, *place)
+        ctx.yield_(10)
+
+
+def _film(ctx: Any, window: Window) -> None:
+    viewer = window.viewer
+    actions.open_panel(viewer, "Record")
+    for _ in range(4):
+        actions.step_camera(viewer, 2)
+        _settled(ctx, window)
+        actions.add_keyframe(viewer)
+    actions.scrub(viewer, 2.5)
+
+
+def _timed(ctx: Any, window: Window) -> None:
+    viewer = window.viewer
+    actions.open_panel(viewer, "Timing")
+    ctx.yield_(30)
+    actions.compare_with_reference(viewer)
+    _settled(ctx, window)
+
+
+def _trained(ctx: Any, window: Window) -> None:
+    """A room of a dozen photographs, in the midst of its training."""
+    viewer, folder = window.viewer, Path(tempfile.mkdtemp())
+    room = ["demo", "dataset", "--seed", "3", "--views", "12", "--out", str(folder / "room")]
+    subprocess.run([sys.executable, "-m", "langsplat_core", *room], check=True)
+    actions.open_panel(viewer, "Train")
+    actions.fill_in(viewer, TrainingForm(str(folder / "room"), str(folder / "room.ply"), "quick"))
+    actions.start_training(viewer)
+    training = viewer.training
+    assert training is not None
+    while training.exit_code is None and len(training.losses) < 120:
+        ctx.yield_()
+
+
+def _settled(ctx: Any, window: Window) -> None:
+    """Nothing moves, and nothing works in the background."""
+    ctx.yield_(60)
+    while window.viewer.worker.current is not None:
+        ctx.yield_()
+
+
 # File -> what is searched, and what is done in the window before its picture is taken.
 WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
     "window.png": (QUERIES, _found),
     "cursor.jpg": (("teddy bear",), _under_the_cursor),
     "select.jpg": (("teddy bear",), _selected),
     "side_by_side.jpg": (("teddy bear",), _side_by_side),
+    "palette.jpg": (QUERIES, _palette),
+    "structure.jpg": (("toy, not teddy bear", "keyboard of the laptop"), _with_structure),
+    "three_levels.jpg": (("teddy bear",), _three_levels),
+    "light.jpg": (("teddy bear",), _light),
+    "overlays.jpg": (("teddy bear",), _overlays),
+    "film.jpg": (("teddy bear",), _film),
+    "timing.jpg": (("teddy bear",), _timed),
+    "training.jpg": (("teddy bear",), _trained),
 }
 
 

@@ -13,7 +13,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.extent import to_margin
+from langsplat_core.query.extent import cut, to_margin
 from langsplat_core.query.places import locate
 from langsplat_core.query.surface import Surface
 from langsplat_core.scene import LEVELS
@@ -22,6 +22,7 @@ WHOLE = LEVELS.index("whole")
 SHARE = 0.6  # of the way from what is typical of a thing's least fitting surface to the part's peak on it
 LEAST = 0.05  # quantile of a part's relevancy on its thing that stands for "not this part"
 SPAN = 0.02  # of relevancy: the least distance that is divided
+SURE = 0.7  # of the best margin: what fits an unwanted name so well is what was meant
 HALF = 0.5  # of the peak: what is less is no longer the place
 
 
@@ -104,15 +105,17 @@ def joined(answers: list[QueryResult], all_needed: bool) -> QueryResult:
     )
 
 
-def without(what: QueryResult, unwanted: QueryResult, rivals: bool) -> QueryResult:
-    """`what` but for `unwanted`, if that is there. rivals: two names of whole things, of which the better one
-    counts: a green mug resembles "red mug", and "mug" more."""
-    if not unwanted.found:
-        return what
-    taken = unwanted.members
-    if rivals and what.level == unwanted.level:
-        taken = taken & (unwanted.relevancy[unwanted.level] >= what.relevancy[what.level])
-    return restricted(what, ~taken, what)
+def without(what: QueryResult, unwanted: QueryResult) -> QueryResult:
+    """`what` but for `unwanted`, if that is there."""
+    return restricted(what, ~unwanted.members, what) if unwanted.found else what
+
+
+def surest(engine: QueryEngine, answer: QueryResult) -> QueryResult:
+    """Those members alone that fit nearly as well as the best one does. A green mug may be in the answer to
+    "red mug", for want of a better one; it is not what "not red mug" means."""
+    margins = to_margin(answer.even, engine.field.reading.temperature)
+    best = float(margins[answer.members].max(initial=-np.inf))
+    return replace(answer, members=answer.members & (margins >= cut(best, SURE)))
 
 
 def _combined(

@@ -10,7 +10,16 @@ from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.combine import cut_inside, grown, joined, owners, placed, restricted, without
+from langsplat_core.query.combine import (
+    cut_inside,
+    grown,
+    joined,
+    owners,
+    placed,
+    restricted,
+    surest,
+    without,
+)
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import parse
 from langsplat_core.query.phrase_tree import (
@@ -132,7 +141,10 @@ class _Asking:
             case Union(items):
                 return joined([self.answer(item, level) for item in items], all_needed=False)
             case Without(what, unwanted):
-                return without(self.answer(what, level), self.answer(unwanted), isinstance(unwanted, Atom))
+                excluded = self.answer(unwanted)
+                if isinstance(unwanted, Atom):
+                    excluded = surest(self.engine, excluded)
+                return without(self.answer(what, level), excluded)
             case Inside(part, whole):
                 return self._inside(part, whole, level)
             case Relation() | Superlative():

@@ -36,7 +36,7 @@ def draw(viewer: Viewer) -> None:
 
 
 def rows_shown(count: int, room: float) -> float:
-    """Of `count` queries in a panel that has `room` for so many rows: all where the details still fit below."""
+    """Of `count` queries in a panel that has `room` for so many rows: all where the details fit below."""
     return min(count or 1, max(ROWS, math.floor(room - BELOW) + 0.5))
 
 
