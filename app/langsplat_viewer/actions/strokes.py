@@ -7,6 +7,7 @@ import numpy as np
 from langsplat_core.query.selection import at_point
 from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions.selecting import find, reach, take, use_tool
+from langsplat_viewer.camera.parallel import eye_depth
 from langsplat_viewer.drawing.seeing import UNCLIPPED
 from langsplat_viewer.marks import strokes
 from langsplat_viewer.marks.selecting import Mode, Stroke
@@ -56,9 +57,9 @@ def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
         return
     wanted = state.selection.only_visible and drawn.tool in strokes.ON_SCREEN and viewer.surface is not None
     depths = viewer.surface.depths() if wanted and viewer.surface is not None else None
-    means, clip = state.scene.gaussians.means, state.seeing.clip
+    means, clip = state.scene.gaussians.means, state.seeing.clip.beyond(eye_depth(drawn.camera))
     found = strokes.caught(drawn, means, depths)
-    if clip != UNCLIPPED and drawn.tool in strokes.ON_SCREEN:  # what was cut away lies under no outline
+    if clip != UNCLIPPED and drawn.tool in strokes.ON_SCREEN:  # what is not drawn lies under no outline
         found &= clip.keeps(means @ drawn.camera.rotation[2] + drawn.camera.world_to_camera[2, 3])
     take(viewer, found, mode)
 

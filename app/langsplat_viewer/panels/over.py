@@ -24,6 +24,7 @@ def draw(viewer: Viewer, area: Area) -> None:
     state = viewer.state
     if state.scene is None or state.view is None or state.extent is None:
         return
+    _projection(viewer, area)
     count = splitting.columns(state.seeing.split)
     width = area.width / count
     paint = imgui.get_background_draw_list()
@@ -47,6 +48,17 @@ def draw(viewer: Viewer, area: Area) -> None:
             actions.measure_at(viewer, *area.fraction(mouse.x, mouse.y))
 
 
+def _projection(viewer: Viewer, area: Area) -> None:
+    """That there is no perspective, and how much the picture shows."""
+    view, scene = viewer.state.view, viewer.state.scene
+    if view is None or scene is None or not view.back:
+        return
+    line = imgui.get_text_line_height()
+    lines_below = 2 if "grid" in viewer.state.preferences.overlays else 1
+    text = f"orthographic, {overlays.length_text(view.span, scene.metres_per_unit)} across"
+    text_on_shade(text, area.left + 0.6 * line, area.top + area.height - 1.6 * lines_below * line, area)
+
+
 def clicked(area: Area) -> bool:
     """Whether the left button was clicked in the area, without modifiers and without a drag."""
     io = imgui.get_io()
@@ -58,8 +70,10 @@ def clicked(area: Area) -> bool:
 
 
 def _least_depth(viewer: Viewer) -> float:
+    """Camera z from which on lines are drawn: a little before the eye."""
     assert viewer.state.extent is not None
-    return overlays.LEAST_DEPTH * viewer.state.extent.radius
+    assert viewer.state.view is not None
+    return viewer.state.view.back + overlays.LEAST_DEPTH * viewer.state.extent.radius
 
 
 def _lines(area: Area, segments: Array, colour: tuple[float, float, float, float], thick: float) -> None:
