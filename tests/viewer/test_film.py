@@ -17,6 +17,7 @@ from langsplat_core.formats import save_scene
 from langsplat_core.progress import Cancelled
 from langsplat_viewer import __main__ as program
 from langsplat_viewer import options
+from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.files.flight_files import write_flight
 from langsplat_viewer.output import film_files
@@ -44,7 +45,9 @@ sys.exit(1)
 
 def shot(away: float = 0.0, **changed) -> Shot:
     given = {"fps": 4.0, "backend": "cpu", **changed}
-    return Shot(Subject(blob_scene()), cameras_of(flight(away), given["fps"], SIZE), **given)
+    return Shot(
+        Subject(blob_scene()), cameras_of(flight(away), extent_of(blob_scene()), given["fps"], SIZE), **given
+    )
 
 
 def picture(path: Path) -> np.ndarray:
@@ -230,7 +233,7 @@ def test_a_film_of_nothing_is_refused(folder):
 
 def test_pictures_of_nothing_are_counted(folder):
     keys = (*flight().keyframes, Keyframe(2.0, flight(1.0).keyframes[2].pose))
-    cameras = cameras_of(Flight(keys), 2.0, SIZE)
+    cameras = cameras_of(Flight(keys), extent_of(blob_scene()), 2.0, SIZE)
     lines = make_film(Shot(Subject(blob_scene()), cameras, 2.0, "cpu"), folder / "a.gif")
     assert lines[1].endswith("of 5 pictures show nothing of the scene")
 

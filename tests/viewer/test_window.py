@@ -53,6 +53,7 @@ def folder(tmp_path: Path) -> Path:
         "close_while_opening",
         "split_the_view",
         "draw_over_the_scene",
+        "look_without_perspective",
         "reload_what_changed",
         "change_a_key",
         "cut_by_depth",

@@ -138,7 +138,7 @@ def copy_command(viewer: Viewer, folder: Path) -> str:
         camera = str(saved.absolute())
     words = ["langsplat-viewer", str(state.path.absolute()), "--headless", "--camera", camera]
     if state.view.back:
-        words += ["--orthographic", repr(state.view.span)]
+        words += ["--orthographic", repr(float(state.view.span_in(*state.size)))]
     words += ["--size", "{}x{}".format(*state.size), *_display_words(state), *_look_words(state)]
     if viewer.services.encoder_id:
         words += ["--encoder", viewer.services.encoder_id]

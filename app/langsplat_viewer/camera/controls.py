@@ -67,9 +67,13 @@ class OrbitCamera:
 
     @property
     def span(self) -> float:
-        """World units across the shorter side of the picture, as far away as the target."""
-        inner = self.intrinsics
-        return self.distance * min(inner.width, inner.height) / min(inner.fx, inner.fy)
+        """World units across the shorter side of the uncropped picture, as far away as the target."""
+        return self.span_in(self.intrinsics.width, self.intrinsics.height)
+
+    def span_in(self, width: float, height: float) -> float:
+        """The same of a picture of `width` x `height` pixels."""
+        inner = self.intrinsics.fitted(width, height)
+        return self.distance * min(width, height) / min(inner.fx, inner.fy)
 
     @property
     def elevation(self) -> float:
@@ -252,7 +256,8 @@ def in_perspective(view: OrbitCamera) -> OrbitCamera:
 
 
 def spanning(view: OrbitCamera, span: float, extent: Extent) -> OrbitCamera:
-    """From the same eye in parallel projection, `span` world units across the picture's shorter side."""
+    """From the same eye in parallel projection, `span` world units across the uncropped picture's shorter
+    side."""
     distance = view.distance * span / view.span
     return in_parallel(focus(view, view.eye + distance * view.rotation[2], distance), extent)
 

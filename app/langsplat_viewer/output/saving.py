@@ -64,6 +64,6 @@ def save_view(viewer: Viewer, folder: Path) -> Path | None:
     except OSError as error:
         state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
         return None
-    span = f" --orthographic {state.view.span:.6g}" if state.view.back else ""
+    span = f" --orthographic {state.view.span_in(*state.size):.6g}" if state.view.back else ""
     state.say(f"saved {path}; show it again with --camera {path.name}{span}")
     return path

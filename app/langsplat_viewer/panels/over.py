@@ -55,7 +55,8 @@ def _projection(viewer: Viewer, area: Area) -> None:
         return
     line = imgui.get_text_line_height()
     lines_below = 2 if "grid" in viewer.state.preferences.overlays else 1
-    text = f"orthographic, {overlays.length_text(view.span, scene.metres_per_unit)} across"
+    span = overlays.length_text(view.span_in(*viewer.state.size), scene.metres_per_unit)
+    text = f"orthographic, {span} across the shorter side"
     text_on_shade(text, area.left + 0.6 * line, area.top + area.height - 1.6 * lines_below * line, area)
 
 
