@@ -24,7 +24,6 @@ def draw(viewer: Viewer, area: Area) -> None:
     state = viewer.state
     if state.scene is None or state.view is None or state.extent is None:
         return
-    _projection(viewer, area)
     count = splitting.columns(state.seeing.split)
     width = area.width / count
     paint = imgui.get_background_draw_list()
@@ -41,6 +40,7 @@ def draw(viewer: Viewer, area: Area) -> None:
             _things(viewer, part, camera)
         _ruler(viewer, part, camera)
         paint.pop_clip_rect()
+    _projection(viewer, area)
     if state.seeing.ruler.measures and not imgui.get_io().want_capture_mouse:
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_all)
         if clicked(area):
