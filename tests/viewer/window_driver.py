@@ -307,6 +307,21 @@ def close_while_opening(s: Session) -> None:
     assert s.window.viewer.worker.current is None
 
 
+def use_the_palette(s: Session) -> None:
+    """Its keys keep away from the scrollbar; Enter does the first command that matches."""
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
+    s.ctx.yield_(3)
+    box, bar = s.ctx.item_info("//Commands/##command").rect_full, imgui.get_style().scrollbar_size
+    right, rows = int(box.max.x - bar), slice(int(box.max.y) + 10, int(box.max.y) + 150)
+    seen = s.shot("palette")[rows]
+    assert np.ptp(seen[:, right - 100 : right], axis=0).max() > 60  # keys
+    assert np.ptp(seen[:, right - 5 : right - 1], axis=0).max() < 10
+    s.ctx.key_chars_append_enter("show depth")
+    s.ctx.yield_(3)
+    assert s.state.picture.display == "depth"
+    assert not s.state.show_palette
+
+
 def use_shortcuts(s: Session) -> None:
     """Chords work everywhere, letters only by themselves and never while typing."""
     s.wait(lambda: s.state.scene is not None)
@@ -350,12 +365,7 @@ def use_shortcuts(s: Session) -> None:
     s.ctx.yield_(2)
     assert s.state.show_help
     s.ctx.key_press(key.escape)
-    s.ctx.key_press(ctrl | shift | key.p)
-    s.ctx.yield_(3)
-    s.ctx.key_chars_append_enter("show depth")
-    s.ctx.yield_(3)
-    assert s.state.picture.display == "depth"
-    assert not s.state.show_palette
+    use_the_palette(s)
     s.ctx.key_press(ctrl | key.z)
     s.ctx.yield_(2)
     assert s.state.picture.display == "rgb"
