@@ -1,14 +1,17 @@
 """Scenarios of `window_driver` about seeing: several pictures, what is drawn over them, measuring."""
 
 from collections.abc import Callable
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from imgui_bundle import imgui  # isort: skip
 from langsplat_viewer import actions
+from langsplat_viewer.camera.labels import Label
 from langsplat_viewer.camera.view_cube import visible_faces
-from langsplat_viewer.panels.area import scene_area
+from langsplat_viewer.panels import over
+from langsplat_viewer.panels.area import Area, scene_area
 from langsplat_viewer.panels.cube import EDGE
 from tests.support.fakes import CENTRES
 
@@ -254,7 +257,33 @@ def look_without_perspective(s: Any) -> None:
     assert (s.state.camera_index, s.state.view.back) == (2, 0.0)
 
 
+def name_what_is_close(s: Any) -> None:
+    """Things in one line of sight have their names one above the other."""
+    begin(s)
+    actions.show_overlay(s.window.viewer, "things", True)
+    for word in ("mug", "book", "plant"):
+        s.search(word)
+    actions.look_from(s.window.viewer, "left")
+    s.settle()
+    written, write = [], over.text_on_shade
+
+    def remembered(text: str, x: float, y: float, area: Area) -> None:
+        size = imgui.calc_text_size(text)
+        written.append((text, Label(x, y, size.x, size.y)))
+        write(text, x, y, area)
+
+    over.text_on_shade = remembered
+    s.ctx.yield_(2)
+    over.text_on_shade = write
+    frame = dict(written)
+    assert set(frame) == {"mug", "book", "plant"}
+    assert not any(a.covers(b) for a, b in combinations(frame.values(), 2))
+    assert written[:3] == written[3:6]  # from frame to frame the same
+    s.shot("names")
+
+
 SCENARIOS: dict[str, Scenario] = {
+    "name_what_is_close": (name_what_is_close, "blobs.ply", {}),
     "look_without_perspective": (look_without_perspective, "blobs.ply", {}),
     "split_the_view": (split_the_view, "blobs.ply", {}),
     "cut_by_depth": (cut_by_depth, "blobs.ply", {}),
