@@ -164,7 +164,6 @@ def test_what_is_under_the_cursor_is_said_to_be_as_far_as_from_the_eye(flat):
 
 
 def test_opening_with_a_span_shows_as_much(opened):
-    actions.resize(opened, 100, 300)
     actions.open_orthographic(opened, 3.0)
-    assert opened.state.view.span_in(100, 300) == pytest.approx(3.0)
+    assert opened.state.view.span_in(*SIZE) == pytest.approx(3.0)
     assert errors(opened) == []

@@ -27,11 +27,12 @@ from langsplat_viewer.camera.controls import (
 from langsplat_viewer.camera.flight import Flight, Keyframe, camera_of, pose_at, pose_of, turntable, view_of
 from langsplat_viewer.camera.parallel import FarCamera, eye_depth
 from langsplat_viewer.drawing.channels import depth_range
+from langsplat_viewer.drawing.frame import FrameRenderer
 from langsplat_viewer.drawing.looking import looking_settings, why_nothing
 from langsplat_viewer.drawing.seeing import Clip
 from langsplat_viewer.options import scene_path
 from langsplat_viewer.output.headless import render_picture
-from tests.support.fakes import blob_scene
+from tests.support.fakes import CENTRES, blob_scene
 
 SIZE = (1280, 720)
 SIDES = ("front", "back", "left", "right", "top", "bottom")
@@ -112,6 +113,26 @@ def test_rasterizers_agree_on_it(room, side):
     assert images[0].std() > 20
     assert difference.mean() < 0.5
     assert np.quantile(difference, 0.999) <= 6
+
+
+@pytest.mark.parametrize("backend", ["opengl", "cpu"])
+def test_what_is_clicked_is_where_it_is(gl, backend):
+    """By the depth of one pixel, and by that of all of them."""
+    view = in_parallel(VIEW, EXTENT)
+    camera = view.camera(320, 240)
+    renderer = FrameRenderer(gl, backend, "half")
+    renderer.set_scene(BLOBS)
+    renderer.read(camera, PictureConfig())
+    for centre in CENTRES:
+        (pixel,), _ = camera.project(centre[None])
+        x, y = np.floor(pixel) + 0.5
+        one, every = renderer.depth_at(x, y), renderer.depth_map()[int(y), int(x)]
+        for depth in (one, every):
+            found = camera.unproject((x, y), float(depth)) - centre
+            assert -0.5 < found @ view.rotation[2] < 0.1  # the front of the blob
+            assert np.linalg.norm(found[:2]) < 0.3
+    assert renderer.depth_at(2.5, 2.5) is None
+    renderer.release()
 
 
 def test_lines_of_one_direction_are_parallel_in_the_picture():

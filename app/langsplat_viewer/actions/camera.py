@@ -146,10 +146,10 @@ def toggle_orthographic(viewer: Viewer) -> None:
 
 
 def open_orthographic(viewer: Viewer, span: float) -> None:
-    """Look without perspective, `span` world units across the window's shorter side."""
-    extent, size = viewer.state.extent, viewer.state.size
+    """Look without perspective, `span` world units across the shorter side of the uncropped picture."""
+    extent = viewer.state.extent
     if extent is not None:
-        move(viewer, lambda view: spanning(view, span * view.span / view.span_in(*size), extent))
+        move(viewer, lambda view: spanning(view, span, extent))
 
 
 def set_walking(viewer: Viewer, walks: bool) -> None:
