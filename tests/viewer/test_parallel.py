@@ -25,13 +25,13 @@ from langsplat_viewer.camera.controls import (
     zoom,
 )
 from langsplat_viewer.camera.flight import Flight, Keyframe, camera_of, pose_at, pose_of, turntable, view_of
-from langsplat_viewer.camera.parallel import FarCamera, eye_depth
 from langsplat_viewer.drawing.channels import depth_range
 from langsplat_viewer.drawing.frame import FrameRenderer
 from langsplat_viewer.drawing.looking import looking_settings, why_nothing
 from langsplat_viewer.drawing.seeing import Clip
 from langsplat_viewer.options import scene_path
 from langsplat_viewer.output.headless import render_picture
+from langsplat_viewer.parallel import FarCamera, eye_depth
 from tests.support.fakes import CENTRES, blob_scene
 
 SIZE = (1280, 720)

@@ -7,11 +7,11 @@ import numpy as np
 from langsplat_core.query.selection import at_point
 from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions.selecting import find, reach, take, use_tool
-from langsplat_viewer.camera.parallel import eye_depth
 from langsplat_viewer.drawing.seeing import UNCLIPPED
 from langsplat_viewer.marks import strokes
 from langsplat_viewer.marks.selecting import Mode, Stroke
 from langsplat_viewer.marks.strokes import Drawn
+from langsplat_viewer.parallel import eye_depth
 from langsplat_viewer.viewer import Viewer
 
 STEP = 0.002  # of the picture: places nearer to each other are one

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera, Intrinsics, Scene, look_at
 from langsplat_viewer.camera.framing import Sample, framing_eye, median_depth, nearest_depth, reach, sample_of
-from langsplat_viewer.camera.parallel import FarCamera, narrowed
+from langsplat_viewer.parallel import FarCamera, narrowed
 
 MAX_ELEVATION = math.radians(88)  # nearer to the pole a small drag would spin the picture
 DEFAULT_FOV = 50.0  # degrees, of the picture's shorter side

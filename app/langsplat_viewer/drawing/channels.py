@@ -14,9 +14,9 @@ from langsplat_core.raster import Rasterizer, View
 from langsplat_core.raster.protocol import MedianDepth
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Camera, Gaussians
-from langsplat_viewer.camera.parallel import eye_depth
 from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
 from langsplat_viewer.drawing.sight import LastView, Sight
+from langsplat_viewer.parallel import eye_depth
 
 _DEPTH_SAMPLE = 20_000  # Gaussians looked at for the depth range; quantiles need no more
 

@@ -8,8 +8,8 @@ import numpy as np
 from langsplat_core.arrays import logit
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians, Scene
-from langsplat_viewer.camera.parallel import eye_depth
 from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip, Splats
+from langsplat_viewer.parallel import eye_depth
 
 NEAR_SHARE = 0.25  # of the depth of what is nearest in the picture
 NEAREST_SHARE = 0.01  # of the Gaussians in the picture that count as the nearest

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from langsplat_core.config import RasterSettings
 from langsplat_core.raster import Rasterizer, View
 from langsplat_core.scene import Camera, Scene
-from langsplat_viewer.camera.parallel import eye_depth
 from langsplat_viewer.drawing.looking import looking_settings
 from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
+from langsplat_viewer.parallel import eye_depth
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.query.screen_selection import in_polygon, in_rectangle, in_stroke, on_surface, project
 from langsplat_core.query.selection import in_box, in_sphere
 from langsplat_core.scene import Camera
-from langsplat_viewer.camera.parallel import eye_depth
 from langsplat_viewer.marks.selecting import Stroke, Tool
+from langsplat_viewer.parallel import eye_depth
 
 CLICK = 0.006  # of the picture's height: a shorter drag is a click
 ROUND = 48  # corners of a circle
