@@ -15,6 +15,7 @@ from langsplat_core.display.colour_maps import MAX_QUERIES
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.ranges import Range
+from langsplat_viewer.camera.flight import SPAN_LIMITS
 from langsplat_viewer.drawing.frame import Backend
 from langsplat_viewer.drawing.seeing import Clip
 from langsplat_viewer.files.preferences import preferences_folder
@@ -29,6 +30,7 @@ from langsplat_viewer.options import (
 
 Seconds = Annotated[float, Range(0.1, 36_000.0)]
 PicturesPerSecond = Annotated[float, Range(0.1, 240.0)]
+Span = Annotated[float, Range(*SPAN_LIMITS)]
 Cuts = tuple[Share, ...]
 Colours = tuple[Annotated[int, Range(1, MAX_QUERIES)], ...]
 
@@ -64,6 +66,8 @@ class ViewerCommand:
     """Size of the window or picture in pixels."""
     camera: Annotated[str, tyro.conf.arg(metavar="FILE|INDEX")] = ""
     """First view: a camera file (JSON, as "Save view" writes it), or a training camera by number from 0."""
+    orthographic: Span | None = None
+    """Look without perspective: so many world units across the picture's shorter side."""
     backend: Backend = "auto"
     """What draws."""
     encoder: Annotated[str, tyro.conf.arg(metavar="ID|FOLDER")] = ""
@@ -103,6 +107,8 @@ class ViewerCommand:
 
         if self.path is not None and self.turntable is not None:
             raise InputError("--path and --turntable are two films; choose one")
+        if self.path is not None and self.orthographic is not None:
+            raise InputError("--orthographic is for one view; the keyframes of a --path say it themselves")
         is_film = self.path is not None or self.turntable is not None
         if is_film and self.transparent:
             raise InputError("--transparent is for pictures; films have a background")
@@ -121,6 +127,7 @@ class ViewerCommand:
             colours=self.colour,
             size=size,
             camera=self.camera,
+            orthographic=self.orthographic,
             backend=self.backend,
             colour_map=self.colour_map or "turbo",
             transparent=self.transparent,
@@ -167,6 +174,7 @@ class ViewerCommand:
                 display=chosen_display(self.display, self.query),
                 size=size,
                 camera=self.camera,
+                orthographic=self.orthographic,
                 backend=self.backend,
                 path_file=self.path,
                 heat_opacity=self.heat_opacity,

@@ -178,6 +178,7 @@ COMMANDS: tuple[Command, ...] = (
         "take the picture's up as the world's", lambda viewer: actions.move(viewer, adopt_up), menu="Camera"
     ),
     *(_side(side, key) for side, key in SIDE_KEYS),
+    Command("orthographic view, and back", actions.toggle_orthographic, ("O", "Keypad5"), "Camera"),
     Command("walk in place of flying, and back", actions.toggle_walking, menu="Camera"),
     Command("bookmark this view", actions.add_bookmark, ("Ctrl+B",), "Camera"),
     Command("add a keyframe here", actions.add_keyframe, ("K",), "Camera"),

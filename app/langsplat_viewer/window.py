@@ -65,6 +65,7 @@ class WindowRequest:
     display: Display = "rgb"
     size: tuple[int, int] | None = None  # of the window, pixels
     camera: str = ""
+    orthographic: float | None = None  # world units across the picture's shorter side; None: in perspective
     backend: Backend = "auto"
     path_file: Path | None = None  # a camera path
     heat_opacity: float = PictureConfig.heat_opacity
@@ -198,6 +199,8 @@ class Window:
                 actions.open_at(viewer, camera)
         except InputError as error:
             state.say(str(error), is_error=True)
+        if request.orthographic is not None:
+            actions.open_orthographic(viewer, request.orthographic)
         looks = replace(state.picture, heat_opacity=request.heat_opacity, dim=request.dim)
         actions.set_picture(viewer, looks)
         if request.path_file is not None:

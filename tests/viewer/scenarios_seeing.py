@@ -1,14 +1,17 @@
 """Scenarios of `window_driver` about seeing: several pictures, what is drawn over them, measuring."""
 
 from collections.abc import Callable
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from imgui_bundle import imgui  # isort: skip
 from langsplat_viewer import actions
+from langsplat_viewer.camera.labels import Label
 from langsplat_viewer.camera.view_cube import visible_faces
-from langsplat_viewer.panels.area import scene_area
+from langsplat_viewer.panels import over
+from langsplat_viewer.panels.area import Area, scene_area
 from langsplat_viewer.panels.cube import EDGE
 from tests.support.fakes import CENTRES
 
@@ -176,7 +179,112 @@ def faces_on_screen(s: Any, side: Any) -> list[tuple[str, tuple[float, float]]]:
 
 
 Scenario = tuple[Callable[[Any], None], str, dict[str, Any]]
+
+
+def measure_and_select(s: Any) -> None:
+    """From the mug to the book, then the book by a lasso."""
+    s.ctx.key_press(imgui.Key.m)
+    s.ctx.yield_(2)
+    for thing in (MUG, BOOK):
+        click(s, on_screen(s, thing))
+    assert abs(s.state.seeing.ruler.length - np.linalg.norm(MUG - BOOK)) < 0.2
+    s.ctx.key_press(imgui.Key.escape)
+    s.ctx.yield_(2)
+
+    actions.use_tool(s.window.viewer, "lasso")
+    middle = np.array(on_screen(s, BOOK))
+    reach = 0.45 * (on_screen(s, PLANT)[0] - middle[0])
+    turns = np.linspace(0, 2 * np.pi, 16)
+    places = middle + reach * np.stack([np.cos(turns), np.sin(turns)], 1)
+    s.ctx.mouse_teleport_to_pos(tuple(places[0]))
+    s.ctx.mouse_down(0)
+    for x, y in places:
+        s.ctx.mouse_teleport_to_pos((x, y))
+        s.ctx.yield_()
+    s.ctx.mouse_up(0)
+    s.ctx.yield_(2)
+    selected = s.state.selection.marks.selected.reshape(3, -1).sum(1)
+    assert selected[0] == selected[2] == 0
+    assert selected[1] > 40
+    s.shot("selected")
+    actions.use_tool(s.window.viewer, None)
+
+
+def look_without_perspective(s: Any) -> None:
+    """A key takes perspective away until it is pressed again; axes, wheel, tools and the click on a camera
+    work as ever, and the picture says what it is."""
+    begin(s)
+    deep, view = s.shot("deep"), s.state.view
+    s.ctx.key_press(imgui.Key.o)
+    s.settle()
+    assert s.state.view.back > 0
+    flat, area = s.shot("flat"), scene_area()
+    for thing in CENTRES:
+        assert s.at(flat, thing).argmax() == s.at(deep, thing).argmax()
+    corner = (slice(int(area.top + area.height) - 40, None), slice(int(area.left), int(area.left) + 200))
+    assert (flat[corner].min(-1) > 200).sum() > 100  # words
+    assert (deep[corner].min(-1) > 200).sum() == 0
+
+    s.ctx.key_press(imgui.Key.keypad1)
+    s.settle()
+    before = on_screen(s, PLANT)[0] - on_screen(s, MUG)[0]
+    s.ctx.mouse_teleport_to_pos((area.left + area.width / 2, area.top + area.height / 2))
+    s.ctx.mouse_wheel_y(-1)
+    s.ctx.yield_(2)
+    s.settle()
+    assert abs((on_screen(s, PLANT)[0] - on_screen(s, MUG)[0]) / before - 0.88) < 1e-3
+
+    measure_and_select(s)
+    s.menu("View", "Show or hide the training cameras")
+    s.ctx.key_press(imgui.Key.home)
+    s.settle()
+    assert s.state.view.back > 0
+    actions.open_panel(s.window.viewer, "Camera")
+    s.ctx.yield_(4)
+    s.ctx.item_click("//Camera/###orthographic")
+    s.settle()
+    np.testing.assert_allclose(
+        s.state.view.camera(160, 120).world_to_camera, view.camera(160, 120).world_to_camera, atol=1e-9
+    )
+    s.ctx.key_press(imgui.Key.keypad5)
+    s.ctx.yield_(2)
+    assert s.state.view.back > 0
+    actions.zoom_by(s.window.viewer, 4.0)  # until all cameras are in the picture
+    s.settle()
+    s.shot("cameras")
+    click(s, on_screen(s, s.state.scene.cameras[2].position))
+    s.settle()
+    assert (s.state.camera_index, s.state.view.back) == (2, 0.0)
+
+
+def name_what_is_close(s: Any) -> None:
+    """Things in one line of sight have their names one above the other."""
+    begin(s)
+    actions.show_overlay(s.window.viewer, "things", True)
+    for word in ("mug", "book", "plant"):
+        s.search(word)
+    actions.look_from(s.window.viewer, "left")
+    s.settle()
+    written, write = [], over.text_on_shade
+
+    def remembered(text: str, x: float, y: float, area: Area) -> None:
+        size = imgui.calc_text_size(text)
+        written.append((text, Label(x, y, size.x, size.y)))
+        write(text, x, y, area)
+
+    over.text_on_shade = remembered
+    s.ctx.yield_(2)
+    over.text_on_shade = write
+    frame = dict(written)
+    assert set(frame) == {"mug", "book", "plant"}
+    assert not any(a.covers(b) for a, b in combinations(frame.values(), 2))
+    assert written[:3] == written[3:6]  # from frame to frame the same
+    s.shot("names")
+
+
 SCENARIOS: dict[str, Scenario] = {
+    "name_what_is_close": (name_what_is_close, "blobs.ply", {}),
+    "look_without_perspective": (look_without_perspective, "blobs.ply", {}),
     "split_the_view": (split_the_view, "blobs.ply", {}),
     "cut_by_depth": (cut_by_depth, "blobs.ply", {}),
     "time_and_compare": (time_and_compare, "blobs.ply", {}),

@@ -149,6 +149,8 @@ def test_options_of_pictures_say_where_the_window_has_them(viewer, folder, optio
         (("--near-cut", "-1"), "--near-cut -1: must be 0"),
         (("--far-cut", "0"), "--far-cut 0: must be above 0"),
         (("--near-cut", "30"), "nothing of the scene"),
+        (("--orthographic", "0"), "--orthographic 0: must be 1e-09 to 1e+09"),
+        (("--orthographic", "4", "--near-cut", "30"), "nothing of the scene"),
     ],
 )
 def test_cuts_and_canonical_phrases_that_cannot_be_are_one_line(viewer, folder, options, said):
@@ -156,6 +158,22 @@ def test_cuts_and_canonical_phrases_that_cannot_be_are_one_line(viewer, folder, 
     assert (code, len(errors)) == (2, 1)
     assert said in errors[0]
     assert not (folder / "a.png").exists()
+
+
+def test_without_perspective_the_picture_has_the_scale_that_was_asked_for(viewer, folder):
+    """Three units across 120 pixels; each blob is as large as the others, however far away."""
+    code, out, err = viewer("blobs.ply", "--headless", "--orthographic", "3", "--out", "a.png")
+    assert (code, out, err) == (0, ["a.png: 160x120, rgb"], [])
+    image, camera = picture(folder / "a.png").astype(int), blob_scene().cameras[0]
+    sizes, middles = [], []
+    for colour in range(3):
+        others = [part for part in range(3) if part != colour]
+        rows, columns = np.nonzero(image[..., colour] - image[..., others].max(-1) > 40)
+        sizes.append(len(rows))
+        middles.append(columns.mean())
+    assert max(sizes) < 1.3 * min(sizes)
+    along = float((PLANT - MUG) @ camera.rotation[0])
+    assert abs(middles[2] - middles[0] - along * 120 / 3) < 4
 
 
 def test_a_cut_of_zero_is_the_answers_own(viewer, folder):

@@ -17,6 +17,7 @@ from langsplat_core.formats import save_scene
 from langsplat_core.progress import Cancelled
 from langsplat_viewer import __main__ as program
 from langsplat_viewer import options
+from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.files.flight_files import write_flight
 from langsplat_viewer.output import film_files
@@ -44,7 +45,9 @@ sys.exit(1)
 
 def shot(away: float = 0.0, **changed) -> Shot:
     given = {"fps": 4.0, "backend": "cpu", **changed}
-    return Shot(Subject(blob_scene()), cameras_of(flight(away), given["fps"], SIZE), **given)
+    return Shot(
+        Subject(blob_scene()), cameras_of(flight(away), extent_of(blob_scene()), given["fps"], SIZE), **given
+    )
 
 
 def picture(path: Path) -> np.ndarray:
@@ -230,7 +233,7 @@ def test_a_film_of_nothing_is_refused(folder):
 
 def test_pictures_of_nothing_are_counted(folder):
     keys = (*flight().keyframes, Keyframe(2.0, flight(1.0).keyframes[2].pose))
-    cameras = cameras_of(Flight(keys), 2.0, SIZE)
+    cameras = cameras_of(Flight(keys), extent_of(blob_scene()), 2.0, SIZE)
     lines = make_film(Shot(Subject(blob_scene()), cameras, 2.0, "cpu"), folder / "a.gif")
     assert lines[1].endswith("of 5 pictures show nothing of the scene")
 
@@ -239,6 +242,7 @@ def test_pictures_of_nothing_are_counted(folder):
     ("arguments", "reason"),
     [
         (["--path", "path.json", "--turntable", "3", "--out", "a.gif"], "choose one"),
+        (["--path", "path.json", "--orthographic", "2", "--out", "a.gif"], "--orthographic is for one view"),
         (["--path", "path.json"], "--out film.mp4"),
         (["--path", "path.json", "--out", "a.png"], "a film is .mp4"),
         (["--path", "broken.json", "--out", "a.gif"], "broken.json"),
@@ -256,6 +260,21 @@ def test_what_cannot_work_is_one_line(viewer, folder, arguments, reason):
     assert (code, out, len(err)) == (2, [], 1)
     assert reason in err[0]
     assert sorted(folder.rglob("*")) == before
+
+
+def test_a_turntable_without_perspective_begins_with_the_same_picture(viewer, folder):
+    arguments = ["--orthographic", "3", "--size", "64x48", "--query", "plant", "--display", "rgb"]
+    for more in (["--turntable", "1", "--fps", "4", "--out", "film"], ["--out", "still.png"]):
+        assert viewer("blobs.ply", *arguments, *more)[0] == 0
+    first, still = picture(folder / "film" / FRAMES[0]), picture(folder / "still.png")
+    assert still.std() > 10
+    np.testing.assert_allclose(first, still, atol=2)
+    assert np.abs(picture(folder / "film" / FRAMES[1]).astype(int) - still).max() > 30
+    turned = [*arguments, "--turntable", "1", "--fps", "4", "--around", "answer", "--out", "around"]
+    assert viewer("blobs.ply", *turned)[0] == 0
+    for name in FRAMES[:4]:  # the plant, as large as before, in the middle
+        seen = picture(folder / "around" / name).astype(int)
+        assert seen[20:28, 28:36].mean((0, 1)).argmax() == 2
 
 
 def test_the_sides_of_a_video_are_even(ffmpeg, viewer, folder):

@@ -24,12 +24,16 @@ def file_of(*entries, version=1):
 
 def test_a_path_is_read_as_it_was_written(tmp_path):
     rotation = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    keys = tuple(Keyframe(t, Pose(np.array([t, 0.1, -2e-7]), rotation, 33.3)) for t in (0.0, 1 / 3, 2.5))
+    keys = tuple(
+        Keyframe(t, Pose(np.array([t, 0.1, -2e-7]), rotation, 33.3, span))
+        for t, span in ((0.0, None), (1 / 3, 4.2), (2.5, None))
+    )
     write_flight(tmp_path / "path.json", Flight(keys))
     assert [path.name for path in tmp_path.iterdir()] == ["path.json"]
     for got, wanted in zip(read_flight(tmp_path / "path.json").keyframes, keys, strict=True):
         assert got.seconds == wanted.seconds
         assert got.pose.fov_degrees == wanted.pose.fov_degrees
+        assert got.pose.span == wanted.pose.span
         assert_allclose(got.pose.position, wanted.pose.position, rtol=0, atol=0)
         assert_allclose(got.pose.rotation, wanted.pose.rotation, rtol=0, atol=0)
 
@@ -59,6 +63,9 @@ def test_a_path_is_read_as_it_was_written(tmp_path):
         (file_of(entry(fov_degrees=0)), "0.01 to 179"),
         (file_of(entry(fov_degrees=180)), "0.01 to 179"),
         (file_of(entry(fov_degrees=10**400)), "not a number"),
+        (file_of(entry(span=0)), "'span' is 0"),
+        (file_of(entry(span=1e300)), "'span' is 1e+300"),
+        (file_of(entry(span="wide")), "'span' is not a number"),
     ],
 )
 def test_what_is_no_path_is_one_line(tmp_path, top, reason):

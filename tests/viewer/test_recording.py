@@ -251,7 +251,18 @@ def cut_by_hand(viewer) -> None:
 
 QUERIES = ("queries", "colours", "sliders", "cuts", "canonical")
 SLIDERS = PictureConfig(display="relevancy", heat_opacity=0.3, dim=0.9)
+
+
+def look_flat(viewer) -> None:
+    """In a tall window, and with a cut, which counts from the eye."""
+    actions.resize(viewer, 130, 200)
+    actions.toggle_orthographic(viewer)
+    actions.zoom_by(viewer, 0.8)
+    actions.set_clip(viewer, Clip(3.9, 4.3))
+
+
 LOOKS = {
+    "orthographic": look_flat,
     "colours": lambda viewer: actions.hide(viewer, viewer.state.queries[0]),
     "sliders": lambda viewer: actions.set_picture(viewer, SLIDERS),
     "cuts": cut_by_hand,
@@ -261,7 +272,9 @@ LOOKS = {
 }
 
 
-@pytest.mark.parametrize("case", ["training camera", "elsewhere", *QUERIES, "latent", "depth", "clip"])
+@pytest.mark.parametrize(
+    "case", ["training camera", "elsewhere", *QUERIES, "latent", "depth", "clip", "orthographic"]
+)
 def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run, case):
     where = folder / "with a space"
     where.mkdir()
@@ -284,7 +297,9 @@ def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run
         [] if case == "training camera" else [".json"]
     )
     with painter(subject_of(opened.state), "cpu") as paint:
-        expected = draw_something(subject_of(opened.state), opened.state.view.camera(200, 130), paint)
+        expected = draw_something(
+            subject_of(opened.state), opened.state.view.camera(*opened.state.size), paint
+        )
     assert_allclose(run(command), expected.astype(int), atol=2)
     assert expected.std() > 5
     assert errors(opened) == []

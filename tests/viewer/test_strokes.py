@@ -6,6 +6,7 @@ import pytest
 from langsplat_core.scene import look_at
 from langsplat_viewer import actions
 from langsplat_viewer.camera.controls import from_camera
+from langsplat_viewer.drawing.seeing import Clip
 from langsplat_viewer.marks import strokes
 from langsplat_viewer.marks.selecting import Stroke
 from langsplat_viewer.marks.strokes import Drawn, caught, outlines
@@ -105,6 +106,26 @@ def test_what_lies_behind_something_is_left_out_unless_all_is_wanted(front, monk
     assert marked(front)[0] == "book"
     np.testing.assert_array_equal(in_front, marks_of(front).selected & (z + 5 <= 4.95 * 1.03))
     assert 20 < in_front.sum() < 100
+
+
+def test_in_parallel_projection_strokes_meet_the_same(front, monkeypatch):
+    """Depths count from the eye: what hides, and what is cut away."""
+    actions.toggle_orthographic(front)
+    back = front.state.view.back
+    monkeypatch.setattr(FakeSurface, "depths", lambda self: np.full((30, 40), back + 4.95))
+    z = front.state.scene.gaussians.means[:, 2]
+    actions.use_tool(front, "lasso")
+    draw(front, around(front, CENTRES[0], 0.7))
+    in_front = marks_of(front).selected
+    actions.set_only_visible(front, False)
+    draw(front, around(front, CENTRES[0], 0.7))
+    assert marked(front)[0] == "mug"
+    np.testing.assert_array_equal(in_front, marks_of(front).selected & (z + 5 <= 4.95 * 1.03))
+    assert 20 < in_front.sum() < 100
+    actions.set_clip(front, Clip(5.0))
+    draw(front, around(front, CENTRES[0], 0.7))
+    assert 20 < marks_of(front).selected.sum() < 100
+    assert (z[marks_of(front).selected] > 0).all()
 
 
 def test_a_click_selects_the_thing_at_the_level_of_the_queries(front, monkeypatch):

@@ -53,6 +53,8 @@ def folder(tmp_path: Path) -> Path:
         "close_while_opening",
         "split_the_view",
         "draw_over_the_scene",
+        "look_without_perspective",
+        "name_what_is_close",
         "reload_what_changed",
         "change_a_key",
         "cut_by_depth",

@@ -277,8 +277,11 @@ def from_the_command_line(s: Session) -> None:
     assert [query.result is not None for query in s.state.queries] == [True, False, True]
     assert s.state.picture.display == "segmentation"
     assert s.state.level == "whole"
-    expected = s.state.scene.cameras[2].world_to_camera
-    np.testing.assert_allclose(s.state.view.camera(160, 120).world_to_camera, expected, atol=1e-9)
+    expected = s.state.scene.cameras[2]
+    np.testing.assert_allclose(s.state.view.eye, expected.position, atol=1e-9)
+    np.testing.assert_allclose(s.state.view.rotation, expected.rotation, atol=1e-9)
+    assert s.state.view.back > 0
+    assert abs(s.state.view.span - 4.0) < 1e-9
 
 
 def broken_renderer(s: Session) -> None:
@@ -305,6 +308,21 @@ def close_while_opening(s: Session) -> None:
     assert s.window.viewer.worker.current is not None
     s.ctx.item_click("//**/Cancel")
     assert s.window.viewer.worker.current is None
+
+
+def use_the_palette(s: Session) -> None:
+    """Its keys keep away from the scrollbar; Enter does the first command that matches."""
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
+    s.ctx.yield_(3)
+    box, bar = s.ctx.item_info("//Commands/##command").rect_full, imgui.get_style().scrollbar_size
+    right, rows = int(box.max.x - bar), slice(int(box.max.y) + 10, int(box.max.y) + 150)
+    seen = s.shot("palette")[rows]
+    assert np.ptp(seen[:, right - 100 : right], axis=0).max() > 60  # keys
+    assert np.ptp(seen[:, right - 5 : right - 1], axis=0).max() < 10
+    s.ctx.key_chars_append_enter("show depth")
+    s.ctx.yield_(3)
+    assert s.state.picture.display == "depth"
+    assert not s.state.show_palette
 
 
 def use_shortcuts(s: Session) -> None:
@@ -350,12 +368,7 @@ def use_shortcuts(s: Session) -> None:
     s.ctx.yield_(2)
     assert s.state.show_help
     s.ctx.key_press(key.escape)
-    s.ctx.key_press(ctrl | shift | key.p)
-    s.ctx.yield_(3)
-    s.ctx.key_chars_append_enter("show depth")
-    s.ctx.yield_(3)
-    assert s.state.picture.display == "depth"
-    assert not s.state.show_palette
+    use_the_palette(s)
     s.ctx.key_press(ctrl | key.z)
     s.ctx.yield_(2)
     assert s.state.picture.display == "rgb"
@@ -506,7 +519,13 @@ SCENARIOS = {
     "from_the_command_line": (
         from_the_command_line,
         "blobs.ply",
-        {"queries": ("mug", "sofa", "plant"), "display": "segmentation", "level": "whole", "camera": "2"},
+        {
+            "queries": ("mug", "sofa", "plant"),
+            "display": "segmentation",
+            "level": "whole",
+            "camera": "2",
+            "orthographic": 4.0,
+        },
     ),
     "broken_renderer": (broken_renderer, "blobs.ply", {}),
     "use_shortcuts": (use_shortcuts, "blobs.ply", {}),

@@ -30,11 +30,14 @@ from langsplat_viewer.actions.camera import go_to_camera as go_to_camera
 from langsplat_viewer.actions.camera import look_from as look_from
 from langsplat_viewer.actions.camera import move as move
 from langsplat_viewer.actions.camera import open_at as open_at
+from langsplat_viewer.actions.camera import open_orthographic as open_orthographic
 from langsplat_viewer.actions.camera import reset_view as reset_view
 from langsplat_viewer.actions.camera import set_fly_speed as set_fly_speed
+from langsplat_viewer.actions.camera import set_orthographic as set_orthographic
 from langsplat_viewer.actions.camera import set_walking as set_walking
 from langsplat_viewer.actions.camera import step_camera as step_camera
 from langsplat_viewer.actions.camera import tick as tick
+from langsplat_viewer.actions.camera import toggle_orthographic as toggle_orthographic
 from langsplat_viewer.actions.camera import toggle_walking as toggle_walking
 from langsplat_viewer.actions.camera import zoom_by as zoom_by
 from langsplat_viewer.actions.exporting import export as export

@@ -1,6 +1,7 @@
 """Time, and the camera that moves in it: at once, or gliding from view to view."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from langsplat_viewer.camera.controls import (
     from_camera,
     from_side,
     holding_distance,
+    in_parallel,
+    in_perspective,
+    spanning,
     zoom,
 )
 from langsplat_viewer.state import GLIDE_SECONDS, Glide, Query
@@ -92,10 +96,21 @@ def opening_view(viewer: Viewer) -> OrbitCamera | None:
 
 
 def reset_view(viewer: Viewer) -> None:
-    """Return to the opening view."""
-    view = opening_view(viewer)
-    if view is not None:
-        glide_to(viewer, view)
+    """Return to the opening view, in the projection of now."""
+    view, extent = opening_view(viewer), viewer.state.extent
+    if view is None or extent is None:
+        return
+    if viewer.state.view is not None and viewer.state.view.back:
+        view = in_parallel(view, extent)
+        if _opens_framed(viewer):
+            view = frame_all(view, extent, viewer.state.size)
+    glide_to(viewer, view)
+
+
+def _opens_framed(viewer: Viewer) -> bool:
+    """Whether the opening view is one of everything."""
+    scene = viewer.state.scene
+    return viewer.state.opening_camera is None and scene is not None and not scene.cameras
 
 
 def frame_scene(viewer: Viewer) -> None:
@@ -109,6 +124,32 @@ def look_from(viewer: Viewer, side: Side) -> None:
     """Look at what the view turns around along one of the world's axes, from as far as now."""
     if viewer.state.view is not None:
         glide_to(viewer, from_side(viewer.state.view, side))
+
+
+def set_orthographic(viewer: Viewer, orthographic: bool) -> None:
+    """Look without perspective, or with it again; a glide under way goes on."""
+    state = viewer.state
+    view, extent, glide = state.view, state.extent, state.glide
+    if view is None or extent is None or bool(view.back) == orthographic:
+        return
+
+    def turned(view: OrbitCamera) -> OrbitCamera:
+        return in_parallel(view, extent) if orthographic else in_perspective(view)
+
+    move(viewer, turned)
+    state.glide = None if glide is None else replace(glide, end=turned(glide.end))
+
+
+def toggle_orthographic(viewer: Viewer) -> None:
+    """Look without perspective, or with it again."""
+    set_orthographic(viewer, viewer.state.view is not None and not viewer.state.view.back)
+
+
+def open_orthographic(viewer: Viewer, span: float) -> None:
+    """Look without perspective, `span` world units across the shorter side of the uncropped picture."""
+    extent = viewer.state.extent
+    if extent is not None:
+        move(viewer, lambda view: spanning(view, span, extent))
 
 
 def set_walking(viewer: Viewer, walks: bool) -> None:
@@ -176,5 +217,7 @@ def focus_pixel(viewer: Viewer, u: float, v: float) -> None:
     if point is None:
         viewer.state.say("nothing under the cursor to turn around")
         return
-    depth = float((point - viewer.state.view.eye) @ viewer.state.view.rotation[2])
-    glide_to(viewer, focus(viewer.state.view, point, depth))
+    view = viewer.state.view
+    # The eye stays, but in parallel projection the size of things does.
+    depth = None if view.back else float((point - view.eye) @ view.rotation[2])
+    glide_to(viewer, focus(view, point, depth))

@@ -15,7 +15,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress
 from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions.playback import path_seconds
-from langsplat_viewer.camera.controls import from_camera
+from langsplat_viewer.camera.controls import from_camera, in_perspective
 from langsplat_viewer.camera.flight import Motion, turntable
 from langsplat_viewer.drawing.channels import Layers
 from langsplat_viewer.drawing.seeing import Splats
@@ -58,13 +58,13 @@ def film_motion(viewer: Viewer) -> Motion | None:
 def save_film(viewer: Viewer, folder: Path) -> None:
     """Have a film made along the path, to the typed place or to a new name in `folder`."""
     state, record, motion = viewer.state, viewer.state.record, film_motion(viewer)
-    if motion is None:
+    if motion is None or state.extent is None:
         state.say("a film needs a path: add a keyframe, or choose a turntable", is_error=True)
         return
     subject = subject_of(state)
     try:
         out = check_film(_film_out(viewer, folder), record.size)
-        cameras = cameras_of(motion, record.fps, record.size)
+        cameras = cameras_of(motion, state.extent, record.fps, record.size)
     except (InputError, OSError) as error:
         state.say(f"no film: {error}", is_error=True)
         return
@@ -137,6 +137,8 @@ def copy_command(viewer: Viewer, folder: Path) -> str:
             return ""
         camera = str(saved.absolute())
     words = ["langsplat-viewer", str(state.path.absolute()), "--headless", "--camera", camera]
+    if state.view.back:
+        words += ["--orthographic", repr(float(state.view.span_in(*state.size)))]
     words += ["--size", "{}x{}".format(*state.size), *_display_words(state), *_look_words(state)]
     if viewer.services.encoder_id:
         words += ["--encoder", viewer.services.encoder_id]
@@ -153,10 +155,10 @@ def take_clipboard(viewer: Viewer) -> str:
 
 
 def _training_camera(state: ViewerState) -> str | None:
-    """The number of the training camera that the view is, exactly."""
+    """The number of the training camera whose view it is, exactly, with perspective or without."""
     if state.view is None or state.scene is None or state.extent is None:
         return None
-    here = state.view.camera(*state.size)
+    here = in_perspective(state.view).camera(*state.size)
     for number, own in enumerate(state.scene.cameras):
         there = from_camera(own, state.extent).camera(*state.size)
         same = np.allclose(there.world_to_camera, here.world_to_camera, rtol=0, atol=1e-9)

@@ -20,9 +20,17 @@ SAME = 1e-6  # of the scene's radius, and of a rotation: nearer is the same plac
 
 
 def standing_at(state: ViewerState) -> Camera | None:
-    """The training camera whose pose the view has, whatever its field of view; None elsewhere."""
+    """The training camera whose pose the view has, whatever its field of view; None elsewhere, and without
+    perspective."""
     scene, view, index = state.scene, state.view, state.camera_index
-    if scene is None or view is None or state.extent is None or index is None or state.glide is not None:
+    if (
+        scene is None
+        or view is None
+        or view.back
+        or state.extent is None
+        or index is None
+        or state.glide is not None
+    ):
         return None
     camera = scene.cameras[index]
     is_there = np.abs(view.eye - camera.position).max() <= SAME * state.extent.radius

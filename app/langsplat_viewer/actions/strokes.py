@@ -11,6 +11,7 @@ from langsplat_viewer.drawing.seeing import UNCLIPPED
 from langsplat_viewer.marks import strokes
 from langsplat_viewer.marks.selecting import Mode, Stroke
 from langsplat_viewer.marks.strokes import Drawn
+from langsplat_viewer.parallel import eye_depth
 from langsplat_viewer.viewer import Viewer
 
 STEP = 0.002  # of the picture: places nearer to each other are one
@@ -56,9 +57,9 @@ def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
         return
     wanted = state.selection.only_visible and drawn.tool in strokes.ON_SCREEN and viewer.surface is not None
     depths = viewer.surface.depths() if wanted and viewer.surface is not None else None
-    means, clip = state.scene.gaussians.means, state.seeing.clip
+    means, clip = state.scene.gaussians.means, state.seeing.clip.beyond(eye_depth(drawn.camera))
     found = strokes.caught(drawn, means, depths)
-    if clip != UNCLIPPED and drawn.tool in strokes.ON_SCREEN:  # what was cut away lies under no outline
+    if clip != UNCLIPPED and drawn.tool in strokes.ON_SCREEN:  # what is not drawn lies under no outline
         found &= clip.keeps(means @ drawn.camera.rotation[2] + drawn.camera.world_to_camera[2, 3])
     take(viewer, found, mode)
 

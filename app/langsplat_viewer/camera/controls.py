@@ -13,12 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera, Intrinsics, Scene, look_at
-from langsplat_viewer.camera.framing import Sample, framing_eye, median_depth, reach, sample_of
+from langsplat_viewer.camera.framing import Sample, framing_eye, median_depth, nearest_depth, reach, sample_of
+from langsplat_viewer.parallel import FarCamera, narrowed
 
 MAX_ELEVATION = math.radians(88)  # nearer to the pole a small drag would spin the picture
 DEFAULT_FOV = 50.0  # degrees, of the picture's shorter side
 FOV_RANGE = (10.0, 120.0)  # degrees
 FARTHEST = 12.0  # of the distance from the middle that holds the scene: it is still a spot that can be seen
+BACK = 25.0  # of `Extent.farthest`: so far behind the eye stands the camera of a parallel projection
+NARROW = 1e4  # how much longer the lens is by which a scene is framed in parallel projection
 SURROUNDINGS = 1.8  # how much more than a thing itself a view of it shows
 
 
@@ -40,6 +43,9 @@ class OrbitCamera:
     distance: float  # world units from the eye to the target, > 0
     up: Array  # (3,) unit, the world's up: the axis that a sideways drag turns about
     intrinsics: Intrinsics  # of a picture that any window shows whole, uncropped
+    back: float = (
+        0.0  # world units that the camera stands behind the eye, see `in_parallel`; 0: in perspective
+    )
 
     @property
     def eye(self) -> Array:
@@ -47,12 +53,27 @@ class OrbitCamera:
         return self.target - self.distance * self.rotation[2]
 
     def camera(self, width: int, height: int) -> Camera:
-        """The pinhole camera for a picture of `width` x `height` pixels."""
+        """The camera for a picture of `width` x `height` pixels."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.rotation
         matrix[:3, 3] = -self.rotation @ self.eye
         inner = self.intrinsics.fitted(width, height)
-        return Camera(width, height, inner.fx, inner.fy, inner.cx, inner.cy, matrix)
+        if not self.back:
+            return Camera(width, height, inner.fx, inner.fy, inner.cx, inner.cy, matrix)
+        matrix[2, 3] += self.back
+        inner = narrowed(inner, (self.distance + self.back) / self.distance)
+        pinhole = (width, height, inner.fx, inner.fy, inner.cx, inner.cy, matrix)
+        return FarCamera(*pinhole, back=self.back, distance=self.distance)
+
+    @property
+    def span(self) -> float:
+        """World units across the shorter side of the uncropped picture, as far away as the target."""
+        return self.span_in(self.intrinsics.width, self.intrinsics.height)
+
+    def span_in(self, width: float, height: float) -> float:
+        """The same of a picture of `width` x `height` pixels."""
+        inner = self.intrinsics.fitted(width, height)
+        return self.distance * min(width, height) / min(inner.fx, inner.fy)
 
     @property
     def elevation(self) -> float:
@@ -105,10 +126,11 @@ def zoom(
     view: OrbitCamera, factor: float, min_distance: float, max_distance: float = math.inf
 ) -> OrbitCamera:
     """Multiply the distance by `factor`; at `min_distance` the target is pushed on, so it never sticks, and
-    at `max_distance` the way back ends (a view from farther away stays where it is)."""
+    at `max_distance` the way back ends (a view from farther away stays where it is). In parallel projection
+    pushing on would make nothing larger."""
     wanted = view.distance * factor
     distance = min(max(wanted, min_distance), max(max_distance, view.distance))
-    push = distance - wanted if factor < 1 else 0.0
+    push = distance - wanted if factor < 1 and not view.back else 0.0
     return replace(view, distance=distance, target=view.target + push * view.rotation[2])
 
 
@@ -175,7 +197,7 @@ def with_fov(view: OrbitCamera, fov_degrees: float) -> OrbitCamera:
 
 
 def between(start: OrbitCamera, end: OrbitCamera, t: float) -> OrbitCamera:
-    """A view on the way from `start` (t = 0) to `end` (t = 1); the intrinsics are the end's."""
+    """A view on the way from `start` (t = 0) to `end` (t = 1); intrinsics and projection are the end's."""
     if t >= 1:
         return end
     ease = t * t * (3 - 2 * t)
@@ -210,21 +232,48 @@ def extent_of(scene: Scene) -> Extent:
 
 
 def from_camera(camera: Camera, extent: Extent) -> OrbitCamera:
-    """The exact view of `camera`, turning around the depth at which it sees the scene's middle."""
+    """The exact view of `camera`, turning around the depth at which it sees the scene's middle; of a far one
+    around what it was made for."""
     forward = camera.rotation[2]
+    if isinstance(camera, FarCamera):
+        target = camera.position + (camera.back + camera.distance) * forward
+        lens = camera.near_intrinsics
+        return OrbitCamera(camera.rotation, target, camera.distance, extent.up, lens, camera.back)
     distance = max(float((extent.centre - camera.position) @ forward), 0.3 * extent.radius)
     target = camera.position + distance * forward
     return OrbitCamera(camera.rotation, target, distance, extent.up, camera.intrinsics)
 
 
+def in_parallel(view: OrbitCamera, extent: Extent) -> OrbitCamera:
+    """The same view without perspective: what is as far as the target keeps its size. What lies behind the
+    eye stays out of the picture."""
+    return replace(view, back=BACK * extent.farthest)
+
+
+def in_perspective(view: OrbitCamera) -> OrbitCamera:
+    """The same view with perspective."""
+    return replace(view, back=0.0)
+
+
+def spanning(view: OrbitCamera, span: float, extent: Extent) -> OrbitCamera:
+    """From the same eye in parallel projection, `span` world units across the uncropped picture's shorter
+    side."""
+    distance = view.distance * span / view.span
+    return in_parallel(focus(view, view.eye + distance * view.rotation[2], distance), extent)
+
+
 def frame_all(view: OrbitCamera, extent: Extent, size: tuple[int, int]) -> OrbitCamera:
     """Stand back, or come nearer, until a window of `size` pixels holds the scene; the direction is kept."""
-    eye = framing_eye(extent.sample, view.rotation, view.intrinsics.fitted(*size))
+    narrow = NARROW if view.back else 1.0
+    eye = framing_eye(extent.sample, view.rotation, narrowed(view.intrinsics.fitted(*size), narrow))
     forward = view.rotation[2]
     if eye is None:
         return focus(view, extent.centre, 2.6 * extent.radius)
-    distance = max(median_depth(extent.sample, eye, forward), 1e-3 * extent.radius)
-    return replace(view, target=eye + distance * forward, distance=distance)
+    depth = max(median_depth(extent.sample, eye, forward), 1e-3 * extent.radius)
+    target, distance = eye + depth * forward, depth / narrow
+    if view.back:  # however flat the scene looks from here, nothing of it is behind the eye
+        distance = max(distance, -nearest_depth(extent.sample, target, forward))
+    return replace(view, target=target, distance=distance)
 
 
 def holding_distance(view: OrbitCamera, box: Array) -> float:

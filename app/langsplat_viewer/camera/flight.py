@@ -4,10 +4,11 @@ A path passes through its keyframes and is smooth in between: position and orien
 velocities (Catmull and Rom 1974; for orientations the cumulative Bezier curve of Kim, Kim and Shin 1995, "A
 general construction scheme for unit quaternion curves with simple high order derivatives"). Each stretch
 depends on its two keyframes and their neighbours only, so that a change is not felt far away. Where two
-keyframes are equal, the camera rests between them.
+keyframes are equal, the camera rests between them. Perspective or not is as in the keyframe before.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -18,10 +19,11 @@ from scipy.spatial.transform import Rotation
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera
-from langsplat_viewer.camera.controls import Extent, OrbitCamera, from_camera, symmetric_intrinsics
+from langsplat_viewer.camera.controls import Extent, OrbitCamera, from_camera, spanning, symmetric_intrinsics
 
 SAME = 1e-9  # a step as small as this, of the largest coordinate or in radians, is none
 FOV_LIMITS = (0.01, 179.0)  # degrees
+SPAN_LIMITS = (1e-9, 1e9)  # world units
 LONGEST = 36_000.0  # seconds of a path
 SAME_TIME = 1e-3  # seconds: two keyframes are not nearer
 
@@ -33,9 +35,13 @@ class Pose:
     position: Array  # (3,) world units
     rotation: Array  # (3, 3) world to camera, rows are right, down and forward
     fov_degrees: float  # across the picture's shorter side, within `FOV_LIMITS`
+    span: float | None = (
+        None  # world units across that side in parallel projection, > 0; None: in perspective
+    )
 
     def camera(self, width: int, height: int) -> Camera:
-        """The pinhole camera of a picture of `width` x `height` pixels, its principal point in the centre."""
+        """The pinhole camera of a picture of `width` x `height` pixels, its principal point in the centre;
+        `camera_of` minds `span`."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.rotation
         matrix[:3, 3] = -self.rotation @ self.position
@@ -112,7 +118,7 @@ class Turntable:
         turns = Rotation.from_rotvec(angles[:, None] * self.up).as_matrix()
         arm = self.start.position - self.centre
         return tuple(
-            Pose(self.centre + turn.T @ arm, self.start.rotation @ turn, self.start.fov_degrees)
+            replace(self.start, position=self.centre + turn.T @ arm, rotation=self.start.rotation @ turn)
             for turn in turns
         )
 
@@ -124,12 +130,20 @@ def turntable(view: OrbitCamera, seconds: float) -> Turntable:
 
 def pose_of(view: OrbitCamera) -> Pose:
     """The eye of a view. A principal point that is off the centre moves there."""
-    return Pose(view.eye, view.rotation, view.intrinsics.fov_degrees)
+    span = view.span if view.back else None
+    return Pose(view.eye, view.rotation, view.intrinsics.fov_degrees, span)
 
 
 def view_of(pose: Pose, extent: Extent) -> OrbitCamera:
-    """A view from `pose`, turning around the depth at which it sees the scene's middle."""
-    return from_camera(pose.camera(1, 1), extent)
+    """A view from `pose`, turning around the depth at which it sees the scene's middle; without perspective
+    around the depth of which perspective would show as much."""
+    view = from_camera(pose.camera(1, 1), extent)
+    return view if pose.span is None else spanning(view, pose.span, extent)
+
+
+def camera_of(pose: Pose, extent: Extent, size: tuple[int, int]) -> Camera:
+    """The camera of a picture of `size` (width, height) pixels from `pose`."""
+    return pose.camera(*size) if pose.span is None else view_of(pose, extent).camera(*size)
 
 
 def pose_at(motion: Motion, seconds: float) -> Pose:
@@ -181,6 +195,9 @@ class _Curve:
         # The focal length, which grows evenly when one zooms; its curve stays within the keyframes.
         focal = [-math.log(math.tan(math.radians(key.pose.fov_degrees) / 2)) for key in keyframes]
         self._focal = PchipInterpolator(self._times, focal)
+        spans = [key.pose.span for key in keyframes]
+        self._parallel = np.array([span is not None for span in spans])
+        self._span = PchipInterpolator(self._times, [math.log(span) for span in _without_gaps(spans)])
 
     def poses(self, seconds: Array) -> tuple[Pose, ...]:
         times = np.clip(seconds, self._times[0], self._times[-1])
@@ -193,8 +210,22 @@ class _Curve:
             * Rotation.from_rotvec(u**3 * self._last[row])
         )
         fov = np.degrees(2 * np.arctan(np.exp(-self._focal(times))))
-        found = zip(self._positions(times), turned.inv().as_matrix(), fov, strict=True)
-        return tuple(Pose(position, rotation, float(degrees)) for position, rotation, degrees in found)
+        parallel = self._parallel[np.searchsorted(self._times, times, "right") - 1]  # till the next keyframe
+        spans = [
+            float(span) if flat else None
+            for span, flat in zip(np.exp(self._span(times)), parallel, strict=True)
+        ]
+        found = zip(self._positions(times), turned.inv().as_matrix(), fov.tolist(), spans, strict=True)
+        return tuple(Pose(*parts) for parts in found)
+
+
+def _without_gaps(spans: Sequence[float | None]) -> list[float]:
+    """Each where it is None as the last one before it, at the start as the next one; 1 without any."""
+    held, filled = next((span for span in spans if span is not None), 1.0), []
+    for span in spans:
+        held = held if span is None else span
+        filled.append(held)
+    return filled
 
 
 def tangents(times: Array, steps: Array, least: float) -> Array:

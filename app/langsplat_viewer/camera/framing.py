@@ -79,6 +79,12 @@ def median_depth(sample: Sample, eye: Array, forward: Array) -> float:
     return _quantile((sample.points - eye) @ forward, sample.weights, 0.5)
 
 
+def nearest_depth(sample: Sample, eye: Array, forward: Array) -> float:
+    """How far ahead of `eye` (3,) along the unit `forward` (3,) the scene begins but for `1 - SHARE` of its
+    weight, world units; negative behind it."""
+    return _quantile((sample.points - eye) @ forward, sample.weights, 1 - SHARE)
+
+
 def _ordered(values: Array, weights: Array) -> tuple[Array, Array]:
     """(M,) values in rising order and the share of the weight up to each."""
     order = np.argsort(values)

@@ -16,6 +16,7 @@ from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
 from langsplat_viewer.drawing.sight import LastView, Sight
+from langsplat_viewer.parallel import eye_depth
 
 _DEPTH_SAMPLE = 20_000  # Gaussians looked at for the depth range; quantiles need no more
 
@@ -74,7 +75,7 @@ def depth_range(gaussians: Gaussians, camera: Camera, clip: Clip = UNCLIPPED) ->
     with np.errstate(invalid="ignore", over="ignore"):
         pixels, depths = camera.project(means)
         inside = (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1) & (depths > 0)
-        inside &= clip.keeps(depths)
+        inside &= clip.beyond(eye_depth(camera)).keeps(depths)
     if not inside.any():
         return 0.0, 1.0
     near, far = np.quantile(depths[inside], [0.02, 0.98])

@@ -9,6 +9,7 @@ from langsplat_core.arrays import logit
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians, Scene
 from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip, Splats
+from langsplat_viewer.parallel import eye_depth
 
 NEAR_SHARE = 0.25  # of the depth of what is nearest in the picture
 NEAREST_SHARE = 0.01  # of the Gaussians in the picture that count as the nearest
@@ -46,9 +47,11 @@ def drawn_scene(scene: Scene, splats: Splats) -> Scene:
 
 
 def looking_settings(scene: Scene, camera: Camera, clip: Clip = UNCLIPPED) -> RasterSettings:
-    """The scene's own image formation, with the near plane of `near_plane`, and what `clip` cuts away."""
+    """The scene's own image formation, with the near plane of `near_plane`, and what `clip` cuts away;
+    without what lies behind the eye of a parallel projection."""
     settings = scene.raster_settings()
     near = near_plane(scene.gaussians, camera, settings.near)
+    clip = clip.beyond(eye_depth(camera))
     return replace(settings, near=max(near, clip.near), far=None if math.isinf(clip.far) else clip.far)
 
 
@@ -72,7 +75,7 @@ def why_nothing(gaussians: Gaussians, camera: Camera) -> str:
     if reason:
         return reason
     _, depths = camera.project(gaussians.means[gaussians.valid()].astype(np.float64))
-    if (depths <= 0).all():
+    if (depths <= eye_depth(camera)).all():
         return "the whole scene lies behind the camera"
     if (depths <= near_plane(gaussians, camera)).all():
         return "the whole scene lies nearer than the camera can see"

@@ -62,11 +62,15 @@ class Splats:
 
 @dataclass(frozen=True)
 class Clip:
-    """Between which depths Gaussians are drawn, told by their centres; world units. For looking into things:
-    answers and files have all of them."""
+    """Between which depths Gaussians are drawn, told by their centres; world units from the eye. For looking
+    into things: answers and files have all of them."""
 
     near: float = 0.0
     far: float = math.inf
+
+    def beyond(self, plane: float) -> "Clip":
+        """The same in depths of a camera before which the eye's plane lies `plane` away."""
+        return Clip(self.near + plane, self.far + plane)
 
     def keeps(self, depths: Array) -> Array:
         """(N,) bool, of (N,) camera z."""

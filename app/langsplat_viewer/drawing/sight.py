@@ -7,6 +7,7 @@ from langsplat_core.raster import Rasterizer, View
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.drawing.looking import looking_settings
 from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
+from langsplat_viewer.parallel import eye_depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +26,8 @@ class Sight:
         return hash((id(self.scene), self._place()))
 
     def _place(self) -> tuple[object, ...]:
-        return self.clip, self.camera.intrinsics, self.camera.world_to_camera.tobytes()
+        plane = eye_depth(self.camera)
+        return self.clip, plane, self.camera.intrinsics, self.camera.world_to_camera.tobytes()
 
     def settings(self) -> RasterSettings:
         """The image formation for it."""

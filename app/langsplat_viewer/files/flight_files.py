@@ -4,7 +4,8 @@
  "keyframes": [{"seconds": 0.0,             rising, 0 to 36000
                 "position": [x, y, z],      world units
                 "rotation": [[...], ...],   camera to world, three rows; OpenCV axes, as in cameras.json
-                "fov_degrees": 50.0}]}      across the picture's shorter side
+                "fov_degrees": 50.0,        across the picture's shorter side
+                "span": 4.0}]}              world units across it; where it is, there is no perspective
 """
 
 import json
@@ -18,7 +19,15 @@ from langsplat_core.files import atomic_path
 from langsplat_core.formats.cameras_json import is_rotation, numbers
 from langsplat_core.parsing.opening import read_json_file
 from langsplat_core.scene import FARTHEST
-from langsplat_viewer.camera.flight import FOV_LIMITS, LONGEST, SAME_TIME, Flight, Keyframe, Pose
+from langsplat_viewer.camera.flight import (
+    FOV_LIMITS,
+    LONGEST,
+    SAME_TIME,
+    SPAN_LIMITS,
+    Flight,
+    Keyframe,
+    Pose,
+)
 
 SUFFIX = ".path.json"  # that ours have
 MARK, VERSION = "langsplat_flight", 1
@@ -63,11 +72,12 @@ def write_flight(path: Path | str, flight: Flight) -> None:
 
 def pose_entry(pose: Pose) -> dict[str, Any]:
     """A pose as JSON has it."""
-    return {
+    entry = {
         "position": np.asarray(pose.position, float).tolist(),
         "rotation": np.asarray(pose.rotation, float).T.tolist(),
         "fov_degrees": float(pose.fov_degrees),
     }
+    return entry if pose.span is None else {**entry, "span": float(pose.span)}
 
 
 def pose_from(entry: Any, what: str) -> Pose:
@@ -84,4 +94,8 @@ def pose_from(entry: Any, what: str) -> Pose:
     if not FOV_LIMITS[0] <= fov <= FOV_LIMITS[1]:
         low, high = FOV_LIMITS
         raise FormatError(f"{what}: 'fov_degrees' is {fov:g}; expected {low:g} to {high:g}")
-    return Pose(position, rotation.T, fov)
+    span = float(numbers(entry, "span", (), what)) if "span" in entry else None
+    if span is not None and not SPAN_LIMITS[0] <= span <= SPAN_LIMITS[1]:
+        low, high = SPAN_LIMITS
+        raise FormatError(f"{what}: 'span' is {span:g}; expected {low:g} to {high:g}")
+    return Pose(position, rotation.T, fov, span)

@@ -4,7 +4,7 @@ Places are fractions of the picture, (0, 0) its top left corner.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -14,6 +14,7 @@ from langsplat_core.query.screen_selection import in_polygon, in_rectangle, in_s
 from langsplat_core.query.selection import in_box, in_sphere
 from langsplat_core.scene import Camera
 from langsplat_viewer.marks.selecting import Stroke, Tool
+from langsplat_viewer.parallel import eye_depth
 
 CLICK = 0.006  # of the picture's height: a shorter drag is a click
 ROUND = 48  # corners of a circle
@@ -64,7 +65,12 @@ def caught(drawn: Drawn, means: Array, depths: Array | None = None) -> Array:
         inside = in_polygon(seen, pixels)
     else:
         inside = in_stroke(seen, pixels, drawn.brush * camera.height)
-    return inside if depths is None else inside & on_surface(seen, depths, (camera.width, camera.height))
+    if depths is None:
+        return inside
+    plane = eye_depth(camera)  # what counts as hidden is a share of the depth from the eye
+    seen = replace(seen, depths=seen.depths - plane)
+    depths = np.where(depths > 0, depths - plane, 0)
+    return inside & on_surface(seen, depths, (camera.width, camera.height))
 
 
 def _in_body(drawn: Drawn, means: Array) -> Array:

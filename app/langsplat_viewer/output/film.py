@@ -12,8 +12,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Camera
-from langsplat_viewer.camera.controls import extent_of, focus, from_camera, holding_distance
-from langsplat_viewer.camera.flight import Motion, frame_times, turntable
+from langsplat_viewer.camera.controls import Extent, extent_of, focus, from_camera, holding_distance
+from langsplat_viewer.camera.flight import Motion, camera_of, frame_times, turntable
 from langsplat_viewer.drawing.frame import Backend
 from langsplat_viewer.drawing.looking import why_nothing
 from langsplat_viewer.files.flight_files import read_flight
@@ -72,7 +72,7 @@ def draw_film(request: FilmRequest, services: Services, progress: Progress = sil
         size = (max(size[0] - size[0] % 2, 2), max(size[1] - size[1] % 2, 2))
     shot = Shot(
         prepared.subject,
-        cameras_of(flight or turn(prepared, request), request.fps, size),
+        cameras_of(flight or turn(prepared, request), extent_of(prepared.subject.scene), request.fps, size),
         request.fps,
         still.backend,
     )
@@ -96,16 +96,16 @@ def turn(prepared: Prepared, request: FilmRequest) -> Motion:
         if box is None:
             box = np.stack([place, place + 0.1 * extent.radius])
         nearer = min(holding_distance(view, box), float(np.linalg.norm(place - view.eye)))
-        view = focus(view, place, nearer)
+        view = focus(view, place, None if view.back else nearer)  # the scale of a parallel one was chosen
     assert request.turntable is not None
     return turntable(view, request.turntable)
 
 
-def cameras_of(motion: Motion, fps: float, size: tuple[int, int]) -> tuple[Camera, ...]:
+def cameras_of(motion: Motion, extent: Extent, fps: float, size: tuple[int, int]) -> tuple[Camera, ...]:
     """One for each picture of a film. InputError for more than `MOST_FRAMES`."""
     if motion.seconds * fps > MOST_FRAMES:
         raise InputError(f"a film of {motion.seconds * fps:.0f} pictures; at most {MOST_FRAMES}, lower --fps")
-    return tuple(pose.camera(*size) for pose in motion.poses(frame_times(motion, fps)))
+    return tuple(camera_of(pose, extent, size) for pose in motion.poses(frame_times(motion, fps)))
 
 
 def make_film(shot: Shot, out: Path, progress: Progress = silent) -> list[str]:

@@ -11,6 +11,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
 from langsplat_core.files import atomic_path
 from langsplat_core.formats.cameras_json import write_cameras
+from langsplat_viewer.camera.controls import in_perspective
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.viewer import Viewer
 
@@ -51,16 +52,18 @@ def save_picture(viewer: Viewer, folder: Path) -> Path | None:
 
 
 def save_view(viewer: Viewer, folder: Path) -> Path | None:
-    """Save the current camera to a new file that `--camera` reads; returns its path, None if that failed."""
+    """Save the current camera, with perspective, to a new file that `--camera` reads; returns its path, None
+    if that failed."""
     state = viewer.state
     if state.view is None:
         state.say("open a scene first, then save a view of it", is_error=True)
         return None
     path = free_name(folder, f"{state.path.stem if state.path else 'view'}-view", ".json")
     try:
-        write_cameras(path, (state.view.camera(*state.size),))
+        write_cameras(path, (in_perspective(state.view).camera(*state.size),))
     except OSError as error:
         state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
         return None
-    state.say(f"saved {path}; show it again with --camera {path.name}")
+    span = f" --orthographic {state.view.span_in(*state.size):.6g}" if state.view.back else ""
+    state.say(f"saved {path}; show it again with --camera {path.name}{span}")
     return path

@@ -21,7 +21,7 @@ from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.phrases import split_phrases
-from langsplat_viewer.camera.controls import default_view, extent_of
+from langsplat_viewer.camera.controls import default_view, extent_of, from_camera, spanning
 from langsplat_viewer.drawing import painting
 from langsplat_viewer.drawing.channels import Layers
 from langsplat_viewer.drawing.frame import Backend
@@ -51,6 +51,7 @@ class StillRequest:
     colours: tuple[int, ...] = ()  # of the queries, from 1; none: in their order
     size: tuple[int, int] | None = None  # pixels; None: the training camera's, else DEFAULT_SIZE
     camera: str = ""
+    orthographic: float | None = None  # world units across the picture's shorter side; None: in perspective
     backend: Backend = "auto"
     colour_map: ColourMap = "turbo"
     transparent: bool = False
@@ -79,6 +80,12 @@ def still_camera(scene: Scene, choice: str, size: tuple[int, int] | None) -> Cam
     if size is None or size == (camera.width, camera.height):
         return camera
     return camera.with_intrinsics(camera.intrinsics.fitted(*size))
+
+
+def without_perspective(scene: Scene, camera: Camera, span: float) -> Camera:
+    """From the same eye in parallel projection, `span` world units across the picture's shorter side."""
+    extent = extent_of(scene)
+    return spanning(from_camera(camera, extent), span, extent).camera(camera.width, camera.height)
 
 
 def describe(result: QueryResult) -> str:
@@ -111,6 +118,8 @@ def prepare(request: StillRequest, services: Services, progress: Progress = sile
         raise InputError(f"{request.path}: {reason}; export it again, or open another scene")
     check_display(scene, request.display, request.queries)
     camera = still_camera(scene, request.camera, request.size)
+    if request.orthographic is not None:
+        camera = without_perspective(scene, camera, request.orthographic)
     engine = services.engine(scene)
     phrases = [phrase for text in request.queries for phrase in split_phrases(text) or [text]]
     check_colours(request.colours, len(phrases))

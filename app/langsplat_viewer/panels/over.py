@@ -1,5 +1,7 @@
 """Lines over the pictures of the scene: training cameras, ground grid, ruler; and the clicks on them."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from imgui_bundle import ImVec2, imgui
 
@@ -8,8 +10,9 @@ from langsplat_core.display.colour_maps import QUERY_COLOURS
 from langsplat_core.scene import Camera
 from langsplat_viewer import actions
 from langsplat_viewer.camera import overlays
+from langsplat_viewer.camera.labels import Label, placed
 from langsplat_viewer.panels.area import Area
-from langsplat_viewer.panels.pictures import text_on_shade
+from langsplat_viewer.panels.pictures import shade_edge, text_on_shade
 from langsplat_viewer.pictures import splitting
 from langsplat_viewer.viewer import Viewer
 
@@ -17,6 +20,15 @@ REACH = 7.0  # window units from a line at which a click means it
 STILL = 4.0  # a click that moves farther is a drag
 CAMERA, CHOSEN, HOVERED = (0.75, 0.82, 0.95, 0.75), (0.98, 0.62, 0.15, 1.0), (1.0, 1.0, 1.0, 1.0)
 GRID, RULER = (0.85, 0.85, 0.85, 0.4), (1.0, 0.9, 0.2, 1.0)
+
+
+@dataclass(frozen=True)
+class Named:
+    """A thing that has a name in the picture."""
+
+    text: str
+    corner: tuple[float, float]  # the highest one of its box, in units of the picture
+    colour: tuple[float, float, float, float]
 
 
 def draw(viewer: Viewer, area: Area) -> None:
@@ -40,11 +52,24 @@ def draw(viewer: Viewer, area: Area) -> None:
             _things(viewer, part, camera)
         _ruler(viewer, part, camera)
         paint.pop_clip_rect()
+    _projection(viewer, area)
     if state.seeing.ruler.measures and not imgui.get_io().want_capture_mouse:
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_all)
         if clicked(area):
             mouse = imgui.get_io().mouse_pos
             actions.measure_at(viewer, *area.fraction(mouse.x, mouse.y))
+
+
+def _projection(viewer: Viewer, area: Area) -> None:
+    """That there is no perspective, and how much the picture shows."""
+    view, scene = viewer.state.view, viewer.state.scene
+    if view is None or scene is None or not view.back:
+        return
+    line = imgui.get_text_line_height()
+    lines_below = 2 if "grid" in viewer.state.preferences.overlays else 1
+    span = overlays.length_text(view.span_in(*viewer.state.size), scene.metres_per_unit)
+    text = f"orthographic, {span} across the shorter side"
+    text_on_shade(text, area.left + 0.6 * line, area.top + area.height - 1.6 * lines_below * line, area)
 
 
 def clicked(area: Area) -> bool:
@@ -58,8 +83,10 @@ def clicked(area: Area) -> bool:
 
 
 def _least_depth(viewer: Viewer) -> float:
+    """Camera z from which on lines are drawn: a little before the eye."""
     assert viewer.state.extent is not None
-    return overlays.LEAST_DEPTH * viewer.state.extent.radius
+    assert viewer.state.view is not None
+    return viewer.state.view.back + overlays.LEAST_DEPTH * viewer.state.extent.radius
 
 
 def _lines(area: Area, segments: Array, colour: tuple[float, float, float, float], thick: float) -> None:
@@ -98,6 +125,7 @@ def _cameras(viewer: Viewer, area: Area, camera: Camera) -> None:
 
 def _things(viewer: Viewer, area: Area, camera: Camera) -> None:
     """A box around each thing that a query shown has found, and the phrase beside it."""
+    named: list[Named] = []
     for query in viewer.state.shown():
         if query is None or query.slot is None:
             continue
@@ -110,8 +138,26 @@ def _things(viewer: Viewer, area: Area, camera: Camera) -> None:
             if len(segments):
                 x, y = segments.reshape(-1, 2)[segments.reshape(-1, 2)[:, 1].argmin()].tolist()
                 text = query.phrase if len(query.things) == 1 else f"{query.phrase} {number}"
-                line = imgui.get_text_line_height()
-                text_on_shade(text, area.left + x + 4, area.top + max(y - 1.4 * line, 0), area)
+                named.append(Named(text, (x, y), (red, green, blue, 1.0)))
+    _names(named, area)
+
+
+def _names(named: list[Named], area: Area) -> None:
+    """The phrases, above the highest corners of their boxes; a line leads to those that had to make room."""
+    line, edge, paint = imgui.get_text_line_height(), shade_edge(), imgui.get_background_draw_list()
+    room = (area.width, area.height)
+    wanted = []
+    for name in named:
+        (x, y), size = name.corner, imgui.calc_text_size(name.text)
+        wanted.append(Label(x + 4 - edge, y - 1.4 * line - edge, size.x + 2 * edge, size.y + 2 * edge))
+    found = placed(wanted, room)
+    for name, alone, label in zip(named, wanted, found, strict=True):
+        if abs(label.y - placed([alone], room)[0].y) > label.height / 2:
+            start = ImVec2(area.left + name.corner[0], area.top + name.corner[1])
+            end = ImVec2(area.left + label.x, area.top + label.y + label.height / 2)
+            paint.add_line(start, end, imgui.get_color_u32(name.colour), 1.5)
+    for name, label in zip(named, found, strict=True):
+        text_on_shade(name.text, area.left + label.x + edge, area.top + label.y + edge, area)
 
 
 def _grid(viewer: Viewer, area: Area, camera: Camera, is_named: bool) -> None:

@@ -9,6 +9,7 @@ from langsplat_viewer.panels.style import muted
 from langsplat_viewer.viewer import Viewer
 
 WIDTH_EM, HEIGHT_EM = 26.0, 20.0
+GAP_EM = 0.6  # from the keys to the scrollbar
 
 
 def draw(viewer: Viewer) -> None:
@@ -43,7 +44,7 @@ def _clicked(found: list[Command], changed: Changed) -> Command | None:
     """The list; the command that was clicked."""
     chosen = None
     if imgui.begin_child("found"):
-        right = imgui.get_content_region_avail().x
+        right = imgui.get_content_region_avail().x - hello_imgui.em_size(GAP_EM)
         for command in found:
             if imgui.selectable(command.does, False)[0]:
                 chosen = command

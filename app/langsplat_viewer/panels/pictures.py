@@ -73,9 +73,14 @@ def _name(viewer: Viewer, area: Area) -> None:
             text_on_shade(name, area.left + place * area.width / len(names) + gap, top, area)
 
 
+def shade_edge() -> float:
+    """How far the shade of `text_on_shade` reaches beyond the text, window units."""
+    return float(hello_imgui.em_size(0.2))
+
+
 def text_on_shade(text: str, x: float, y: float, area: Area) -> None:
     """On a shade, nowhere outside the area."""
-    paint, size, edge = imgui.get_background_draw_list(), imgui.calc_text_size(text), hello_imgui.em_size(0.2)
+    paint, size, edge = imgui.get_background_draw_list(), imgui.calc_text_size(text), shade_edge()
     paint.push_clip_rect(ImVec2(area.left, area.top), ImVec2(area.left + area.width, area.top + area.height))
     paint.add_rect_filled(
         ImVec2(x - edge, y - edge), ImVec2(x + size.x + edge, y + size.y + edge), SHADE, 3.0

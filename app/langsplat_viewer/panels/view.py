@@ -10,7 +10,7 @@ from langsplat_core.display.colour_maps import COLOUR_MAPS
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions
-from langsplat_viewer.camera.controls import FOV_RANGE, adopt_up, level, with_fov
+from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, adopt_up, level, with_fov
 from langsplat_viewer.camera.overlays import length_text
 from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of, with_key
 from langsplat_viewer.drawing.seeing import MOST_DEGREE, SIZE_RANGE, Clip, Splats
@@ -194,10 +194,7 @@ def draw_camera(viewer: Viewer) -> None:
         actions.move(viewer, adopt_up)
     tip("Take what is up in the picture as the world's up")
     if state.view is not None:
-        before = state.view.intrinsics.fov_degrees
-        fov = _slider("Field of view", before, *FOV_RANGE, "%.0f deg")
-        if abs(fov - before) > 1e-3:
-            actions.move(viewer, lambda view: with_fov(view, fov))
+        _projection(viewer, state.view)
     _cuts(viewer)
     speed = _slider("Fly speed", state.fly_speed, 0.05, 4.0, "%.2f", logarithmic=True)
     actions.set_fly_speed(viewer, speed)
@@ -209,6 +206,20 @@ def draw_camera(viewer: Viewer) -> None:
     actions.set_coarse_while_moving(viewer, coarse)
     tip("Draw fewer pixels and merged Gaussians while the camera moves, where drawing is slow")
     imgui.end_disabled()
+
+
+def _projection(viewer: Viewer, view: OrbitCamera) -> None:
+    """With perspective or without; the field of view is one of perspective."""
+    text = with_key("Orthographic", actions.toggle_orthographic, viewer.state.preferences.keys)
+    _, orthographic = imgui.checkbox(f"{text}###orthographic", bool(view.back))
+    actions.set_orthographic(viewer, orthographic)
+    tip("No perspective: what is parallel looks parallel; the wheel changes the scale")
+    before = view.intrinsics.fov_degrees
+    imgui.begin_disabled(orthographic)
+    fov = _slider("Field of view", before, *FOV_RANGE, "%.0f deg")
+    imgui.end_disabled()
+    if abs(fov - before) > 1e-3:
+        actions.move(viewer, lambda view: with_fov(view, fov))
 
 
 def _cuts(viewer: Viewer) -> None:
