@@ -8,7 +8,7 @@ import pytest
 from langsplat_core.query import boxes
 from langsplat_core.scene import look_at
 from langsplat_viewer.camera import overlays
-from langsplat_viewer.camera.controls import extent_of
+from langsplat_viewer.camera.controls import extent_of, frame_of
 from tests.support.fakes import blob_scene, cameras
 
 SIZE = (120, 80)
@@ -82,7 +82,7 @@ def test_the_nearest_segment():
 @pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (0.1, -0.9, 0.4)])
 def test_the_frame_is_a_right_handed_one_with_up_as_up(up):
     up = np.array(up, float) / np.linalg.norm(up)
-    frame = overlays.frame_of(up)
+    frame = frame_of(up)
     np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(frame[1], up)
     assert np.linalg.det(frame) == pytest.approx(1)
@@ -111,11 +111,11 @@ def test_the_grid_lies_level_below_the_scene_at_round_distances(scale):
     assert 0 < below < 0.05
     unit = scale or 1.0
     assert overlays.round_length(grid.spacing * unit) == pytest.approx(grid.spacing * unit)
-    right = grid.segments[:, 0] @ overlays.frame_of(up)[0]
+    right = grid.segments[:, 0] @ frame_of(up)[0]
     np.testing.assert_allclose(right / grid.spacing, np.rint(right / grid.spacing), atol=1e-9)
     assert 8 < len(grid.segments) < 40
     for text, point in grid.marks:
-        along = overlays.frame_of(up)[[0, 2]] @ point * unit
+        along = frame_of(up)[[0, 2]] @ point * unit
         assert np.abs(along - float(text)).min() < 1e-9
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from langsplat_viewer import actions
-from langsplat_viewer.camera.controls import default_view, extent_of, orbit
+from langsplat_viewer.camera.controls import default_view, extent_of, from_side, orbit
 from langsplat_viewer.camera.view_cube import FACES, face_at, facing, visible_faces, world_axes
 from tests.support.fakes import blob_scene
 from tests.support.windowless import arrive
@@ -59,3 +59,11 @@ def test_a_click_glides_there(opened):
     assert opened.state.glide is not None
     arrive(opened)
     assert visible_faces(opened.state.view)[0].name == "top"
+
+
+@pytest.mark.parametrize("side", ["front", "back", "left", "right", "top", "bottom"])
+@pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (0.1, -0.9, 0.4)])
+def test_keys_and_cube_call_the_sides_by_the_same_names(side, up):
+    view = replace(VIEW, up=np.array(up, float) / np.linalg.norm(up))
+    (face,) = visible_faces(from_side(view, side))
+    assert face.name == side

@@ -152,21 +152,26 @@ def walk(view: OrbitCamera, right: float, up: float, forward: float) -> OrbitCam
     return replace(view, target=view.target + step)
 
 
+def frame_of(up: Array) -> Array:
+    """(3, 3) rows right, up and front of a world whose up is `up` (3,) unit. Who looks at the front looks
+    along the world's z axis, made level, or along y where z is up."""
+    forward = np.eye(3)[2 if abs(up[2]) < 0.9 else 1]
+    forward = forward - (forward @ up) * up
+    forward /= np.linalg.norm(forward)
+    return np.stack([np.cross(forward, up), up, -forward])
+
+
 def from_side(view: OrbitCamera, side: Side) -> OrbitCamera:
-    """The same target from the same distance, along an axis. The front looks along the world's z axis, or
-    along y where z is up; from the top and from below the picture's foot is the front."""
-    axes = np.eye(3)[[2, 1]]
-    front = axes[0] if abs(axes[0] @ view.up) < 0.9 else axes[1]
-    front = front - (front @ view.up) * view.up
-    front = front / np.linalg.norm(front)
-    right = np.cross(front, view.up)
+    """The same target from the same distance, along an axis of `frame_of`; from the top and from below the
+    picture's foot is the front."""
+    right, up, front = frame_of(view.up)
     forward, down = {
-        "front": (front, -view.up),
-        "back": (-front, -view.up),
-        "left": (right, -view.up),
-        "right": (-right, -view.up),
-        "top": (-view.up, -front),
-        "bottom": (view.up, front),
+        "front": (-front, -up),
+        "back": (front, -up),
+        "left": (right, -up),
+        "right": (-right, -up),
+        "top": (-up, front),
+        "bottom": (up, -front),
     }[side]
     return replace(view, rotation=np.array([np.cross(down, forward), down, forward]))
 

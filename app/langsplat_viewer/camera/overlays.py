@@ -9,7 +9,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera
-from langsplat_viewer.camera.controls import Extent
+from langsplat_viewer.camera.controls import Extent, frame_of
 from langsplat_viewer.camera.framing import Sample
 
 LEAST_DEPTH = 1e-3  # of the scene's radius: lines end this far in front of the eye
@@ -82,15 +82,6 @@ def nearest_segment(segments: Array, point: tuple[float, float]) -> tuple[int, f
     distances = np.linalg.norm(start + along[:, None] * step - point, axis=1)
     row = int(distances.argmin())
     return row, float(distances[row])
-
-
-def frame_of(up: Array) -> Array:
-    """(3, 3) rows right, up and front of a world whose up is `up` (3,) unit: right is the world axis that is
-    most level, made level; front is towards who looks at it with right on the right."""
-    axis = np.eye(3)[int(np.argmin(np.abs(up)))]
-    right = axis - (axis @ up) * up
-    right /= np.linalg.norm(right)
-    return np.stack([right, up, np.cross(right, up)])
 
 
 def round_length(length: float) -> float:

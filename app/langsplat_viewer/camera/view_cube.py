@@ -7,8 +7,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import look_at
-from langsplat_viewer.camera.controls import OrbitCamera
-from langsplat_viewer.camera.overlays import frame_of
+from langsplat_viewer.camera.controls import OrbitCamera, frame_of
 
 # Name of a face -> its normal in the axes right, up and front.
 FACES: dict[str, tuple[int, int, int]] = {
