@@ -100,6 +100,18 @@ def _overlays(ctx: Any, window: Window) -> None:
         ctx.yield_(10)
 
 
+def _orthographic(ctx: Any, window: Window) -> None:
+    viewer = window.viewer
+    actions.set_display(viewer, "rgb")
+    actions.toggle_orthographic(viewer)
+    actions.look_from(viewer, "top")
+    _settled(ctx, window)
+    actions.zoom_by(viewer, 1.6)
+    actions.show_overlay(viewer, "cube", True)
+    actions.show_overlay(viewer, "grid", True)
+    _settled(ctx, window)
+
+
 def _film(ctx: Any, window: Window) -> None:
     viewer = window.viewer
     actions.open_panel(viewer, "Record")
@@ -115,6 +127,7 @@ def _timed(ctx: Any, window: Window) -> None:
     actions.open_panel(viewer, "Timing")
     ctx.yield_(30)
     ctx.item_click("//Timing/Compare with the reference")  # what draws must run where the window does
+    ctx.mouse_teleport_to_pos((900, 600))
     while viewer.state.timing.comparison is None:
         ctx.yield_()
 
@@ -151,6 +164,7 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
     "three_levels.jpg": (("teddy bear",), _three_levels),
     "light.jpg": (("teddy bear",), _light),
     "overlays.jpg": (("teddy bear",), _overlays),
+    "orthographic.jpg": (("teddy bear",), _orthographic),
     "film.jpg": (("teddy bear",), _film),
     "timing.jpg": (("teddy bear",), _timed),
     "training.jpg": (("teddy bear",), _trained),
