@@ -79,8 +79,7 @@ def open_window(request: WindowRequest, services: Services) -> None:
     immapp.run(window.params())
     if window.failure is not None:
         raise window.failure
-    workers = (window.viewer.worker, window.viewer.recorder)
-    if any(worker.is_running for worker in workers):  # they stop for nothing, and libraries wait for them
+    if window.is_running:  # they stop for nothing, and libraries wait for them
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(0)
@@ -180,6 +179,7 @@ class Window:
         except DRAW_ERRORS as error:
             self.failure = BackendError(one_line(error))
             return
+        self._canvas.wake_with(glfw.post_empty_event)
         self._screen = ctx.detect_framebuffer()
         self.viewer.surface = self._canvas
         self.viewer.worker.wake = self.viewer.recorder.wake = glfw.post_empty_event
@@ -246,10 +246,21 @@ class Window:
         )
         self._last = there
         self._frames = AWAKE_FRAMES if changed else max(self._frames - 1, 0)
+        awaits = self._canvas is not None and self._canvas.waits  # and is woken
         busy = (
-            self.unfinished or state.glide is not None or state.record.began is not None or self._frames > 0
+            (self.unfinished and not awaits)
+            or state.glide is not None
+            or state.record.began is not None
+            or self._frames > 0
         )
         idling.enable_idling = self.idles and (self.is_minimised() or not busy)
+
+    @property
+    def is_running(self) -> bool:
+        """Whether threads are still at work that would keep the process."""
+        workers = (self.viewer.worker, self.viewer.recorder)
+        draws = self._canvas is not None and self._canvas.is_running
+        return draws or any(worker.is_running for worker in workers)
 
     def is_minimised(self) -> bool:
         """Whether nobody can see the window."""
