@@ -127,8 +127,8 @@ class Canvas:
         self._background.worker.wake = wake
 
     def _draw_at_rest(self, state: ViewerState, shown: Sequence[ViewerState], wanted: Depiction) -> None:
-        """Draw the fine picture once another thread has rasterized it; until then a coarse one where that is
-        quick, else what was there stays."""
+        """Draw the fine picture once another thread has rasterized it; until then one of merged
+        Gaussians where they are there, else what was there stays."""
         camera = wanted.view.camera(*wanted.size)
         rasterizing = self._fine.ahead(wanted, shown, self._mark(wanted), camera)
         if rasterizing is None:
@@ -142,8 +142,8 @@ class Canvas:
             raise
         if made is not None:
             self._draw(state, shown, wanted, FINE, made)
-        elif wanted != self._drawn and state.coarse_while_moving:
-            level = self._pace.stand_in(self._merged() is not None)
+        elif wanted != self._drawn and state.coarse_while_moving and self._merged() is not None:
+            level = self._pace.stand_in()
             if level is not None:
                 self._draw(state, shown, wanted, level)
 

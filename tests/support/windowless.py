@@ -8,6 +8,7 @@ import numpy as np
 from langsplat_core.errors import FormatError
 from langsplat_core.scene import Scene
 from langsplat_viewer import actions
+from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.state import GLIDE_SECONDS, ViewerState
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
@@ -57,3 +58,11 @@ def arrive(viewer: Viewer) -> None:
 
 def errors(viewer: Viewer) -> list[str]:
     return [message.text for message in viewer.state.messages if message.is_error]
+
+
+def rest(canvas: Canvas, state: ViewerState, now: float) -> None:
+    """Update until the fine picture is there, whoever rasterizes it."""
+    end = time.monotonic() + 60
+    while canvas.update(state, now) and canvas.waits:
+        assert time.monotonic() < end, "the picture never came"
+        time.sleep(0.002)

@@ -111,6 +111,9 @@ class FakeRenderer:
     def prepare(self, camera, pictures) -> None:
         self.calls.append(("prepare", [picture.display for picture, _ in pictures]))
 
+    def ahead(self, camera, pictures) -> None:
+        return None
+
     def draw(self, target, camera, picture, heat_ranges=(), layers=None) -> None:
         self.calls.append(("draw", (camera.width, camera.height)))
         self.now += self.seconds

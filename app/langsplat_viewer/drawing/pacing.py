@@ -57,10 +57,11 @@ class Pace:
         levels = WITH_MERGED if has_merged else PLAIN
         return next(filter(self._is_within, levels), levels[-1])
 
-    def stand_in(self, has_merged: bool) -> Level | None:
-        """The finest coarse one that is expected within the budget, if there is one."""
-        levels = WITH_MERGED if has_merged else PLAIN
-        return next(filter(self._is_within, levels[1:]), None)
+    def stand_in(self) -> Level | None:
+        """The finest of merged Gaussians that is expected within the budget, if there is one: all of them are
+        projected for few pixels, too."""
+        merged = (level for level in WITH_MERGED if level.merged)
+        return next(filter(self._is_within, merged), None)
 
     def _is_within(self, level: Level) -> bool:
         return self._each * self._count * self._share(level) <= MOVING_BUDGET
