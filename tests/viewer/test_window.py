@@ -58,6 +58,7 @@ def folder(tmp_path: Path) -> Path:
         "reload_what_changed",
         "change_a_key",
         "cut_by_depth",
+        "rasterize_elsewhere",
         "watch_a_training",
         "read_what_speaks_against",
         "switch_between_scenes",
