@@ -240,7 +240,8 @@ class Window:
         state, idling = self.viewer.state, hello_imgui.get_runner_params().fps_idling
         news = (self.viewer.worker.delivered, self.viewer.recorder.delivered)
         asked = (state.selection.leaving, state.selection.may_close)
-        there = (state.view, self.viewer.watch.changed, *news, state.nothing, state.hover, *asked)
+        seen = (self.unfinished, state.nothing, state.hover)
+        there = (state.view, self.viewer.watch.changed, *news, *seen, *asked)
         changed = len(there) != len(self._last) or any(
             a is not b and a != b for a, b in zip(there, self._last, strict=True)
         )
@@ -254,6 +255,8 @@ class Window:
             or self._frames > 0
         )
         idling.enable_idling = self.idles and (self.is_minimised() or not busy)
+        # Frames that show nothing new would take the cores from the thread that is waited for.
+        idling.time_active_after_last_event = 0.0 if awaits else AWAKE_SECONDS
 
     @property
     def is_running(self) -> bool:
@@ -282,17 +285,18 @@ class Window:
         navigation.handle(viewer, area)
         scale = imgui.get_io().display_framebuffer_scale
         actions.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))
-        self._pace()
         canvas, state = self._canvas, viewer.state
         if state.timing.wanted:
             state.timing.add("panels", 1e3 * (time.perf_counter() - self._began))
         if canvas is None or self._screen is None or self.is_minimised():
+            self._pace()
             return
         try:
             self.unfinished = canvas.update(state, imgui.get_time())
         except DRAW_ERRORS as error:
             self.unfinished = False
             state.say(one_line(error), is_error=True)
+        self._pace()
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
         pictures.draw(viewer, area, canvas.textures)

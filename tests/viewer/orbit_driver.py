@@ -4,8 +4,9 @@
                                         [--at-once]
 
 Prints JSON: pictures per second while the camera moves, seconds from the last move to the full picture, the
-longest frame of the window in either, and the processor time of both, which other work on the machine changes
-little. With --at-once full pictures are rasterized in the window's own thread. Needs a display (xvfb-run).
+longest that a frame kept the window's thread in either, and the processor time of both, which other work on
+the machine changes little. With --at-once full pictures are rasterized in the window's own thread. Needs a
+display (xvfb-run).
 """
 
 import argparse
@@ -46,8 +47,8 @@ class Orbiting:
     picture: list[float] = field(default_factory=list)  # median of the canvas's own times
     sizes: list[tuple[int, int]] = field(default_factory=list)  # of the last picture while moving
     merged: list[bool] = field(default_factory=list)  # whether its Gaussians were
-    longest_moving: list[float] = field(default_factory=list)  # from one frame to the next
-    longest_resting: list[float] = field(default_factory=list)  # until the full picture is there
+    longest_moving: list[float] = field(default_factory=list)  # that a frame kept the window's thread
+    longest_resting: list[float] = field(default_factory=list)  # the same, until the full picture is there
     sharp_after: list[float] = field(default_factory=list)
     cpu_to_sharp: list[float] = field(default_factory=list)
 
@@ -78,7 +79,7 @@ class Rider:
 
     def frame(self) -> None:
         viewer, now = self.window.viewer, time.monotonic()
-        self._longest, self._framed = max(self._longest, now - self._framed), now
+        self._framed = now
         state = viewer.state
         if state.scene is None or viewer.worker.current is not None or state.stats.width == 0:
             self._waited = now
@@ -88,13 +89,17 @@ class Rider:
             self._rest(now)
         elif self._moving_since is None:
             self._moving_since, self._started, self._pictures = now, self._cpu(), [0.0]
-            self._longest = 0.0
+            self._longest, self.window.idles = 0.0, False
             self._turn()
         elif now - self._moving_since < self.seconds:
             self._pictures.append(state.stats.milliseconds / 1e3)
             self._turn()
         else:
             self._stop(now)
+
+    def framed(self) -> None:
+        """Panels and picture of a frame are drawn."""
+        self._longest = max(self._longest, time.monotonic() - self._framed)
 
     def _turn(self) -> None:
         actions.move(self.window.viewer, lambda view: orbit(view, STEP, 0.0))
@@ -109,6 +114,7 @@ class Rider:
         self.seen.merged.append(stats.merged)
         self.seen.longest_moving.append(self._longest)
         self._resting_since, self._started, self._longest = now, self._cpu(), 0.0
+        self.window.idles = True
 
     def _rest(self, now: float) -> None:
         if self.window.viewer.state.stats.scale < 1 or self.window.unfinished:
@@ -139,13 +145,17 @@ def ride(
     window.idles = False
     rider = Rider(window, seconds)
     params = window.params()
-    gui = params.callbacks.show_gui
+    gui, picture = params.callbacks.show_gui, params.callbacks.before_imgui_render
 
     def ridden() -> None:
         rider.frame()
         gui()
 
-    params.callbacks.show_gui = ridden
+    def pictured() -> None:
+        picture()
+        rider.framed()
+
+    params.callbacks.show_gui, params.callbacks.before_imgui_render = ridden, pictured
     params.fps_idling.vsync_to_monitor = False
     immapp.run(params)
     state = window.viewer.state

@@ -21,8 +21,7 @@ from langsplat_viewer.drawing import frame, pacing
 from langsplat_viewer.drawing.frame import FrameRenderer
 from langsplat_viewer.drawing.seeing import Clip, Splats
 from langsplat_viewer.viewer import Viewer
-from tests.support.windowless import rest, settle
-from tests.viewer.test_window import FakeRenderer
+from tests.support.windowless import FakeRenderer, rest, settle
 
 SIZE = (120, 90)
 
