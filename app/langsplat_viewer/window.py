@@ -21,7 +21,7 @@ from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.drawing.frame import Backend, FrameRenderer
 from langsplat_viewer.drawing.renderer import Renderer
 from langsplat_viewer.files.bookmarks import Shelf
-from langsplat_viewer.jobs import one_line
+from langsplat_viewer.jobs import one_line, share_one_heap
 from langsplat_viewer.options import chosen_camera, latent_level
 from langsplat_viewer.panels import keyboard, layout, menu, navigation, over, photograph, pictures
 from langsplat_viewer.panels.area import scene_area
@@ -75,6 +75,7 @@ class WindowRequest:
 
 def open_window(request: WindowRequest, services: Services) -> None:
     """Run until the window is closed. Raises BackendError where there is no display or no OpenGL."""
+    share_one_heap()
     window = Window(request, services, lambda ctx: FrameRenderer(ctx, request.backend))
     immapp.run(window.params())
     if window.failure is not None:
