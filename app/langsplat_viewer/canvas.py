@@ -2,7 +2,7 @@
 
 Needs a GL context but no window. While the camera moves on a slow machine the picture is drawn at a
 fraction of the window's resolution, of a large scene from merged Gaussians; as soon as it rests, once more
-with everything.
+with everything, which another thread rasterizes where that takes long.
 """
 
 import time
@@ -13,6 +13,7 @@ import moderngl
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.errors import BackendError
 from langsplat_core.scene import Camera
 from langsplat_core.scene.merging import Merged
 from langsplat_core.stopwatch import watched
@@ -22,10 +23,11 @@ from langsplat_viewer.commands import with_key
 from langsplat_viewer.drawing.channels import Layers
 from langsplat_viewer.drawing.looking import why_nothing, why_undrawable
 from langsplat_viewer.drawing.pacing import FINE, Level, Pace
-from langsplat_viewer.drawing.renderer import Renderer
+from langsplat_viewer.drawing.renderer import Rasterized, Renderer
 from langsplat_viewer.drawing.seeing import UNCLIPPED
 from langsplat_viewer.keys import Changed
 from langsplat_viewer.pictures import splitting
+from langsplat_viewer.pictures.background import Background
 from langsplat_viewer.pictures.depiction import Depiction, depiction
 from langsplat_viewer.pictures.marked_scene import MarkedScene, marked_scene
 from langsplat_viewer.pictures.staging import Merger, Stage
@@ -57,6 +59,7 @@ class Canvas:
         self._quick = None if quick is None else Stage(quick)
         self._renderer = renderer  # that drew the last picture
         self._merger = Merger()
+        self._background = Background(clock)
         self._pace = Pace()
         self._clock = clock
         self._targets: dict[Key, moderngl.Framebuffer] = {}  # the latest used last
@@ -81,6 +84,7 @@ class Canvas:
         """
         self._state = state
         if state.scene is None or state.view is None:
+            self._background.drop()
             return False
         if state.view is not self._view:
             if self._view is not None:
@@ -93,16 +97,55 @@ class Canvas:
         if self._begins_timing(state, moving):
             self._drawn = None
             self._fine.renderer.forget()
-        if wanted != self._drawn or (self._drawn_at != FINE and not coarse):
-            self._drawn = wanted
-            self._drawn_at = self._pace.level(self._merged() is not None) if coarse else FINE
-            self._draw(state, shown, wanted, self._drawn_at)
-            state.nothing, self._unsure = "", True
-        if self._unsure and not moving and self._camera is not None:
+        self._pace.expect(len(state.scene.gaussians))
+        is_due = wanted != self._drawn or (self._drawn_at != FINE and not coarse)
+        if is_due and not moving and self._pace.is_slow:
+            self._draw_at_rest(state, shown, wanted)
+        else:
+            self._background.drop()
+            if is_due:
+                level = self._pace.level(self._merged() is not None) if coarse else FINE
+                self._draw(state, shown, wanted, level)
+        if self._unsure and not moving and not self.waits and self._camera is not None:
             self._unsure = False  # asked at rest only: it reads the picture back
             if self._renderer.shows_nothing():
                 state.nothing = self._why_nothing(wanted, self._camera, state.preferences.keys)
-        return moving
+        return moving or self.waits
+
+    @property
+    def waits(self) -> bool:
+        """Whether another thread rasterizes the picture; it calls what `wake_with` was given when it has."""
+        return self._background.waits
+
+    @property
+    def is_running(self) -> bool:
+        """Whether other threads are at work, wanted or not."""
+        return self._background.worker.is_running or self._merger.is_running
+
+    def wake_with(self, wake: Callable[[], None]) -> None:
+        """Have `wake` called on another thread when `update` should be."""
+        self._background.worker.wake = wake
+
+    def _draw_at_rest(self, state: ViewerState, shown: Sequence[ViewerState], wanted: Depiction) -> None:
+        """Draw the fine picture once another thread has rasterized it; until then one of merged
+        Gaussians where they are there, else what was there stays."""
+        camera = wanted.view.camera(*wanted.size)
+        rasterizing = self._fine.ahead(wanted, shown, self._mark(wanted), camera)
+        if rasterizing is None:
+            self._background.drop()
+            self._draw(state, shown, wanted, FINE)
+            return
+        try:
+            made = self._background.get(rasterizing)
+        except BackendError:
+            self._drawn, self._drawn_at = wanted, FINE
+            raise
+        if made is not None:
+            self._draw(state, shown, wanted, FINE, made)
+        elif wanted != self._drawn and state.coarse_while_moving and self._merged() is not None:
+            level = self._pace.stand_in()
+            if level is not None:
+                self._draw(state, shown, wanted, level)
 
     def _begins_timing(self, state: ViewerState, moving: bool) -> bool:
         """Whether this is the first frame whose steps are measured: what was kept of earlier ones would have
@@ -135,7 +178,7 @@ class Canvas:
         self, wanted: Depiction, shown: Sequence[ViewerState], camera: Camera, level: Level
     ) -> list[Layers | None]:
         """Choose the renderer and have it ready to draw all pictures; returns the layers of each."""
-        marked = self._marked = marked_scene(wanted.model.scene, wanted.model.marks, self._marked)
+        marked = self._mark(wanted)
         instead = self._merged() if level.merged else None
         stage = self._fine if instead is None or self._quick is None else self._quick
         self._renderer = stage.renderer
@@ -143,29 +186,48 @@ class Canvas:
             self._quick.let_go(wanted.model.scene)
         return stage.prepare(wanted, shown, marked, camera, instead)
 
+    def _mark(self, wanted: Depiction) -> MarkedScene:
+        """What is drawn of the scene."""
+        self._marked = marked_scene(wanted.model.scene, wanted.model.marks, self._marked)
+        return self._marked
+
     def _draw(
-        self, state: ViewerState, shown: Sequence[ViewerState], wanted: Depiction, level: Level
+        self,
+        state: ViewerState,
+        shown: Sequence[ViewerState],
+        wanted: Depiction,
+        level: Level,
+        made: Rasterized | None = None,
     ) -> None:
+        """`made`: by another thread, of the fine picture."""
+        is_projected = level != self._drawn_at or self._drawn is None or not wanted.is_placed_as(self._drawn)
+        self._drawn, self._drawn_at = wanted, level  # also where it fails: it is not tried again
         width, height = (max(1, round(side * level.scale)) for side in wanted.size)
         camera = wanted.view.camera(width, height)
         keys = [(place, width, height) for place in range(len(shown))]
         targets = [self._target(key, len(shown)) for key in keys]
         began = self._clock()
         with watched() if state.timing.wanted else nullcontext(dict[str, float]()) as laps:
+            if made is not None:
+                self._fine.renderer.take(made)
             prepared = self._prepare(wanted, shown, camera, level)
             for target, look, layers in zip(targets, wanted.looks, prepared, strict=True):
                 self._renderer.draw(target, camera, look.picture, look.heat_ranges, layers)
         self._ctx.finish()
         milliseconds = 1e3 * (self._clock() - began)
+        if made is not None:
+            milliseconds, laps = milliseconds + made.milliseconds, {**made.laps, **laps}
         if state.timing.wanted and level == FINE:
             for name, taken in (*laps.items(), ("picture", milliseconds)):
                 state.timing.add(name, taken)
-        self._pace.drew(level, milliseconds)
+        if is_projected:
+            self._pace.drew(level, milliseconds)
         if self._quick is not None and self._marked is not None and self._pace.is_slow:
             self._merger.want(self._marked.scene.gaussians)
         self._camera = camera
         self.textures = tuple(self._textures[key] for key in keys)
         state.stats = FrameStats(milliseconds, width, height, level.scale, level.merged)
+        state.nothing, self._unsure = "", True
 
     def _target(self, key: Key, count: int) -> moderngl.Framebuffer:
         """A framebuffer for one of `count` pictures; those of the last few sizes are kept, because moving
@@ -184,6 +246,7 @@ class Canvas:
 
     def close(self) -> None:
         """The window closes."""
+        self._background.worker.close()
         self._merger.close()
 
     def point_at(self, u: float, v: float) -> Array | None:

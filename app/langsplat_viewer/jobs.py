@@ -128,13 +128,26 @@ class Worker:
             self._thread.join(patience)
 
 
+_ARENA_MAX = -8  # M_ARENA_MAX of malloc.h
+
+
 def give_memory_back() -> None:
     """Return to the system what the C library keeps of memory that was freed, where it can: reading a scene
     leaves tens of megabytes of it."""
+    _in_c_library("malloc_trim", 0)
+
+
+def share_one_heap() -> None:
+    """Have threads that begin after this take memory from one heap, where the C library allows it: with one
+    each, all of them keep what they have freed."""
+    _in_c_library("mallopt", _ARENA_MAX, 1)
+
+
+def _in_c_library(name: str, *arguments: int) -> None:
     if sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc has it, others do not
-        if trim is not None:
-            trim(0)
+        function = getattr(ctypes.CDLL(None), name, None)  # glibc has them, others do not
+        if function is not None:
+            function(*arguments)
 
 
 def deliver(job: Job) -> None:

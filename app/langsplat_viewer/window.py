@@ -21,7 +21,7 @@ from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.drawing.frame import Backend, FrameRenderer
 from langsplat_viewer.drawing.renderer import Renderer
 from langsplat_viewer.files.bookmarks import Shelf
-from langsplat_viewer.jobs import one_line
+from langsplat_viewer.jobs import one_line, share_one_heap
 from langsplat_viewer.options import chosen_camera, latent_level
 from langsplat_viewer.panels import keyboard, layout, menu, navigation, over, photograph, pictures
 from langsplat_viewer.panels.area import scene_area
@@ -75,12 +75,12 @@ class WindowRequest:
 
 def open_window(request: WindowRequest, services: Services) -> None:
     """Run until the window is closed. Raises BackendError where there is no display or no OpenGL."""
+    share_one_heap()
     window = Window(request, services, lambda ctx: FrameRenderer(ctx, request.backend))
     immapp.run(window.params())
     if window.failure is not None:
         raise window.failure
-    workers = (window.viewer.worker, window.viewer.recorder)
-    if any(worker.is_running for worker in workers):  # they stop for nothing, and libraries wait for them
+    if window.is_running:  # they stop for nothing, and libraries wait for them
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(0)
@@ -180,6 +180,7 @@ class Window:
         except DRAW_ERRORS as error:
             self.failure = BackendError(one_line(error))
             return
+        self._canvas.wake_with(glfw.post_empty_event)
         self._screen = ctx.detect_framebuffer()
         self.viewer.surface = self._canvas
         self.viewer.worker.wake = self.viewer.recorder.wake = glfw.post_empty_event
@@ -240,16 +241,30 @@ class Window:
         state, idling = self.viewer.state, hello_imgui.get_runner_params().fps_idling
         news = (self.viewer.worker.delivered, self.viewer.recorder.delivered)
         asked = (state.selection.leaving, state.selection.may_close)
-        there = (state.view, self.viewer.watch.changed, *news, state.nothing, state.hover, *asked)
+        seen = (self.unfinished, state.nothing, state.hover)
+        there = (state.view, self.viewer.watch.changed, *news, *seen, *asked)
         changed = len(there) != len(self._last) or any(
             a is not b and a != b for a, b in zip(there, self._last, strict=True)
         )
         self._last = there
         self._frames = AWAKE_FRAMES if changed else max(self._frames - 1, 0)
+        awaits = self._canvas is not None and self._canvas.waits  # and is woken
         busy = (
-            self.unfinished or state.glide is not None or state.record.began is not None or self._frames > 0
+            (self.unfinished and not awaits)
+            or state.glide is not None
+            or state.record.began is not None
+            or self._frames > 0
         )
         idling.enable_idling = self.idles and (self.is_minimised() or not busy)
+        # Frames that show nothing new would take the cores from the thread that is waited for.
+        idling.time_active_after_last_event = 0.0 if awaits else AWAKE_SECONDS
+
+    @property
+    def is_running(self) -> bool:
+        """Whether threads are still at work that would keep the process."""
+        workers = (self.viewer.worker, self.viewer.recorder)
+        draws = self._canvas is not None and self._canvas.is_running
+        return draws or any(worker.is_running for worker in workers)
 
     def is_minimised(self) -> bool:
         """Whether nobody can see the window."""
@@ -271,17 +286,18 @@ class Window:
         navigation.handle(viewer, area)
         scale = imgui.get_io().display_framebuffer_scale
         actions.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))
-        self._pace()
         canvas, state = self._canvas, viewer.state
         if state.timing.wanted:
             state.timing.add("panels", 1e3 * (time.perf_counter() - self._began))
         if canvas is None or self._screen is None or self.is_minimised():
+            self._pace()
             return
         try:
             self.unfinished = canvas.update(state, imgui.get_time())
         except DRAW_ERRORS as error:
             self.unfinished = False
             state.say(one_line(error), is_error=True)
+        self._pace()
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
         pictures.draw(viewer, area, canvas.textures)

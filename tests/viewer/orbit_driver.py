@@ -1,9 +1,12 @@
 """Orbits in the real window, as the program opens it, and says how fast; run by test_orbiting.py and by hand:
 
     python -m tests.viewer.orbit_driver [--scene SCENE.ply] [--count 500000] [--seconds 10] [--size 1280 800]
+                                        [--at-once]
 
-Prints JSON: pictures per second while the camera moves, seconds from the last move to the full picture, and
-the processor time of both, which other work on the machine changes little. Needs a display (xvfb-run).
+Prints JSON: pictures per second while the camera moves, seconds from the last move to the full picture, the
+longest that a frame kept the window's thread in either, and the processor time of both, which other work on
+the machine changes little. With --at-once full pictures are rasterized in the window's own thread. Needs a
+display (xvfb-run).
 """
 
 import argparse
@@ -44,8 +47,17 @@ class Orbiting:
     picture: list[float] = field(default_factory=list)  # median of the canvas's own times
     sizes: list[tuple[int, int]] = field(default_factory=list)  # of the last picture while moving
     merged: list[bool] = field(default_factory=list)  # whether its Gaussians were
+    longest_moving: list[float] = field(default_factory=list)  # that a frame kept the window's thread
+    longest_resting: list[float] = field(default_factory=list)  # the same, until the full picture is there
     sharp_after: list[float] = field(default_factory=list)
     cpu_to_sharp: list[float] = field(default_factory=list)
+
+
+class AtOnce(FrameRenderer):
+    """Leaves nothing to other threads."""
+
+    def ahead(self, *_: object) -> None:
+        return None
 
 
 class Rider:
@@ -59,6 +71,7 @@ class Rider:
         self._resting_since: float | None = None
         self._started = self._waited = 0.0
         self._pictures: list[float] = []
+        self._framed = self._longest = 0.0
 
     def _cpu(self) -> float:
         times = self._process.cpu_times()
@@ -66,6 +79,7 @@ class Rider:
 
     def frame(self) -> None:
         viewer, now = self.window.viewer, time.monotonic()
+        self._framed = now
         state = viewer.state
         if state.scene is None or viewer.worker.current is not None or state.stats.width == 0:
             self._waited = now
@@ -75,12 +89,17 @@ class Rider:
             self._rest(now)
         elif self._moving_since is None:
             self._moving_since, self._started, self._pictures = now, self._cpu(), [0.0]
+            self._longest, self.window.idles = 0.0, False
             self._turn()
         elif now - self._moving_since < self.seconds:
             self._pictures.append(state.stats.milliseconds / 1e3)
             self._turn()
         else:
             self._stop(now)
+
+    def framed(self) -> None:
+        """Panels and picture of a frame are drawn."""
+        self._longest = max(self._longest, time.monotonic() - self._framed)
 
     def _turn(self) -> None:
         actions.move(self.window.viewer, lambda view: orbit(view, STEP, 0.0))
@@ -93,12 +112,15 @@ class Rider:
         self.seen.picture.append(statistics.median(self._pictures))
         self.seen.sizes.append((stats.width, stats.height))
         self.seen.merged.append(stats.merged)
-        self._resting_since, self._started = now, self._cpu()
+        self.seen.longest_moving.append(self._longest)
+        self._resting_since, self._started, self._longest = now, self._cpu(), 0.0
+        self.window.idles = True
 
     def _rest(self, now: float) -> None:
         if self.window.viewer.state.stats.scale < 1 or self.window.unfinished:
             return
         assert self._resting_since is not None
+        self.seen.longest_resting.append(self._longest)
         self.seen.sharp_after.append(now - self._resting_since)
         self.seen.cpu_to_sharp.append(self._cpu() - self._started)
         self._moving_since = self._resting_since = None
@@ -106,24 +128,34 @@ class Rider:
             glfw.set_window_should_close(glfw_window_hello_imgui(), True)
 
 
-def ride(scene: Path, count: int, seconds: float, size: tuple[int, int]) -> Orbiting:
+def ride(
+    scene: Path,
+    count: int,
+    seconds: float,
+    size: tuple[int, int],
+    renderer: type[FrameRenderer] = FrameRenderer,
+) -> Orbiting:
     def load(path: Path) -> Scene:
         found = load_scene(path)
         return repeated(found, count) if count else found
 
     window = Window(
-        WindowRequest(scene, size=size), Services(load, lambda encoder_id: FakeEncoder()), FrameRenderer
+        WindowRequest(scene, size=size), Services(load, lambda encoder_id: FakeEncoder()), renderer
     )
     window.idles = False
     rider = Rider(window, seconds)
     params = window.params()
-    gui = params.callbacks.show_gui
+    gui, picture = params.callbacks.show_gui, params.callbacks.before_imgui_render
 
     def ridden() -> None:
         rider.frame()
         gui()
 
-    params.callbacks.show_gui = ridden
+    def pictured() -> None:
+        picture()
+        rider.framed()
+
+    params.callbacks.show_gui, params.callbacks.before_imgui_render = ridden, pictured
     params.fps_idling.vsync_to_monitor = False
     immapp.run(params)
     state = window.viewer.state
@@ -138,5 +170,7 @@ if __name__ == "__main__":
     parser.add_argument("--count", type=int, default=500_000, help="Gaussians; 0: as the file has")
     parser.add_argument("--seconds", type=float, default=10.0, help="of moving, three times")
     parser.add_argument("--size", type=int, nargs=2, default=(1280, 800))
+    parser.add_argument("--at-once", action="store_true", help="full pictures in the window's thread")
     asked = parser.parse_args()
-    print(json.dumps(asdict(ride(asked.scene, asked.count, asked.seconds, tuple(asked.size)))))
+    renderer = AtOnce if asked.at_once else FrameRenderer
+    print(json.dumps(asdict(ride(asked.scene, asked.count, asked.seconds, tuple(asked.size), renderer))))

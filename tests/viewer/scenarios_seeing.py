@@ -2,14 +2,19 @@
 
 from collections.abc import Callable
 from itertools import combinations
+from threading import Event, current_thread
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from imgui_bundle import imgui  # isort: skip
+from imgui_bundle.immapp import testing  # isort: skip
 from langsplat_viewer import actions
 from langsplat_viewer.camera.labels import Label
 from langsplat_viewer.camera.view_cube import visible_faces
+from langsplat_viewer.drawing import pacing
+from langsplat_viewer.drawing.channels import ArrayChannels
 from langsplat_viewer.panels import over
 from langsplat_viewer.panels.area import Area, scene_area
 from langsplat_viewer.panels.cube import EDGE
@@ -178,6 +183,49 @@ def faces_on_screen(s: Any, side: Any) -> list[tuple[str, tuple[float, float]]]:
     ]
 
 
+def rasterize_elsewhere(s: Any) -> None:
+    """While a thread rasterizes the fine picture the window shows a coarse one and works; what goes wrong
+    there is said once."""
+    gate, problems, rasterize = Event(), [], ArrayChannels.render_all
+
+    def gated(self: ArrayChannels, *arguments: Any) -> Any:
+        if current_thread().name == "langsplat-worker":
+            assert gate.wait(60)
+            if problems:
+                raise problems[0]
+        return rasterize(self, *arguments)
+
+    ArrayChannels.render_all = gated
+    pacing.MOVING_BUDGET = 0.0  # everything is slow
+    begin(s)
+    s.drag((600, 300), (656, 279))
+    s.wait(lambda: s.window.viewer.surface.waits)
+    assert s.state.stats.scale < 1
+    s.ctx.key_press(imgui.Key.f1)
+    s.ctx.yield_(3)
+    assert s.state.show_help
+    s.ctx.key_press(imgui.Key.f1)
+    s.ctx.yield_(3)
+    testing.capture(s.ctx, str(s.folder / "coarse.png"))
+    gate.set()
+    fine = s.shot("fine")
+    assert s.state.stats.scale == 1
+    coarse = np.asarray(Image.open(s.folder / "coarse.png").convert("RGB")).astype(int)
+    for thing in CENTRES:
+        np.testing.assert_allclose(s.at(coarse, thing), s.at(fine, thing), atol=25)
+
+    problems.append(FloatingPointError("out of range"))
+    s.drag((656, 279), (600, 300))
+    s.settle()
+    s.ctx.yield_(20)
+    said = [message.text for message in s.state.messages if message.is_error]
+    assert said == ["internal error: FloatingPointError: out of range"]
+    problems.clear()
+    s.drag((600, 300), (656, 279))
+    s.settle()
+    assert s.state.stats.scale == 1
+
+
 Scenario = tuple[Callable[[Any], None], str, dict[str, Any]]
 
 
@@ -288,5 +336,6 @@ SCENARIOS: dict[str, Scenario] = {
     "split_the_view": (split_the_view, "blobs.ply", {}),
     "cut_by_depth": (cut_by_depth, "blobs.ply", {}),
     "time_and_compare": (time_and_compare, "blobs.ply", {}),
+    "rasterize_elsewhere": (rasterize_elsewhere, "blobs.ply", {"backend": "cpu"}),
     "draw_over_the_scene": (draw_over_the_scene, "blobs.ply", {}),
 }

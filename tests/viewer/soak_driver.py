@@ -64,9 +64,8 @@ class SoakSession(Session):
     patience = 3600.0
 
     def __init__(self, folder: Path, backend: Backend) -> None:
-        self.backend: Backend = backend
         self._wanted: Callable[[], object] | None = None  # at the next frame
-        super().__init__(folder, SCENES[0])
+        super().__init__(folder, SCENES[0], backend=backend)
 
     def _make_renderer(self, ctx: moderngl.Context) -> FrameRenderer:
         return FrameRenderer(ctx, self.backend)

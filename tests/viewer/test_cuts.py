@@ -21,7 +21,7 @@ from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
 from langsplat_viewer.output.headless import painter
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.selected import marked
-from tests.support.windowless import settle
+from tests.support.windowless import rest, settle
 
 SIZE = (160, 120)
 # From the side: the blobs lie behind each other, mug, book, plant, at depths of about 3.8, 5 and 6.2.
@@ -83,17 +83,17 @@ def beside(opened):
 def test_the_canvas_draws_another_cut_once_and_says_where_nothing_is_left(gl, beside):
     renderer = FrameRenderer(gl, "cpu")
     canvas, state = Canvas(gl, renderer), beside.state
-    canvas.update(state, 0.0)
+    rest(canvas, state, 0.0)
     actions.set_clip(beside, BOOK_ALONE)
-    canvas.update(state, 1.0)
+    rest(canvas, state, 1.0)
     book = np.frombuffer(canvas.textures[0].read(), np.uint8).reshape(120, 160, 4)[60, 80]
     assert book[:3].argmax() == 1
     assert abs(canvas.point_at(0.5, 0.5)[0] - CENTRES[1][0]) < 0.6  # of the surface that is seen
     actions.set_clip(beside, Clip(20.0, 30.0))
-    canvas.update(state, 2.0)
+    rest(canvas, state, 2.0)
     assert state.nothing == NOTHING_BETWEEN
     actions.set_clip(beside, UNCLIPPED)
-    canvas.update(state, 3.0)
+    rest(canvas, state, 3.0)
     assert state.nothing == ""
     renderer.release()
 

@@ -57,3 +57,22 @@ def test_better_is_tried_again_after_some_rests():
     for _ in range(3):
         pace.drew(FINE, 150)
     assert pace.level(True) == HALF
+
+
+def test_other_scenes_take_as_long_as_they_are_large():
+    pace = Pace()
+    pace.expect(1000)
+    assert not pace.is_slow
+    pace.expect(1_000_000)  # guessed
+    assert pace.is_slow
+    pace.drew(FINE, 1000)
+    pace.expect(100_000)
+    assert pace.level(False) == HALF
+    pace.expect(50_000)
+    assert pace.level(False) == FINE
+
+
+def test_only_merged_gaussians_stand_in():
+    assert after((FINE, 300)).stand_in() == MERGED
+    assert after((FINE, 2000)).stand_in() == COARSEST
+    assert after((FINE, 1e5)).stand_in() is None

@@ -14,7 +14,7 @@ from langsplat_viewer.drawing.seeing import OVERLAYS, Ruler, Splats
 from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.output import saving
 from tests.support.scenes import random_gaussians
-from tests.support.windowless import settle
+from tests.support.windowless import rest, settle
 
 
 def test_overlays_are_shown_and_remembered(opened, tmp_path):
@@ -79,11 +79,11 @@ def test_the_canvas_takes_other_splats_once(gl, opened):
     renderer.set_scene = lambda scene: (given.append(scene), original(scene))
     canvas, state = Canvas(gl, renderer), opened.state
     state.size = (240, 180)
-    canvas.update(state, 1.0)
+    rest(canvas, state, 1.0)
     whole = canvas.capture(state)
     actions.set_splats(opened, Splats(0.1))
     for now in (2.0, 3.0, 4.0):
-        canvas.update(state, now)
+        rest(canvas, state, now)
     assert len(given) == 2
     assert 0 < (canvas.capture(state) > 20).sum() < 0.7 * (whole > 20).sum()
     actions.set_splats(opened, Splats())

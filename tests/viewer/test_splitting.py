@@ -18,7 +18,7 @@ from langsplat_viewer.drawing.seeing import AT_RANGE, Split
 from langsplat_viewer.panels.view import compared_name
 from langsplat_viewer.pictures import splitting
 from tests.support.scenes import random_camera, random_gaussians, random_values
-from tests.support.windowless import errors, settle
+from tests.support.windowless import errors, rest, settle
 
 COUNT = 120
 SCENE = Scene(random_gaussians(COUNT, sh_degree=1))
@@ -161,18 +161,18 @@ def test_the_canvas_draws_both_and_then_rests(gl, opened):
     renderer.draw = lambda *args, **kwargs: (drawn.append(args[2].display), original(*args, **kwargs))
     for display in DISPLAYS:
         actions.compare_with(opened, display)
-        canvas.update(state, 1.0)
+        rest(canvas, state, 1.0)
         assert len(canvas.textures) == 2
         assert canvas.textures[0].size == (60, 40)
     drawn.clear()
     actions.move_line(opened, 0.2)  # only the window is drawn anew
-    canvas.update(state, 2.0)
+    rest(canvas, state, 2.0)
     assert drawn == []
     both = canvas.capture(state)
     actions.show_one(opened)
     np.testing.assert_array_equal(canvas.capture(state)[:, :12], both[:, :12])
     actions.toggle_levels(opened)
-    canvas.update(state, 3.0)
+    rest(canvas, state, 3.0)
     assert [texture.size for texture in canvas.textures] == [(20, 40)] * 3
     assert canvas.capture(state).shape == (40, 60, 3)
     renderer.release()
@@ -182,12 +182,12 @@ def test_the_surface_is_found_in_every_column(gl, opened):
     canvas, state = Canvas(gl, FrameRenderer(gl, "cpu")), opened.state
     state.size = (240, 120)
     actions.toggle_levels(opened)
-    canvas.update(state, 1.0)
+    rest(canvas, state, 1.0)
     places = [canvas.point_at((column + 0.5) / 3, 0.5) for column in range(3)]
     assert all(place is not None for place in places)
     np.testing.assert_allclose(places[0], places[1])
     np.testing.assert_allclose(places[0], places[2])
     actions.show_one(opened)
     state.picture = replace(state.picture, display="rgb")
-    canvas.update(state, 2.0)
+    rest(canvas, state, 2.0)
     np.testing.assert_allclose(canvas.point_at(0.5, 0.5), places[0], atol=0.1)

@@ -12,7 +12,7 @@ from langsplat_viewer.drawing.seeing import Clip, Splats
 from langsplat_viewer.panels.timing import in_numbers
 from langsplat_viewer.pictures.comparing import LONGEST_SIDE, reference_of, small
 from langsplat_viewer.timing import KEPT, Timing, compared, memory_bytes
-from tests.support.windowless import errors, settle
+from tests.support.windowless import errors, rest, settle
 
 
 def test_the_median_of_the_last_measurements_is_told():
@@ -49,7 +49,7 @@ def drawn(gl, opened, request):
     opened.surface = canvas = Canvas(gl, renderer)
     opened.state.backend = renderer.backend
     actions.resize(opened, 400, 300)
-    canvas.update(opened.state, 0.0)
+    rest(canvas, opened.state, 0.0)
     yield opened
     renderer.release()
 
@@ -60,7 +60,7 @@ def test_the_steps_of_a_picture_are_measured_while_the_panel_is_seen(drawn):
     drawn.state.coarse_while_moving = False
     actions.look_from(drawn, "left")
     actions.tick(drawn, 10.0)
-    drawn.surface.update(drawn.state, 10.0)
+    rest(drawn.surface, drawn.state, 10.0)
     laps, steps = drawn.state.timing.laps, {"projection", "sort", "blend", "compose"}
     if drawn.state.backend == "cpu":
         steps |= {"upload"}
@@ -72,14 +72,14 @@ def test_the_panel_has_a_picture_measured_when_it_opens(drawn):
     """All of its steps, though nothing has changed; once."""
     for now in (10.0, 11.0):
         actions.measure_frame(drawn)
-        drawn.surface.update(drawn.state, now)
+        rest(drawn.surface, drawn.state, now)
         counts = {name: len(measured) for name, measured in drawn.state.timing.laps.items()}
         assert counts.keys() >= {"projection", "sort", "blend", "compose", "picture"}
         assert set(counts.values()) == {1}
     drawn.state.timing.wanted = False  # closed, and opened again
-    drawn.surface.update(drawn.state, 12.0)
+    rest(drawn.surface, drawn.state, 12.0)
     actions.measure_frame(drawn)
-    drawn.surface.update(drawn.state, 13.0)
+    rest(drawn.surface, drawn.state, 13.0)
     assert {len(measured) for measured in drawn.state.timing.laps.values()} == {2}
 
 
@@ -134,7 +134,7 @@ def test_what_is_wrong_is_told(drawn, monkeypatch):
 def test_the_picture_on_screen_is_drawn_again_after_it(drawn):
     actions.compare_with_reference(drawn)
     wait(drawn)
-    drawn.surface.update(drawn.state, 2.0)
+    rest(drawn.surface, drawn.state, 2.0)
     assert drawn.surface.textures[0].size == (400, 300)
     depths = drawn.surface.depths()
     assert depths.shape == (300, 400)

@@ -18,6 +18,7 @@ from langsplat_viewer.marks.selecting import unmarked
 from langsplat_viewer.state import ViewerState
 from tests.support.fakes import blob_scene
 from tests.support.on_display import play
+from tests.support.windowless import FakeRenderer
 
 
 @pytest.fixture
@@ -58,6 +59,7 @@ def folder(tmp_path: Path) -> Path:
         "reload_what_changed",
         "change_a_key",
         "cut_by_depth",
+        "rasterize_elsewhere",
         "watch_a_training",
         "read_what_speaks_against",
         "switch_between_scenes",
@@ -81,49 +83,6 @@ def drive(scenario: str, display: str, folder: Path) -> None:
     arguments = ["-m", "tests.viewer.window_driver", scenario, str(folder)]
     said = play(display, arguments, folder, timeout=300)
     assert said.rstrip().endswith("PASSED"), said[-4000:]
-
-
-class FakeRenderer:
-    """Notes what is asked of it, and takes as long as it is told to, on a clock of its own."""
-
-    backend = "fake"
-
-    def __init__(self, seconds: float = 0.0) -> None:
-        self.calls: list[tuple[str, object]] = []
-        self.seconds = seconds  # that a picture takes
-        self.now = 0.0
-
-    def clock(self) -> float:
-        return self.now
-
-    def set_scene(self, scene) -> None:
-        self.calls.append(("scene", scene))
-
-    def set_clip(self, clip) -> None:
-        self.calls.append(("clip", clip))
-
-    def forget(self) -> None:
-        self.calls.append(("forget", None))
-
-    def set_layers(self, latent_rgb, relevancies) -> None:
-        self.calls.append(("layers", latent_rgb is not None))
-
-    def prepare(self, camera, pictures) -> None:
-        self.calls.append(("prepare", [picture.display for picture, _ in pictures]))
-
-    def draw(self, target, camera, picture, heat_ranges=(), layers=None) -> None:
-        self.calls.append(("draw", (camera.width, camera.height)))
-        self.now += self.seconds
-        target.clear(1.0, 0.0, 0.0, 1.0)
-
-    def read(self, camera, picture, heat_ranges=(), layers=None):
-        return np.zeros((camera.height, camera.width, 3), np.uint8)
-
-    def shows_nothing(self) -> bool:
-        return False
-
-    def depth_at(self, x_px, y_px):
-        return 2.0 if x_px > 100 else None
 
 
 @pytest.fixture

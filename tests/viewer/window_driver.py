@@ -20,7 +20,7 @@ from langsplat_core.errors import BackendError
 from langsplat_core.formats import load_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer import actions
-from langsplat_viewer.drawing.frame import FrameRenderer
+from langsplat_viewer.drawing.frame import Backend, FrameRenderer
 from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest
@@ -39,8 +39,8 @@ def digit_key(digit: int) -> imgui.Key:
 class CountingRenderer(FrameRenderer):
     """Counts the pictures it draws."""
 
-    def __init__(self, ctx) -> None:
-        super().__init__(ctx, "opengl")
+    def __init__(self, ctx, backend: Backend) -> None:
+        super().__init__(ctx, backend)
         self.count = 0
 
     def draw(self, *args, **kwargs) -> None:
@@ -53,8 +53,16 @@ class Session:
 
     patience = PATIENCE
 
-    def __init__(self, folder: Path, scene: str, load=load_scene, size=(860, 620), **request) -> None:
-        self.folder = folder
+    def __init__(
+        self,
+        folder: Path,
+        scene: str,
+        load=load_scene,
+        size=(860, 620),
+        backend: Backend = "opengl",
+        **request,
+    ) -> None:
+        self.folder, self.backend = folder, backend
         self.renderer: CountingRenderer | None = None
         services = Services(load, lambda encoder_id: FakeEncoder())
         self.window = Window(
@@ -64,7 +72,7 @@ class Session:
         self.state = self.window.viewer.state
 
     def _make_renderer(self, ctx) -> CountingRenderer:
-        self.renderer = CountingRenderer(ctx)
+        self.renderer = CountingRenderer(ctx, self.backend)
         return self.renderer
 
     def run(self, test: Callable[["Session"], None]) -> None:

@@ -1,6 +1,6 @@
 """Channel textures: what the composite shader reads, from either rasterizer."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, Protocol
 
 import moderngl
@@ -8,6 +8,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.display.compose import Channels
+from langsplat_core.progress import Progress
 from langsplat_core.raster import Rasterizer
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer, GlView, Source
 from langsplat_core.scene import Gaussians, Scene
@@ -16,6 +17,7 @@ from langsplat_viewer.drawing.channels import ArrayChannels, Channel, surface_de
 from langsplat_viewer.drawing.sight import LastView, Sight
 
 Textures = tuple[moderngl.Texture, ...]  # colours with alpha, then one for each channel that was wanted
+Ahead = Callable[[Progress], Callable[[], Textures]]  # for any thread; what it returns: for the context's
 
 
 class ChannelSource(Protocol):
@@ -24,6 +26,9 @@ class ChannelSource(Protocol):
     def render(self, sight: Sight, wanted: Sequence[Channel]) -> Textures:
         """Colours, then the texture of each channel (the colours' for "none"), valid until the next call.
         At most three with values, none of them twice."""
+
+    def ahead(self, sight: Sight, wanted: Sequence[Channel]) -> Ahead | None:
+        """What of `render` another thread can do, whatever is rendered here meanwhile; None: nothing."""
 
     def depth_at(self, sight: Sight, column: int, row: int) -> tuple[float, float]:
         """Surface depth (world units, 0: nothing) and alpha of one pixel."""
@@ -66,6 +71,9 @@ class GlSource:
         )
         return (colours, *by_channel)
 
+    def ahead(self, sight: Sight, wanted: Sequence[Channel]) -> Ahead | None:
+        return None  # the context is this thread's
+
     def _upload(self, gaussians: Gaussians, values: Array) -> moderngl.Texture:
         if id(values) not in self._uploads:
             with lap("upload", self._ctx.finish):
@@ -103,11 +111,29 @@ class ArraySource:
         self._textures: dict[tuple[int, int], moderngl.Texture] = {}  # by place and number of components
 
     def render(self, sight: Sight, wanted: Sequence[Channel]) -> Textures:
-        drawn = self._channels.render_all(sight, wanted or [Channel()])
-        with lap("upload", self._ctx.finish):
-            return self._uploaded(drawn, len(wanted))
+        return self._uploaded(self._channels.render_all(sight, wanted or [Channel()]), len(wanted))
+
+    def ahead(self, sight: Sight, wanted: Sequence[Channel]) -> Ahead | None:
+        channels = self._channels.apart()
+
+        def work(report: Progress) -> Callable[[], Textures]:
+            channels.views.of(sight)
+            report("", 0.5)  # ends here where nobody wants it any more
+            drawn = channels.render_all(sight, wanted or [Channel()])
+
+            def finish() -> Textures:
+                self._channels = channels
+                return self._uploaded(drawn, len(wanted))
+
+            return finish
+
+        return work
 
     def _uploaded(self, drawn: Sequence[Channels], wanted: int) -> Textures:
+        with lap("upload", self._ctx.finish):
+            return self._upload_all(drawn, wanted)
+
+    def _upload_all(self, drawn: Sequence[Channels], wanted: int) -> Textures:
         colours = self._upload(0, 4, drawn[0].rgb, drawn[0].alpha)
         textures = [colours]
         for place, channels in enumerate(drawn[:wanted], 1):

@@ -1,6 +1,7 @@
 """Which channels a picture needs, and those channels as arrays. No graphics device here."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,6 +104,12 @@ class ArrayChannels:
 
     def __init__(self, rasterizer: Rasterizer) -> None:
         self.views = LastView(rasterizer)
+
+    def apart(self) -> "ArrayChannels":
+        """Other ones, with the same projection to begin with: for another thread."""
+        made = copy(self)
+        made.views = copy(self.views)
+        return made
 
     def render(self, sight: Sight, layers: Layers, extra: Extra) -> Channels:
         """Colours, alpha and `extra`, in one pass."""

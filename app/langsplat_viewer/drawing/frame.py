@@ -25,6 +25,7 @@ from langsplat_core.stopwatch import lap
 from langsplat_viewer.drawing.channel_textures import ArraySource, ChannelSource, GlSource, Textures
 from langsplat_viewer.drawing.channels import Channel, Layers, depth_range
 from langsplat_viewer.drawing.looking import VISIBLE_ALPHA
+from langsplat_viewer.drawing.renderer import Rasterized, Rasterizing
 from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
 from langsplat_viewer.drawing.sight import Sight
 
@@ -103,23 +104,45 @@ class FrameRenderer:
         """Rasterize in one pass what several pictures of one camera need, at most three, unless it is all
         there; their `draw` or `read` then only composes. Layers of a picture as in `draw`."""
         if self._scene is not None:
-            self._rasterize(
-                self._sight(self._scene, camera),
-                [(layers or self._layers).channel(p) for p, layers in pictures],
-            )
+            self._rasterize(self._sight(self._scene, camera), self._wanted(pictures))
+
+    def ahead(
+        self, camera: Camera, pictures: Sequence[tuple[PictureConfig, Layers | None]]
+    ) -> Rasterizing | None:
+        """What of `prepare` another thread can do, whatever is drawn here meanwhile; None where that is
+        nothing, or all of it is there."""
+        if self._scene is None:
+            return None
+        sight = self._sight(self._scene, camera)
+        missing = self._missing(sight, self._wanted(pictures))
+        work = None if missing is None else self._source.ahead(sight, missing)
+        return None if missing is None or work is None else Rasterizing(sight, tuple(missing), work)
+
+    def take(self, made: Rasterized) -> None:
+        """Have what came of that, as if it had been prepared here."""
+        self._held, self._channels = None, ()
+        self._textures = made.finish()
+        self._held, self._channels = made.of.sight, made.of.channels
+
+    def _wanted(self, pictures: Sequence[tuple[PictureConfig, Layers | None]]) -> list[Channel]:
+        return [(layers or self._layers).channel(picture) for picture, layers in pictures]
 
     def _sight(self, scene: Scene, camera: Camera) -> Sight:
         return Sight(scene, camera, self._clip)
 
     def _rasterize(self, sight: Sight, wanted: Sequence[Channel]) -> None:
         """Have `wanted` among the channels that are held."""
+        missing = self._missing(sight, wanted)
+        if missing is not None:
+            self._held, self._channels = None, ()
+            self._textures = self._source.render(sight, missing)
+            self._held, self._channels = sight, tuple(missing)
+
+    def _missing(self, sight: Sight, wanted: Sequence[Channel]) -> list[Channel] | None:
+        """What to rasterize beside colours to have `wanted`; None where all of it is held."""
         held = {channel.key for channel in self._channels}
         needed = {channel.key: channel for channel in wanted if channel.extra != "none"}
-        if self._held == sight and needed.keys() <= held:
-            return
-        self._held, self._channels = None, ()
-        self._textures = self._source.render(sight, list(needed.values()))
-        self._held, self._channels = sight, tuple(needed.values())
+        return None if self._held == sight and needed.keys() <= held else list(needed.values())
 
     def _texture_of(self, channel: Channel) -> moderngl.Texture:
         """The one that holds a channel; the colours where it is none."""

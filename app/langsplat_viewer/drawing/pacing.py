@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 MOVING_BUDGET = 50.0  # milliseconds: with the panels, some fifteen pictures a second
+GUESS = 5e-4  # milliseconds of a fine picture for each Gaussian, before one was drawn
 MERGED_SHARE = 0.25  # of a picture's time, guessed, when four Gaussians are drawn as one
 FORGET = 0.8  # what was learned is lowered by this with every fine picture, so that better is tried again
 
@@ -30,27 +31,40 @@ class Pace:
     """Times of pictures, in milliseconds."""
 
     def __init__(self) -> None:
-        self._fine = 0.0
+        self._count = 1
+        self._each = GUESS  # of a fine picture's time, for one Gaussian
         self._shares: dict[Level, float] = {}  # of the fine picture's time, measured
+
+    def expect(self, count: int) -> None:
+        """Pictures are of so many Gaussians from now on."""
+        self._count = max(count, 1)
 
     @property
     def is_slow(self) -> bool:
         """Whether fine pictures are too slow to follow a movement."""
-        return self._fine > MOVING_BUDGET
+        return not self._is_within(FINE)
 
     def drew(self, level: Level, milliseconds: float) -> None:
         """A picture took so long."""
         if level == FINE:
-            self._fine = milliseconds
+            self._each = milliseconds / self._count
             self._shares = {other: FORGET * share for other, share in self._shares.items()}
-        elif self._fine > 0:
-            self._shares[level] = (self._share(level) + milliseconds / self._fine) / 2
+        elif self._each > 0:
+            self._shares[level] = (self._share(level) + milliseconds / (self._each * self._count)) / 2
 
     def level(self, has_merged: bool) -> Level:
         """The finest at which a picture is expected within the budget, or the coarsest of all."""
         levels = WITH_MERGED if has_merged else PLAIN
-        within = (level for level in levels if self._fine * self._share(level) <= MOVING_BUDGET)
-        return next(within, levels[-1])
+        return next(filter(self._is_within, levels), levels[-1])
+
+    def stand_in(self) -> Level | None:
+        """The finest of merged Gaussians that is expected within the budget, if there is one: all of them are
+        projected for few pixels, too."""
+        merged = (level for level in WITH_MERGED if level.merged)
+        return next(filter(self._is_within, merged), None)
+
+    def _is_within(self, level: Level) -> bool:
+        return self._each * self._count * self._share(level) <= MOVING_BUDGET
 
     def _share(self, level: Level) -> float:
         return 1.0 if level == FINE else self._shares.get(level, level.guess)

@@ -1,6 +1,7 @@
 """What draws the pictures, as the canvas sees it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import moderngl
@@ -9,8 +10,38 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.compose import HeatRanges
 from langsplat_core.scene import Camera, Scene
-from langsplat_viewer.drawing.channels import Layers
+from langsplat_viewer.drawing.channel_textures import Ahead, Textures
+from langsplat_viewer.drawing.channels import Channel, Layers
 from langsplat_viewer.drawing.seeing import Clip
+from langsplat_viewer.drawing.sight import Sight
+
+
+@dataclass(frozen=True, eq=False)
+class Rasterizing:
+    """What another thread can do of a picture. Equal where the same comes of it."""
+
+    sight: Sight
+    channels: tuple[Channel, ...]  # beside the colours
+    work: Ahead
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Rasterizing) and self.sight == other.sight and self._keys() == other._keys()
+
+    def __hash__(self) -> int:
+        return hash((self.sight, self._keys()))
+
+    def _keys(self) -> tuple[object, ...]:
+        return tuple(channel.key for channel in self.channels)
+
+
+@dataclass(frozen=True)
+class Rasterized:
+    """What came of it."""
+
+    of: Rasterizing
+    finish: Callable[[], Textures]  # what its work returned
+    milliseconds: float
+    laps: Mapping[str, float]  # see `langsplat_core.stopwatch`
 
 
 class Renderer(Protocol):
@@ -32,6 +63,14 @@ class Renderer(Protocol):
 
     def prepare(self, camera: Camera, pictures: Sequence[tuple[PictureConfig, Layers | None]]) -> None:
         """Rasterize at once what several pictures of one camera need."""
+
+    def ahead(
+        self, camera: Camera, pictures: Sequence[tuple[PictureConfig, Layers | None]]
+    ) -> Rasterizing | None:
+        """What of `prepare` another thread can do; None where nothing is left of it."""
+
+    def take(self, made: Rasterized) -> None:
+        """Have what came of that."""
 
     def draw(
         self,

@@ -6,7 +6,7 @@ the id of one that is gone may be given to the next.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.compose import HeatRanges
@@ -45,6 +45,10 @@ class Depiction:
     view: OrbitCamera
     size: tuple[int, int]  # of each picture at rest, pixels
     looks: tuple[Look, ...]  # from left to right
+
+    def is_placed_as(self, other: "Depiction") -> bool:
+        """Whether one projection of the Gaussians serves both."""
+        return replace(self, looks=()) == replace(other, looks=())
 
 
 def depiction(state: ViewerState, shown: Sequence[ViewerState]) -> Depiction:

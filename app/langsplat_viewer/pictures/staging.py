@@ -3,11 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+from langsplat_core.config import PictureConfig
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.scene.merging import Merged, merged
 from langsplat_viewer.drawing.channels import Layers
 from langsplat_viewer.drawing.looking import drawn_scene
-from langsplat_viewer.drawing.renderer import Renderer
+from langsplat_viewer.drawing.renderer import Rasterizing, Renderer
 from langsplat_viewer.jobs import Worker
 from langsplat_viewer.pictures.depiction import Depiction
 from langsplat_viewer.pictures.marked_scene import MarkedScene, layers_of
@@ -34,11 +35,23 @@ class Stage:
         None for those that it has. `instead`: what is drawn in place of `marked.scene`, of which it was made.
         """
         self._hand_over(wanted, shown, marked, instead)
-        layers = [None, *self._layers[1:]]
         if len(shown) > 1:
-            looks = [look.picture for look in wanted.looks]
-            self.renderer.prepare(camera, list(zip(looks, layers, strict=True)))
-        return layers
+            self.renderer.prepare(camera, self._pictures(wanted))
+        return self._own_layers()
+
+    def ahead(
+        self, wanted: Depiction, shown: Sequence[ViewerState], marked: MarkedScene, camera: Camera
+    ) -> Rasterizing | None:
+        """What of these pictures another thread can do; None where nothing is left of it."""
+        self._hand_over(wanted, shown, marked, None)
+        return self.renderer.ahead(camera, self._pictures(wanted))
+
+    def _own_layers(self) -> list[Layers | None]:
+        return [None, *self._layers[1:]]
+
+    def _pictures(self, wanted: Depiction) -> list[tuple[PictureConfig, Layers | None]]:
+        looks = [look.picture for look in wanted.looks]
+        return list(zip(looks, self._own_layers(), strict=True))
 
     def let_go(self, scene: Scene) -> None:
         """Hold nothing of another scene than this one."""
@@ -107,6 +120,11 @@ class Merger:
         """What has been made of these, if it is ready."""
         self._worker.poll()
         return self._made if self._source is gaussians else None
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it is at work."""
+        return self._worker.is_running
 
     def close(self) -> None:
         """Begin nothing more."""
