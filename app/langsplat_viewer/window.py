@@ -1,9 +1,8 @@
-"""The window: the only user of hello_imgui and glfw. Everything it does is in actions, panels and canvas."""
+"""The window: with `display_probe` the only user of hello_imgui and glfw. All it does is in actions, panels, canvas."""
 
 import os
 import sys
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from langsplat_core.config import Display, LevelChoice, PictureConfig
 from langsplat_core.errors import BackendError, InputError, LangSplatError
 from langsplat_viewer import actions, fonts
 from langsplat_viewer.canvas import Canvas
+from langsplat_viewer.display_probe import probe_gl
 from langsplat_viewer.drawing.frame import Backend, FrameRenderer
 from langsplat_viewer.drawing.renderer import Renderer
 from langsplat_viewer.files.bookmarks import Shelf
@@ -30,8 +30,6 @@ from langsplat_viewer.viewer import Services, Viewer
 
 TITLE = "LangSplat viewer"
 DEFAULT_SIZE = (1280, 800)
-# 4.3 sorts splats, 4.1 draws them on every system; 3.3 still shows the CPU's pictures.
-GL_VERSIONS = ((4, 3), (4, 1), (3, 3))
 IDLE_FPS = 0.01  # frames per second while nothing happens: an event, or the worker, wakes the window at once
 AWAKE_SECONDS = 0.4  # after an event: tooltips come, and widgets take their places in a few frames
 AWAKE_FRAMES = 4  # after news from the worker, for the same reason
@@ -84,34 +82,6 @@ def open_window(request: WindowRequest, services: Services) -> None:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(0)
-
-
-def probe_gl() -> tuple[int, int]:
-    """The newest of `GL_VERSIONS` that a window can have here. Raises BackendError without a display."""
-    hint = "to draw a picture without a window add --headless --out picture.png"
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", glfw.GLFWError)
-        is_linux = sys.platform.startswith("linux")
-        if is_linux and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-            raise BackendError(f"no display to open a window on (DISPLAY is not set); {hint}")
-        if not glfw.init():
-            raise BackendError(f"the display cannot be reached; {hint}")
-        for major, minor in GL_VERSIONS:
-            glfw.window_hint(glfw.VISIBLE, False)
-            _gl_hints(major, minor)
-            window = glfw.create_window(16, 16, "probe", None, None)
-            glfw.default_window_hints()
-            if window:
-                glfw.destroy_window(window)
-                return major, minor
-    raise BackendError(f"the display offers no OpenGL 3.3; update the graphics driver, or {hint}")
-
-
-def _gl_hints(major: int, minor: int) -> None:
-    glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, major)
-    glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, minor)
-    glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
-    glfw.window_hint(glfw.OPENGL_FORWARD_COMPAT, True)
 
 
 class Window:

@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera
 from langsplat_viewer.camera.controls import Extent, OrbitCamera, from_camera, spanning, symmetric_intrinsics
-from langsplat_viewer.camera.curves import cubic, monotone_slopes
 
 SAME = 1e-9  # a step as small as this, of the largest coordinate or in radians, is none
 FOV_LIMITS = (0.01, 179.0)  # degrees
@@ -179,10 +178,14 @@ class _Curve:
     """What is computed once for two or more keyframes."""
 
     def __init__(self, keyframes: tuple[Keyframe, ...]) -> None:
+        # 12 MB of modules, for those who record a path.
+        from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
+
         self._times = np.array([key.seconds for key in keyframes], np.float64)
-        self._positions = np.array([key.pose.position for key in keyframes], np.float64)
-        least = SAME * (1 + np.abs(self._positions).max())
-        self._velocities = tangents(self._times, np.diff(self._positions, axis=0), least)
+        positions = np.array([key.pose.position for key in keyframes], np.float64)
+        least = SAME * (1 + np.abs(positions).max())
+        slopes = tangents(self._times, np.diff(positions, axis=0), least)
+        self._positions = CubicHermiteSpline(self._times, positions, slopes)
         # Camera to world: a product from the right is then a turn as the camera feels it.
         self._rotations = Rotation.from_matrix(np.array([key.pose.rotation.T for key in keyframes]))
         steps = (self._rotations[:-1].inv() * self._rotations[1:]).as_rotvec()
@@ -193,10 +196,10 @@ class _Curve:
         self._middle = (ends[0] * Rotation.from_rotvec(steps) * ends[1]).as_rotvec()
         # The focal length, which grows evenly when one zooms; its curve stays within the keyframes.
         focal = [-math.log(math.tan(math.radians(key.pose.fov_degrees) / 2)) for key in keyframes]
-        self._focal = np.array(focal)
+        self._focal = PchipInterpolator(self._times, focal)
         spans = [key.pose.span for key in keyframes]
         self._parallel = np.array([span is not None for span in spans])
-        self._span = np.log(_without_gaps(spans))
+        self._span = PchipInterpolator(self._times, np.log(_without_gaps(spans)))
 
     def poses(self, seconds: Array) -> tuple[Pose, ...]:
         times = np.clip(seconds, self._times[0], self._times[-1])
@@ -208,20 +211,14 @@ class _Curve:
             * Rotation.from_rotvec((3 * u**2 - 2 * u**3) * self._middle[row])
             * Rotation.from_rotvec(u**3 * self._last[row])
         )
-        fov = np.degrees(2 * np.arctan(np.exp(-self._monotone(self._focal, times))))
+        fov = np.degrees(2 * np.arctan(np.exp(-self._focal(times))))
         parallel = self._parallel[np.searchsorted(self._times, times, "right") - 1]  # till the next keyframe
         spans = [
             float(span) if flat else None
-            for span, flat in zip(np.exp(self._monotone(self._span, times)), parallel, strict=True)
+            for span, flat in zip(np.exp(self._span(times)), parallel, strict=True)
         ]
-        positions = cubic(self._times, self._positions, self._velocities, times)
-        found = zip(positions, turned.inv().as_matrix(), fov.tolist(), spans, strict=True)
+        found = zip(self._positions(times), turned.inv().as_matrix(), fov.tolist(), spans, strict=True)
         return tuple(Pose(*parts) for parts in found)
-
-    def _monotone(self, values: Array, at: Array) -> Array:
-        """Of (K,) values of the keyframes at (T,) times, between those of the neighbours."""
-        slopes = monotone_slopes(self._times, values)
-        return cubic(self._times, values[:, None], slopes[:, None], at)[:, 0]
 
 
 def _without_gaps(spans: Sequence[float | None]) -> list[float]:
