@@ -1,4 +1,4 @@
-"""The window: with `display_probe` the only user of hello_imgui and glfw. All it does is in actions, panels, canvas."""
+"""The window. Only this and `display_probe` use hello_imgui and glfw; the rest is in actions and panels."""
 
 import os
 import sys
