@@ -52,7 +52,7 @@ class DatasetConfig:
     max_side: Side = 800  # photographs are shrunk until their longer side has at most this many pixels
     test_every: CountOrZero = 8  # every n-th view, in name order, is held out from training; 0 holds out none
     metres_per_unit: Positive | None = None
-    """Of the dataset's world; None: as transforms.json says, if it does."""
+    """Of the dataset's world; None: as transforms.json says, or else the photographs' places (GPS)."""
     # go on where fewer than half of the photographs, or fewer than three, have a camera
     allow_few_cameras: bool = False
 

@@ -10,6 +10,7 @@ from langsplat_core.datasets.colmap import find_model, load_colmap
 from langsplat_core.datasets.known_poses import add_points
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.datasets.photos import load_photos, photo_folder
+from langsplat_core.datasets.places import metres_of
 from langsplat_core.errors import InputError
 from langsplat_core.files import shown
 from langsplat_core.progress import Progress, silent
@@ -29,7 +30,8 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
     Recognises, in this order, a nerfstudio ``transforms.json``, a COLMAP model, and plain photographs,
     whose cameras are then found by structure from motion. A dataset with cameras but without points gets
     ones that are triangulated from its training views. Whatever had to be computed is kept in ``work/sfm-*``
-    and not computed again for the same photographs. The world is the dataset's own. What had to be left out
+    and not computed again for the same photographs. The world is the dataset's own; how long its unit is, is
+    said by `config`, the dataset, or the places (GPS) of the photographs. What had to be left out
     is reported once, by a warning of the logger "langsplat". Raises InputError where nothing usable remains.
     """
     path = Path(path)
@@ -40,8 +42,8 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
         capture = _load(path, config, work, progress)
     except PermissionError as error:
         raise InputError(f"{error.filename}: may not be read ({error.strerror}); see to its rights") from None
-    if config.metres_per_unit is not None:
-        capture = replace(capture, metres_per_unit=config.metres_per_unit)
+    metres = config.metres_per_unit or capture.metres_per_unit or metres_of(capture)
+    capture = replace(capture, metres_per_unit=metres)
     if len(capture.points):
         return capture
     return add_points(capture, capture.split(config.test_every)[0], work, progress)

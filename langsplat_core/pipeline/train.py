@@ -107,7 +107,8 @@ def _train(
         gaussians = crew.once(lambda: trained_gaussians(capture, train, config, work, progress))
     else:
         gaussians = given.gaussians
-    metres = capture.metres_per_unit or (None if given is None else given.metres_per_unit)
+    said = None if given is None else given.metres_per_unit  # the dataset's may be an estimate
+    metres = config.dataset.metres_per_unit or said or capture.metres_per_unit
     clock.lap("radiance")
 
     cameras = tuple(capture.cameras[i] for i in train)

@@ -22,6 +22,7 @@ from langsplat_core.config import (
 )
 from langsplat_core.errors import EncoderError, FormatError, InputError
 from langsplat_core.formats import load_scene
+from langsplat_core.formats.metres import write_metres
 from langsplat_core.pipeline import language, train
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import train_scene
@@ -284,6 +285,9 @@ def test_a_trained_scene_is_given_a_meaning(room, tmp_path):
     assert field is not None
     assert field.codec.index_size == 9
     assert run("train", room, "--out", again, "--gaussians", tmp_path / "missing.ply", *options) == 2
+    write_metres(first, 0.25)  # as `langsplat scale` measured it; the photographs say 0.5
+    assert run("train", room, "--out", again, "--gaussians", first, *options) == 0
+    assert load_scene(again).metres_per_unit == 0.25
 
 
 def test_profiles_are_defaults_that_options_override():
