@@ -69,7 +69,8 @@ def place(path: Path) -> tuple[float, float]:
     """Latitude and longitude of a photograph, degrees, north and east positive; NaN where it names none."""
     try:
         with opened(path) as picture:
-            if picture.format != "PNG" or "exif" in picture.info:  # else all of it is decoded to look behind it
+            # What stands behind a PNG's pixels is read by decoding them all.
+            if picture.format != "PNG" or "exif" in picture.info:
                 return _place(picture.getexif())
     except PictureError:
         pass
