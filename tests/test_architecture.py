@@ -34,6 +34,7 @@ LAYERS = [
         "langsplat_viewer.fonts",
         "langsplat_viewer.parallel",
     ],
+    ["langsplat_viewer.memory"],
     ["langsplat_core.__main__"],
     ["langsplat_core.cli"],
     ["langsplat_core.lab"],

@@ -4,8 +4,6 @@ Work is submitted from the window's thread and its outcome is handed back there 
 needs to know about threads.
 """
 
-import ctypes
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -16,6 +14,7 @@ from typing import Any, TypeVar
 
 from langsplat_core.errors import LangSplatError
 from langsplat_core.progress import Cancelled, Progress
+from langsplat_viewer.memory import give_memory_back
 
 T = TypeVar("T")
 
@@ -126,28 +125,6 @@ class Worker:
         self._waiting.put(None)
         if self._thread is not None and patience > 0:
             self._thread.join(patience)
-
-
-_ARENA_MAX = -8  # M_ARENA_MAX of malloc.h
-
-
-def give_memory_back() -> None:
-    """Return to the system what the C library keeps of memory that was freed, where it can: reading a scene
-    leaves tens of megabytes of it."""
-    _in_c_library("malloc_trim", 0)
-
-
-def share_one_heap() -> None:
-    """Have threads that begin after this take memory from one heap, where the C library allows it: with one
-    each, all of them keep what they have freed."""
-    _in_c_library("mallopt", _ARENA_MAX, 1)
-
-
-def _in_c_library(name: str, *arguments: int) -> None:
-    if sys.platform == "linux":
-        function = getattr(ctypes.CDLL(None), name, None)  # glibc has them, others do not
-        if function is not None:
-            function(*arguments)
 
 
 def deliver(job: Job) -> None:

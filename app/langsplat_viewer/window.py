@@ -21,7 +21,8 @@ from langsplat_viewer.display_probe import probe_gl
 from langsplat_viewer.drawing.frame import Backend, FrameRenderer
 from langsplat_viewer.drawing.renderer import Renderer
 from langsplat_viewer.files.bookmarks import Shelf
-from langsplat_viewer.jobs import one_line, share_one_heap
+from langsplat_viewer.jobs import one_line
+from langsplat_viewer.memory import give_memory_back, share_one_heap
 from langsplat_viewer.options import chosen_camera, latent_level
 from langsplat_viewer.panels import keyboard, layout, menu, navigation, over, photograph, pictures
 from langsplat_viewer.panels.area import scene_area
@@ -102,6 +103,7 @@ class Window:
         self._began = 0.0  # this frame, seconds
         self._frames = AWAKE_FRAMES  # to be drawn whatever happens
         self._last: tuple[object, ...] = ()  # what was there in the last frame
+        self._tidied: tuple[int, int] = (0, 0)  # news after which memory was given back
         self._titled: Path | None = None  # the scene that the window's title names
 
     def params(self) -> hello_imgui.RunnerParams:
@@ -226,6 +228,9 @@ class Window:
             or self._frames > 0
         )
         idling.enable_idling = self.idles and (self.is_minimised() or not busy)
+        if idling.enable_idling and not awaits and news != self._tidied:
+            give_memory_back()  # a driver may have compiled shaders for what came
+            self._tidied = news
         # Frames that show nothing new would take the cores from the thread that is waited for.
         idling.time_active_after_last_event = 0.0 if awaits else AWAKE_SECONDS
 

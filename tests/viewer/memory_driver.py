@@ -46,6 +46,7 @@ def measure(viewer: Viewer) -> None:
     time.sleep(SETTLE)
     kinds = resident()
     print(f"{sum(kinds.values()) / 1024:6.0f} resident")
+    print(f"{sum(resident('Pss:').values()) / 1024:6.0f} of it, if what others hold too is divided among all")
     for name, kilobytes in kinds.most_common(SHOWN):
         print(f"{kilobytes / 1024:6.0f}   {name}")
     library = ctypes.CDLL(None)
@@ -55,15 +56,15 @@ def measure(viewer: Viewer) -> None:
     close()
 
 
-def resident() -> Counter[str]:
-    """kB by the name of what is mapped."""
+def resident(measure: str = "Rss:") -> Counter[str]:
+    """kB by the name of what is mapped; measure: one of smaps."""
     found: Counter[str] = Counter()
     name = ""
     for line in Path("/proc/self/smaps").read_text(encoding="utf-8").splitlines():
         first, *rest = line.split(maxsplit=5)
         if not first.endswith(":"):
             name = Path(rest[4]).name if len(rest) > 4 and rest[4].startswith("/") else "without a name"
-        elif first == "Rss:":
+        elif first == measure:
             found[name] += int(rest[0])
     return found
 

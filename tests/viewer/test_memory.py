@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -10,7 +11,7 @@ from tests.viewer import memory_driver
 
 HEAPS = """
 import ctypes, sys, threading
-from langsplat_viewer.jobs import share_one_heap
+from langsplat_viewer.memory import share_one_heap
 if sys.argv[1] == "one":
     share_one_heap()
 library = ctypes.CDLL(None)
@@ -46,3 +47,30 @@ def test_the_kinds_of_memory_are_all_of_it():
     kinds = memory_driver.resident()
     assert sum(kinds.values()) * 1024 == pytest.approx(memory_bytes(), rel=0.05)
     assert kinds["without a name"] > 1000
+
+
+PAGED_OUT = """
+import mmap, re, sys
+from pathlib import Path
+from langsplat_viewer.memory import give_memory_back
+def held():
+    text = Path("/proc/self/smaps").read_text()
+    return int(re.search(r"libLLVM-test.so[^|]*?Rss: *([0-9]+) kB", text)[1])
+with open(sys.argv[1], "rb") as file, mmap.mmap(file.fileno(), 0, mmap.MAP_PRIVATE, mmap.PROT_READ) as shown:
+    sum(shown[::4096])
+    before = held()
+    give_memory_back()
+    print(before, held(), sum(shown[::4096]) == 7 * (len(shown) // 4096))
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="of madvise")
+def test_a_compilers_code_is_given_back_and_read_again(tmp_path: Path):
+    library = tmp_path / "libLLVM-test.so"
+    library.write_bytes(bytes([7]) * 2**23)
+    command = [sys.executable, "-c", PAGED_OUT, str(library)]
+    before, after, same = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    assert same == "True"
+    if after == before:
+        pytest.skip("Linux before 5.4, or a file system that has no disk")
+    assert int(after) < int(before) / 2
