@@ -44,7 +44,8 @@ def metres_per_unit(eyes: Array, places: Array) -> float | None:
     """(K, 3) camera positions and (K, 2) latitudes and longitudes in degrees -> the median ratio of distances
     over far pairs; None where a quarter and three quarters of the pairs differ by more than `MOST_SPREAD`.
 
-    Heights are left out, as most cameras know them badly: a climb as steep as a stair adds a tenth.
+    Heights are left out, as most cameras know them badly: for a climb as steep as a stair that is an eighth
+    too little.
     """
     apart = pdist(eyes)
     far = apart >= FAR * apart.max(initial=0)

@@ -141,5 +141,5 @@ def test_a_capture_gets_its_scale_from_its_photographs(tmp_path: Path) -> None:
         capture.photos, places_at(20 * (eyes - eyes[0]) @ level.T), strict=True
     ):
         tagged(photo.path, parts(latitude), parts(longitude))
-    assert loaded(config) == pytest.approx(20, rel=0.1)
+    assert loaded(config) == pytest.approx(20, rel=0.01)
     assert loaded(DatasetConfig(metres_per_unit=3.0)) == 3.0
