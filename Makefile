@@ -1,6 +1,7 @@
 # `make help` lists the targets. PYTHON may name another interpreter (3.11 or newer).
 PYTHON ?= python3
 VENV := .venv
+LIGHT := .venv-light
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 # One file of tests is one worker's: its fixtures are made once.
@@ -65,6 +66,11 @@ pictures: system  ## make the README's pictures again (on a display, or on Xvfb)
 app: system  ## open the viewer
 	$(BIN)/langsplat-viewer
 
+light:  ## what a user without extras gets, in .venv-light: how long the installation takes, and its size
+	rm -rf $(LIGHT)
+	time sh -c '$(PYTHON) -m venv $(LIGHT) && $(LIGHT)/bin/pip install --quiet --constraint packaging/constraints.txt .'
+	du -sm $(LIGHT)
+
 bundle: system  ## the programs with their own Python in one folder, dist/langsplat-viewer, and try it
 	$(BIN)/pip install --quiet --constraint packaging/constraints.txt --editable '.[bundle]'
 	$(BIN)/pyinstaller --noconfirm --log-level ERROR --workpath dist/work packaging/bundle/langsplat-viewer.spec
@@ -81,4 +87,4 @@ desktop: $(STAMP)  ## show the viewer among this user's programs, and open scene
 	-update-desktop-database $(DATA)/applications
 
 clean:  ## remove what these targets made
-	rm -rf $(VENV) $(GPU) demo_out bench_out dist .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(LIGHT) $(GPU) demo_out bench_out dist .pytest_cache .mypy_cache .ruff_cache

@@ -6,6 +6,8 @@ The public names below load on first use, so that importing the package costs no
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from langsplat_core.extras import optional_imports
+
 if TYPE_CHECKING:
     from langsplat_core.config import TrainConfig
     from langsplat_core.formats import load_scene, save_scene
@@ -63,4 +65,5 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'langsplat_core' has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    with optional_imports():
+        return getattr(import_module(_HOMES[name]), name)

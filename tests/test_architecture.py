@@ -50,7 +50,7 @@ LAYERS = [
     ],
     ["langsplat_core.scene", "langsplat_core.parsing"],
     ["langsplat_core.config", "langsplat_core.progress", "langsplat_core.files", "langsplat_core.compiled"],
-    ["langsplat_core.arrays", "langsplat_core.ranges", "langsplat_core.stopwatch"],
+    ["langsplat_core.arrays", "langsplat_core.ranges", "langsplat_core.stopwatch", "langsplat_core.extras"],
     ["langsplat_core.errors"],
 ]
 FACADE = "langsplat_core.__init__"  # the public names; it may reach anything below the command line

@@ -2,7 +2,6 @@
 
 import ctypes.util
 import importlib.metadata
-import importlib.util
 import json
 import os
 import platform
@@ -17,11 +16,13 @@ from rich.text import Text
 from langsplat_core import __version__
 from langsplat_core.cli.console import OutputConsole
 from langsplat_core.errors import BackendError, LangSplatError
+from langsplat_core.extras import EXTRAS, remedy
 from langsplat_core.formats import load_scene
 from langsplat_core.formats.summary import NEEDLE, OPACITY_EDGES, SceneSummary, disk_bytes, summarise
 from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import load_text_encoder
 
+OPTIONAL = ("torch", "transformers", "pycolmap", "open3d", "matplotlib", "gsplat")
 LIBRARIES = {
     "EGL": "libegl1",
     "GL": "libgl1",
@@ -113,7 +114,7 @@ class Doctor:
         print(
             f"python           {platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores"
         )
-        for package in ("numpy", "numba", "torch", "transformers", "moderngl", "imgui-bundle", "open3d"):
+        for package in ("numpy", "numba", "moderngl", "imgui-bundle", *OPTIONAL):
             print(f"{package:<16} {_version(package)}")
         for library, package in LIBRARIES.items():
             found = ctypes.util.find_library(library)
@@ -121,8 +122,6 @@ class Doctor:
         print(f"DISPLAY          {os.environ.get('DISPLAY') or 'not set: use --headless'}")
         print(f"OpenGL           {_opengl()}")
         print(f"text encoder     {_encoder()}")
-        has_gsplat = importlib.util.find_spec("gsplat") is not None
-        print(f"CUDA backend     {'gsplat is installed' if has_gsplat else 'gsplat is not installed'}")
 
 
 def _opengl() -> str:
@@ -154,4 +153,4 @@ def _version(package: str) -> str:
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
-        return "missing"
+        return f"missing: {remedy(package)}" if package in EXTRAS else "missing"

@@ -21,6 +21,7 @@ from typing import Protocol
 from langsplat_core import __version__
 from langsplat_core.cli.checks import check_arguments
 from langsplat_core.errors import LangSplatError, printable_line
+from langsplat_core.extras import optional_imports
 from langsplat_core.files import NO_ROOM, shown
 from langsplat_core.progress import Terminated
 
@@ -80,7 +81,7 @@ def main(program: str, parser: Callable[[], Command]) -> int:
     logging.getLogger("langsplat").setLevel(logging.INFO)
     warnings.filterwarnings("ignore", module=r"(torch|transformers|huggingface_hub|numba)(\.|$)")
     try:
-        with _sigterm_raises():
+        with _sigterm_raises(), optional_imports():
             check_arguments(command)
             command.run()
             sys.stdout.flush()  # now, while what goes wrong can still be said in a line

@@ -7,9 +7,7 @@ from pathlib import Path
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.colmap import find_model, load_colmap
-from langsplat_core.datasets.known_poses import add_points
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
-from langsplat_core.datasets.photos import load_photos, photo_folder
 from langsplat_core.datasets.places import metres_of
 from langsplat_core.errors import InputError
 from langsplat_core.files import shown
@@ -46,6 +44,9 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
     capture = replace(capture, metres_per_unit=metres)
     if len(capture.points):
         return capture
+    # pycolmap is imported where something is computed: a dataset with cameras and points does without.
+    from langsplat_core.datasets.known_poses import add_points
+
     return add_points(capture, capture.split(config.test_every)[0], work, progress)
 
 
@@ -58,6 +59,8 @@ def _load(path: Path, config: DatasetConfig, work: Path, progress: Progress) -> 
     model = find_model(path)
     if model is not None:
         return load_colmap(path, model, max_side, progress)
+    from langsplat_core.datasets.photos import load_photos, photo_folder
+
     photos = photo_folder(path)
     if photos is None:
         raise InputError(f"{path} is no dataset; expected {ACCEPTED}")

@@ -12,7 +12,6 @@ from typing import Protocol
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.colmap_library import pycolmap
 from langsplat_core.scene import Intrinsics
 
 # What no photograph exceeds; numbers of damaged files would overflow in what is computed from them.
@@ -85,6 +84,8 @@ class ColmapDistortion:
     cy: float
 
     def __call__(self, xy: Array) -> Array:
+        from langsplat_core.datasets.colmap_library import pycolmap
+
         # The size plays no part in these models, but pycolmap asks for one.
         camera = pycolmap.Camera(model=self.model, width=1, height=1, params=np.array(self.params))
         rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)

@@ -7,6 +7,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
 from langsplat_core.errors import BackendError, InputError
+from langsplat_core.extras import optional_imports
 from langsplat_core.raster.protocol import (
     FreezableView,
     LiftingRasterizer,
@@ -55,7 +56,8 @@ def load_rasterizer(name: str, **resources: Any) -> Rasterizer:
         raise InputError(f"unknown rasterizer {name!r}; choose one of {', '.join(BACKENDS)}")
     backend = BACKENDS[name]
     try:
-        rasterizer: Rasterizer = getattr(import_module(backend.module), backend.class_name)(**resources)
+        with optional_imports():
+            rasterizer: Rasterizer = getattr(import_module(backend.module), backend.class_name)(**resources)
     except (ImportError, OSError, BackendError) as error:
         reason = " ".join(str(error).split())
         raise BackendError(

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from langsplat_core.errors import EncoderError
+from langsplat_core.extras import optional_imports
 from langsplat_core.semantics.encoder import Encoder, Family, PhraseEncoder
 from langsplat_core.semantics.families.clip import CLIP
 from langsplat_core.semantics.families.siglip import NAFLEX, SIGLIP
@@ -18,6 +19,7 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(  # by `model_type` of config.
 )
 
 
+@optional_imports(EncoderError)
 def load_text_encoder(model: str, device: str = "cpu") -> PhraseEncoder:
     """Load the text half of `model`: a folder, a hub id, or "demo" for the bundled encoder.
 
@@ -28,6 +30,7 @@ def load_text_encoder(model: str, device: str = "cpu") -> PhraseEncoder:
     return PhraseEncoder(weights, _family(weights).text(weights))
 
 
+@optional_imports(EncoderError)
 def load_encoder(model: str, device: str = "auto", batch: int = 32) -> Encoder:
     """Load both halves of `model`: a folder, a hub id, or "demo" for the bundled encoder.
 

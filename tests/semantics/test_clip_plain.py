@@ -10,12 +10,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tokenizers import Tokenizer
 from transformers import CLIPModel, CLIPTokenizerFast
 
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.families.clip import ClipText, clip_text
-from langsplat_core.semantics.families.clip_plain import PlainClipText, TextConfig, plain_text_tower
+from langsplat_core.semantics.families.clip_plain import (
+    BYTES,
+    PlainClipText,
+    TextConfig,
+    plain_text_tower,
+    read_pair_tokenizer,
+)
 from langsplat_core.semantics.weights import Weights
 from tests.support.tiny_clip import tiny_clip
 
@@ -175,11 +184,48 @@ def test_the_bundled_tokenizer_can_read_every_word_of_its_vocabulary() -> None:
     assert encoder.encode_texts(taught(DEMO)).shape == (len(taught(DEMO)), 512)
 
 
+def spelled_bytes(path: Path) -> Tokenizer:
+    """The bundled tokenizer with a vocabulary that has every byte, within a word and at its end, and a few
+    merges; written to `path`."""
+    stated = json.loads((DEMO / "tokenizer.json").read_text(encoding="utf-8"))
+    tokens = ["<|startoftext|>", "<|endoftext|>", *(byte + end for end in ("", "</w>") for byte in BYTES)]
+    merges = [["a", "b"], ["ab", "ab"], ["a", "a"], ["'", "'"], ["Ã", "Ł"], ["0", "1</w>"], ["b", "a</w>"]]
+    tokens += ["".join(pair) for pair in merges]
+    stated["model"] |= {"vocab": {token: i for i, token in enumerate(tokens)}, "merges": merges}
+    path.write_text(json.dumps(stated), encoding="utf-8")
+    return Tokenizer.from_file(str(path))
+
+
+def test_phrases_are_read_as_tokenizers_reads_them(tmp_path: Path) -> None:
+    theirs = spelled_bytes(tmp_path / "tokenizer.json")
+    ours = read_pair_tokenizer(tmp_path / "tokenizer.json")
+    assert ours is not None
+    # Letters as old as any table of Unicode: the two libraries have tables of different years.
+    likely = st.sampled_from("aaabb01' -_.sÀßΣσİé\u0301²½Ⅷ漢ﬁ\t\n")
+
+    @given(st.text(likely | st.characters(max_codepoint=0x2FF)))
+    def check(phrase: str) -> None:
+        assert ours.encode(phrase) == theirs.encode(phrase, add_special_tokens=False).ids
+
+    check()
+    assert ours.encode("red <|endoftext|>")[-1] == ours.end
+
+
+@pytest.mark.parametrize("place", ["normalizer", "pre_tokenizer", "post_processor"])
+def test_a_tokenizer_of_other_rules_is_not_read(tmp_path: Path, place: str) -> None:
+    path = tmp_path / "tokenizer.json"
+    spelled_bytes(path)
+    stated = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps(stated | {place: {"type": "Sequence"}}), encoding="utf-8")
+    assert read_pair_tokenizer(path) is None
+
+
 def test_neither_torch_nor_transformers_is_imported() -> None:
     code = (
         "import sys; from langsplat_core import load_text_encoder;"
         "assert load_text_encoder('demo').encode_texts(['red mug']).shape == (1, 512);"
-        "print([m for m in ('torch', 'transformers', 'huggingface_hub', 'scipy') if m in sys.modules])"
+        "heavy = ('torch', 'transformers', 'tokenizers', 'huggingface_hub', 'scipy');"
+        "print([m for m in heavy if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

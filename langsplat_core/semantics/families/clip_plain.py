@@ -1,23 +1,26 @@
-"""The text half of a small CLIP in NumPy, from the file of its weights: neither torch nor transformers is
-imported for it, which takes seconds and hundreds of megabytes.
+"""The text half of a small CLIP in NumPy, from the files of its weights and tokenizer: it needs neither torch
+nor transformers nor tokenizers, which take seconds to import and hundreds of megabytes to install.
 
 The network is that of Radford et al. 2021: token and position vectors, layers of causal self-attention and a
 two-layer perceptron, each behind a layer norm and added to what came in, a last norm, and the vector at the
-end token projected. It is equal to `transformers.CLIPTextModelWithProjection` but for rounding.
+end token projected. It is equal to `transformers.CLIPTextModelWithProjection` but for rounding. The tokenizer
+is CLIP's byte-level byte-pair encoding (Sennrich et al. 2016), equal to that of `tokenizers` but for letters
+that are newer than Python's table of Unicode.
 """
 
 import json
-from collections.abc import Callable, Mapping
+import re
+import unicodedata
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import groupby, pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import EncoderError
 from langsplat_core.semantics.encoder import Logits
-from langsplat_core.semantics.tokens import FILE, check_whole, read_tokenizer
+from langsplat_core.semantics.tokens import FILE, check_whole
 from langsplat_core.semantics.weights import CONFIG, SAFE, Weights
 
 # Of the text half. NumPy was the quicker one at 63 million too (docs/encoders.md); but checkpoints that large
@@ -31,6 +34,20 @@ TOKENS, POSITIONS = (f"{PREFIX}embeddings.{name}_embedding.weight" for name in (
 PROJECTION = "text_projection.weight"
 
 Tensors = Mapping[str, Array]  # name -> float32
+
+# How tokenizer.json states CLIP's rules; a file that states others is left to `tokenizers`.
+NORMALIZERS = (
+    {"type": "NFC"},
+    {"type": "Replace", "pattern": {"Regex": "\\s+"}, "content": " "},
+    {"type": "Lowercase"},
+)
+SPLIT = r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"
+END_OF_WORD = "</w>"
+# `SPLIT` in Python's syntax, which has no classes of letters and numbers: runs of both are parted afterwards.
+# Unlike Unicode, it also counts four control characters as spaces.
+PIECES = re.compile(
+    r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[^\W_]+|(?:[^\s\w]|[_\x1c-\x1f])+"
+)
 
 
 @dataclass(frozen=True)
@@ -70,12 +87,11 @@ class TextConfig:
 class PlainClipText:
     """A `TextTower`."""
 
-    def __init__(self, id: str, config: TextConfig, tensors: Tensors, tokenizer: Any, end: int) -> None:
+    def __init__(self, id: str, config: TextConfig, tensors: Tensors, tokenizer: "PairTokenizer") -> None:
         self.id = id
         self.temperature = TEMPERATURE
         self.logits: Logits | None = None
-        self._config, self._tensors = config, tensors
-        self._tokenizer, self._end = tokenizer, end
+        self._config, self._tensors, self._tokenizer = config, tensors, tokenizer
 
     @property
     def dim(self) -> int:
@@ -84,12 +100,13 @@ class PlainClipText:
 
     def encode(self, texts: list[str]) -> Array:
         """See `TextTower`."""
-        rows = [found.ids for found in self._tokenizer.encode_batch(texts)]
+        begin, end = self._tokenizer.begin, self._tokenizer.end
+        rows = [[begin, *self._tokenizer.encode(text), end] for text in texts]
         for text, row in zip(texts, rows, strict=True):
-            check_whole(text, row[1:-1], self._config.max_position_embeddings - 2, {self._end})
+            check_whole(text, row[1:-1], self._config.max_position_embeddings - 2, {end})
         longest = max(map(len, rows))
         # What follows the end token is not seen by it.
-        ids = np.array([row + [self._end] * (longest - len(row)) for row in rows])
+        ids = np.array([row + [end] * (longest - len(row)) for row in rows])
         return text_vectors(self._tensors, self._config, ids, np.array([len(row) - 1 for row in rows]))
 
 
@@ -111,16 +128,15 @@ def plain_text_tower(weights: Weights, most: int = MOST_WEIGHTS) -> PlainClipTex
     shapes = config.shapes()
     if sum(int(np.prod(shape)) for shape in shapes.values()) > most:
         return None
-    tokenizer = _tokenizer(weights)
-    tensors = None if tokenizer is None else _tensors(weights.folder, shapes)
-    if tensors is None:
+    tokenizer = read_pair_tokenizer(weights.folder / FILE)
+    tensors = _tensors(weights.folder, shapes) if tokenizer else None
+    if tokenizer is None or tensors is None:
         return None
-    row = tokenizer.encode("").ids  # the tokens that begin and end every phrase
-    highest = max(tokenizer.get_vocab(with_added_tokens=True).values())
-    ends = (config.eos_token_id,) if config.eos_token_id != LEGACY_END else (highest,)
-    if len(row) != 2 or row[1] not in ends or highest >= config.vocab_size:
+    highest = max(tokenizer.numbers.values())
+    end = config.eos_token_id if config.eos_token_id != LEGACY_END else highest
+    if tokenizer.end != end or highest >= config.vocab_size:
         return None
-    return PlainClipText(weights.id, config, tensors, tokenizer, row[1])
+    return PlainClipText(weights.id, config, tensors, tokenizer)
 
 
 def text_vectors(tensors: Tensors, config: TextConfig, ids: Array, ends: Array) -> Array:
@@ -202,12 +218,79 @@ def _text_config(weights: Weights) -> TextConfig | None:
     )
 
 
-def _tokenizer(weights: Weights) -> Any:
-    if not (weights.folder / FILE).is_file():
-        return None
+@dataclass(frozen=True)
+class PairTokenizer:
+    """CLIP's byte-pair encoding."""
+
+    numbers: Mapping[str, int]  # token -> its number
+    ranks: Mapping[tuple[str, str], int]  # pair of tokens that are merged -> its place, the lowest first
+    begin: int  # number of the token before a phrase
+    end: int  # of the one behind it, which also stands for what the vocabulary lacks
+
+    def encode(self, text: str) -> list[int]:
+        """Numbers of the tokens of `text`, without those that begin and end a phrase."""
+        return [self.numbers.get(token, self.end) for piece in _pieces(text) for token in self._merged(piece)]
+
+    def _merged(self, piece: str) -> list[str]:
+        """The tokens of a word: its bytes, of which neighbours are merged in the order of their ranks."""
+        if piece in ("<|startoftext|>", "<|endoftext|>"):
+            return [""]  # neither may stand within a phrase
+        word = [BYTES[byte] for byte in piece.encode()]
+        word[-1] += END_OF_WORD
+        while pairs := [pair for pair in pairwise(word) if pair in self.ranks]:
+            first = min(pairs, key=self.ranks.__getitem__)
+            merged, at = [], 0
+            while at < len(word):
+                taken = 2 if tuple(word[at : at + 2]) == first else 1
+                merged.append("".join(word[at : at + taken]))
+                at += taken
+            word = merged
+        return word
+
+
+def _pieces(text: str) -> Iterator[str]:
+    """What `SPLIT` finds in `text` behind the normalizers: words, single numbers, runs of marks."""
+    plain = "".join(letter.lower() for letter in unicodedata.normalize("NFC", text))
+    for found in PIECES.findall(plain):
+        for is_word, letters in groupby(found, str.isalpha) if found[0].isalnum() else [(True, found)]:
+            yield from ["".join(letters)] if is_word else letters
+
+
+def _byte_letters() -> tuple[str, ...]:
+    """The letter that stands for each byte in a byte-level vocabulary: itself where Latin-1 prints it, the
+    others from U+0100 on (Radford et al. 2019)."""
+    shown = [*range(0x21, 0x7F), *range(0xA1, 0xAD), *range(0xAE, 0x100)]
+    others = [byte for byte in range(256) if byte not in shown]
+    return tuple(chr(byte if byte in shown else 256 + others.index(byte)) for byte in range(256))
+
+
+BYTES = _byte_letters()
+
+
+def read_pair_tokenizer(path: Path) -> PairTokenizer | None:
+    """The tokenizer of a tokenizer.json that states CLIP's rules; None for another, and for no file."""
     try:
-        return read_tokenizer(weights)
-    except EncoderError:
+        stated = json.loads(path.read_text(encoding="utf-8"))
+        model, ends = stated["model"], stated["post_processor"]
+        split, level = stated["pre_tokenizer"]["pretokenizers"]
+        rules = (
+            *stated["normalizer"]["normalizers"],
+            *(model["type"], model["end_of_word_suffix"], model["unk_token"], ends["type"]),
+            *(split["pattern"], split["behavior"], split["invert"]),
+            *(level["type"], level["add_prefix_space"]),
+        )
+        (last, end), (_, begin) = ends["sep"], ends["cls"]
+        if rules != (
+            *NORMALIZERS,
+            *("BPE", END_OF_WORD, last, "RobertaProcessing"),
+            *({"Regex": SPLIT}, "Removed", True),
+            *("ByteLevel", False),
+        ):
+            return None
+        merges = [pair.split() if isinstance(pair, str) else pair for pair in model["merges"]]
+        ranks = {(first, second): rank for rank, (first, second) in enumerate(merges)}
+        return PairTokenizer({str(k): int(v) for k, v in model["vocab"].items()}, ranks, int(begin), int(end))
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
         return None
 
 
