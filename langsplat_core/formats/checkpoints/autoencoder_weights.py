@@ -26,10 +26,8 @@ _NAME = re.compile(r"(encoder|decoder)\.(\d{1,3})\.(\w+)")
 Layer = dict[str, Array]
 
 
-def is_autoencoder(content: Any) -> bool:
-    """Whether a file's content is a dictionary with weights of an encoder and a decoder."""
-    if not isinstance(content, Mapping):
-        return False
+def is_autoencoder(content: Mapping[Any, Any]) -> bool:
+    """Whether these are weights of an encoder and a decoder."""
     parts = {found[1] for name in content if isinstance(name, str) and (found := _NAME.fullmatch(name))}
     return parts == {"encoder", "decoder"}
 

@@ -19,7 +19,7 @@ from langsplat_core.formats.checkpoints.autoencoder_weights import autoencoder_f
 from langsplat_core.formats.checkpoints.gaussian_tuple import GEOMETRY, gaussians_of, model_tuple
 from langsplat_core.formats.checkpoints.meanings import Leaves, SparseCodes, Vectors
 from langsplat_core.formats.checkpoints.quantisers import checked_centroids, is_centroids, read_faiss
-from langsplat_core.formats.checkpoints.unpickling import load_torch, plain_array
+from langsplat_core.formats.checkpoints.unpickling import load_torch, plain_array, plain_mapping
 from langsplat_core.formats.ply import read_ply_scene
 from langsplat_core.parsing.npy import MAGIC as NPY
 from langsplat_core.parsing.npy import read_npy, read_npz
@@ -155,11 +155,12 @@ def _from_torch(content: Any, path: Path) -> Part:
     elements = model_tuple(content)
     if elements is not None:
         return _from_tuple(elements, path)
-    if isinstance(content, Mapping) and content.get("magic") == FVDB_MAGIC:
-        return _from_fvdb(content, path)
-    if is_autoencoder(content):
-        return Autoencoder(path, autoencoder_from(content, path))
-    named = dict(content) if isinstance(content, Mapping) else {"": content}
+    mapping = plain_mapping(content)
+    named = {"": content} if mapping is None else mapping
+    if named.get("magic") == FVDB_MAGIC:
+        return _from_fvdb(named, path)
+    if is_autoencoder(named):
+        return Autoencoder(path, autoencoder_from(named, path))
     arrays = {str(name): plain_array(value, path) for name, value in named.items()}
     found = {name: array for name, array in arrays.items() if array is not None}
     if any(is_centroids(array) for array in found.values()):
@@ -237,13 +238,10 @@ def _from_fvdb(content: Mapping[str, Any], path: Path) -> Carrier:
     topk = _mapping(config, "model").get("topk", 4)
     level = config.get("feature_level")
     if not isinstance(topk, int) or topk < 1:
-        raise FormatError(
-            f"{path}: config.model.topk is {str(topk)[:40]!r}; expected a whole number, 1 or more"
-        )
+        raise FormatError(f"{path}: config.model.topk is not a whole number, 1 or more")
     meaning = _sparse(logits[0], codewords[0], topk, path)
     return Carrier(path, FVDB, None, meaning, None, level if isinstance(level, int) else None)
 
 
 def _mapping(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    value = content.get(name)
-    return value if isinstance(value, Mapping) else {}
+    return plain_mapping(content.get(name)) or {}
