@@ -25,7 +25,7 @@ _ARCHIVE = b"PK\x03\x04"  # how torch tells an archive
 _PICKLES = 5  # that a file begins with where it is none: magic number, version, system, content, storages
 _STORAGES = ("Bool", "Byte", "Char", "Short", "Int", "Long", "Half", "BFloat16", "Float", "Double")
 _MARKED = (pickletools.markobject, pickletools.stackslice)
-_CODE = re.compile(r"b1|[iu][1248]|f[248]|[SU][1-9]\d{0,3}", re.ASCII)  # numbers and texts; no objects, no records
+_CODE = re.compile(r"b1|[iu][1248]|f[248]|[SU][1-9]\d{0,3}", re.ASCII)  # no objects, no records
 
 
 class _Kind:
