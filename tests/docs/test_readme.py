@@ -77,11 +77,10 @@ def test_commands_parse(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
                 pytest.fail(f"{program} {shlex.join(words)}: {capsys.readouterr().err}")
 
 
-def test_the_readme_has_commands_and_is_short() -> None:
+def test_the_readme_has_commands() -> None:
     found = [" ".join(words[:2]) for words in commands(README.read_text())]
     wanted = {"make demo", "make test", "langsplat train", "langsplat query", "langsplat compact"}
     assert wanted <= set(found)
-    assert len(README.read_text().splitlines()) <= 125
 
 
 @pytest.mark.parametrize("page", PAGES, ids=named)

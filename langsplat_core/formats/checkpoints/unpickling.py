@@ -18,6 +18,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError
+from langsplat_core.extras import optional_imports
 from langsplat_core.parsing.opening import open_for_reading
 
 DEEPEST = 100  # tuples in tuples; Python's hash goes down them on the machine's stack, which ends at 100 000
@@ -92,6 +93,7 @@ _NAMED = {
 }
 
 
+@optional_imports()
 def load_torch(path: Path) -> Any:
     """What a file of `torch.save` holds; tensors are on the CPU and, where the file allows, read when used.
 
