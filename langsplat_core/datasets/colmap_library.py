@@ -1,14 +1,37 @@
-"""pycolmap, imported so that it leaves signals alone.
+"""pycolmap, imported so that it leaves signals alone and its libraries keep to one thread.
 
 Its logging library installs a handler of its own for SIGTERM, which prints a stack trace and kills the
-process. Whatever was there before is put back. Import `pycolmap` from here.
+process. Whatever was there before is put back. Its wheel brings OpenMP (and a package of other make may bring
+OpenBLAS) of its own, which ask the environment how many threads to use when they are loaded, and never again.
+COLMAP's own threads are another matter. Import `pycolmap` from here.
 """
 
 import ctypes
+import os
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np  # noqa: F401  pycolmap imports it too: first, so that its OpenBLAS keeps its threads
 
 __all__ = ["pycolmap"]
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """What is loaded meanwhile keeps to one thread."""
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def _handler(number: int, handler: int | None) -> int | None:
@@ -21,11 +44,13 @@ def _handler(number: int, handler: int | None) -> int | None:
 
 
 if sys.platform == "win32":  # no such handler there
-    import pycolmap
+    with _one_thread():
+        import pycolmap
 else:
     _before = _handler(signal.SIGTERM, None)
     try:
-        import pycolmap
+        with _one_thread():
+            import pycolmap
     finally:
         _handler(signal.SIGTERM, _before)
         signal.siginterrupt(signal.SIGTERM, True)  # as Python has it: a call that waits shall return

@@ -3,8 +3,10 @@
 
 A *workspace* is a folder with small copies of the photographs (``images``), COLMAP's ``database.db`` and,
 in the end, the model (``sparse``). It is named by a digest of all that it is made from; the database keeps
-what was computed, so an interrupted run goes on, and ends with the same cameras, byte for byte: photographs
-are numbered in the order of their names, every random choice has its seed, and the mapper runs on one thread.
+what was computed, so an interrupted run goes on, and within one machine ends with the same cameras, byte for
+byte: photographs are numbered in the order of their names, every random choice has its seed, and what adds up
+over photographs runs on one thread. Extraction and matching use all cores: one thread does a whole photograph
+or pair, and the database is the same. Another processor may round otherwise, and find other matches.
 """
 
 import errno

@@ -1,6 +1,9 @@
 """Structure from motion that has to try several ways, and what is done where it finds too little."""
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -95,6 +98,34 @@ def test_the_model_with_most_well_held_photographs_is_kept() -> None:
     wobbly = synthetic(7, mapping.FEWEST_POINTS - 1)  # all of its cameras are guesses
     assert mapping.best_model(large, [wobbly]) is large
     assert mapping.best_model(None, [wobbly]) is None
+
+
+def test_of_models_about_as_good_the_first_is_kept() -> None:
+    def erring(images: int, error: float) -> "pycolmap.Reconstruction":
+        model = synthetic(images, 100)
+        for point in model.points3D.values():
+            point.error = error
+        return model
+
+    first, better, more = erring(6, 1.0), erring(6, 0.94), erring(7, 2.0)
+    assert mapping.best_model(first, [erring(6, 0.96)]) is first
+    assert mapping.best_model(None, [first, erring(6, 0.96), better]) is better
+    assert mapping.best_model(None, [better, more, first]) is more
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_libraries_inside_of_pycolmap_keep_to_one_thread_and_others_do_not() -> None:
+    code = """
+import ctypes, os
+from langsplat_core.datasets.colmap_library import pycolmap
+libraries = {line.split()[-1] for line in open("/proc/self/maps") if "pycolmap.libs/libgomp" in line}
+print([ctypes.CDLL(path).omp_get_max_threads() for path in libraries], os.environ["OMP_NUM_THREADS"])
+"""
+    environment = os.environ | {"OMP_NUM_THREADS": "3"}
+    told = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert told.stdout.split() == ["[1]", "3"]
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,15 @@
 
 import logging
 import os
+import random
 import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Collection, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,13 +21,13 @@ from PIL import Image
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets import load_capture
+from langsplat_core.datasets import load_capture, mapping
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
 from langsplat_core.datasets.known_poses import add_points, neighbouring_views
 from langsplat_core.datasets.sfm import pairs_by_name
 from langsplat_core.errors import InputError
-from langsplat_core.progress import Cancelled, silent
+from langsplat_core.progress import Cancelled, Progress, silent
 from langsplat_core.scene import Camera, look_at
 from tests.support.photographed import (
     colmap_reconstruction,
@@ -41,6 +49,75 @@ STAGES = [
     "locating cameras",
     "reading photographs",
 ]
+TABLES = ("keypoints", "descriptors", "matches", "two_view_geometries")
+RUNS = 20  # that are killed, beside BUSY processes that never rest
+BUSY = 4
+KILLED = """
+import os, signal, sys, threading
+from pathlib import Path
+from langsplat_core.config import DatasetConfig
+from langsplat_core.datasets import load_capture
+timer = threading.Timer(float(sys.argv[3]), os.kill, (os.getpid(), signal.SIGKILL))
+timer.daemon = True
+timer.start()
+load_capture(Path(sys.argv[1]), DatasetConfig(max_side=400), Path(sys.argv[2]))
+"""
+
+
+@contextmanager
+def recorded(folder: Path) -> Iterator[None]:
+    """Keeps in `folder` what every way of the mapper is given and gives: ``0.db``, ``0-0/cameras.bin`` ..."""
+    folder.mkdir(parents=True)
+
+    def watched(number: int, way: Callable[..., Collection[mapping.Model]]) -> Callable[..., object]:
+        def run(workspace: Path, attempts: Path, advance: Callable[[], None]) -> Collection[mapping.Model]:
+            models = list(way(workspace, attempts, advance))
+            with closing(sqlite3.connect(workspace / "database.db")) as database:
+                database.execute("VACUUM INTO ?", (str(folder / f"{number}.db"),))
+            for index, model in enumerate(models):
+                (folder / f"{number}-{index}").mkdir()
+                model.write_binary(folder / f"{number}-{index}")
+            return models
+
+        return run
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mapping, "WAYS", tuple(watched(*each) for each in enumerate(mapping.WAYS)))
+        yield
+
+
+def contents(record: Path) -> dict[str, bytes]:
+    """Tables of the databases, and files of the models, in what was `recorded`."""
+    found = {str(path.relative_to(record)): path.read_bytes() for path in record.rglob("*.bin")}
+    for path in record.glob("*.db"):
+        with closing(sqlite3.connect(path)) as database:
+            for table in TABLES:
+                rows = database.execute(f"SELECT * FROM {table} ORDER BY 1").fetchall()
+                found[f"{path.name} {table}"] = repr(rows).encode()
+    return found
+
+
+def assert_same(ours: Path, theirs: Path) -> None:
+    """Two work folders: what differs is printed, of both, each table and each way's model by itself."""
+    a, b = contents(ours / "record"), contents(theirs / "record")
+    assert {f"{way}.db {table}" for way in range(3) for table in TABLES} < a.keys()
+    lines = []
+    for name in sorted(a.keys() | b.keys()):
+        mine, other = a.get(name, b""), b.get(name, b"")
+        if mine != other:
+            pairs = enumerate(zip(mine, other, strict=False))
+            at = next((place for place, (x, y) in pairs if x != y), min(len(mine), len(other)))
+            lines.append(f"{name} from byte {at}: {mine[at : at + 32]!r} and {other[at : at + 32]!r}")
+    assert not lines, "\n".join([*lines, f"kept: {ours}", f"and {theirs}"])
+
+
+def solve(photos: Path, work: Path, progress: Progress = silent) -> Capture:
+    """Goes on from what is in `work`; what the mapper was given and gave, and the model, is in ``record``."""
+    with recorded(work / "record"):
+        capture = load_capture(photos, CONFIG, work, progress)
+    (stage,) = work.glob("sfm-*")
+    shutil.copytree(stage / "sparse", work / "record" / "sparse")
+    return capture
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +154,7 @@ def located(
     logging.getLogger("langsplat").addHandler(handler)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pycolmap, "extract_features", _never)
-        capture = load_capture(photos, CONFIG, work, lambda label, _: labels.append(label))
+        capture = solve(photos, work, lambda label, _: labels.append(label))
     logging.getLogger("langsplat").removeHandler(handler)
     return capture, work, labels, messages
 
@@ -97,6 +174,7 @@ def aligned(points: Array, source: Array, target: Array) -> Array:
 
 
 def test_cameras_are_found_where_they_were(located) -> None:  # type: ignore[no-untyped-def]
+    """On every processor; that they are the same bytes is promised within one machine only."""
     capture, _, labels, _ = located
     assert [camera.name for camera in capture.cameras] == [f"view_{i}" for i in range(VIEWS)]
     assert list(dict.fromkeys(labels)) == STAGES
@@ -140,11 +218,43 @@ def test_cameras_are_the_same_byte_for_byte(
     shutil.copytree(photos, tmp_path / "moved")
     for photo in (tmp_path / "moved" / "images").iterdir():
         os.utime(photo, (0, 0))
-    load_capture(tmp_path / "moved", CONFIG, tmp_path / "work")
+    solve(tmp_path / "moved", tmp_path / "work")
+    assert_same(located[1], tmp_path / "work")
     (ours,), (theirs,) = located[1].glob("sfm-*"), (tmp_path / "work").glob("sfm-*")
     assert ours.name == theirs.name
-    for name in ("cameras.bin", "images.bin", "points3D.bin"):
-        assert (ours / "sparse" / name).read_bytes() == (theirs / "sparse" / name).read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="no signal 9")
+def test_killed_anywhere_beside_load_it_ends_the_same(photos: Path, tmp_path: Path) -> None:
+    """Every run is killed at a random moment of a fixed seed, and then goes on to its end."""
+    rest = "import time\nwhile time.monotonic() < float('{}'): pass"
+    busy = [
+        subprocess.Popen([sys.executable, "-c", rest.format(time.monotonic() + 3600)]) for _ in range(BUSY)
+    ]
+    generator, kills = random.Random(0), 0
+    try:
+        start = time.monotonic()
+        solve(photos, tmp_path / "whole")
+        seconds = time.monotonic() - start
+        for number in range(RUNS):
+            work = tmp_path / str(number)
+            words = [str(photos), str(work), str(generator.uniform(0, seconds))]
+            code = subprocess.run([sys.executable, "-c", KILLED, *words], check=False).returncode
+            assert code in (0, -signal.SIGKILL)
+            left = sorted(path.name for path in work.glob("sfm-*/*"))
+            if "sparse" in left:  # it was faster than the whole one
+                shutil.rmtree(work)
+                continue
+            kills += 1
+            solve(photos, work)
+            assert_same(tmp_path / "whole", work)
+            print(f"| {number} | killed after {float(words[2]):.1f} s | left {left} | same |", flush=True)
+        assert kills > RUNS / 2
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
 
 
 def test_changed_photographs_are_computed_again(
