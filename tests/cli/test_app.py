@@ -8,18 +8,16 @@ import pytest
 from tyro.extras import get_parser
 
 from langsplat_core import __version__
-from langsplat_core.cli.app import COMMANDS, GROUPS, entry, parse
+from langsplat_core.cli.app import COMMANDS, GROUPS, entry, load_command, parse
 from langsplat_core.cli.inspect import Doctor
-from langsplat_core.cli.train import Train
 from langsplat_core.errors import InputError
 from langsplat_viewer.__main__ import ViewerCommand
 from langsplat_viewer.__main__ import entry as viewer_entry
 
 EVERY = {
     "viewer": ViewerCommand,
-    "train": Train,
-    **COMMANDS,
-    **{f"{group} {name}": made for group, (_, members) in GROUPS.items() for name, made in members.items()},
+    **{name: load_command(where) for name, where in COMMANDS.items()},
+    **{f"{group} {name}": load_command(at) for group in GROUPS for name, at in GROUPS[group][1].items()},
 }
 
 

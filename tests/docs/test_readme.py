@@ -9,13 +9,12 @@ from importlib.resources import files
 from pathlib import Path
 
 import pytest
-import tyro
 from PIL import Image
 
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import Command, main
 from langsplat_core.formats import load_scene
-from langsplat_viewer.__main__ import ViewerCommand
+from langsplat_viewer.__main__ import parse as parse_viewer
 from tests.support.file_samples import compressed_ply
 from tests.support.scenes import random_gaussians
 
@@ -28,10 +27,6 @@ PAGES = [
     *(ROOT / "assets").rglob("*.md"),
 ]
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
-
-
-def parse_viewer(words: list[str]) -> Command:
-    return tyro.cli(ViewerCommand, prog="langsplat-viewer", args=words)
 
 
 PARSERS: dict[str, Callable[[list[str]], Command]] = {"langsplat": parse, "langsplat-viewer": parse_viewer}
