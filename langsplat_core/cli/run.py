@@ -121,6 +121,7 @@ def main(program: str, parser: Callable[[], Command]) -> int:
     return 0
 
 
+@optional_imports()
 def _run(program: str, parser: Callable[[], Command]) -> None:
     if sys.argv[1:] == ["--version"]:
         print(f"{program} {__version__}")
@@ -139,7 +140,7 @@ def _run(program: str, parser: Callable[[], Command]) -> None:
     logging.basicConfig(handlers=[handler])
     warnings.filterwarnings("ignore", module=r"(torch|transformers|huggingface_hub|numba)(\.|$)")
     began = time.perf_counter()
-    with _sigterm_raises(), optional_imports():
+    with _sigterm_raises():
         check_arguments(command)
         command.run()
     log.debug("%s %s: %.1f s", program, __version__, time.perf_counter() - began)

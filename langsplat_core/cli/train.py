@@ -137,6 +137,9 @@ def _words(table: Mapping[str, Any], before: str = "") -> Iterator[str]:
 
 def _named(args: Sequence[str], option: str) -> str:
     """What `args` give for an option, the last time they do; "" where they do not."""
-    values = [word for before, word in pairwise([*args, ""]) if before == option]
-    values += [word.partition("=")[2] for word in args if word.startswith(f"{option}=")]
+    values = [
+        after if word == option else word.partition("=")[2]
+        for word, after in pairwise([*args, ""])
+        if word.partition("=")[0] == option
+    ]
     return values[-1] if values else ""
