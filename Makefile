@@ -7,12 +7,17 @@ STAMP := $(VENV)/.installed
 # One file of tests is one worker's: its fixtures are made once.
 PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
+# With --quiet, pip says what fails and nothing else: no notices of its own, of its settings or of setuptools.
+export PIP_QUIET := 1
+.SILENT: $(STAMP) demo
+
 .PHONY: help demo quick test slow check format bench gpu pictures app bundle desktop clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
 
 $(STAMP): pyproject.toml packaging/constraints.txt
+	echo "Installing everything into $(VENV): some minutes"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
 	$(BIN)/pip install --quiet --constraint packaging/constraints.txt torch

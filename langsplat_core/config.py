@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Annotated, Literal
 
+import tyro
+
 from langsplat_core.ranges import Range
 
 # What a number may be: every field with numbers names one of these, or a range of its own.
@@ -131,7 +133,8 @@ class CodecConfig:
     kind: Literal["codebook", "autoencoder", "linear"] = "codebook"  # how vectors are kept
     # codewords of a codebook; 0: as many as `max_relevancy_error` asks for
     size: Annotated[int, Range(0, 65_535)] = 0
-    max_relevancy_error: Share = 0.005  # mean over the scene's vectors and a few hundred phrases
+    # mean over the scene's vectors and a few hundred phrases
+    max_relevancy_error: Annotated[Share, tyro.conf.arg(aliases=["--max-relevancy-error"])] = 0.005
     latent_dim: Annotated[int, Range(1, 4_096)] = 3  # numbers that the other kinds keep
     steps: Count = 4_000  # of the autoencoder's training, as are the following
     batch: SeveralCount = 256  # vectors per step

@@ -2,19 +2,22 @@
 supply one each. A `Progress` may raise to interrupt the work (Ctrl-C, the window's cancel button)."""
 
 import json
+import logging
 import sys
 from collections.abc import Callable
 from types import TracebackType
 
-from rich.console import Console
-from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.progress import Progress as RichBar
-
+log = logging.getLogger("langsplat")
 Progress = Callable[[str, float], None]  # (what is being done, fraction done in [0, 1])
 
 
 def silent(label: str, fraction: float) -> None:
     """Reports nothing."""
+
+
+def is_quiet() -> bool:
+    """Whether only errors are wanted."""
+    return log.getEffectiveLevel() >= logging.ERROR
 
 
 class Cancelled(Exception):
@@ -42,7 +45,7 @@ class LineProgress:
 
     def __call__(self, label: str, fraction: float) -> None:
         report = (label, round(min(max(fraction, 0.0), 1.0), 3))
-        if report != self._last:
+        if report != self._last and not is_quiet():
             self._last = report
             line = json.dumps({"label": report[0], "fraction": report[1]})
             print(line, file=sys.stderr, flush=True)
@@ -52,6 +55,10 @@ class TerminalProgress:
     """A `Progress` that draws one bar per label on stderr; use as a context manager."""
 
     def __init__(self) -> None:
+        from rich.console import Console  # a tenth of a second that nothing else needs
+        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.progress import Progress as RichBar
+
         self._bar = RichBar(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -59,6 +66,7 @@ class TerminalProgress:
             TimeElapsedColumn(),
             TimeRemainingColumn(),
             console=Console(file=sys.stderr),
+            disable=is_quiet(),
         )
         self._tasks: dict[str, int] = {}
 

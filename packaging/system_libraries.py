@@ -50,8 +50,11 @@ def main() -> int:
         return 0
     print("Installing system libraries: " + " ".join(missing))
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-    subprocess.run(["apt-get", "update", "-q"], env=environment, stdout=subprocess.DEVNULL, check=False)
-    return subprocess.run(command, env=environment, stdout=subprocess.DEVNULL, check=False).returncode
+    subprocess.run(["apt-get", "update", "-q"], env=environment, capture_output=True, check=False)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        print(done.stderr, file=sys.stderr, end="")
+    return done.returncode
 
 
 if __name__ == "__main__":

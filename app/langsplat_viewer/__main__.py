@@ -2,6 +2,7 @@
 
 import math
 import sys
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from langsplat_core.cli.run import main
+from langsplat_core.cli.run import main, parsed
 from langsplat_core.config import ColourMap, LevelChoice, NotNegative, PictureConfig, Positive, Share
 from langsplat_core.display.colour_maps import MAX_QUERIES
 from langsplat_core.errors import InputError
@@ -185,13 +186,15 @@ class ViewerCommand:
         )
 
 
-def _parse() -> ViewerCommand:
-    return tyro.cli(ViewerCommand, prog="langsplat-viewer")
+def parse(args: Sequence[str]) -> ViewerCommand:
+    """The command that the words of a command line make; SystemExit as tyro raises it."""
+    found: ViewerCommand = parsed("langsplat-viewer", ViewerCommand, args)
+    return found
 
 
 def entry() -> None:
     """The `langsplat-viewer` console script."""
-    sys.exit(main("langsplat-viewer", _parse))
+    sys.exit(main("langsplat-viewer", lambda: parse(sys.argv[1:])))
 
 
 if __name__ == "__main__":

@@ -2,86 +2,70 @@
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import make_dataclass
 from difflib import get_close_matches
+from importlib import import_module
+from itertools import takewhile
 from types import MappingProxyType
+from typing import Annotated, Any, Union
 
-from tyro.extras import SubcommandApp
+import tyro
 
-from langsplat_core.cli.bench import BenchRaster
-from langsplat_core.cli.bench_endurance import BenchEndurance
-from langsplat_core.cli.bench_gains import BenchGains
-from langsplat_core.cli.bench_lift import BenchLift
-from langsplat_core.cli.bench_load import BenchLoad
-from langsplat_core.cli.bench_memory import BenchMemory
-from langsplat_core.cli.bench_moving import BenchMoving
-from langsplat_core.cli.bench_paper import BenchPaper
-from langsplat_core.cli.bench_phrases import BenchPhrases
-from langsplat_core.cli.bench_query import BenchQuery
-from langsplat_core.cli.bench_steps import BenchSteps
-from langsplat_core.cli.bench_verdict import BenchVerdict
-from langsplat_core.cli.bench_words import BenchWords
-from langsplat_core.cli.compact import Compact
-from langsplat_core.cli.convert import Convert
-from langsplat_core.cli.demo import DemoBuild, DemoDataset, DemoEncoder, DemoSheet
-from langsplat_core.cli.describe import Describe
-from langsplat_core.cli.evaluate import EvalSynthetic
-from langsplat_core.cli.evaluate_labels import EvalLerfOvs, EvalOvs3d, EvalScanNet
-from langsplat_core.cli.inspect import Doctor, Inspect
-from langsplat_core.cli.query import QueryScene
-from langsplat_core.cli.run import Command, main
-from langsplat_core.cli.scale import Scale
-from langsplat_core.cli.select import Select
-from langsplat_core.cli.train import train_command
+from langsplat_core.cli.run import Command, main, parsed
 from langsplat_core.errors import InputError
 
-# Options that are asked for often enough to have a short name.
-ALIASES = {"--max-relevancy-error": "--codec.max-relevancy-error"}
-
-
-COMMANDS: Mapping[str, type[Command]] = MappingProxyType(
+FLAGS = ("-q", "--quiet", "-v", "--verbose")  # may precede a command
+# Name -> class, in a module beside this one that is imported when the command line needs it.
+COMMANDS: Mapping[str, str] = MappingProxyType(
     {
-        "query": QueryScene,
-        "describe": Describe,
-        "select": Select,
-        "scale": Scale,
-        "convert": Convert,
-        "compact": Compact,
-        "inspect": Inspect,
-        "doctor": Doctor,
+        "train": "train.Train",
+        "query": "query.QueryScene",
+        "describe": "describe.Describe",
+        "select": "select.Select",
+        "scale": "scale.Scale",
+        "convert": "convert.Convert",
+        "compact": "compact.Compact",
+        "inspect": "inspect.Inspect",
+        "doctor": "inspect.Doctor",
     }
 )
 # Name -> what it is about, and its commands.
-GROUPS: Mapping[str, tuple[str, Mapping[str, type[Command]]]] = MappingProxyType(
+GROUPS: Mapping[str, tuple[str, Mapping[str, str]]] = MappingProxyType(
     {
         "demo": (
             "Make the bundled scene, its photographs and its encoder.",
-            {"build": DemoBuild, "dataset": DemoDataset, "encoder": DemoEncoder, "sheet": DemoSheet},
+            {
+                "build": "demo.DemoBuild",
+                "dataset": "demo.DemoDataset",
+                "encoder": "demo.DemoEncoder",
+                "sheet": "demo.DemoSheet",
+            },
         ),
         "eval": (
             "Measure a scene against ground truth.",
             {
-                "synthetic": EvalSynthetic,
-                "lerf-ovs": EvalLerfOvs,
-                "3d-ovs": EvalOvs3d,
-                "scannet": EvalScanNet,
+                "synthetic": "evaluate.EvalSynthetic",
+                "lerf-ovs": "evaluate_labels.EvalLerfOvs",
+                "3d-ovs": "evaluate_labels.EvalOvs3d",
+                "scannet": "evaluate_labels.EvalScanNet",
             },
         ),
         "bench": (
             "Speed against error, measured in one run.",
             {
-                "raster": BenchRaster,
-                "endurance": BenchEndurance,
-                "gains": BenchGains,
-                "lift": BenchLift,
-                "paper": BenchPaper,
-                "load": BenchLoad,
-                "moving": BenchMoving,
-                "memory": BenchMemory,
-                "phrases": BenchPhrases,
-                "query": BenchQuery,
-                "steps": BenchSteps,
-                "verdict": BenchVerdict,
-                "words": BenchWords,
+                "raster": "bench.BenchRaster",
+                "endurance": "bench_endurance.BenchEndurance",
+                "gains": "bench_gains.BenchGains",
+                "lift": "bench_lift.BenchLift",
+                "paper": "bench_paper.BenchPaper",
+                "load": "bench_load.BenchLoad",
+                "moving": "bench_moving.BenchMoving",
+                "memory": "bench_memory.BenchMemory",
+                "phrases": "bench_phrases.BenchPhrases",
+                "query": "bench_query.BenchQuery",
+                "steps": "bench_steps.BenchSteps",
+                "verdict": "bench_verdict.BenchVerdict",
+                "words": "bench_words.BenchWords",
             },
         ),
     }
@@ -90,29 +74,56 @@ GROUPS: Mapping[str, tuple[str, Mapping[str, type[Command]]]] = MappingProxyType
 
 def parse(args: list[str]) -> Command:
     """The command that the words of a command line name; SystemExit as tyro raises it, with its message on
-    stderr. Raises InputError for a command that does not exist."""
+    stderr. Raises InputError for a command that does not exist, and for an unusable `--config`."""
+    before = list(takewhile(FLAGS.__contains__, args))
+    args = args[len(before) :]
     check_commands(args)
-    app = SubcommandApp()
-    app.command(name="train")(train_command(args))
-    for name, command in COMMANDS.items():
-        app.command(name=name)(command)
-    for name, (about, commands) in GROUPS.items():
-        group = SubcommandApp()
-        for member, command in commands.items():
-            group.command(name=member)(command)
-        app.command(group, name=name, help=about)
-    args = [ALIASES.get(word, word) for word in args]
-    found: Command = app.cli(
-        prog="langsplat",
-        description="Train, query, convert and measure 3D Gaussian scenes with a language field.",
-        args=args,
-    )
+    if args[:1] == ["train"]:
+        from langsplat_core.cli.train import train_command, with_file
+
+        args = with_file(args)
+        commands = [_subcommand("train", train_command(args))]
+    elif args and args[0] in GROUPS:
+        commands = [_group(args[0], args[1:2])]
+    elif args and args[0] in COMMANDS:
+        commands = [_subcommand(args[0], load_command(COMMANDS[args[0]]))]
+    else:
+        commands = [_subcommand(name, load_command(where)) for name, where in COMMANDS.items()]
+        commands += [_group(name, ()) for name in GROUPS]
+    about = "Train, query, convert and measure 3D Gaussian scenes with a language field."
+    found = parsed("langsplat", _union(commands), [*before, *args], about)
+    command: Command = getattr(found, "command", found)  # of a group
+    return command
+
+
+def load_command(where: str) -> type[Command]:
+    """The class at a place of `COMMANDS` or `GROUPS`."""
+    module, _, name = where.partition(".")
+    found: type[Command] = getattr(import_module(f"langsplat_core.cli.{module}"), name)
     return found
+
+
+def _subcommand(name: str, command: type[Command]) -> Any:
+    return Annotated[command, tyro.conf.subcommand(name=name)]
+
+
+def _group(name: str, words: Sequence[str]) -> Any:
+    """A group's commands, or only the one that `words` begins with."""
+    about, members = GROUPS[name]
+    named = [word for word in words if word in members] or list(members)
+    made = _union([_subcommand(member, load_command(members[member])) for member in named])
+    group = make_dataclass("Group", [("command", Annotated[made, tyro.conf.arg(name="")])])
+    return Annotated[group, tyro.conf.subcommand(name=name, description=about)]
+
+
+def _union(commands: Sequence[Any]) -> Any:
+    """tyro asks for two subcommands at least."""
+    return Union[(*commands, Annotated[None, tyro.conf.Suppress])]
 
 
 def check_commands(args: Sequence[str]) -> None:
     """InputError that names a command which does not exist, and those that are written like it."""
-    known: Iterable[str] = ("train", *COMMANDS, *GROUPS)
+    known: Iterable[str] = (*COMMANDS, *GROUPS)
     for place, word in enumerate(args[:2]):
         if word.startswith("-"):
             return

@@ -13,23 +13,51 @@ import re
 import signal
 import sys
 import threading
+import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, make_dataclass
 from types import FrameType
-from typing import Protocol
+from typing import Annotated, Any, Protocol
+
+import tyro
 
 from langsplat_core import __version__
 from langsplat_core.cli.checks import check_arguments
-from langsplat_core.errors import LangSplatError, printable_line
+from langsplat_core.errors import InputError, LangSplatError, printable_line
 from langsplat_core.extras import optional_imports
 from langsplat_core.files import NO_ROOM, shown
 from langsplat_core.progress import Terminated
 
+log = logging.getLogger("langsplat")
+COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
+SHELLS = ("bash", "zsh", "fish", "tcsh")
 _LOG_LIMIT = 2000  # characters of a warning
 # What writing to an open file or standard output ends in where there is no room or no file.
 _UNWRITTEN = (*NO_ROOM, errno.EBADF)
 _ROOM = "make room, or choose another place; what was finished is kept"
 _FRAME = re.compile(r"[│╭╮╰╯]|─+")
+
+
+_Flag = Annotated[
+    tyro.conf.FlagCreatePairsOff[bool],
+    tyro.conf.create_mutex_group(required=False, title="how much is said"),
+]
+
+
+@dataclass(frozen=True)
+class Verbosity:
+    """How much is said on standard error, beside the answer."""
+
+    quiet: Annotated[_Flag, tyro.conf.arg(aliases=["-q"])] = False
+    """Errors alone: no progress, notes or warnings."""
+    verbose: Annotated[_Flag, tyro.conf.arg(aliases=["-v"])] = False
+    """Also what each step took, and what was taken from an earlier run."""
+
+    @property
+    def level(self) -> int:
+        """Of the log; progress is shown below ERROR."""
+        return logging.ERROR if self.quiet else logging.DEBUG if self.verbose else logging.INFO
 
 
 class _OneLine(logging.Formatter):
@@ -59,35 +87,63 @@ def one_line(box: str) -> str:
     return f"{words or heading or 'unusable arguments'} (see --help)"
 
 
+def parsed(program: str, kind: Any, args: Sequence[str], description: str | None = None) -> Any:
+    """The command of type `kind`, a dataclass or a union of subcommands, that the words `args` name.
+
+    Sets how much is said; -v and -q may stand anywhere. SystemExit as tyro raises it, with help and
+    completion scripts on stdout and complaints on stderr. InputError for completion of an unknown shell.
+    """
+    if args and args[0] in COMPLETION and args[1:2] and args[1] not in SHELLS:
+        raise InputError(f"{args[0]} {args[1]}: there is {', '.join(SHELLS)}")
+    line = make_dataclass(
+        "Line",
+        [
+            ("command", Annotated[kind, tyro.conf.arg(name="")]),
+            ("verbosity", Annotated[Verbosity, tyro.conf.arg(name="")], Verbosity()),
+        ],
+        namespace={"__doc__": getattr(kind, "__doc__", None)},
+    )
+    found: Any = tyro.cli(
+        line, prog=program, description=description, args=args, config=(tyro.conf.CascadeSubcommandArgs,)
+    )
+    log.setLevel(found.verbosity.level)
+    return found.command
+
+
 def main(program: str, parser: Callable[[], Command]) -> int:
-    """Parse and run; returns the exit code."""
-    _prepare_standard_output()
+    """Parse and run; returns the exit code. All that is printed is printed in here, help and version too."""
+    _prepare_standard_streams()
+    try:
+        _run(program, parser)
+        sys.stdout.flush()  # now, while what goes wrong can still be said in a line
+    except (LangSplatError, OSError, MemoryError, KeyboardInterrupt) as error:
+        return _ended(program, error)
+    return 0
+
+
+@optional_imports()
+def _run(program: str, parser: Callable[[], Command]) -> None:
     if sys.argv[1:] == ["--version"]:
         print(f"{program} {__version__}")
-        return 0
+        return
+    log.setLevel(Verbosity().level)
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
             command = parser()
-    except LangSplatError as error:
-        return _fail(program, str(error))
     except SystemExit as stop:
         if stop.code in (0, None):
-            return 0
-        return _fail(program, one_line(complaint.getvalue()))
+            return
+        raise InputError(one_line(complaint.getvalue())) from None
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_OneLine())
     logging.basicConfig(handlers=[handler])
-    logging.getLogger("langsplat").setLevel(logging.INFO)
     warnings.filterwarnings("ignore", module=r"(torch|transformers|huggingface_hub|numba)(\.|$)")
-    try:
-        with _sigterm_raises(), optional_imports():
-            check_arguments(command)
-            command.run()
-            sys.stdout.flush()  # now, while what goes wrong can still be said in a line
-    except (LangSplatError, OSError, MemoryError, KeyboardInterrupt) as error:
-        return _ended(program, error)
-    return 0
+    began = time.perf_counter()
+    with _sigterm_raises():
+        check_arguments(command)
+        command.run()
+    log.debug("%s %s: %.1f s", program, __version__, time.perf_counter() - began)
 
 
 def _ended(program: str, error: BaseException) -> int:
@@ -123,17 +179,39 @@ def _sigterm_raises() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before if before is not None else signal.SIG_DFL)
 
 
-def _prepare_standard_output() -> None:
+class _StandardError(io.FileIO):
+    """Standard error. What it does not take is lost, and the work goes on."""
+
+    def write(self, data: Any) -> int:
+        """Number of bytes written, or lost."""
+        try:
+            return super().write(data)
+        except OSError:
+            return len(data)
+
+
+def _prepare_standard_streams() -> None:
     """Names that cannot be encoded are printed with escapes. A closed standard output fails when it is
-    written to, and no file that is opened later takes its place."""
+    written to, standard error never does, and no file that is opened later takes their place."""
     if sys.stdout is None:
-        nowhere = os.open(os.devnull, os.O_RDONLY)
-        if nowhere != 1:
-            os.dup2(nowhere, 1)
-            os.close(nowhere)
+        _occupy(1, os.O_RDONLY)
         sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115  as long as the process
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
+    if sys.stderr is sys.__stderr__:
+        if sys.stderr is None:
+            _occupy(2, os.O_WRONLY)
+        encoding = "utf-8" if sys.stderr is None else sys.stderr.encoding
+        raw = io.BufferedWriter(_StandardError(2, "w", closefd=False))
+        sys.stderr = io.TextIOWrapper(raw, encoding, errors="backslashreplace", line_buffering=True)
+
+
+def _occupy(descriptor: int, flags: int) -> None:
+    """Have a closed standard stream lead nowhere."""
+    nowhere = os.open(os.devnull, flags)
+    if nowhere != descriptor:
+        os.dup2(nowhere, descriptor)
+        os.close(nowhere)
 
 
 def _drop_standard_output() -> None:

@@ -1,18 +1,24 @@
 """`langsplat train`: photographs -> scene.ply with a language field."""
 
+import contextlib
+import io
 import logging
-from collections.abc import Sequence
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
 from langsplat_core.cli.checks import OutFile, OutFolder
+from langsplat_core.cli.run import one_line
 from langsplat_core.config import TRAIN_PROFILES, TrainConfig, TrainPreset, TrainProfile, with_preset
+from langsplat_core.errors import InputError
 from langsplat_core.progress import LineProgress, TerminalProgress, silent
+from langsplat_core.ranges import check_settings
 
 log = logging.getLogger("langsplat")
 
@@ -35,6 +41,8 @@ class Train:
     for a GPU; options beside it still count."""
     progress: Literal["bars", "lines"] = "bars"
     """How progress is shown: as bars, or for other programs as lines of JSON, both on standard error."""
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml")] = None
+    """A file of options, `preset = "good"` or `radiance.steps = 7000`; options beside it count more."""
     gaussians: Path | None = None
     """Take the Gaussians of this scene, trained elsewhere from the same cameras, and give them a meaning."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = field(default_factory=TrainConfig)
@@ -91,8 +99,47 @@ def train_command(args: Sequence[str]) -> type[Train]:
     return ProfiledTrain
 
 
+def with_file(args: Sequence[str]) -> list[str]:
+    """The words of `langsplat train ...`, those of the file that --config names before all others, so that
+    options beside it win. InputError that names file and key for what is no option, or not of its kind."""
+    name = _named(args, "--config")
+    if not name:
+        return list(args)
+    complaint = io.StringIO()
+    try:
+        words = list(_words(tomllib.loads(Path(name).read_text("utf-8"))))
+        alone = ["photographs", *words, "--out=s.ply"]  # first, so that the file is blamed for what is in it
+        with contextlib.redirect_stderr(complaint):
+            check_settings(tyro.cli(train_command(words), prog=name, args=alone, add_help=False))
+    except SystemExit:
+        raise InputError(f"{name}: {one_line(complaint.getvalue())}") from None
+    except (OSError, ValueError, InputError) as error:  # a TOMLDecodeError is a ValueError
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{name}: cannot be used as --config: {reason}") from None
+    return [args[0], *words, "--config", name, *args[1:]]  # an option, so that no list takes the dataset
+
+
+def _words(table: Mapping[str, Any], before: str = "") -> Iterator[str]:
+    """A TOML table as the words of a command line; ValueError for what cannot be told from an option."""
+    for key, value in table.items():
+        values = list(map(str, value)) if isinstance(value, list) else []
+        if f"{before}{key}" == "config" or any(text.startswith("-") for text in values):
+            raise ValueError(f"{key}: names another file, or begins with a dash")
+        if isinstance(value, dict):
+            yield from _words(value, f"{before}{key}.")
+        elif isinstance(value, bool):
+            yield f"--{before}{'' if value else 'no-'}{key}"
+        elif isinstance(value, list):
+            yield from (f"--{before}{key}", *values)
+        else:
+            yield f"--{before}{key}={value}"
+
+
 def _named(args: Sequence[str], option: str) -> str:
     """What `args` give for an option, the last time they do; "" where they do not."""
-    values = [word for before, word in pairwise([*args, ""]) if before == option]
-    values += [word.partition("=")[2] for word in args if word.startswith(f"{option}=")]
+    values = [
+        after if word == option else word.partition("=")[2]
+        for word, after in pairwise([*args, ""])
+        if word.partition("=")[0] == option
+    ]
     return values[-1] if values else ""

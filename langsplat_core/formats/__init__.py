@@ -110,6 +110,7 @@ def _read_scene(path: Path) -> Scene:
     """What the scene's own file holds; a warning where most of it cannot be drawn."""
     scene = _read_by_kind(path)
     count = len(scene.gaussians)
+    log.debug("%s: %d Gaussians", path, count)
     looked_at = scene.gaussians.take(np.arange(0, count, max(1, count // LOOKED_AT)))
     if 2 * looked_at.valid().sum() < len(looked_at):
         reasons = looked_at.invalid_rows()

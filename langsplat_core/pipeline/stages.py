@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
@@ -18,6 +19,7 @@ from langsplat_core.parsing.npy import write_npy
 from langsplat_core.scene import Gaussians
 from langsplat_core.semantics.store import ImageFeatures
 
+log = logging.getLogger("langsplat")
 T = TypeVar("T")
 Arrays = Mapping[str, Array]
 
@@ -37,6 +39,7 @@ def kept(path: Path, make: Callable[[], T], pack: Callable[[T], Arrays], unpack:
     """What a stage makes: taken from `path` (*.npz) where it was made before, else made and stored there,
     whole or not at all. `pack` and `unpack` turn it into named arrays and back."""
     if path.exists():
+        log.debug("%s: kept from an earlier run", path.name)
         return unpack(read_arrays(path))
     result = make()
     with atomic_path(path) as temporary:

@@ -152,6 +152,7 @@ def trained_gaussians(
     settings = replace(config.radiance, backend="auto", checkpoint_every=every)
     done = work / f"{stage_key('radiance', 2, settings, capture.digest(train))}.ply"
     if done.exists():
+        log.debug("%s: kept from an earlier run", done.name)
         return read_ply(done)
     gaussians = train_radiance(
         capture, config.radiance, train, done.with_suffix(".checkpoint.safetensors"), progress
@@ -171,4 +172,5 @@ class _Clock:
     def lap(self, name: str) -> None:
         now = time.perf_counter()
         self.laps[name] = round(now - self._last, 1)
+        log.debug("%s: %.1f s", name, self.laps[name])
         self._last = now

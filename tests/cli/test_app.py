@@ -1,6 +1,7 @@
 """The command line as a whole: its commands, their options, and what it says of those that do not exist."""
 
 import dataclasses
+import logging
 import subprocess
 import sys
 
@@ -8,18 +9,17 @@ import pytest
 from tyro.extras import get_parser
 
 from langsplat_core import __version__
-from langsplat_core.cli.app import COMMANDS, GROUPS, entry, parse
+from langsplat_core.cli.app import COMMANDS, GROUPS, entry, load_command, parse
 from langsplat_core.cli.inspect import Doctor
-from langsplat_core.cli.train import Train
 from langsplat_core.errors import InputError
 from langsplat_viewer.__main__ import ViewerCommand
 from langsplat_viewer.__main__ import entry as viewer_entry
+from langsplat_viewer.__main__ import parse as viewer_parse
 
 EVERY = {
     "viewer": ViewerCommand,
-    "train": Train,
-    **COMMANDS,
-    **{f"{group} {name}": made for group, (_, members) in GROUPS.items() for name, made in members.items()},
+    **{name: load_command(where) for name, where in COMMANDS.items()},
+    **{f"{group} {name}": load_command(at) for group in GROUPS for name, at in GROUPS[group][1].items()},
 }
 
 
@@ -57,6 +57,48 @@ def test_versions(program, run, monkeypatch, capsys):
         run()
     assert not stop.value.code
     assert capsys.readouterr().out == f"{program} {__version__}\n"
+
+
+@pytest.mark.parametrize(("flag", "level"), [("-q", "ERROR"), ("--verbose", "DEBUG")])
+def test_how_much_is_said_stands_anywhere(flag, level):
+    log = logging.getLogger("langsplat")
+    for words in ([flag, "doctor"], ["doctor", flag], ["bench", flag, "load"], ["bench", "load", flag]):
+        log.setLevel(logging.INFO)
+        parse(words)
+        assert logging.getLevelName(log.level) == level
+    log.setLevel(logging.INFO)
+    viewer_parse([flag, "scene.ply"])
+    assert logging.getLevelName(log.level) == level
+    parse(["doctor"])
+    assert log.level == logging.INFO
+
+
+COMPLETE = """
+source /dev/stdin
+try() {
+  COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1))
+  _tyro_langsplat langsplat "${@: -1}"
+  echo "${COMPREPLY[@]}"
+}
+try langsplat q
+try langsplat bench v
+try langsplat train --max
+try langsplat train --preset g
+"""
+
+
+def test_bash_completes_commands_options_and_choices(capsys):
+    with pytest.raises(SystemExit) as stop:
+        parse(["--tyro-print-completion", "bash"])
+    assert not stop.value.code
+    script = capsys.readouterr().out
+    done = subprocess.run(["bash", "-c", COMPLETE], input=script, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["query", "verdict", "--max-relevancy-error", "good"]
+
+
+def test_a_shell_without_completion_is_named():
+    with pytest.raises(InputError, match="--tyro-print-completion ksh: there is bash, zsh"):
+        parse(["--tyro-print-completion", "ksh"])
 
 
 def test_doctor_says_what_draws_and_what_encodes(capsys):

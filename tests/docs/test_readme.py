@@ -9,13 +9,12 @@ from importlib.resources import files
 from pathlib import Path
 
 import pytest
-import tyro
 from PIL import Image
 
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import Command, main
 from langsplat_core.formats import load_scene
-from langsplat_viewer.__main__ import ViewerCommand
+from langsplat_viewer.__main__ import parse as parse_viewer
 from tests.support.file_samples import compressed_ply
 from tests.support.scenes import random_gaussians
 
@@ -27,11 +26,8 @@ PAGES = [
     *sorted((ROOT / "docs").rglob("*.md")),
     *(ROOT / "assets").rglob("*.md"),
 ]
+TOML = re.compile(r"^```toml\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
-
-
-def parse_viewer(words: list[str]) -> Command:
-    return tyro.cli(ViewerCommand, prog="langsplat-viewer", args=words)
 
 
 PARSERS: dict[str, Callable[[list[str]], Command]] = {"langsplat": parse, "langsplat-viewer": parse_viewer}
@@ -61,8 +57,13 @@ def named(page: Path) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
-def test_commands_parse(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_parse(
+    page: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    monkeypatch.chdir(tmp_path)
+    for settings in TOML.findall(page.read_text()):
+        Path("train.toml").write_text(settings)
     for program, *words in commands(page.read_text()):
         if program == "make":
             assert words[0] in targets, words
@@ -73,8 +74,9 @@ def test_commands_parse(page: Path, capsys: pytest.CaptureFixture[str]) -> None:
         else:
             try:
                 PARSERS[program](words)
-            except SystemExit:
-                pytest.fail(f"{program} {shlex.join(words)}: {capsys.readouterr().err}")
+            except SystemExit as stop:
+                if stop.code:  # a completion script ends without
+                    pytest.fail(f"{program} {shlex.join(words)}: {capsys.readouterr().err}")
 
 
 def test_the_readme_has_commands() -> None:
