@@ -13,6 +13,8 @@ from langsplat_core.scene import Camera
 
 log = logging.getLogger("langsplat")
 
+DECIMALS = 9  # of world units: what a digest tells apart, far above rounding and far below a pixel
+
 
 def tell_of_lost_points(good: Array, source: str) -> None:
     """A warning where most of the points of `source` had to be left out; `good`: (M,) bool, those that were
@@ -61,13 +63,14 @@ class Capture:
     def digest(self, indices: Sequence[int]) -> str:
         """Of all that a training on the photographs at `indices` sees: these in their order, their cameras,
         and the points. Structure from motion run again may place the same photographs in another world, so
-        names alone do not identify a capture."""
+        names alone do not identify a capture. Poses and points count to `DECIMALS`, so that a work folder is
+        taken up on another processor too, whose products of matrices differ in their last digits."""
         digest = hashlib.blake2b(digest_size=16)
         for camera, image in ((self.cameras[i], self.images[i]) for i in indices):
             digest.update(repr((camera.name, camera.intrinsics)).encode())
-            digest.update(camera.world_to_camera.tobytes())
+            digest.update(_rounded(camera.world_to_camera).tobytes())
             digest.update(np.ascontiguousarray(image).data)
-        digest.update(self.points.astype(np.float64).tobytes())
+        digest.update(_rounded(self.points).tobytes())
         digest.update(self.colours.tobytes())
         return digest.hexdigest()
 
@@ -76,3 +79,9 @@ class Capture:
         INRIA code multiplies position learning rates with. World units, > 0."""
         centres = np.array([camera.position for camera in self.cameras])
         return max(1.1 * float(np.linalg.norm(centres - centres.mean(0), axis=1).max()), 1e-6)
+
+
+def _rounded(values: Array) -> Array:
+    """To `DECIMALS`, float64, without a negative zero."""
+    rounded: Array = np.round(values.astype(np.float64), DECIMALS) + 0.0
+    return rounded
