@@ -21,14 +21,14 @@ ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "docs" / "benchmarks" / "elsewhere.md"
 OUT = ROOT / "elsewhere_out"
 COMPUTING = (
-    "raster scene query training semantics display compaction evaluation datasets lab formats pipeline "
-    "test_arrays.py test_compiled.py"
+    "raster scene query training semantics display compaction evaluation datasets lab formats "
+    "pipeline/test_train.py pipeline/test_importing.py test_arrays.py test_compiled.py"
 )
 WRITING = "cli datasets formats parsing pipeline scene semantics test_files.py viewer/test_preferences.py"
 HEAD = """# The tests on other machines
 
 `make elsewhere` on {machine}; one row by `make elsewhere ONLY=avx2`. Two workers of pytest. Minutes are
-the processor's, in the row `numba` with all kernels compiled twice.
+the processor's, with the kernels' compilation where there were none yet.
 
 | row | what is different | passed | failed | skipped | CPU minutes | at |
 |---|---|---|---|---|---|---|
@@ -75,8 +75,8 @@ def rows(seed: int, newest: str) -> list[Row]:
         Row("avx2", libraries.format("Haswell", ",".join(avx512), "avx2", "AVX2", "AVX2")),
         Row("numba", "NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= NUMBA_CACHE_DIR={tmp}"),
         Row("threads", "OMP_NUM_THREADS=4"),
-        Row("one-core", before="taskset -c 0"),
-        Row("busy", loops=2),
+        Row("one-core", before="taskset -c 0", folders=f"{COMPUTING} pipeline"),
+        Row("busy", folders=f"{COMPUTING} pipeline", loops=2),
         Row("shuffled", arguments=f"--shuffle {seed}"),
         Row("turkish", f"{TURKISH} PYTHONUTF8=0 TZ=Pacific/Kiritimati", folders=WRITING),
         Row("c-locale", "LC_ALL=C TZ=America/St_Johns", folders=WRITING),
@@ -129,7 +129,8 @@ def main() -> int:
     if unknown := asked - {row.name for row in every}:
         parser.error(f"no such row: {', '.join(unknown)}; there are {', '.join(row.name for row in every)}")
     OUT.mkdir(exist_ok=True)
-    commit = subprocess.check_output(["git", "describe", "--always", "--dirty"], cwd=ROOT, text=True).strip()
+    describe = ["git", "describe", "--always", "--dirty"]
+    commit = subprocess.run(describe, cwd=ROOT, capture_output=True, text=True).stdout.strip() or "-"
     model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text(encoding="utf-8"))
     head = HEAD.format(machine=f"{model[1] if model else 'an unknown processor'}, {os.cpu_count()} cores")
     known = TABLE.read_text(encoding="utf-8").splitlines(keepends=True) if TABLE.exists() else []
