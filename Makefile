@@ -11,7 +11,7 @@ PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist
 export PIP_QUIET := 1
 .SILENT: $(STAMP) demo
 
-.PHONY: help demo quick test slow check format bench gpu pictures app bundle desktop clean
+.PHONY: help demo quick test slow check format elsewhere bench gpu pictures app light bundle desktop clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -49,6 +49,16 @@ check: $(STAMP)  ## ruff (rules and format) and mypy only
 format: $(STAMP)  ## put every file into ruff's format
 	$(BIN)/ruff check --fix --select I
 	$(BIN)/ruff format
+
+# NEWEST: the newest Python that there are wheels of everything for; its row is left out where it is not installed.
+NEWEST ?= python3.14
+NEWER := .venv-newest
+elsewhere: system  ## the tests that compute, as on other processors, in other orders and places (docs/benchmarks)
+	if $(NEWEST) --version >/dev/null 2>&1 && ! [ -e $(NEWER)/.installed ]; then $(NEWEST) -m venv $(NEWER) \
+	  && $(NEWER)/bin/pip install --quiet --constraint packaging/constraints.txt --editable '.[dev]' \
+	  && touch $(NEWER)/.installed; fi
+	$(BIN)/python packaging/elsewhere.py $(if $(ONLY),--only $(ONLY)) \
+	  $$([ -e $(NEWER)/.installed ] && echo --newest $(NEWER)/bin/python)
 
 bench: system  ## speed against error, on this machine
 	$(BIN)/langsplat bench raster --out bench_out
@@ -92,4 +102,4 @@ desktop: $(STAMP)  ## show the viewer among this user's programs, and open scene
 	-update-desktop-database $(DATA)/applications
 
 clean:  ## remove what these targets made
-	rm -rf $(VENV) $(LIGHT) $(GPU) demo_out bench_out dist .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(LIGHT) $(GPU) $(NEWER) demo_out elsewhere_out bench_out dist .pytest_cache .mypy_cache .ruff_cache

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -107,6 +108,13 @@ def _existing_folder(target: Path) -> Path:
         size = len(str(target).encode())
     except UnicodeEncodeError:
         raise InputError(f"{shown(target)}: the name is not UTF-8; choose another") from None
+    try:
+        os.fsencode(target)
+    except UnicodeEncodeError:
+        raise InputError(
+            f"{shown(target)}: names here are {sys.getfilesystemencoding()} (language settings), which lacks "
+            "some of these letters; choose another name"
+        ) from None
     if "\0" in str(target):
         raise InputError(f"{shown(target)!r}: no name can hold a zero byte; choose another")
     whole = Path(os.path.abspath(target))

@@ -1,6 +1,7 @@
 """Fixtures for every test, the option that runs the slow ones, and what tests in parallel need."""
 
 import os
+import random
 from pathlib import Path
 
 # Before torch and BLAS are imported. Networks as small as the tests' are ten times slower on two threads than
@@ -31,6 +32,7 @@ own_kernel_cache()
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--slow", action="store_true", help="run the slow tier too")
     parser.addoption("--seed", type=int, help="of the damaged files of the slow tier, in place of its own")
+    parser.addoption("--shuffle", type=int, metavar="SEED", help="run tests in an order drawn with it")
     parser.addoption("--measured", action="store_true", help="print the errors that accuracy tests measured")
 
 
@@ -42,7 +44,11 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if hasattr(config, "workerinput"):  # long ones first, so that parallel workers end at about the same time
+    if (seed := config.getoption("--shuffle")) is not None:
+        random.Random(seed).shuffle(items)
+    elif hasattr(
+        config, "workerinput"
+    ):  # long ones first, so that parallel workers end at about the same time
         items.sort(key=lambda item: item.get_closest_marker("long") is None)
     if not config.getoption("--slow"):
         for item in items:

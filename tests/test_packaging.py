@@ -1,5 +1,7 @@
 """What a desktop is told of the viewer, and what the one-folder build is made of."""
 
+import importlib.util
+import sys
 from configparser import ConfigParser
 from pathlib import Path
 from xml.etree import ElementTree
@@ -63,3 +65,29 @@ def test_a_one_folder_build_trains_by_the_program_beside_it(monkeypatch: pytest.
     frozen = command(request)
     assert frozen[0] == str(tmp_path / "langsplat")
     assert frozen[1:] == plain[3:]
+
+
+def test_a_row_of_another_machine_leaves_the_other_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    spec = importlib.util.spec_from_file_location("elsewhere", PACKAGING / "elsewhere.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "elsewhere", module)  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    python = tmp_path / "python"
+    python.write_text('#!/bin/sh\necho "$*"\necho "$CODE failed, 2 passed, 3 skipped in 1s"\nexit $CODE\n')
+    python.chmod(0o755)
+    rows = [module.Row(f"row{n}", f"CODE={n}", folders="a b", python=str(python)) for n in range(3)]
+    for name, value in {"ROOT": tmp_path, "OUT": tmp_path / "out", "TABLE": tmp_path / "table.md"}.items():
+        monkeypatch.setattr(module, name, value)
+    monkeypatch.setattr(module, "rows", lambda seed, newest: rows)
+    for only, code in (("row1", 1), ("row0", 0), ("row2", 1)):
+        monkeypatch.setattr("sys.argv", ["elsewhere.py", "--only", only])
+        assert module.main() == code
+    lines = [line.split(" | ")[:5] for line in (tmp_path / "table.md").read_text().splitlines()[-3:]]
+    assert lines == [
+        ["| row0", "`CODE=0`, `python`", "2", "0", "3"],
+        ["| row1", "`CODE=1`, `python`", "2", "1", "3"],
+        ["| row2", "`CODE=2`, `python`", "2", "ended with 2", "3"],
+    ]
+    assert "-n 2 --dist loadfile tests/a tests/b" in (tmp_path / "out" / "row1.txt").read_text()

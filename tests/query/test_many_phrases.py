@@ -94,7 +94,8 @@ def test_many_phrases_together_are_answered_as_one_by_one(kind, rule, exact):
         np.testing.assert_allclose(together.relevancy, alone.relevancy, atol=1e-6)
         np.testing.assert_allclose(together.even, alone.even, atol=1e-6)
         np.testing.assert_allclose(together.scores, alone.scores, atol=1e-6)
-        np.testing.assert_array_equal(together.members, alone.members)
+        differ = together.members != alone.members  # at most where rounding decides
+        np.testing.assert_allclose(alone.even[differ], min(alone.cut, together.cut), atol=1e-5)
 
 
 def test_many_phrases_are_encoded_in_one_batch_or_not_at_all():

@@ -87,7 +87,7 @@ def load(path: Path) -> Scene:
     return SCENES[path.name]
 
 
-def settle(viewer: Viewer, seconds: float = 10.0) -> None:
+def settle(viewer: Viewer, seconds: float = 120.0) -> None:
     """Frames until the worker has nothing left to do."""
     end = time.monotonic() + seconds
     while viewer.worker.current is not None:

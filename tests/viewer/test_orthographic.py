@@ -154,7 +154,7 @@ def test_what_is_under_the_cursor_is_said_to_be_as_far_as_from_the_eye(flat):
     actions.hover(flat, pixel)
     flat.clock += 1.0
     actions.hover(flat, pixel)
-    settle(flat, 120)  # the first time kernels are compiled
+    settle(flat)  # the first time kernels are compiled
     found = flat.state.hover.found
     assert len(found.words) == len(LEVELS)
     away = float(figures(flat.state.hover)[-1].split(", ")[1].removesuffix(" away"))

@@ -91,7 +91,7 @@ def test_a_search_is_measured(opened):
 
 def wait(viewer) -> None:
     viewer.worker, viewer.recorder = viewer.recorder, viewer.worker
-    settle(viewer, 60)
+    settle(viewer)
     viewer.worker, viewer.recorder = viewer.recorder, viewer.worker
 
 

@@ -12,6 +12,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -230,21 +231,39 @@ def _spread(values: Array) -> str:
     return f"{values.mean():.1f} +/- {values.std(ddof=1) if len(values) > 1 else 0:.1f}"
 
 
-def curve_table(rows: Sequence[Verdict], asked: str = "thing") -> str:
-    """Markdown: of everything said with a probability between two limits, how much was there, present and
-    absent ones weighing the same in all. asked: a key of `PAIRS`."""
-    pair = PAIRS[asked]
-    judged = [row for row in rows if row.probability is not None and row.kind in pair]
-    said = np.array([row.probability for row in judged])
-    there = np.array([row.kind == pair[0] for row in judged], dtype=bool)
-    weights = np.where(there, 1 / max(there.sum(), 1), 1 / max((~there).sum(), 1))
-    lines = [f"| probability of a {asked} said | phrases | mean said % | there % |", "|---|---|---|---|"]
+@dataclass(frozen=True)
+class CurvePoint:
+    """What was said with a probability from `low` to `high`; present and absent weigh the same in all."""
+
+    low: float
+    high: float
+    phrases: int
+    said: float  # mean probability
+    there: float  # share, 0 to 1
+
+
+def curve(rows: Sequence[Verdict], asked: str = "thing") -> list[CurvePoint]:
+    """The calibration curve, without probabilities that nothing was said with. asked: a key of `PAIRS`."""
+    there, not_there = (
+        [row.probability for row in rows if row.kind == kind and row.probability is not None]
+        for kind in PAIRS[asked]
+    )
+    points = []
     for low, high in pairwise(BINS):
-        inside = (said >= low) & (said < high) if high < 1 else said >= low
-        if inside.any():
-            share = weights[inside] / weights[inside].sum()
-            cells = f"{100 * share @ said[inside]:.0f} | {100 * share @ there[inside]:.0f}"
-            lines.append(f"| {low:g} to {high:g} | {inside.sum()} | {cells} |")
+        right, wrong = ([p for p in said if low <= p < high or high == 1 <= p] for said in (there, not_there))
+        if right or wrong:
+            # Whole weights and sums that are rounded once: the same figure on every machine, in any order.
+            weights = [max(len(not_there), 1)] * len(right) + [max(len(there), 1)] * len(wrong)
+            share = sum(weights[: len(right)]) / sum(weights)
+            points.append(CurvePoint(low, high, len(weights), fmean(right + wrong, weights), share))
+    return points
+
+
+def curve_table(rows: Sequence[Verdict], asked: str = "thing") -> str:
+    """`curve` as Markdown."""
+    lines = [f"| probability of a {asked} said | phrases | mean said % | there % |", "|---|---|---|---|"]
+    for p in curve(rows, asked):
+        lines.append(f"| {p.low:g} to {p.high:g} | {p.phrases} | {100 * p.said:.0f} | {100 * p.there:.0f} |")
     return "\n".join(lines) + "\n"
 
 

@@ -17,6 +17,7 @@ from langsplat_core.lab.rooms.verdicts import (
     PAIRS,
     REJECTED,
     Verdict,
+    curve,
     curve_table,
     figures,
     fit_calibration,
@@ -170,23 +171,19 @@ def test_a_room_without_one_kind_of_phrase_is_no_error():
 
 
 def test_the_curve_weighs_present_and_absent_alike():
-    many = ROOM + [row("absent", p) for p in (0.01, 0.02, 0.5, 0.76)] * 9
-    assert [cells(curve_table(many), n)[2:] for n in range(2, 7)] == [
-        cells(curve_table(ROOM), n)[2:] for n in range(2, 7)
-    ]
-    lines = [cells(curve_table(ROOM), n) for n in range(2, 7)]
-    assert [line[0] for line in lines] == [
-        "0 to 0.1",
-        "0.1 to 0.25",
-        "0.5 to 0.75",
-        "0.75 to 0.9",
-        "0.9 to 1",
-    ]
-    assert [line[1] for line in lines] == ["2", "1", "1", "2", "2"]  # coloured things are not counted
-    assert [line[3] for line in lines] == ["0", "100", "0", "50", "100"]
-    certain = curve_table([row("object", 1.0), row("absent", 0.0)])
-    assert (cells(certain, 2)[3], cells(certain, 3)[3]) == ("0", "100")
-    assert curve_table([row("object", None)]).count("\n") == 2
+    points = curve(ROOM)
+    assert [(p.low, p.high) for p in points] == [(0, 0.1), (0.1, 0.25), (0.5, 0.75), (0.75, 0.9), (0.9, 1)]
+    assert [p.phrases for p in points] == [2, 1, 1, 2, 2]  # coloured things are not counted
+    assert [p.said for p in points] == pytest.approx([0.015, 0.2, 0.5, 0.78, 0.925])
+    assert [p.there for p in points] == pytest.approx([0, 1, 0, 0.5, 1])
+    uneven = curve(ROOM + [row("absent", p) for p in (0.01, 0.02, 0.5, 0.76)] * 9)
+    assert [p.phrases for p in uneven] == [20, 1, 10, 11, 2]
+    assert [p.said for p in uneven] == pytest.approx([p.said for p in points])
+    assert [p.there for p in uneven] == pytest.approx([p.there for p in points])
+    assert cells(curve_table(ROOM), 5) == ["0.75 to 0.9", "2", "78", "50"]
+    certain = curve([row("object", 1.0), row("absent", 0.0)])
+    assert [(p.low, p.there) for p in certain] == [(0, 0), (0.9, 1)]
+    assert curve([row("object", None)]) == []
 
 
 @pytest.mark.parametrize("changes", [{"seeds": ()}, {"tiers": ()}])
