@@ -1,8 +1,9 @@
 """Every script in `docs/examples` runs without arguments of its own, and says and draws what it promises."""
 
 import re
-import subprocess
-import sys
+import runpy
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,11 @@ EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 
 def run(name: str, out: Path) -> str:
     """What the example prints; its files are written to `out`."""
-    command = [sys.executable, str(EXAMPLES / f"{name}.py"), str(out)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    path = str(EXAMPLES / f"{name}.py")
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as said:
+        patch.setattr("sys.argv", [path, str(out)])
+        runpy.run_path(path, run_name="__main__")
+    return said.getvalue()
 
 
 def pixels(path: Path) -> np.ndarray:

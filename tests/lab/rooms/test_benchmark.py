@@ -16,6 +16,7 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.formats import save_scene
 from langsplat_core.lab.config import BenchmarkConfig, GainBenchConfig, LiftBenchConfig, PaperBenchConfig
 from langsplat_core.lab.demo import SEED
+from langsplat_core.lab.rooms import patches, tiles
 from langsplat_core.lab.rooms import scoring as synthetic
 from langsplat_core.lab.rooms.benchmark import run_benchmark
 from langsplat_core.lab.rooms.gain_bench import gain_table, measure_gains
@@ -211,12 +212,14 @@ def test_changes_of_the_lifting_are_compared_with_none(run, tmp_path, monkeypatc
         measure_gains(replace(config, seeds=()), run.work)
 
 
-def test_the_papers_ways_are_compared_with_lerfs(run):
+def test_the_papers_ways_are_compared_with_lerfs(run, monkeypatch):
+    monkeypatch.setattr(patches, "SCALES", (0.3, 0.5))  # of the smallest there are thousands in every picture
+    monkeypatch.setattr(tiles, "SIDES", (1 / 8, 1 / 4, 1 / 2))
     chosen = ("LERF", "in one pass", "subpart alone", "squares")
     config = PaperBenchConfig("separate", (101,), dims=(1,), codec_steps=40, only=chosen)
     lerf, paper, subpart, squares = (row.measured for row in measure_paper(config, run.work, rooms=TINY))
     assert (lerf.query, paper.query, squares.masks) == ("blend answers", "paper", "tiles")
-    assert lerf.bytes_per_gaussian == 7 * 512 * 4
+    assert lerf.bytes_per_gaussian == 2 * 512 * 4
     assert min(len(row.scores) for row in (lerf, paper, subpart, squares)) > 0
     assert min(row.frame_ms for row in (lerf, paper, subpart, squares)) > 0
     assert len({row.scores for row in (lerf, paper, subpart, squares)}) == 4
