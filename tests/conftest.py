@@ -12,7 +12,6 @@ import pytest
 from tests.support.backends import backend, fast_backend, gl_rasterizers, gsplat_twin
 from tests.support.gl_context import gl, gl_session
 from tests.support.measured import measured, print_measured
-from tests.support.parallel import own_kernel_cache
 
 __all__ = [
     "backend",
@@ -24,8 +23,6 @@ __all__ = [
     "measured",
     "real_data",
 ]
-
-own_kernel_cache()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
