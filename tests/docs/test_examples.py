@@ -65,10 +65,3 @@ def test_write_a_backend(tmp_path: Path) -> None:
     assert 1e-3 < float(coarse) < 0.2
     assert float(fine) < 1e-6
     assert float(largest) < 1e-4
-
-
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
-def test_examples_are_short_and_say_what_they_show(path: Path) -> None:
-    lines = path.read_text().splitlines()
-    assert len(lines) < 40
-    assert lines[0].startswith('"""')

@@ -14,6 +14,7 @@ from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
 from langsplat_core.pipeline.crew import Crew, join_crew
 from langsplat_core.pipeline.views import StoredViews
+from langsplat_core.training.language import codebook_fit
 from tests.support.lifting import make_views
 from tests.support.tiny_room import tiny_room
 
@@ -61,6 +62,7 @@ def test_views_are_read_when_they_are_looked_at():
 def train(room: Path, out: Path, said: Path, surroundings: dict[str, str]) -> None:
     """The command, in an environment; its exit code becomes this process's, unless it is 0."""
     os.environ.update(surroundings)
+    codebook_fit.COLOUR_STEPS = 20  # as in this folder's tests
     words = ["train", str(room), "--out", str(out), "--phrases", "red mug", *OPTIONS]
     with said.open("w") as file, redirect_stdout(file), redirect_stderr(file):
         code = main("langsplat", lambda: parse([*words, "--clip.model", str(room / "encoder")]))
