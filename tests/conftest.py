@@ -1,5 +1,6 @@
 """Fixtures for every test, the option that runs the slow ones, and what tests in parallel need."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -45,6 +46,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for item in items:
             if "slow" in item.keywords:
                 item.add_marker(pytest.mark.skip(reason="slow tier: run with --slow"))
+
+
+def pytest_configure() -> None:
+    gc.disable()  # what is imported stays: looking through its millions of objects is time lost, now and later
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
