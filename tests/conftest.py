@@ -49,7 +49,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_configure() -> None:
-    gc.disable()  # what is imported stays: looking through its millions of objects is time lost, now and later
+    gc.disable()  # what is imported stays: looking through its millions of objects is time lost
 
 
 def pytest_collection_finish() -> None:
