@@ -19,20 +19,27 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
+from numba.core.compiler_lock import global_compiler_lock
 
 from langsplat_core.arrays import Array
+
+try:
+    import fcntl
+except ImportError:  # Windows; there processes that begin at once compile the same twice
+    fcntl = None  # type: ignore[assignment]
 
 log = logging.getLogger("langsplat")
 
 _PIECES_PER_THREAD = 4
 _PACKAGE = Path(__file__).resolve().parent
+_compiling: set[Path] = set()  # locks that this process holds
 _IMPORT = re.compile(rf"^\s*from {_PACKAGE.name}([\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE)
 
 
@@ -52,7 +59,22 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     if folder:
         cache_of_it = made._cache  # noqa: SLF001  numba has no other way to it
         cache_of_it.save_overload = partial(_kept_if_there_is_room, cache_of_it.save_overload)
+        made.compile = partial(_compiled_once, folder / f"{function.__name__}.lock", made.compile)
     return made
+
+
+def _compiled_once(lock: Path, compiled: Callable[..., Any], signature: Any) -> Any:
+    """Compile a kernel, or wait for the process that does and take its machine code: numba's index knows no
+    locks, and processes that compile at once would mix up their files."""
+    with global_compiler_lock, ExitStack() as held:  # in this order in every thread
+        if fcntl is not None and lock not in _compiling:
+            _compiling.add(lock)
+            held.callback(_compiling.discard, lock)
+            with suppress(OSError):  # a full disk, or a file system that knows no locks
+                file = held.enter_context(lock.open("ab"))
+                fcntl.flock(file, fcntl.LOCK_EX)
+                held.callback(fcntl.flock, file, fcntl.LOCK_UN)
+        return compiled(signature)
 
 
 def _kept_if_there_is_room(save: Callable[..., None], *overload: Any) -> None:

@@ -1,5 +1,6 @@
 """Fixtures for every test, the option that runs the slow ones, and what tests in parallel need."""
 
+import gc
 import os
 import random
 from pathlib import Path
@@ -13,7 +14,6 @@ import pytest
 from tests.support.backends import backend, fast_backend, gl_rasterizers, gsplat_twin
 from tests.support.gl_context import gl, gl_session
 from tests.support.measured import measured, print_measured
-from tests.support.parallel import own_kernel_cache
 
 __all__ = [
     "backend",
@@ -25,8 +25,6 @@ __all__ = [
     "measured",
     "real_data",
 ]
-
-own_kernel_cache()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -54,6 +52,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for item in items:
             if "slow" in item.keywords:
                 item.add_marker(pytest.mark.skip(reason="slow tier: run with --slow"))
+
+
+def pytest_configure() -> None:
+    gc.disable()  # what is imported stays: looking through its millions of objects is time lost
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:

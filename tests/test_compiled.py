@@ -32,30 +32,28 @@ CALL = "import numpy as np; from langsplat_core.running import run; x = np.zeros
 
 
 @pytest.mark.long
-def test_a_change_in_another_files_helper_is_noticed(tmp_path: Path) -> None:
+def test_processes_that_begin_at_once_compile_once_and_see_a_change_in_another_files_helper(
+    tmp_path: Path,
+) -> None:
     package = tmp_path / "langsplat_core"
     package.mkdir()
     (package / "__init__.py").touch()
     for name in ("arrays.py", "compiled.py", "errors.py"):
         shutil.copy(PACKAGE / name, package / name)
     (package / "running.py").write_text(KERNEL)
-
-    def called(step: int) -> str:
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment["PYTHONPATH"] = str(tmp_path)
+    for step, said in ((1, "[1. 2. 3.]"), (5, "[5. 6. 7.]")):
         (package / "adding.py").write_text(HELPER.format(step=step))
-        environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
-        environment["PYTHONPATH"] = str(tmp_path)
-        done = subprocess.run(
-            [sys.executable, "-c", CALL],
-            env=environment,
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        return done.stdout.strip()
-
-    assert called(1) == "[1. 2. 3.]"
-    assert called(5) == "[5. 6. 7.]"
+        code = f"{CALL}; print(sum(run.stats.cache_misses.values()))"
+        command = [sys.executable, "-c", code]
+        both = [
+            subprocess.Popen(command, env=environment, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+            for _ in range(2)
+        ]
+        texts = [process.communicate()[0].splitlines() for process in both]
+        assert [lines[0] for lines in texts] == [said, said]
+        assert sorted(lines[1] for lines in texts) == ["0", "1"]
     kept = list((package / "__pycache__" / "kernels" / "running").iterdir())
     assert len(kept) == 1  # the code of the older sources is gone
 

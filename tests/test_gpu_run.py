@@ -1,7 +1,6 @@
 """`make gpu`: its sections over the twin of gsplat's kernels, and its runner where there is no GPU."""
 
 import importlib
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -101,22 +100,17 @@ def test_opengl_tables_on_any_driver(sections: ModuleType, gl_session: object) -
 
 @pytest.mark.long
 @pytest.mark.skipif("__import__('torch').cuda.is_available()", reason="needs a machine without CUDA")
-def test_without_a_gpu_it_says_so_in_one_line_and_writes_nothing(tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        str(GPU / "run.py"),
-        "--only",
-        "environment,gradients",
-        "--out",
-        str(tmp_path / "out"),
-    ]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": ""}
-    )
-    assert done.returncode == 2
-    assert done.stderr == "gpu: nothing could be run (no CUDA device); see docs/gpu.md\n"
-    assert "gradients: skipped: no CUDA device" in done.stdout
-    assert not (tmp_path / "out").exists()
+def test_without_a_gpu_it_says_so_in_one_line_and_writes_nothing(
+    tmp_path: Path, runner: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    monkeypatch.setattr(sys, "argv", ["run.py", "--only", "environment,gradients", "--out", str(out)])
+    monkeypatch.setenv("PYTHONPATH", "")
+    assert runner.main() == 2
+    said = capsys.readouterr()
+    assert said.err == "gpu: nothing could be run (no CUDA device); see docs/gpu.md\n"
+    assert "gradients: skipped: no CUDA device" in said.out
+    assert not out.exists()
 
 
 def test_a_section_that_fails_or_takes_too_long_does_not_stop_the_others(

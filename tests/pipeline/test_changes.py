@@ -114,7 +114,7 @@ def test_a_clock_that_was_wrong(year: str, room: Path, whole: dict[str, bytes], 
 
 
 @pytest.mark.parametrize(
-    "surroundings", [{}, {"LANG": "C", "LC_ALL": "C"}, {"HOME": "/nonexistent"}, {"LANG": "xx_YY.nothing"}]
+    "surroundings", [{"HOME": "/nonexistent", "LANG": "C", "LC_ALL": "C"}, {"LANG": "xx_YY.nothing"}]
 )
 def test_questions_without_a_home_a_language_or_a_place_to_write(
     surroundings: dict[str, str], tmp_path: Path

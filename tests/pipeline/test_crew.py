@@ -1,14 +1,20 @@
 """Several processes that share one training: the same scene as from one."""
 
-import subprocess
+import multiprocessing
+import os
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
+import torch.distributed
 
+from langsplat_core.cli.app import parse
+from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
 from langsplat_core.pipeline.crew import Crew, join_crew
 from langsplat_core.pipeline.views import StoredViews
+from langsplat_core.training.language import codebook_fit
 from tests.support.lifting import make_views
 from tests.support.tiny_room import tiny_room
 
@@ -53,18 +59,37 @@ def test_views_are_read_when_they_are_looked_at():
         StoredViews([camera for camera, _ in pairs], [pairs[0][1]] * 2)
 
 
-def train(room: Path, out: Path, *launcher: str) -> None:
-    command = [sys.executable, "-m", *launcher, "langsplat_core", "train", str(room), "--out", str(out)]
-    command += ["--clip.model", str(room / "encoder"), "--phrases", "red mug", *OPTIONS]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("Gaussians from 3 photographs") == 1
+def train(room: Path, out: Path, said: Path, surroundings: dict[str, str]) -> None:
+    """The command, in an environment; its exit code becomes this process's, unless it is 0."""
+    os.environ.update(surroundings)
+    codebook_fit.COLOUR_STEPS = 20  # as in this folder's tests
+    words = ["train", str(room), "--out", str(out), "--phrases", "red mug", *OPTIONS]
+    with said.open("w") as file, redirect_stdout(file), redirect_stderr(file):
+        code = main("langsplat", lambda: parse([*words, "--clip.model", str(room / "encoder")]))
+    if code:
+        sys.exit(code)
 
 
-def test_two_processes_make_the_scene_of_one(tmp_path):
+def test_two_processes_make_the_scene_of_one(tmp_path: Path) -> None:
+    """Joined as torchrun joins them: it keeps the store where they meet."""
     room = tiny_room(tmp_path / "room")
-    train(room, tmp_path / "one.ply")
-    together = ("torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m")
-    train(room, tmp_path / "two.ply", *together)
+    train(room, tmp_path / "one.ply", tmp_path / "one.txt", {})
+    store = torch.distributed.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
+    there = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(store.port), "WORLD_SIZE": "2"}
+    there["TORCHELASTIC_USE_AGENT_STORE"] = "True"
+    processes = multiprocessing.get_context("forkserver")
+    processes.set_forkserver_preload(["tests.pipeline.test_crew"])
+    two, said = [], [tmp_path / "0.txt", tmp_path / "1.txt"]
+    for rank, text in enumerate(said):
+        surroundings = there | {"RANK": str(rank), "LOCAL_RANK": str(rank)}
+        arguments = (room, tmp_path / "two.ply", text, surroundings)
+        two.append(processes.Process(target=train, args=arguments, daemon=True))
+    for process in two:
+        process.start()
+    for process in two:
+        process.join(300)
+    texts = [text.read_text() for text in said]
+    assert [process.exitcode for process in two] == [0, 0], texts
+    assert [text.count("Gaussians from 3 photographs") for text in texts] == [1, 0]
     for suffix in (".ply", ".langsplat.safetensors"):
         assert (tmp_path / f"two{suffix}").read_bytes() == (tmp_path / f"one{suffix}").read_bytes()

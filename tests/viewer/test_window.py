@@ -3,6 +3,7 @@
 import gc
 import time
 import weakref
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +18,16 @@ from langsplat_viewer.canvas import NOTHING_LEFT, REST_SECONDS, Canvas
 from langsplat_viewer.marks.selecting import unmarked
 from langsplat_viewer.state import ViewerState
 from tests.support.fakes import blob_scene
-from tests.support.on_display import play
+from tests.support.on_display import Cast
 from tests.support.windowless import FakeRenderer
+
+
+@pytest.fixture(scope="module")
+def cast(display: str) -> Iterator[Cast]:
+    """Plays scenarios of `window_driver`."""
+    made = Cast("tests.viewer.window_driver", display)
+    yield made
+    made.close()
 
 
 @pytest.fixture
@@ -68,20 +77,19 @@ def folder(tmp_path: Path) -> Path:
         "large_letters",
     ],
 )
-def test_window(scenario: str, display: str, folder: Path):
-    drive(scenario, display, folder)
+def test_window(scenario: str, cast: Cast, folder: Path):
+    drive(scenario, cast, folder)
 
 
 @pytest.mark.long
-def test_what_was_arranged_is_found_again(display: str, folder: Path):
-    drive("leave_settings", display, folder)
-    drive("find_settings", display, folder)
+def test_what_was_arranged_is_found_again(cast: Cast, folder: Path):
+    drive("leave_settings", cast, folder)
+    drive("find_settings", cast, folder)
 
 
-def drive(scenario: str, display: str, folder: Path) -> None:
+def drive(scenario: str, cast: Cast, folder: Path) -> None:
     """Play one scenario of `window_driver`."""
-    arguments = ["-m", "tests.viewer.window_driver", scenario, str(folder)]
-    said = play(display, arguments, folder, timeout=300)
+    said = cast.play([scenario, str(folder)], folder, timeout=300)
     assert said.rstrip().endswith("PASSED"), said[-4000:]
 
 

@@ -1,11 +1,9 @@
 """Drives the real window through imgui's test engine; run by test_window.py in a process of its own.
 
-    python -m tests.viewer.window_driver SCENARIO FOLDER
-
-A scenario asserts as it goes and ends with "PASSED". FOLDER holds the scenes and is the working folder.
+Its arguments: SCENARIO FOLDER. A scenario asserts as it goes and ends with "PASSED". FOLDER holds the scenes
+and is the working folder.
 """
 
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +23,7 @@ from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest
 from tests.support.fakes import CENTRES, FakeEncoder
+from tests.support.on_display import serve
 from tests.viewer import scenarios_files, scenarios_layout, scenarios_seeing, scenarios_select
 from tests.viewer.scenarios_record import RECORD_SCENARIOS
 
@@ -552,7 +551,12 @@ SCENARIOS = {
 }
 
 
-if __name__ == "__main__":
-    scenario, scene_name, settings = SCENARIOS[sys.argv[1]]
-    Session(Path(sys.argv[2]), scene_name, **settings).run(scenario)
+def play_one(arguments: list[str]) -> None:
+    name, folder = arguments
+    scenario, scene_name, settings = SCENARIOS[name]
+    Session(Path(folder), scene_name, **settings).run(scenario)
     print("PASSED")
+
+
+if __name__ == "__main__":
+    serve(play_one)

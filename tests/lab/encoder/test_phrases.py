@@ -23,7 +23,7 @@ from langsplat_core.scene import CANONICAL_PHRASES
 
 pytestmark = pytest.mark.long
 
-SEEDS = 20
+SEEDS = 10
 # Words that are right for two things because they are the same thing, or that no phrase can tell apart:
 # the fruit and the colour; a room's walls and a house's; the hat that a snowman wears.
 SHARED = {"orange", "wall", "floor", "rug", "hat"}

@@ -1,0 +1,5 @@
+"""Rooms that train in seconds."""
+
+from tests.support.tiny_room import rough_colours
+
+__all__ = ["rough_colours"]
