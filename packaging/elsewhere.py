@@ -133,14 +133,14 @@ def main() -> int:
     commit = subprocess.run(describe, cwd=ROOT, capture_output=True, text=True).stdout.strip() or "-"
     model = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text(encoding="utf-8"))
     head = HEAD.format(machine=f"{model[1] if model else 'an unknown processor'}, {os.cpu_count()} cores")
-    known = TABLE.read_text(encoding="utf-8").splitlines(keepends=True) if TABLE.exists() else []
-    written = {line.split(" ")[1]: line for line in known if line.startswith("| ")}
     good = True
     for row in every:
         if row.name in asked and row.python:
             print(f"{row.name}: {row.difference}", flush=True)
             cells, passed = run(row)
             good &= passed
+            known = TABLE.read_text(encoding="utf-8").splitlines(keepends=True) if TABLE.exists() else []
+            written = {line.split(" ")[1]: line for line in known if line.startswith("| ")}
             written[row.name] = f"| {' | '.join(map(str, (row.name, row.difference, *cells, commit)))} |\n"
             TABLE.write_text(head + "".join(written.get(other.name, "") for other in every), encoding="utf-8")
     return 0 if good else 1
