@@ -44,9 +44,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if (seed := config.getoption("--shuffle")) is not None:
         random.Random(seed).shuffle(items)
-    elif hasattr(
-        config, "workerinput"
-    ):  # long ones first, so that parallel workers end at about the same time
+    elif hasattr(config, "workerinput"):  # long ones first: parallel workers end at about the same time
         items.sort(key=lambda item: item.get_closest_marker("long") is None)
     if not config.getoption("--slow"):
         for item in items:
