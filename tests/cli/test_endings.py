@@ -1,5 +1,6 @@
 """Whatever happens to a command, it ends with one line."""
 
+import json
 import os
 import signal
 import subprocess
@@ -223,24 +224,45 @@ def test_a_signal_ends_a_command_in_a_line(number: int, said: str, tmp_path: Pat
     assert line == f"langsplat: {said}; the same command continues where it stopped"
 
 
+CLOSED = (".", "images", "sparse/0/cameras.bin", "transforms.json")
+TRAIN_ALL = """
+import json, sys
+from langsplat_core.cli.app import parse
+from langsplat_core.cli.run import main
+for words in json.load(sys.stdin):
+    print(main("langsplat", lambda: parse(words)), flush=True)
+"""
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("closed", [".", "images", "sparse/0/cameras.bin", "transforms.json"])
-def test_datasets_that_may_not_be_read(closed: str, tmp_path: Path) -> None:
-    data = tmp_path / "data"
-    if closed == "transforms.json":
+def test_datasets_that_may_not_be_read(tmp_path: Path) -> None:
+    """One process tries them all: to be bound by permissions it has to be one of its own."""
+    lines, paths = [], []
+    for number, closed in enumerate(CLOSED):
+        data = tmp_path / str(number)
         data.mkdir()
-        (data / closed).write_text("{}")
-    else:
-        (data / "images").mkdir(parents=True)
-        (data / "sparse" / "0").mkdir(parents=True)
-        for name in ("cameras.bin", "images.bin", "points3D.bin"):
-            (data / "sparse" / "0" / name).write_bytes(bytes(8))
-    (data / closed).chmod(0)
-    words = ["train", str(data), "--out", str(tmp_path / "s.ply"), "--clip.model", "demo"]
+        if closed == "transforms.json":
+            (data / closed).write_text("{}")
+        else:
+            (data / "images").mkdir()
+            (data / "sparse" / "0").mkdir(parents=True)
+            for name in ("cameras.bin", "images.bin", "points3D.bin"):
+                (data / "sparse" / "0" / name).write_bytes(bytes(8))
+        paths.append(data / closed)
+        lines.append(["train", str(data), "--out", str(tmp_path / f"{number}.ply"), "--clip.model", "demo"])
+    for path in paths:
+        path.chmod(0)
     done = subprocess.run(
-        [*RUN, *words], capture_output=True, text=True, check=False, preexec_fn=bound_by_permissions()
+        [sys.executable, "-c", TRAIN_ALL],
+        input=json.dumps(lines),
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=bound_by_permissions(),
     )
-    (data / closed).chmod(0o755)
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
-    assert line.startswith("langsplat: ")
+    for path in paths:
+        path.chmod(0o755)
+    assert done.stdout.split() == ["2"] * len(CLOSED), done.stderr
+    said = done.stderr.splitlines()
+    assert len(said) == len(CLOSED), said
+    assert all(line.startswith("langsplat: ") for line in said)

@@ -9,7 +9,6 @@ import numpy as np
 from PIL import Image
 
 from imgui_bundle import imgui  # isort: skip
-from imgui_bundle.immapp import testing  # isort: skip
 from langsplat_viewer import actions
 from langsplat_viewer.camera.labels import Label
 from langsplat_viewer.camera.view_cube import visible_faces
@@ -206,7 +205,7 @@ def rasterize_elsewhere(s: Any) -> None:
     assert s.state.show_help
     s.ctx.key_press(imgui.Key.f1)
     s.ctx.yield_(3)
-    testing.capture(s.ctx, str(s.folder / "coarse.png"))
+    s.capture(s.folder / "coarse.png")
     gate.set()
     fine = s.shot("fine")
     assert s.state.stats.scale == 1

@@ -62,6 +62,7 @@ class SoakSession(Session):
     """A window with the renderer of a backend, whose thread can be told what to do."""
 
     patience = 3600.0
+    watched = True
 
     def __init__(self, folder: Path, backend: Backend) -> None:
         self._wanted: Callable[[], object] | None = None  # at the next frame

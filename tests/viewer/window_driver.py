@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from imgui_bundle import hello_imgui, imgui  # isort: skip
+from imgui_bundle import ImVec2, hello_imgui, imgui  # isort: skip
 from imgui_bundle.immapp import testing  # isort: skip
 from langsplat_core.display.colour_maps import QUERY_COLOURS
 from langsplat_core.errors import BackendError
@@ -51,6 +51,7 @@ class Session:
     """A window under test."""
 
     patience = PATIENCE
+    watched = False  # frames are drawn: not those that no picture is taken of
 
     def __init__(
         self,
@@ -84,8 +85,25 @@ class Session:
         testing.run(test_function=body, runner_params=self.params())
 
     def params(self) -> hello_imgui.RunnerParams:
-        """Of the window."""
-        return self.window.params()
+        """Of the window. A frame takes llvmpipe ten milliseconds of two cores: at next to no pixels per unit,
+        imgui's backend leaves it out."""
+        params = self.window.params()
+        picture, kept = params.callbacks.before_imgui_render, ImVec2(1, 1)
+
+        def scale(pixels: ImVec2) -> None:
+            imgui.get_io().display_framebuffer_scale = pixels
+            imgui.get_main_viewport().framebuffer_scale = pixels
+
+        def unwatched() -> None:
+            nonlocal kept
+            picture()
+            kept = ImVec2(imgui.get_io().display_framebuffer_scale)
+            if not self.watched:
+                scale(ImVec2(1e-6, 1e-6))
+
+        params.callbacks.before_imgui_render = unwatched
+        params.callbacks.after_swap = lambda: scale(kept)
+        return params
 
     def wait(self, condition: Callable[[], bool]) -> None:
         for _ in range(3000):
@@ -105,8 +123,15 @@ class Session:
         """(H, W, 3) the whole window."""
         self.settle()
         path = self.folder / f"{name}.png"
-        testing.capture(self.ctx, str(path))
+        self.capture(path)
         return np.asarray(Image.open(path).convert("RGB")).astype(int)
+
+    def capture(self, path: Path) -> None:
+        """The window as it is."""
+        before, self.watched = self.watched, True
+        self.ctx.yield_(2)
+        testing.capture(self.ctx, str(path))
+        self.watched = before
 
     def at(self, shot: np.ndarray, point: np.ndarray) -> np.ndarray:
         """(3,) mean colour of the 5 x 5 pixels around a world point."""
