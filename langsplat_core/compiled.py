@@ -183,7 +183,9 @@ def _cache_folder(folder: Path) -> Iterator[None]:
     """numba puts the code of functions decorated meanwhile into `folder`; where that lies beside the package,
     the code of older sources goes."""
     if folder.is_relative_to(_PACKAGE) and not folder.exists():
-        shutil.rmtree(folder.parent, ignore_errors=True)
+        for older in folder.parent.glob("*"):
+            if older != folder:  # another process may have made it meanwhile
+                shutil.rmtree(older, ignore_errors=True)
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(folder)
     try:

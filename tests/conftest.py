@@ -9,6 +9,7 @@ from pathlib import Path
 # on one as soon as anything else wants the cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import hypothesis
 import pytest
 
 from tests.support.backends import backend, fast_backend, gl_rasterizers, gsplat_twin
@@ -52,8 +53,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
                 item.add_marker(pytest.mark.skip(reason="slow tier: run with --slow"))
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     gc.disable()  # what is imported stays: looking through its millions of objects is time lost
+    # Chance and the clock decide nothing but in the slow tier, which looks for new cases.
+    chance = config.getoption("--slow")
+    hypothesis.settings.register_profile("tests", derandomize=not chance, deadline=None, database=None)
+    hypothesis.settings.load_profile("tests")
 
 
 def pytest_collection_finish() -> None:

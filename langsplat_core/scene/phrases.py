@@ -51,8 +51,10 @@ def _bare(word: str) -> str:
         return word
     kinds = [unicodedata.category(mark) for mark in word]
     marks = [kind[0] in "PZ" or kind == "Cf" for kind in kinds]
-    if all(marks) or all(kind in ("Cf", "Po", "Mn") for kind in kinds):
+    if all(marks):
         return ""
     first, last = marks.index(False), len(marks) - marks[::-1].index(False)
+    if all(kind in ("Cf", "Po", "Mn") for kind in kinds[first:last]):
+        return ""
     owns = word[last : last + 1] == "'" and first == 0 and word[last - 1] == "s"
     return word[first:last] + ("'" if owns else "")

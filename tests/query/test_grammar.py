@@ -141,7 +141,7 @@ WORDS = st.sampled_from(
 )
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 @given(st.one_of(st.text(max_size=60), st.lists(WORDS, max_size=14).map(" ".join)))
 def test_every_text_is_read_or_refused(text):
     """Nothing but InputError is raised, every phrase of a tree says something, and a reading shows it."""

@@ -48,9 +48,8 @@ def cases(draw: st.DrawFn) -> Case:
 def over_random_cases(law: Callable[[Case], None], slow: bool, largest: int = 1000) -> None:
     """Run `law` on as many cases as the tier has."""
     examples = settings(
-        max_examples=largest if slow else 25, derandomize=True, deadline=None, database=None,
-        suppress_health_check=list(HealthCheck),
-    )  # fmt: skip
+        max_examples=largest if slow else 25, derandomize=True, suppress_health_check=list(HealthCheck)
+    )
     examples(given(cases())(law))()
 
 
