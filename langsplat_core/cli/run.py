@@ -17,6 +17,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, make_dataclass
+from itertools import dropwhile, takewhile
 from types import FrameType
 from typing import Annotated, Any, Protocol
 
@@ -37,6 +38,7 @@ _LOG_LIMIT = 2000  # characters of a warning
 _UNWRITTEN = (*NO_ROOM, errno.EBADF)
 _ROOM = "make room, or choose another place; what was finished is kept"
 _FRAME = re.compile(r"[│╭╮╰╯]|─+")
+_RULE = re.compile(r"[\s│╰╯├┤]*(─{2,}|-{5,})[\s│╰╯├┤]*")
 
 
 _Flag = Annotated[
@@ -77,12 +79,9 @@ class Command(Protocol):
 def one_line(box: str) -> str:
     """tyro's framed complaint as one line: its title and text, without rule and hints below it."""
     title, *body = box.strip().splitlines() or [""]
-    text: list[str] = []
-    for line in body:
-        if "──" in line:
-            break
-        text.append(_FRAME.sub(" ", line))
-    words = " ".join(" ".join(text).split())
+    body = list(dropwhile(_RULE.fullmatch, body))  # below the title where the terminal has no frames
+    text = takewhile(lambda line: not _RULE.fullmatch(line), body)
+    words = " ".join(_FRAME.sub(" ", " ".join(text)).split())
     heading = " ".join(_FRAME.sub(" ", title).split()).lower()
     return f"{words or heading or 'unusable arguments'} (see --help)"
 

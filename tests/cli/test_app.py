@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import os
 import subprocess
 import sys
 
@@ -92,7 +93,15 @@ def test_bash_completes_commands_options_and_choices(capsys):
         parse(["--tyro-print-completion", "bash"])
     assert not stop.value.code
     script = capsys.readouterr().out
-    done = subprocess.run(["bash", "-c", COMPLETE], input=script, capture_output=True, text=True, check=True)
+    terminal = {**os.environ, "LC_ALL": "C.UTF-8", "PYTHONUTF8": "1"}  # of others tyro's scripts know nothing
+    done = subprocess.run(
+        ["bash", "-c", COMPLETE],
+        input=script,
+        capture_output=True,
+        encoding="utf-8",
+        check=True,
+        env=terminal,
+    )
     assert done.stdout.splitlines() == ["query", "verdict", "--max-relevancy-error", "good"]
 
 

@@ -26,7 +26,8 @@ MAKERS: dict[str, Maker] = {
 
 @pytest.fixture(scope="module", params=sorted(MAKERS))
 def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
-    folder = tmp_path_factory.mktemp(request.param)
+    folder = tmp_path_factory.mktemp("made") / request.param
+    folder.mkdir()
     return folder, MAKERS[request.param](folder)
 
 
@@ -77,7 +78,7 @@ def test_case_does_not_matter_and_punctuation_only_to_the_second(made: tuple[Pat
     encoder = load_text_encoder(str(made[0]))
     small, large, dotted = encoder.encode_texts(["red mug", "RED Mug", "red mug!"])
     np.testing.assert_allclose(small, large, atol=1e-6)
-    assert np.allclose(small, dotted, atol=1e-6) == made[0].name.startswith("siglip0")
+    assert np.allclose(small, dotted, atol=1e-6) == (made[0].name == "siglip")
 
 
 def test_images_agree_with_the_whole_model(tmp_path: Path) -> None:
