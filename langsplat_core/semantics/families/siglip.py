@@ -19,8 +19,8 @@ from langsplat_core.semantics.encoder import Family, Logits, inferred, pixel_sta
 from langsplat_core.semantics.tokens import load_tokens
 from langsplat_core.semantics.weights import (
     Weights,
+    load_config,
     load_model,
-    loading_errors,
     read_scalars,
 )
 
@@ -98,11 +98,6 @@ class NaflexPictures(SiglipPictures):
         ).pooler_output
 
 
-def _config(weights: Weights, kind: Any, name: str) -> Any:
-    with loading_errors(weights.id, name):
-        return kind.from_pretrained(weights.folder, local_files_only=True)
-
-
 def _logits(weights: Weights) -> Logits:
     found = read_scalars(weights, ("logit_scale", "logit_bias"))
     if len(found) < 2 or not all(map(math.isfinite, found.values())):
@@ -113,25 +108,25 @@ def _logits(weights: Weights) -> Logits:
 def _siglip_text(weights: Weights) -> SiglipText:
     from transformers import SiglipConfig, SiglipTextModel
 
-    return SiglipText(weights, SiglipTextModel, _config(weights, SiglipConfig, "SigLIP"))
+    return SiglipText(weights, SiglipTextModel, load_config(SiglipConfig, weights, "SigLIP"))
 
 
 def _siglip_pictures(weights: Weights) -> SiglipPictures:
     from transformers import SiglipConfig, SiglipVisionModel
 
-    return SiglipPictures(weights, SiglipVisionModel, _config(weights, SiglipConfig, "SigLIP"))
+    return SiglipPictures(weights, SiglipVisionModel, load_config(SiglipConfig, weights, "SigLIP"))
 
 
 def _naflex_text(weights: Weights) -> SiglipText:
     from transformers import Siglip2Config, Siglip2TextModel
 
-    return SiglipText(weights, Siglip2TextModel, _config(weights, Siglip2Config, "SigLIP 2"))
+    return SiglipText(weights, Siglip2TextModel, load_config(Siglip2Config, weights, "SigLIP 2"))
 
 
 def _naflex_pictures(weights: Weights) -> NaflexPictures:
     from transformers import Siglip2Config, Siglip2VisionModel
 
-    return NaflexPictures(weights, Siglip2VisionModel, _config(weights, Siglip2Config, "SigLIP 2"))
+    return NaflexPictures(weights, Siglip2VisionModel, load_config(Siglip2Config, weights, "SigLIP 2"))
 
 
 SIGLIP = Family("SigLIP", _siglip_text, _siglip_pictures)
