@@ -138,6 +138,10 @@ def _read(id: str, file: Path) -> Tensors:
     found = found.get("state_dict", found.get("model", found)) if isinstance(found, dict) else {}
     if not isinstance(found, dict):
         raise ValueError("it holds no named tensors")
+    if any(
+        tensor.nbytes > file.stat().st_size for tensor in found.values() if isinstance(tensor, torch.Tensor)
+    ):
+        raise ValueError("a tensor claims more numbers than the file holds")
     names = {
         name: name.removeprefix("module.").removeprefix("text.") for name in found if isinstance(name, str)
     }

@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import save_file
 from transformers import CLIPTokenizer
 
-from langsplat_core.errors import EncoderError
+from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
 from langsplat_core.semantics.families.clip import CLIP_MEAN, CLIP_STD
 from langsplat_core.semantics.segmenters import load_segmenter
@@ -150,6 +150,31 @@ def test_without_its_tokenizer_a_clip_says_which_file_to_put_beside(tmp_path: Pa
         load_text_encoder(str(path))
 
 
+@pytest.mark.parametrize(
+    ("typed", "plain"),
+    [
+        ("the cat’s mug", "the cat's mug"),
+        ("mug &amp;amp; bowl", "mug & bowl"),
+        ("of\ufb01ce   chair", "office chair"),
+        ("‘mug’", "'mug'"),
+    ],
+)
+def test_texts_are_cleaned_as_open_clip_does(typed: str, plain: str, tmp_path: Path) -> None:
+    letter_tokenizer(tmp_path)
+    encoder = load_text_encoder(str(training_checkpoint(tmp_path, open_clip_tensors())[0]))
+    got, want, other = (encoder.encode_texts([text])[0] for text in (typed, plain, "the cats mug"))
+    np.testing.assert_array_equal(got, want)
+    assert abs(want - other).max() > 1e-3  # so the marks are read
+
+
+@pytest.mark.parametrize("phrase", ["&nbsp;", "&amp;amp;"])
+def test_a_phrase_of_which_nothing_is_left_is_empty(phrase: str, tmp_path: Path) -> None:
+    letter_tokenizer(tmp_path)
+    encoder = load_text_encoder(str(training_checkpoint(tmp_path, open_clip_tensors())[0]))
+    with pytest.raises(InputError, match="empty phrase"):
+        encoder.encode_texts(["mug", phrase])
+
+
 def without(name: str) -> Callable[[Tensors], object]:
     return lambda tensors: {key: tensor for key, tensor in tensors.items() if key != name}
 
@@ -176,6 +201,7 @@ HOSTILE_CLIP = {
     "nothing": lambda t: {},
     "a list": lambda t: list(t.values()),
     "a number for its state": lambda t: {"state_dict": 5},
+    "more than the file": lambda t: t | {"positional_embedding": torch.zeros(1).expand(1 << 40, 128)},
     "a name that is none": lambda t: {5: torch.zeros(3)},
 }
 HOSTILE_SAM = {

@@ -6,7 +6,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError
 from langsplat_core.semantics.encoder import Family, Logits, TextTower, inferred, pixel_statistics
 from langsplat_core.semantics.families.clip_plain import TEMPERATURE, plain_text_tower
-from langsplat_core.semantics.tokens import check_whole
+from langsplat_core.semantics.tokens import check_whole, text_cleaner
 from langsplat_core.semantics.weights import Weights, load_config, load_model, loading_errors
 
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)  # of OpenAI's CLIP, kept by OpenCLIP
@@ -21,6 +21,7 @@ class ClipText:
 
         self.temperature = TEMPERATURE
         self.logits: Logits | None = None
+        self._clean = text_cleaner()
         self._device = weights.device
         self._model: Any = _load(CLIPTextModelWithProjection, "text", weights)
         self._tokenizer: Any = _load_tokenizer(CLIPTokenizerFast, weights, int(self._model.config.vocab_size))
@@ -34,10 +35,11 @@ class ClipText:
         """See `TextTower`."""
         limit = int(self._model.config.max_position_embeddings) - 2  # one begins a phrase, one ends it
         ends = {int(self._tokenizer.eos_token_id)}
-        for text, row in zip(texts, self._tokenizer(texts, verbose=False).input_ids, strict=True):
+        plain = [self._clean(text) for text in texts]
+        for text, row in zip(texts, self._tokenizer(plain, verbose=False).input_ids, strict=True):
             check_whole(text, row[1:-1], limit, ends)
         # Padding follows the end token, which attends to earlier tokens only: no attention mask is needed.
-        tokens = self._tokenizer(texts, padding=True, return_tensors="pt").input_ids.to(self._device)
+        tokens = self._tokenizer(plain, padding=True, return_tensors="pt").input_ids.to(self._device)
         return inferred(lambda: self._model(input_ids=tokens).text_embeds)
 
 

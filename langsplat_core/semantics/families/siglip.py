@@ -16,7 +16,7 @@ from typing import Any
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError
 from langsplat_core.semantics.encoder import Family, Logits, inferred, pixel_statistics
-from langsplat_core.semantics.tokens import load_tokens
+from langsplat_core.semantics.tokens import load_tokens, text_cleaner
 from langsplat_core.semantics.weights import (
     Weights,
     load_config,
@@ -34,6 +34,7 @@ class SiglipText:
     def __init__(self, weights: Weights, kind: Any, config: Any) -> None:
         self._device = weights.device
         self._model: Any = load_model(kind, weights, config.text_config)
+        self._clean = text_cleaner()
         self._tokens = load_tokens(weights, int(config.text_config.max_position_embeddings), ends=True)
         learned = _logits(weights)
         self.logits: Logits | None = learned
@@ -50,8 +51,8 @@ class SiglipText:
         return inferred(lambda: self._model(input_ids=ids.to(self._device)).pooler_output)
 
     def canonical(self, text: str) -> str:
-        """As the captions of its training: lower case; SigLIP 1 had no punctuation either."""
-        lower = text.lower()
+        """As the captions of its training: clean, in lower case; SigLIP 1 had no punctuation either."""
+        lower = self._clean(text).lower()
         return " ".join(lower.translate(NO_PUNCTUATION).split()) if self._tokens.is_unigram else lower
 
 
