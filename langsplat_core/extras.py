@@ -14,6 +14,7 @@ EXTRAS: Mapping[str, str] = MappingProxyType(  # name as imported -> extra, as i
         "transformers": "encoders",
         "tokenizers": "encoders",
         "huggingface_hub": "encoders",
+        "ftfy": "encoders",
         "open3d": "geometry",
         "matplotlib": "plots",
         "gsplat": "cuda",

@@ -16,7 +16,7 @@ import numpy as np
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.scene import Calibration, Odds, Reading
-from langsplat_core.semantics.weights import Weights
+from langsplat_core.semantics.weights import OPEN_CLIP_CONFIG, Weights
 
 OPEN_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 VOCABULARY = "vocabulary.txt"  # beside the weights: the only words the encoder was taught, one per line
@@ -276,14 +276,18 @@ def pixel_statistics(weights: Weights, mean: Triple, std: Triple) -> tuple[Array
     Raises EncoderError where that file cannot be read, or states no three numbers.
     """
     path = weights.folder / "preprocessor_config.json"
+    name = OPEN_CLIP_CONFIG if weights.converted else path.name
     try:
-        settings = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        if weights.converted:
+            settings = weights.converted.preprocessor
+        else:
+            settings = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
         stated = settings.get("image_mean") or mean, settings.get("image_std") or std
         found = np.array(stated, np.float32)
     except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise EncoderError(f"{weights.id}: {path.name} cannot be read ({error})") from error
+        raise EncoderError(f"{weights.id}: {name} cannot be read ({error})") from error
     if found.shape != (2, 3) or not (found[1] > 0).all():
-        raise EncoderError(f"{weights.id}: {path.name} states no mean and deviation of three colours")
+        raise EncoderError(f"{weights.id}: {name} states no mean and deviation of three colours")
     return found[0], found[1]
 
 

@@ -1,4 +1,4 @@
-"""Image-text encoders by hub id or folder: a new family is one file and one row here."""
+"""Image-text encoders by hub id, folder or file: a new family is one file and one row here."""
 
 from collections.abc import Mapping
 from importlib.resources import files
@@ -11,7 +11,8 @@ from langsplat_core.semantics.encoder import Encoder, Family, PhraseEncoder
 from langsplat_core.semantics.families.clip import CLIP
 from langsplat_core.semantics.families.siglip import NAFLEX, SIGLIP
 from langsplat_core.semantics.families.tips import TIPS
-from langsplat_core.semantics.weights import Weights, model_type, torch_device, weights_folder
+from langsplat_core.semantics.layouts import open_weights
+from langsplat_core.semantics.weights import Weights, model_type, torch_device, weights_path
 
 DEMO = "demo"
 FAMILIES: Mapping[str, Family] = MappingProxyType(  # by `model_type` of config.json
@@ -21,32 +22,32 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(  # by `model_type` of config.
 
 @optional_imports(EncoderError)
 def load_text_encoder(model: str, device: str = "cpu") -> PhraseEncoder:
-    """Load the text half of `model`: a folder, a hub id, or "demo" for the bundled encoder.
+    """Load the text half of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder.
 
     The device is the CPU unless told otherwise, because a phrase takes it a few milliseconds.
     Raises EncoderError where the weights are absent or are those of no family here.
     """
-    weights = Weights(model, model_folder(model, "--encoder"), torch_device(device))
+    weights = open_weights(model, model_path(model, "--encoder"), torch_device(device))
     return PhraseEncoder(weights, _family(weights).text(weights))
 
 
 @optional_imports(EncoderError)
 def load_encoder(model: str, device: str = "auto", batch: int = 32) -> Encoder:
-    """Load both halves of `model`: a folder, a hub id, or "demo" for the bundled encoder.
+    """Load both halves of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder.
 
     batch: pictures per forward pass.
     Raises EncoderError where the weights are absent or are those of no family here.
     """
-    weights = Weights(model, model_folder(model, "--clip.model"), torch_device(device))
+    weights = open_weights(model, model_path(model, "--clip.model"), torch_device(device))
     family = _family(weights)
     text = PhraseEncoder(weights, family.text(weights))
     return Encoder(text, family.pictures(weights), weights.device, batch)
 
 
-def model_folder(model: str, option: str) -> Path:
-    """Where the files of `model` lie; `option` is what messages name, see `weights.weights_folder`."""
+def model_path(model: str, option: str) -> Path:
+    """Where the files of `model` lie; `option` is what messages name, see `weights.weights_path`."""
     if model != DEMO:
-        return weights_folder(model, option)
+        return weights_path(model, option)
     folder = Path(str(files("langsplat_assets") / "demo_encoder"))
     if not folder.is_dir():
         raise EncoderError(f"the bundled demo encoder is missing ({folder}); reinstall, or pass {option}")

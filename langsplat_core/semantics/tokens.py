@@ -4,8 +4,9 @@ The file is read as it is, by the `tokenizers` library: what transformers' own c
 side is padded, whether an end token is there) differs between its versions, and one needs SentencePiece.
 """
 
+import html
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,6 +59,23 @@ def load_tokens(weights: Weights, length: int, ends: bool) -> Tokens:
     tokenizer = read_tokenizer(weights)
     pad = _number(weights, tokenizer, "pad_token")
     return Tokens(tokenizer, length, pad, _number(weights, tokenizer, "eos_token") if ends else None)
+
+
+def text_cleaner() -> Callable[[str], str]:
+    """What open_clip does to a text before its tokenizer reads it: broken Unicode is mended, curly quotes and
+    ligatures are made plain, names of HTML replaced, spaces made single.
+
+    The function raises InputError where no letter and no digit is left.
+    """
+    import ftfy
+
+    def clean(text: str) -> str:
+        plain = " ".join(html.unescape(html.unescape(ftfy.fix_text(text))).split())
+        if not any(map(str.isalnum, plain)):
+            raise InputError(f"empty phrase {text!r}: type a word or a few, such as 'red mug'")
+        return plain
+
+    return clean
 
 
 def check_whole(text: str, ids: Sequence[int], room: int, ends: Collection[int]) -> None:

@@ -1,11 +1,12 @@
-"""Finding and reading the weights of a model: a folder, or a model of the Hugging Face hub."""
+"""Finding and reading the weights of a model: a folder, a file, or a model of the Hugging Face hub."""
 
 import json
 import pickle
 import warnings
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,9 @@ CONFIG = "config.json"
 SMALL_FILES = ["*.json", "*.txt"]
 SAFE = ["model.safetensors", "model-*.safetensors"]
 PICKLED = ["pytorch_model.bin", "pytorch_model-*.bin"]  # transformers reads these with weights_only
+OPEN_CLIP_CONFIG = "open_clip_config.json"
+OPEN_CLIP = ["open_clip_model.safetensors", "open_clip_pytorch_model.bin"]  # either, the first is preferred
+FILES = (".safetensors", ".bin", ".pt", ".pth")  # what no hub id ends with
 # What transformers, safetensors and torch raise for files that are no weights.
 UNREADABLE = (
     *(OSError, ValueError, TypeError, LookupError, AttributeError, AssertionError, ImportError),
@@ -23,42 +27,66 @@ UNREADABLE = (
 )
 
 
+@dataclass(frozen=True, eq=False)
+class Converted:
+    """Weights of another layout as transformers names them, see `layouts.open_weights`."""
+
+    config: dict[str, Any]  # of config.json
+    tensors: Mapping[str, Any]  # name -> torch.Tensor
+    preprocessor: dict[str, Any]  # of preprocessor_config.json
+
+
 @dataclass(frozen=True)
 class Weights:
     """A model that was found, and where it shall run."""
 
     id: str  # hub id or folder, as it was asked for
-    folder: Path  # in Hugging Face layout
+    folder: Path  # in Hugging Face layout, or that of `converted`, with what lies beside the weights
     device: str  # of torch: "cpu", "cuda"
+    converted: Converted | None = None  # where they are in another layout than Hugging Face's
 
 
-def weights_folder(model: str, option: str) -> Path:
-    """The folder that holds `model`, downloaded from the hub when it is a hub id that is not cached yet.
+def weights_path(model: str, option: str) -> Path:
+    """The folder or file that holds `model`, downloaded when it is a hub id that is not cached yet.
 
-    model: an existing folder, or a hub id "owner/name"; option: the setting to name in messages, such as
-    "--clip.model". A folder is never looked up on the hub, and with HF_HUB_OFFLINE set nothing is.
+    model: an existing folder or file, or a hub id "owner/name"; option: the setting to name in messages, such
+    as "--clip.model". What exists is never looked up on the hub, and with HF_HUB_OFFLINE set nothing is.
     Raises EncoderError saying what to pass or to run.
     """
-    folder = Path(model).expanduser()
-    if folder.is_dir():
-        if not _complete(folder):
+    path = Path(model).expanduser()
+    if path.is_file():
+        plain = any(path.match(pattern) for pattern in SAFE + PICKLED)
+        return path.parent if plain and is_hugging_face(path.parent) else path
+    if path.is_dir():
+        if not _complete(path):
             raise EncoderError(
                 f"{model}: no {CONFIG} with model.safetensors in this folder; {option} wants a model folder "
-                "in Hugging Face layout"
+                f"in Hugging Face layout, or that of open_clip with {OPEN_CLIP_CONFIG} and {OPEN_CLIP[0]}"
             )
-        return folder
+        return path
     if not _is_hub_id(model):
-        raise EncoderError(f"{model}: no such folder; pass `{option} FOLDER` or a hub id such as owner/name")
+        raise EncoderError(
+            f"{model}: no such file, no such folder; pass `{option} FOLDER`, a file or a hub id such as "
+            "owner/name"
+        )
     return _from_hub(model, option)
 
 
 def _is_hub_id(model: str) -> bool:
-    return model.count("/") == 1 and not model.startswith((".", "~", "/")) and not model.endswith("/")
+    return (
+        model.count("/") == 1 and not model.startswith((".", "~", "/")) and not model.endswith(("/", *FILES))
+    )
+
+
+def is_hugging_face(folder: Path) -> bool:
+    """Whether a folder holds weights and their configuration as transformers saves them."""
+    weights = any(next(folder.glob(pattern), None) for pattern in SAFE + PICKLED)
+    return weights and (folder / CONFIG).is_file()
 
 
 def _complete(folder: Path) -> bool:
-    weights = any(next(folder.glob(pattern), None) for pattern in SAFE + PICKLED)
-    return weights and (folder / CONFIG).is_file()
+    weights = any((folder / name).is_file() for name in OPEN_CLIP)
+    return is_hugging_face(folder) or (weights and (folder / OPEN_CLIP_CONFIG).is_file())
 
 
 def _from_hub(model: str, option: str) -> Path:
@@ -66,7 +94,7 @@ def _from_hub(model: str, option: str) -> Path:
 
     reason = "HF_HUB_OFFLINE is set"
     for local_only in (True,) if constants.HF_HUB_OFFLINE else (True, False):
-        for weights in (SAFE, PICKLED):
+        for weights in (SAFE, PICKLED, OPEN_CLIP[:1], OPEN_CLIP[1:]):
             try:
                 patterns = SMALL_FILES + weights
                 found = snapshot_download(model, allow_patterns=patterns, local_files_only=local_only)
@@ -87,6 +115,8 @@ def model_type(weights: Weights) -> str:
 
     Raises EncoderError for a file that is no JSON.
     """
+    if weights.converted:
+        return str(weights.converted.config["model_type"])
     try:
         settings = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -94,18 +124,37 @@ def model_type(weights: Weights) -> str:
     return str(settings.get("model_type", "")) if isinstance(settings, dict) else ""
 
 
+def load_config(kind: Any, weights: Weights, name: str) -> Any:
+    """The configuration of `weights` as transformers' class `kind`; `name` is the family's in messages.
+
+    Raises EncoderError where it cannot be read.
+    """
+    with loading_errors(weights.id, name):
+        if weights.converted:
+            return kind.from_dict(deepcopy(weights.converted.config))
+        return kind.from_pretrained(weights.folder, local_files_only=True)
+
+
 def load_model(kind: Any, weights: Weights, config: Any) -> Any:
     """A transformers model of class `kind` in float32 on the device of `weights`, ready to be asked.
 
     Raises EncoderError where the folder lacks some of its weights or has them in another shape:
-    transformers alone would fill those with random numbers.
+    transformers alone would fill those with random numbers. Converted weights may hold no more than the model
+    has, either: what was deduced from them may be wrong.
     """
     import torch
 
     options = {"local_files_only": True, "ignore_mismatched_sizes": True, "output_loading_info": True}
     with loading_errors(weights.id, kind.__name__):
-        model, report = kind.from_pretrained(weights.folder, config=config, dtype=torch.float32, **options)
+        source = None if weights.converted else weights.folder
+        tensors = dict(weights.converted.tensors) if weights.converted else None
+        model, report = kind.from_pretrained(
+            source, config=config, state_dict=tensors, dtype=torch.float32, **options
+        )
     wrong = sorted(report["missing_keys"]) or sorted(str(key[0]) for key in report["mismatched_keys"])
+    if weights.converted and not wrong:
+        halves = {name.partition(".")[0] for name in model.state_dict()}
+        wrong = sorted(name for name in report["unexpected_keys"] if name.partition(".")[0] in halves)
     if wrong:
         raise EncoderError(
             f"{weights.id}: not weights of {kind.__name__}: {len(wrong)} do not fit, such as {wrong[0]}"
@@ -144,6 +193,7 @@ def _pickled_scalars(path: Path, names: tuple[str, ...]) -> dict[str, float]:
 @contextmanager
 def loading_errors(id: str, kind: str) -> Iterator[None]:
     """While transformers reads a folder: nothing on the terminal, and one line in place of its tracebacks."""
+    from huggingface_hub.errors import StrictDataclassError
     from safetensors import SafetensorError
     from transformers.utils import logging
 
@@ -154,12 +204,17 @@ def loading_errors(id: str, kind: str) -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
-    except (*UNREADABLE, SafetensorError) as error:
-        lines = str(error).strip().splitlines() or [type(error).__name__]
+    except (*UNREADABLE, SafetensorError, StrictDataclassError) as error:
+        strict = isinstance(
+            error, StrictDataclassError
+        )  # by which class, in the first line; why, in the last
+        lines = str(error.__cause__ or error if strict else error).strip().splitlines() or [
+            type(error).__name__
+        ]
         # torch's own words advise to run the file.
         pickled = isinstance(error, pickle.UnpicklingError) or "weights_only" in str(error)
         reason = "a pickle that holds more than tensors, which is not run" if pickled else lines[0][:200]
-        raise EncoderError(f"{id}: not {kind} weights that transformers can load ({reason})") from error
+        raise EncoderError(f"{id}: not {kind} weights that can be loaded ({reason})") from error
     finally:
         logging.set_verbosity(level)
         if bars:

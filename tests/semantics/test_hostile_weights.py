@@ -1,5 +1,6 @@
 """Folders of weights that hold something else: one line each, and nothing in them is run."""
 
+import json
 import os
 import pickle
 from pathlib import Path
@@ -63,4 +64,15 @@ def test_bytes_that_are_no_weights(content: bytes, name: str, tmp_path: Path) ->
     (tmp_path / name).write_bytes(content)
     with pytest.raises(EncoderError, match=r"not .* weights") as caught:
         load_text_encoder(str(tmp_path))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_configuration_that_contradicts_itself_is_one_line(tmp_path: Path) -> None:
+    tiny_clip(tmp_path)
+    path = tmp_path / "config.json"
+    config = json.loads(path.read_text(encoding="utf-8"))
+    config["vision_config"]["num_attention_heads"] = 7  # of a width of 32
+    path.write_text(json.dumps(config), encoding="utf-8")
+    with pytest.raises(EncoderError, match="multiple of the number of attention heads") as caught:
+        load_encoder(str(tmp_path))
     assert "\n" not in str(caught.value)

@@ -40,10 +40,11 @@ ENCODER = {
 }
 
 
-def tiny_sam(folder: Path) -> SamModel:
+def tiny_sam(folder: Path, decoder_heads: int = 2) -> SamModel:
     """A SAM with random weights that answers every point differently."""
     prompts = PROMPTS | {"image_embedding_size": SIDE // 16}
-    config = SamConfig(vision_config=ENCODER, prompt_encoder_config=prompts, mask_decoder_config=DECODER)
+    decoder = DECODER | {"num_attention_heads": decoder_heads}
+    config = SamConfig(vision_config=ENCODER, prompt_encoder_config=prompts, mask_decoder_config=decoder)
     return _saved(SamModel, config, folder, seed=9)
 
 

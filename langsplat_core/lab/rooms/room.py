@@ -58,7 +58,7 @@ from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import LEVELS, Camera, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.encoder import Encoder
-from langsplat_core.semantics.encoders import model_folder
+from langsplat_core.semantics.encoders import model_path
 from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sources import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture
@@ -71,8 +71,8 @@ FRAMES = 5  # timed pictures of one phrase
 
 def weights_digest(model: str) -> str:
     """Of an encoder's weights: a folder may be filled with others under the same name."""
-    folder, digest = model_folder(model, "--encoder"), hashlib.sha256()
-    for path in sorted([*folder.glob("*.safetensors"), *folder.glob("*.bin")]):
+    found, digest = model_path(model, "--encoder"), hashlib.sha256()
+    for path in sorted([*found.glob("*.safetensors"), *found.glob("*.bin")]) if found.is_dir() else [found]:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
 

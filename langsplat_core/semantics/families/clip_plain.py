@@ -116,7 +116,7 @@ def plain_text_tower(weights: Weights, most: int = MOST_WEIGHTS) -> PlainClipTex
 
     most: how many weights the half may have.
     """
-    if weights.device != "cpu":
+    if weights.device != "cpu" or weights.converted:
         return None
     config = _text_config(weights)
     if (

@@ -4,7 +4,7 @@ from typing import Any
 
 from langsplat_core.arrays import Array
 from langsplat_core.semantics.segmenter import Look, padded
-from langsplat_core.semantics.weights import Weights, load_model, loading_errors
+from langsplat_core.semantics.weights import Weights, load_config, load_model
 
 
 class Sam:
@@ -44,9 +44,7 @@ class SamHq:
 
 
 def _load(kind: Any, config: Any, weights: Weights, name: str) -> Any:
-    with loading_errors(weights.id, name):
-        settings = config.from_pretrained(weights.folder, local_files_only=True)
-    return load_model(kind, weights, settings)
+    return load_model(kind, weights, load_config(config, weights, name))
 
 
 def _seen(model: Any, image: Array) -> tuple[Any, int, tuple[int, int]]:

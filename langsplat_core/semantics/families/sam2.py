@@ -4,7 +4,7 @@ from typing import Any
 
 from langsplat_core.arrays import Array
 from langsplat_core.semantics.segmenter import Look, squashed
-from langsplat_core.semantics.weights import Weights, load_model, loading_errors
+from langsplat_core.semantics.weights import Weights, load_config, load_model
 
 
 class Sam2:
@@ -15,9 +15,8 @@ class Sam2:
     def __init__(self, weights: Weights) -> None:
         from transformers import Sam2Config, Sam2Model
 
-        with loading_errors(weights.id, self.name):  # the hub's files state the video model's configuration
-            settings = Sam2Config.from_pretrained(weights.folder, local_files_only=True)
-        self._model: Any = load_model(Sam2Model, weights, settings)
+        # The hub's files state the video model's configuration.
+        self._model: Any = load_model(Sam2Model, weights, load_config(Sam2Config, weights, self.name))
 
     def look(self, image: Array) -> Look:
         """See `Segmenter`."""

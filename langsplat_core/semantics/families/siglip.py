@@ -16,11 +16,11 @@ from typing import Any
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError
 from langsplat_core.semantics.encoder import Family, Logits, inferred, pixel_statistics
-from langsplat_core.semantics.tokens import load_tokens
+from langsplat_core.semantics.tokens import load_tokens, text_cleaner
 from langsplat_core.semantics.weights import (
     Weights,
+    load_config,
     load_model,
-    loading_errors,
     read_scalars,
 )
 
@@ -34,6 +34,7 @@ class SiglipText:
     def __init__(self, weights: Weights, kind: Any, config: Any) -> None:
         self._device = weights.device
         self._model: Any = load_model(kind, weights, config.text_config)
+        self._clean = text_cleaner()
         self._tokens = load_tokens(weights, int(config.text_config.max_position_embeddings), ends=True)
         learned = _logits(weights)
         self.logits: Logits | None = learned
@@ -50,8 +51,8 @@ class SiglipText:
         return inferred(lambda: self._model(input_ids=ids.to(self._device)).pooler_output)
 
     def canonical(self, text: str) -> str:
-        """As the captions of its training: lower case; SigLIP 1 had no punctuation either."""
-        lower = text.lower()
+        """As the captions of its training: clean, in lower case; SigLIP 1 had no punctuation either."""
+        lower = self._clean(text).lower()
         return " ".join(lower.translate(NO_PUNCTUATION).split()) if self._tokens.is_unigram else lower
 
 
@@ -98,11 +99,6 @@ class NaflexPictures(SiglipPictures):
         ).pooler_output
 
 
-def _config(weights: Weights, kind: Any, name: str) -> Any:
-    with loading_errors(weights.id, name):
-        return kind.from_pretrained(weights.folder, local_files_only=True)
-
-
 def _logits(weights: Weights) -> Logits:
     found = read_scalars(weights, ("logit_scale", "logit_bias"))
     if len(found) < 2 or not all(map(math.isfinite, found.values())):
@@ -113,25 +109,25 @@ def _logits(weights: Weights) -> Logits:
 def _siglip_text(weights: Weights) -> SiglipText:
     from transformers import SiglipConfig, SiglipTextModel
 
-    return SiglipText(weights, SiglipTextModel, _config(weights, SiglipConfig, "SigLIP"))
+    return SiglipText(weights, SiglipTextModel, load_config(SiglipConfig, weights, "SigLIP"))
 
 
 def _siglip_pictures(weights: Weights) -> SiglipPictures:
     from transformers import SiglipConfig, SiglipVisionModel
 
-    return SiglipPictures(weights, SiglipVisionModel, _config(weights, SiglipConfig, "SigLIP"))
+    return SiglipPictures(weights, SiglipVisionModel, load_config(SiglipConfig, weights, "SigLIP"))
 
 
 def _naflex_text(weights: Weights) -> SiglipText:
     from transformers import Siglip2Config, Siglip2TextModel
 
-    return SiglipText(weights, Siglip2TextModel, _config(weights, Siglip2Config, "SigLIP 2"))
+    return SiglipText(weights, Siglip2TextModel, load_config(Siglip2Config, weights, "SigLIP 2"))
 
 
 def _naflex_pictures(weights: Weights) -> NaflexPictures:
     from transformers import Siglip2Config, Siglip2VisionModel
 
-    return NaflexPictures(weights, Siglip2VisionModel, _config(weights, Siglip2Config, "SigLIP 2"))
+    return NaflexPictures(weights, Siglip2VisionModel, load_config(Siglip2Config, weights, "SigLIP 2"))
 
 
 SIGLIP = Family("SigLIP", _siglip_text, _siglip_pictures)

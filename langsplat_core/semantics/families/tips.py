@@ -8,7 +8,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError
 from langsplat_core.semantics.encoder import Family, Logits, inferred
 from langsplat_core.semantics.tokens import load_tokens
-from langsplat_core.semantics.weights import Weights, load_model, loading_errors, read_scalars
+from langsplat_core.semantics.weights import Weights, load_config, load_model, read_scalars
 
 
 class TipsText:
@@ -68,8 +68,7 @@ def _config(weights: Weights) -> Any:
         raise EncoderError(
             f"{weights.id}: TIPS v2 needs a newer transformers: `pip install -U transformers`"
         ) from error
-    with loading_errors(weights.id, "TIPS v2"):
-        return Tipsv2Config.from_pretrained(weights.folder, local_files_only=True)
+    return load_config(Tipsv2Config, weights, "TIPS v2")
 
 
 TIPS = Family("TIPS v2", TipsText, TipsPictures)

@@ -18,7 +18,7 @@ from langsplat_core.lab.world.appearance.colours import COLOURS
 from langsplat_core.lab.world.captions import Label
 from langsplat_core.progress import Cancelled, silent
 from langsplat_core.scene import CANONICAL_PHRASES
-from langsplat_core.semantics.encoders import load_encoder, model_folder
+from langsplat_core.semantics.encoders import load_encoder, model_path
 
 pytestmark = pytest.mark.long
 
@@ -247,7 +247,7 @@ def test_calibration_moves_the_canonical_phrases_only(tmp_path):
 @pytest.fixture(scope="module")
 def bundled():
     try:
-        model_folder("demo", "--encoder")
+        model_path("demo", "--encoder")
     except EncoderError:
         pytest.skip("the bundled demo encoder is not there")
     return load_encoder("demo", "cpu")

@@ -1,0 +1,388 @@
+"""Weights in the layouts of open_clip, OpenAI's CLIP and segment_anything, renamed to those of transformers.
+
+What a model is made of follows from the shapes of its tensors; an open_clip_config.json beside them says
+what shapes do not: the heads, and which GELU. Without one, CLIP's heads are 64 wide, those for pictures at
+most 16, as in the models that OpenAI and open_clip published; and the GELU is OpenAI's quick one where the
+file holds OpenAI's `input_resolution` too or has "quickgelu" or "openai" in its name, else the exact one.
+"""
+
+import io
+import json
+import pickletools
+import re
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from langsplat_core.errors import EncoderError
+from langsplat_core.semantics.weights import (
+    OPEN_CLIP,
+    OPEN_CLIP_CONFIG,
+    UNREADABLE,
+    Converted,
+    Weights,
+    is_hugging_face,
+    loading_errors,
+)
+
+Tensors = Mapping[str, Any]  # name -> torch.Tensor
+Settings = dict[str, Any]
+
+KNOWN = (
+    "neither CLIP's (ViT) by open_clip or OpenAI nor SAM's (ViT) by segment_anything; for another model pass "
+    "a folder or hub id in Hugging Face layout"
+)
+HEAD_WIDTH, MOST_HEADS = 64, 16
+SAM_HEADS = 8  # of the mask decoder, which no shape tells
+NOT_OURS = "open_clip's {part} states {name} {value!r}, which is not computed here"
+
+WHOLE = {
+    "logit_scale": "logit_scale",
+    "token_embedding.weight": "text_model.embeddings.token_embedding.weight",
+    "positional_embedding": "text_model.embeddings.position_embedding.weight",
+    "visual.class_embedding": "vision_model.embeddings.class_embedding",
+    "visual.conv1.weight": "vision_model.embeddings.patch_embedding.weight",
+    "visual.positional_embedding": "vision_model.embeddings.position_embedding.weight",
+}
+NORMS = {
+    "ln_final": "text_model.final_layer_norm",
+    "visual.ln_pre": "vision_model.pre_layrnorm",  # as transformers spells it
+    "visual.ln_post": "vision_model.post_layernorm",
+}
+TRANSPOSED = {"text_projection": "text_projection.weight", "visual.proj": "visual_projection.weight"}
+OPENAI = {"input_resolution", "context_length", "vocab_size"}  # numbers beside OpenAI's weights
+UNUSED = OPENAI | {"attn_mask"}
+BLOCK = re.compile(r"(visual\.)?transformer\.resblocks\.(\d+)\.(ln_1|ln_2|attn|mlp)[._](.+)")
+IN_BLOCK = {
+    **{f"ln_{number} {part}": f"layer_norm{number}.{part}" for number in "12" for part in ("weight", "bias")},
+    **{f"attn out_proj.{part}": f"self_attn.out_proj.{part}" for part in ("weight", "bias")},
+    **{f"mlp c_fc.{part}": f"mlp.fc1.{part}" for part in ("weight", "bias")},
+    **{f"mlp c_proj.{part}": f"mlp.fc2.{part}" for part in ("weight", "bias")},
+}
+STATED = {  # settings of open_clip_config.json that are read or follow from the shapes
+    "model_cfg": {"embed_dim", "vision_cfg", "text_cfg", "quick_gelu", "custom_text", "init_logit_scale"},
+    "vision_cfg": {"image_size", "patch_size", "width", "layers", "head_width", "mlp_ratio", "patch_dropout"},
+    "text_cfg": {"context_length", "vocab_size", "width", "layers", "heads", "mlp_ratio"},
+}
+USUAL: tuple[object, ...] = (
+    None,
+    False,
+    0,
+    "",
+    {},
+    "tok",
+    "argmax",
+    "linear",
+)  # what other settings may be without any effect
+
+SAM_NAMES = tuple(
+    (re.compile(pattern), name)
+    for pattern, name in (
+        (r"^image_encoder\.", "vision_encoder."),
+        (r"\.blocks\.", ".layers."),
+        (r"\.patch_embed\.proj\.", ".patch_embed.projection."),
+        (r"\.norm(\d|_final_attn)\.", r".layer_norm\1."),
+        (r"\.neck\.0\.", ".neck.conv1."),
+        (r"\.neck\.1\.", ".neck.layer_norm1."),
+        (r"\.neck\.2\.", ".neck.conv2."),
+        (r"\.neck\.3\.", ".neck.layer_norm2."),
+        (r"\.pe_layer\.positional_encoding_gaussian_matrix$", ".shared_embedding.positional_embedding"),
+        (r"\.point_embeddings\.", ".point_embed."),
+        (r"\.mask_downscaling\.0\.", ".mask_embed.conv1."),
+        (r"\.mask_downscaling\.1\.", ".mask_embed.layer_norm1."),
+        (r"\.mask_downscaling\.3\.", ".mask_embed.conv2."),
+        (r"\.mask_downscaling\.4\.", ".mask_embed.layer_norm2."),
+        (r"\.mask_downscaling\.6\.", ".mask_embed.conv3."),
+        (r"\.output_upscaling\.0\.", ".upscale_conv1."),
+        (r"\.output_upscaling\.1\.", ".upscale_layer_norm."),
+        (r"\.output_upscaling\.3\.", ".upscale_conv2."),
+        (r"(_head|_mlps\.\d)\.layers\.0\.", r"\1.proj_in."),
+        (r"(_head|_mlps\.\d)\.layers\.1\.", r"\1.layers.0."),
+        (r"(_head|_mlps\.\d)\.layers\.2\.", r"\1.proj_out."),
+    )
+)
+SAM_GRID = "prompt_encoder.shared_embedding.positional_embedding"
+
+
+def open_weights(id: str, path: Path, device: str) -> Weights:
+    """The weights at `path`, a folder or a file that `weights.weights_path` found.
+
+    Raises EncoderError for a file that is damaged, or holds no tensors of a layout known here.
+    """
+    if path.is_dir() and is_hugging_face(path):
+        return Weights(id, path, device)
+    file = path if path.is_file() else next(path / name for name in OPEN_CLIP if (path / name).is_file())
+    with loading_errors(id, "CLIP or SAM"):
+        tensors = _read(id, file)
+        if "image_encoder.pos_embed" in tensors:
+            converted = Converted(_sam_config(tensors), _sam_tensors(tensors), {})
+        elif "visual.class_embedding" in tensors:
+            converted = _clip(file, tensors)
+        else:
+            raise EncoderError(f"{id}: its tensors, such as {next(iter(tensors), 'none')}, are {KNOWN}")
+    return Weights(id, file.parent, device, converted)
+
+
+def _read(id: str, file: Path) -> Tensors:
+    """The tensors of a file, without the wrappings of a training's checkpoint; none of its code is run."""
+    import torch
+    from safetensors.torch import load_file
+
+    if file.suffix == ".safetensors":
+        return load_file(file)
+    zipped = zipfile.is_zipfile(file)  # files of PyTorch before 1.6 are none, and cannot be mapped
+    if zipped and any(name.endswith("/constants.pkl") for name in zipfile.ZipFile(file).namelist()):
+        try:
+            found: Any = _script_tensors(file)
+        except UNREADABLE as error:
+            raise EncoderError(
+                f"{id}: a TorchScript archive that is damaged or whose code would have to be run; pass the "
+                "same weights in another layout, such as the hub id openai/clip-vit-base-patch16"
+            ) from error
+    else:
+        found = torch.load(file, map_location="cpu", weights_only=True, mmap=zipped)
+    found = found.get("state_dict", found.get("model", found)) if isinstance(found, dict) else {}
+    if not isinstance(found, dict):
+        raise ValueError("it holds no named tensors")
+    if any(
+        tensor.nbytes > file.stat().st_size for tensor in found.values() if isinstance(tensor, torch.Tensor)
+    ):
+        raise ValueError("a tensor claims more numbers than the file holds")
+    names = {
+        name: name.removeprefix("module.").removeprefix("text.") for name in found if isinstance(name, str)
+    }
+    return {names[name]: found[name] for name in names if isinstance(found[name], torch.Tensor)}
+
+
+class _Module:
+    """Stands for every class of a TorchScript archive: its attributes, and none of its code."""
+
+    parts: Mapping[Any, Any] = MappingProxyType({})
+
+    def __setstate__(self, state: Any) -> None:
+        self.parts = state if isinstance(state, dict) else {}
+
+
+def _script_tensors(file: Path) -> dict[str, Any]:
+    """The tensors of a TorchScript archive, as OpenAI publishes CLIP, by their modules' names.
+
+    torch reads such an archive only by running it, so what holds the tensors is put into one of its own.
+    """
+    import torch
+
+    copy = io.BytesIO()
+    with zipfile.ZipFile(file) as archive, zipfile.ZipFile(copy, "w") as plain:
+        for entry in archive.infolist():
+            _, _, name = entry.filename.partition("/")
+            if name in ("data.pkl", "version", "byteorder") or name.startswith("data/"):
+                if entry.compress_type != zipfile.ZIP_STORED:
+                    raise ValueError("torch compresses nothing")
+                plain.writestr(f"archive/{name}", archive.read(entry))
+        pickled = plain.read("archive/data.pkl")
+    named = (str(argument) for code, argument, _ in pickletools.genops(pickled) if code.name == "GLOBAL")
+    classes = {name.replace(" ", ".", 1) for name in named if name.startswith("__torch__.")}
+    copy.seek(0)
+    with torch.serialization.safe_globals([(_Module, name) for name in sorted(classes)]):
+        waiting = [("", torch.load(copy, map_location="cpu", weights_only=True))]
+    found: dict[str, Any] = {}
+    seen: set[int] = set()  # a part may hold itself
+    while waiting:
+        prefix, module = waiting.pop()
+        if isinstance(module, _Module) and id(module) not in seen:
+            seen.add(id(module))
+            waiting += [(f"{prefix}{name}.", part) for name, part in module.parts.items()]
+        elif isinstance(module, torch.Tensor):
+            found[prefix[:-1]] = module
+    return found
+
+
+def _clip(file: Path, tensors: Tensors) -> Converted:
+    stated = _stated(file.parent / OPEN_CLIP_CONFIG)
+    config = _clip_config(tensors)
+    if stated:
+        model = stated["model_cfg"]
+        _check(model, config)
+        quick = bool(model.get("quick_gelu", False))
+        config["vision_config"]["num_attention_heads"] = config["vision_config"]["hidden_size"] // int(
+            model["vision_cfg"].get("head_width", HEAD_WIDTH)
+        )
+        config["text_config"]["num_attention_heads"] = int(model["text_cfg"].get("heads", 8))
+    else:
+        named = file.name.lower().replace("_", "").replace("-", "")
+        quick = tensors.keys() >= OPENAI or "quickgelu" in named or "openai" in named
+    for half in ("text_config", "vision_config"):
+        config[half]["hidden_act"] = "quick_gelu" if quick else "gelu"
+    pixels = stated.get("preprocess_cfg") or {}
+    statistics = {f"image_{name}": pixels[name] for name in ("mean", "std") if name in pixels}
+    return Converted(config, _clip_tensors(tensors), statistics)
+
+
+def _stated(path: Path) -> Settings:
+    """What open_clip_config.json says; nothing where there is none."""
+    if not path.is_file():
+        return {}
+    try:
+        stated: Settings = json.loads(path.read_text(encoding="utf-8"))
+        parts = [stated["model_cfg"], stated["model_cfg"]["vision_cfg"], stated["model_cfg"]["text_cfg"]]
+        if all(isinstance(part, dict) for part in parts):
+            return stated
+    except (ValueError, LookupError, TypeError):
+        pass
+    raise ValueError(f"{path.name} states no model_cfg with vision_cfg and text_cfg")
+
+
+def _clip_config(tensors: Tensors) -> Settings:
+    """What the shapes tell, as a config.json of transformers would."""
+    words, wide = _shape(tensors, "token_embedding.weight", 2)
+    channels, _, patch, _ = _shape(tensors, "visual.conv1.weight", 4)
+    positions, _ = _shape(tensors, "visual.positional_embedding", 2)
+    first = "transformer.resblocks.0.mlp.c_fc.weight"
+    text = {
+        "vocab_size": words,
+        "hidden_size": wide,
+        "intermediate_size": _shape(tensors, first, 2)[0],
+        "num_hidden_layers": _count(tensors, r"transformer\.resblocks\.(\d+)\."),
+        "num_attention_heads": wide // HEAD_WIDTH,
+        "max_position_embeddings": _shape(tensors, "positional_embedding", 2)[0],
+        "eos_token_id": 2,  # to transformers: the end is the token with the highest number, as in open_clip
+    }
+    vision = {
+        "image_size": patch * round((positions - 1) ** 0.5),
+        "patch_size": patch,
+        "hidden_size": channels,
+        "intermediate_size": _shape(tensors, f"visual.{first}", 2)[0],
+        "num_hidden_layers": _count(tensors, r"visual\.transformer\.resblocks\.(\d+)\."),
+        "num_attention_heads": min(channels // HEAD_WIDTH, MOST_HEADS),
+    }
+    size = _shape(tensors, "text_projection", 2)[1]
+    return {"model_type": "clip", "projection_dim": size, "text_config": text, "vision_config": vision}
+
+
+def _check(model: Settings, config: Settings) -> None:
+    """Raise ValueError where open_clip_config.json asks for another network than is computed here, or states
+    other numbers than the tensors have."""
+    text, vision = config["text_config"], config["vision_config"]
+    for part in STATED:
+        settings = model if part == "model_cfg" else model[part]
+        for name, value in settings.items():
+            if name not in STATED[part] and value not in USUAL:
+                raise ValueError(NOT_OURS.format(part=part, name=name, value=value))
+    found = {
+        ("vision_cfg", "image_size"): vision["image_size"],
+        ("vision_cfg", "patch_size"): vision["patch_size"],
+        ("vision_cfg", "width"): vision["hidden_size"],
+        ("vision_cfg", "layers"): vision["num_hidden_layers"],
+        ("text_cfg", "context_length"): text["max_position_embeddings"],
+        ("text_cfg", "vocab_size"): text["vocab_size"],
+        ("text_cfg", "width"): text["hidden_size"],
+        ("text_cfg", "layers"): text["num_hidden_layers"],
+    }
+    for (part, name), number in found.items():
+        if model[part].get(name, number) != number:
+            raise ValueError(
+                f"{OPEN_CLIP_CONFIG} states {name} {model[part][name]}, the tensors have {number}"
+            )
+
+
+def _clip_tensors(tensors: Tensors) -> dict[str, Any]:
+    renamed: dict[str, Any] = {}
+    for name, tensor in tensors.items():
+        stem, _, leaf = name.rpartition(".")
+        if name in WHOLE:
+            renamed[WHOLE[name]] = tensor
+        elif stem in NORMS:
+            renamed[f"{NORMS[stem]}.{leaf}"] = tensor
+        elif name in TRANSPOSED:
+            renamed[TRANSPOSED[name]] = tensor.T
+        elif block := BLOCK.fullmatch(name):
+            renamed |= _block(name, block, tensor)
+        elif name not in UNUSED:
+            raise ValueError(f"{name} is no tensor of a CLIP with a vision transformer")
+    return renamed
+
+
+def _block(name: str, found: re.Match[str], tensor: Any) -> dict[str, Any]:
+    """The tensors of a layer that one of open_clip's is: queries, keys and values are one there."""
+    layer = f"{'vision' if found[1] else 'text'}_model.encoder.layers.{found[2]}."
+    if found[4].startswith("in_proj_"):
+        part = found[4].removeprefix("in_proj_")
+        return {
+            f"{layer}self_attn.{role}_proj.{part}": third
+            for role, third in zip("qkv", tensor.chunk(3), strict=True)
+        }
+    inner = f"{found[3]} {found[4]}"
+    if inner not in IN_BLOCK:
+        raise ValueError(f"{name} is no tensor of a CLIP with a vision transformer")
+    return {f"{layer}{IN_BLOCK[inner]}": tensor}
+
+
+def _sam_tensors(tensors: Tensors) -> dict[str, Any]:
+    renamed = {}
+    for old, tensor in tensors.items():
+        name = old
+        for pattern, by in SAM_NAMES:
+            name = pattern.sub(by, name)
+        renamed[name] = tensor
+    renamed["shared_image_embedding.positional_embedding"] = renamed[SAM_GRID]
+    return renamed
+
+
+def _sam_config(tensors: Tensors) -> Settings:
+    """What the shapes tell, as a config.json of transformers would."""
+    _, grid, _, wide = _shape(tensors, "image_encoder.pos_embed", 4)
+    patch = _shape(tensors, "image_encoder.patch_embed.proj.weight", 4)[2]
+    layers = _count(tensors, r"image_encoder\.blocks\.(\d+)\.")
+    reach = [_shape(tensors, f"image_encoder.blocks.{n}.attn.rel_pos_h", 2) for n in range(layers)]
+    everywhere = [n for n, (rows, _) in enumerate(reach) if rows == 2 * grid - 1]
+    windows = [(rows + 1) // 2 for n, (rows, _) in enumerate(reach) if n not in everywhere]
+    tokens, size = _shape(tensors, "mask_decoder.mask_tokens.weight", 2)
+    decoder = "mask_decoder.transformer.layers.0."
+    narrow = _shape(tensors, f"{decoder}cross_attn_token_to_image.q_proj.weight", 2)[0]
+    vision = {
+        "image_size": grid * patch,
+        "patch_size": patch,
+        "hidden_size": wide,
+        "num_hidden_layers": layers,
+        "num_attention_heads": wide // reach[0][1],
+        "mlp_dim": _shape(tensors, "image_encoder.blocks.0.mlp.lin1.weight", 2)[0],
+        "output_channels": _shape(tensors, "image_encoder.neck.0.weight", 4)[0],
+        "window_size": windows[0] if windows else 0,
+        "global_attn_indexes": everywhere,
+        "num_pos_feats": _shape(tensors, "prompt_encoder.pe_layer.positional_encoding_gaussian_matrix", 2)[1],
+    }
+    prompts = {
+        "hidden_size": size,
+        "image_size": grid * patch,
+        "patch_size": patch,
+        "image_embedding_size": grid,
+        "mask_input_channels": _shape(tensors, "prompt_encoder.mask_downscaling.3.weight", 4)[0],
+    }
+    masks = {
+        "hidden_size": size,
+        "mlp_dim": _shape(tensors, f"{decoder}mlp.lin1.weight", 2)[0],
+        "num_hidden_layers": _count(tensors, r"mask_decoder\.transformer\.layers\.(\d+)\."),
+        "num_attention_heads": SAM_HEADS,
+        "attention_downsample_rate": size // narrow,
+        "num_multimask_outputs": tokens - 1,
+        "iou_head_hidden_dim": _shape(tensors, "mask_decoder.iou_prediction_head.layers.0.weight", 2)[0],
+    }
+    return {
+        "model_type": "sam",
+        "vision_config": vision,
+        "prompt_encoder_config": prompts,
+        "mask_decoder_config": masks,
+    }
+
+
+def _shape(tensors: Tensors, name: str, axes: int) -> tuple[int, ...]:
+    found = tensors.get(name)
+    if found is None or found.ndim != axes or not found.numel():
+        raise ValueError(f"no {name} of {axes} axes among the tensors")
+    return tuple(found.shape)
+
+
+def _count(tensors: Tensors, pattern: str) -> int:
+    """How many numbers the names have that begin with `pattern`."""
+    return len({found[1] for found in map(re.compile(pattern).match, tensors) if found})

@@ -1,0 +1,332 @@
+"""Weights in the layouts of open_clip, OpenAI and segment_anything, against open_clip's arithmetic and
+against the same weights in Hugging Face layout."""
+
+import json
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+from transformers import CLIPTokenizer
+
+from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
+from langsplat_core.semantics.families.clip import CLIP_MEAN, CLIP_STD
+from langsplat_core.semantics.segmenters import load_segmenter
+from tests.semantics.test_hostile_weights import Runs
+from tests.support.other_layouts import (
+    SIDE,
+    Tensors,
+    letter_tokenizer,
+    open_clip_config,
+    open_clip_tensors,
+    plain_pictures,
+    plain_texts,
+    segment_anything_tensors,
+)
+from tests.support.tiny_clip import tiny_clip
+from tests.support.tiny_sam import tiny_sam
+
+pytestmark = pytest.mark.long  # transformers alone takes seconds to load
+PHRASES = ["red mug", "a", "handle"]
+CONFIG = "open_clip_config.json"
+Case = tuple[Path, int, int, bool, Any]  # what to load, heads of pictures and of text, quick GELU, config
+
+
+def crops() -> np.ndarray:
+    return np.random.default_rng(2).integers(0, 256, (3, SIDE, SIDE, 3), dtype=np.uint8)
+
+
+def with_config(folder: Path, heads: int, head_width: int, quick: bool) -> Any:
+    config = open_clip_config(heads, head_width, quick)
+    (folder / CONFIG).write_text(json.dumps(config), encoding="utf-8")
+    return config
+
+
+def hub_folder(folder: Path, tensors: Tensors) -> Case:
+    torch.save(tensors, folder / "open_clip_pytorch_model.bin")
+    return folder, 4, 8, False, with_config(folder, 8, 32, quick=False)
+
+
+def hub_folder_of_safetensors(folder: Path, tensors: Tensors) -> Case:
+    save_file(
+        {name: tensor.contiguous() for name, tensor in tensors.items()},
+        folder / "open_clip_model.safetensors",
+    )
+    return folder, 2, 4, True, with_config(folder, 4, 64, quick=True)
+
+
+def text_apart(folder: Path, tensors: Tensors) -> Case:
+    halves = {
+        name if name.startswith(("visual", "logit")) else f"text.{name}": t for name, t in tensors.items()
+    }
+    torch.save(halves, folder / "open_clip_pytorch_model.bin")
+    config = with_config(folder, 4, 64, quick=False)
+    config["model_cfg"] |= {"custom_text": True}
+    config["model_cfg"]["vision_cfg"] |= {"pool_type": "tok", "ls_init_value": None}
+    (folder / CONFIG).write_text(json.dumps(config), encoding="utf-8")
+    return folder, 2, 4, False, config
+
+
+def training_checkpoint(folder: Path, tensors: Tensors) -> Case:
+    state = {f"module.{name}": tensor for name, tensor in tensors.items()}
+    torch.save({"epoch": 3, "state_dict": state, "optimizer": {"state": {}}}, folder / "epoch_3.pt")
+    return folder / "epoch_3.pt", 2, 2, False, None
+
+
+def quick_by_name(folder: Path, tensors: Tensors) -> Case:
+    path = folder / "vit_b_16-quickgelu-laion400m.safetensors"
+    save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, path)
+    return path, 2, 2, True, None
+
+
+def openai_state(folder: Path, tensors: Tensors) -> Case:
+    numbers = {"input_resolution": SIDE, "context_length": 20, "vocab_size": 54}
+    torch.save(tensors | {name: torch.tensor(n) for name, n in numbers.items()}, folder / "ViT.bin")
+    return folder / "ViT.bin", 2, 2, True, None
+
+
+def openai_script(folder: Path, tensors: Tensors) -> Case:
+    """As OpenAI publishes them: a TorchScript archive of modules with parameters and three numbers."""
+    root = torch.nn.Module()
+    for name, tensor in tensors.items():
+        *path, leaf = name.split(".")
+        module = root
+        for part in path:
+            if not hasattr(module, part):
+                module.add_module(part, torch.nn.Module())
+            module = getattr(module, part)
+        module.register_parameter(leaf, torch.nn.Parameter(tensor, requires_grad=False))
+    for number in ("input_resolution", "context_length", "vocab_size"):
+        root.register_buffer(number, torch.tensor(3))
+    torch.jit.script(root).save(folder / "ViT-B-16.pt")
+    return folder / "ViT-B-16.pt", 2, 2, True, None
+
+
+LAYOUTS = [
+    pytest.param(openai_script, marks=pytest.mark.filterwarnings("ignore::DeprecationWarning")),
+    *(hub_folder, hub_folder_of_safetensors, text_apart),
+    *(training_checkpoint, quick_by_name, openai_state),
+]
+
+
+def compare(case: Case, tensors: Tensors, tolerance: float = 1e-5) -> None:
+    """Both halves of what `case` loads against open_clip's arithmetic."""
+    path, vision_heads, text_heads, quick, config = case
+    encoder = load_encoder(str(path), "cpu")
+    assert (encoder.id, encoder.image_size, encoder.dim) == (str(path), SIDE, 24)
+    stated = config["preprocess_cfg"] if config else {"mean": CLIP_MEAN, "std": CLIP_STD}
+    pixels = (crops() / 255 - np.array(stated["mean"])) / np.array(stated["std"])
+    given = torch.from_numpy(pixels.transpose(0, 3, 1, 2).astype(np.float32))
+    pictures, texts = encoder.encode_images(crops()), encoder.encode_texts(PHRASES)
+    np.testing.assert_allclose(pictures, plain_pictures(tensors, given, vision_heads, quick), atol=tolerance)
+    np.testing.assert_allclose(texts, plain_texts(tensors, PHRASES, text_heads, quick), atol=tolerance)
+    other = plain_texts(tensors, PHRASES, text_heads, not quick)
+    assert abs(texts - other.numpy()).max() > 20 * tolerance  # so the kind of GELU was seen
+
+
+@pytest.mark.parametrize("write", LAYOUTS)
+def test_each_layout_of_clip_gives_the_vectors_of_open_clip(
+    write: Callable[[Path, Tensors], Case], tmp_path: Path
+) -> None:
+    tensors = open_clip_tensors()
+    letter_tokenizer(tmp_path, old=write is openai_state)
+    compare(write(tmp_path, tensors), tensors)
+
+
+def test_heads_of_a_wide_model_without_configuration(tmp_path: Path) -> None:
+    tensors = open_clip_tensors(vision=1280, layers=1, inner=8)  # as ViT-H-14: 16 heads of 80
+    letter_tokenizer(tmp_path)
+    torch.save(tensors, tmp_path / "quickgelu.pt")
+    compare((tmp_path / "quickgelu.pt", 16, 2, True, None), tensors)
+
+
+def test_what_lies_beside_does_not_stand_in_for_a_file(tmp_path: Path) -> None:
+    tensors = open_clip_tensors()
+    tiny_clip(tmp_path)  # another model, of which a tokenizer will be replaced
+    (tmp_path / "tokenizer.json").unlink()
+    letter_tokenizer(tmp_path)
+    compare(quick_by_name(tmp_path, tensors), tensors)
+    folder = load_encoder(str(tmp_path / "model.safetensors"), "cpu")  # a file of a folder is the folder
+    assert folder.image_size == load_encoder(str(tmp_path), "cpu").image_size == 32
+
+
+def test_without_its_tokenizer_a_clip_says_which_file_to_put_beside(tmp_path: Path) -> None:
+    path = training_checkpoint(tmp_path, open_clip_tensors())[0]
+    with pytest.raises(
+        EncoderError, match=r"put tokenizer\.json there.*openai/clip-vit-base-patch32"
+    ) as error:
+        load_text_encoder(str(path))
+    assert "\n" not in str(error.value)
+    tokens = {f"x{number}": number for number in range(60)} | {"<|startoftext|>": 60, "<|endoftext|>": 61}
+    CLIPTokenizer(vocab=tokens, merges=[]).save_pretrained(tmp_path)
+    with pytest.raises(EncoderError, match="has more tokens than the model's 58"):
+        load_text_encoder(str(path))
+
+
+@pytest.mark.parametrize(
+    ("typed", "plain"),
+    [
+        ("the cat’s mug", "the cat's mug"),
+        ("mug &amp;amp; bowl", "mug & bowl"),
+        ("of\ufb01ce   chair", "office chair"),
+        ("‘mug’", "'mug'"),
+    ],
+)
+def test_texts_are_cleaned_as_open_clip_does(typed: str, plain: str, tmp_path: Path) -> None:
+    letter_tokenizer(tmp_path)
+    encoder = load_text_encoder(str(training_checkpoint(tmp_path, open_clip_tensors())[0]))
+    got, want, other = (encoder.encode_texts([text])[0] for text in (typed, plain, "the cats mug"))
+    np.testing.assert_array_equal(got, want)
+    assert abs(want - other).max() > 1e-3  # so the marks are read
+
+
+@pytest.mark.parametrize("phrase", ["&nbsp;", "&amp;amp;"])
+def test_a_phrase_of_which_nothing_is_left_is_empty(phrase: str, tmp_path: Path) -> None:
+    letter_tokenizer(tmp_path)
+    encoder = load_text_encoder(str(training_checkpoint(tmp_path, open_clip_tensors())[0]))
+    with pytest.raises(InputError, match="empty phrase"):
+        encoder.encode_texts(["mug", phrase])
+
+
+def without(name: str) -> Callable[[Tensors], object]:
+    return lambda tensors: {key: tensor for key, tensor in tensors.items() if key != name}
+
+
+def replaced(name: str, by: torch.Tensor) -> Callable[[Tensors], object]:
+    return lambda tensors: tensors | {name: by}
+
+
+HOSTILE_CLIP = {
+    "no projection": without("visual.proj"),
+    "no projection of text": without("text_projection"),
+    "no bias": without("visual.transformer.resblocks.1.attn.in_proj_bias"),
+    "no norm": without("ln_final.weight"),
+    "a hole": lambda t: {k.replace("resblocks.0", "resblocks.7"): v for k, v in t.items()},
+    "a short norm": replaced("ln_final.bias", torch.zeros(5)),
+    "queries alone": replaced("transformer.resblocks.0.attn.in_proj_weight", torch.zeros(128, 128)),
+    "a scalar": replaced("transformer.resblocks.0.attn.in_proj_weight", torch.tensor(1.0)),
+    "a flat patch": replaced("visual.conv1.weight", torch.zeros(128)),
+    "empty": replaced("token_embedding.weight", torch.zeros(0, 128)),
+    "a tensor too many": replaced("visual.conv1.bias", torch.zeros(128)),
+    "another network": lambda t: (
+        {"visual.trunk.blocks.0.norm1.weight": torch.zeros(3)} | without("visual.proj")(t)
+    ),
+    "nothing": lambda t: {},
+    "a list": lambda t: list(t.values()),
+    "a number for its state": lambda t: {"state_dict": 5},
+    "more than the file": lambda t: t | {"positional_embedding": torch.zeros(1).expand(1 << 40, 128)},
+    "a name that is none": lambda t: {5: torch.zeros(3)},
+}
+HOSTILE_SAM = {
+    "SAM-HQ": replaced("mask_decoder.hf_token.weight", torch.zeros(1, 16)),
+    "SAM 2": lambda t: {"model": {"image_encoder.trunk.pos_embed": torch.zeros(1)}},
+    "MobileSAM": lambda t: {"image_encoder.patch_embed.seq.0.c.weight": torch.zeros(1)},
+    "no grid": without("prompt_encoder.pe_layer.positional_encoding_gaussian_matrix"),
+    "no reach": without("image_encoder.blocks.1.attn.rel_pos_h"),
+    "no head": without("mask_decoder.iou_prediction_head.layers.2.weight"),
+    "a short norm": replaced("image_encoder.neck.1.weight", torch.zeros(5)),
+}
+
+
+def refusal(load: Callable[[str], object], path: Path) -> str:
+    with pytest.raises(EncoderError) as error:
+        load(str(path))
+    said = str(error.value)
+    assert "\n" not in said
+    assert len(said) < 420
+    assert said.startswith(str(path))
+    return said
+
+
+@pytest.mark.parametrize("case", HOSTILE_CLIP)
+def test_tensors_that_are_no_clip_are_one_line(case: str, tmp_path: Path) -> None:
+    letter_tokenizer(tmp_path)
+    torch.save(HOSTILE_CLIP[case](open_clip_tensors()), tmp_path / "model.pt")
+    refusal(load_encoder, tmp_path / "model.pt")
+
+
+@pytest.mark.parametrize("case", HOSTILE_SAM)
+def test_tensors_that_are_no_sam_are_one_line(case: str, tmp_path: Path) -> None:
+    tensors = segment_anything_tensors(tiny_sam(tmp_path, decoder_heads=8))
+    torch.save(HOSTILE_SAM[case](tensors), tmp_path / "sam.pth")
+    refusal(load_segmenter, tmp_path / "sam.pth")
+
+
+@pytest.mark.parametrize("load", [load_encoder, load_segmenter])
+def test_damaged_files_are_one_line_and_run_nothing(load: Callable[[str], object], tmp_path: Path) -> None:
+    whole = tmp_path / "whole.pt"
+    torch.save(open_clip_tensors(), whole)
+    for name, content in (("a.pt", whole.read_bytes()[:-900]), ("b.pth", b""), ("c.safetensors", b"\x08{}")):
+        (tmp_path / name).write_bytes(content)
+        refusal(load, tmp_path / name)
+    torch.save(open_clip_tensors() | {"logit_scale": Runs(tmp_path / "ran")}, whole)
+    assert "a pickle that holds more than tensors" in refusal(load, whole)
+    assert not (tmp_path / "ran").exists()
+    script = tmp_path / "ViT-B-16.pt"
+    for content in (b"", pickle.dumps({"visual": Runs(tmp_path / "ran")}, 2)):
+        for packed in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            with zipfile.ZipFile(script, "w", packed) as archive:
+                for part in ("data.pkl", "version", "constants.pkl", "code/__torch__.py"):
+                    archive.writestr(f"ViT-B-16/{part}", content if part == "data.pkl" else b"3")
+            assert "openai/clip-vit-base-patch16" in refusal(load, script)
+    assert not (tmp_path / "ran").exists()
+
+
+def stating(part: str, **settings: object) -> Callable[[Any], Any]:
+    return lambda config: config["model_cfg"][part].update(settings) or config
+
+
+HOSTILE_CONFIGS = {
+    "other width": stating("vision_cfg", width=64),
+    "more layers": stating("text_cfg", layers=3),
+    "timm": stating("vision_cfg", timm_model_name="vit_base"),
+    "other pooling": stating("text_cfg", pool_type="last"),
+    "no heads": stating("vision_cfg", head_width=0),
+    "heads that do not divide": stating("text_cfg", heads=7),
+    "no text": lambda config: {"model_cfg": {"vision_cfg": {}}},
+    "a list": lambda config: [],
+    "a captioner": lambda config: {"model_cfg": config["model_cfg"] | {"multimodal_cfg": {"width": 8}}},
+    "two colours": lambda config: config | {"preprocess_cfg": {"mean": [0, 0]}},
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE_CONFIGS)
+def test_a_configuration_of_another_model_is_one_line(case: str, tmp_path: Path) -> None:
+    letter_tokenizer(tmp_path)
+    config = hub_folder(tmp_path, open_clip_tensors())[-1]
+    (tmp_path / CONFIG).write_text(json.dumps(HOSTILE_CONFIGS[case](config)), encoding="utf-8")
+    refusal(load_encoder, tmp_path)
+
+
+def test_a_file_of_segment_anything_answers_as_the_folder_does(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    tensors = segment_anything_tensors(tiny_sam(tmp_path / "folder", decoder_heads=8))
+    torch.save(tensors, tmp_path / "sam_vit_b_01ec64.pth")
+    image = np.random.default_rng(3).integers(0, 256, (48, 80, 3), dtype=np.uint8)
+    points = np.array([[5, 7], [60, 40]], np.float32)
+    with torch.inference_mode():
+        (got, masks), (want, folder_masks) = (
+            load_segmenter(str(tmp_path / name), "cpu").look(image).ask(points)
+            for name in ("sam_vit_b_01ec64.pth", "folder")
+        )
+    torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(masks, folder_masks, rtol=1e-5, atol=1e-5)
+    assert masks.std() > 0.01
+    assert (masks[0] - masks[1]).abs().max() > 0.01
+
+
+def test_a_file_is_never_a_hub_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("models").mkdir()
+    assert "no such file" in refusal(load_segmenter, Path("models/sam_vit_h_4b8939.pth"))
+    for name in ("models/sam_vit_h_4b8939.pth", "models/sam"):
+        Path(name).write_bytes(b"PK\x03\x04")
+        said = refusal(load_segmenter, Path(name))
+        assert "hf download" not in said
+        assert "not CLIP or SAM weights" in said
