@@ -264,12 +264,14 @@ def test_changed_photographs_are_computed_again(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    dataset, work = tmp_path / "dataset", tmp_path / "work"
+    dataset.mkdir()
     for photo in (photos / "images").glob("*.png"):
-        (tmp_path / photo.name).write_bytes(photo.read_bytes())
-    _, work, _, _ = located
+        shutil.copy(photo, dataset)
+    shutil.copytree(located[1], work)
     monkeypatch.setattr(pycolmap, "extract_features", _never)
     with pytest.raises(AssertionError, match="computed again"):
-        load_capture(tmp_path, CONFIG, work)
+        load_capture(dataset, CONFIG, work)
 
 
 def known(count: int = VIEWS, size: tuple[int, int] = (320, 240)) -> Capture:
