@@ -66,16 +66,8 @@ STATED = {  # settings of open_clip_config.json that are read or follow from the
     "vision_cfg": {"image_size", "patch_size", "width", "layers", "head_width", "mlp_ratio", "patch_dropout"},
     "text_cfg": {"context_length", "vocab_size", "width", "layers", "heads", "mlp_ratio"},
 }
-USUAL: tuple[object, ...] = (
-    None,
-    False,
-    0,
-    "",
-    {},
-    "tok",
-    "argmax",
-    "linear",
-)  # what other settings may be without any effect
+# What other settings may be without any effect.
+USUAL: tuple[object, ...] = (None, False, 0, "", {}, "tok", "argmax", "linear")
 
 SAM_NAMES = tuple(
     (re.compile(pattern), name)

@@ -205,12 +205,9 @@ def loading_errors(id: str, kind: str) -> Iterator[None]:
             warnings.simplefilter("ignore")
             yield
     except (*UNREADABLE, SafetensorError, StrictDataclassError) as error:
-        strict = isinstance(
-            error, StrictDataclassError
-        )  # by which class, in the first line; why, in the last
-        lines = str(error.__cause__ or error if strict else error).strip().splitlines() or [
-            type(error).__name__
-        ]
+        # Its own text names the class that complains; why it does stands in its cause.
+        told = (error.__cause__ or error) if isinstance(error, StrictDataclassError) else error
+        lines = str(told).strip().splitlines() or [type(error).__name__]
         # torch's own words advise to run the file.
         pickled = isinstance(error, pickle.UnpicklingError) or "weights_only" in str(error)
         reason = "a pickle that holds more than tensors, which is not run" if pickled else lines[0][:200]
