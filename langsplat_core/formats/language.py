@@ -12,6 +12,8 @@ executed). Version 2, for N Gaussians, CLIP vectors of D numbers and P phrases:
     positions        uint64   (N,)       of the Gaussians that the field belongs to, see `packed_positions`
     corners          float32  (2, 3)     of the box of these positions
     canonical        float    (4, D)     unit text vectors of "object", "things", "stuff", "texture"
+    everyday         float    (V, D)     unit text vectors of phrases most of which name nothing in the scene;
+                                         absent where the encoder knows too few
     phrasebook       float    (P, D)     unit text vectors of `phrases`; absent when P = 0
     codec.*          float               of a codebook vectors (K, D) and colours (K, 3); basis (d, D) of a
                                          linear codec; of an autoencoder
@@ -29,8 +31,8 @@ executed). Version 2, for N Gaussians, CLIP vectors of D numbers and P phrases:
     phrases          JSON list of the P phrases
     temperature      of the softmax that reads this encoder's cosines, decimal
     found            relevancy from which a phrase counts as present, decimal
-    calibration      JSON: a list of numbers for each of the three `Odds` of `scene.Calibration`; absent where
-                     the encoder has none
+    odds             JSON: a list of numbers for each of the three `Odds` of `scene.Calibration`; absent where
+                     the encoder has none ("calibration" of older files is of another scale, and is not read)
 
 "float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
 like the one in memory. With a codebook as `langsplat train` makes it that is 22 bytes per Gaussian, 6 of
@@ -74,6 +76,7 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
         "confidence": field.confidence,
         "canonical": field.canonical,
         **({} if indexed else {"latents": field.latents}),
+        **({} if field.everyday is None else {"everyday": field.everyday}),
         **({"phrasebook": np.stack(list(field.phrasebook.values()))} if field.phrasebook else {}),
         **{CODEC + name: tensor for name, tensor in field.codec.tensors().items()},
     }
@@ -98,7 +101,7 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
     }
     if field.reading.calibration is not None:
         odds = astuple(field.reading.calibration)
-        metadata["calibration"] = json.dumps([[float(n) for n in numbers] for numbers in odds])
+        metadata["odds"] = json.dumps([[float(n) for n in numbers] for numbers in odds])
     with atomic_path(path) as temporary:
         save_tensors(temporary, tensors, metadata)
 

@@ -135,16 +135,16 @@ def _field(
         dict(zip(phrases, vectors, strict=True)),
         reading,
         tensors.get("things"),
+        tensors.get("everyday"),
     )
 
 
 def _calibration(metadata: dict[str, str], path: Path) -> Calibration | None:
-    if "calibration" not in metadata:
+    if "odds" not in metadata:
         return None
-    stated = parse_json(metadata["calibration"].encode(), path)
-    odds = [stated] * WAYS if _four(stated) else stated  # files of before parts had odds of their own
+    odds = parse_json(metadata["odds"].encode(), path)
     if not isinstance(odds, list) or len(odds) != WAYS or not all(map(_four, odds)):
-        raise FormatError(f"{path}: the header's 'calibration' is not {WAYS} lists of four numbers")
+        raise FormatError(f"{path}: the header's 'odds' are not {WAYS} lists of four numbers")
     return Calibration(*(Odds(*numbers) for numbers in odds))
 
 

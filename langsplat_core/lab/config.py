@@ -49,7 +49,10 @@ class BenchmarkConfig:
     steps: Count = 1_500  # of radiance training
     max_gaussians: Count = 50_000  # of a room
     masks: MaskOrigin = "truth"  # where outlines come from
-    encoder: str = "demo"  # "demo" for the bundled one, a folder, or a hub id
+    encoder: str = "demo"
+    """"demo" for the bundled one, a folder, a hub id, or clip-geometry:OWN[,ALIKE]: vectors made from truth
+    with the geometry of CLIP, OWN being the cosine of a picture with its words (0.22 to 0.32)."""
+    text_vectors: Path | None = None  # .npy of real text vectors for clip-geometry, names in a .txt beside it
     codec: CodecConfig = field(default_factory=CodecConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     cut: CutRule | Literal["regions"] = "regions"
@@ -120,6 +123,8 @@ class VerdictBenchConfig:
     """Of the rooms; never that of the bundled scene, nor 201 to 203, which calibrate the demo encoder."""
     masks: MaskOrigin = "truth"  # whose masks the fields are made of
     """Exact outlines, the same with 15 % wrong vectors, the weight-free segmenter's."""
+    encoder: str = "demo"  # as of `langsplat eval synthetic`
+    text_vectors: Path | None = None  # .npy of real text vectors for clip-geometry, names in a .txt beside it
     codec: CodecConfig = CodecConfig()  # noqa: RUF009 (frozen)
 
 

@@ -29,6 +29,7 @@ from langsplat_core.scene.codec import SHORTEST, latent_dtype
 from langsplat_core.scene.codec.codebook import LARGEST
 from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import load_text_encoder
+from langsplat_core.semantics.everyday import everyday_vectors
 from langsplat_core.training.language.codebook_fit import codeword_colours, rounded
 from langsplat_core.training.language.codec_fit import fit_codec
 from langsplat_core.training.language.relevancy_error import (
@@ -89,6 +90,7 @@ def import_scene(
         encoder_id=encoder.id,
         phrasebook=encoded_phrases(encoder, phrases),
         reading=encoder.reading,
+        everyday=everyday_vectors(encoder),
     )
     subpart, part, whole = confidence.mean(1).tolist() if confidence.size else (0.0, 0.0, 0.0)
     size = codec.index_size or codec.latent_dim

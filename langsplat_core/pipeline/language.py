@@ -42,6 +42,7 @@ from langsplat_core.scene import (
 from langsplat_core.scene.codec import latent_dtype
 from langsplat_core.scene.phrases import phrase_key
 from langsplat_core.semantics.encoder import Encoder, PhraseEncoder
+from langsplat_core.semantics.everyday import everyday_vectors
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.codec_fit import fit_codec
 from langsplat_core.training.language.gradient_lift import lift_by_gradient
@@ -88,6 +89,7 @@ def language_field(
         phrasebook=encoded_phrases(encoder, config.phrases),
         reading=encoder.reading,
         things=stages.things(),
+        everyday=everyday_vectors(encoder),
     )
     return field, report
 

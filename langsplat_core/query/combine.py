@@ -12,8 +12,9 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.chance import excess
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.extent import cut, to_margin
+from langsplat_core.query.extent import lowest
 from langsplat_core.query.places import locate
 from langsplat_core.query.surface import Surface
 from langsplat_core.scene import LEVELS
@@ -22,7 +23,7 @@ WHOLE = LEVELS.index("whole")
 SHARE = 0.6  # of the way from what is typical of a thing's least fitting surface to the part's peak on it
 LEAST = 0.05  # quantile of a part's relevancy on its thing that stands for "not this part"
 SPAN = 0.02  # of relevancy: the least distance that is divided
-SURE = 0.7  # of the best margin: what fits an unwanted name so well is what was meant
+SURE = 0.5  # of the way that an answer reaches: what fits an unwanted name so well is what was meant
 HALF = 0.5  # of the peak: what is less is no longer the place
 
 
@@ -59,14 +60,16 @@ def cut_inside(
     own_surface = thing.members & known[chosen]  # without what it touches, which may be anything
     low = float(np.quantile(even[chosen][own_surface], LEAST)) if own_surface.any() else peak
     members = inside & (even[chosen] > low + SHARE * max(peak - low, SPAN))
-    reading = engine.field.reading
-    probability, fits = thing.probability, True
-    subpart, part, whole = to_margin(np.array(peaks), reading.temperature).tolist()
-    margins = (subpart, part, whole)
-    if reading.calibration is not None and probability is not None:
-        odds = reading.calibration.inside
-        fits = odds.probability(margins) >= odds.found
-        probability = min(probability, odds.probability(margins))
+    subpart, part, whole = engine.scale.fit(np.array(peaks)).tolist()
+    fits, probability = (subpart, part, whole), thing.probability
+    right, above = True, None
+    if engine.calibration is not None and probability is not None:
+        odds = engine.calibration.inside
+        right = odds.probability(fits) >= odds.found
+        probability = min(probability, odds.probability(fits))
+    elif engine.chance is not None:
+        above = excess(fits, engine.chance_among(there), "inside", level)
+        right = above >= 0
     return replace(
         asked[0],
         level=chosen,
@@ -74,9 +77,10 @@ def cut_inside(
         relevancy=relevancy,
         even=even[chosen],
         peak=peak,
-        margins=margins,
+        fits=fits,
         probability=probability if members.any() else 0.0,
-        found=bool(members.any() and thing.found and fits),
+        excess=above,
+        found=bool(members.any() and thing.found and right),
         members=members,
     )
 
@@ -113,9 +117,9 @@ def without(what: QueryResult, unwanted: QueryResult) -> QueryResult:
 def surest(engine: QueryEngine, answer: QueryResult) -> QueryResult:
     """Those members alone that fit nearly as well as the best one does. A green mug may be in the answer to
     "red mug", for want of a better one; it is not what "not red mug" means."""
-    margins = to_margin(answer.even, engine.field.reading.temperature)
-    best = float(margins[answer.members].max(initial=-np.inf))
-    return replace(answer, members=answer.members & (margins >= cut(best, SURE)))
+    fits = engine.scale.fit(answer.even)
+    best = float(fits[answer.members].max(initial=-np.inf))
+    return replace(answer, members=answer.members & (fits >= lowest(best, SURE)))
 
 
 def _combined(

@@ -15,13 +15,15 @@ from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.formats.language import SUFFIX
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import AnswerRule, QueryResult, by_peak, by_regions
+from langsplat_core.query.chance import SAMPLED, Bars, Chance, Scale, chance_in
 from langsplat_core.query.instances import Instance, find_instances
 from langsplat_core.query.lookup import Lookup, build_lookup
 from langsplat_core.query.regions import Regions, build_regions
 from langsplat_core.query.surface import Surface, build_surface
 from langsplat_core.query.vocabulary import STOP_WORDS, check_names, only
-from langsplat_core.scene import CANONICAL_PHRASES, LanguageField, Scene
+from langsplat_core.scene import CANONICAL_PHRASES, Calibration, LanguageField, Scene
 from langsplat_core.scene.phrases import phrase_key, tidy
+from langsplat_core.semantics.everyday import everyday_vectors
 
 BATCH = 256  # phrases that are encoded, and compared with codewords, at a time
 SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them
@@ -66,10 +68,11 @@ class QueryEngine:
     ) -> None:
         """load_encoder: usually `semantics.encoders.load_text_encoder`; without one only the scene's own
         phrasebook can be asked. encoder_id: in place of the encoder that the scene names. exact: decode at
-        every Gaussian instead of looking up, 2 KB each, to measure the table by. rule: see `answers`."""
+        every Gaussian instead of looking up, 2 KB each, to measure the table by. rule: see `answers`;
+        "regions" becomes "peak" where neither scene nor encoder has everyday phrases to compare with."""
         self.scene = scene
         self.exact = exact
-        self.rule = rule
+        self._rule: AnswerRule = rule
         self._load_encoder = load_encoder
         self._encoder_id = encoder_id
         self._encoder: TextEncoder | None = None
@@ -85,9 +88,42 @@ class QueryEngine:
         field = self.scene.language
         if field is None:
             raise InputError(no_field(self.scene))
-        if self._canonical is None:
-            return field
-        return replace(field, canonical=self._canonical, reading=replace(field.reading, calibration=None))
+        return field if self._canonical is None else replace(field, canonical=self._canonical)
+
+    @property
+    def rule(self) -> AnswerRule:
+        """How answers are read."""
+        return "regions" if self.scale.everyday is not None else "peak"
+
+    @property
+    def scale(self) -> Scale:
+        """How cosines are read."""
+        field = self.field
+        return Scale(field.canonical, self._everyday, field.reading.temperature)
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """By which a probability is said; None where the encoder has none, and with other canonical phrases
+        than those it was fitted with."""
+        usual = self._canonical is None and self.rule == "regions"
+        return self.field.reading.calibration if usual else None
+
+    @cached_property
+    def _everyday(self) -> Array | None:
+        """The scene's own everyday phrases, else the encoder's; None where the rule needs none."""
+        if self._rule == "peak":
+            return None
+        stored = self.field.everyday
+        return stored if stored is not None else self._encoded_everyday()
+
+    def _encoded_everyday(self) -> Array | None:
+        try:
+            encoder = self.load_encoder()
+            self._check_encoder(encoder)
+            with self._turn:
+                return everyday_vectors(encoder)
+        except EncoderError:
+            return None
 
     def compare_with(self, phrases: Sequence[str] = (), progress: Progress = silent) -> None:
         """Take other canonical phrases (LERF, section 3.3: what everything is compared with) from now on;
@@ -98,7 +134,8 @@ class QueryEngine:
         canonical = self.text_vectors(phrases, progress) if phrases else None
         self._canonical = canonical
         self.canonical_phrases = tuple(map(phrase_key, phrases)) or CANONICAL_PHRASES
-        self.__dict__.pop("_lookup", None)
+        for made in ("_lookup", "chance", "_bars"):
+            self.__dict__.pop(made, None)
 
     @property
     def encoder(self) -> TextEncoder:
@@ -133,7 +170,27 @@ class QueryEngine:
 
     @cached_property
     def _lookup(self) -> Lookup:
-        return build_lookup(self.field, self.exact)
+        return build_lookup(self.field, self.scale, self.exact)
+
+    @cached_property
+    def chance(self) -> Chance | None:
+        """What everyday phrases fit in the scene; None where there are none."""
+        everyday = self.scale.everyday
+        if everyday is None:
+            return None
+        some = everyday[np.unique(np.linspace(0, len(everyday) - 1, SAMPLED).astype(np.int64))]
+        return chance_in(self.field, self.surface, self.regions, self.scale, self._relevancies(some))
+
+    @cached_property
+    def _bars(self) -> Bars | None:
+        return None if self.chance is None else self.chance.bars()
+
+    def chance_among(self, members: Array) -> Bars:
+        """What the best fits of everyday phrases are at the regions of some Gaussians, (N,) bool."""
+        assert self.chance is not None
+        everywhere = self.regions.everywhere[:, members]
+        subpart, part, whole = (np.unique(row[row >= 0]) for row in everywhere)
+        return self.chance.bars((subpart, part, whole))
 
     def unknown_words(self, phrase: str) -> tuple[str, ...]:
         """Words for which `phrase` cannot be asked; none where the phrasebook has it. EncoderError as
@@ -251,10 +308,12 @@ class QueryEngine:
         return results
 
     def _answer(self, phrase: str, relevancy: Array, level: LevelChoice) -> QueryResult:
-        reading = self.field.reading
-        if self.rule == "peak":
-            return by_peak(phrase, relevancy, self.surface, reading, level)
-        return by_regions(phrase, relevancy, self.surface, self.regions, reading, level)
+        if self._bars is None:
+            found = self.field.reading.found
+            return by_peak(phrase, relevancy, self.surface, self.scale, found, level)
+        return by_regions(
+            phrase, relevancy, self.surface, self.regions, self.scale, self._bars, self.calibration, level
+        )
 
     def evened(self, relevancy: Array) -> Array:
         """(3, N) relevancy -> the same, of every region its mean; of what is off the surface its own."""

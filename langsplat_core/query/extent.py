@@ -1,8 +1,8 @@
 """How far an answer reaches: its level, the regions that are it, and how good the best one is.
 
-Everything is judged by the margin of a region, its cosine with the phrase minus that with the nearest
-canonical phrase: relevancy without its temperature, so that one rule fits all encoders of one family. Shares
-and differences were chosen on the rooms that the demo encoder is calibrated on, never on those that measure.
+Everything is judged by the fit of a region, in spreads of what phrases fit by chance (`chance`), so that one
+rule serves all encoders. The numbers were chosen on rooms 201 to 203, with the bundled encoder and with the
+geometry of CLIP, never on rooms that measure.
 """
 
 from collections.abc import Mapping
@@ -12,20 +12,20 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
+from langsplat_core.query.chance import Scale
 from langsplat_core.query.regions import SMALLEST, Regions
 from langsplat_core.query.vocabulary import Named
-from langsplat_core.scene import LEVELS
+from langsplat_core.scene import LEVELS, Fits
 
-# Of margin that each level is given before the best is chosen, by what a phrase names. A thing is one whole,
-# whatever some part of it looks like; the best of a part asked for alone may stand for the thing it is on.
+# Spreads that each level is given before the best is chosen, by what a phrase names. A thing is one whole,
+# whatever some part of it looks like; a part is rather too fine than too coarse.
 ADVANTAGE: Mapping[Named, tuple[float, float, float]] = {
-    "thing": (0.0, 0.0, 0.12),
-    "part": (0.0, 0.0, 0.03),
-    "part of a thing": (0.0, 0.03, -0.03),
+    "thing": (0.0, 0.0, 0.5),
+    "part": (0.0, 0.0, 0.25),
+    "part of a thing": (0.0, 0.0, -0.25),
 }
-SHARES = (0.4, 0.4, 0.3)  # of the best margin at each level from which a region belongs to the answer
-FAINT = 0.03  # a best margin below this is no scale to take shares of
-NARROWEST = 1e-6  # distance of a relevancy from 0 and 1, so that its margin is finite
+REACH = 0.4  # of the best fit: what fits less by no more than this, and by `NEAREST` to `FARTHEST`, is it too
+NEAREST, FARTHEST = 0.15, 1.0  # spreads
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class Extent:
     """What of a surface answers a phrase: some of the R regions of a level."""
 
     level: int  # index into LEVELS
-    margins: tuple[float, float, float]  # of the best region of each level
+    fits: Fits  # of the best region of each level
     peaks: tuple[float, float, float]  # relevancy of the best region of each level
     even: Array  # (R,) float32 relevancy, the same all over a region
     inside: Array  # (R,) bool
@@ -42,7 +42,7 @@ class Extent:
 def find_extent(
     relevancy: Array,
     regions: Regions,
-    temperature: float,
+    scale: Scale,
     level: LevelChoice = "auto",
     named: Named = "thing",
 ) -> Extent:
@@ -50,26 +50,21 @@ def find_extent(
     is wanted."""
     means = regions.means(relevancy)
     peaks = [_best(values, sizes) for values, sizes in zip(means, regions.sizes, strict=True)]
-    best = to_margin(np.array(peaks), temperature)
+    best = scale.fit(np.array(peaks))
     chosen = _level(best, named) if level == "auto" else LEVELS.index(level)
     return Extent(
         level=chosen,
-        margins=(float(best[0]), float(best[1]), float(best[2])),
+        fits=(float(best[0]), float(best[1]), float(best[2])),
         peaks=(peaks[0], peaks[1], peaks[2]),
         even=means[chosen].astype(np.float32),
-        inside=to_margin(means[chosen], temperature) > cut(float(best[chosen]), SHARES[chosen]),
+        inside=scale.fit(means[chosen]) >= lowest(float(best[chosen])),
     )
 
 
-def to_margin(relevancy: Array, temperature: float) -> Array:
-    """Relevancy in [0, 1] -> the margin of cosines that it stands for."""
-    clipped = np.clip(np.asarray(relevancy, np.float64), NARROWEST, 1 - NARROWEST)
-    return np.asarray(np.log(clipped / (1 - clipped)) / temperature)
-
-
-def cut(best: float, share: float) -> float:
-    """The margin above which a region belongs to an answer whose best region has the margin `best`."""
-    return share * best if best > FAINT else best - (1 - share) * FAINT
+def lowest(best: float, share: float = 1.0) -> float:
+    """The fit from which a region belongs to an answer whose best region has the fit `best`; share: of the
+    way that such an answer reaches."""
+    return best - share * float(np.clip(REACH * best, NEAREST, FARTHEST))
 
 
 def _best(means: Array, sizes: Array) -> float:

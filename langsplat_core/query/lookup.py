@@ -13,11 +13,12 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import kernel, plain, shared_workers
+from langsplat_core.query.chance import Scale, relevancy_of
 from langsplat_core.query.table import build_table, suits_table
 from langsplat_core.scene import LanguageField
-from langsplat_core.semantics.relevancy import CHUNK, from_cosines, latent_relevancy
 
 TOGETHER = 16  # phrases compared with every latent at a time: 12 bytes each per Gaussian
+CHUNK = 16_384  # latents that are compared with texts, or decoded vectors held, at a time
 
 
 class Lookup(Protocol):
@@ -28,15 +29,15 @@ class Lookup(Protocol):
         meaning. What can be computed for all phrases together is."""
 
 
-def build_lookup(field: LanguageField, exact: bool = False) -> Lookup:
+def build_lookup(field: LanguageField, scale: Scale, exact: bool = False) -> Lookup:
     """The fastest lookup for `field`; with `exact` none that interpolates, to measure a table by."""
     if field.codec.space == "index":
-        return CodeLookup(field)
+        return CodeLookup(field, scale)
     if exact:
-        return DecodedLookup(field)
+        return DecodedLookup(field, scale)
     if suits_table(field.codec):
-        return build_table(field.codec, known_latents(field), field.canonical, field.reading.temperature)
-    return LatentLookup(field)
+        return build_table(field.codec, known_latents(field), scale)
+    return LatentLookup(field, scale)
 
 
 def known_latents(field: LanguageField) -> Array:
@@ -48,16 +49,15 @@ def known_latents(field: LanguageField) -> Array:
 class CodeLookup:
     """K relevancies of codewords, and a fetch per Gaussian: exact."""
 
-    def __init__(self, field: LanguageField) -> None:
+    def __init__(self, field: LanguageField, scale: Scale) -> None:
         count = field.codec.index_size
-        self._temperature = field.reading.temperature
         self._vectors = field.codec.decode(np.arange(count, dtype=np.uint16)[:, None])
-        self._nearest = (self._vectors @ field.canonical.T).max(1)
+        self._zero, self._rate = scale.of(self._vectors @ scale.texts.T)
         self._codes = np.where(field.known, field.latents[..., 0], count).astype(np.uint16).reshape(-1)
 
     def relevancies(self, phrases: Array) -> Iterator[Array]:
         """See `Lookup`."""
-        values = from_cosines(self._vectors @ phrases.T, self._nearest[:, None], self._temperature)
+        values = relevancy_of(self._vectors @ phrases.T, self._zero[:, None], self._rate[:, None])
         for row in values.T:
             found = np.empty(len(self._codes), np.float32)
             shared_workers().run(_fetch, len(found), plain(np.append(row, 0)), self._codes, found)
@@ -69,15 +69,34 @@ class LatentLookup:
     """Every latent compared, in bounded memory."""
 
     field: LanguageField
+    scale: Scale
+
+    @cached_property
+    def _read(self) -> tuple[Array, Array, Array]:
+        """Rows of (3 N,) with a meaning, and the (M,) zero and rate of each."""
+        field = self.field
+        rows = np.flatnonzero(field.known)
+        latents = field.latents.reshape(-1, field.latents.shape[-1])
+        zero, rate = np.empty(len(rows), np.float32), np.empty(len(rows), np.float32)
+        for start in range(0, len(rows), CHUNK):
+            part = slice(start, start + CHUNK)
+            zero[part], rate[part] = self.scale.of(
+                field.codec.similarities(latents[rows[part]], self.scale.texts)
+            )
+        return rows, zero, rate
 
     def relevancies(self, phrases: Array) -> Iterator[Array]:
         """See `Lookup`."""
-        field = self.field
-        latents, temperature = known_latents(field), field.reading.temperature
-        for start in range(0, len(phrases), TOGETHER):
-            some = phrases[start : start + TOGETHER]
-            values = latent_relevancy(field.codec, latents, some, field.canonical, temperature)
-            yield from np.ascontiguousarray(values.T)
+        field, (rows, zero, rate) = self.field, self._read
+        latents = field.latents.reshape(-1, field.latents.shape[-1])
+        for first in range(0, len(phrases), TOGETHER):
+            some = phrases[first : first + TOGETHER]
+            values = np.zeros((len(some), len(latents)), np.float32)
+            for start in range(0, len(rows), CHUNK):
+                part = slice(start, start + CHUNK)
+                cosines = field.codec.similarities(latents[rows[part]], some)
+                values[:, rows[part]] = relevancy_of(cosines, zero[part, None], rate[part, None]).T
+            yield from values
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,28 +104,28 @@ class DecodedLookup:
     """Every latent decoded once, 2 KB each at D = 512."""
 
     field: LanguageField
+    scale: Scale
 
     @cached_property
-    def _decoded(self) -> tuple[Array, Array, Array]:
-        """Rows of (3 N,) with a meaning, their (M, D) vectors, and (M,) their cosine with the nearest
-        canonical phrase."""
+    def _decoded(self) -> tuple[Array, Array, Array, Array]:
+        """Rows of (3 N,) with a meaning, their (M, D) vectors, and the (M,) zero and rate of each."""
         field = self.field
         rows = np.flatnonzero(field.known)
         latents = field.latents.reshape(-1, field.latents.shape[-1])
         vectors = np.empty((len(rows), field.codec.vector_dim), np.float32)
-        nearest = np.empty(len(rows), np.float32)
+        zero, rate = np.empty(len(rows), np.float32), np.empty(len(rows), np.float32)
         for start in range(0, len(rows), CHUNK):
             part = slice(start, start + CHUNK)
             vectors[part] = field.codec.decode(latents[rows[part]])
-            nearest[part] = (vectors[part] @ field.canonical.T).max(1)
-        return rows, vectors, nearest
+            zero[part], rate[part] = self.scale.of(vectors[part] @ self.scale.texts.T)
+        return rows, vectors, zero, rate
 
     def relevancies(self, phrases: Array) -> Iterator[Array]:
         """See `Lookup`."""
-        rows, vectors, nearest = self._decoded
+        rows, vectors, zero, rate = self._decoded
         for phrase in phrases:
             values = np.zeros(self.field.confidence.size, np.float32)
-            values[rows] = from_cosines(vectors @ phrase, nearest, self.field.reading.temperature)
+            values[rows] = relevancy_of(vectors @ phrase, zero, rate)
             yield values
 
 

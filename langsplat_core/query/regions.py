@@ -17,13 +17,13 @@ from langsplat_core.compiled import kernel, plain, shared_workers
 from langsplat_core.query.surface import Surface
 from langsplat_core.scene import LEVELS, NO_THING, LanguageField
 
-SCALE = 5.0  # of the criterion, in 1 - cosine times Gaussians: larger prefers larger regions
+SCALE = 6.8  # of the criterion, in typical steps times Gaussians: larger prefers larger regions
 SMALLEST = 10  # Gaussians; smaller patches join the neighbour that means the most similar
-BORDER = 0.3  # added to the step between two things, in 1 - cosine
+BORDER = 0.6  # added to the step between two things, in typical steps
 UNKNOWN = 2.0  # step between a Gaussian with a meaning and one without: as much as between opposites
 CHUNK = 65_536  # links whose ends are compared at a time
 PIECES = 4  # that a level is summed in, so that more than three cores have work
-STEPS = 65_535 / (UNKNOWN + BORDER)  # of 1 - cosine that are told apart: 16 bits sort in linear time
+STEPS = 65_535 / (UNKNOWN + 2 * BORDER)  # of 1 - cosine that are told apart: 16 bits sort in linear time
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +65,12 @@ def build_regions(surface: Surface, field: LanguageField) -> Regions:
     of = []
     for level in range(len(LEVELS)):
         steps = _steps(field, level, surface.rows, ends)
+        typical = _typical_step(field, level, surface.rows)
         if level == len(LEVELS) - 1 and field.things is not None:
-            steps = _along_things(steps, field.things[surface.rows], ends)
+            steps = _along_things(steps, field.things[surface.rows], ends, BORDER * typical)
         ranks = np.round(steps * STEPS).astype(np.uint16)
         order = np.argsort(ranks, kind="stable").astype(np.int32)
-        roots = _merge(len(surface.rows), *ends, steps.astype(np.float32), order, SCALE, SMALLEST)
+        roots = _merge(len(surface.rows), *ends, steps.astype(np.float32), order, SCALE * typical, SMALLEST)
         of.append(np.unique(roots, return_inverse=True)[1].astype(np.int32).reshape(-1))
     return regions_from(surface, np.stack(of))
 
@@ -99,6 +100,20 @@ def _steps(field: LanguageField, level: int, rows: Array, ends: tuple[Array, Arr
     return np.asarray(np.where(both, steps, np.where(neither, 0.0, UNKNOWN)).clip(0, UNKNOWN))
 
 
+def _typical_step(field: LanguageField, level: int, rows: Array) -> float:
+    """The mean of 1 - cosine between two Gaussians drawn by chance: what is far in this encoder's space. It
+    is 1 minus the squared length of their mean vector."""
+    latents = field.latents[level][rows[field.known[level][rows]]]
+    if len(latents) == 0:
+        return 1.0
+    if field.codec.space == "index":
+        counts = np.bincount(latents[:, 0], minlength=field.codec.index_size)
+        mean = counts @ field.codec.decode(np.arange(len(counts), dtype=np.uint16)[:, None]) / len(latents)
+    else:
+        mean = unit(latents.astype(np.float32)).mean(0, dtype=np.float64)
+    return max(1 - float(mean @ mean), 0.0)
+
+
 def _apart(directions: Array, first: Array, second: Array) -> Array:
     """(E,) 1 - cosine of pairs among (K, D) unit vectors, from a table of all where that is smaller."""
     if len(directions) ** 2 <= len(first):
@@ -110,11 +125,11 @@ def _apart(directions: Array, first: Array, second: Array) -> Array:
     return steps
 
 
-def _along_things(steps: Array, things: Array, ends: tuple[Array, Array]) -> Array:
+def _along_things(steps: Array, things: Array, ends: tuple[Array, Array], border: float) -> Array:
     """No step within a thing, a larger one between two."""
     a, b = things[ends[0]], things[ends[1]]
     told = (a != NO_THING) & (b != NO_THING)
-    return np.where(told, np.where(a == b, 0, steps + BORDER), steps)
+    return np.where(told, np.where(a == b, 0, steps + border), steps)
 
 
 @kernel

@@ -13,9 +13,9 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import kernel, shared_workers
-from langsplat_core.scene import Codec, Reading
+from langsplat_core.query.chance import Scale, relevancy_of
+from langsplat_core.scene import Codec
 from langsplat_core.scene.codec import meaningful
-from langsplat_core.semantics.relevancy import from_cosines
 
 RESOLUTION = 256  # nodes per side; error against exact decoding falls with its square
 
@@ -44,16 +44,16 @@ class SphereTable:
 
     used: Array  # (U,) int64 index of each node in the grid, row-major
     vectors: Array  # (U, D) float32 decoded unit vectors
-    nearest_canonical: Array  # (U,) largest cosine with a canonical phrase
+    zero: Array  # (U,) cosine of relevancy 0.5, see `chance.Scale`
+    rate: Array  # (U,)
     corner: Array  # (M,) int32 index of the lower left node; -1 for a latent without meaning
     fraction: Array  # (M, 2) float32 position inside the cell, in [0, 1]
     resolution: int
-    temperature: float
 
     def relevancies(self, phrases: Array) -> Iterator[Array]:
         """(Q, D) unit phrase vectors -> of each in turn (M,) float32 relevancy; 0 where the latent has no
         meaning."""
-        values = from_cosines(self.vectors @ phrases.T, self.nearest_canonical[:, None], self.temperature)
+        values = relevancy_of(self.vectors @ phrases.T, self.zero[:, None], self.rate[:, None])
         nodes = np.zeros(self.resolution**2, np.float32)
         for row in values.T:
             nodes[self.used] = row
@@ -68,13 +68,7 @@ def suits_table(codec: Codec) -> bool:
     return codec.latent_dim == 3 and codec.space == "sphere"
 
 
-def build_table(
-    codec: Codec,
-    latents: Array,
-    canonical: Array,
-    temperature: float = Reading.temperature,
-    resolution: int = RESOLUTION,
-) -> SphereTable:
+def build_table(codec: Codec, latents: Array, scale: Scale, resolution: int = RESOLUTION) -> SphereTable:
     """Tabulate `codec` for (M, 3) latents; those of no length have no meaning."""
     if not suits_table(codec):
         raise ValueError(f"a sphere table needs unit latents of 3 numbers; {codec.kind} has others")
@@ -89,14 +83,15 @@ def build_table(
     used = np.flatnonzero(needed)
     grid = np.stack([used % resolution, used // resolution], 1) / (resolution - 1)
     vectors = codec.decode(octahedral_to_sphere(grid).astype(np.float32))
+    zero, rate = scale.of(vectors @ scale.texts.T)
     return SphereTable(
         used=used,
         vectors=vectors,
-        nearest_canonical=(vectors @ canonical.T).max(1),
+        zero=zero,
+        rate=rate,
         corner=np.where(known, corner, -1).astype(np.int32),
         fraction=(position - cell).astype(np.float32),
         resolution=resolution,
-        temperature=temperature,
     )
 
 

@@ -19,14 +19,15 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Codec, LanguageField
 
-# times `Reading.temperature`, which is a tenth of the encoder's own scale of logits: half of that scale for
-# words, a fifth for attributes. Found in two rooms, docs/describing.md.
-WORD_SCALE = 5.0
-ATTRIBUTE_SCALE = 2.0
+# Logits per spread of phrases' cosines with a meaning: a probability is then right about so often, with the
+# bundled encoder and with the geometry of CLIP (rooms 201 to 203, docs/describing.md).
+WORD_SCALE = 6.0
+ATTRIBUTE_SCALE = 3.4
 NEAREST = 10  # meanings that make a word's hub, as in the paper
 BANK = 4096  # meanings that are looked at for it, of codebooks; of other codecs fewer, since none is distinct
 SAMPLES = 512
 CERTAIN = 0.5  # probability from which a colour or material is said
+NARROWEST = 1e-6  # spread; words that are all the same have none
 CELLS = 8_000_000  # numbers of a block of meanings times words: 32 MB
 
 
@@ -103,16 +104,25 @@ class WordScores:
 
 def build_words(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
     """Names of things: V phrases and their (V, D) unit vectors."""
-    every = np.concatenate([vectors, field.canonical]).astype(np.float32)
-    return WordScores(phrases, every, hubs(every, meanings(field)), WORD_SCALE * field.reading.temperature)
+    every, bank = np.concatenate([vectors, field.canonical]).astype(np.float32), meanings(field)
+    return WordScores(phrases, every, hubs(every, bank), WORD_SCALE / _spread(field, vectors, bank))
 
 
 def build_attributes(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
     """Words of which a thing has one, such as colours: V phrases and their (V, D) unit vectors. Few and all
     of one kind, they are no hubs."""
-    none = np.zeros(len(vectors), np.float32)
-    scale = ATTRIBUTE_SCALE * field.reading.temperature
+    none, scale = (
+        np.zeros(len(vectors), np.float32),
+        ATTRIBUTE_SCALE / _spread(field, vectors, meanings(field)),
+    )
     return WordScores(phrases, vectors.astype(np.float32), none, scale)
+
+
+def _spread(field: LanguageField, vectors: Array, bank: Array) -> float:
+    """Median, over meanings, of the standard deviation of cosines: of everyday phrases, else of the words."""
+    texts = vectors if field.everyday is None else field.everyday
+    spreads = (bank @ texts.T).std(1) if len(bank) and len(texts) > 1 else np.ones(1)
+    return max(float(np.median(spreads)), NARROWEST)
 
 
 def meanings(field: LanguageField) -> Array:

@@ -16,7 +16,7 @@ from langsplat_core.scene.language import (
     NO_THING,
     LanguageField,
 )
-from langsplat_core.scene.reading import Calibration, Margins, Odds, Reading
+from langsplat_core.scene.reading import Calibration, Fits, Odds, Reading
 from langsplat_core.scene.scene import Scene
 
 __all__ = [
@@ -30,11 +30,11 @@ __all__ = [
     "Camera",
     "CodebookCodec",
     "Codec",
+    "Fits",
     "Gaussians",
     "Intrinsics",
     "LanguageField",
     "LinearCodec",
-    "Margins",
     "Odds",
     "Reading",
     "Scene",

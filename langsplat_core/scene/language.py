@@ -27,6 +27,7 @@ class LanguageField:
     phrasebook: Mapping[str, Array] = field(default_factory=dict)  # `phrase_key` -> (D,) unit vector
     reading: Reading = field(default_factory=Reading)
     things: Array | None = None  # (N,) uint16 number of the thing that each belongs to, or NO_THING
+    everyday: Array | None = None  # (V, D) float32 unit vectors of phrases most of which name nothing here
 
     def __post_init__(self) -> None:
         d, big = self.codec.latent_dim, self.codec.vector_dim
@@ -41,6 +42,8 @@ class LanguageField:
             raise ValueError("canonical: a phrase is compared with one other at least")
         if self.things is not None:
             check_array("things", self.things, ("N",), dims, dtype=np.uint16)
+        if self.everyday is not None:
+            check_array("everyday", self.everyday, ("V", big), dtype=np.float32)
         known = {phrase_key(phrase): vector for phrase, vector in self.phrasebook.items()}
         object.__setattr__(self, "phrasebook", known)
         for phrase, vector in known.items():

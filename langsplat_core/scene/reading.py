@@ -6,13 +6,13 @@ import numpy as np
 
 from langsplat_core.arrays import sigmoid
 
-Margins = tuple[float, float, float]  # of each level, the best: cosine with the phrase minus canonical cosine
+Fits = tuple[float, float, float]  # of each level, the best, see `query.chance.Scale.fit`
 
 
 @dataclass(frozen=True)
 class Odds:
-    """A logistic function of the best margins of an answer (Platt 1999):
-    ``probability = sigmoid(constant + whole * margin of whole things + finer * the better one of the finer
+    """A logistic function of the best fits of an answer (Platt 1999):
+    ``probability = sigmoid(constant + whole * fit of whole things + finer * the better one of the finer
     levels)``, present and absent being as likely beforehand."""
 
     constant: float
@@ -23,18 +23,18 @@ class Odds:
     def __post_init__(self) -> None:
         slopes = (self.whole, self.finer)
         if not (np.isfinite([self.constant, *slopes]).all() and sum(slopes) > 0 and 0.5 <= self.found <= 1):
-            raise ValueError(f"{self}: expected finite numbers, rising with margins, and found in [0.5, 1]")
+            raise ValueError(f"{self}: expected finite numbers, rising with fits, and found in [0.5, 1]")
 
-    def probability(self, margins: Margins) -> float:
+    def probability(self, fits: Fits) -> float:
         """That what is asked for is there, in (0, 1)."""
-        subpart, part, whole = margins
+        subpart, part, whole = fits
         logit = self.constant + self.whole * whole + self.finer * max(subpart, part)
         return float(sigmoid(np.array(logit)))
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """The odds of the three ways in which something is looked for: margins of each have another spread."""
+    """The odds of the three ways in which something is looked for: fits of each have another spread."""
 
     thing: Odds  # "mug": anything, among all that there is
     part: Odds  # "handle": a part of whatever has one
@@ -46,7 +46,7 @@ class Reading:
     """How cosines of one text encoder are read: other encoders have another scale."""
 
     temperature: float = 10.0  # of the softmax; 10 in the public code of LERF and LangSplat, for CLIP
-    found: float = 0.6  # peak relevancy from which a phrase counts as present, without a calibration
+    found: float = 0.6  # peak relevancy, as published, from which a phrase counts as present
     calibration: Calibration | None = None
 
     def __post_init__(self) -> None:

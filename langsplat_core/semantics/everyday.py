@@ -1,8 +1,12 @@
-"""Everyday phrases: what a codec's errors are judged on, beside a scene's own vectors."""
+"""Everyday phrases: what a codec's errors are judged on, beside a scene's own vectors, and what answers are
+compared with (`query.chance`)."""
 
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import numpy as np
+
+from langsplat_core.arrays import Array
 
 
 def _words(text: str) -> tuple[str, ...]:
@@ -27,6 +31,13 @@ ADJECTIVES = _words(
     "striped wooden metal plastic shiny dark soft broken open"
 )
 MIXED = 96  # phrases of two words
+FEWEST = 48  # phrases from which they tell what fits by chance
+
+
+class _TextEncoder(Protocol):
+    def encode_texts(self, texts: list[str]) -> Array: ...
+
+    def unknown_words(self, text: str) -> tuple[str, ...]: ...
 
 
 def everyday_phrases(unknown_words: Callable[[str], Sequence[str]], seed: int = 0) -> list[str]:
@@ -39,3 +50,12 @@ def everyday_phrases(unknown_words: Callable[[str], Sequence[str]], seed: int = 
     generator = np.random.default_rng(seed)
     pairs = zip(generator.choice(adjectives, MIXED), generator.choice(nouns, MIXED), strict=True)
     return [*nouns, *sorted({f"{adjective} {noun}" for adjective, noun in pairs})]
+
+
+def everyday_vectors(encoder: _TextEncoder) -> Array | None:
+    """(V, D) float32 unit vectors of the everyday phrases, of float16 precision, as a scene keeps them; None
+    for an encoder that was taught too few of them."""
+    phrases = everyday_phrases(encoder.unknown_words)
+    if len(phrases) < FEWEST:
+        return None
+    return encoder.encode_texts(phrases).astype(np.float16).astype(np.float32)

@@ -7,23 +7,21 @@ from langsplat_core.errors import InputError
 from langsplat_core.lab.config import BenchmarkConfig
 from langsplat_core.lab.demo import SEED
 from langsplat_core.lab.rooms.report import RoomReport
-from langsplat_core.lab.rooms.room import Room, labelled, weights_digest
+from langsplat_core.lab.rooms.room import Room, labelled, room_encoder
 from langsplat_core.progress import Progress, silent
 from langsplat_core.ranges import check_settings
-from langsplat_core.semantics.encoders import load_encoder
 
 
 def run_benchmark(config: BenchmarkConfig, work: Path, progress: Progress = silent) -> list[RoomReport]:
     """Measure every tier and seed. What is in `work` from an earlier run with the same settings is not made
     again. Raises InputError for settings that cannot be measured."""
     _check(config)
-    encoder = load_encoder(config.encoder)
-    weights = weights_digest(config.encoder)
+    encoder = room_encoder(config.encoder, config.text_vectors)
     reports = []
     for tier in config.tiers:
         for seed in config.seeds:
             label = f"{tier} {seed}, "
-            room = Room(config, tier, seed, work, (encoder, weights), labelled(progress, label))
+            room = Room(config, tier, seed, work, encoder, labelled(progress, label))
             reports.append(room.report())
     return reports
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import cast
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.formats.language import means_checksum
 from langsplat_core.lab.config import BenchmarkConfig, MaskOrigin, Tier
+from langsplat_core.lab.rooms.clip_geometry import ClipGeometry, read_geometry
 from langsplat_core.lab.rooms.oracles import (
     TruthMasks,
     moved_to_pictures,
@@ -58,7 +60,7 @@ from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import LEVELS, Camera, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.encoder import Encoder
-from langsplat_core.semantics.encoders import model_path
+from langsplat_core.semantics.encoders import load_encoder, model_path
 from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sources import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture
@@ -75,6 +77,14 @@ def weights_digest(model: str) -> str:
     for path in sorted([*found.glob("*.safetensors"), *found.glob("*.bin")]) if found.is_dir() else [found]:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
+
+
+def room_encoder(model: str, text_vectors: Path | None = None) -> tuple[Encoder | ClipGeometry, str]:
+    """An encoder, simulated ones included (`read_geometry`), and the digest of its weights."""
+    geometry = read_geometry(model, text_vectors)
+    if geometry is None:
+        return load_encoder(model), weights_digest(model)
+    return geometry, geometry.digest
 
 
 def train_config(config: BenchmarkConfig) -> TrainConfig:
@@ -95,7 +105,7 @@ class Room:
         tier: Tier,
         seed: int,
         work: Path,
-        encoder: tuple[Encoder, str],
+        encoder: tuple[Encoder | ClipGeometry, str],
         progress: Progress,
     ) -> None:
         width, height = config.size
@@ -165,6 +175,11 @@ class Room:
             self.progress,
         )
         self._lap(f"masks ({variant.masks}) and vectors", start)
+        if isinstance(self.encoder, ClipGeometry):
+            features = [
+                self.encoder.describe(item, self.truth.labels(camera.name), self.truth, row)
+                for row, (item, camera) in enumerate(zip(features, cameras, strict=True))
+            ]
         if variant.masks == "wrong":
             features = [with_wrong_vectors(item, seed) for seed, item in enumerate(features)]
         if variant.vectors == "text":
@@ -187,7 +202,8 @@ class Room:
         settings = replace(self.settings, codec=variant.codec, lift=variant.lift)
         with TemporaryDirectory(dir=self.folder) as empty:
             work = Path(empty) if fresh else self.folder
-            made = language_field(self.gaussians, views, self.encoder, settings, work, self.progress)
+            encoder = cast(Encoder, self.encoder)
+            made = language_field(self.gaussians, views, encoder, settings, work, self.progress)
         self._lap(f"language field ({variant.name})", start)
         return *made, round(time.perf_counter() - start, 1)
 

@@ -2,7 +2,7 @@
 
 In rooms whose truth is known every thing that is there is asked for, and every thing of the catalogue that is
 not; every part alone, and part words that nothing in the room is called by; every part of a thing, and as
-many that the thing has not. A calibration is fitted to the margins of each (Platt 1999, with Platt's smoothed
+many that the thing has not. A calibration is fitted to the fits of each (Platt 1999, with Platt's smoothed
 targets); it is fair only to rooms that it was not fitted to.
 """
 
@@ -23,7 +23,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
 from langsplat_core.lab.config import BenchmarkConfig, VerdictBenchConfig
 from langsplat_core.lab.rooms.report import separation
-from langsplat_core.lab.rooms.room import Room, weights_digest
+from langsplat_core.lab.rooms.room import Room, room_encoder
 from langsplat_core.lab.rooms.scoring import MIN_GAUSSIANS
 from langsplat_core.lab.rooms.truth import Region
 from langsplat_core.lab.rooms.variants import Variant
@@ -34,8 +34,7 @@ from langsplat_core.query.answers import WEAK, QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.vocabulary import PARTS, forms, is_part
-from langsplat_core.scene import Calibration, Margins, Odds, Scene
-from langsplat_core.semantics.encoders import load_encoder
+from langsplat_core.scene import Calibration, Fits, Odds, Scene
 
 REJECTED = 0.95  # of what is absent, in the rooms that a calibration is fitted to
 BINS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)  # of probability
@@ -55,24 +54,25 @@ class Verdict:
     seed: int
     text: str
     kind: str  # one of those in `PAIRS`, or "colour+object"
-    margins: Margins  # of the best region of each level
+    fits: Fits  # of the best region of each level
     probability: float | None
     found: bool
+    excess: float | None = None  # see `QueryResult`
 
 
 def measure_verdicts(config: VerdictBenchConfig, work: Path, progress: Progress = silent) -> list[Verdict]:
     """Every room, every thing. Rooms that are not in `work` are made. Raises InputError without a room."""
     if not config.seeds or not config.tiers:
         raise InputError("bench verdict: name at least one of --tiers and one of --seeds")
-    encoder, weights = load_encoder("demo"), weights_digest("demo")
+    encoder = room_encoder(config.encoder, config.text_vectors)
     settings = BenchmarkConfig()
     variant = Variant("the method", config.masks, codec=config.codec)
     rows: list[Verdict] = []
     for tier in config.tiers:
         for seed in config.seeds:
-            room = Room(settings, tier, seed, work, (encoder, weights), progress)
+            room = Room(settings, tier, seed, work, encoder, progress)
             field, _, _ = room.field(variant)
-            rows += _of_room(room, QueryEngine(Scene(room.gaussians, field), lambda _: encoder))
+            rows += _of_room(room, QueryEngine(Scene(room.gaussians, field), lambda _: encoder[0]))
             progress(f"{tier} {seed}", 1.0)
     return rows
 
@@ -92,7 +92,9 @@ def _of_room(room: Room, engine: QueryEngine) -> list[Verdict]:
 
 
 def _verdict(room: Room, text: str, kind: str, answer: QueryResult) -> Verdict:
-    return Verdict(room.tier, room.seed, text, kind, answer.margins, answer.probability, answer.found)
+    return Verdict(
+        room.tier, room.seed, text, kind, answer.fits, answer.probability, answer.found, answer.excess
+    )
 
 
 def _part_words(room: Room) -> tuple[list[str], list[str]]:
@@ -133,24 +135,21 @@ def _uncalled(words: Iterable[str], called: AbstractSet[str]) -> list[str]:
 def fit_calibration(rows: Sequence[Verdict]) -> Calibration:
     """To all kinds of phrases. Raises as `fit_odds` does."""
     return Calibration(
-        **{
-            name: fit_odds(margins_of(rows, there), margins_of(rows, not_))
-            for name, (there, not_) in PAIRS.items()
-        }
+        **{name: fit_odds(fits_of(rows, there), fits_of(rows, not_)) for name, (there, not_) in PAIRS.items()}
     )
 
 
 def fit_odds(present: Array, absent: Array) -> Odds:
-    """Of margins (P, 3) of things that are there and (A, 3) of things that are not, which weigh the same.
+    """Of fits (P, 3) of things that are there and (A, 3) of things that are not, which weigh the same.
 
-    Raises InputError where there are fewer than ten of either, or the margins do not tell them apart.
+    Raises InputError where there are fewer than ten of either, or the fits do not tell them apart.
     """
     if min(len(present), len(absent)) < 10:
         raise InputError(
             "a calibration needs ten things that are there and ten that are not; take more rooms"
         )
-    margins = np.concatenate([present, absent])
-    features = np.stack([margins[:, 2], margins[:, :2].max(axis=1)], axis=1)
+    fits = np.concatenate([present, absent])
+    features = np.stack([fits[:, 2], fits[:, :2].max(axis=1)], axis=1)
     targets = np.repeat(
         [(len(present) + 1) / (len(present) + 2), 1 / (len(absent) + 2)], [len(present), len(absent)]
     )
@@ -162,7 +161,7 @@ def fit_odds(present: Array, absent: Array) -> Odds:
 
     constant, whole, finer = minimize(loss, np.array([0.0, 10.0, 0.0]), method="BFGS").x.round(3)
     if whole + finer <= 0:
-        raise InputError("what is there has no larger margins than what is not: nothing to calibrate")
+        raise InputError("what is there has no larger fits than what is not: nothing to calibrate")
     plain = Odds(float(constant), float(whole), float(finer))
     said = [plain.probability((m[0], m[1], m[2])) for m in absent.tolist()]
     highest = float(np.quantile(said, REJECTED, method="higher"))
@@ -177,9 +176,9 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
         temporary.write_text(json.dumps(stated, indent=1) + "\n", encoding="utf-8")
 
 
-def margins_of(rows: Sequence[Verdict], kind: str) -> Array:
-    """(n, 3) margins of one kind of phrase."""
-    return np.array([row.margins for row in rows if row.kind == kind])
+def fits_of(rows: Sequence[Verdict], kind: str) -> Array:
+    """(n, 3) fits of one kind of phrase."""
+    return np.array([row.fits for row in rows if row.kind == kind])
 
 
 def verdict_table(rows: Sequence[Verdict]) -> str:
@@ -218,7 +217,9 @@ def _mean(values: Sequence[bool]) -> float:
 
 def _score(row: Verdict) -> float:
     """What a threshold would be put on."""
-    return max(row.margins) if row.probability is None else row.probability
+    if row.probability is not None:
+        return row.probability
+    return max(row.fits) if row.excess is None else row.excess
 
 
 def _spreads(rooms: Sequence[tuple[float, ...]]) -> list[str]:

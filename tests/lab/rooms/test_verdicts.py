@@ -32,7 +32,7 @@ TRUE = Odds(-1.0, 18.0, 6.0)
 
 
 def logistic(count: int, seed: int = 0) -> tuple[Array, Array]:
-    """Margins of things that are there and that are not, by `TRUE`: about as many of both."""
+    """Fits of things that are there and that are not, by `TRUE`: about as many of both."""
     rng = np.random.default_rng(seed)
     margins = rng.uniform([-0.3, -0.3, -0.25], [0.3, 0.1, 0.3], (count, 3))
     likely = np.array([TRUE.probability(tuple(row)) for row in margins.tolist()])
