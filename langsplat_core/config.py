@@ -134,7 +134,7 @@ class CodecConfig:
     # codewords of a codebook; 0: as many as `max_relevancy_error` asks for
     size: Annotated[int, Range(0, 65_535)] = 0
     # mean over the scene's vectors and a few hundred phrases
-    max_relevancy_error: Annotated[Share, tyro.conf.arg(aliases=["--max-relevancy-error"])] = 0.005
+    max_relevancy_error: Annotated[Share, tyro.conf.arg(aliases=["--max-relevancy-error"])] = 0.006
     latent_dim: Annotated[int, Range(1, 4_096)] = 3  # numbers that the other kinds keep
     steps: Count = 4_000  # of the autoencoder's training, as are the following
     batch: SeveralCount = 256  # vectors per step

@@ -7,7 +7,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
-from langsplat_core.query.chance import Bars, Scale, excess
+from langsplat_core.query.chance import Bars, excess
 from langsplat_core.query.cut import cut_level
 from langsplat_core.query.extent import find_extent
 from langsplat_core.query.places import locate
@@ -15,7 +15,7 @@ from langsplat_core.query.regions import Regions
 from langsplat_core.query.surface import Surface
 from langsplat_core.query.vocabulary import named
 from langsplat_core.scene import LEVELS, Calibration, Fits, Odds
-from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN
+from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, Scale
 
 AnswerRule = Literal["regions", "peak"]
 Verdict = Literal["found", "weak match", "not here"]

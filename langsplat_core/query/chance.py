@@ -1,18 +1,7 @@
-"""What phrases fit by chance: the scale of every answer, whatever the encoder.
+"""What everyday phrases fit in a scene, where most of them are not: what exceeds that is found.
 
-Cosines of one encoder say 0.3 for what another calls 0.6. So a phrase is read against everyday phrases, most
-of which are not there: at every meaning of the scene its cosine is compared with theirs, in units of their
-spread,
-
-    fit  =  (cosine - zero) / spread,        relevancy  =  1 / (1 + exp(-fit)),
-
-where the spread is the standard deviation of the everyday phrases' cosines there, and zero is what the best
-of them have by chance (the mean of the largest `TOP`), mixed with the nearest of the canonical phrases, which
-are LERF's own null, of four. A meaning that lies near all phrases ("hub") thereby loses its advantage. What
-the best of a whole scene is for phrases that are not there follows from the same phrases: "found" is what
-exceeds it.
-
-Without everyday phrases, and for answers as published, relevancy is LERF's (`semantics.relevancy`).
+Fits are those of `semantics.relevancy.Scale`. The more places a scene has, the better the best of them fits a
+phrase by chance; so "found" is said by the best fits of everyday phrases in the scene itself.
 """
 
 from collections.abc import Iterator, Mapping
@@ -22,16 +11,14 @@ from typing import Literal
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from langsplat_core.arrays import Array, sigmoid
+from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.regions import SMALLEST, Regions
 from langsplat_core.query.surface import Surface
 from langsplat_core.query.vocabulary import Named
 from langsplat_core.scene import LEVELS, Fits, LanguageField
+from langsplat_core.semantics.relevancy import NARROWEST, Scale, relevancy_of
 
-TOP = 0.07  # of the everyday phrases: those that fit best by chance
-CANONICAL = 0.25  # weight of the nearest canonical phrase in the zero
-NARROWEST = 1e-6  # distance of a relevancy from 0 and 1, so that its fit is finite
 SAMPLED = 96  # everyday phrases that are looked up in a scene without codewords, where each costs a query
 # Spreads above the median best fit of everyday phrases from which a phrase is found, among whole things and
 # at the finer levels, by what it names: where things like it are, and elsewhere, where more is asked for. One
@@ -43,47 +30,7 @@ FOUND: Mapping[Named | Literal["inside"], tuple[float, float]] = {
     "part of a thing": (2.5, 1.5),
     "inside": (np.inf, 2.0),  # a part, among what is on a thing that is there
 }
-LOW = (
-    0.16  # quantile one standard deviation below the median: what is there lies above, and does not widen it
-)
-
-
-@dataclass(frozen=True, eq=False)
-class Scale:
-    """How the cosines of a field are read."""
-
-    canonical: Array  # (C, D) float32 unit
-    everyday: Array | None  # (V, D) float32 unit; None: as published
-    temperature: float  # of relevancy as published
-
-    @property
-    def texts(self) -> Array:
-        """(T, D) everything that `of` compares with."""
-        return self.canonical if self.everyday is None else np.concatenate([self.canonical, self.everyday])
-
-    def of(self, cosines: Array) -> tuple[Array, Array]:
-        """(M, T) cosines of meanings with `texts` -> (M,) float32 zero and rate of each: relevancy is
-        sigmoid(rate * (cosine - zero))."""
-        nearest = cosines[:, : len(self.canonical)].max(1)
-        if self.everyday is None:
-            return nearest, np.full(len(cosines), self.temperature, np.float32)
-        others = cosines[:, len(self.canonical) :]
-        count = max(round(TOP * others.shape[1]), 1)
-        top = np.partition(others, -count, axis=1)[:, -count:].mean(1)
-        spread = np.maximum(others.std(1), NARROWEST)
-        zero = CANONICAL * nearest + (1 - CANONICAL) * top
-        return zero.astype(np.float32), (1 / spread).astype(np.float32)
-
-    def fit(self, relevancy: Array | float) -> Array:
-        """Relevancy in [0, 1] -> the fit it stands for, in spreads; as published, the margin of cosines."""
-        clipped = np.clip(np.asarray(relevancy, np.float64), NARROWEST, 1 - NARROWEST)
-        rate = 1.0 if self.everyday is not None else self.temperature
-        return np.asarray(np.log(clipped / (1 - clipped)) / rate)
-
-
-def relevancy_of(cosines: Array, zero: Array, rate: Array) -> Array:
-    """Of shapes that go together, in (0, 1)."""
-    return sigmoid(rate * (cosines - zero))
+LOW = 0.16  # quantile one standard deviation below the median; what is there lies above, and widens nothing
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
-from langsplat_core.query.chance import Scale
 from langsplat_core.query.regions import SMALLEST, Regions
 from langsplat_core.query.vocabulary import Named
 from langsplat_core.scene import LEVELS, Fits
+from langsplat_core.semantics.relevancy import Scale
 
 # Spreads that each level is given before the best is chosen, by what a phrase names. A thing is one whole,
 # whatever some part of it looks like; a part is rather too fine than too coarse.

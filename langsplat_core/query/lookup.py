@@ -13,9 +13,9 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import kernel, plain, shared_workers
-from langsplat_core.query.chance import Scale, relevancy_of
 from langsplat_core.query.table import build_table, suits_table
 from langsplat_core.scene import LanguageField
+from langsplat_core.semantics.relevancy import Scale, relevancy_of
 
 TOGETHER = 16  # phrases compared with every latent at a time: 12 bytes each per Gaussian
 CHUNK = 16_384  # latents that are compared with texts, or decoded vectors held, at a time

@@ -13,9 +13,9 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import kernel, shared_workers
-from langsplat_core.query.chance import Scale, relevancy_of
 from langsplat_core.scene import Codec
 from langsplat_core.scene.codec import meaningful
+from langsplat_core.semantics.relevancy import Scale, relevancy_of
 
 RESOLUTION = 256  # nodes per side; error against exact decoding falls with its square
 

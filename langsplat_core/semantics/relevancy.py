@@ -1,10 +1,20 @@
-"""Relevancy of a phrase (LERF, adopted by LangSplat, section 3.4), exact.
+"""Relevancy of a phrase: as published (LERF, adopted by LangSplat, section 3.4), and on the scale of chance.
 
     relevancy(F, q) = min over canonical phrases c of  softmax(t [F.q, F.c])[0]
                     = sigmoid(t (F.q - max_c F.c))
 
-The temperature t is 10 in the method's code, absent from the paper's formula; other encoders have another.
+The temperature t is 10 in the method's code, absent from the paper's formula; other encoders have another,
+and cosines of 0.3 for what one calls 0.6. So answers read a phrase against everyday phrases, most of which
+are not there: at every meaning of the scene its cosine is compared with theirs, in units of their spread,
+
+    fit  =  (F.q - zero) / spread,        relevancy  =  sigmoid(fit),
+
+where the spread is the standard deviation of the everyday phrases' cosines there, and zero is what the best
+of them have by chance (the mean of the largest `TOP`), mixed with the nearest of the canonical phrases, which
+are LERF's own null, of four. A meaning that lies near all phrases ("hub") thereby loses its advantage.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,6 +24,9 @@ from langsplat_core.scene.codec import meaningful
 
 FLOOR = 0.5  # no closer to the phrase than to the closest of "object", "things", "stuff", "texture"
 MIN_HEAT_SPAN = 0.1  # a peak closer than this to the floor is not stretched to full heat
+TOP = 0.07  # of the everyday phrases: those that fit best by chance
+CANONICAL = 0.25  # weight of the nearest canonical phrase in the zero
+NARROWEST = 1e-6  # distance of a relevancy from 0 and 1, so that its fit is finite; least spread
 CHUNK = 16_384  # decoded vectors held at a time: 32 MB at 512 float32 numbers
 
 
@@ -48,3 +61,41 @@ def latent_relevancy(
         nearest = cosines[:, len(phrases) :].max(1, keepdims=True)
         out[rows] = from_cosines(cosines[:, : len(phrases)], nearest, temperature)
     return out
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """How the cosines of a field are read."""
+
+    canonical: Array  # (C, D) float32 unit
+    everyday: Array | None  # (V, D) float32 unit; None: as published
+    temperature: float  # of relevancy as published
+
+    @property
+    def texts(self) -> Array:
+        """(T, D) everything that `of` compares with."""
+        return self.canonical if self.everyday is None else np.concatenate([self.canonical, self.everyday])
+
+    def of(self, cosines: Array) -> tuple[Array, Array]:
+        """(M, T) cosines of meanings with `texts` -> (M,) float32 zero and rate of each: relevancy is
+        sigmoid(rate * (cosine - zero))."""
+        nearest = cosines[:, : len(self.canonical)].max(1)
+        if self.everyday is None:
+            return nearest, np.full(len(cosines), self.temperature, np.float32)
+        others = cosines[:, len(self.canonical) :]
+        count = max(round(TOP * others.shape[1]), 1)
+        top = np.partition(others, -count, axis=1)[:, -count:].mean(1)
+        spread = np.maximum(others.std(1), NARROWEST)
+        zero = CANONICAL * nearest + (1 - CANONICAL) * top
+        return zero.astype(np.float32), (1 / spread).astype(np.float32)
+
+    def fit(self, relevancy: Array | float) -> Array:
+        """Relevancy in [0, 1] -> the fit it stands for, in spreads; as published, the margin of cosines."""
+        clipped = np.clip(np.asarray(relevancy, np.float64), NARROWEST, 1 - NARROWEST)
+        rate = 1.0 if self.everyday is not None else self.temperature
+        return np.asarray(np.log(clipped / (1 - clipped)) / rate)
+
+
+def relevancy_of(cosines: Array, zero: Array, rate: Array) -> Array:
+    """Of shapes that go together, in (0, 1)."""
+    return sigmoid(rate * (cosines - zero))

@@ -32,7 +32,7 @@ from langsplat_core.scene.phrases import phrase_key
 from langsplat_core.semantics.store import ImageFeatures
 
 PREFIX = "clip-geometry:"
-VERSION = 1  # of the simulation
+VERSION = 2  # of the simulation
 DIM = 512
 PROMPTS = 0.565  # mean cosine of two prompts, ViT-B/16
 OTHER = 0.19  # cosine of a picture with words that are not true of it
@@ -223,12 +223,14 @@ class ClipGeometry:
         return known or {f"word {row}": row for row in range(len(vectors))}, unit(vectors)
 
     def _word(self, word: str) -> Array:
-        """(D,) unit: the file's own, else one of its others by chance, always the same."""
+        """(D,) unit: the file's own, else between two of its others by chance, always the same."""
         names, vectors = self._file
         singular = word.removesuffix("s")
-        if names:
-            row = names.get(word, names.get(singular, _seed(singular) % len(vectors)))
+        row = names.get(word, names.get(singular))
+        if row is not None:
             return np.asarray(self._own[row])
+        if names:
+            return np.asarray(unit(self._own[_random(singular).choice(len(vectors), 2, False)].sum(0)))
         kind = _drawn(f"kind {_seed(singular) % CLUSTERS}")
         drawn = np.sqrt(KINSHIP) * kind + np.sqrt(1 - KINSHIP) * _drawn(singular)
         return np.asarray(unit(drawn - (drawn @ self._middle) * self._middle))

@@ -7,23 +7,23 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.scene import CANONICAL_PHRASES, Codec
 from langsplat_core.semantics.encoder import Encoder, PhraseEncoder
-from langsplat_core.semantics.everyday import everyday_phrases
-from langsplat_core.semantics.relevancy import relevancy
+from langsplat_core.semantics.everyday import everyday_phrases, everyday_vectors
+from langsplat_core.semantics.relevancy import Scale, relevancy_of
 
 CHUNK = 4_096  # vectors judged at a time
 
 
 @dataclass(frozen=True, eq=False)
 class Vocabulary:
-    """The phrases that errors are measured with."""
+    """The phrases that errors are measured with, and against which relevancy is read."""
 
     phrases: Array  # (Q, D) float32 unit text vectors
-    canonical: Array  # (C, D) float32 unit text vectors of CANONICAL_PHRASES
-    temperature: float
+    scale: Scale
 
     def relevancy(self, vectors: Array) -> Array:
         """(M, D) unit vectors -> (M, Q) in [0, 1]."""
-        return relevancy(vectors, self.phrases, self.canonical, self.temperature)
+        zero, rate = self.scale.of(vectors @ self.scale.texts.T)
+        return relevancy_of(vectors @ self.phrases.T, zero[:, None], rate[:, None])
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,9 @@ class RelevancyError:
 def everyday_vocabulary(encoder: Encoder | PhraseEncoder, phrases: tuple[str, ...] = ()) -> Vocabulary:
     """`phrases` and everyday ones, as `encoder` writes them."""
     texts = list(dict.fromkeys([*phrases, *everyday_phrases(encoder.unknown_words)]))
-    return Vocabulary(
-        encoder.encode_texts(texts) if texts else encoder.encode_texts(list(CANONICAL_PHRASES)),
-        encoder.encode_texts(list(CANONICAL_PHRASES)),
-        encoder.temperature,
-    )
+    canonical = encoder.encode_texts(list(CANONICAL_PHRASES))
+    scale = Scale(canonical, everyday_vectors(encoder), encoder.temperature)
+    return Vocabulary(encoder.encode_texts(texts) if texts else canonical, scale)
 
 
 def relevancy_error(made: Array, vectors: Array, vocabulary: Vocabulary) -> RelevancyError:
