@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -110,21 +111,23 @@ def pooled(scores: Iterable[Score]) -> tuple[int, float, float]:
 def score_table(reports: Sequence[RoomReport]) -> str:
     """Markdown: the method, per tier and kind of phrase: means over the rooms, and the standard deviation
     between them where there are several."""
-    lines = ["| tier | phrases | queries | mIoU % | localisation % | 3D IoU % |", "|---|---|---|---|---|---|"]
+    head = ("tier", "phrases", "queries", "mIoU %", "localisation %", "3D IoU %", "right regions: 3D IoU %")
+    lines = [_row(head), "|" + "---|" * len(head)]
     for tier, rooms in _by_tier(reports):
         for kind in (*KINDS, "all"):
             of_rooms = [of_kind(room.measured[0], kind) for room in rooms]
             count = sum(queries for queries, *_ in of_rooms)
             if count:
                 spreads = [_spread(values) for values in zip(*(row[1:] for row in of_rooms), strict=True)]
+                spreads.append(_spread([_direct(room.measured[0], kind, "ceiling") for room in rooms]))
                 lines.append(_row((tier, kind, count, *spreads)))
     return "\n".join(lines)
 
 
 def of_kind(measured: Measured, kind: str) -> tuple[int, float, float, float]:
     """Queries, mean IoU, localisation and 3-D IoU of one kind of phrase, or of all."""
-    direct = [score for score in measured.direct if kind in (score.kind, "all")]
-    return (*pooled(s for s in measured.scores if kind in (s.kind, "all")), _direct(direct))
+    direct = _direct(measured, kind, "mean_iou")
+    return (*pooled(s for s in measured.scores if kind in (s.kind, "all")), direct)
 
 
 def _spread(shares: Sequence[float]) -> str:
@@ -211,9 +214,11 @@ def _by_tier(reports: Sequence[RoomReport]) -> Iterator[tuple[str, list[RoomRepo
         yield tier, [report for report in reports if report.tier == tier]
 
 
-def _direct(scores: Sequence[DirectScore]) -> float:
+def _direct(measured: Measured, kind: str, name: Literal["mean_iou", "ceiling"]) -> float:
+    """Mean over the phrases of a kind, or of all, among the Gaussians."""
+    scores = [score for score in measured.direct if kind in (score.kind, "all")]
     count = sum(score.phrases for score in scores)
-    return sum(score.mean_iou * score.phrases for score in scores) / max(count, 1)
+    return float(sum(getattr(score, name) * score.phrases for score in scores) / max(count, 1))
 
 
 def _percent(share: float) -> str:

@@ -22,6 +22,7 @@ from langsplat_core.query.cut import CutRule, cut_level
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.places import peak_pixel
+from langsplat_core.query.regions import Regions
 from langsplat_core.raster.protocol import Rasterizer, View
 from langsplat_core.scene import Camera
 from langsplat_core.semantics.relevancy import FLOOR
@@ -91,6 +92,7 @@ class DirectScore:
     kind: str
     phrases: int
     mean_iou: float
+    ceiling: float = 0.0  # mean IoU of the regions that are right, at the level where they fit best
 
 
 def ask(engine: QueryEngine, texts: Iterable[str], level: LevelChoice = "auto") -> Asked:
@@ -232,7 +234,7 @@ def evaluate_direct(
     """The overlap without any view. labels: (3, N) the true id of every Gaussian at each level, -1 for those
     that no photograph shows, which count on neither side (see `oracles.true_labels`)."""
     seen = (labels >= 0).any(axis=0)
-    results: dict[str, list[float]] = {}
+    results: dict[str, list[tuple[float, float]]] = {}
     for phrase in truth.phrases:
         right = _mask(labels, phrase)[seen]
         if phrase.text not in asked.answers or right.sum() < MIN_GAUSSIANS:
@@ -243,11 +245,28 @@ def evaluate_direct(
             found = answer.members[seen]
         else:
             found = values > cut_level(rule, values, answer.peak, answer.median)
-        results.setdefault(phrase.kind, []).append(intersection_over_union(found, right))
+        best = _ceiling(asked.engine.regions, seen, np.asarray(right)) if rule == "regions" else 0.0
+        results.setdefault(phrase.kind, []).append((intersection_over_union(found, right), best))
     return [
-        DirectScore(kind, len(rows), float(np.mean(rows)))
+        DirectScore(
+            kind, len(rows), float(np.mean([r[0] for r in rows])), float(np.mean([r[1] for r in rows]))
+        )
         for kind, rows in sorted(results.items(), key=lambda item: KINDS.index(item[0]))
     ]
+
+
+def _ceiling(regions: Regions, seen: Array, right: Array) -> float:
+    """The largest overlap of a union of one level's regions with `right`, of the `seen` Gaussians: regions are
+    taken by the share of them that is right."""
+    best = 0.0
+    for everywhere in regions.everywhere[:, seen]:
+        near = everywhere >= 0
+        sizes = np.bincount(everywhere[near])
+        hits = np.bincount(everywhere[near & right], minlength=len(sizes))
+        order = np.argsort(-hits / np.maximum(sizes, 1), kind="stable")
+        hit, size = np.cumsum(hits[order]), np.cumsum(sizes[order])
+        best = max(best, float((hit / (size + right.sum() - hit)).max(initial=0)))
+    return best
 
 
 def found_rate(asked: Asked, texts: Iterable[str]) -> tuple[float, int]:
