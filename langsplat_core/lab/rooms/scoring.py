@@ -233,7 +233,7 @@ def evaluate_direct(
 ) -> list[DirectScore]:
     """The overlap without any view. labels: (3, N) the true id of every Gaussian at each level, -1 for those
     that no photograph shows, which count on neither side (see `oracles.true_labels`)."""
-    seen = (labels >= 0).any(axis=0)
+    seen = np.asarray((labels >= 0).any(axis=0))
     results: dict[str, list[tuple[float, float]]] = {}
     for phrase in truth.phrases:
         right = _mask(labels, phrase)[seen]
@@ -245,7 +245,7 @@ def evaluate_direct(
             found = answer.members[seen]
         else:
             found = values > cut_level(rule, values, answer.peak, answer.median)
-        best = _ceiling(asked.engine.regions, seen, np.asarray(right)) if rule == "regions" else 0.0
+        best = _ceiling(asked.engine.regions, seen, right) if rule == "regions" else 0.0
         results.setdefault(phrase.kind, []).append((intersection_over_union(found, right), best))
     return [
         DirectScore(
@@ -256,8 +256,8 @@ def evaluate_direct(
 
 
 def _ceiling(regions: Regions, seen: Array, right: Array) -> float:
-    """The largest overlap of a union of one level's regions with `right`, of the `seen` Gaussians: regions are
-    taken by the share of them that is right."""
+    """The largest overlap of a union of one level's regions with `right`, of the `seen` Gaussians; the regions
+    are taken by the share of them that is right."""
     best = 0.0
     for everywhere in regions.everywhere[:, seen]:
         near = everywhere >= 0
