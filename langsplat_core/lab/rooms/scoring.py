@@ -256,8 +256,8 @@ def evaluate_direct(
 
 
 def _ceiling(regions: Regions, seen: Array, right: Array) -> float:
-    """The largest overlap of a union of one level's regions with `right`, of the `seen` Gaussians; the regions
-    are taken by the share of them that is right."""
+    """The largest overlap of a union of one level's regions with `right`, of the `seen` Gaussians; regions
+    are taken in the order of the share that is right."""
     best = 0.0
     for everywhere in regions.everywhere[:, seen]:
         near = everywhere >= 0
