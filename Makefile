@@ -11,7 +11,7 @@ PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist
 export PIP_QUIET := 1
 .SILENT: $(STAMP) demo
 
-.PHONY: help demo quick test slow check format elsewhere bench gpu pictures app light bundle desktop clean
+.PHONY: help demo quick test slow check format elsewhere parity bench gpu pictures app light bundle desktop clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -60,6 +60,13 @@ elsewhere: system  ## the tests that compute, as on other processors, in other o
 	$(BIN)/python packaging/elsewhere.py $(if $(ONLY),--only $(ONLY)) \
 	  $$([ -e $(NEWER)/.installed ] && echo --newest $(NEWER)/bin/python)
 
+PARITY := .parity
+parity: $(STAMP)  ## vectors and masks against those of open_clip, segment_anything and sam2, in .parity (docs/encoders.md)
+	SAM2_BUILD_CUDA=0 $(BIN)/pip install --quiet --upgrade --target $(PARITY) --no-deps --no-build-isolation \
+	  --constraint packaging/constraints.txt $$($(BIN)/python -c "import tomllib; print(*tomllib.load(open( \
+	  'pyproject.toml', 'rb'))['project']['optional-dependencies']['parity'])")
+	PYTHONPATH=$(CURDIR)/$(PARITY) $(BIN)/python -m pytest --slow tests/semantics/test_parity.py
+
 bench: system  ## speed against error, on this machine
 	$(BIN)/langsplat bench raster --out bench_out
 
@@ -102,4 +109,4 @@ desktop: $(STAMP)  ## show the viewer among this user's programs, and open scene
 	-update-desktop-database $(DATA)/applications
 
 clean:  ## remove what these targets made
-	rm -rf $(VENV) $(LIGHT) $(GPU) $(NEWER) demo_out elsewhere_out bench_out dist .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(LIGHT) $(GPU) $(NEWER) $(PARITY) demo_out elsewhere_out bench_out dist .pytest_cache .mypy_cache .ruff_cache

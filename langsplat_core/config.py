@@ -100,7 +100,7 @@ class MaskConfig:
     """Where masks come from and which are kept (paper section 3.1 and the method's public code)."""
 
     source: Literal["auto", "sam", "graph"] = "auto"  # auto: sam when `sam` names weights, else graph
-    # hub id or folder of SAM, SAM 2 or SAM-HQ weights, e.g. facebook/sam-vit-huge
+    # hub id, folder or file of SAM, SAM 2 or SAM-HQ weights, e.g. facebook/sam-vit-huge
     sam: str = ""
     # layers of crops that SAM sees beside the whole picture, 2 x 2 in the first: 0 as the paper's text,
     # 1 as its code, which takes five times as long

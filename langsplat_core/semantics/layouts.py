@@ -1,9 +1,10 @@
-"""Weights in the layouts of open_clip, OpenAI's CLIP and segment_anything, renamed to those of transformers.
+"""Weights in the layouts of open_clip, OpenAI, segment_anything and sam2, renamed to those of transformers.
 
 What a model is made of follows from the shapes of its tensors; an open_clip_config.json beside them says
 what shapes do not: the heads, and which GELU. Without one, CLIP's heads are 64 wide, those for pictures at
 most 16, as in the models that OpenAI and open_clip published; and the GELU is OpenAI's quick one where the
 file holds OpenAI's `input_resolution` too or has "quickgelu" or "openai" in its name, else the exact one.
+Of SAM 2, whose windows and heads no shape tells, the published sizes are known.
 """
 
 import io
@@ -12,6 +13,7 @@ import pickletools
 import re
 import zipfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -29,10 +31,15 @@ from langsplat_core.semantics.weights import (
 
 Tensors = Mapping[str, Any]  # name -> torch.Tensor
 Settings = dict[str, Any]
+Names = tuple[tuple[re.Pattern[str], str], ...]  # of transformers, for patterns of another layout's
 
 KNOWN = (
-    "neither CLIP's (ViT) by open_clip or OpenAI nor SAM's (ViT) by segment_anything; for another model pass "
-    "a folder or hub id in Hugging Face layout"
+    "neither CLIP's (ViT) by open_clip or OpenAI nor SAM's (ViT) by segment_anything or SAM 2's (Hiera) by "
+    "sam2; for another model pass a folder or hub id in Hugging Face layout"
+)
+MOBILE_SAM = (
+    "a MobileSAM, whose encoder TinyViT transformers does not have; pass sam_vit_b_01ec64.pth in its place, "
+    "or for speed sam2.1_hiera_tiny.pt"
 )
 HEAD_WIDTH, MOST_HEADS = 64, 16
 SAM_HEADS = 8  # of the mask decoder, which no shape tells
@@ -73,7 +80,7 @@ SAM_NAMES = tuple(
     (re.compile(pattern), name)
     for pattern, name in (
         (r"^image_encoder\.", "vision_encoder."),
-        (r"\.blocks\.", ".layers."),
+        (r"^vision_encoder\.blocks\.", "vision_encoder.layers."),
         (r"\.patch_embed\.proj\.", ".patch_embed.projection."),
         (r"\.norm(\d|_final_attn)\.", r".layer_norm\1."),
         (r"\.neck\.0\.", ".neck.conv1."),
@@ -95,7 +102,39 @@ SAM_NAMES = tuple(
         (r"(_head|_mlps\.\d)\.layers\.2\.", r"\1.proj_out."),
     )
 )
+SAM2_NAMES = tuple(  # what is named otherwise than in SAM
+    (re.compile(pattern), name)
+    for pattern, name in (
+        (r"^vision_encoder\.trunk\.", "vision_encoder.backbone."),
+        (r"(\.neck\.convs\.\d)\.conv\.", r"\1."),
+        (r"\.mlp\.layers\.0\.", ".mlp.proj_in."),
+        (r"\.mlp\.layers\.1\.", ".mlp.proj_out."),
+        (r"\.out_proj\.", ".o_proj."),
+        (r"^no_mem_embed$", "no_memory_embedding"),
+    )
+)
 SAM_GRID = "prompt_encoder.shared_embedding.positional_embedding"
+SAM2_POINTS = [f"prompt_encoder.point_embeddings.{n}.weight" for n in range(4)]  # outside, inside, corners
+SAM2_SIDE = 1024  # px, of the square that SAM 2 sees, which no shape tells
+
+
+@dataclass(frozen=True)
+class Hiera:
+    """What the shapes of a SAM 2 do not tell of its encoder."""
+
+    heads: int  # of the first stage; they double with the width
+    windows: tuple[int, int, int, int]  # side by stage, in positions of its grid
+    everywhere: tuple[int, ...]  # blocks that attend to the whole picture
+
+
+SAM2_SIZES: Mapping[tuple[int, int], Hiera] = MappingProxyType(  # by width of the first stage and blocks
+    {
+        (96, 12): Hiera(1, (8, 4, 14, 7), (5, 7, 9)),  # tiny
+        (96, 16): Hiera(1, (8, 4, 14, 7), (7, 10, 13)),  # small
+        (112, 24): Hiera(2, (8, 4, 14, 7), (12, 16, 20)),  # base plus
+        (144, 48): Hiera(2, (8, 4, 16, 8), (23, 33, 43)),  # large
+    }
+)
 
 
 def open_weights(id: str, path: Path, device: str) -> Weights:
@@ -109,7 +148,11 @@ def open_weights(id: str, path: Path, device: str) -> Weights:
     with loading_errors(id, "CLIP or SAM"):
         tensors = _read(id, file)
         if "image_encoder.pos_embed" in tensors:
-            converted = Converted(_sam_config(tensors), _sam_tensors(tensors), {})
+            converted = Converted(_sam_config(tensors), _sam_tensors(tensors, SAM_NAMES), {})
+        elif "image_encoder.trunk.pos_embed" in tensors:
+            converted = _sam2({name.removeprefix("sam_"): tensor for name, tensor in tensors.items()})
+        elif "image_encoder.patch_embed.seq.0.c.weight" in tensors:
+            raise EncoderError(f"{id}: {MOBILE_SAM}")
         elif "visual.class_embedding" in tensors:
             converted = _clip(file, tensors)
         else:
@@ -310,11 +353,11 @@ def _block(name: str, found: re.Match[str], tensor: Any) -> dict[str, Any]:
     return {f"{layer}{IN_BLOCK[inner]}": tensor}
 
 
-def _sam_tensors(tensors: Tensors) -> dict[str, Any]:
+def _sam_tensors(tensors: Tensors, names: Names) -> dict[str, Any]:
     renamed = {}
     for old, tensor in tensors.items():
         name = old
-        for pattern, by in SAM_NAMES:
+        for pattern, by in names:
             name = pattern.sub(by, name)
         renamed[name] = tensor
     renamed["shared_image_embedding.positional_embedding"] = renamed[SAM_GRID]
@@ -329,9 +372,6 @@ def _sam_config(tensors: Tensors) -> Settings:
     reach = [_shape(tensors, f"image_encoder.blocks.{n}.attn.rel_pos_h", 2) for n in range(layers)]
     everywhere = [n for n, (rows, _) in enumerate(reach) if rows == 2 * grid - 1]
     windows = [(rows + 1) // 2 for n, (rows, _) in enumerate(reach) if n not in everywhere]
-    tokens, size = _shape(tensors, "mask_decoder.mask_tokens.weight", 2)
-    decoder = "mask_decoder.transformer.layers.0."
-    narrow = _shape(tensors, f"{decoder}cross_attn_token_to_image.q_proj.weight", 2)[0]
     vision = {
         "image_size": grid * patch,
         "patch_size": patch,
@@ -344,28 +384,79 @@ def _sam_config(tensors: Tensors) -> Settings:
         "global_attn_indexes": everywhere,
         "num_pos_feats": _shape(tensors, "prompt_encoder.pe_layer.positional_encoding_gaussian_matrix", 2)[1],
     }
-    prompts = {
-        "hidden_size": size,
+    settings = _decoder_config(tensors, "lin1") | {"model_type": "sam", "vision_config": vision}
+    settings["prompt_encoder_config"] |= {
         "image_size": grid * patch,
         "patch_size": patch,
         "image_embedding_size": grid,
-        "mask_input_channels": _shape(tensors, "prompt_encoder.mask_downscaling.3.weight", 4)[0],
     }
+    return settings
+
+
+def _decoder_config(tensors: Tensors, first: str) -> Settings:
+    """What the shapes tell of the halves for prompts and masks; `first`: of the two layers of an "mlp"."""
+    tokens, size = _shape(tensors, "mask_decoder.mask_tokens.weight", 2)
+    decoder = "mask_decoder.transformer.layers.0."
+    narrow = _shape(tensors, f"{decoder}cross_attn_token_to_image.q_proj.weight", 2)[0]
     masks = {
         "hidden_size": size,
-        "mlp_dim": _shape(tensors, f"{decoder}mlp.lin1.weight", 2)[0],
+        "mlp_dim": _shape(tensors, f"{decoder}mlp.{first}.weight", 2)[0],
         "num_hidden_layers": _count(tensors, r"mask_decoder\.transformer\.layers\.(\d+)\."),
         "num_attention_heads": SAM_HEADS,
         "attention_downsample_rate": size // narrow,
         "num_multimask_outputs": tokens - 1,
         "iou_head_hidden_dim": _shape(tensors, "mask_decoder.iou_prediction_head.layers.0.weight", 2)[0],
     }
-    return {
-        "model_type": "sam",
-        "vision_config": vision,
-        "prompt_encoder_config": prompts,
-        "mask_decoder_config": masks,
+    channels = _shape(tensors, "prompt_encoder.mask_downscaling.3.weight", 4)[0]
+    prompts = {"hidden_size": size, "mask_input_channels": channels}
+    return {"prompt_encoder_config": prompts, "mask_decoder_config": masks}
+
+
+def _sam2(tensors: dict[str, Any]) -> Converted:
+    """The half of a SAM 2 or 2.1 that sees single pictures; its memory of films is left out.
+
+    tensors: without "sam_" before the names of prompt encoder and mask decoder.
+    """
+    import torch
+
+    points = [tensors.pop(name) for name in SAM2_POINTS if _shape(tensors, name, 2)]
+    renamed = _sam_tensors(tensors, SAM_NAMES + SAM2_NAMES)
+    renamed["prompt_encoder.point_embed.weight"] = torch.cat(points)
+    return Converted(_sam2_config(tensors), renamed, {})
+
+
+def _sam2_config(tensors: Tensors) -> Settings:
+    """What shapes and the published sizes tell, as a config.json of transformers would."""
+    _, wide, *background = _shape(tensors, "image_encoder.trunk.pos_embed", 4)
+    blocks = _count(tensors, r"image_encoder\.trunk\.blocks\.(\d+)\.")
+    if (wide, blocks) not in SAM2_SIZES:
+        raise ValueError(f"a SAM 2 of {blocks} blocks, {wide} wide, which is none of the published ones")
+    size = SAM2_SIZES[wide, blocks]
+    widths = [
+        _shape(tensors, f"image_encoder.trunk.blocks.{n}.attn.proj.weight", 2)[0] for n in range(blocks)
+    ]
+    stages = sorted(set(widths))
+    backbone = {
+        "model_type": "sam2_hiera_det_model",
+        "hidden_size": wide,
+        "num_attention_heads": size.heads,
+        "image_size": [SAM2_SIDE, SAM2_SIDE],
+        "window_positional_embedding_background_size": background,
+        "blocks_per_stage": [widths.count(width) for width in stages],
+        "embed_dim_per_stage": stages,
+        "num_attention_heads_per_stage": [size.heads * width // wide for width in stages],
+        "window_size_per_stage": list(size.windows),
+        "global_attention_blocks": list(size.everywhere),
     }
+    vision = {
+        "backbone_config": backbone,
+        "backbone_channel_list": stages[::-1],
+        "backbone_feature_sizes": [[SAM2_SIDE // step] * 2 for step in (4, 8, 16)],
+        "fpn_hidden_size": _shape(tensors, "image_encoder.neck.convs.0.conv.weight", 4)[0],
+    }
+    settings = _decoder_config(tensors, "layers.0") | {"model_type": "sam2", "vision_config": vision}
+    settings["prompt_encoder_config"]["image_size"] = SAM2_SIDE
+    return settings
 
 
 def _shape(tensors: Tensors, name: str, axes: int) -> tuple[int, ...]:

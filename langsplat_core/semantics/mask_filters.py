@@ -36,7 +36,7 @@ def box_nms(boxes: Array, scores: Array, iou: float) -> Array:
         width = np.minimum(right[best], right[rest]) - np.maximum(left[best], left[rest])
         height = np.minimum(bottom[best], bottom[rest]) - np.maximum(top[best], top[rest])
         common = np.maximum(width, 0) * np.maximum(height, 0)
-        order = rest[common <= iou * (area[best] + area[rest] - common)]
+        order = rest[common / (area[best] + area[rest] - common) <= iou]
     return np.array(kept, int)
 
 

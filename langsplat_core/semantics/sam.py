@@ -20,7 +20,7 @@ from langsplat_core.semantics.masks import LevelMasks
 from langsplat_core.semantics.segmenter import LEVELS, Look, Segmenter
 from langsplat_core.semantics.segmenters import load_segmenter
 
-VERSION = 1
+VERSION = 2
 MASKS_AT_ONCE = 16  # full-size masks of float logits held at one time
 
 

@@ -16,7 +16,7 @@ FAMILIES: Mapping[str, Callable[[Weights], Segmenter]] = MappingProxyType(  # by
 
 
 def load_segmenter(model: str, device: str = "auto") -> Segmenter:
-    """Load `model`: a folder in Hugging Face layout, a file of segment_anything or a hub id.
+    """Load `model`: a folder in Hugging Face layout, a file of segment_anything or sam2, or a hub id.
 
     Raises EncoderError where the weights are absent or are those of no family here.
     """

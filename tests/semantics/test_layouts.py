@@ -1,4 +1,4 @@
-"""Weights in the layouts of open_clip, OpenAI and segment_anything, against open_clip's arithmetic and
+"""Weights in the layouts of open_clip, OpenAI, segment_anything and sam2, against open_clip's arithmetic and
 against the same weights in Hugging Face layout."""
 
 import json
@@ -15,6 +15,7 @@ from safetensors.torch import save_file
 from transformers import CLIPTokenizer
 
 from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.semantics import layouts
 from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
 from langsplat_core.semantics.families.clip import CLIP_MEAN, CLIP_STD
 from langsplat_core.semantics.segmenters import load_segmenter
@@ -27,10 +28,12 @@ from tests.support.other_layouts import (
     open_clip_tensors,
     plain_pictures,
     plain_texts,
+    sam2_tensors,
     segment_anything_tensors,
 )
 from tests.support.tiny_clip import tiny_clip
-from tests.support.tiny_sam import tiny_sam
+from tests.support.tiny_sam import SIDE as SAM_SIDE
+from tests.support.tiny_sam import tiny_sam, tiny_sam2
 
 pytestmark = pytest.mark.long  # transformers alone takes seconds to load
 PHRASES = ["red mug", "a", "handle"]
@@ -226,7 +229,6 @@ HOSTILE_CLIP = {
 HOSTILE_SAM = {
     "SAM-HQ": replaced("mask_decoder.hf_token.weight", torch.zeros(1, 16)),
     "SAM 2": lambda t: {"model": {"image_encoder.trunk.pos_embed": torch.zeros(1)}},
-    "MobileSAM": lambda t: {"image_encoder.patch_embed.seq.0.c.weight": torch.zeros(1)},
     "no grid": without("prompt_encoder.pe_layer.positional_encoding_gaussian_matrix"),
     "no reach": without("image_encoder.blocks.1.attn.rel_pos_h"),
     "no head": without("mask_decoder.iou_prediction_head.layers.2.weight"),
@@ -256,6 +258,43 @@ def test_tensors_that_are_no_sam_are_one_line(case: str, tmp_path: Path) -> None
     tensors = segment_anything_tensors(tiny_sam(tmp_path, decoder_heads=8))
     torch.save(HOSTILE_SAM[case](tensors), tmp_path / "sam.pth")
     refusal(load_segmenter, tmp_path / "sam.pth")
+
+
+HOSTILE_SAM2 = {
+    "three points": without("sam_prompt_encoder.point_embeddings.2.weight"),
+    "a flat point": replaced("sam_prompt_encoder.point_embeddings.2.weight", torch.zeros(16)),
+    "no mask": without("sam_mask_decoder.mask_tokens.weight"),
+    "no block": lambda t: {name: tensor for name, tensor in t.items() if "blocks.2" not in name},
+    "no grid": without("sam_prompt_encoder.pe_layer.positional_encoding_gaussian_matrix"),
+    "a short norm": replaced("image_encoder.trunk.blocks.0.norm1.weight", torch.zeros(5)),
+    "a tensor too many": replaced("image_encoder.trunk.cls_token", torch.zeros(5)),
+    "another width": replaced("image_encoder.trunk.pos_embed", torch.zeros(1, 9, 2, 2)),
+}
+
+
+@pytest.fixture
+def sam2_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tiny SAM 2 counts as published."""
+    monkeypatch.setattr(layouts, "SAM2_SIDE", SAM_SIDE)
+    monkeypatch.setattr(layouts, "SAM2_SIZES", {(8, 5): layouts.Hiera(1, (8, 4, 4, 2), (3,))})
+
+
+@pytest.mark.usefixtures("sam2_size")
+@pytest.mark.parametrize("case", HOSTILE_SAM2)
+def test_tensors_that_are_no_sam2_are_one_line(case: str, tmp_path: Path) -> None:
+    model = tiny_sam2(tmp_path / "folder", decoder_heads=8)
+    model.shared_image_embedding = model.prompt_encoder.shared_embedding
+    tensors = sam2_tensors(model)
+    torch.save({"model": HOSTILE_SAM2[case](tensors)}, tmp_path / "sam2.1_hiera_tiny.pt")
+    refusal(load_segmenter, tmp_path / "sam2.1_hiera_tiny.pt")
+
+
+def test_a_mobile_sam_is_told_what_to_take_in_its_place(tmp_path: Path) -> None:
+    tensors = segment_anything_tensors(tiny_sam(tmp_path, decoder_heads=8))
+    encoder = {"image_encoder.patch_embed.seq.0.c.weight": torch.zeros(32, 3, 3, 3)}
+    decoder = {name: tensor for name, tensor in tensors.items() if not name.startswith("image_encoder")}
+    torch.save(encoder | decoder, tmp_path / "mobile_sam.pt")
+    assert "sam_vit_b_01ec64.pth" in refusal(load_segmenter, tmp_path / "mobile_sam.pt")
 
 
 @pytest.mark.parametrize("load", [load_encoder, load_segmenter])
@@ -304,16 +343,29 @@ def test_a_configuration_of_another_model_is_one_line(case: str, tmp_path: Path)
     refusal(load_encoder, tmp_path)
 
 
-def test_a_file_of_segment_anything_answers_as_the_folder_does(tmp_path: Path) -> None:
-    (tmp_path / "folder").mkdir()
-    tensors = segment_anything_tensors(tiny_sam(tmp_path / "folder", decoder_heads=8))
-    torch.save(tensors, tmp_path / "sam_vit_b_01ec64.pth")
+FILES = {
+    "sam_vit_b_01ec64.pth": (tiny_sam, segment_anything_tensors),
+    "sam2.1_hiera_tiny.pt": (tiny_sam2, lambda model: {"model": sam2_tensors(model)}),
+}
+
+
+@pytest.mark.usefixtures("sam2_size")
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_of_a_segmenter_answers_as_the_folder_does(name: str, tmp_path: Path) -> None:
+    make, renamed = FILES[name]
+    model = make(tmp_path / "folder", decoder_heads=8)
+    with torch.no_grad():  # what is zero in a new one too
+        for parameter in model.parameters():
+            parameter.add_(torch.randn_like(parameter) * 0.1)
+        grid = model.prompt_encoder.shared_embedding.positional_embedding
+        model.shared_image_embedding.positional_embedding.copy_(grid)  # as published ones
+    model.save_pretrained(tmp_path / "folder")
+    torch.save(renamed(model), tmp_path / name)
     image = np.random.default_rng(3).integers(0, 256, (48, 80, 3), dtype=np.uint8)
     points = np.array([[5, 7], [60, 40]], np.float32)
     with torch.inference_mode():
         (got, masks), (want, folder_masks) = (
-            load_segmenter(str(tmp_path / name), "cpu").look(image).ask(points)
-            for name in ("sam_vit_b_01ec64.pth", "folder")
+            load_segmenter(str(tmp_path / path), "cpu").look(image).ask(points) for path in (name, "folder")
         )
     torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(masks, folder_masks, rtol=1e-5, atol=1e-5)

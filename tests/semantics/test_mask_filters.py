@@ -107,3 +107,9 @@ def test_the_largest_island_always_stays() -> None:
     cleaned, _ = clean_regions(mask, 100)
     assert cleaned.sum() == 16
     assert cleaned[10:14, 10:14].all()
+
+
+def test_a_box_tied_at_the_limit_stays() -> None:
+    boxes = np.array([[0, 0, 9, 10], [0, 0, 9, 7]])  # 63 of 90 px, though 0.7 * 90 is less than 63 in floats
+    assert box_nms(boxes, np.array([0.9, 0.8]), 0.7).tolist() == [0, 1]
+    assert box_nms(boxes, np.array([0.9, 0.8]), 0.69).tolist() == [0]

@@ -19,6 +19,7 @@ from langsplat_core.progress import silent
 from langsplat_core.semantics.mask_filters import clean_regions, mask_boxes
 from langsplat_core.semantics.sam import grid_points, load_sam
 from langsplat_core.semantics.segmenter import by_area, padded, squashed, upscale
+from langsplat_core.semantics.segmenters import load_segmenter
 from langsplat_core.semantics.sources import load_mask_source
 from tests.support.plain_filters import plain_box_nms, plain_mask_nms
 from tests.support.tiny_sam import SIDE, tiny_sam, tiny_sam2, tiny_sam2_video, tiny_sam_hq
@@ -192,6 +193,23 @@ def test_a_layer_of_crops_agrees_with_crops_one_after_another(family: str, tmp_p
     crops = [(0, 0, 48, 32), (0, 16, 48, 48), (32, 0, 80, 32), (32, 16, 80, 48)]
     compare(config, kind.from_pretrained(tmp_path).eval(), image, [(0, 0, 80, 48), *crops])
     assert load_sam(config, "cpu").key != load_sam(replace(config, crop_layers=0), "cpu").key
+
+
+@pytest.mark.parametrize("make", [tiny_sam, tiny_sam_hq])
+def test_the_decoder_has_its_authors_norms_whatever_the_file_states(
+    make: Callable[[Path], Any], tmp_path: Path
+) -> None:
+    make(tmp_path)
+    answers = []
+    for epsilon in (1e-6, 0.5):
+        stated = json.loads((tmp_path / "config.json").read_text(encoding="utf-8"))
+        stated["mask_decoder_config"]["layer_norm_eps"] = epsilon
+        (tmp_path / "config.json").write_text(json.dumps(stated), encoding="utf-8")
+        with torch.inference_mode():
+            answers.append(
+                load_segmenter(str(tmp_path), "cpu").look(photograph()).ask(grid_points(2, (48, 80)))
+            )
+    assert torch.equal(answers[0][1], answers[1][1])
 
 
 def test_three_answers_are_put_in_order_of_size_for_each_point() -> None:

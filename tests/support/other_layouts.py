@@ -1,9 +1,10 @@
-"""Tiny models in the layouts of open_clip and segment_anything, and what open_clip computes from its tensors.
+"""Tiny models in the layouts of open_clip, segment_anything and sam2, and what open_clip computes.
 
 Written from the papers and the names in published checkpoints, apart from the product's own tables.
 """
 
 import json
+import re
 from pathlib import Path
 from string import ascii_lowercase
 from typing import Any
@@ -158,6 +159,48 @@ def segment_anything_tensors(model: Any) -> Tensors:
         found[SAM_STEMS.get(stem, "") + name.removeprefix(stem)] = tensor
     assert not any("layer_norm" in name or "vision" in name or "proj_" in name for name in found)
     return found
+
+
+def sam2_tensors(model: Any) -> Tensors:
+    """The weights of transformers' Sam2Model as sam2 names them, with some of its memory of films."""
+    state = model.state_dict()
+    grid = state.pop("shared_image_embedding.positional_embedding")
+    assert torch.equal(grid, state["prompt_encoder.shared_embedding.positional_embedding"])
+    points = state.pop("prompt_encoder.point_embed.weight")
+    found = {f"sam_prompt_encoder.point_embeddings.{n}.weight": points[n : n + 1] for n in range(4)}
+    for name, tensor in state.items():
+        for pattern, by in SAM2_WORDS:
+            name = re.sub(pattern, by, name)
+        found[name] = tensor
+    assert not any("layer_norm" in name or "vision" in name or "proj_" in name for name in found)
+    films = ("maskmem_tpos_enc", "memory_attention.layers.0.norm1.weight", "mask_downsample.bias")
+    return found | {name: torch.ones(3) for name in films}
+
+
+SAM2_WORDS = (
+    *(
+        (rf"(_head|_mlps\.\d)\.{a}\.", rf"\1.layers.{n}.")
+        for a, n in (("layers.0", 1), ("proj_in", 0), ("proj_out", 2))
+    ),
+    *((rf"\.mlp\.{a}\.", f".mlp.layers.{n}.") for a, n in (("proj_in", 0), ("proj_out", 1))),
+    *(
+        (rf"\.mask_embed\.{a}\.", f".mask_downscaling.{n}.")
+        for a, n in (("conv1", 0), ("conv2", 3), ("conv3", 6))
+    ),
+    *((rf"\.mask_embed\.layer_norm{a}\.", f".mask_downscaling.{n}.") for a, n in ((1, 1), (2, 4))),
+    *(
+        (rf"\.upscale_{a}\.", f".output_upscaling.{n}.")
+        for a, n in (("conv1", 0), ("layer_norm", 1), ("conv2", 3))
+    ),
+    (r"\.layer_norm(\d|_final_attn)\.", r".norm\1."),
+    (r"\.o_proj\.", ".out_proj."),
+    (r"\.shared_embedding\.positional_embedding", ".pe_layer.positional_encoding_gaussian_matrix"),
+    (r"^vision_encoder\.neck\.convs\.(\d)\.", r"image_encoder.neck.convs.\1.conv."),
+    (r"^vision_encoder\.backbone\.", "image_encoder.trunk."),
+    (r"\.patch_embed\.projection\.", ".patch_embed.proj."),
+    (r"^(prompt_en|mask_de)coder\.", r"sam_\1coder."),
+    ("^no_memory_embedding$", "no_mem_embed"),
+)
 
 
 def _sam_stems() -> dict[str, str]:

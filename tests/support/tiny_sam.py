@@ -63,7 +63,7 @@ def sam2_vision() -> Sam2VisionConfig:
         image_size=[SIDE, SIDE],
         blocks_per_stage=[1, 1, 2, 1],
         embed_dim_per_stage=[8, 16, 32, 64],
-        num_attention_heads_per_stage=[1, 1, 2, 2],
+        num_attention_heads_per_stage=[1, 2, 4, 8],
         window_size_per_stage=[8, 4, 4, 2],
         window_positional_embedding_background_size=[2, 2],
         global_attention_blocks=[3],
@@ -76,10 +76,11 @@ def sam2_vision() -> Sam2VisionConfig:
     )
 
 
-def tiny_sam2(folder: Path) -> Sam2Model:
+def tiny_sam2(folder: Path, decoder_heads: int = 2) -> Sam2Model:
     """A SAM 2 likewise."""
+    decoder = DECODER | {"num_attention_heads": decoder_heads}
     config = Sam2Config(
-        vision_config=sam2_vision(), prompt_encoder_config=PROMPTS, mask_decoder_config=DECODER
+        vision_config=sam2_vision(), prompt_encoder_config=PROMPTS, mask_decoder_config=decoder
     )
     return _saved(Sam2Model, config, folder, seed=4)
 

@@ -6,6 +6,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.semantics.segmenter import Look, padded
 from langsplat_core.semantics.weights import Weights, load_config, load_model
 
+EPSILON = 1e-5  # of the norms between attentions in segment_anything, PyTorch's; transformers has 1e-6 there
+
 
 class Sam:
     """A `Segmenter`. Its three masks of a point are subpart, part and whole (LangSplat section 3.1)."""
@@ -44,7 +46,9 @@ class SamHq:
 
 
 def _load(kind: Any, config: Any, weights: Weights, name: str) -> Any:
-    return load_model(kind, weights, load_config(config, weights, name))
+    settings = load_config(config, weights, name)
+    settings.mask_decoder_config.layer_norm_eps = EPSILON
+    return load_model(kind, weights, settings)
 
 
 def _seen(model: Any, image: Array) -> tuple[Any, int, tuple[int, int]]:

@@ -1,0 +1,334 @@
+"""Vectors and masks against those of open_clip, segment_anything and sam2 themselves, at full size with the
+same random weights. `make parity` installs them and runs this; else it is skipped."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy import ndimage
+from torch.nn.functional import normalize
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import MaskConfig
+from langsplat_core.progress import silent
+from langsplat_core.semantics.crops import masked_crop
+from langsplat_core.semantics.encoders import load_encoder
+from langsplat_core.semantics.masks import label_maps
+from langsplat_core.semantics.sam import SamMasks, load_sam
+from langsplat_core.semantics.segmenter import LEVELS, Look
+from langsplat_core.semantics.segmenters import load_segmenter
+from langsplat_core.semantics.sources import load_mask_source
+from tests.support.measured import Measure
+from tests.support.upstream import save_clip, scrambled, siglip_tensors, upstream
+
+pytestmark = pytest.mark.slow
+PLAIN = ["red mug", "a photo of a chair", "the handle of a green mug", "object", "things", "naïve café"]
+PLAIN += ["crème brûlée", "ein Fenster", "日本", "3 yellow bananas", "UPPER Case WORDS", "x y z", "texture"]
+MARKED = ["it's", "it’s", "“quoted” mug", "salt &amp; pepper", "of\ufb01ce chair", "mug, not red", "mug 🍵"]
+MARKED += [
+    "3.5 mm jack",
+    "what is this?",
+    "a&b",
+    "co₂",
+    "½ apple",
+    "  two  spaces ",
+    "don`t",
+    "a/b (c)",
+    "a-b",
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def field() -> SimpleNamespace:
+    """The packages, imported before transformers looks for torchvision."""
+    return upstream()
+
+
+def squares(side: int, count: int = 4) -> Array:
+    """Smooth pictures in bright colours, (count, side, side, 3) uint8."""
+    noise = np.random.default_rng(1).uniform(0, 255, (count, side // 16, side // 16, 3)).astype(np.uint8)
+    return np.stack([np.asarray(Image.fromarray(some).resize((side, side))) for some in noise])
+
+
+def close(what: str, got: Any, want: Any, most: float, measured: Measure) -> None:
+    """At most `most` apart, where rows of `want` themselves are a hundred times as far from each other."""
+    got, want = torch.as_tensor(got), torch.as_tensor(want)
+    apart = (got - want).abs().max().item()
+    measured(what, "largest difference", apart)
+    assert got.shape == want.shape
+    assert apart <= most
+    assert (want[0] - want[1]).abs().max() > 100 * most
+
+
+@pytest.mark.parametrize("name", ["ViT-B-16", "ViT-L-14-quickgelu"])
+def test_a_clip_of_open_clip(name: str, field: SimpleNamespace, tmp_path: Path, measured: Measure) -> None:
+    model = scrambled(field.open_clip.create_model, name)
+    save_clip(name, model, tmp_path)
+    encoder = load_encoder(str(tmp_path), "cpu")
+    see = field.open_clip.transform.image_transform(encoder.image_size, is_train=False)
+    pictures = squares(encoder.image_size)
+    phrases = PLAIN + MARKED
+    with torch.inference_mode():
+        texts = normalize(model.encode_text(field.open_clip.get_tokenizer(name)(phrases)))
+        seen = normalize(model.encode_image(torch.stack([see(Image.fromarray(some)) for some in pictures])))
+    close(f"{name}, text", encoder.encode_texts(phrases), texts, 1e-5, measured)
+    close(f"{name}, pictures", encoder.encode_images(pictures), seen, 1e-5, measured)
+
+
+def test_siglip_2_of_open_clip(field: SimpleNamespace, tmp_path: Path, measured: Measure) -> None:
+    """transformers has the tanh form of GELU in both halves; in open_clip pictures go through the exact one,
+    which is replaced here to compare all else."""
+    from safetensors.torch import save_file
+    from transformers import SiglipConfig
+
+    from tests.support.tiny_siglip import gemma_tokenizer
+
+    model = scrambled(field.open_clip.create_model, "ViT-B-16-SigLIP2")
+    tensors = {name: tensor.contiguous() for name, tensor in siglip_tensors(model.state_dict()).items()}
+    save_file(tensors, tmp_path / "model.safetensors")
+    text = {"vocab_size": gemma_tokenizer(tmp_path, words=256_000), "projection_size": 768}
+    SiglipConfig(text_config=text, vision_config={"patch_size": 16}).save_pretrained(tmp_path)
+    encoder = load_encoder(str(tmp_path), "cpu")
+    words = field.open_clip.tokenizer.HFTokenizer(str(tmp_path), context_length=64, clean="canonicalize")
+    pictures = squares(encoder.image_size)
+    pixels = torch.from_numpy(pictures.transpose(0, 3, 1, 2).astype(np.float32) / 127.5 - 1)
+    with torch.inference_mode():
+        texts = normalize(model.encode_text(words(PLAIN)))
+        exact = normalize(model.encode_image(pixels))
+        for module in model.visual.modules():
+            if isinstance(module, torch.nn.GELU):
+                module.approximate = "tanh"
+        seen = normalize(model.encode_image(pixels))
+    close("SigLIP 2, text", encoder.encode_texts(PLAIN), texts, 1e-5, measured)
+    close("SigLIP 2, pictures", encoder.encode_images(pictures), seen, 1e-5, measured)
+    measured("SigLIP 2, pictures", "as open_clip leaves them", (exact - seen).abs().max().item())
+
+
+POINTS = np.array([[100, 200], [700, 500], [1300, 1000]], np.float32) / (1440, 1080)  # shares of a picture
+
+
+def compare(
+    name: str, look: Look, embedding: Any, points: Array, want: tuple[Any, Any], measured: Measure
+) -> None:
+    """A `Look` against the package's `embedding` (1, C, h, w), and what it answers from that same one against
+    `want`, scores (P, 3) and full-size logits (P, 3, H, W); what rounding grows to by both is measured."""
+    field = upstream()
+    scores, full = want
+    seen = look.seen["image_embeddings"]
+    mine, alike = (seen[-1], [*seen[:-1], embedding]) if isinstance(seen, list) else (seen, embedding)
+    close(
+        f"{name}, embedding / sd", *(some[0] / embedding.std() for some in (mine, embedding)), 5e-5, measured
+    )
+    for what, given in (("alone", alike), ("and picture", seen)):
+        ious, logits = replace(look, seen={"image_embeddings": given}, ordered=True).ask(points)
+        enlarged = torch.stack([look.enlarge(masks) for masks in logits])
+        measured(f"{name}, decoder {what}", "predicted IoU", (ious - scores).abs().max().item())
+        share = ((enlarged > 0) != (full > 0)).float().mean().item()
+        measured(f"{name}, decoder {what}", "share of pixels otherwise", share)
+        assert share < 1e-4
+        if what == "alone":
+            stability = field.segment_anything.utils.amg.calculate_stability_score
+            found, wanted = (stability(masks, 0.0, 1.0) for masks in (enlarged, full))
+            close(f"{name}, predicted IoU", ious, scores, 7e-5, measured)
+            close(f"{name}, stability", found, wanted, 1.5e-4, measured)
+            close(f"{name}, logits / sd", enlarged / full.std(), full / full.std(), 5.6e-4, measured)
+
+
+def test_sam_of_segment_anything(field: SimpleNamespace, tmp_path: Path, measured: Measure) -> None:
+    model = scrambled(field.segment_anything.build_sam_vit_b)
+    torch.save(model.state_dict(), tmp_path / "sam_vit_b_01ec64.pth")
+    segmenter = load_segmenter(str(tmp_path / "sam_vit_b_01ec64.pth"), "cpu")
+    photograph = np.asarray(Image.fromarray(squares(1024, 1)[0]).resize((1440, 1080)))
+    points = POINTS * (1440, 1080)
+    predictor = field.segment_anything.SamPredictor(model)
+    with torch.inference_mode():
+        predictor.set_image(photograph)
+        given = torch.from_numpy(predictor.transform.apply_coords(points, photograph.shape[:2]))[:, None]
+        full, scores, _ = predictor.predict_torch(given, torch.ones(len(points), 1), return_logits=True)
+        look = segmenter.look(photograph)
+        compare("SAM ViT-B", look, predictor.features, points.astype(np.float32), (scores, full), measured)
+
+
+def test_sam_2_of_sam2(field: SimpleNamespace, tmp_path: Path, measured: Measure) -> None:
+    """On a square of its own size: others are rounded to bytes here when they are resized, not in sam2."""
+    file = tmp_path / "sam2.1_hiera_tiny.pt"
+    model = scrambled(field.sam2.build_sam.build_sam2, "configs/sam2.1/sam2.1_hiera_t.yaml", device="cpu")
+    torch.save({"model": model.state_dict()}, file)
+    segmenter = load_segmenter(str(file), "cpu")
+    predictor = field.sam2.sam2_image_predictor.SAM2ImagePredictor(model)
+    square = squares(1024, 1)[0]
+    points = (POINTS * 1024).astype(np.float32)
+    with torch.inference_mode():
+        predictor.set_image(square)
+        answers = [
+            predictor.predict(point[None], np.ones(1), multimask_output=True, return_logits=True)
+            for point in points
+        ]
+        want = tuple(torch.from_numpy(np.stack([answer[part] for answer in answers])) for part in (1, 0))
+        embedding = predictor.get_image_embedding()
+        compare("SAM 2.1 tiny", segmenter.look(square), embedding, points, (want[0], want[1]), measured)
+    loose = MaskConfig(
+        sam=str(file), points_per_side=2, predicted_iou=0, stability=0, nms_score=-1, nms_inner=2, nms_iou=2
+    )
+    levels = load_sam(loose, "cpu")(square, silent)
+    assert [len(masks) > 0 for masks in levels.masks] == [True] * LEVELS
+
+
+class Drawn:
+    """A segmenter and, for some levels, a predictor of segment_anything, which answer each point with uneven
+    ellipses. The pictures they see hold the position of each pixel in the whole, for the crops."""
+
+    name, device, shape = "drawn", "cpu", (320, 420)
+    model = SimpleNamespace(mask_threshold=0.0, image_encoder=SimpleNamespace(img_size=1024))
+    transform = SimpleNamespace(apply_coords=lambda points, size: points.astype(np.float32))
+    picture = np.stack(np.mgrid[: shape[0], : shape[1]][::-1], axis=2)
+
+    def __init__(self, levels: tuple[int, ...] = tuple(range(LEVELS))) -> None:
+        rng = np.random.default_rng(0)
+        self._noise = ndimage.gaussian_filter(rng.normal(size=self.shape), 1.5) * 4
+        self._ellipses = [
+            (rng.uniform((0, 0), self.shape[::-1], (n, 2)), rng.uniform(*radii, (n, 2)))
+            for n, radii in ((120, (5, 16)), (60, (12, 34)), (20, (25, 60)))
+        ]
+        self._levels = list(levels)
+
+    def look(self, image: Array) -> Any:
+        """See `Segmenter`."""
+        self._seen = image
+        return SimpleNamespace(ask=self._ask, enlarge=lambda logits: logits)
+
+    set_image = look
+
+    def reset_image(self) -> None:
+        del self._seen
+
+    def predict_torch(self, points: torch.Tensor, *_: object, **__: object) -> tuple[Any, Any, None]:
+        return *self._ask(points[:, 0].numpy())[::-1], None
+
+    def _ask(self, points: Array) -> tuple[Any, Any]:
+        answers = [self._answer(point) for point in points + self._seen[0, 0]]
+        ious, logits = (torch.from_numpy(np.stack(part)) for part in zip(*answers, strict=True))
+        return ious, logits
+
+    def _answer(self, point: Array) -> tuple[Array, Array]:
+        rng = np.random.default_rng((point * 4).astype(int))
+        shifts, stretches = rng.normal(size=(LEVELS, 2)), np.exp(rng.normal(size=(LEVELS, 2)) * 0.08)
+        roughness, ious = rng.uniform(0.2, 1.5, LEVELS), rng.uniform(0.6, 1, LEVELS)
+        x, y = self._seen[0, :, 0], self._seen[:, 0, 1, None]
+        logits = []
+        for n in self._levels:
+            centres, radii = self._ellipses[n]
+            nearest = np.argmin((((centres - point) / radii) ** 2).sum(1))
+            (u, v), (a, b) = centres[nearest] + shifts[n], radii[nearest] * stretches[n]
+            smooth = np.clip(20 * (1 - ((x - u) / a) ** 2 - ((y - v) / b) ** 2), -8, 8)
+            logits.append((smooth + self._noise[y, x] * roughness[n]).astype(np.float32))
+        return ious[self._levels].astype(np.float32), np.stack(logits)
+
+
+def test_the_filters_of_segment_anything_but_for_its_boxes(
+    field: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, measured: Measure
+) -> None:
+    """Its boxes end at the last pixel, ours behind it: with ours in their place every mask is the same, bit
+    by bit. What LangSplat adds, `mask_nms`, lets all pass here: test_mask_filters.py has it."""
+    passing = {"nms_iou": 2.0, "nms_score": -1.0, "nms_inner": 2.0}
+    config = MaskConfig(points_per_side=16, crop_layers=1, min_region=30, **passing)
+    module = field.segment_anything.automatic_mask_generator
+    theirs = module.batched_mask_to_box
+
+    def generated(level: int) -> list[bytes]:
+        generator = module.SamAutomaticMaskGenerator(
+            Drawn.model,
+            points_per_side=config.points_per_side,
+            pred_iou_thresh=config.predicted_iou,
+            stability_score_thresh=config.stability,
+            box_nms_thresh=config.box_nms,
+            crop_n_layers=config.crop_layers,
+            crop_nms_thresh=config.box_nms,
+            min_mask_region_area=config.min_region,
+        )
+        generator.predictor = Drawn((level,))
+        found = generator.generate(Drawn.picture)
+        return sorted(np.packbits(mask["segmentation"]).tobytes() for mask in found)
+
+    ours = [
+        sorted(np.packbits(mask).tobytes() for mask in masks)
+        for masks in SamMasks(Drawn(), config)(Drawn.picture, silent).masks
+    ]
+    as_they_are = [generated(level) for level in range(LEVELS)]
+    for level, (mine, other) in enumerate(zip(ours, as_they_are, strict=True)):
+        for whose, masks in (("ours", mine), ("segment_anything's", other), ("both", {*mine} & {*other})):
+            measured(f"masks of level {level}", whose, len(masks))
+    assert as_they_are != ours
+    after = torch.tensor([0, 0, 1, 1])
+    monkeypatch.setattr(module, "batched_mask_to_box", lambda masks: theirs(masks) + after)
+    assert [generated(level) for level in range(LEVELS)] == ours
+    assert min(map(len, ours)) > 20
+
+
+def langsplat_crop(image: Array, mask: Array, side: int, whole_box: bool = False) -> Array:
+    """As LangSplat's preprocess.py: boxes end one pixel early; OpenCV's linear resize without antialias."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    black = np.where(mask[..., None], image, np.uint8(0))
+    patch = black[rows[0] : rows[-1] + whole_box, columns[0] : columns[-1] + whole_box]
+    height, width = patch.shape[:2]
+    square = np.zeros((max(height, width),) * 2 + (3,), np.uint8)
+    top, left = (len(square) - height) // 2, (len(square) - width) // 2
+    square[top : top + height, left : left + width] = patch
+    resized: Array = upstream().cv2.resize(square, (side, side))
+    return resized
+
+
+Region = tuple[Array, Array]  # picture of its box and its mask there
+SIZES = {"under 112": (4, 112), "112 to 448": (112, 448), "over 448": (448, 4000)}  # px of the longer side
+
+
+@pytest.fixture(scope="module")
+def regions(real_data: Path) -> dict[str, list[Region]]:
+    """40 regions of each of `SIZES` in real photographs, by the segmenter that needs no weights."""
+    source = load_mask_source(MaskConfig(source="graph"))
+    found: dict[str, list[Region]] = {name: [] for name in SIZES}
+    for folder in ("banana/photos", "captures/buddha", "captures/monstree", "captures/tower", "fox/images"):
+        for path in sorted((real_data / folder).iterdir())[1:6:3]:
+            photograph = Image.open(path).convert("RGB")
+            photograph.thumbnail((1440, 1440))
+            image = np.asarray(photograph)
+            for labels in label_maps(source(image, silent)):
+                for row, box in enumerate(ndimage.find_objects(labels + 1)):
+                    sides = [part.stop - part.start for part in box or ()]
+                    for name, (least, most) in SIZES.items():
+                        if box and min(sides) >= 4 and least <= max(sides) < most:
+                            found[name].append((image[box], labels[box] == row))
+    rng = np.random.default_rng(0)
+    return {name: [some[i] for i in rng.permutation(len(some))[:40]] for name, some in found.items()}
+
+
+def test_crops_are_resized_as_langsplats_where_they_grow(regions: dict[str, list[Region]]) -> None:
+    for image, mask in regions["under 112"]:
+        ours = masked_crop(image, mask, 224).astype(int)
+        assert abs(ours - langsplat_crop(image, mask, 224, whole_box=True)).max() <= 2
+
+
+@pytest.mark.parametrize("name", ["demo", "ViT-B-16"])
+def test_vectors_of_langsplats_crops(
+    name: str, regions: dict[str, list[Region]], field: SimpleNamespace, tmp_path: Path, measured: Measure
+) -> None:
+    if name != "demo":
+        save_clip(name, scrambled(field.open_clip.create_model, name), tmp_path)
+    encoder = load_encoder(name if name == "demo" else str(tmp_path), "cpu")
+    for size, every in regions.items():
+        some = every if name == "demo" else every[:10]
+        ours, theirs = (
+            encoder.encode_images(np.stack([crop(image, mask, encoder.image_size) for image, mask in some]))
+            for crop in (masked_crop, langsplat_crop)
+        )
+        apart = 1 - (ours * theirs).sum(axis=1)
+        others = 1 - (ours @ ours.T)[~np.eye(len(ours), dtype=bool)]
+        for what, value in (("median", np.median(apart)), ("largest", apart.max())):
+            measured(f"{name}, crops {size} px, 1 - cosine", what, value)
+        measured(f"{name}, crops {size} px, 1 - cosine", "median to other crops", np.median(others))
+        assert np.median(apart) < 0.05 * np.median(others)
