@@ -22,8 +22,8 @@ from langsplat_core.semantics.relevancy import NARROWEST, Scale, relevancy_of
 SAMPLED = 96  # everyday phrases that are looked up in a scene without codewords, where each costs a query
 # Spreads above the median best fit of everyday phrases from which a phrase is found, among whole things and
 # at the finer levels, by what it names: where things like it are, and elsewhere, where more is asked for. One
-# absent phrase in twenty exceeds it (rooms 201 to 203, the bundled encoder and CLIP's geometry with six sets of
-# vectors). Some everyday phrases are there, which raises their median; that is in these numbers.
+# absent phrase in twenty exceeds it (rooms 201 to 203, the bundled encoder and CLIP's geometry with six sets
+# of vectors). Some everyday phrases are there, which raises their median; that is in these numbers.
 FOUND: Mapping[Named | Literal["inside"], tuple[float, float]] = {
     "thing": (1.35, 2.6),
     "part": (2.55, 1.3),
