@@ -66,7 +66,7 @@ def test_the_layout_is_the_documented_one(sidecar, tmp_path, means):
     with safe_open(sidecar, framework="numpy") as file:
         stored, metadata = file.get_slice("things"), file.metadata()
         assert (stored.get_dtype(), stored.get_shape()) == ("U16", [N])
-    assert json.loads(metadata["calibration"]) == [
+    assert json.loads(metadata["odds"]) == [
         [-0.25, 18.548, 2.7, 0.62],
         [0.5, 2.25, 15.5, 0.75],
         [0.75, -0.5, 9.25, 0.5],
@@ -74,27 +74,25 @@ def test_the_layout_is_the_documented_one(sidecar, tmp_path, means):
     write_language(tmp_path / "a.safetensors", random_field(N), means)
     with safe_open(tmp_path / "a.safetensors", framework="numpy") as file:
         assert "things" not in file.keys()  # noqa: SIM118 (not a dictionary)
-        assert "calibration" not in file.metadata()
+        assert "odds" not in file.metadata()
 
 
 def test_a_field_without_either_is_what_files_held_before(sidecar, means):
     def older(tensors: dict[str, Array], metadata: dict[str, str]) -> None:
-        del tensors["things"], metadata["calibration"]
+        del tensors["things"], tensors["everyday"], metadata["odds"]
+        metadata["calibration"] = "[-0.25, 18.5, 2.75, 0.625]"  # of another scale: not read
 
     change(sidecar, older)
     field = read_language(sidecar, means)
-    assert (field.things, field.reading) == (None, Reading(11.7, 0.73))
-
-
-def test_four_numbers_are_the_odds_of_everything(sidecar, means):
-    """As files had it before parts had odds of their own."""
-    change(sidecar, stating("[-0.25, 18.5, 2.75, 0.625]"))
-    calibration = Calibration(*[Odds(-0.25, 18.5, 2.75, 0.625)] * 3)
-    assert read_language(sidecar, means).reading == Reading(11.7, 0.73, calibration)
+    assert (field.things, field.everyday, field.reading) == (None, None, Reading(11.7, 0.73))
 
 
 def stating(text: str) -> Change:
-    return lambda tensors, metadata: metadata.update(calibration=text)
+    return lambda tensors, metadata: metadata.update(odds=text)
+
+
+def thrice(numbers: str) -> str:
+    return f"[[{numbers}], [{numbers}], [{numbers}]]"
 
 
 def holding(things: Array) -> Change:
@@ -114,15 +112,23 @@ DAMAGED = {
     "lists of four": (stating("[[0.0, 1.0, 2.0, 0.7], [0.0, 1.0, 2.0, 0.7], [0.0]]"), "not 3 lists"),
     "a falling one": (
         stating("[[0.0, 1.0, 2.0, 0.7], [0.0, 1.0, 2.0, 0.7], [0.0, -3.0, 2.0, 0.7]]"),
-        "rising with margins",
+        "rising with fits",
     ),
     "lists": (stating("[[0.0], [1.0], [2.0], [0.7]]"), "not 3 lists of four numbers"),
     "an endless number": (stating("[1" + "0" * 500 + ", 1.0, 2.0, 0.7]"), "not 3 lists of four numbers"),
     "nested without end": (stating("[" * 100_000), "not readable as JSON"),
-    "NaN": (stating("[NaN, 1.0, 2.0, 0.7]"), "expected finite numbers"),
-    "infinite": (stating("[0.0, Infinity, 2.0, 0.7]"), "expected finite numbers"),
-    "falling": (stating("[0.0, -3.0, 2.0, 0.7]"), "rising with margins"),
-    "found by less than even": (stating("[0.0, 3.0, 2.0, 0.3]"), r"found in \[0.5, 1\]"),
+    "NaN": (stating(thrice("NaN, 1.0, 2.0, 0.7")), "expected finite numbers"),
+    "infinite": (stating(thrice("0.0, Infinity, 2.0, 0.7")), "expected finite numbers"),
+    "falling": (stating(thrice("0.0, -3.0, 2.0, 0.7")), "rising with fits"),
+    "found by less than even": (stating(thrice("0.0, 3.0, 2.0, 0.3")), r"found in \[0.5, 1\]"),
+    "everyday phrases of whole numbers": (
+        lambda tensors, _: tensors.update(everyday=np.zeros((60, 16), np.int32)),
+        "'everyday' is I32",
+    ),
+    "everyday phrases of another length": (
+        lambda tensors, _: tensors.update(everyday=np.zeros((60, 3), np.float32)),
+        "everyday: expected shape",
+    ),
     "things of floats": (holding(np.zeros(N, np.float32)), "'things' is F32; expected U16"),
     "things of 32 bits": (holding(np.zeros(N, np.int32)), "'things' is I32; expected U16"),
     "things of bytes": (holding(np.zeros(N, np.uint8)), "'things' is U8; expected U16"),

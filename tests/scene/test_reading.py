@@ -13,9 +13,9 @@ N = 20
 
 def test_a_probability_is_the_logistic_of_whole_and_the_better_finer_margin():
     odds = Odds(-1.0, 18.0, 3.0)
-    for margins in ((0.1, -0.2, 0.3), (-0.2, 0.1, 0.3), (-5.0, -4.0, -9.0)):
-        logit = -1 + 18 * margins[2] + 3 * max(margins[:2])
-        assert odds.probability(margins) == pytest.approx(1 / (1 + np.exp(-logit)))
+    for fits in ((0.1, -0.2, 0.3), (-0.2, 0.1, 0.3), (-5.0, -4.0, -9.0)):
+        logit = -1 + 18 * fits[2] + 3 * max(fits[:2])
+        assert odds.probability(fits) == pytest.approx(1 / (1 + np.exp(-logit)))
     far = odds.probability((-999.0, -999.0, -999.0)), odds.probability((999.0, 999.0, 999.0))
     assert 0 <= far[0] < 1e-9 < 1 - 1e-9 < far[1] <= 1
     assert type(far[0]) is float
@@ -35,8 +35,8 @@ def test_a_probability_is_the_logistic_of_whole_and_the_better_finer_margin():
         (0, 1, 1, np.nan),
     ],
 )
-def test_odds_rise_with_margins(numbers):
-    with pytest.raises(ValueError, match="expected finite numbers, rising with margins"):
+def test_odds_rise_with_fits(numbers):
+    with pytest.raises(ValueError, match="expected finite numbers, rising with fits"):
         Odds(*numbers)
 
 

@@ -15,6 +15,7 @@ from langsplat_core.scene import (
     Scene,
     look_at,
 )
+from tests.support.everyday import everyday_about
 
 WORDS = ("mug", "book", "plant")  # each an axis of the vector space; the fourth is the canonical phrases'
 CENTRES = np.array([[-1.2, 0.0, 0.0], [0.0, 0.0, 0.0], [1.2, 0.0, 0.0]])
@@ -54,6 +55,7 @@ def language(phrasebook: bool = False) -> LanguageField:
         canonical=np.tile(axis(3), (4, 1)),
         encoder_id="fake",
         phrasebook={"book": axis(1)} if phrasebook else {},
+        everyday=everyday_about(axis(3)),
     )
 
 

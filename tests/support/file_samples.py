@@ -260,6 +260,7 @@ def random_field(
         latents = unit(rng.normal(size=(3, n, codec.latent_dim))).astype(np.float32)
     latents[:, ::7] = 0  # never observed
     big = codec.vector_dim
+    others = unit(np.random.default_rng((seed, 1)).normal(size=(60, big)))
     return LanguageField(
         latents=latents,
         confidence=rng.uniform(0, 9, size=(3, n)).astype(np.float32),
@@ -267,4 +268,5 @@ def random_field(
         canonical=unit(rng.normal(size=(len(CANONICAL_PHRASES), big))).astype(np.float32),
         encoder_id="demo",
         phrasebook={phrase: unit(rng.normal(size=big)).astype(np.float32) for phrase in phrases},
+        everyday=others.astype(np.float16).astype(np.float32),
     )

@@ -16,6 +16,7 @@ from langsplat_core.scene import (
     Scene,
     look_at,
 )
+from tests.support.everyday import everyday_about
 
 DIM = 8
 AXES = (
@@ -27,7 +28,8 @@ AXES = (
     "blue",
 )  # the seventh is the canonical phrases', eighth nothing's
 COLOURS = ("red", "blue")
-TEMPERATURE = 2.0  # so that half as much likeness is visibly less
+TEMPERATURE = 2.0  # so that half as much likeness is visibly less, also
+SPREAD = 0.4  # of everyday phrases about the canonical one
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -100,7 +102,7 @@ def laid_table(phrasebook: dict[str, Array] | None = None) -> tuple[Scene, dict[
     canonical = np.tile(np.eye(DIM, dtype=np.float32)[6], (4, 1))
     field = LanguageField(
         latents, confidence, LinearCodec(np.eye(DIM, dtype=np.float32)), canonical, "plain", phrasebook or {},
-        Reading(temperature=TEMPERATURE),
+        Reading(temperature=TEMPERATURE), everyday=everyday_about(np.eye(DIM)[6], SPREAD),
     )  # fmt: skip
     masks = {block.name: owners == number for number, block in enumerate(BLOCKS)}
     return Scene(gaussians, field, (front_camera(),)), masks

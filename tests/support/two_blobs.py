@@ -12,6 +12,7 @@ from langsplat_core.scene import (
     Scene,
     look_at,
 )
+from tests.support.everyday import everyday_about
 
 D = 16
 
@@ -56,6 +57,7 @@ def two_blob_scene(linear: bool = True) -> tuple[Scene, np.ndarray, np.ndarray]:
     confidence[0] = 0
     field = LanguageField(latents, confidence, codec, np.eye(D, dtype=np.float32)[8:12], "none")
     phrasebook = {"Left": np.eye(D, dtype=np.float32)[0], "nowhere": np.eye(D, dtype=np.float32)[5]}
-    field = LanguageField(latents, confidence, codec, field.canonical, "none", phrasebook)
+    everyday = everyday_about(np.eye(D)[8])
+    field = LanguageField(latents, confidence, codec, field.canonical, "none", phrasebook, everyday=everyday)
     camera = look_at(np.zeros(3), np.array([0, 0, 4.0]), np.array([0, -1.0, 0]), (64, 48))
     return Scene(gaussians, field, (camera,)), means[:count], means[count:]
