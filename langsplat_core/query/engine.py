@@ -59,6 +59,7 @@ class Basis:
     calibration: str | None  # where percentages were seen to hold; None: there are none
     short: str  # one line
     long: str  # the same with what follows from it, and what to do about it
+    guesses: bool  # of the demo encoder, outside the rooms that it was made for
 
 
 LoadEncoder = Callable[[str], TextEncoder]  # from a hub id, a folder or "demo"; may raise EncoderError
@@ -128,7 +129,8 @@ class QueryEngine:
         name, calibration = field.encoder_id, None
         if name == DEMO:
             name = "demo encoder"
-        if field.encoder_id == DEMO and field.reading.calibration is None:
+        guesses = field.encoder_id == DEMO and field.reading.calibration is None
+        if guesses:
             short, long = f"{name}, made for drawn rooms: guesses here", DEMO_ELSEWHERE
         elif everyday is None:
             short = f"{name}, as published: no everyday phrases to compare with"
@@ -142,7 +144,7 @@ class QueryEngine:
         else:
             short, calibration = f"{name}, calibrated in drawn rooms", "drawn rooms"
             long = f"{short}. Percentages hold in such rooms, and this scene is one"
-        return Basis(field.encoder_id, calibration, short, long)
+        return Basis(field.encoder_id, calibration, short, long, guesses)
 
     @cached_property
     def _everyday(self) -> Array | None:
@@ -299,7 +301,8 @@ class QueryEngine:
             return
         canonical = np.asarray(encoder.encode_texts(list(CANONICAL_PHRASES)), np.float64)
         assert self.scene.language is not None
-        if ((canonical * self.scene.language.canonical).sum(1) < SAME_ENCODER).any():
+        own = self.scene.language.canonical
+        if canonical.shape != own.shape or ((canonical * own).sum(1) < SAME_ENCODER).any():
             raise EncoderError(
                 f"the scene was made with other weights of {self.field.encoder_id}; give those with "
                 "--encoder, or make the scene again"
