@@ -12,10 +12,13 @@ from langsplat_core.scene import CANONICAL_PHRASES, Calibration, Odds, Reading, 
 from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import DEMO
 from tests.support.blob_words import named_scene
-from tests.support.fakes import DIM, FakeEncoder, axis
+from tests.support.fakes import DIM, WORDS, FakeEncoder, axis
 
 CALIBRATED = Reading(calibration=Calibration(*[Odds(0, 1, 1)] * 3))
-EVERYDAY = unit(np.random.default_rng(4).normal(size=(40, DIM)).astype(np.float32))
+FAR = np.where(
+    np.arange(DIM) < len(WORDS), 0.5, 1
+)  # from what is in the scene, so that that is found clearly
+EVERYDAY = unit((FAR * np.random.default_rng(4).normal(size=(40, DIM))).astype(np.float32))
 
 
 def scene_of(encoder: str, reading: Reading, *, everyday: bool = True) -> Scene:
@@ -74,15 +77,17 @@ def test_everyday_phrases_of_the_encoder_count_once_they_are_there():
 def test_without_a_calibration_combined_answers_have_no_probability_and_the_weakest_excess():
     scene = scene_of("lab/clip", Reading())
     assert scene.language is not None
-    book = scene.language.phrasebook | {"handle": axis(5)}
+    book = scene.language.phrasebook | {"handle": axis(3)}
     engine = QueryEngine(replace(scene, language=replace(scene.language, phrasebook=book)))
     parts = [engine.run(text) for text in ("mug", "wall")]
     both = run_phrase(engine, "mug and wall").answer
     assert both.excess == min(part.excess for part in parts) < parts[0].excess
     either = run_phrase(engine, "mug or wall").answer
     assert either.excess == parts[0].excess
+    assert run_phrase(engine, "mug near the wall").answer.excess == parts[1].excess
     assert [part.found for part in (*parts, both, either)] == [True, False, False, True]
     inside = run_phrase(engine, "handle of the wall").answer
+    assert inside.excess == parts[1].excess < run_phrase(engine, "handle of the mug").answer.excess
     none = run_phrase(engine, "mug, not mug").answer
     assert not none.members.any()
     for answer in (both, either, inside, none):
