@@ -68,6 +68,7 @@ class Describe:
             engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
             describer = Describer(engine, phrases, progress)
             answer = self._entries(describer, progress) if self._everything else self._words(describer)
+        answer |= {"encoder": engine.basis.encoder, "calibration": engine.basis.calibration}
         if self.json:
             json.dump(answer, sys.stdout, indent=1)
             print()
@@ -76,6 +77,7 @@ class Describe:
             _print_inventory(answer["inventory"])
         else:
             _print_words(answer["levels"])
+        print(f"answers: {engine.basis.long}")
         if describer.left_out:
             names = ", ".join(describer.left_out[:3]) + (" ..." if len(describer.left_out) > 3 else "")
             print(
@@ -121,8 +123,9 @@ class Describe:
 
     def _entries(self, describer: Describer, progress: Progress) -> dict[str, Any]:
         """The inventory, ready for JSON."""
+        sure = describer.engine.basis.calibration is not None
         entries = [
-            _entry(entry)
+            _entry(entry, sure)
             for entry in describer.inventory(progress)
             if self.level in (None, LEVELS[entry.level])
         ]
@@ -144,7 +147,8 @@ class Describe:
             levels = describer.at_gaussians(np.array([self.gaussian]), np.ones(1), self.top)
             place = {"gaussian": self.gaussian}
         wanted = [words for words in levels if self.level in (None, LEVELS[words.level])]
-        return place | _asked(describer) | {"levels": [_level(words) for words in wanted]}
+        sure = describer.engine.basis.calibration is not None
+        return place | _asked(describer) | {"levels": [_level(words, sure) for words in wanted]}
 
     def _thing(self, engine: QueryEngine, phrase: str) -> Instance:
         answer = combine([run_phrase(engine, phrase, "auto").answer], "union")
@@ -156,46 +160,55 @@ def _asked(describer: Describer) -> dict[str, Any]:
     return {"asked": len(describer.words[0].phrases), "left_out": len(describer.left_out)}
 
 
-def _word(word: Word | None) -> dict[str, Any] | None:
-    return None if word is None else {"phrase": word.phrase, "probability": word.probability}
+def _share(softmax: float, sure: bool) -> dict[str, Any]:
+    """A share of the softmax over a vocabulary, and whether that is a probability too."""
+    return {"softmax": softmax, "probability": softmax if sure else None}
 
 
-def _level(words: Words) -> dict[str, Any]:
+def _word(word: Word | None, sure: bool) -> dict[str, Any] | None:
+    return None if word is None else {"phrase": word.phrase, **_share(word.probability, sure)}
+
+
+def _level(words: Words, sure: bool) -> dict[str, Any]:
     return {
         "level": LEVELS[words.level],
-        "words": [_word(word) for word in words.words],
+        "words": [_word(word, sure) for word in words.words],
         "other": words.other,
         "known": words.known,
-        "colour": _word(words.colour),
-        "material": _word(words.material),
+        "colour": _word(words.colour, sure),
+        "material": _word(words.material, sure),
     }
 
 
-def _spot(spot: Spot) -> dict[str, Any]:
+def _spot(spot: Spot, sure: bool) -> dict[str, Any]:
     return {
         "centre": spot.centre.tolist(),
         "box": spot.box.tolist(),
         "gaussians": len(spot.rows),
         "share": spot.share,
-        "colour": _word(spot.colour),
-        "material": _word(spot.material),
+        "colour": _word(spot.colour, sure),
+        "material": _word(spot.material, sure),
     }
 
 
-def _entry(entry: Entry) -> dict[str, Any]:
+def _entry(entry: Entry, sure: bool) -> dict[str, Any]:
     return {
         "phrase": entry.phrase,
         "also": list(entry.also),
         "level": LEVELS[entry.level],
-        "probability": entry.probability,
+        **_share(entry.probability, sure),
         "score": entry.score,
         "share": entry.share,
-        "spots": [_spot(spot) for spot in entry.spots],
+        "spots": [_spot(spot, sure) for spot in entry.spots],
     }
 
 
 def _looks(described: dict[str, Any]) -> str:
     return " ".join(described[key]["phrase"] for key in ("colour", "material") if described[key] is not None)
+
+
+def _percent(described: dict[str, Any]) -> str:
+    return "" if described["probability"] is None else f" {100 * described['probability']:.0f} %"
 
 
 def _print_inventory(entries: list[dict[str, Any]]) -> None:
@@ -205,7 +218,7 @@ def _print_inventory(entries: list[dict[str, Any]]) -> None:
             entry["phrase"],
             ", ".join(entry["also"]),
             entry["level"],
-            f"{100 * entry['probability']:.0f}",
+            _percent(entry).strip(" %") or "-",
         )
         for number, spot in enumerate(entry["spots"]):
             centre = " ".join(f"{value:.2f}" for value in spot["centre"])
@@ -222,6 +235,6 @@ def _print_words(levels: list[dict[str, Any]]) -> None:
         if not level["words"]:
             print(f"{level['level']:<8} nothing is known here")
             continue
-        said = ", ".join(f"{word['phrase']} {100 * word['probability']:.0f} %" for word in level["words"])
+        said = ", ".join(word["phrase"] + _percent(word) for word in level["words"])
         looks = _looks(level)
         print(f"{level['level']:<8} {said}" + (f"; looks {looks}" if looks else ""))

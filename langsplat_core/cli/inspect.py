@@ -19,6 +19,7 @@ from langsplat_core.errors import BackendError, LangSplatError
 from langsplat_core.extras import EXTRAS, remedy
 from langsplat_core.formats import load_scene
 from langsplat_core.formats.summary import NEEDLE, OPACITY_EDGES, SceneSummary, disk_bytes, summarise
+from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import load_text_encoder
 
@@ -51,6 +52,8 @@ class Inspect:
         table = Table.grid(padding=(0, 2))
         for name, value in [("on disk", f"{size / 1e6:.2f} MB, companions included"), *_lines(summary)]:
             table.add_row(name, Text(value))
+        if scene.language is not None:
+            table.add_row("answers", Text(QueryEngine(scene).basis.long))
         for reason in scene.unread:
             table.add_row("not read", Text(reason))
         OutputConsole().print(table)
@@ -97,7 +100,6 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
         ("phrasebook", f"{field.phrases} phrases"),
         ("observed", observed),
         ("things", "none" if field.things is None else f"{field.things}"),
-        ("verdicts", "calibrated" if field.calibrated else "uncalibrated: no probabilities"),
     ]
 
 

@@ -66,6 +66,7 @@ class QueryScene:
         for text in self._askable(engine, camera):
             result, understood = self._ask(engine, text, camera)
             answer = _answer(result, scene, engine, camera, self.mode) | {"reading": understood}
+            answer |= {"encoder": engine.basis.encoder, "calibration": engine.basis.calibration}
             things = engine.instances(result, self.instances) if result.found else ()
             answer["metres_per_unit"] = unit.length if unit.name == "m" else None
             answer["instances"] = [instance_json(thing, number) for number, thing in enumerate(things, 1)]
@@ -87,6 +88,7 @@ class QueryScene:
                 *lines,
                 sep="\n",
             )
+        print(f"answers: {engine.basis.long}")
 
     def _askable(self, engine: QueryEngine, camera: Camera | None) -> list[str]:
         """The phrases that can be asked; of the others it is said why on stderr, before anything is searched.

@@ -89,7 +89,7 @@ def import_scene(
         canonical=encoder.encode_texts(list(CANONICAL_PHRASES)),
         encoder_id=encoder.id,
         phrasebook=encoded_phrases(encoder, phrases),
-        reading=encoder.reading,
+        reading=encoder.reading.elsewhere,
         everyday=everyday_vectors(encoder),
     )
     subpart, part, whole = confidence.mean(1).tolist() if confidence.size else (0.0, 0.0, 0.0)

@@ -29,7 +29,7 @@ from langsplat_core.pipeline.views import StoredViews
 from langsplat_core.progress import Progress, silent
 from langsplat_core.ranges import check_settings
 from langsplat_core.scene import Gaussians, Scene
-from langsplat_core.semantics.encoders import load_encoder
+from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, load_encoder
 from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sources import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, StoredFeatures, describe_capture
@@ -93,6 +93,8 @@ def _train(
         )
     mask_source = named or masks_of(capture)  # type: ignore[misc]  # one of them is there
     log.info("masks: %s, encoder: %s", mask_source.name, encoder.id)
+    if encoder.id == DEMO and not capture.drawn:
+        log.warning("%s", DEMO_ELSEWHERE)
     train, held_out = capture.split(config.dataset.test_every)
     clock.lap("photographs")
 
@@ -115,6 +117,8 @@ def _train(
     features = StoredFeatures(store, [camera.name for camera in cameras])
     views = StoredViews(cameras, features)
     language, loss = language_field(gaussians, views, encoder, config, work, progress, crew)
+    if not capture.drawn:
+        language = replace(language, reading=language.reading.elsewhere)
     clock.lap("language field")
 
     if crew.leads:

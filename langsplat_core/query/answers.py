@@ -56,7 +56,8 @@ class QueryResult:
             return "found"
         if self.probability is not None:
             return "weak match" if self.probability >= WEAK else "not here"
-        return "weak match" if self.excess is not None and self.excess >= NEARLY else "not here"
+        near = self.excess is not None and self.excess >= NEARLY
+        return "weak match" if near and self.members.any() else "not here"
 
     @property
     def heat_range(self) -> tuple[float, float]:

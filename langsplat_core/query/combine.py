@@ -70,6 +70,7 @@ def cut_inside(
     elif engine.chance is not None:
         above = excess(fits, engine.chance_among(there), "inside", level)
         right = above >= 0
+        above = _combined([above, thing.excess], min)
     return replace(
         asked[0],
         level=chosen,
@@ -78,7 +79,7 @@ def cut_inside(
         even=even[chosen],
         peak=peak,
         fits=fits,
-        probability=probability if members.any() else 0.0,
+        probability=_of_any(members, probability),
         excess=above,
         found=bool(members.any() and thing.found and right),
         members=members,
@@ -104,6 +105,7 @@ def joined(answers: list[QueryResult], all_needed: bool) -> QueryResult:
         even=np.max([np.where(a.members, a.even, 0) for a in counting], axis=0),
         peak=peak,
         probability=_combined([answer.probability for answer in counting], score),
+        excess=_combined([answer.excess for answer in counting], score),
         found=(all if all_needed else any)(answer.found for answer in answers),
         members=np.any([answer.members for answer in counting], axis=0),
     )
@@ -122,12 +124,15 @@ def surest(engine: QueryEngine, answer: QueryResult) -> QueryResult:
     return replace(answer, members=answer.members & (fits >= lowest(best, SURE)))
 
 
-def _combined(
-    probabilities: Sequence[float | None], score: Callable[[Iterable[float]], float]
-) -> float | None:
+def _combined(values: Sequence[float | None], score: Callable[[Iterable[float]], float]) -> float | None:
     """The weakest or the best, as `score` says; None where one is not known."""
-    known = [probability for probability in probabilities if probability is not None]
-    return score(known) if len(known) == len(probabilities) else None
+    known = [value for value in values if value is not None]
+    return score(known) if len(known) == len(values) else None
+
+
+def _of_any(members: Array, probability: float | None) -> float | None:
+    """0 where there are no members, in a scene that has probabilities."""
+    return probability if probability is None or members.any() else 0.0
 
 
 def restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryResult:
@@ -137,7 +142,8 @@ def restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryRe
         answer,
         relevancy=np.where(members, answer.relevancy, 0),
         even=np.where(members, answer.even, 0),
-        probability=_combined([answer.probability, needed.probability], min) if members.any() else 0.0,
+        probability=_of_any(members, _combined([answer.probability, needed.probability], min)),
+        excess=_combined([answer.excess, needed.excess], min),
         peak=answer.peak if members.any() else 0.0,
         found=bool(members.any() and answer.found and needed.found),
         members=members,

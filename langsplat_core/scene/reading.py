@@ -1,6 +1,6 @@
 """How the cosines of one text encoder are read, and what they say about whether a thing is there at all."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,7 +47,12 @@ class Reading:
 
     temperature: float = 10.0  # of the softmax; 10 in the public code of LERF and LangSplat, for CLIP
     found: float = 0.6  # peak relevancy, as published, from which a phrase counts as present
-    calibration: Calibration | None = None
+    calibration: Calibration | None = None  # in drawn rooms, the only ones whose truth is known
+
+    @property
+    def elsewhere(self) -> "Reading":
+        """The same for scenes other than drawn rooms: no probability is known to hold there."""
+        return replace(self, calibration=None)
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.temperature) and self.temperature > 0 and 0 <= self.found <= 1):

@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 from langsplat_core.errors import EncoderError
 from langsplat_core.extras import optional_imports
-from langsplat_core.semantics.encoder import Encoder, Family, PhraseEncoder
+from langsplat_core.semantics.encoder import OPEN_MODEL, Encoder, Family, PhraseEncoder
 from langsplat_core.semantics.families.clip import CLIP
 from langsplat_core.semantics.families.siglip import NAFLEX, SIGLIP
 from langsplat_core.semantics.families.tips import TIPS
@@ -15,6 +15,11 @@ from langsplat_core.semantics.layouts import open_weights
 from langsplat_core.semantics.weights import Weights, model_type, torch_device, weights_path
 
 DEMO = "demo"
+DEMO_ELSEWHERE = (
+    "the demo encoder was made for drawn rooms, and this scene is not marked as one: on photographs its "
+    "answers are guesses, without percentages. Real weights: "
+    f"langsplat train DATASET --out scene.ply --clip.model {OPEN_MODEL}"
+)
 FAMILIES: Mapping[str, Family] = MappingProxyType(  # by `model_type` of config.json
     {"clip": CLIP, "siglip": SIGLIP, "siglip2": NAFLEX, "tipsv2": TIPS}
 )

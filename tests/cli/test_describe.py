@@ -84,7 +84,8 @@ def test_the_inventory_as_json(folder, capsys):
     assert {entry["phrase"] for entry in found["inventory"]} == {"mug", "book", "plant"}
     for entry in found["inventory"]:
         assert entry["level"] == "whole"
-        assert 0 < entry["probability"] <= 1
+        assert 0 < entry["softmax"] <= 1
+        assert entry["probability"] is None
         assert all(len(spot["centre"]) == 3 for spot in entry["spots"])
     assert run("a.ply", "--vocabulary", "list.txt", "--json", "--level", "subpart") == 0
     assert json.loads(capsys.readouterr().out)["inventory"] == []
@@ -103,6 +104,7 @@ def test_a_gaussian_and_a_pixel(folder, capsys):
     assert run("a.ply", *place, "--vocabulary", "list.txt", "--top", "2") == 0
     said = capsys.readouterr().out
     assert "whole    mug" in said
+    assert "%" not in said
     assert "subpart  nothing is known here" in said
     assert run("a.ply", "--pixel", "0", "0", "--vocabulary", "list.txt") == 0
     assert capsys.readouterr().out.count("nothing is known here") == 3

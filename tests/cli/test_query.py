@@ -22,6 +22,7 @@ from langsplat_core.lab.rooms.scoring import ask, evaluate
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Calibration, Odds, Reading, Scene
+from langsplat_core.semantics.encoder import OPEN_MODEL
 from tests.support.fakes import FakeEncoder, axis, blobs
 from tests.support.fakes import cameras as fake_cameras
 from tests.support.fakes import language as fake_language
@@ -72,7 +73,7 @@ def test_phrases_of_the_phrasebook_need_no_encoder(tmp_path):
         [sys.executable, "-c", ASK], cwd=tmp_path, env=os.environ, capture_output=True, text=True
     )
     assert run.returncode == 0, run.stderr
-    book, _, first, pot, _, _, heavy = run.stdout.splitlines()
+    book, _, first, pot, _, _, _, heavy = run.stdout.splitlines()
     assert book.startswith("Book: found")
     assert first.split()[0] == "1"
     assert pot.startswith("PLANT pot: found")
@@ -158,7 +159,7 @@ def test_the_things_of_an_answer_are_listed(tmp_path, capsys):
         np.testing.assert_allclose(thing["size"], 2 * np.array(thing["oriented_box"]["half_extents"]))
         assert 0.4 < thing["share"] < 0.6
     QueryScene(tmp_path / "a.ply", ("pair",), instances=1).run()
-    verdict, heading, *rows = capsys.readouterr().out.splitlines()
+    verdict, heading, *rows, _ = capsys.readouterr().out.splitlines()
     assert " m, pixel" in verdict
     assert "centre, m" in heading
     (row,) = rows
@@ -197,7 +198,12 @@ def test_without_a_calibration_there_is_no_probability(tmp_path, capsys):
     save_scene(tmp_path / "a.ply", Scene(blobs(), fake_language(phrasebook=True)))
     lines, (answer,) = asked(capsys, tmp_path / "a.ply", "book")
     assert lines[0].startswith("book: found, score ")
-    assert answer["probability"] is None
+    assert (answer["probability"], answer["encoder"], answer["calibration"]) == (None, "fake", None)
+    assert not any("%)" in line for line in lines)
+    scene = replace(fake_language(phrasebook=True), encoder_id="demo")
+    save_scene(tmp_path / "a.ply", Scene(blobs(), scene))
+    lines, _ = asked(capsys, tmp_path / "a.ply", "book", "book")
+    assert [f"--clip.model {OPEN_MODEL}" in line for line in lines] == [False] * (len(lines) - 1) + [True]
 
 
 def test_structure_is_read_unless_the_phrase_is_asked_whole(tmp_path, capsys):

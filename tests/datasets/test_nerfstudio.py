@@ -234,12 +234,17 @@ def test_the_real_dataset_with_missing_files(caplog: pytest.LogCaptureFixture) -
     assert all(image.mean() > 30 for image in capture.images)
 
 
-def test_a_dataset_may_say_how_long_its_unit_is(tmp_path: Path) -> None:
+def test_a_dataset_may_say_how_long_its_unit_is_and_that_it_is_drawn(tmp_path: Path) -> None:
     data = write_dataset(tmp_path, GLOBAL)
     assert load(tmp_path).metres_per_unit is None
     rewrite(tmp_path, {**data, "metres_per_unit": 0.5})
     assert load(tmp_path).metres_per_unit == 0.5
     (tmp_path / "work").mkdir()
+    assert not load(tmp_path).drawn
+    for said in (True, "yes"):
+        rewrite(tmp_path, {**data, "drawn": said})
+        assert load(tmp_path).drawn == (said is True)
+    rewrite(tmp_path, {**data, "metres_per_unit": 0.5})
     given = load_capture(tmp_path, DatasetConfig(metres_per_unit=2.0), tmp_path / "work")
     assert given.metres_per_unit == 2.0
     for wrong in (0, -1, "1 m", [1]):

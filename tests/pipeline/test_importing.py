@@ -1,5 +1,6 @@
 """Foreign scenes with a language field, and the way back: numbers, against a tiny CLIP."""
 
+import json
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -47,6 +48,8 @@ SEEN[::9] = False
 def clip(tmp_path_factory: pytest.TempPathFactory) -> str:
     folder = tmp_path_factory.mktemp("clip")
     tiny_clip(folder)
+    odds = {key: {"constant": 0, "whole": 1, "finer": 1} for key in ("thing", "part", "inside")}
+    (folder / "reading.json").write_text(json.dumps({"calibration": odds}))
     return str(folder)
 
 
@@ -67,6 +70,7 @@ def test_few_meanings_become_a_codebook_of_them(tmp_path, clip):
     assert field is not None
     assert_same(scene.gaussians, G)
     assert (report.codec, report.codec_size) == ("codebook", 7)
+    assert field.reading.calibration is None  # the encoder's is of drawn rooms
     np.testing.assert_array_equal(field.confidence, np.tile(SEEN.astype(np.float32), (3, 1)))
     for level in range(3):
         # codewords are float16 numbers

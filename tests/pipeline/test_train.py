@@ -39,6 +39,26 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny_room(tmp_path_factory.mktemp("room"))
 
 
+def test_a_calibration_is_kept_in_drawn_rooms_alone(room, tmp_path):
+    """Also by a work folder of earlier."""
+    data, sidecar = tmp_path / "room", tmp_path / "scene.langsplat.safetensors"
+    shutil.copytree(room, data)
+    odds = {"constant": 0, "whole": 1, "finer": 1}
+    (data / "encoder" / "reading.json").write_text(
+        json.dumps({"found": 0.7, "calibration": dict.fromkeys(("thing", "part", "inside"), odds)})
+    )
+    made = []
+    for drawn in (True, False):
+        frames = json.loads((data / "transforms.json").read_text())
+        (data / "transforms.json").write_text(json.dumps({**frames, "drawn": drawn}))
+        train_scene(data, tmp_path / "scene.ply", tiny_settings(data))
+        field = load_scene(tmp_path / "scene.ply").language
+        made.append((field.reading.found, field.reading.calibration is not None, load_file(sidecar)))
+    assert [(found, kept) for found, kept, _ in made] == [(0.7, True), (0.7, False)]
+    for name, tensor in made[0][2].items():
+        np.testing.assert_array_equal(tensor, made[1][2][name])
+
+
 def test_photographs_become_a_searchable_scene(room, tmp_path):
     out = tmp_path / "scene.ply"
     report = train_scene(room, out, tiny_settings(room))

@@ -53,7 +53,9 @@ def test_it_is_said_once_the_mouse_rests(pointing):
     found = pointing.state.hover
     assert found.phrases == ("mug",)
     assert found.found.relevancy[0] > 0.9
-    assert "mug" in said(found.found.words[2])
+    assert "mug" in said(found.found.words[2], sure=False)
+    assert "%" not in said(found.found.words[2], sure=False)
+    assert "mug 100 %" in said(found.found.words[2], sure=True)
     assert "away" in figures(found)[-1]
     assert figures(found)[0].startswith("mug: ")
 

@@ -98,6 +98,8 @@ def test_the_verdict_and_how_likely_it_is(viewer, paper, constant, verdict, perc
 
 def test_without_a_calibration_nothing_is_said_to_be_likely(viewer, paper):
     panel.draw(searched(viewer, "mug"))
+    assert viewer.engine.basis.short in paper.said
+    assert viewer.engine.basis.long in " ".join(" ".join(paper.said).split())
     assert "found" in paper.said
     assert not any("likely" in text for text in paper.said)
     assert not any("read as" in text for text in paper.said)

@@ -106,7 +106,7 @@ class Prepared:
     subject: Subject
     camera: Camera
     results: tuple[QueryResult, ...]
-    lines: tuple[str, ...]  # one for each query, for people and scripts
+    lines: tuple[str, ...]  # one for each query, and what all stand on, for people and scripts
 
 
 def prepare(request: StillRequest, services: Services, progress: Progress = silent) -> Prepared:
@@ -134,7 +134,8 @@ def prepare(request: StillRequest, services: Services, progress: Progress = sile
         pairs = zip(results, request.cuts, strict=True)
         results = tuple(recut(result, cut) if cut > 0 else result for result, cut in pairs)
     subject = _subject(scene, request, slots(results, request.colours))
-    return Prepared(subject, camera, results, tuple(describe(result) for result in results))
+    basis = (f"answers: {engine.basis.long}",) if results else ()
+    return Prepared(subject, camera, results, (*map(describe, results), *basis))
 
 
 def _compare_with(engine: QueryEngine, text: str, progress: Progress) -> None:

@@ -17,20 +17,22 @@ def draw(viewer: Viewer) -> None:
     if hover is None or hover.found is None or not imgui.begin_tooltip():
         return
     imgui.push_text_wrap_pos(hello_imgui.em_size(24))
+    sure = viewer.engine is not None and viewer.engine.basis.calibration is not None
     for name, words in zip(LEVELS, hover.found.words, strict=True):
         imgui.text_colored(muted(), name)
         imgui.same_line(hello_imgui.em_size(4.5))
-        imgui.text_unformatted(said(words))
+        imgui.text_unformatted(said(words, sure))
     for line in figures(hover):
         imgui.text_colored(muted(), line)
     imgui.pop_text_wrap_pos()
     imgui.end_tooltip()
 
 
-def said(words: Words) -> str:
-    """ "teddy bear 64 %, toy 12 %": the most probable words of a place at one level."""
+def said(words: Words, sure: bool) -> str:
+    """ "teddy bear 64 %, toy 12 %": the most probable words of a place at one level, without percentages
+    where none are `sure`."""
     likely = [word for word in words.words if word.probability > UNSURE]
-    named = [f"{word.phrase} {100 * word.probability:.0f} %" for word in likely]
+    named = [word.phrase + (f" {100 * word.probability:.0f} %" if sure else "") for word in likely]
     of_colour = "" if words.colour is None else f"{words.colour.phrase}: "
     return of_colour + ", ".join(named) if named else "nothing known"
 

@@ -9,7 +9,7 @@ from langsplat_core.query.engine import no_field
 from langsplat_core.scene import CANONICAL_PHRASES
 from langsplat_viewer import actions
 from langsplat_viewer.panels import answers, query_box
-from langsplat_viewer.panels.style import beside_boxed, muted, small_wrapped
+from langsplat_viewer.panels.style import bad, beside_boxed, muted, small_wrapped, tip
 from langsplat_viewer.viewer import Viewer
 
 CHOICES: tuple[LevelChoice, ...] = get_args(LevelChoice)
@@ -30,6 +30,10 @@ def draw(viewer: Viewer) -> None:
         actions.mute_letters(viewer, True)  # what is typed now was meant for the box
     _level(viewer)
     imgui.end_disabled()
+    if viewer.engine is not None:
+        basis = viewer.engine.basis
+        small_wrapped(basis.short, bad() if basis.guesses else muted())
+        tip(basis.long)
     answers.draw(viewer)
     _canonical(viewer)
 

@@ -1,11 +1,13 @@
 """Colours and small widgets that the panels share."""
 
 from collections.abc import Callable
+from textwrap import fill
 
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
 from langsplat_viewer.files.preferences import Preferences
 
+TIP_LETTERS = 72  # of a line
 # Window units at a scale of 1.
 SPACES = {
     "window_padding": (10.0, 8.0),
@@ -64,7 +66,7 @@ def small_wrapped(text: str, colour: ImVec4) -> None:
 def tip(text: str) -> None:
     """What is said while the mouse is over the last item."""
     if imgui.is_item_hovered():
-        imgui.set_tooltip(text)
+        imgui.set_tooltip(fill(text, TIP_LETTERS, break_on_hyphens=False))
 
 
 def stoppable(label: str, fraction: float, tag: str = "") -> bool:

@@ -53,9 +53,9 @@ def write_dataset(
     photographs. Written are images/view_000.png ..., points.ply, truth/view_000.npz (`ids`: (3, H, W) int32
     label ids at subpart, part and whole level, -1 where there is nothing; `depth`: (H, W) float32 metres
     along the camera's z), truth/labels.json (id -> level, word, thing, colour, phrase, words) and, last,
-    transforms.json in nerfstudio's convention (OpenGL camera-to-world). A view counts as done when its truth
-    file is there, so an interrupted call goes on where it stopped. Raises InputError for a size or number out
-    of range.
+    transforms.json in nerfstudio's convention (OpenGL camera-to-world), marked as "drawn". A view counts as
+    done when its truth file is there, so an interrupted call goes on where it stopped. Raises InputError for
+    a size or number out of range.
     """
     if views < 4 or min(size) < 16:
         raise InputError(
@@ -178,6 +178,7 @@ def _write_transforms(cameras: list[Camera], suffix: str, path: Path) -> None:
         "cy": first.cy,
         "ply_file_path": "points.ply",
         "metres_per_unit": 1.0,
+        "drawn": True,
         "frames": [
             {
                 "file_path": f"images/{camera.name}{suffix}",

@@ -157,7 +157,7 @@ def test_things_cast_shadows(world, renderer):
 def test_dataset_on_disk(tmp_path, coarse_light):
     write_dataset(tmp_path, 1, 5, (64, 48), silent)
     capture = load_nerfstudio(tmp_path / "transforms.json", 800, silent)
-    assert capture.metres_per_unit == 1
+    assert (capture.metres_per_unit, capture.drawn) == (1, True)
     assert len(capture) == 5
     assert capture.images[0].shape == (48, 64, 3)
     assert len(capture.points) == 20_000
