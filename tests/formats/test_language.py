@@ -88,14 +88,14 @@ def test_the_layout_is_the_documented_one(sidecar, means):
     metadata = header.pop("__metadata__")
     shapes = {name: tuple(entry["shape"]) for name, entry in header.items()}
     kinds = {name: entry["dtype"] for name, entry in header.items()}
-    assert kinds.pop("positions") == "U64"
+    assert (kinds.pop("positions"), kinds.pop("everyday")) == ("U64", "F16")
     assert set(kinds.values()) == {"F32"}
     assert shapes["latents"] == (3, N, 3)
     assert shapes["confidence"] == (3, N)
     assert shapes["positions"] == (N,)
     assert shapes["corners"] == (2, 3)
     assert shapes["canonical"] == (4, 16)
-    assert shapes["phrasebook"] == (2, 16)
+    assert (shapes["phrasebook"], shapes["everyday"]) == ((2, 16), (60, 16))
     assert shapes["codec.encoder.0.weight"] == (8, 16)
     assert metadata == {
         "format": "langsplat",
@@ -277,7 +277,7 @@ def test_a_code_without_a_codeword_is_refused(tmp_path, means):
 
 def test_version_1_still_opens(tmp_path, means):
     """As the first release wrote it: everything float32, and the means themselves."""
-    field = random_field(N)
+    field = replace(random_field(N), everyday=None)
     path = tmp_path / "a.langsplat.safetensors"
     write_language(path, field, means)
     metadata = header_of(path, metadata=True)

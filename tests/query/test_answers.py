@@ -7,11 +7,13 @@ import pytest
 
 from langsplat_core.arrays import sigmoid
 from langsplat_core.query.answers import QueryResult, by_peak, by_regions
+from langsplat_core.query.chance import chance_in
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.lookup import build_lookup
 from langsplat_core.query.regions import SMALLEST, build_regions
 from langsplat_core.query.surface import Surface, build_surface
 from langsplat_core.scene import LEVELS, Calibration, Gaussians, LanguageField, Odds, Reading, Scene
-from langsplat_core.semantics.relevancy import FLOOR
+from langsplat_core.semantics.relevancy import FLOOR, Scale
 from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, blob_scene, blobs, language
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_gaussians
@@ -29,9 +31,14 @@ def calibrated(calibration: Calibration | None) -> QueryEngine:
 def asked(
     relevancy, surface: Surface, field: LanguageField, rule: str, level="auto", phrase="x"
 ) -> QueryResult:
+    scale = Scale(field.canonical, field.everyday, field.reading.temperature)
     if rule == "peak":
-        return by_peak(phrase, relevancy, surface, field.reading, level)
-    return by_regions(phrase, relevancy, surface, build_regions(surface, field), field.reading, level)
+        return by_peak(phrase, relevancy, surface, scale, field.reading.found, level)
+    regions, calibration = build_regions(surface, field), field.reading.calibration
+    others = build_lookup(field, scale).relevancies(field.everyday[:9])
+    others = (values.reshape(relevancy.shape) for values in others)
+    bars = chance_in(field, surface, regions, scale, others).bars()
+    return by_regions(phrase, relevancy, surface, regions, scale, bars, calibration, level)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -49,10 +56,11 @@ def test_whatever_is_asked_the_answer_is_sound(kind, rule, level):
     assert (result.even.dtype, result.members.dtype) == (np.float32, bool)
     assert result.members.any()
     assert level in ("auto", LEVELS[result.level])
-    assert np.isfinite([*result.scores, *result.margins]).all()
+    assert np.isfinite([*result.scores, *result.fits]).all()
     assert result.peak == result.scores[result.level]
     assert result.probability is None
-    np.testing.assert_allclose(sigmoid(10 * np.array(result.margins)), result.scores, atol=1e-5)
+    rate = 10 if rule == "peak" else 1
+    np.testing.assert_allclose(sigmoid(rate * np.array(result.fits)), result.scores, atol=1e-5)
 
 
 def test_an_answer_by_regions_has_their_borders():
@@ -85,7 +93,7 @@ def test_a_level_at_which_the_thing_is_not_has_not_found_it(rule):
     engine = QueryEngine(blob_scene(), lambda _: FakeEncoder(), rule=rule)
     assert engine.run("mug", "whole").found
     result = engine.run("mug", "part")
-    assert result.margins[1] < 0 < 0.5 < result.margins[2]
+    assert result.fits[1] < result.fits[2]
     assert not result.found
 
 
@@ -109,62 +117,62 @@ def test_a_crumb_is_no_place():
 
 
 @pytest.mark.parametrize(
-    ("constant", "verdict"), [(0.0, "found"), (-7.0, "weak match"), (-10.0, "not here"), (99.0, "found")]
+    ("below", "verdict"), [(0.1, "found"), (-0.5, "weak match"), (-1.5, "not here"), (9.0, "found")]
 )
-def test_a_calibrated_verdict(constant, verdict):
-    """The book's margins: 1 as a whole, -0.8 as a part, and as a subpart nothing was seen."""
-    odds = Odds(constant, whole=8.0, finer=0.01, found=0.75)
-    never = Odds(-99.0, whole=8.0, finer=0.01)
+def test_a_calibrated_verdict(below, verdict):
+    """`below`: what the odds of the book's whole lie above those that are even by, as a logit, less 1."""
+    fit = calibrated(None).run("book").fits[2]
+    odds = Odds(1 + below - 2 * fit, whole=2.0, finer=0.0, found=sigmoid(np.array(1.0)).item())
+    never = Odds(-99.0, whole=2.0, finer=0.01)
     result = calibrated(Calibration(odds, never, never)).run("book")
-    subpart, part, whole = result.margins
-    assert (part, whole) == (pytest.approx(-0.8, abs=1e-3), pytest.approx(1.0, abs=0.05))
-    want = 1 / (1 + np.exp(-(constant + 8 * whole + 0.01 * max(subpart, part))))
-    assert result.probability == pytest.approx(want)
+    assert result.probability == pytest.approx(1 / (1 + np.exp(-(1 + below))))
     assert (result.found, result.verdict) == (verdict == "found", verdict)
 
 
-@pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("phrase", ["handle", "the handle", "red handle", "Handles"])
-def test_a_part_that_is_asked_for_alone_has_odds_of_its_own(rule, phrase):
+def test_a_part_that_is_asked_for_alone_has_odds_of_its_own(phrase):
     gaussians, field = random_gaussians(300), random_field(300, "codebook")
     relevancy = np.full((3, 300), 0.4, np.float32)
     relevancy[1, :100] = 0.7  # among the parts it is there, among wholes it is not
     calibration = Calibration(Odds(0, 20, 0), Odds(0, 0, 20), Odds(-99, 1, 1))
     field = replace(field, reading=Reading(calibration=calibration))
     surface = build_surface(gaussians)
-    part, thing = (asked(relevancy, surface, field, rule, phrase=text) for text in (phrase, "mug"))
-    assert part.margins == thing.margins
-    assert part.probability == pytest.approx(sigmoid(np.array(20 * max(part.margins[:2]))))
+    part, thing = (asked(relevancy, surface, field, "regions", phrase=text) for text in (phrase, "mug"))
+    assert part.fits == thing.fits
+    assert part.probability == pytest.approx(sigmoid(np.array(20 * max(part.fits[:2]))))
     assert part.probability > 0.5 > thing.probability
-    assert (thing.found, thing.probability) == (False, pytest.approx(sigmoid(np.array(20 * part.margins[2]))))
+    assert (thing.found, thing.probability) == (False, pytest.approx(sigmoid(np.array(20 * part.fits[2]))))
 
 
-@pytest.mark.parametrize("rule", RULES)
-def test_probability_is_of_being_there_at_all(rule):
-    """It knows no level: what is asked for at another one is there all the same."""
-    engine = QueryEngine(calibrated(SURE).scene, lambda _: FakeEncoder(), rule=rule)
+def test_probability_is_of_being_there_at_all():
+    """It knows no level: what is asked for at another one is there all the same. The peak, whose scale is
+    another, has none."""
+    scene = calibrated(SURE).scene
+    assert QueryEngine(scene, lambda _: FakeEncoder(), rule="peak").run("mug").probability is None
+    engine = QueryEngine(scene, lambda _: FakeEncoder())
     said = {engine.run("mug", level).probability for level in ("auto", *LEVELS)}
     assert len(said) == 1
     assert min(said) > 0.99
     assert calibrated(None).run("mug").probability is None
 
 
-def test_without_a_calibration_the_best_margin_decides():
+def test_of_the_peak_the_best_relevancy_decides():
     scene = blob_scene()
     for found, says in ((0.6, True), (0.9999, True), (1.0, False)):
         field = replace(language(), reading=Reading(found=found))
-        result = QueryEngine(replace(scene, language=field), lambda _: FakeEncoder()).run("mug")
+        scene = replace(scene, language=field)
+        result = QueryEngine(scene, lambda _: FakeEncoder(), rule="peak").run("mug")
         assert (result.found, result.verdict) == (says, "found" if says else "not here")
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_negative_margins_everywhere(rule):
+def test_negative_fits_everywhere(rule):
     gaussians, field = random_gaussians(200), random_field(200, "codebook")
     relevancy = np.random.default_rng(0).uniform(0.05, 0.2, (3, 200)).astype(np.float32)
     for level in ("auto", *LEVELS):
         result = asked(relevancy, build_surface(gaussians), field, rule, level)
         assert (result.found, result.verdict) == (False, "not here")
-        assert max(result.margins) < 0
+        assert max(result.fits) < 0
         assert result.heat_range == (FLOOR, pytest.approx(FLOOR + 0.1))
         assert np.isfinite([*result.place, *result.box.ravel()]).all()
 
@@ -177,7 +185,7 @@ def test_almost_no_gaussians(rule, calibration, count):
     result = QueryEngine(Scene(random_gaussians(count), field), rule=rule).run("red mug")
     assert not result.found
     assert result.members.shape == (count,)
-    assert np.isfinite([*result.scores, *result.margins]).all()
+    assert np.isfinite([*result.scores, *result.fits]).all()
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -191,7 +199,7 @@ def test_no_meaning_anywhere(rule):
     )
     result = QueryEngine(Scene(random_gaussians(150), field), rule=rule).run("red mug")
     assert (result.verdict, result.place, result.scores) == ("not here", None, (0, 0, 0))
-    assert result.probability < 1e-3
+    assert rule == "peak" or result.probability < 1e-3
 
 
 def test_evened_relevancy_is_that_of_its_region():

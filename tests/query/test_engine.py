@@ -13,7 +13,7 @@ from langsplat_core.query.surface import build_surface
 from langsplat_core.query.table import build_table, octahedral_to_sphere, sphere_to_octahedral, suits_table
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import LanguageField, LinearCodec, Scene
-from langsplat_core.semantics.relevancy import FLOOR, latent_relevancy, relevancy
+from langsplat_core.semantics.relevancy import FLOOR, Scale, latent_relevancy, relevancy
 from tests.support.fakes import WORDS, FakeEncoder, blob_scene
 from tests.support.two_blobs import D, random_codec, two_blob_scene
 
@@ -75,7 +75,7 @@ def test_table_agrees_with_exact_decoding_and_improves_with_resolution():
     exact = latent_relevancy(codec, latents, phrases, canonical)
     errors = {}
     for resolution in (48, 192):
-        table = build_table(codec, latents, canonical, resolution=resolution)
+        table = build_table(codec, latents, Scale(canonical, None, 10.0), resolution=resolution)
         got = np.stack(list(table.relevancies(phrases)), 1)
         errors[resolution] = np.abs(got - exact)
     assert errors[192].mean() < 3e-4
@@ -88,13 +88,13 @@ def test_a_table_decodes_only_what_latents_lie_between():
     codec, canonical = random_codec(rng), unit(rng.normal(size=(4, D)))
     latents = np.repeat(unit(rng.normal(size=(5, 3))), 40, axis=0).astype(np.float32)
     latents[:40] = 0  # no meaning
-    table = build_table(codec, latents, canonical, resolution=64)
+    table = build_table(codec, latents, Scale(canonical, None, 10.0), resolution=64)
     assert len(table.used) == len(table.vectors) <= 4 * 4
     phrases = unit(rng.normal(size=(2, D)))
     got = np.stack(list(table.relevancies(phrases)), 1)
     np.testing.assert_allclose(got, latent_relevancy(codec, latents, phrases, canonical), atol=0.02)
     assert (got[:40] == 0).all()
-    nothing = build_table(codec, np.zeros((7, 3), np.float32), canonical)
+    nothing = build_table(codec, np.zeros((7, 3), np.float32), Scale(canonical, None, 10.0))
     assert (next(nothing.relevancies(phrases)) == 0).all()
 
 
@@ -284,7 +284,7 @@ def test_both_orders_agree_inside_one_object_and_are_gated_outside():
     scene, *_ = two_blob_scene()
     assert scene.language is not None
     view = ReferenceRasterizer().view(scene.gaussians, scene.cameras[0])
-    engine = QueryEngine(scene)
+    engine = QueryEngine(scene, rule="peak")
     phrase = engine.text_vector("left")
     ours = splatted_relevancy(view, engine.relevancy(phrase)[2][:, None], 0.3)[..., 0]
     paper = decoded_relevancy(view, scene.language, 2, phrase[None], 0.3)[..., 0]

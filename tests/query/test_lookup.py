@@ -1,37 +1,50 @@
 """Relevancy of every Gaussian, by whatever the codec allows, against the definition."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from langsplat_core.arrays import unit
+from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.query.lookup import build_lookup
 from langsplat_core.scene import LanguageField, Reading
-from langsplat_core.semantics.relevancy import relevancy
+from langsplat_core.scene.codec import CodebookCodec
+from langsplat_core.semantics.relevancy import CANONICAL, NARROWEST, TOP, Scale, relevancy_of
 from tests.support.file_samples import random_field
 
 TOLERANCE = {"codebook": 1e-6, "linear": 1e-5, "autoencoder": 0.05}  # the last interpolates in a table
 
 
-def wanted(field: LanguageField, phrase: np.ndarray) -> np.ndarray:
-    flat = field.latents.reshape(-1, field.latents.shape[2])
-    vectors = field.codec.decode(flat)
-    t = field.reading.temperature
-    values = relevancy(vectors.astype(np.float64), phrase[None], field.canonical, t)[:, 0]
-    return np.where(field.known.reshape(-1), values, 0)
+def scale_of(field: LanguageField, chance: bool) -> Scale:
+    return Scale(field.canonical, field.everyday if chance else None, field.reading.temperature)
+
+
+def plain_relevancy(vector: Array, phrase: Array, scale: Scale) -> float:
+    """The definition, one meaning after the other, in float64."""
+    vector, nearest = vector.astype(np.float64), float((scale.canonical @ vector).max())
+    if scale.everyday is None:
+        return 1 / (1 + math.exp(-scale.temperature * (float(phrase @ vector) - nearest)))
+    cosines = sorted((float(other @ vector) for other in scale.everyday.astype(np.float64)), reverse=True)
+    top = np.mean(cosines[: round(TOP * len(cosines))])
+    zero = CANONICAL * nearest + (1 - CANONICAL) * top
+    return 1 / (1 + math.exp(-(float(phrase @ vector) - zero) / np.std(cosines)))
 
 
 @pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
 @pytest.mark.parametrize("temperature", [10.0, 25.0])
 @pytest.mark.parametrize("exact", [False, True])
-def test_every_lookup_finds_the_relevancy_of_what_latents_stand_for(kind, temperature, exact):
+@pytest.mark.parametrize("chance", [False, True])
+def test_every_lookup_finds_the_relevancy_of_what_latents_stand_for(kind, temperature, exact, chance):
     field = replace(random_field(300, kind), reading=Reading(temperature))
     field.confidence[1, 5:20] = 0
+    scale = scale_of(field, chance)
     phrase = unit(np.random.default_rng(3).normal(size=field.codec.vector_dim)).astype(np.float32)
-    got = next(build_lookup(field, exact).relevancies(phrase[None]))
-    error = np.abs(got - wanted(field, phrase))
-    assert error.max() < (1e-5 if exact else TOLERANCE[kind])
+    got = next(build_lookup(field, scale, exact).relevancies(phrase[None]))
+    vectors = field.codec.decode(field.latents.reshape(-1, field.latents.shape[2]))
+    known = field.known.reshape(-1)
+    want = [plain_relevancy(v, phrase, scale) if k else 0 for v, k in zip(vectors, known, strict=True)]
+    assert np.abs(got - want).max() < (1e-5 if exact else TOLERANCE[kind])
     assert (got.reshape(3, 300)[1, 5:20] == 0).all()
 
 
@@ -40,6 +53,47 @@ def test_codeword_zero_is_a_meaning_like_any_other():
     field.latents[:] = 0
     field.confidence[:] = 1
     field.confidence[2, 4] = 0
-    values = next(build_lookup(field).relevancies(field.codec.vectors[:1])).reshape(3, 10)
+    lookup = build_lookup(field, scale_of(field, chance=False))
+    values = next(lookup.relevancies(field.codec.vectors[:1])).reshape(3, 10)
     assert values[2, 4] == 0
     assert (np.delete(values[2], 4) > 0.5).all()
+
+
+def test_margins_of_another_size_change_nothing():
+    """All texts and meanings mixed with directions of their own lie closer together, as CLIP's do; what a
+    phrase fits against everyday phrases stays, and as published it does not."""
+    field = random_field(200, "codebook")
+    dim, share = field.codec.vector_dim, 0.2
+
+    def beside(vectors: Array, axis: int) -> Array:
+        common = np.zeros((len(vectors), 2))
+        common[:, axis] = math.sqrt(1 - share)
+        return np.concatenate([math.sqrt(share) * vectors, common], 1).astype(np.float32)
+
+    codec = CodebookCodec(beside(field.codec.vectors, 0), field.codec.colours)
+    canonical, everyday = beside(field.canonical, 1), beside(field.everyday, 1)
+    narrow = replace(field, codec=codec, canonical=canonical, everyday=everyday, phrasebook={})
+    phrase = unit(np.random.default_rng(3).normal(size=dim))[None].astype(np.float32)
+    for chance, tolerance in ((True, 1e-5), (False, None)):
+        wide = next(build_lookup(field, scale_of(field, chance)).relevancies(phrase))
+        close = next(build_lookup(narrow, scale_of(narrow, chance)).relevancies(beside(phrase, 1)))
+        apart = np.abs(wide - close).max()
+        assert apart < tolerance if tolerance else apart > 0.2
+
+
+@pytest.mark.parametrize("everyday", [np.ones((1, 4)), np.eye(4)[[0] * 60], np.zeros((60, 4))])
+def test_phrases_that_are_all_alike_are_no_scale_but_no_nan(everyday):
+    scale = Scale(np.eye(4, dtype=np.float32)[:1], unit(everyday).astype(np.float32), 10.0)
+    zero, rate = scale.of(np.eye(4, dtype=np.float32) @ scale.texts.T)
+    values = relevancy_of(np.linspace(-1, 1, 4, dtype=np.float32), zero, rate)
+    assert np.isfinite(values).all()
+    assert ((values >= 0) & (values <= 1)).all()
+    assert np.isfinite(scale.fit(values)).all()
+
+
+def test_a_fit_is_relevancy_undone():
+    fits = np.linspace(-6, 6, 50)
+    for scale, rate in ((Scale(np.eye(2), np.eye(2), 7.0), 1), (Scale(np.eye(2), None, 7.0), 7)):
+        np.testing.assert_allclose(scale.fit(sigmoid(fits)), fits / rate, atol=1e-9)
+        ends = scale.fit(np.array([0.0, 1.0]))
+        assert ends == pytest.approx(np.array([-1, 1]) * math.log((1 - NARROWEST) / NARROWEST) / rate)

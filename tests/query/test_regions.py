@@ -79,14 +79,23 @@ def plain_step(field: LanguageField, level: int, a: int, b: int) -> float:
     return float(1 - one @ other / (np.linalg.norm(one) * np.linalg.norm(other)))
 
 
+def plain_typical_step(surface: Surface, field: LanguageField, level: int) -> float:
+    """Mean over all pairs of Gaussians with a meaning, each with itself included."""
+    rows = [row for row in surface.rows if field.known[level][row]]
+    latents = field.latents[level][rows]
+    vectors = field.codec.decode(latents) if field.codec.space == "index" else unit(latents)
+    vectors = vectors.astype(np.float64)
+    return float(np.mean(1 - vectors @ vectors.T))
+
+
 def plain_regions(surface: Surface, field: LanguageField, level: int) -> list[int]:
     """Felzenszwalb and Huttenlocher, with sets: the first member of each Gaussian's region."""
-    steps = []
+    steps, typical = [], plain_typical_step(surface, field, level)
     for a, b in links_of(surface):
         one, other = surface.rows[a], surface.rows[b]
         step = min(max(plain_step(field, level, one, other), 0.0), UNKNOWN)
         if level == 2 and field.things is not None and NO_THING not in field.things[[one, other]]:
-            step = 0.0 if field.things[one] == field.things[other] else step + BORDER
+            step = 0.0 if field.things[one] == field.things[other] else step + BORDER * typical
         steps.append((round(step * STEPS), step, a, b))
     steps.sort(key=lambda link: link[0])
     region = {number: frozenset([number]) for number in range(len(surface.rows))}
@@ -99,7 +108,9 @@ def plain_regions(surface: Surface, field: LanguageField, level: int) -> list[in
             if gathering:
                 join = min(len(mine), len(other)) < SMALLEST
             else:
-                join = step <= min(within[mine] + SCALE / len(mine), within[other] + SCALE / len(other))
+                join = step <= min(
+                    within[mine] + SCALE * typical / len(mine), within[other] + SCALE * typical / len(other)
+                )
             if join:
                 both = mine | other
                 within[both] = max(step, within[mine], within[other])

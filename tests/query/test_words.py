@@ -47,9 +47,10 @@ def plain_probabilities(made: LanguageField, vectors: Array, latents: Array, ban
     for word in every:
         cosines = sorted((float(word @ meaning) for meaning in bank.astype(np.float64)), reverse=True)
         hub.append(np.mean(cosines[:NEAREST]))
-    rows = []
+    spreads = [np.std([float(word @ meaning) for word in every[: len(vectors)]]) for meaning in bank]
+    rows, scale = [], words_module.WORD_SCALE / np.median(spreads)
     for vector in made.codec.decode(latents).astype(np.float64):
-        fits = np.array([50 * (vector @ word - own / 2) for word, own in zip(every, hub, strict=True)])
+        fits = np.array([scale * (vector @ word - own / 2) for word, own in zip(every, hub, strict=True)])
         shares = np.exp(fits - fits.max())
         rows.append(shares / shares.sum())
     return np.array(rows)

@@ -19,17 +19,10 @@ from langsplat_core.scene import (
 from tests.support.everyday import everyday_about
 
 DIM = 8
-AXES = (
-    "mug",
-    "handle",
-    "book",
-    "table",
-    "red",
-    "blue",
-)  # the seventh is the canonical phrases', eighth nothing's
-COLOURS = ("red", "blue")
-TEMPERATURE = 2.0  # so that half as much likeness is visibly less, also
-SPREAD = 0.4  # of everyday phrases about the canonical one
+AXES = ("mug", "handle", "book", "table", "red", "blue", "anything", "white")  # the seventh is canonical
+COLOURS = ("red", "blue", "white")
+TEMPERATURE = 2.0  # so that half as much likeness is visibly less, as published
+SPREAD = 0.3  # of everyday phrases about the canonical one: half as much likeness is another thing
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -51,14 +44,14 @@ BLOCKS = (
     Block("blue mug", (1.2, 0, 0.15), (0.2, 0.2, 0.19), "blue mug"),
     Block("blue handle", (1.5, 0, 0.15), (0.1, 0.08, 0.1), "blue mug", "handle"),
     Block("book", (-0.3, 0.5, 0.0), (0.25, 0.2, 0.04), "book"),
-    Block("far mug", (0, 0, -3.0), (0.4, 0.4, 0.4), "mug"),
+    Block("far mug", (0, 0, -3.0), (0.4, 0.4, 0.4), "white mug"),
 )
 STEP = 0.06
 
 
 def meaning(text: str) -> Array:
     """(DIM,) unit vector of a text of `AXES`; a colour says more than a thing, or all mugs would be red."""
-    axes = [np.eye(DIM)[AXES.index(word)] * (1.7 if word in COLOURS else 1) for word in text.split()]
+    axes = [np.eye(DIM)[AXES.index(word)] for word in text.split()]
     return unit(np.sum(axes, 0)).astype(np.float32)
 
 

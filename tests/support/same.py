@@ -30,6 +30,9 @@ def assert_same_field(got: LanguageField, want: LanguageField) -> None:
     if want.things is not None:
         np.testing.assert_array_equal(got.things, want.things)
         assert got.things.dtype == np.uint16
+    assert (got.everyday is None) == (want.everyday is None)
+    if want.everyday is not None:
+        np.testing.assert_array_equal(got.everyday, want.everyday)
     assert got.encoder_id == want.encoder_id
     assert got.reading == want.reading
     assert got.codec.kind == want.codec.kind
