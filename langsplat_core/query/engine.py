@@ -24,7 +24,7 @@ from langsplat_core.query.vocabulary import STOP_WORDS, check_names, only
 from langsplat_core.scene import CANONICAL_PHRASES, Calibration, LanguageField, Scene
 from langsplat_core.scene.phrases import phrase_key, tidy
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE
-from langsplat_core.semantics.everyday import everyday_vectors
+from langsplat_core.semantics.everyday import FEWEST, everyday_vectors
 from langsplat_core.semantics.relevancy import Scale
 
 BATCH = 256  # phrases that are encoded, and compared with codewords, at a time
@@ -152,7 +152,9 @@ class QueryEngine:
         if self._rule == "peak":
             return None
         stored = self.field.everyday
-        return stored if stored is not None else self._encoded_everyday()
+        if stored is None:
+            return self._encoded_everyday()
+        return stored if len(stored) >= FEWEST else None
 
     def _encoded_everyday(self) -> Array | None:
         try:
