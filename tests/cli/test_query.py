@@ -21,9 +21,9 @@ from langsplat_core.formats import (
 from langsplat_core.lab.rooms.scoring import ask, evaluate
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.scene import Calibration, Odds, Reading, Scene
+from langsplat_core.scene import Reading, Scene
 from langsplat_core.semantics.encoder import OPEN_MODEL
-from tests.support.fakes import FakeEncoder, axis, blobs
+from tests.support.fakes import FakeEncoder, axis, blobs, calibrated_for
 from tests.support.fakes import cameras as fake_cameras
 from tests.support.fakes import language as fake_language
 
@@ -179,11 +179,11 @@ def asked(capsys, path, *texts: str, **options) -> tuple[list[str], list[dict]]:
 
 
 @pytest.mark.parametrize(
-    ("constant", "verdict", "probability"),
-    [(1.0, "found", 1.0), (-7.0, "weak match", 0.73), (-11.0, "not here", 0.05)],
+    ("logit", "verdict", "probability"),
+    [(9.0, "found", 1.0), (1.0, "weak match", 0.73), (-3.0, "not here", 0.05)],
 )
-def test_a_verdict_comes_with_its_probability(tmp_path, capsys, constant, verdict, probability):
-    reading = Reading(calibration=Calibration(*[Odds(constant, whole=8.0, finer=0.01)] * 3))
+def test_a_verdict_comes_with_its_probability(tmp_path, capsys, logit, verdict, probability):
+    reading = Reading(calibration=calibrated_for("book", logit))
     field = replace(fake_language(phrasebook=True), reading=reading)
     save_scene(tmp_path / "a.ply", Scene(blobs(), field))
     lines, (answer,) = asked(capsys, tmp_path / "a.ply", "book")

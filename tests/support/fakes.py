@@ -6,12 +6,15 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array, logit, unit
+from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
+    Calibration,
     Camera,
     Gaussians,
     LanguageField,
     LinearCodec,
+    Odds,
     Scene,
     look_at,
 )
@@ -91,3 +94,9 @@ class FakeEncoder:
 
     def near_words(self, word: str) -> tuple[str, ...]:
         return tuple(get_close_matches(word, WORDS))
+
+
+def calibrated_for(phrase: str, logit_of_whole: float) -> Calibration:
+    """With which `phrase`, asked of the blobs, has a probability of sigmoid(logit_of_whole)."""
+    fits = QueryEngine(blob_scene(), lambda _: FakeEncoder()).run(phrase).fits
+    return Calibration(*[Odds(logit_of_whole - 8 * fits[2], whole=8.0, finer=0.0)] * 3)

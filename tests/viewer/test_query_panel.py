@@ -7,12 +7,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from langsplat_core.scene import Calibration, Odds, Reading
+from langsplat_core.scene import Calibration, Reading
 from langsplat_viewer import actions
 from langsplat_viewer.panels import answers, query_box, style
 from langsplat_viewer.panels import search as panel
 from langsplat_viewer.viewer import Viewer
-from tests.support.fakes import blob_scene, language
+from tests.support.fakes import blob_scene, calibrated_for, language
 from tests.support.windowless import SCENES, settle
 
 
@@ -87,11 +87,11 @@ def searched(viewer: Viewer, phrase: str, calibration: Calibration | None = None
 
 
 @pytest.mark.parametrize(
-    ("constant", "verdict", "percent"),
-    [(1.0, "found", "100 %"), (-7.0, "weak match", "73 %"), (-11.0, "not here", "5 %")],
+    ("logit", "verdict", "percent"),
+    [(9.0, "found", "100 %"), (1.0, "weak match", "73 %"), (-3.0, "not here", "5 %")],
 )
-def test_the_verdict_and_how_likely_it_is(viewer, paper, constant, verdict, percent):
-    panel.draw(searched(viewer, "mug", Calibration(*[Odds(constant, whole=8.0, finer=0.01)] * 3)))
+def test_the_verdict_and_how_likely_it_is(viewer, paper, logit, verdict, percent):
+    panel.draw(searched(viewer, "mug", calibrated_for("mug", logit)))
     assert [text for text in paper.said if text in ("found", "weak match", "not here")] == [verdict]
     assert f"{percent} likely to be there" in paper.said
 

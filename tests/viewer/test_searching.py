@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from langsplat_core.scene import Calibration, Odds, Reading
+from langsplat_core.scene import Reading
 from langsplat_viewer import actions
 from langsplat_viewer.drawing.painting import NO_HEAT
 from langsplat_viewer.output.still import describe
 from langsplat_viewer.panels.query_box import hint
-from tests.support.fakes import CENTRES, blob_scene, language
+from tests.support.fakes import CENTRES, blob_scene, calibrated_for, language
 from tests.support.windowless import SCENES, errors, settle
 
 
@@ -196,9 +196,9 @@ def test_a_phrase_with_structure_says_how_it_was_read(opened):
     assert composed.result.members[:240].mean() > 0.9 > 0.1 > composed.result.members[240:].mean()
 
 
-@pytest.mark.parametrize(("constant", "verdict"), [(1.0, "found"), (-7.0, "weak match"), (-11.0, "not here")])
-def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch, constant, verdict):
-    reading = Reading(calibration=Calibration(*[Odds(constant, whole=8.0, finer=0.01)] * 3))
+@pytest.mark.parametrize(("logit", "verdict"), [(9.0, "found"), (1.0, "weak match"), (-3.0, "not here")])
+def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch, logit, verdict):
+    reading = Reading(calibration=calibrated_for("mug", logit))
     scene = replace(blob_scene(), language=replace(language(), reading=reading))
     monkeypatch.setitem(SCENES, "sure.ply", scene)
     actions.open_scene(viewer, Path("sure.ply"))

@@ -126,7 +126,7 @@ def test_what_the_search_found(searched):
 
 def test_nothing_was_searched_or_found(searched):
     query = searched.state.queries[0]
-    query.result = replace(query.result, found=False, probability=None)
+    query.result = replace(query.result, found=False, probability=None, excess=None)
     actions.select_query(searched)
     assert "'book' is not here" in searched.state.messages[-1].text
     actions.find_things(searched)

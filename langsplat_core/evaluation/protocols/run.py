@@ -101,7 +101,12 @@ def _source(
     # With no name in common the scene's views are named by another rule: nothing is known of training.
     related = not own.keys().isdisjoint([*others, *(frame.name for frame in labelled.frames)])
     return SceneSource(
-        QueryEngine(scene, load_encoder, encoder_id=subject.encoder),
+        QueryEngine(
+            scene,
+            load_encoder,
+            encoder_id=subject.encoder,
+            rule="peak" if isinstance(profile.rule, MapRule) else "regions",  # published maps as published
+        ),
         load_rasterizer("cpu"),
         {**others, **own},
         frozenset(own) if related else None,

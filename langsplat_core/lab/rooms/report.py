@@ -119,7 +119,8 @@ def score_table(reports: Sequence[RoomReport]) -> str:
             count = sum(queries for queries, *_ in of_rooms)
             if count:
                 spreads = [_spread(values) for values in zip(*(row[1:] for row in of_rooms), strict=True)]
-                spreads.append(_spread([_direct(room.measured[0], kind, "ceiling") for room in rooms]))
+                ceilings = [_direct(room.measured[0], kind, "ceiling") for room in rooms]
+                spreads.append(_spread(ceilings) if any(ceilings) else "-")
                 lines.append(_row((tier, kind, count, *spreads)))
     return "\n".join(lines)
 

@@ -26,7 +26,7 @@ from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.protocol import View
 from langsplat_core.scene import LEVELS, Camera, CodebookCodec, Codec, LanguageField, Scene
 from langsplat_core.semantics.everyday import everyday_phrases
-from langsplat_core.semantics.relevancy import relevancy
+from langsplat_core.semantics.relevancy import Scale, relevancy_of
 from langsplat_core.training.language.autoencoder_fit import train_autoencoder
 
 GATE = PictureConfig().alpha_gate
@@ -201,9 +201,9 @@ def _ours(
 
 def _exact(asked: _Asked, vectors: Array, field: LanguageField, row: int) -> Array:
     """Relevancy of phrase `row` at all Gaussians with a meaning, in float64; vectors: (K, D) of the codes."""
-    doubles = vectors.astype(np.float64)
-    phrase, canonical = asked.vectors[row : row + 1].astype(np.float64), field.canonical.astype(np.float64)
-    values = relevancy(doubles, phrase, canonical, field.reading.temperature)[:, 0]
+    doubles, scale = vectors.astype(np.float64), Scale(field.canonical, field.everyday, 1.0)
+    zero, rate = scale.of(doubles @ scale.texts.T)
+    values = relevancy_of(doubles @ asked.vectors[row].astype(np.float64), zero, rate)
     return np.asarray(values[asked.codes[asked.known]])
 
 

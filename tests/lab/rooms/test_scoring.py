@@ -56,8 +56,10 @@ def test_direct_overlap_has_its_closed_form(rule):
     )
     made = answer(0.9 * inside) if rule == "floor" else answer(np.full(200, 0.9), members=inside)
     truth = Truth(None, phrases)
-    asked = Asked(None, {phrase.text: made for phrase in phrases}, (), 0.0)
+    engine = SimpleNamespace(regions=SimpleNamespace(everywhere=labels))
+    asked = Asked(engine, {phrase.text: made for phrase in phrases}, (), 0.0)
     (score,) = evaluate_direct(asked, labels, truth, rule)
+    assert score.ceiling == (1 if rule == "regions" else 0)
     assert (score.kind, score.phrases) == ("object", 2)
     assert score.mean_iou == pytest.approx((30 / 100 + 70 / 120) / 2)
 
