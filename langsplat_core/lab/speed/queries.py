@@ -152,8 +152,9 @@ def _paper(scene: Scene, field: LanguageField, camera: Camera, asked: _Asked) ->
     )
     decoding = max(both - blending, 0.0)
     decoded = field.codec.decode(field.codec.encode(asked.codewords))
-    exact = [_exact(asked, decoded, field, row) for row in range(len(asked.texts))]
-    truth = [_exact(asked, asked.codewords, field, row) for row in range(len(asked.texts))]
+    published = Scale(field.canonical, None, field.reading.temperature)
+    exact = [_exact(asked, decoded, published, row) for row in range(len(asked.texts))]
+    truth = [_exact(asked, asked.codewords, published, row) for row in range(len(asked.texts))]
     return QueryCost(
         PAPER,
         answer=decoding,
@@ -185,7 +186,7 @@ def _ours(
     )
     decoded = asked.codewords if codec is None else codec.decode(codec.encode(asked.codewords))
     exact, truth = (
-        [_exact(asked, vectors, engine.field, row) for row in range(len(asked.texts))]
+        [_exact(asked, vectors, engine.scale, row) for row in range(len(asked.texts))]
         for vectors in (decoded, asked.codewords)
     )
     return QueryCost(
@@ -199,9 +200,9 @@ def _ours(
     )
 
 
-def _exact(asked: _Asked, vectors: Array, field: LanguageField, row: int) -> Array:
+def _exact(asked: _Asked, vectors: Array, scale: Scale, row: int) -> Array:
     """Relevancy of phrase `row` at all Gaussians with a meaning, in float64; vectors: (K, D) of the codes."""
-    doubles, scale = vectors.astype(np.float64), Scale(field.canonical, field.everyday, 1.0)
+    doubles = vectors.astype(np.float64)
     zero, rate = scale.of(doubles @ scale.texts.T)
     values = relevancy_of(doubles @ asked.vectors[row].astype(np.float64), zero, rate)
     return np.asarray(values[asked.codes[asked.known]])
