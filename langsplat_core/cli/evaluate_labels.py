@@ -1,12 +1,13 @@
 """`langsplat eval lerf-ovs | 3d-ovs | scannet`: the field's benchmarks."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from langsplat_core.cli.checks import OutFile, OutFolder
+from langsplat_core.config import ClipConfig, MaskConfig, TrainConfig, TrainPreset, with_preset
 from langsplat_core.errors import InputError
 from langsplat_core.evaluation.protocols.profiles import (
     LERF_PROFILES,
@@ -15,6 +16,7 @@ from langsplat_core.evaluation.protocols.profiles import (
     OvsProtocol,
     Profile,
 )
+from langsplat_core.formats.language import SUFFIX
 from langsplat_core.progress import TerminalProgress
 
 if TYPE_CHECKING:
@@ -55,21 +57,67 @@ class _EvalLabels(_Eval):
     """Also write one picture per query into this folder."""
     paper_order: bool = False
     """Blend latents and decode every pixel, as the paper does, not the relevancies; no codebook can."""
+    train: bool = False
+    """Give DATA alone: every scene of it is trained from the photographs beside the labels first, with the
+    settings of `langsplat train`, which no benchmark has chosen; an interrupted run continues."""
+    out: OutFolder = Path("benchmark_scenes")
+    """Folder for the scenes of --train; those in it are not trained again."""
+    preset: TrainPreset = "full"
+    """Of --train, as of `langsplat train`."""
+    clip: ClipConfig = field(default_factory=ClipConfig)
+    masks: MaskConfig = field(default_factory=MaskConfig)
+
+    def scene_and_data(self) -> tuple[Path | None, Path]:
+        """See `_Eval`; the scenes of --train are those in --out."""
+        if not self.train:
+            return super().scene_and_data()
+        if self.maps or len(self.paths) != 1:
+            raise InputError("--train trains the scenes itself; give the benchmark's folder alone")
+        return self.out, self.paths[0]
 
     def evaluate(self, benchmark: "Benchmark", profile: Profile) -> None:
-        """Score, print the table, write what was asked for."""
+        """Train where that is asked for, score, print the tables, write what was asked for."""
+        from langsplat_core.evaluation.protocols.published import beside_published
         from langsplat_core.evaluation.protocols.report import save_json, table
         from langsplat_core.evaluation.protocols.run import Subject, run_benchmark
         from langsplat_core.semantics.encoders import load_text_encoder
 
+        failed = self._train(benchmark) if self.train else {}
+        left = [name for name in self.only or benchmark.scenes if name not in failed]
+        if failed and not left:
+            raise InputError("; ".join(f"{name}: {reason}" for name, reason in failed.items()))
+        only = tuple(left) if failed else self.only
         subject = Subject(self.scene_and_data()[0], self.maps, self.encoder, self.paper_order)
         with TerminalProgress() as progress:
             report = run_benchmark(
-                benchmark, profile, subject, load_text_encoder, self.only, self.pictures, progress
+                benchmark, profile, subject, load_text_encoder, only, self.pictures, progress
             )
         print(table(report))
+        published = beside_published(report)
+        if published:
+            print(f"\n{published}")
         if self.json is not None:
             save_json(self.json, report)
+        if failed:
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in failed.items())
+            raise InputError(f"not trained, and not in the table: {reasons}")
+
+    def _train(self, benchmark: "Benchmark") -> dict[str, str]:
+        """Train the scenes that --out lacks; which could not be, and why."""
+        from langsplat_core.pipeline.train import train_scene
+
+        config = with_preset(TrainConfig(clip=self.clip, masks=self.masks), self.preset)
+        failed = {}
+        for name in self.only or benchmark.scenes:
+            scene, path = benchmark.scenes.get(name), self.out / f"{name}.ply"
+            if scene is None or (path.exists() and path.with_suffix(SUFFIX).exists()):
+                continue  # an unknown name is complained of where all are looked up
+            try:
+                with TerminalProgress() as progress:
+                    train_scene(scene.dataset, path, config, progress=progress)
+            except InputError as error:
+                failed[name] = str(error)
+        return failed
 
 
 @dataclass(frozen=True)
