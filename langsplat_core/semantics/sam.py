@@ -6,7 +6,6 @@ picture is seen once, as a whole; the method's public code, not its paper, sees 
 
 import json
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -27,6 +26,7 @@ VERSION = 2
 # Full-size masks of float logits held at one time: on a CPU 16 take twice as long as four times 4, since the
 # system gives and takes back large memory page by page.
 MASKS_AT_ONCE = 4
+HALF_ON = "cuda"  # where products are float16's: bfloat16's error is seven times as large (docs/encoders.md)
 
 
 def load_sam(config: MaskConfig, device: str = "auto") -> "SamMasks":
@@ -34,10 +34,7 @@ def load_sam(config: MaskConfig, device: str = "auto") -> "SamMasks":
 
     Raises EncoderError where they are absent or are not those of a SAM.
     """
-    import torch
-
-    half = torch_device(device) != "cpu" and torch.cuda.is_bf16_supported(including_emulation=False)
-    return SamMasks(load_segmenter(config.sam, device), config, half)
+    return SamMasks(load_segmenter(config.sam, device), config, torch_device(device).startswith(HALF_ON))
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +60,7 @@ class SamMasks:
     """A `MaskSource` that asks a segmenter."""
 
     def __init__(self, segmenter: Segmenter, config: MaskConfig, half: bool = False) -> None:
-        """half: whether what CUDA multiplies is rounded to bfloat16."""
+        """half: whether the model multiplies in float16, see `HALF_ON`."""
         self._segmenter = segmenter
         self._config = config
         self._half = half
@@ -77,7 +74,7 @@ class SamMasks:
     def key(self) -> str:
         """See `MaskSource`. The size of batches changes no result."""
         settings = asdict(self._config) | {"source": "sam", "points_per_batch": 0}
-        return json.dumps(["sam", VERSION, settings, *["bfloat16"] * self._half], sort_keys=True)
+        return json.dumps(["sam", VERSION, settings, *["float16"] * self._half], sort_keys=True)
 
     def __call__(self, image: Array, progress: Progress) -> LevelMasks:
         """Masks of an image (H, W, 3) uint8, by falling predicted IoU; a level may have none."""
@@ -88,7 +85,11 @@ class SamMasks:
         crops = crop_boxes(image.shape[:2], self._config.crop_layers)
         levels: list[list[Proposal]] = [[] for _ in range(LEVELS)]
         for index, crop in enumerate(crops):
-            found = self._in_crop(image, crop, _part(progress, index, len(crops)))
+            part = _part(progress, index, len(crops))
+            try:
+                found = self._in_crop(image, crop, part, self._half)
+            except OverflowError:
+                found = self._in_crop(image, crop, part, half=False)
             for proposals, more in zip(levels, found, strict=True):
                 proposals += more
         progress("finding masks", 1.0)
@@ -98,8 +99,11 @@ class SamMasks:
         kept = [filter_level(level, shape, self._config) for level in levels]
         return LevelMasks((kept[0][0], kept[1][0], kept[2][0]), (kept[0][1], kept[1][1], kept[2][1]))
 
-    def _in_crop(self, image: Array, crop: Array, progress: Progress) -> list[list[Proposal]]:
-        """The proposals that one crop (4,) of the picture gives at each level, in pixels of the picture."""
+    def _in_crop(self, image: Array, crop: Array, progress: Progress, half: bool) -> list[list[Proposal]]:
+        """The proposals that one crop (4,) of the picture gives at each level, in pixels of the picture.
+
+        Raises OverflowError for `half` where numbers are larger than float16 holds.
+        """
         import torch
 
         left, top, right, bottom = crop
@@ -109,30 +113,30 @@ class SamMasks:
         found = []
         with torch.inference_mode():
             progress("finding masks", 0.0)
-            with self._precision():
+            with torch.autocast(HALF_ON, torch.float16, enabled=half):
                 look = self._segmenter.look(part)
             for start in range(0, len(points), step):
                 if start:
                     progress("finding masks", start / len(points))
-                found.append(self._at_points(look, points[start : start + step], crop, image.shape[:2]))
+                with torch.autocast(HALF_ON, torch.float16, enabled=half):
+                    answer = look.ask(points[start : start + step])
+                if half and not bool(answer[0].isfinite().all()):
+                    raise OverflowError
+                found.append(self._passing(look, answer, crop, image.shape[:2]))
             figures, logits = (
                 np.concatenate([some for some, _ in found]),
                 torch.cat([some for _, some in found]),
             )
             return [self._best(look, figures, logits, level, crop) for level in range(LEVELS)]
 
-    def _precision(self) -> AbstractContextManager[None]:
-        import torch
-
-        return torch.autocast("cuda", torch.bfloat16, enabled=self._half)
-
-    def _at_points(self, look: Look, points: Array, crop: Array, shape: tuple[int, int]) -> tuple[Array, Any]:
+    def _passing(
+        self, look: Look, answer: tuple[Any, Any], crop: Array, shape: tuple[int, int]
+    ) -> tuple[Array, Any]:
         """Of the masks that pass the tests for themselves: (M, 7) level, predicted IoU, stability and box in
         the picture, and (M, h, w) logits, low resolution, still on the device."""
         import torch
 
-        with self._precision():
-            ious, logits = (found.flatten(0, 1).float() for found in look.ask(points))
+        ious, logits = (found.flatten(0, 1).float() for found in answer)
         rows = torch.nonzero(ious > self._config.predicted_iou)[:, 0]
         offset = self._config.stability_offset
         measured = [measure(look.enlarge(logits[some]), offset) for some in rows.split(MASKS_AT_ONCE)]
