@@ -85,6 +85,19 @@ def test_upscaling_forgets_the_padding() -> None:
     np.testing.assert_allclose(full[0, 5, 1:-1], columns[1:-1], atol=1e-5)
 
 
+def test_boxes_and_stability_are_those_of_whole_masks() -> None:
+    rng = np.random.default_rng(0)
+    logits = ndimage.gaussian_filter(rng.normal(size=(9, 30, 41)), (0, 3, 3)) * 20 - 1.5
+    logits[0], logits[1] = -5, 5
+    logits[2], logits[2, 29, 40] = -0.5, 0.5  # one pixel, in the corner
+    found = sam.measure(torch.from_numpy(logits.astype(np.float32)), 1.0).numpy()
+    assert found[0].tolist() == [0] * 5  # nothing at all
+    assert found[2].tolist() == [0, 40, 29, 41, 30]
+    np.testing.assert_array_equal(found[1:, 1:], mask_boxes(logits[1:] > 0))
+    for row, mask in zip(found, logits, strict=True):
+        assert row[0] == pytest.approx((mask > 1).sum() / max((mask > -1).sum(), 1), rel=1e-6)
+
+
 def plain_answer(model: Any, image: np.ndarray, point: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
     """(3,) scores and (3, H, W) logits of subpart, part and whole at one point, by the whole model."""
     height, width = image.shape[:2]
