@@ -52,13 +52,15 @@ class Train:
         from langsplat_core.pipeline.crew import join_crew
         from langsplat_core.pipeline.forecast import Forecast, count_photographs, forecast_in_words, plan
         from langsplat_core.pipeline.train import train_scene
+        from langsplat_core.semantics.weights import torch_device
 
         crew = join_crew()
         shown = LineProgress() if self.progress == "lines" else TerminalProgress()
         photographs, given = count_photographs(self.dataset)
-        stages = plan(self.config, photographs, given, self.gaussians is not None)
+        on_gpu = torch_device(self.config.clip.device) != "cpu"
+        stages = plan(self.config, photographs, given, self.gaussians is not None, on_gpu)
         if crew.leads and photographs:
-            log.info("%d photographs: %s", photographs, forecast_in_words(stages))
+            log.info("%d photographs: %s", photographs, forecast_in_words(stages, on_gpu))
         with shown if crew.leads else nullcontext(silent) as progress:
             report = train_scene(
                 self.dataset,

@@ -1,7 +1,8 @@
 """How long a training will take: said beforehand from measured costs, then from how fast this run is.
 
 The costs are seconds of two CPU cores, measured on photographs and rooms (docs/photographs.md,
-docs/encoders.md). They are rough; what a run has behind it corrects them by one factor, its pace.
+docs/encoders.md); what a GPU makes of them is a guess. They are rough; what a run has behind it corrects them
+by one factor, its pace.
 """
 
 import time
@@ -18,6 +19,25 @@ ASPECT = 0.75  # height by width of an ordinary photograph
 SLOWEST, FASTEST = 20.0, 0.02  # limits of the pace: more is a sleeping machine, less a stage that was kept
 SURE = 0.05  # share of a stage from which its own speed is trusted
 ALL = "all stages"
+GPU = 1 / 30  # of the seconds of two CPU cores; not measured
+POINT = 0.17  # seconds of a point that a segmenter is asked at
+REGIONS = 300  # of an ordinary photograph
+# Millions of weights by what a hub id contains, the first that fits; TIPS sees five times as many patches.
+MILLIONS = {
+    "vit-huge": 641,
+    "vit-large": 312,
+    "vit-base": 94,
+    "hiera-large": 224,
+    "hiera-base": 81,
+    "hiera-small": 46,
+    "hiera-tiny": 39,
+    "vit-h": 986,
+    "vit-l": 428,
+    "so400m": 878,
+    "large": 400,
+    "tips": 590,
+}
+USUAL = 150  # millions of weights of any other: CLIP's of ViT-B
 Given = Literal["nothing", "cameras", "points"]  # what photographs come with: cameras, or cameras and points
 
 
@@ -30,10 +50,14 @@ class Stage:
     seconds: float  # that it is expected to take
 
 
-def plan(config: TrainConfig, photographs: int, given: Given, has_gaussians: bool) -> tuple[Stage, ...]:
-    """The stages of a training from so many photographs, in their order."""
+def plan(
+    config: TrainConfig, photographs: int, given: Given, has_gaussians: bool, on_gpu: bool = False
+) -> tuple[Stage, ...]:
+    """The stages of a training from so many photographs, in their order; on_gpu: whether models run there."""
     megapixels = ASPECT * config.dataset.max_side**2 / 1e6
-    per_photograph = _mask_seconds(config.masks, megapixels) + _encoder_seconds(config.clip.model)
+    speed = GPU if on_gpu else 1.0
+    per_photograph = _mask_seconds(config.masks, megapixels, speed)
+    per_photograph += _encoder_seconds(config.clip.model, config.masks) * speed
     gaussians = config.radiance.max_gaussians
     # A step costs what it draws, and what it keeps: 0.02 s at 0.1 megapixels, 0.1 s at 100 000 Gaussians.
     step = 0.2 * megapixels + 1e-6 * min(gaussians, 300_000)
@@ -56,14 +80,29 @@ def plan(config: TrainConfig, photographs: int, given: Given, has_gaussians: boo
     )
 
 
-def _mask_seconds(masks: MaskConfig, megapixels: float) -> float:
+def _mask_seconds(masks: MaskConfig, megapixels: float, speed: float) -> float:
     if not masks.sam or masks.source == "graph":
         return 0.4 + megapixels
-    return 590.0 * (5 if masks.crop_layers else 1) if "huge" in masks.sam else 330.0
+    of_million = 0.14 if "sam2" in masks.sam.lower() else 0.24  # seconds of seeing a picture
+    crops = sum(4**layer for layer in range(masks.crop_layers + 1))
+    seeing, asking = of_million * _millions(masks.sam), POINT * masks.points_per_side**2
+    return megapixels + crops * (seeing + asking) * speed
 
 
-def _encoder_seconds(model: str) -> float:
-    return 1.2 if model == "demo" else 130.0
+def _encoder_seconds(model: str, masks: MaskConfig) -> float:
+    if model == "demo":
+        return 1.2
+    regions = min(REGIONS, 2 * masks.points_per_side**2) if masks.sam else REGIONS
+    return 0.45 * regions * (_millions(model) / USUAL) ** 1.4
+
+
+def _millions(model: str) -> float:
+    """Weights of a model, in millions: of its files, at four bytes each, or as its name says."""
+    path = Path(model).expanduser()
+    files = [path] if path.is_file() else [*path.glob("*.safetensors")] or [*path.glob("*.bin")]
+    if files:
+        return sum(file.stat().st_size for file in files) / 4e6
+    return next((count for part, count in MILLIONS.items() if part in model.lower()), USUAL)
 
 
 def count_photographs(dataset: Path) -> tuple[int, Given]:
@@ -91,10 +130,11 @@ def in_words(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.0f} h"
 
 
-def forecast_in_words(stages: Sequence[Stage]) -> str:
+def forecast_in_words(stages: Sequence[Stage], on_gpu: bool = False) -> str:
     """What a plan costs: "about 6 min on two CPU cores (photographs 80 s, ...)"."""
+    where = "two CPU cores and a GPU" if on_gpu else "two CPU cores"
     parts = ", ".join(f"{stage.name} {in_words(stage.seconds)}" for stage in stages if stage.seconds > 1)
-    return f"about {in_words(sum(stage.seconds for stage in stages))} on two CPU cores ({parts})"
+    return f"about {in_words(sum(stage.seconds for stage in stages))} on {where} ({parts})"
 
 
 @dataclass(eq=False)

@@ -6,7 +6,7 @@ memory depends on a block of Gaussians and not on all of them times all photogra
 """
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -72,11 +72,8 @@ def language_field(
 
     Raises InputError where no view has a mask, and for a codebook whose numbers the lifting would average.
     """
-    if config.codec.kind == "codebook" and config.lift.mode in LATENT_LIFTS:
-        raise InputError(
-            f"--lift.mode {config.lift.mode} averages latents, and a codebook's are numbers of codewords; "
-            "add --codec.kind autoencoder"
-        )
+    check_lift(config)
+    check_masks(features for _, features in views)
     stages = _Stages(gaussians, views, encoder, config, work, crew or Crew(), progress)
     codec, report = stages.codec()
     latents, confidence = stages.latents(codec)
@@ -92,6 +89,23 @@ def language_field(
         everyday=everyday_vectors(encoder),
     )
     return field, report
+
+
+def check_lift(config: TrainConfig) -> None:
+    """Raises InputError for a codebook whose numbers the lifting would average."""
+    if config.codec.kind == "codebook" and config.lift.mode in LATENT_LIFTS:
+        raise InputError(
+            f"--lift.mode {config.lift.mode} averages latents, and a codebook's are numbers of codewords; "
+            "add --codec.kind autoencoder"
+        )
+
+
+def check_masks(features: Iterable[ImageFeatures]) -> None:
+    """Raises InputError where no photograph has a mask; looks no further than the first that has one."""
+    if not any(len(seen.vectors) for seen in features):
+        raise InputError(
+            "no masks were found in any photograph; try --masks.source graph, or larger photographs"
+        )
 
 
 class _Stages:
@@ -115,10 +129,6 @@ class _Stages:
         for _, features in views:
             self._vectors.append(features.vectors)
             digests.append(features_digest([features]))
-        if sum(map(len, self._vectors)) == 0:
-            raise InputError(
-                "no masks were found in any photograph; try --masks.source graph, or larger photographs"
-            )
         self._inputs = (gaussians_digest(gaussians), digests)
         self._made: tuple[Memberships, MaskGroups] | None = None
 

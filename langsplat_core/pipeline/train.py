@@ -21,7 +21,7 @@ from langsplat_core.files import check_output_folder, shown
 from langsplat_core.formats import check_writable, load_scene, read_ply, save_scene, write_ply
 from langsplat_core.pipeline.crew import Crew
 from langsplat_core.pipeline.doubts import doubts
-from langsplat_core.pipeline.language import language_field
+from langsplat_core.pipeline.language import check_lift, check_masks, language_field
 from langsplat_core.pipeline.lock import sole_use
 from langsplat_core.pipeline.report import TrainReport, read_report, work_folder, write_report
 from langsplat_core.pipeline.stages import stage_key
@@ -57,6 +57,7 @@ def train_scene(
     `gaussians_from`: a scene in the photographs' world whose Gaussians are taken instead of training some.
     """
     check_settings(config)
+    check_lift(config)
     if out.suffix.lower() != ".ply":
         raise InputError(f"{out}: the scene must be named *.ply, for example --out {out.with_suffix('.ply')}")
     work = work or work_folder(out)
@@ -103,6 +104,9 @@ def _train(
     names = [capture.cameras[i].name for i in mine]
     describe_capture([capture.images[i] for i in mine], names, mask_source, encoder, store, progress)
     crew.meet()
+    cameras = tuple(capture.cameras[i] for i in train)
+    features = StoredFeatures(store, [camera.name for camera in cameras])
+    check_masks(features)  # before the Gaussians, which may cost hours
     clock.lap("masks and vectors")
 
     if given is None:
@@ -113,8 +117,6 @@ def _train(
     metres = config.dataset.metres_per_unit or said or capture.metres_per_unit
     clock.lap("radiance")
 
-    cameras = tuple(capture.cameras[i] for i in train)
-    features = StoredFeatures(store, [camera.name for camera in cameras])
     views = StoredViews(cameras, features)
     language, loss = language_field(gaussians, views, encoder, config, work, progress, crew)
     if not capture.drawn:

@@ -35,12 +35,13 @@ def _spans(length: int, count: int, overlap: int) -> list[tuple[int, int]]:
     return [(start, min(start + size, length)) for start in starts if start < length]
 
 
-def cut_by_crop(box: Array, crop: Array, shape: tuple[int, int]) -> bool:
-    """Whether a mask's box ends at an edge of the crop that is no edge of the picture: what it shows goes
-    on outside, and the next crop or the whole picture shows it better.
+def cut_by_crop(boxes: Array, crop: Array, shape: tuple[int, int]) -> Array:
+    """(...,) bool: whether a mask's box ends at an edge of the crop that is no edge of the picture: what it
+    shows goes on outside, and the next crop or the whole picture shows it better.
 
-    box, crop: (4,) left, top, right, bottom, px of the picture; shape: its (height, width).
+    boxes: (..., 4); crop: (4,) left, top, right, bottom, px of the picture; shape: its (height, width).
     """
     picture = np.array([0, 0, shape[1], shape[0]])
-    at_crop, at_picture = np.abs(box - crop) <= EDGE, np.abs(box - picture) <= EDGE
-    return bool((at_crop & ~at_picture).any())
+    at_crop, at_picture = np.abs(boxes - crop) <= EDGE, np.abs(boxes - picture) <= EDGE
+    cut: Array = (at_crop & ~at_picture).any(axis=-1)
+    return cut

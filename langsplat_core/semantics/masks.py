@@ -1,7 +1,8 @@
 """Masks at three levels: what every source of masks gives, and how they become one map per level."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -37,6 +38,14 @@ class MaskSource(Protocol):
 
     def __call__(self, image: Array, progress: Progress) -> LevelMasks:
         """Masks of an image (H, W, 3) uint8."""
+
+
+@runtime_checkable
+class SplitMaskSource(MaskSource, Protocol):
+    """One whose work has two parts: a model sees the next photograph while the second is done."""
+
+    def begin(self, image: Array, progress: Progress) -> Callable[[], LevelMasks]:
+        """Do the model's part; what is returned does the rest, in any thread."""
 
 
 def label_maps(levels: LevelMasks) -> Array:

@@ -4,7 +4,8 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
@@ -19,7 +20,7 @@ from langsplat_core.parsing.npy import read_npz
 from langsplat_core.parsing.opening import exists
 from langsplat_core.progress import Progress, silent
 from langsplat_core.semantics.embed import ImageEncoder, embed_regions
-from langsplat_core.semantics.masks import MaskSource, label_maps
+from langsplat_core.semantics.masks import LevelMasks, MaskSource, SplitMaskSource, label_maps
 
 VERSION = 1
 SUFFIX = ".features.npz"
@@ -177,19 +178,38 @@ def describe_capture(
     """Masks and CLIP vectors of every photograph, in order; those that `store` has already are not redone.
 
     images: (H, W, 3) uint8 each; names: unique, one per image. What is finished is in the store even when
-    `progress` interrupts the work.
+    `progress` interrupts the work. Each photograph's regions are encoded by themselves: its file does not
+    depend on which others were made beside it.
     """
     label = f"masks ({mask_source.name}) and vectors"
     made_by = fingerprint(encoder)
-    for index, (image, name) in enumerate(zip(images, names, strict=True)):
-        part = _part(progress, f"{label}: {name}", index, len(images))
-        part("", 0.0)
-        key = feature_key(image, mask_source, made_by)
-        if not store.has(name, key):
-            labels = label_maps(mask_source(image, part))
-            store.save(name, ImageFeatures(labels, embed_regions(image, labels, encoder)), key)
+
+    def keep(finish: Callable[[], LevelMasks], image: Array, name: str, key: str) -> None:
+        labels = label_maps(finish())
+        store.save(name, ImageFeatures(labels, embed_regions(image, labels, encoder)), key)
+
+    with ThreadPoolExecutor(1) as worker:  # filters, crops and files of one while masks of the next are found
+        before: Future[None] | None = None
+        for index, (image, name) in enumerate(zip(images, names, strict=True)):
+            part = _part(progress, f"{label}: {name}", index, len(images))
+            part("", 0.0)
+            key = feature_key(image, mask_source, made_by)
+            if not store.has(name, key):
+                finish = _begin(mask_source, image, part)
+                if before is not None:  # one photograph's full-size masks at a time
+                    before.result()
+                before = worker.submit(keep, finish, image, name, key)
+        if before is not None:
+            before.result()
     progress(label, 1.0)
     return StoredFeatures(store, names)
+
+
+def _begin(source: MaskSource, image: Array, progress: Progress) -> Callable[[], LevelMasks]:
+    if isinstance(source, SplitMaskSource):
+        return source.begin(image, progress)
+    found = source(image, progress)
+    return lambda: found
 
 
 def _part(progress: Progress, label: str, index: int, count: int) -> Progress:

@@ -219,13 +219,16 @@ def loading_errors(id: str, kind: str) -> Iterator[None]:
 
 
 def torch_device(device: str) -> str:
-    """What "auto" means here: cuda where PyTorch sees one, else cpu. EncoderError for an absent device."""
+    """What "auto" means here: cuda where PyTorch sees one, else cpu. EncoderError for an absent device.
+
+    By its number: which one is current is a matter of each thread.
+    """
     if device == "cpu":
         return device  # without importing torch, which a small text encoder does without
     import torch
 
-    if device == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if device == "cuda" and not torch.cuda.is_available():
+    if torch.cuda.is_available():
+        return f"cuda:{torch.cuda.current_device()}"
+    if device == "cuda":
         raise EncoderError("device cuda: PyTorch sees no CUDA device here; use `--clip.device cpu`")
-    return device
+    return "cpu"

@@ -17,6 +17,7 @@ from langsplat_core.pipeline.views import StoredViews
 from langsplat_core.training.language import codebook_fit
 from tests.support.lifting import make_views
 from tests.support.tiny_room import tiny_room
+from tests.support.tiny_sam import tiny_sam
 
 pytestmark = pytest.mark.long
 
@@ -59,37 +60,53 @@ def test_views_are_read_when_they_are_looked_at():
         StoredViews([camera for camera, _ in pairs], [pairs[0][1]] * 2)
 
 
-def train(room: Path, out: Path, said: Path, surroundings: dict[str, str]) -> None:
+def train(room: Path, out: Path, said: Path, surroundings: dict[str, str], *more: str) -> None:
     """The command, in an environment; its exit code becomes this process's, unless it is 0."""
     os.environ.update(surroundings)
     codebook_fit.COLOUR_STEPS = 20  # as in this folder's tests
-    words = ["train", str(room), "--out", str(out), "--phrases", "red mug", *OPTIONS]
+    words = ["train", str(room), "--out", str(out), "--phrases", "red mug", *OPTIONS, *more]
     with said.open("w") as file, redirect_stdout(file), redirect_stderr(file):
         code = main("langsplat", lambda: parse([*words, "--clip.model", str(room / "encoder")]))
     if code:
         sys.exit(code)
 
 
-def test_two_processes_make_the_scene_of_one(tmp_path: Path) -> None:
-    """Joined as torchrun joins them: it keeps the store where they meet."""
-    room = tiny_room(tmp_path / "room")
-    train(room, tmp_path / "one.ply", tmp_path / "one.txt", {})
+def train_by_two(room: Path, out: Path, *more: str) -> tuple[list[int | None], list[str]]:
+    """Exit codes and what is said, joined as torchrun joins them: it keeps the store where they meet."""
     store = torch.distributed.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
     there = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(store.port), "WORLD_SIZE": "2"}
     there["TORCHELASTIC_USE_AGENT_STORE"] = "True"
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["tests.pipeline.test_crew"])
-    two, said = [], [tmp_path / "0.txt", tmp_path / "1.txt"]
+    two, said = [], [out.with_name("0.txt"), out.with_name("1.txt")]
     for rank, text in enumerate(said):
         surroundings = there | {"RANK": str(rank), "LOCAL_RANK": str(rank)}
-        arguments = (room, tmp_path / "two.ply", text, surroundings)
+        arguments = (room, out, text, surroundings, *more)
         two.append(processes.Process(target=train, args=arguments, daemon=True))
     for process in two:
         process.start()
     for process in two:
         process.join(300)
-    texts = [text.read_text() for text in said]
-    assert [process.exitcode for process in two] == [0, 0], texts
+    return [process.exitcode for process in two], [text.read_text() for text in said]
+
+
+def test_two_processes_make_the_scene_of_one(tmp_path: Path) -> None:
+    room = tiny_room(tmp_path / "room")
+    train(room, tmp_path / "one.ply", tmp_path / "one.txt", {})
+    codes, texts = train_by_two(room, tmp_path / "two.ply")
+    assert codes == [0, 0], texts
     assert [text.count("Gaussians from 3 photographs") for text in texts] == [1, 0]
     for suffix in (".ply", ".langsplat.safetensors"):
         assert (tmp_path / f"two{suffix}").read_bytes() == (tmp_path / f"one{suffix}").read_bytes()
+
+
+def test_two_processes_without_a_mask_both_end_before_training(tmp_path: Path) -> None:
+    room = tiny_room(tmp_path / "room")
+    tiny_sam(tmp_path / "sam")  # random weights, whose scores are far below one
+    picky = ("--masks.source", "sam", "--masks.sam", str(tmp_path / "sam"), "--masks.predicted-iou", "1")
+    codes, texts = train_by_two(room, tmp_path / "two.ply", *picky)
+    assert codes == [2, 2], texts
+    for text in texts:
+        assert text.strip().splitlines()[-1].count("no masks were found") == 1
+        assert "Traceback" not in text
+    assert not list(tmp_path.glob("two.work/radiance*"))

@@ -26,9 +26,10 @@ from langsplat_core.formats.metres import write_metres
 from langsplat_core.pipeline import language, train
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import train_scene
-from langsplat_core.progress import Cancelled, LineProgress
+from langsplat_core.progress import Cancelled, LineProgress, Progress
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics import store
+from langsplat_core.semantics.masks import LevelMasks
 from tests.support.tiny_room import tiny_room, tiny_settings
 
 pytestmark = pytest.mark.long
@@ -226,6 +227,33 @@ def test_what_cannot_be_used_is_said_before_anything_is_made(room, tmp_path):
     with pytest.raises(InputError):
         train_scene(tmp_path / "missing", tmp_path / "scene.ply", tiny_settings(room))
     assert not list(tmp_path.glob("**/*.ply"))
+
+
+class Blind:
+    """A mask source that finds nothing."""
+
+    name = key = "blind"
+
+    def __call__(self, image: np.ndarray, progress: Progress) -> LevelMasks:
+        none = np.zeros((0, *image.shape[:2]), bool)
+        return LevelMasks((none, none, none), (np.zeros(0, np.float32),) * 3)
+
+
+def test_without_any_mask_no_gaussians_are_trained(room, tmp_path):
+    out, said = tmp_path / "scene.ply", []
+    with pytest.raises(InputError, match=r"no masks were found.*--masks\.source graph"):
+        train_scene(
+            room,
+            out,
+            tiny_settings(room),
+            progress=lambda label, _: said.append(label),
+            masks_of=lambda _: Blind(),
+        )
+    assert any("blind" in label for label in said)
+    assert not any("Training" in label for label in said)
+    assert not list(tmp_path.glob("**/*.ply"))
+    train_scene(room, out, tiny_settings(room))  # in the same work folder, as the message advises
+    assert load_scene(out).language is not None
 
 
 def test_two_views_are_no_scene_unless_told_otherwise(room, tmp_path):

@@ -1,13 +1,15 @@
 """Vectors of regions, and the store that lets a run continue."""
 
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
+from threading import get_ident
 
 import numpy as np
 import pytest
 
 from langsplat_core.arrays import unit
-from langsplat_core.errors import FormatError
+from langsplat_core.errors import FormatError, InputError
 from langsplat_core.progress import Cancelled, Progress, silent
 from langsplat_core.semantics.embed import embed_regions
 from langsplat_core.semantics.masks import LevelMasks
@@ -224,6 +226,49 @@ def test_an_interrupted_run_continues_where_it_stopped(tmp_path: Path) -> None:
         np.testing.assert_array_equal(one.vectors, other.vectors)
     assert np.unique(found[0].labels).tolist() == [-1, 0, 1, 2]
     np.testing.assert_allclose(found[0].vectors[:2], [[1, 0, 0], [0, 0, 1]], atol=1e-4)
+
+
+class InTwoParts(Halves):
+    """A source whose filters run later, and fail for the photograph of that number."""
+
+    def __init__(self, fails: int = -1) -> None:
+        super().__init__()
+        self.fails, self.log = fails, []
+
+    def begin(self, image: np.ndarray, progress: Progress) -> Callable[[], LevelMasks]:
+        number = self.calls
+        found = self(image, progress)
+        self.log.append((number, "asked", get_ident()))
+
+        def finish() -> LevelMasks:
+            if number == self.fails:
+                raise InputError("no room")
+            self.log.append((number, "filtered", get_ident()))
+            return found
+
+        return finish
+
+
+def test_filters_of_one_photograph_run_beside_the_model_of_the_next(tmp_path: Path) -> None:
+    images = [np.roll(red_and_blue(), shift, axis=1) for shift in range(4)]
+    names, source, encoder = ["a", "b", "c", "d"], InTwoParts(), ColourEncoder()
+    found = describe_capture(images, names, source, encoder, FeatureStore(tmp_path / "two"))
+    assert {thread for _, what, thread in source.log if what == "asked"} == {get_ident()}
+    assert get_ident() not in {thread for _, what, thread in source.log if what == "filtered"}
+    assert sorted(number for number, what, _ in source.log if what == "filtered") == [0, 1, 2, 3]
+    want = describe_capture(images, names, Halves(), encoder, FeatureStore(tmp_path / "one"))
+    for one, other in zip(found, want, strict=True):
+        np.testing.assert_array_equal(one.labels, other.labels)
+        np.testing.assert_array_equal(one.vectors, other.vectors)
+
+
+@pytest.mark.parametrize("fails", [1, 3])
+def test_what_fails_behind_the_model_is_raised(fails: int, tmp_path: Path) -> None:
+    images = [np.roll(red_and_blue(), shift, axis=1) for shift in range(4)]
+    names, store = ["a", "b", "c", "d"], FeatureStore(tmp_path)
+    with pytest.raises(InputError, match="no room"):
+        describe_capture(images, names, InTwoParts(fails), ColourEncoder(), store)
+    assert [store.has(name) for name in names] == [n < fails for n in range(4)]
 
 
 def test_changed_settings_redo_what_is_stored(tmp_path: Path) -> None:

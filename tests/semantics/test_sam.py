@@ -16,9 +16,10 @@ from transformers import Sam2Model, SamHQModel, SamModel
 from langsplat_core.config import MaskConfig
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import silent
+from langsplat_core.semantics import sam
 from langsplat_core.semantics.mask_filters import clean_regions, mask_boxes
-from langsplat_core.semantics.sam import grid_points, load_sam
-from langsplat_core.semantics.segmenter import by_area, padded, squashed, upscale
+from langsplat_core.semantics.sam import SamMasks, grid_points, load_sam
+from langsplat_core.semantics.segmenter import Look, by_area, padded, squashed, upscale
 from langsplat_core.semantics.segmenters import load_segmenter
 from langsplat_core.semantics.sources import load_mask_source
 from tests.support.plain_filters import plain_box_nms, plain_mask_nms
@@ -82,6 +83,19 @@ def test_upscaling_forgets_the_padding() -> None:
     assert full.shape == (1, 16, 32)
     columns = (np.arange(32) + 0.5) / 2 - 0.5
     np.testing.assert_allclose(full[0, 5, 1:-1], columns[1:-1], atol=1e-5)
+
+
+def test_boxes_and_stability_are_those_of_whole_masks() -> None:
+    rng = np.random.default_rng(0)
+    logits = ndimage.gaussian_filter(rng.normal(size=(9, 30, 41)), (0, 3, 3)) * 20 - 1.5
+    logits[0], logits[1] = -5, 5
+    logits[2], logits[2, 29, 40] = -0.5, 0.5  # one pixel, in the corner
+    found = sam.measure(torch.from_numpy(logits.astype(np.float32)), 1.0).numpy()
+    assert found[0].tolist() == [0] * 5  # nothing at all
+    assert found[2].tolist() == [0, 40, 29, 41, 30]
+    np.testing.assert_array_equal(found[1:, 1:], mask_boxes(logits[1:] > 0))
+    for row, mask in zip(found, logits, strict=True):
+        assert row[0] == pytest.approx((mask > 1).sum() / max((mask > -1).sum(), 1), rel=1e-6)
 
 
 def plain_answer(model: Any, image: np.ndarray, point: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
@@ -291,3 +305,41 @@ def test_sources_are_chosen_and_absences_named(config: MaskConfig, tmp_path: Pat
     with pytest.raises(EncoderError, match="no segmenter known here") as error:
         load_mask_source(MaskConfig(sam=str(tmp_path)))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("make", [tiny_sam, tiny_sam2])
+def test_half_the_digits_give_nearly_the_same_masks(
+    make: Callable[[Path], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a GPU, which alone is asked so: PyTorch rounds on a CPU to the same digits."""
+    make(tmp_path)
+    monkeypatch.setattr(sam, "HALF_ON", "cpu")
+    config = replace(LOOSE, sam=str(tmp_path), predicted_iou=-9.0, stability=0.0, box_nms=1.0, nms_iou=1.0)
+    segmenter = load_segmenter(str(tmp_path), "cpu")
+    whole, half = (SamMasks(segmenter, config, half) for half in (False, True))
+    assert whole.key != half.key
+    for want, got in zip(whole(photograph(), silent).masks, half(photograph(), silent).masks, strict=True):
+        assert abs(len(want) - len(got)) <= 2
+        apart = np.array([min((mask ^ other).mean() for other in want) for mask in got])
+        assert np.median(apart) < 0.02
+        assert (apart > 0).any()  # so it was rounded
+
+
+def test_what_float16_cannot_hold_is_asked_again(config: MaskConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sam, "HALF_ON", "cpu")
+    segmenter, asked = load_segmenter(config.sam, "cpu"), []
+
+    class Overflowing:
+        name = "overflowing"
+
+        def look(self, image: np.ndarray) -> Look:
+            asked.append(torch.is_autocast_enabled("cpu"))
+            look = segmenter.look(image)
+            if asked[-1]:
+                look.seen["image_embeddings"].fill_(torch.inf)
+            return look
+
+    found = SamMasks(Overflowing(), config, half=True)(photograph(), silent)
+    for got, want in zip(found.masks, SamMasks(segmenter, config)(photograph(), silent).masks, strict=True):
+        np.testing.assert_array_equal(got, want)
+    assert asked == [True, False]
