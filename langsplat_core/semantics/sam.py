@@ -123,10 +123,8 @@ class SamMasks:
                 if half and not bool(answer[0].isfinite().all()):
                     raise OverflowError
                 found.append(self._passing(look, answer, crop, image.shape[:2]))
-            figures, logits = (
-                np.concatenate([some for some, _ in found]),
-                torch.cat([some for _, some in found]),
-            )
+            figures = np.concatenate([some for some, _ in found])
+            logits = torch.cat([some for _, some in found])
             return [self._best(look, figures, logits, level, crop) for level in range(LEVELS)]
 
     def _passing(
@@ -169,7 +167,8 @@ def measure(logits: Any, offset: float) -> Any:
     """(B, 5) float32 of (B, H, W) full-size logits, on their device: stability, left, top, right, bottom, px;
     right and bottom exclusive, all 0 of an empty mask.
 
-    At full size, as in segment_anything: at the decoder's own, areas and boxes of small masks differ."""
+    At full size, as in segment_anything: at the decoder's own, areas and boxes of small masks differ.
+    """
     import torch
 
     inside = ((logits > cut).view(torch.uint8).flatten(1) for cut in (offset, -offset))

@@ -42,7 +42,7 @@ class Weights:
 
     id: str  # hub id or folder, as it was asked for
     folder: Path  # in Hugging Face layout, or that of `converted`, with what lies beside the weights
-    device: str  # of torch: "cpu", "cuda"
+    device: str  # of torch: "cpu", "cuda:0"
     converted: Converted | None = None  # where they are in another layout than Hugging Face's
 
 
