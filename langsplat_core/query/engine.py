@@ -125,7 +125,7 @@ class QueryEngine:
     def basis(self) -> Basis:
         """What answers stand on, by what is known so far: nothing is loaded for it."""
         field = self.field
-        everyday = None if self._rule == "peak" else self.__dict__.get("_everyday", field.everyday)
+        everyday = None if self._rule == "peak" else self.__dict__.get("_everyday", _enough(field.everyday))
         name, calibration = field.encoder_id, None
         if name == DEMO:
             name = "demo encoder"
@@ -154,7 +154,7 @@ class QueryEngine:
         stored = self.field.everyday
         if stored is None:
             return self._encoded_everyday()
-        return stored if len(stored) >= FEWEST else None
+        return _enough(stored)
 
     def _encoded_everyday(self) -> Array | None:
         try:
@@ -366,6 +366,10 @@ class QueryEngine:
         """The things among the members of an answer, best first, or only so many of them."""
         relevancy = result.relevancy[result.level]
         return find_instances(self.surface, self.scene.gaussians, result.members, relevancy, at_most)
+
+
+def _enough(everyday: Array | None) -> Array | None:
+    return None if everyday is None or len(everyday) < FEWEST else everyday
 
 
 def _check_words(encoder: TextEncoder, keys: Iterable[str]) -> None:

@@ -11,6 +11,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import CANONICAL_PHRASES, Calibration, Odds, Reading, Scene
 from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import DEMO
+from langsplat_core.semantics.everyday import FEWEST
 from tests.support.blob_words import named_scene
 from tests.support.fakes import DIM, WORDS, FakeEncoder, axis
 
@@ -18,7 +19,7 @@ CALIBRATED = Reading(calibration=Calibration(*[Odds(0, 1, 1)] * 3))
 FAR = np.where(
     np.arange(DIM) < len(WORDS), 0.5, 1
 )  # from what is in the scene, so that that is found clearly
-EVERYDAY = unit((FAR * np.random.default_rng(4).normal(size=(40, DIM))).astype(np.float32))
+EVERYDAY = unit((FAR * np.random.default_rng(4).normal(size=(FEWEST, DIM))).astype(np.float32))
 
 
 def scene_of(encoder: str, reading: Reading, *, everyday: bool = True) -> Scene:
@@ -28,6 +29,13 @@ def scene_of(encoder: str, reading: Reading, *, everyday: bool = True) -> Scene:
     return replace(
         scene, language=replace(scene.language, encoder_id=encoder, reading=reading, everyday=vectors)
     )
+
+
+def test_too_few_everyday_phrases_count_as_none():
+    few = scene_of("lab/clip", Reading())
+    assert few.language is not None
+    few = replace(few, language=replace(few.language, everyday=EVERYDAY[:-1]))
+    assert QueryEngine(few).basis == QueryEngine(scene_of("lab/clip", Reading(), everyday=False)).basis
 
 
 @pytest.mark.parametrize("encoder", [DEMO, "lab/clip"])
