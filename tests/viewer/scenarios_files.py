@@ -13,6 +13,7 @@ from imgui_bundle import imgui  # isort: skip
 from langsplat_core.io import save_scene
 from langsplat_core.pipeline.report import REPORT
 from langsplat_viewer import actions
+from langsplat_viewer import viewer as training
 from langsplat_viewer.panels.area import scene_area
 from tests.support.fakes import CENTRES, blob_scene
 
