@@ -13,7 +13,8 @@ from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.cli.scenes import Convert
 from langsplat_core.errors import InputError
-from langsplat_core.io import companion_path, language, load_scene, save_scene
+from langsplat_core.io import language
+from langsplat_core.io.scenes import companion_path, load_scene, save_scene
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.semantics.encoders import load_text_encoder

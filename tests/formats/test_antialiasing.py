@@ -4,7 +4,9 @@ import json
 
 import pytest
 
-from langsplat_core.io import load_scene, read_ply_scene, read_sog_scene, save_scene, write_ply
+from langsplat_core.io.ply import read_ply_scene, write_ply
+from langsplat_core.io.scenes import load_scene, save_scene
+from langsplat_core.io.sog import read_sog_scene
 from langsplat_core.scene import Scene
 from tests.support.file_samples import (
     compressed_ply,

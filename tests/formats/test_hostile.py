@@ -9,19 +9,13 @@ import pytest
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.io import (
-    read_cameras,
-    read_features,
-    read_ksplat,
-    read_language,
-    read_ply,
-    read_sog,
-    read_splat,
-    read_spz_scene,
-    write_cameras,
-    write_features,
-    write_language,
-)
+from langsplat_core.io.cameras import read_cameras, write_cameras
+from langsplat_core.io.langsplat_files import read_features, write_features
+from langsplat_core.io.language import read_language, write_language
+from langsplat_core.io.ply import read_ply
+from langsplat_core.io.sog import read_sog
+from langsplat_core.io.splat import read_ksplat, read_splat
+from langsplat_core.io.spz import read_spz_scene
 from tests.support.file_samples import (
     ascii_ply,
     compressed_ply,

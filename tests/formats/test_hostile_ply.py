@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.io import ply, read_ply, read_ply_scene, write_ply
+from langsplat_core.io import ply
+from langsplat_core.io.ply import read_ply, read_ply_scene, write_ply
 from langsplat_core.scene import Gaussians, Scene
 from tests.support.file_samples import (
     ascii_ply,

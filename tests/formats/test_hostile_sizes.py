@@ -14,16 +14,13 @@ import zstandard
 from PIL import Image
 
 from langsplat_core.errors import FormatError
-from langsplat_core.io import (
-    load_gaussians,
-    read_cameras,
-    read_ksplat,
-    read_language,
-    read_ply,
-    read_sog,
-    read_spz_scene,
-    write_language,
-)
+from langsplat_core.io.cameras import read_cameras
+from langsplat_core.io.language import read_language, write_language
+from langsplat_core.io.ply import read_ply
+from langsplat_core.io.scenes import load_gaussians
+from langsplat_core.io.sog import read_sog
+from langsplat_core.io.splat import read_ksplat
+from langsplat_core.io.spz import read_spz_scene
 from tests.support.file_samples import (
     plain_ply,
     random_field,

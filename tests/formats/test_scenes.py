@@ -7,16 +7,10 @@ import numpy as np
 import pytest
 
 from langsplat_core.errors import InputError
-from langsplat_core.io import (
-    companion_path,
-    language,
-    load_gaussians,
-    load_scene,
-    save_scene,
-    scene_files,
-    write_language,
-    write_ply,
-)
+from langsplat_core.io import language
+from langsplat_core.io.language import write_language
+from langsplat_core.io.ply import write_ply
+from langsplat_core.io.scenes import companion_path, load_gaussians, load_scene, save_scene, scene_files
 from langsplat_core.scene import Scene
 from tests.support.file_samples import compressed_ply, random_field, sog_files, write_folder
 from tests.support.same import assert_same_field

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.cli.scenes import Inspect
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.io.summary import disk_bytes, duplicates, summarise
 from langsplat_core.scene import NO_THING, Calibration, Gaussians, Odds, Reading, Scene
 from tests.support.file_samples import random_field

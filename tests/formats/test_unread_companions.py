@@ -9,7 +9,7 @@ import pytest
 from langsplat_core.cli.query import QueryScene
 from langsplat_core.cli.scenes import Inspect
 from langsplat_core.errors import InputError
-from langsplat_core.io import load_scene, load_without_language, save_scene
+from langsplat_core.io.scenes import load_scene, load_without_language, save_scene
 from langsplat_core.query.engine import NO_FIELD, QueryEngine
 from tests.support.fakes import blob_scene
 
