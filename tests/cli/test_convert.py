@@ -109,7 +109,7 @@ def test_a_write_that_fails_leaves_the_old_scene(tmp_path, monkeypatch):
     def full_disk(*_: object) -> None:
         raise OSError("No space left on device")
 
-    monkeypatch.setattr("langsplat_core.io.write_language", full_disk)
+    monkeypatch.setattr("langsplat_core.io.scenes.write_language", full_disk)
     with pytest.raises(OSError, match="No space"):
         save_scene(tmp_path / "a.spz", full_scene())
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
