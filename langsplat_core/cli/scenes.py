@@ -1,4 +1,4 @@
-"""`langsplat inspect` and `langsplat doctor`: what a scene holds, what this machine can do."""
+"""`langsplat inspect`, `doctor`, `convert`, `compact` and `scale`: commands on scene files."""
 
 import ctypes.util
 import importlib.metadata
@@ -165,8 +165,6 @@ def _version(package: str) -> str:
         return f"missing: {remedy(package)}" if package in EXTRAS else "missing"
 
 
-# `langsplat convert`: one scene file to another, and to and from what other methods keep.
-
 CHECKPOINTS = (".pth", ".pt", ".ckpt", ".npz", ".npy", ".faiss")  # no scene has such a name
 Target = Literal["scene", "langsplat", "occam", "features"]
 LevelName = Literal["subpart", "part", "whole"]
@@ -300,8 +298,6 @@ class Convert:
         print(f"{self.out}: masks and vectors of {count} photographs")
 
 
-# `langsplat compact`: a scene with no more Gaussians than it needs.
-
 if TYPE_CHECKING:
     from langsplat_core.compaction.compact import CompactReport
 
@@ -384,8 +380,6 @@ def _notes(report: "CompactReport") -> list[str]:
             )
     return lines
 
-
-# `langsplat scale`: how long a scene's world unit is.
 
 Coordinate = Annotated[float, Range(-1e12, 1e12)]
 Span = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]

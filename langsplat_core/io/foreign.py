@@ -1,4 +1,8 @@
-"""A scene of another method, put together from the files that people have of it."""
+"""A scene of another method, put together from the files that people have of it.
+
+Nothing in a file is ever executed, and what a file is tells what it holds. docs/files.md says what to give of
+each method and what becomes of it.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -14,7 +18,6 @@ from langsplat_core.io.cameras import read_cameras
 from langsplat_core.io.foreign_language import (
     DR_SPLAT,
     FEATURE_3DGS,
-    FVDB,
     LANGSPLAT,
     OCCAM,
     OPEN_GAUSSIAN,
@@ -24,7 +27,6 @@ from langsplat_core.io.foreign_language import (
     Carrier,
     Centroids,
     Clusters,
-    Leaves,
     Meaning,
     Part,
     ProductCodes,
@@ -35,7 +37,6 @@ from langsplat_core.io.foreign_language import (
     read_part,
 )
 from langsplat_core.io.hostile import exists
-from langsplat_core.io.langsplat_files import write_autoencoder, write_checkpoint
 from langsplat_core.scene import LEVELS, AutoencoderCodec, Scene
 
 WIDEST_LATENT = 16  # numbers per Gaussian up to which they are an autoencoder's; 1, 2, 3 and 8 were published
@@ -141,7 +142,7 @@ def _without_language(plain: Carrier | None, others: list[Part]) -> ForeignScene
 def _of_clusters(carrier: Carrier | None, clusters: Clusters) -> ForeignScene:
     """OpenGaussian: one level, which is taken for the whole."""
     leaves = clusters.leaves
-    if carrier is None or carrier.gaussians is None:
+    if carrier is None:
         raise InputError(f"{clusters.path}: has no Gaussians; name the scene's checkpoint or PLY too")
     if len(leaves) != len(carrier.gaussians):
         raise FormatError(
@@ -172,7 +173,6 @@ def _of_levels(
         )
     numbers, how = _numbers(tellers, asked)
     carrier = _geometry(plain, tellers)
-    assert carrier.gaussians is not None
     levels: list[Meaning | None] = [None] * len(LEVELS)
     paths: list[Path | None] = [None] * len(LEVELS)
     pruned = 0
@@ -203,9 +203,7 @@ def _numbers(tellers: list[Carrier], asked: Sequence[str]) -> tuple[list[int], s
 
 def _geometry(plain: Carrier | None, tellers: list[Carrier]) -> Carrier:
     """Whose Gaussians the scene has: those without features; else those of the checkpoints."""
-    carriers = [plain] if plain else [teller for teller in tellers if teller.gaussians is not None]
-    if not carriers:
-        raise InputError(f"{tellers[0].path}: of {FVDB}, which keeps no Gaussians; name the scene's PLY too")
+    carriers = [plain] if plain else tellers
     if carriers[0].method not in PRUNED:
         return carriers[0]
     return replace(carriers[0], gaussians=all_gaussians(carriers))
@@ -240,8 +238,7 @@ def _notes(numbers: list[int], tellers: list[Carrier], how: str, pruned: int) ->
 
 
 def _scene(carrier: Carrier) -> Scene:
-    """Its Gaussians, and the cameras that 3D Gaussian Splatting puts into the model's folder."""
-    assert carrier.gaussians is not None
+    """The carrier's Gaussians, and the cameras that 3D Gaussian Splatting puts into the model's folder."""
     folder = carrier.path.resolve().parent
     model = folder.parent.parent if carrier.path.name == "point_cloud.ply" else folder
     cameras = [path for path in (carrier.path.with_suffix(CAMERAS), model / "cameras.json") if exists(path)]
@@ -251,11 +248,3 @@ def _scene(carrier: Carrier) -> Scene:
         antialiased=carrier.antialiased,
         extras=carrier.extras,
     )
-
-
-# Checkpoints of other methods: read as plain data, and written where another method's tools are to go on.
-#
-# Nothing in a file is ever executed, and what a file is tells what it holds. See docs/files.md for what to
-# give of each method and what becomes of it.
-
-__all__ = ["ForeignScene", "Leaves", "read_foreign", "write_autoencoder", "write_checkpoint"]

@@ -1,4 +1,7 @@
-"""The exchange format of the original LangSplat: the masks and CLIP vectors of one photograph.
+"""Files of the original LangSplat and of Gaussian Splatting in torch: features of photographs, the
+autoencoder, and checkpoints of Gaussian models.
+
+The masks and CLIP vectors of one photograph:
 
     <stem>_f.npy   float32 (M, D)      one CLIP vector per mask; D = 512, or 3 after its autoencoder
     <stem>_s.npy   integer (4, H, W)   row of `_f` per pixel, -1 where there is no mask; maps in order
@@ -65,7 +68,7 @@ def _paths(folder: Path | str, stem: str) -> tuple[Path, Path]:
     return Path(folder) / f"{stem}_f.npy", Path(folder) / f"{stem}_s.npy"
 
 
-# LangSplat's autoencoder, `best_ckpt.pth`: a dictionary of weights by the number of a layer in its network.
+# ---- LangSplat's autoencoder, `best_ckpt.pth`: weights by the number of a layer in its network ----
 #
 #     encoder.{0,3,6,9,12}.{weight,bias}                        linear layers 512-256-128-64-32-3
 #     encoder.{1,4,7,10}.{weight,bias,running_mean,running_var} batch normalisation behind all but the last,
@@ -147,7 +150,7 @@ def autoencoder_weights(codec: AutoencoderCodec) -> dict[str, Array]:
     return named
 
 
-# The tuple of a Gaussian model, as 3D Gaussian Splatting saves it and others extend it.
+# ---- the tuple of a Gaussian model, as 3D Gaussian Splatting saves it and others extend it ----
 #
 #     index  element                                        shape
 #     0      active SH degree                               whole number
@@ -205,8 +208,8 @@ def _element(
     return np.asarray(array, np.float32)
 
 
-# Checkpoints as LangSplat and Occam's LGS read them: (tuple of a Gaussian model, iteration), see
-# `gaussian_tuple`; element 7 holds the features, and what an optimiser would need is empty.
+# Checkpoints as LangSplat and Occam's LGS read them: element 7 holds the features, and what an optimiser
+# would need is empty.
 
 ITERATION = 30_000
 

@@ -1,4 +1,47 @@
-"""The tensors of a language sidecar, read and checked; the layout stands in `language`."""
+"""The language field of a scene: `scene.langsplat.safetensors` beside `scene.ply`.
+
+A safetensors file (an 8-byte length, a JSON header, raw little-endian tensors: nothing in it is ever
+executed). Version 2, for N Gaussians, CLIP vectors of D numbers and P phrases:
+
+    tensor           type     shape      meaning
+    codes            uint16   (3, N)     number of the codeword at subpart, part, whole: of a codebook
+    latents          float    (3, N, d)  instead, of another codec; zero where never observed
+    confidence       float    (3, N)     total blending weight of the observations, >= 0; 0 for no meaning
+    things           uint16   (N,)       number of the thing a Gaussian belongs to, 65535 for none; absent
+                                         where it is not known
+    positions        uint64   (N,)       of the Gaussians that the field belongs to, see `pack_positions`
+    corners          float32  (2, 3)     of the box of these positions
+    canonical        float    (4, D)     unit text vectors of "object", "things", "stuff", "texture"
+    everyday         float    (V, D)     unit text vectors of phrases most of which name nothing in the scene;
+                                         absent where the encoder knows too few
+    phrasebook       float    (P, D)     unit text vectors of `phrases`; absent when P = 0
+    codec.*          float               of a codebook vectors (K, D) and colours (K, 3); basis (d, D) of a
+                                         linear codec; of an autoencoder
+                                         {encoder,decoder}.{layer}.{weight,bias}
+
+    metadata         value
+    format           "langsplat"
+    version          "2"
+    encoder          hub id or folder of the text encoder
+    levels           "subpart,part,whole"
+    codec            "codebook", "autoencoder" or "linear"
+    d                latent dimension, decimal
+    gaussians        N, decimal
+    means_blake2b    BLAKE2b-128 of the means of the PLY, as float32 little endian, hexadecimal
+    phrases          JSON list of the P phrases
+    temperature      of the softmax that reads this encoder's cosines, decimal
+    found            relevancy from which a phrase counts as present, decimal
+    odds             JSON: a list of numbers for each of the three `Odds` of `scene.Calibration`; absent where
+                     the encoder has none ("calibration" of older files is of another scale, and is not read)
+
+"float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
+like the one in memory. With a codebook as `langsplat train` makes it that is 22 bytes per Gaussian, 6 of
+them codes.
+
+The PLY stays a plain file that other programs edit; the checksum notices it, and the positions let
+`rematch_language` carry the field over to an edited PLY. Version 1 is read too: everything float32, `means`
+(N, 3) in place of positions and corners, no temperature and no found.
+"""
 
 import hashlib
 import json
@@ -15,7 +58,6 @@ from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import FormatError, printable_line, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading, parse_json
-from langsplat_core.io.ply import pack_positions, step, unpack_positions
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     LEVELS,
@@ -164,7 +206,7 @@ def _means(tensors: dict[str, Array], count: int) -> tuple[Array, float]:
     check_array("positions", tensors["positions"], (count,))
     check_array("corners", tensors["corners"], (2, 3))
     corners = tensors["corners"]
-    return unpack_positions(tensors["positions"], corners), step(corners)
+    return unpack_positions(tensors["positions"], corners), position_step(corners)
 
 
 def _phrases(metadata: dict[str, str], path: Path) -> list[str]:
@@ -191,40 +233,6 @@ def save_tensors(path: Path, tensors: dict[str, Array], metadata: dict[str, str]
             file.seek(8)
             file.write(text.ljust(size))
 
-
-# The language field of a scene: `scene.langsplat.safetensors` beside `scene.ply`.
-#
-# A safetensors file (an 8-byte length, a JSON header, raw little-endian tensors: nothing in it is ever
-# executed). Version 2, for N Gaussians, CLIP vectors of D numbers and P phrases:
-#
-# tensor           type     shape      meaning codes            uint16   (3, N)     number of the codeword
-# at subpart, part, whole: of a codebook latents          float    (3, N, d)  instead, of another codec;
-# zero where never observed confidence       float    (3, N)     total blending weight of the observations,
-# >= 0; 0 for no meaning things           uint16   (N,)       number of the thing a Gaussian belongs to,
-# 65535 for none; absent where it is not known positions        uint64   (N,)       of the Gaussians that
-# the field belongs to, see `packed_positions` corners          float32  (2, 3)     of the box of these
-# positions canonical        float    (4, D)     unit text vectors of "object", "things", "stuff", "texture"
-# everyday         float    (V, D)     unit text vectors of phrases most of which name nothing in the scene;
-# absent where the encoder knows too few phrasebook       float    (P, D)     unit text vectors of
-# `phrases`; absent when P = 0 codec.*          float               of a codebook vectors (K, D) and colours
-# (K, 3); basis (d, D) of a linear codec; of an autoencoder {encoder,decoder}.{layer}.{weight,bias}
-#
-# metadata         value format           "langsplat" version          "2" encoder          hub id or folder
-# of the text encoder levels           "subpart,part,whole" codec            "codebook", "autoencoder" or
-# "linear" d                latent dimension, decimal gaussians        N, decimal means_blake2b
-# BLAKE2b-128 of the means of the PLY, as float32 little endian, hexadecimal phrases          JSON list of
-# the P phrases temperature      of the softmax that reads this encoder's cosines, decimal found
-# relevancy from which a phrase counts as present, decimal odds             JSON: a list of numbers for each
-# of the three `Odds` of `scene.Calibration`; absent where the encoder has none ("calibration" of older
-# files is of another scale, and is not read)
-#
-# "float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
-# like the one in memory. With a codebook as `langsplat train` makes it that is 22 bytes per Gaussian, 6 of
-# them codes.
-#
-# The PLY stays a plain file that other programs edit; the checksum notices it, and the positions let
-# `rematch_language` carry the field over to an edited PLY. Version 1 is read too: everything float32, `means`
-# (N, 3) in place of positions and corners, no temperature and no found.
 
 SUFFIX = ".langsplat.safetensors"
 
@@ -335,3 +343,46 @@ def _median_spacing(tree: Any) -> float:
     sample = tree.data[:: max(1, len(tree.data) // 10_000)]
     distances = tree.query(sample, k=2)[0][:, 1]  # infinite where there is no second point
     return float(np.median(np.where(np.isfinite(distances), distances, 0)))
+
+
+# ---- positions in 8 bytes: 21 bits an axis, between the corners of their box ----
+#
+# They tell which Gaussian was which after a PLY was edited; a 2 millionth of the box is closer than that
+# needs, also where a few floaters make the box a thousand times larger than what is looked at.
+
+_BITS = 21
+_NOWHERE = np.uint64(2**64 - 1)  # of a position that is not finite
+_STEPS = 2**_BITS - 1
+
+
+def pack_positions(means: Array) -> tuple[Array, Array]:
+    """(N, 3) float32 -> (N,) uint64 and (2, 3) float32 lower and upper corner of what is finite."""
+    finite = np.isfinite(means).all(1)
+    if not finite.any():
+        return np.full(len(means), _NOWHERE), np.zeros((2, 3), np.float32)
+    corners = np.stack([means[finite].min(0), means[finite].max(0)]).astype(np.float32)
+    low, span = _box(corners)
+    steps = np.rint((means[finite].astype(np.float64) - low) / span * _STEPS).astype(np.uint64)
+    packed = np.full(len(means), _NOWHERE)
+    packed[finite] = steps[:, 0] | steps[:, 1] << np.uint64(_BITS) | steps[:, 2] << np.uint64(2 * _BITS)
+    return packed, corners
+
+
+def unpack_positions(packed: Array, corners: Array) -> Array:
+    """The inverse, (N, 3) float64 to half a `position_step` on each axis; NaN for what was not finite."""
+    low, span = _box(corners)
+    axes = [(packed >> np.uint64(shift)) & np.uint64(_STEPS) for shift in (0, _BITS, 2 * _BITS)]
+    means = np.stack(axes, 1).astype(np.float64) / _STEPS * span + low
+    means[packed == _NOWHERE] = np.nan
+    return means
+
+
+def position_step(corners: Array) -> float:
+    """Largest distance between two neighbouring packed numbers, in the units of the positions."""
+    return float(_box(corners)[1].max() / _STEPS)
+
+
+def _box(corners: Array) -> tuple[Array, Array]:
+    """Lower corner and extent, float64; an axis without extent gets 1."""
+    low, high = corners.astype(np.float64)
+    return low, np.where(high > low, high - low, 1.0)

@@ -1,4 +1,4 @@
-"""The container of .spz files (Niantic): from the file to one block of bytes per attribute, and back.
+"""The .spz file of Niantic: its container, one block of bytes per attribute, and quantised Gaussians in it.
 
 Versions 1 to 3 are one gzip stream (a few tools write it without gzip) of a 16-byte header and the blocks
 in the order of `widths`. Version 4 is a header of 32 bytes, extension records up to the byte that the
@@ -210,7 +210,7 @@ def write_packed(path: Path | str, packed: Packed) -> None:
         temporary.write_bytes(gzip.compress(content, mtime=0))  # mtime: the same scene, the same bytes
 
 
-# The .spz file of Niantic: quantised Gaussians, about ten times smaller than the PLY.
+# ---- quantised Gaussians, about ten times smaller than the PLY ----
 #
 #     positions   three 24-bit fixed-point numbers; the header says how many bits are behind the point
 #                 (version 1: three float16)

@@ -13,7 +13,8 @@ import numpy as np
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CodecConfig, check_settings
 from langsplat_core.errors import InputError
-from langsplat_core.io.foreign import ForeignScene, Leaves
+from langsplat_core.io.foreign import ForeignScene
+from langsplat_core.io.foreign_language import Leaves
 from langsplat_core.pipeline.language import encoded_phrases
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import (
