@@ -23,6 +23,7 @@ from tests.support.file_samples import (
     ascii_ply,
     compressed_ply,
     ksplat_bytes,
+    mixed_ply,
     plain_ply,
     random_field,
     sog_files,
@@ -30,7 +31,7 @@ from tests.support.file_samples import (
     spz_bytes,
     zipped,
 )
-from tests.support.mutation import Mutation, in_gzip, in_png, in_zip, mutant
+from tests.support.mutation import Mutation, in_gzip, in_ply_header, in_png, in_zip, mutant
 from tests.support.scenes import random_camera, random_gaussians
 from tests.support.small_datasets import write_colmap, write_nerfstudio
 
@@ -194,12 +195,8 @@ def pictures(kind: str) -> Callable[[Path], list[bytes]]:
         modes: dict[str, list[tuple[Image.Image, dict[str, object]]]] = {
             "PNG": [(noise.convert(mode), {}) for mode in ("RGB", "RGBA", "P", "L", "LA", "1")]
             + [(deep, {}), (noise, {"save_all": True, "append_images": [noise.convert("RGB")]})],
-            "JPEG": [
-                (noise, {}),
-                (noise, {"progressive": True}),
-                (noise.convert("L"), {}),
-                (noise.convert("CMYK"), {}),
-            ],
+            "JPEG": [(noise, {}), (noise, {"progressive": True})]
+            + [(noise.convert(mode), {}) for mode in ("L", "CMYK")],
             "WEBP": [(noise, {}), (noise, {"lossless": True}), (noise.convert("RGBA"), {"lossless": True})]
             + [(noise, {"save_all": True, "append_images": [noise.rotate(90)]})],
             "TIFF": [
@@ -239,8 +236,13 @@ def _scenes(file: str, *samples: bytes, damage: Mutation = mutant) -> FileKind:
 
 
 KINDS = {
-    "INRIA PLY": _scenes("a.ply", plain_ply(SCENE), plain_ply(PLAIN), ascii_ply(random_gaussians(5))),
-    "compressed PLY": _scenes("a.ply", compressed_ply(SCENE), compressed_ply(PLAIN, colours=False)),
+    "INRIA PLY": _scenes(
+        *("a.ply", plain_ply(SCENE), plain_ply(PLAIN), mixed_ply(SCENE), ascii_ply(random_gaussians(5))),
+        damage=in_ply_header,
+    ),
+    "compressed PLY": _scenes(
+        "a.ply", compressed_ply(SCENE), compressed_ply(PLAIN, colours=False), damage=in_ply_header
+    ),
     "SOG": _scenes("a.sog", zipped(sog_files(SCENE)), zipped(sog_files(PLAIN)), damage=in_zip),
     **{
         f"SPZ {v}": _scenes("a.spz", spz_bytes(SCENE, v), spz_bytes(PLAIN, v), damage=in_gzip)
@@ -255,7 +257,7 @@ KINDS = {
     ),
     "cameras.json": FileKind("a.cameras.json", camera_files, camera_list),
     "transforms.json": FileKind("transforms.json", transforms, beside_transforms),
-    "point-cloud PLY": FileKind("cloud.ply", cloud_folder, beside_transforms),
+    "point-cloud PLY": FileKind("cloud.ply", cloud_folder, beside_transforms, in_ply_header),
     **{
         f"COLMAP {part}.{form}": colmap(f"{part}.{form}")
         for form in ("bin", "txt")
