@@ -189,7 +189,7 @@ FALSE = {  # what stands in place of the number of vertices
 
 @pytest.mark.parametrize("case", FALSE)
 @pytest.mark.parametrize("kind", KINDS)
-def test_headers_that_say_what_is_not_so(put, kind, case):
+def test_headers_that_say_what_is_not_so(put, bounded, kind, case):
     content = KINDS[kind](random_gaussians(3))
     assert VERTICES.encode() in content
     path = put(content.replace(VERTICES.encode(), FALSE[case].encode()))

@@ -19,7 +19,6 @@ from tests.support.foreign_files import (
     autoencoder,
     faiss_index,
     geometry,
-    save_fvdb,
     save_model,
     tensor,
     training_state,
@@ -138,27 +137,6 @@ def test_langsplat_v2(tmp_path):
     assert got.levels[0] is got.levels[2] is None
 
 
-def test_fvdb(tmp_path):
-    logits = rng.normal(size=(N, 2 * 16)).astype(np.float32)
-    codebooks = rng.normal(size=(2, 16, D)).astype(np.float32)
-    write_ply(tmp_path / "scene.ply", G)
-    path = save_fvdb(tmp_path / "any.pt", logits, codebooks, level=1, topk=3)
-    got = read_foreign([path, tmp_path / "scene.ply"])
-    np.testing.assert_allclose(rows(got, 0), mixture(logits, codebooks, 3), atol=1e-5)
-    assert_same(got.scene.gaussians, G)
-    with pytest.raises(InputError, match="keeps no Gaussians; name the scene's PLY"):
-        read_foreign([path])
-    write_ply(tmp_path / "other.ply", random_gaussians(N + 1))
-    with pytest.raises(FormatError, match="features of 20 Gaussians, the scene has 21"):
-        read_foreign([path, tmp_path / "other.ply"])
-    default = save_fvdb(tmp_path / "default.pt", logits, codebooks, level=0)
-    with pytest.raises(InputError, match="of which levels"):
-        read_foreign([default, tmp_path / "scene.ply"])
-    torch.save({"magic": "LangSplatV2Checkpoint", "model": {"a": torch.zeros(3)}}, tmp_path / "no.pt")
-    with pytest.raises(FormatError, match="0 tensors of logits"):
-        read_foreign([tmp_path / "no.pt", tmp_path / "scene.ply"])
-
-
 def occam(folder: Path, kept: tuple[Array, ...]) -> list[Path]:
     return [
         save_model(folder / f"chkpnt30000_langfeat_{level + 1}.pth", G.take(k), tensor(VECTORS[level][k]))
@@ -210,10 +188,7 @@ def test_dr_splat(tmp_path):
         got = read_foreign([path, tmp_path / "pq_index.faiss"])
         np.testing.assert_array_equal(rows(got, 0), want)
     np.save(tmp_path / "a.npy", CENTROIDS)
-    np.savez(tmp_path / "a.npz", centroids=CENTROIDS)
-    torch.save(torch.from_numpy(CENTROIDS), tmp_path / "a.pt")
-    for name in ("a.npy", "a.npz", "a.pt"):
-        np.testing.assert_array_equal(rows(read_foreign([tmp_path / name, path]), 0), want)
+    np.testing.assert_array_equal(rows(read_foreign([tmp_path / "a.npy", path]), 0), want)
     with pytest.raises(InputError, match=r"name its pq_index\.faiss"):
         read_foreign([path])
     np.save(tmp_path / "a.npy", CENTROIDS[:3])
@@ -404,36 +379,3 @@ def test_damaged_quantisers(tmp_path):
         refused([path, checkpoint], message)
     np.savez(tmp_path / "x.npz", a=np.zeros((3, 4)))
     refused([tmp_path / "x.npz", checkpoint], r"holds arrays \(3, 4\)")
-
-
-SAMPLES = {
-    "checkpoint": lambda folder: save_model(folder / "c.pth", G.take(ALL[:4]), tensor(VECTORS[0][:4])),
-    "autoencoder": lambda folder: best_ckpt(folder, encoder=(8, 3), decoder=(5,)),
-}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", SAMPLES)
-def test_damage_anywhere_is_one_line(tmp_path, kind):
-    path = SAMPLES[kind](tmp_path)
-    plain = save_model(tmp_path / "plain_1.pth", G.take(ALL[:4]), tensor(LATENTS[0][:4]))
-    given = [path] if kind == "checkpoint" else [path, plain]
-    good, messages = path.read_bytes(), []
-    generator = np.random.default_rng(0)
-    for round_ in range(150):
-        data = bytearray(good)
-        place = int(generator.integers(len(data)))
-        match round_ % 3:
-            case 0:
-                data = data[:place]
-            case 1:
-                data[place : place + 4] = generator.bytes(4)
-            case _:
-                del data[place : place + int(generator.integers(1, 9))]
-        path.write_bytes(bytes(data))
-        try:
-            read_foreign(given)
-        except InputError as error:
-            messages.append(str(error))
-    assert len(messages) > 40
-    assert all("\n" not in message and str(tmp_path) in message for message in messages)

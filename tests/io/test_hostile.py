@@ -1,4 +1,4 @@
-"""Archives that lie or use what nobody needs: one error each."""
+"""Archives, arrays, pictures and clouds of points that are malformed, and files made to exhaust memory."""
 
 import gzip
 import io
@@ -33,10 +33,8 @@ from langsplat_core.io.ply import read_ply
 from langsplat_core.io.ply_table import GREY, read_cloud
 from langsplat_core.io.scenes import load_gaussians
 from langsplat_core.io.sog import read_sog
-from langsplat_core.io.splat import read_ksplat
 from langsplat_core.io.spz import read_spz_scene
 from tests.support.file_samples import (
-    ksplat_bytes,
     plain_ply,
     random_field,
     sog_files,
@@ -57,11 +55,6 @@ def read(folder: Path, data: bytes, name: str = "a", limit: int = 10_000) -> byt
     (folder / "made.zip").write_bytes(data)
     with opened_archive(folder / "made.zip", "archive") as archive:
         return archive.read(name, limit)
-
-
-@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
-def test_members_are_read(tmp_path: Path, method: int) -> None:
-    assert read(tmp_path, packed(method)) == b"content" * 100
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
@@ -140,7 +133,7 @@ def test_integers_beyond_any_float(tmp_path: Path) -> None:
     [
         ("element vertex", "element corner", "no element 'vertex'"),
         ("property double y", "property double q", "no number 'y'"),
-        ("property double z", "property list uchar int l\nproperty double z", "hold lists"),
+        ("property double z", "property list uchar int l\nproperty double z", "holds lists"),
         ("element vertex 1", "element vertex 1000000000000", "truncated"),
     ],
 )
@@ -268,11 +261,6 @@ def test_whatever_a_decoder_raises_is_one_error(tmp_path: Path, error: type[Exce
         raise error("inside\nPillow")
     assert str(caught.value) == f"{tmp_path / 'a.png'}: not a readable picture (damaged: inside Pillow)"
     assert caught.value.reason == "damaged: inside Pillow"
-
-
-def test_what_the_reader_itself_refuses_is_kept() -> None:
-    with pytest.raises(FormatError, match="too small"), opened(saved("PNG")):
-        raise FormatError("too small")
 
 
 def test_damaged_tiff_says_nothing_on_the_standard_error(
@@ -427,16 +415,6 @@ def test_spz_4_streams_that_unfold_to_gigabytes(tmp_path, bounded):
         read_spz_scene(path)
 
 
-@pytest.mark.parametrize("at", [4, 16, 4096, 4100, 4108, 4132])
-@pytest.mark.parametrize("count", [10**6, 2**31, 2**32 - 1])
-def test_ksplat_counts_of_what_is_not_there(tmp_path, bounded, at, count):
-    content = bytearray(ksplat_bytes([SCENE], 1))
-    struct.pack_into("<I", content, at, count)
-    (tmp_path / "a.ksplat").write_bytes(content)
-    with pytest.raises(FormatError):
-        read_ksplat(tmp_path / "a.ksplat")
-
-
 @pytest.mark.parametrize("name", ["a.ksplat", "a.spz"])
 def test_files_of_a_terabyte_of_nothing(tmp_path, bounded, name):
     with (tmp_path / name).open("wb") as file:
@@ -450,13 +428,6 @@ def ply_with(line: str, body: bytes = b"") -> bytes:
     old = f"element vertex {len(SCENE)}".encode()
     assert old in sample
     return sample.replace(old, line.encode()) + body
-
-
-@pytest.mark.parametrize("count", [21, 10**6, 10**12, 2**63, 2**64 - 1, 10**19])
-def test_vertices_that_are_not_there(tmp_path, bounded, count):
-    (tmp_path / "a.ply").write_bytes(ply_with(f"element vertex {count}"))
-    with pytest.raises(FormatError, match=f"truncated: {count} rows of element vertex"):
-        read_ply(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from langsplat_core.datasets.capture import Capture, read_photo
 from langsplat_core.datasets.colmap import load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.io.cameras import read_cameras, write_cameras
+from langsplat_core.io.foreign import read_foreign
 from langsplat_core.io.hostile import picture_size
 from langsplat_core.io.language import read_language, write_language
 from langsplat_core.io.scenes import load_scene
@@ -235,6 +236,35 @@ def _scenes(file: str, *samples: bytes, damage: Mutation = mutant) -> FileKind:
     return FileKind(file, lambda _: [*samples], scene_share, damage)
 
 
+def checkpoints(folder: Path) -> list[bytes]:
+    """Of Occam's LGS, and without features."""
+    from tests.support.foreign_files import save_model, tensor  # imports torch
+
+    vectors = np.random.default_rng(0).normal(size=(20, 24)).astype(np.float32)
+    paths = [save_model(folder / "made", SCENE, tensor(vectors)), save_model(folder / "plain", SCENE)]
+    return [path.read_bytes() for path in paths]
+
+
+def autoencoders(folder: Path) -> list[bytes]:
+    """Of LangSplat; the checkpoint that goes with it lies beside."""
+    import torch
+
+    from tests.support.foreign_files import autoencoder, save_model, tensor
+
+    save_model(folder / "latents_1.pth", SCENE, tensor(np.ones((20, 3), np.float32)))
+    torch.save(autoencoder(24, (8, 3), (5,)).state_dict(), folder / "made")
+    return [(folder / "made").read_bytes()]
+
+
+def imported(path: Path) -> float:
+    beside = path.with_name("latents_1.pth")
+    scene = read_foreign([path, *[beside] * beside.exists()])
+    for level, meaning in enumerate(scene.levels):
+        if meaning is not None:
+            scene.rows(level, np.arange(len(meaning)))
+    return 1.0
+
+
 KINDS = {
     "INRIA PLY": _scenes(
         *("a.ply", plain_ply(SCENE), plain_ply(PLAIN), mixed_ply(SCENE), ascii_ply(random_gaussians(5))),
@@ -264,6 +294,8 @@ KINDS = {
         for part in ("cameras", "images", "points3D")
     },
     ".features.npz": FileKind("a.features.npz", feature_files, stored_features, in_zip),
+    "checkpoint": FileKind("a.pth", checkpoints, imported),
+    "autoencoder": FileKind("a.pth", autoencoders, imported),
     "PNG": _photographs("PNG", in_png),
     **{kind: _photographs(kind) for kind in ("JPEG", "WEBP", "TIFF", "BMP", "AVIF")},
 }
