@@ -134,7 +134,7 @@ class Doctor:
 
 
 def _opengl() -> str:
-    """What draws without a window, or why it cannot and what to do."""
+    """Name of the OpenGL that draws without a window, or why there is none and what to do."""
     from langsplat_core.raster.opengl.scene_textures import create_egl_context
 
     try:
@@ -149,7 +149,7 @@ def _opengl() -> str:
 
 
 def _encoder() -> str:
-    """Whether the bundled encoder works, and what real photographs want."""
+    """State of the bundled encoder, and what real photographs want."""
     try:
         encoder = load_text_encoder("demo")
         encoder.encode_texts(["red mug"])
@@ -203,12 +203,12 @@ class Convert:
 
     @property
     def sources(self) -> tuple[Path, ...]:
-        """All that is read."""
+        """Files that are read."""
         return (self.source, *self.rest[:-1])
 
     @property
     def out(self) -> Path:
-        """What is written."""
+        """File or folder that is written."""
         return self.rest[-1]
 
     def run(self) -> None:
@@ -416,7 +416,8 @@ class Scale:
 
 
 def metres_per_unit(metres: float, between: Span) -> float:
-    """From a length in metres and two points in world units. InputError unless both lengths are positive."""
+    """Metres per unit of a length in metres between two points. InputError unless both lengths are
+    positive."""
     units = math.dist(between[:3], between[3:])
     if not (0 < metres < math.inf and 0 < units < math.inf):
         raise InputError(

@@ -1,6 +1,7 @@
-"""What the Gaussians of a foreign checkpoint mean, each method's own way, read a block at a time.
+"""Language features of other methods' checkpoints: the files that carry them, and the vectors that they stand
+for, read a block at a time.
 
-A `Meaning` is the vectors of N Gaussians at one level. Methods keep 512 numbers per Gaussian, or something
+`Features` are the vectors of N Gaussians at one level. Methods keep 512 numbers per Gaussian, or something
 smaller that stands for them; either way no (N, 512) array is made here.
 """
 
@@ -30,22 +31,19 @@ from langsplat_core.io.unpickling import load_torch, plain_array, plain_mapping
 from langsplat_core.scene import LEVELS, AutoencoderCodec, Gaussians
 from langsplat_core.scene.gaussians import join_gaussians
 
-NO_CODE = 255  # in every place of a product code: no meaning
+NO_CODE = 255  # in every place of a product code: no features
 TOPK = 4  # codewords of a Gaussian in LangSplatV2
 
 
-class Meaning(Protocol):
+class Features(Protocol):
     """The vectors of N Gaussians."""
-
-    def __len__(self) -> int:
-        """N"""
 
     @property
     def dim(self) -> int:
         """Numbers per vector."""
 
     def rows(self, indices: Array) -> Array:
-        """(n,) whole numbers below N -> (n, dim) float32 vectors of any length; zero for no meaning."""
+        """(n,) whole numbers below N -> (n, dim) float32 vectors of any length; zero for no features."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +51,6 @@ class Vectors:
     """A vector for each: Occam's LGS, Feature-3DGS; or a latent for each: LangSplat."""
 
     values: Array  # (N, D) floats of any length
-
-    def __len__(self) -> int:
-        return len(self.values)
 
     @property
     def dim(self) -> int:
@@ -75,9 +70,6 @@ class SparseCodes:
 
     logits: Array  # (N, L K) floats, for L layers of codewords one after the other
     codewords: Array  # (L, K, D) float32; the layers' mixtures are added
-
-    def __len__(self) -> int:
-        return len(self.logits)
 
     @property
     def dim(self) -> int:
@@ -109,11 +101,8 @@ def _largest_of_softmax(logits: Array, count: int) -> Array:
 class ProductCodes:
     """Dr. Splat: a byte for each of M parts of the vector names one of 256 centroids of that part."""
 
-    codes: Array  # (N, M) uint8; a row of NO_CODE has no meaning
+    codes: Array  # (N, M) uint8; a row of NO_CODE has no features
     centroids: Array  # (M, 256, D / M) float32
-
-    def __len__(self) -> int:
-        return len(self.codes)
 
     @property
     def dim(self) -> int:
@@ -130,8 +119,8 @@ class ProductCodes:
 class Leaves:
     """OpenGaussian: a Gaussian belongs to one cluster, and the clusters have vectors."""
 
-    index: Array  # (N,) int64 rows of `vectors`; anything beyond them has no meaning
-    vectors: Array  # (K, D) float32 of any length; zero for a cluster without a meaning
+    index: Array  # (N,) int64 rows of `vectors`; anything beyond them has no features
+    vectors: Array  # (K, D) float32 of any length; zero for a cluster without any
 
     def __len__(self) -> int:
         return len(self.index)
@@ -148,23 +137,20 @@ class Leaves:
 
 @dataclass(frozen=True, eq=False)
 class Rearranged:
-    """A meaning carried over to other Gaussians."""
+    """Features carried over to other Gaussians."""
 
-    meaning: Meaning
-    partner: Array  # (N,) int64 row of `meaning`; -1 for none
-
-    def __len__(self) -> int:
-        return len(self.partner)
+    features: Features
+    partner: Array  # (N,) int64 row of `features`; -1 for none
 
     @property
     def dim(self) -> int:
-        return self.meaning.dim
+        return self.features.dim
 
     def rows(self, indices: Array) -> Array:
         partner = self.partner[indices]
         out = np.zeros((len(partner), self.dim), np.float32)
         found = partner >= 0
-        out[found] = self.meaning.rows(partner[found])
+        out[found] = self.features.rows(partner[found])
         return out
 
 
@@ -228,13 +214,13 @@ def read_faiss(path: Path) -> Array:
 
 # One file of what people give to an import, recognised by what it holds, never by its name or length.
 #
-# A `Carrier` has Gaussians, meanings of one level, or both. What a method keeps beside its checkpoints, an
+# A `Carrier` has Gaussians, features of one level, or both. What a method keeps beside its checkpoints, an
 # autoencoder, a quantiser or the vectors of clusters, is of no use alone.
 
 PLAIN, UNNAMED = "3D Gaussian Splatting", "LangSplat or Occam's LGS"
 LANGSPLAT, OCCAM, V2 = "LangSplat", "Occam's LGS", "LangSplatV2"
 DR_SPLAT, FEATURE_3DGS, OPEN_GAUSSIAN = "Dr. Splat", "Feature-3DGS", "OpenGaussian"
-INSTANCE = 6  # numbers per Gaussian that OpenGaussian tells instances by, twice; they mean nothing alone
+INSTANCE = 6  # numbers per Gaussian that OpenGaussian tells instances by, twice; they tell nothing alone
 PICKLE = b"\x80"  # how files of torch began before they were archives
 SEMANTIC = re.compile(r"semantic_\d+")
 
@@ -246,20 +232,20 @@ class Carrier:
     path: Path
     method: str
     gaussians: Gaussians
-    meaning: Vectors | SparseCodes | None = None
+    features: Vectors | SparseCodes | None = None
     codes: Array | None = None  # (N, M) uint8 of Dr. Splat: they need a quantiser
     extras: Mapping[str, Array] = field(default_factory=dict)  # of a PLY, as `Scene.extras`
     antialiased: bool = False
 
     @property
-    def tells(self) -> bool:
-        """Whether there is more in it than Gaussians."""
+    def has_features(self) -> bool:
+        """Return whether the file carries more than Gaussians."""
         return self.method != PLAIN
 
 
 @dataclass(frozen=True, eq=False)
 class Centroids:
-    """A product quantiser."""
+    """The centroids of a product quantiser, as Dr. Splat keeps them beside its checkpoints."""
 
     path: Path
     values: Array  # (M, 256, D / M) float32
@@ -285,8 +271,8 @@ Part = Carrier | Centroids | Clusters | Autoencoder
 
 
 def read_part(path: Path) -> Part:
-    """What `path` holds. Raises InputError where it cannot be opened, FormatError where it is nothing known
-    or damaged."""
+    """Read a file of any method, told by its content. Raises InputError where it cannot be opened,
+    FormatError where it is nothing known or damaged."""
     file, _ = open_for_reading(path)
     with file:
         start = file.read(8)
@@ -364,14 +350,14 @@ def _from_torch(content: Any, path: Path) -> Part:
 
 def _from_tuple(elements: tuple[Any, ...], path: Path) -> Carrier:
     gaussians = gaussians_of(elements, path)
-    method, meaning, codes = _language(elements, len(gaussians), path)
-    return Carrier(path, method, gaussians, meaning, codes)
+    method, features, codes = _language(elements, len(gaussians), path)
+    return Carrier(path, method, gaussians, features, codes)
 
 
 def _language(
     elements: tuple[Any, ...], count: int, path: Path
 ) -> tuple[str, Vectors | SparseCodes | None, Array | None]:
-    """Method, meaning and codes of what follows the geometry."""
+    """Method, features and codes of what follows the geometry."""
     first = plain_array(elements[GEOMETRY], path)
     second = plain_array(elements[GEOMETRY + 1], path) if len(elements) > GEOMETRY + 1 else None
     if first is None or first.ndim != 2:  # (N,) radii of plain 3D Gaussian Splatting
@@ -460,8 +446,8 @@ def _numbered(path: Path) -> int | None:
 
 
 def all_gaussians(carriers: Sequence[Carrier]) -> Gaussians:
-    """Of checkpoints that lack different ones: those of the first, then what each further one has beside
-    them. Raises FormatError where they are not of one scene."""
+    """Return the Gaussians of checkpoints that lack different ones: those of the first, then what each
+    further one has beside them. Raises FormatError where they are not of one scene."""
     found = carriers[0].gaussians
     for carrier in carriers[1:]:
         theirs = carrier.gaussians

@@ -92,7 +92,7 @@ def _parse(file: BinaryIO, size: int, name: str) -> Array:
 
 
 def _is_text(data: Array) -> bool:
-    """Whether every code point of a text array exists; NumPy raises SystemError over one that does not."""
+    """Return whether every code point of a text array exists; NumPy raises SystemError over others."""
     codes = data.view(data.dtype.byteorder.replace("|", "=") + "u4")
     return bool(((codes < 0xD800) | (codes > 0xDFFF) & (codes <= 0x10FFFF)).all())
 
@@ -165,7 +165,7 @@ class Archive:
 
     @property
     def names(self) -> list[str]:
-        """Of all members, in the directory's order."""
+        """Names of all members, in the directory's order."""
         return self._archive.namelist()
 
     def read(self, name: str, limit: int) -> bytes:

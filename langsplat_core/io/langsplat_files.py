@@ -85,7 +85,7 @@ Layer = dict[str, Array]
 
 
 def is_autoencoder(content: Mapping[Any, Any]) -> bool:
-    """Whether these are weights of an encoder and a decoder."""
+    """Return whether these are weights of an encoder and a decoder."""
     parts = {found[1] for name in content if isinstance(name, str) and (found := _NAME.fullmatch(name))}
     return parts == {"encoder", "decoder"}
 

@@ -86,7 +86,7 @@ _WHOLE = {"codes": "U16", "things": "U16", "positions": "U64"}  # tensors that h
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """What a sidecar holds."""
+    """Content of a sidecar."""
 
     field: LanguageField
     means: Array  # (N, 3) positions of the Gaussians it was made for, world units; NaN for those not finite
@@ -238,7 +238,8 @@ SUFFIX = ".langsplat.safetensors"
 
 
 def means_checksum(means: Array) -> str:
-    """Of (N, 3) float32 positions; every bit counts, so that any edit or reordering is noticed."""
+    """Return the BLAKE2b-128 of (N, 3) float32 positions; every bit counts, so that any edit or reordering is
+    noticed."""
     data = np.ascontiguousarray(means, dtype="<f4")
     return hashlib.blake2b(data.tobytes(), digest_size=16).hexdigest()
 
@@ -283,7 +284,6 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
 
 
 def _narrow(tensor: Array) -> Array:
-    """As float16 where that loses nothing."""
     with np.errstate(over="ignore"):
         half = tensor.astype(np.float16)
     return half if np.array_equal(half.astype(np.float32), tensor) else tensor

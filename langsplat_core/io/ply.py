@@ -299,7 +299,7 @@ _SH_VALUES[[0, 255]] = -4, 4
 
 
 def is_compressed(header: PlyHeader) -> bool:
-    """Whether the header announces packed Gaussians."""
+    """Return whether the header announces packed Gaussians."""
     vertex = header.element("vertex")
     return (
         header.element("chunk") is not None

@@ -59,13 +59,13 @@ class PlyElement:
         return sum(np.dtype(prop.count_code or prop.code).itemsize for prop in self.properties)
 
     def dtype(self, byte_order: str) -> np.dtype:
-        """Of a row without lists in a binary file."""
+        """Type of a row without lists in a binary file."""
         return np.dtype([(prop.name, byte_order + prop.code) for prop in self.properties])
 
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """A parsed header."""
+    """Header of a PLY file: byte order, elements, comments."""
 
     byte_order: str  # "<", ">" or "" for ascii
     elements: tuple[PlyElement, ...]
@@ -122,7 +122,7 @@ def _parse(lines: list[str], size: int, path: Path) -> PlyHeader:
 
 
 def is_name(word: str) -> bool:
-    """Whether an element or property may be called so: names are shown in messages, in one line."""
+    """Return whether an element or property may be called so: names are shown in messages, in one line."""
     return word.isprintable() and word.split() == [word] and len(word) <= NAME_LIMIT
 
 

@@ -126,7 +126,7 @@ def load_scene(path: Path | str) -> Scene:
 
 
 def load_without_language(path: Path | str) -> Scene:
-    """As `load_scene`, but without the language field, which is not even looked at."""
+    """Return a scene as `load_scene` does, but without the language field, which is not even looked at."""
     path = Path(path)
     scene, cameras = replace(_read_scene(path), path=path), _cameras_path(path)
     if not exists(cameras):

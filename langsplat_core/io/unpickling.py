@@ -94,7 +94,8 @@ _NAMED = {
 
 @optional_imports()
 def load_torch(path: Path) -> Any:
-    """What a file of `torch.save` holds; tensors are on the CPU and, where the file allows, read when used.
+    """Return the content of a file of `torch.save`; tensors are on the CPU and, where the file allows, read
+    when used.
 
     Tensors, containers, and NumPy's numbers and arrays, which training code leaves among them; `plain_array`
     and `plain_mapping` say what they are. Raises InputError where the file cannot be opened; FormatError
@@ -116,7 +117,7 @@ def load_torch(path: Path) -> Any:
 
 
 def _look_through(path: Path) -> bool:
-    """Whether a file is an archive. Raises FormatError for what its pickles may not hold."""
+    """Return whether a file is an archive. Raises FormatError for what its pickles may not hold."""
     from torch._C import PyTorchFileReader
 
     with open_for_reading(path)[0] as file:

@@ -98,7 +98,7 @@ def test_levels_may_be_missing_and_are_told_apart(tmp_path):
     np.testing.assert_array_equal(rows(got, 0), LATENTS[0])
     np.testing.assert_array_equal(rows(got, 2), LATENTS[2])
     assert got.levels[1] is None
-    assert "without meanings: part" in got.notes
+    assert "without features: part" in got.notes
     nameless = [save_model(tmp_path / f"{name}.pth", G, tensor(LATENTS[i])) for i, name in enumerate("xyz")]
     assert "by their order" in read_foreign([*nameless, ae]).notes[0]
     assert "one alone is taken for the whole" in read_foreign([nameless[0], ae]).notes[0]
@@ -215,7 +215,7 @@ def test_open_gaussian(tmp_path, as_ply):
         write_ply(path, G, extras=dict(zip(names, instance.T, strict=True)))
     else:
         path = save_model(tmp_path / "chkpnt90000.pth", G, tensor(instance), tensor(instance))
-        with pytest.raises(InputError, match=r"name its cluster_lang\.npz"):
+        with pytest.raises(InputError, match=r"cluster_lang\.npz, name it too"):
             read_foreign([path])
     got = read_foreign([path, tmp_path / "cluster_lang.npz"])
     assert got.method == "OpenGaussian"

@@ -119,7 +119,7 @@ def test_the_damage_is_reproducible(tmp_path: Path) -> None:
         (lambda _: os.write(2, b"stray") and 1.0, "on the standard error: 'stray'"),
     ],
 )
-def test_the_ordeal_itself_can_fail(tmp_path: Path, read: Callable[[Path], float], fault: str) -> None:
+def test_a_fuzz_run_can_fail(tmp_path: Path, read: Callable[[Path], float], fault: str) -> None:
     outcome = FuzzRun(tmp_path / "a", read).run(iter([b"content"]))
     assert [what.startswith(fault) for what in outcome.faults] == [True], outcome.summary()
 

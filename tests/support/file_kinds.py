@@ -259,9 +259,8 @@ def autoencoders(folder: Path) -> list[bytes]:
 def imported(path: Path) -> float:
     beside = path.with_name("latents_1.pth")
     scene = read_foreign([path, *[beside] * beside.exists()])
-    for level, meaning in enumerate(scene.levels):
-        if meaning is not None:
-            scene.rows(level, np.arange(len(meaning)))
+    for level in (level for level in range(3) if scene.levels[level] is not None):
+        scene.rows(level, np.arange(len(scene.scene.gaussians)))
     return 1.0
 
 
