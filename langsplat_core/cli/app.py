@@ -44,28 +44,16 @@ GROUPS: Mapping[str, tuple[str, Mapping[str, str]]] = MappingProxyType(
         "eval": (
             "Measure a scene against ground truth.",
             {
-                "synthetic": "evaluate.EvalSynthetic",
-                "lerf-ovs": "evaluate_labels.EvalLerfOvs",
-                "3d-ovs": "evaluate_labels.EvalOvs3d",
-                "scannet": "evaluate_labels.EvalScanNet",
+                "lerf-ovs": "evaluate.EvalLerfOvs",
+                "3d-ovs": "evaluate.EvalOvs3d",
+                "scannet": "evaluate.EvalScanNet",
             },
         ),
         "bench": (
             "Speed against error, measured in one run.",
             {
                 "raster": "bench.BenchRaster",
-                "endurance": "bench_endurance.BenchEndurance",
-                "gains": "bench_gains.BenchGains",
-                "lift": "bench_lift.BenchLift",
-                "paper": "bench_paper.BenchPaper",
-                "load": "bench_load.BenchLoad",
-                "moving": "bench_moving.BenchMoving",
-                "memory": "bench_memory.BenchMemory",
-                "phrases": "bench_phrases.BenchPhrases",
-                "query": "bench_query.BenchQuery",
-                "steps": "bench_steps.BenchSteps",
-                "verdict": "bench_verdict.BenchVerdict",
-                "words": "bench_words.BenchWords",
+                "query": "bench.BenchQuery",
             },
         ),
     }

@@ -1,24 +1,25 @@
-"""What a phrase costs, and how wrong it is, in every order: the paper's, a table over the sphere, a codebook.
+"""The query benchmark (`langsplat bench query`): time and error of a phrase in every order of work.
 
-All ways answer for the same meanings, the scene's codewords: the autoencoder of d = 3 is fitted to them here.
-The paper's order blends latents, decodes every pixel of a view at three levels and compares (LangSplat,
-section 3.4); it knows nothing but that view. The other two find the relevancy of every Gaussian and answer
-with level, regions, verdict and place, which hold for all views; a picture then blends one number per
-Gaussian.
+All methods answer for the same vectors, the scene's codewords: the autoencoder of d = 3 is fitted to them
+here. The paper's order blends latents, decodes every pixel of a view at three levels and compares (LangSplat,
+section 3.4); it knows nothing but that view. The other two, a table over the sphere and a codebook, find the
+relevancy of every Gaussian and answer with level, regions, verdict and place, which hold for all views; an
+image then blends one number per Gaussian.
 """
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from statistics import median
 from typing import Any
 
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.bench import QueryBenchConfig
+from langsplat_core.bench.measure import markdown
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import InputError
-from langsplat_core.lab.config import QueryBenchConfig
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryEngine, TextEncoder
 from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
@@ -34,8 +35,8 @@ PAPER = "paper's order"
 
 
 @dataclass(frozen=True)
-class Error:
-    """Absolute, of relevancy, over all Gaussians with a meaning, levels and phrases."""
+class RelevancyError:
+    """Absolute error of relevancy over all Gaussians with a meaning, levels and phrases."""
 
     mean: float
     p99: float
@@ -43,20 +44,20 @@ class Error:
 
 @dataclass(frozen=True)
 class QueryCost:
-    """One way; seconds."""
+    """Seconds and errors of one order of work."""
 
     way: str
     answer: float  # a new phrase: relevancy at three levels, and what else the way has to say
-    shown: float  # a new phrase until its picture is there, the camera standing still
+    shown: float  # a new phrase until its image is there, the camera standing still
     camera: float  # a new camera, before any phrase can be shown
-    frame: float  # camera and picture of a phrase already asked
-    lookup: Error  # against exact dot products with what the latents decode to, in float64
-    codec: Error  # against the codewords' 512 numbers, in float64
+    frame: float  # camera and image of a phrase already asked
+    lookup: RelevancyError  # against exact dot products with what the latents decode to, in float64
+    codec: RelevancyError  # against the codewords' 512 numbers, in float64
 
 
 @dataclass(frozen=True)
 class QueryReport:
-    """Of one scene."""
+    """Costs of all orders on one scene."""
 
     gaussians: int
     size: tuple[int, int]
@@ -70,7 +71,7 @@ class QueryReport:
 
 @dataclass(frozen=True, eq=False)
 class _Asked:
-    """Phrases, and what they should find."""
+    """Phrases, and the codewords that they should find."""
 
     texts: Sequence[str]
     vectors: Array  # (Q, D)
@@ -161,7 +162,7 @@ def _paper(scene: Scene, field: LanguageField, camera: Camera, asked: _Asked) ->
         shown=decoding,
         camera=camera_seconds + blending,
         frame=camera_seconds + both,
-        lookup=Error(0.0, 0.0),  # it decodes
+        lookup=RelevancyError(0.0, 0.0),  # it decodes
         codec=_error(exact, truth),
     )
 
@@ -181,7 +182,7 @@ def _ours(
         for _ in range(repeats)
     )
     splatted_relevancy(view, result.even[:, None], GATE)
-    picture = median(
+    image = median(
         _seconds(lambda: splatted_relevancy(view, result.even[:, None], GATE)) for _ in range(repeats)
     )
     decoded = asked.codewords if codec is None else codec.decode(codec.encode(asked.codewords))
@@ -192,9 +193,9 @@ def _ours(
     return QueryCost(
         way,
         answer=answer,
-        shown=answer + picture,
+        shown=answer + image,
         camera=seen,
-        frame=seen + picture,
+        frame=seen + image,
         lookup=_error(found, exact),
         codec=_error(found, truth),
     )
@@ -208,9 +209,9 @@ def _exact(asked: _Asked, vectors: Array, scale: Scale, row: int) -> Array:
     return np.asarray(values[asked.codes[asked.known]])
 
 
-def _error(got: Sequence[Array], want: Sequence[Array]) -> Error:
+def _error(got: Sequence[Array], want: Sequence[Array]) -> RelevancyError:
     apart = np.abs(np.concatenate(got).astype(np.float64) - np.concatenate(want))
-    return Error(float(apart.mean()), float(np.quantile(apart, 0.99))) if len(apart) else Error(0.0, 0.0)
+    return RelevancyError(float(apart.mean()), float(np.quantile(apart, 0.99))) if len(apart) else RelevancyError(0.0, 0.0)
 
 
 def _seconds(work: Callable[[], Any]) -> float:
@@ -220,31 +221,19 @@ def _seconds(work: Callable[[], Any]) -> float:
 
 
 def query_table(report: QueryReport) -> str:
-    """Markdown; ratios are to the paper's order."""
-    paper = report.costs[0]
-    width, height = report.size
-    lines = [
-        f"{report.gaussians} Gaussians, {width}x{height}; milliseconds; errors of relevancy, mean / 99 %",
-        "",
-        "| order | new phrase | times faster | shown | new camera | frame | lookup error | codec error |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for cost in report.costs:
-        times = " | ".join(f"{1e3 * value:.1f}" for value in (cost.shown, cost.camera, cost.frame))
-        errors = " | ".join(f"{error.mean:.1e} / {error.p99:.1e}" for error in (cost.lookup, cost.codec))
-        lines.append(
-            f"| {cost.way} | {1e3 * cost.answer:.1f} | {paper.answer / max(cost.answer, 1e-9):.0f} | {times} "
-            f"| {errors} |"
-        )
-    lines += [
-        "",
+    """Both tables as Markdown; ratios are to the paper's order."""
+    paper, (width, height) = report.costs[0], report.size
+    head = ("order", "new phrase", "times faster", "shown", "new camera", "frame", "lookup error", "codec error")
+    rows = (
+        (cost.way, f"{1e3 * cost.answer:.1f}", f"{paper.answer / max(cost.answer, 1e-9):.0f}")
+        + tuple(f"{1e3 * value:.1f}" for value in (cost.shown, cost.camera, cost.frame))
+        + tuple(f"{error.mean:.1e} / {error.p99:.1e}" for error in (cost.lookup, cost.codec))
+        for cost in report.costs
+    )
+    return (
+        f"{report.gaussians} Gaussians, {width}x{height}; milliseconds; errors of relevancy, mean / 99 %\n\n"
+        f"{markdown(head, rows)}\n"
         f"Once for the scene: surface {report.surface:.1f} s, regions {report.regions:.1f} s. "
         f"{report.phrases} phrases, encoded and answered: {1e3 * report.alone:.1f} ms each one by one, "
-        f"{1e3 * report.together:.1f} ms at once.",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def figures(config: QueryBenchConfig, report: QueryReport) -> dict[str, Any]:
-    """For the JSON."""
-    return {"config": asdict(config), "report": asdict(report)}
+        f"{1e3 * report.together:.1f} ms at once.\n"
+    )
