@@ -1,11 +1,10 @@
-"""Speed against error on the user's machine: settings of `langsplat bench raster` and `langsplat bench query`."""
+"""Settings of `langsplat bench raster` and `langsplat bench query`: speed against error on this machine."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from langsplat_core.config import Count, CountOrZero, Positive
-from langsplat_core.ranges import Range
+from langsplat_core.config import Count, CountOrZero, Positive, Range
 
 Pixels = Annotated[int, Range(1, 65_536)]
 Size = tuple[Pixels, Pixels]  # width and height of an image

@@ -152,7 +152,13 @@ def measure(
     for operation in operations(backend, case, channels, exact):
         key = (backend_name, operation.name, channels)
         row = Measurement(
-            case.scene, len(case.gaussians), camera.width, camera.height, channels, operation.name, backend_name
+            case.scene,
+            len(case.gaussians),
+            camera.width,
+            camera.height,
+            channels,
+            operation.name,
+            backend_name,
         )
         expected = foresight.expected(key, overlaps)
         if expected > foresight.limit_s:
@@ -166,9 +172,7 @@ def measure(
         )
         if operation.error is not None:
             error = operation.error()
-            row = replace(
-                row, largest_error=error.largest, error_off_cuts=error.off_cuts, flips=error.flips
-            )
+            row = replace(row, largest_error=error.largest, error_off_cuts=error.off_cuts, flips=error.flips)
         yield row
 
 
@@ -259,9 +263,7 @@ def _two_cameras(camera: Camera) -> tuple[Camera, Camera]:
     return camera, replace(camera, world_to_camera=moved)
 
 
-def _gradient_error(
-    view: Any, case: Case, values: Array, masked: Array, exact: "ReferenceWindows"
-) -> Error:
+def _gradient_error(view: Any, case: Case, values: Array, masked: Array, exact: "ReferenceWindows") -> Error:
     """Largest error of `backward`'s gradients, each relative to its greatest entry, against float64 autograd
     through the PyTorch baseline, which knows nothing of the CPU's derivatives."""
     import torch

@@ -22,13 +22,13 @@ from langsplat_core.config import PictureConfig
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryEngine, TextEncoder
-from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
+from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.protocol import View
 from langsplat_core.scene import LEVELS, Camera, CodebookCodec, Codec, LanguageField, Scene
-from langsplat_core.semantics.everyday import everyday_phrases
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
-from langsplat_core.training.language.autoencoder_fit import train_autoencoder
+from langsplat_core.semantics.vocabulary import everyday_phrases
+from langsplat_core.training.language.codec_fit import train_autoencoder
 
 GATE = PictureConfig().alpha_gate
 PAPER = "paper's order"
@@ -211,7 +211,11 @@ def _exact(asked: _Asked, vectors: Array, scale: Scale, row: int) -> Array:
 
 def _error(got: Sequence[Array], want: Sequence[Array]) -> RelevancyError:
     apart = np.abs(np.concatenate(got).astype(np.float64) - np.concatenate(want))
-    return RelevancyError(float(apart.mean()), float(np.quantile(apart, 0.99))) if len(apart) else RelevancyError(0.0, 0.0)
+    return (
+        RelevancyError(float(apart.mean()), float(np.quantile(apart, 0.99)))
+        if len(apart)
+        else RelevancyError(0.0, 0.0)
+    )
 
 
 def _seconds(work: Callable[[], Any]) -> float:
@@ -223,7 +227,16 @@ def _seconds(work: Callable[[], Any]) -> float:
 def query_table(report: QueryReport) -> str:
     """Both tables as Markdown; ratios are to the paper's order."""
     paper, (width, height) = report.costs[0], report.size
-    head = ("order", "new phrase", "times faster", "shown", "new camera", "frame", "lookup error", "codec error")
+    head = (
+        "order",
+        "new phrase",
+        "times faster",
+        "shown",
+        "new camera",
+        "frame",
+        "lookup error",
+        "codec error",
+    )
     rows = (
         (cost.way, f"{1e3 * cost.answer:.1f}", f"{paper.answer / max(cost.answer, 1e-9):.0f}")
         + tuple(f"{1e3 * value:.1f}" for value in (cost.shown, cost.camera, cost.frame))

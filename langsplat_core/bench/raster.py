@@ -24,10 +24,10 @@ from langsplat_core.bench.measure import (
 )
 from langsplat_core.bench.torch_rasterizer import TorchRasterizer
 from langsplat_core.errors import BackendError
-from langsplat_core.formats import load_scene
+from langsplat_core.io import load_scene
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.opengl.context import create_egl_context
+from langsplat_core.raster.opengl.scene_textures import create_egl_context
 from langsplat_core.raster.protocol import Rasterizer
 
 SceneSize = tuple[int, tuple[int, int]]  # Gaussians, (width, height)

@@ -11,8 +11,8 @@ import tyro
 from langsplat_core.bench import QueryBenchConfig, RasterBenchConfig
 from langsplat_core.cli.checks import OutFolder
 from langsplat_core.errors import InputError
-from langsplat_core.files import atomic_path
-from langsplat_core.formats import load_scene
+from langsplat_core.io import load_scene
+from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import no_field
 from langsplat_core.semantics.encoders import load_text_encoder
@@ -32,7 +32,9 @@ class BenchRaster:
         from langsplat_core.bench.raster import Report, plot, quick_plan, run_plan
 
         def keep(report: Report) -> None:
-            write_report(self.out, "raster", report.text, report.figures, lambda path: plot(report.rows, path))
+            write_report(
+                self.out, "raster", report.text, report.figures, lambda path: plot(report.rows, path)
+            )
 
         with TerminalProgress() as progress:
             report = run_plan(quick_plan(self.config) if self.quick else self.config, progress, keep)

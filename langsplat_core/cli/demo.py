@@ -11,7 +11,7 @@ import tyro
 
 from langsplat_core.cli.checks import OutFile, OutFolder
 from langsplat_core.config import Count, Seed
-from langsplat_core.files import atomic_path
+from langsplat_core.io.files import atomic_path
 from langsplat_core.lab.config import DemoEncoderConfig, LabelLayout, MaskOrigin, Pixels, Size, Tier
 from langsplat_core.progress import TerminalProgress
 

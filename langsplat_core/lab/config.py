@@ -4,9 +4,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from langsplat_core.config import CodecConfig, Count, CountOrZero, LiftConfig, Positive, Rate, Seed
-from langsplat_core.query.cut import CutRule
-from langsplat_core.ranges import Range
+from langsplat_core.config import CodecConfig, Count, CountOrZero, LiftConfig, Positive, Range, Rate, Seed
+from langsplat_core.query.answers import CutRule
 
 Pixels = Annotated[int, Range(1, 65_536)]
 Tier = Literal["separate", "clutter", "occlusion"]  # objects apart, cluttered, packed with look-alikes

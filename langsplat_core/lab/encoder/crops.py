@@ -10,7 +10,8 @@ from PIL import Image, ImageFilter
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from langsplat_core.arrays import Array
-from langsplat_core.files import atomic_path
+from langsplat_core.io.files import atomic_path
+from langsplat_core.io.hostile import opened
 from langsplat_core.lab.config import TIERS, DemoEncoderConfig
 from langsplat_core.lab.world.appearance.colours import (
     COLOURS,
@@ -24,10 +25,9 @@ from langsplat_core.lab.world.appearance.render import Light, Picture, Renderer
 from langsplat_core.lab.world.appearance.textures import noise
 from langsplat_core.lab.world.assembly import World, build_room
 from langsplat_core.lab.world.captions import Label
-from langsplat_core.parsing.pictures import opened
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera, look_at
-from langsplat_core.semantics.crops import masked_crop
+from langsplat_core.semantics.store import masked_crop
 
 CROP = 64  # side of a training crop, px
 _VIEW = (480, 360)  # width, height of the photographs that crops are cut from

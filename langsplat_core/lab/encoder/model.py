@@ -11,7 +11,7 @@ from torch.func import functional_call
 from torch.nn import functional as F
 
 from langsplat_core.arrays import Array
-from langsplat_core.files import atomic_path
+from langsplat_core.io.files import atomic_path
 from langsplat_core.lab.encoder.crops import CROP
 from langsplat_core.lab.encoder.phrases import CONTEXT
 

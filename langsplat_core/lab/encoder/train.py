@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from langsplat_core.files import atomic_path
+from langsplat_core.io.files import atomic_path
 from langsplat_core.lab.config import DemoEncoderConfig
 from langsplat_core.lab.encoder.batches import Batch, Sampler
 from langsplat_core.lab.encoder.crops import CropSet, read_crops, write_crops

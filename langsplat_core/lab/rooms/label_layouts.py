@@ -11,7 +11,7 @@ from scipy.ndimage import find_objects
 from scipy.ndimage import label as connected
 
 from langsplat_core.arrays import Array
-from langsplat_core.files import atomic_path
+from langsplat_core.io.files import atomic_path
 from langsplat_core.lab.config import LabelLayout, Tier
 from langsplat_core.lab.rooms.outlines import outlines
 from langsplat_core.lab.rooms.scoring import MIN_PIXELS

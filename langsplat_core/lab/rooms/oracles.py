@@ -17,8 +17,7 @@ from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import LEVELS, Camera, Gaussians
 from langsplat_core.semantics.masks import LevelMasks
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.mask_groups import MaskGroups
-from langsplat_core.training.language.memberships import find_memberships
+from langsplat_core.training.language.mask_weights import MaskGroups, find_memberships
 
 MIN_REGION = 16  # px: of a smaller region not even an oracle's crop shows anything
 

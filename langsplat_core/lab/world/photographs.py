@@ -9,7 +9,7 @@ from PIL import Image
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
-from langsplat_core.files import atomic_path
+from langsplat_core.io.files import atomic_path
 from langsplat_core.lab.config import Tier
 from langsplat_core.lab.world.appearance.render import Light, Picture, Renderer
 from langsplat_core.lab.world.assembly import World, build_room

@@ -7,9 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from langsplat_core.cli.app import parse
-from langsplat_core.evaluation.protocols.labels import Outlines
-from langsplat_core.evaluation.protocols.lerf_ovs import read_lerf_ovs
-from langsplat_core.evaluation.protocols.ovs3d import read_3d_ovs
+from langsplat_core.evaluation.labels import Outlines, read_3d_ovs, read_lerf_ovs
 from langsplat_core.lab.rooms.label_layouts import write_labelled
 from langsplat_core.lab.rooms.outlines import outlines
 from langsplat_core.lab.rooms.scoring import MIN_PIXELS
