@@ -151,15 +151,8 @@ def measure(
     camera, backend_name = case.camera, label(backend)
     for operation in operations(backend, case, channels, exact):
         key = (backend_name, operation.name, channels)
-        row = Measurement(
-            case.scene,
-            len(case.gaussians),
-            camera.width,
-            camera.height,
-            channels,
-            operation.name,
-            backend_name,
-        )
+        drawn_at = (len(case.gaussians), camera.width, camera.height)
+        row = Measurement(case.scene, *drawn_at, channels, operation.name, backend_name)
         expected = foresight.expected(key, overlaps)
         if expected > foresight.limit_s:
             yield replace(row, note=f"not run: about {expected:.0f} s expected")
@@ -346,7 +339,7 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceWindows:
-    """The float64 reference on three small windows of one view of N Gaussians: an error for scenes of any size.
+    """The float64 reference on three small windows of one view of N Gaussians, which may be millions.
 
     The reference draws Gaussians one by one, so a whole image of a million of them takes minutes. A window's
     pixels depend only on the Gaussians that reach into it; projected by the whole image's camera (as the

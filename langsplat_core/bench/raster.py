@@ -1,4 +1,4 @@
-"""The rasterizer benchmark (`langsplat bench raster`): every backend that loads here, its tables and its plot."""
+"""The rasterizer benchmark (`langsplat bench raster`): every backend that loads here, tables and plot."""
 
 import os
 import platform

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,9 +33,8 @@ class BenchRaster:
         from langsplat_core.bench.raster import Report, plot, quick_plan, run_plan
 
         def keep(report: Report) -> None:
-            write_report(
-                self.out, "raster", report.text, report.figures, lambda path: plot(report.rows, path)
-            )
+            draw = partial(plot, report.rows)
+            write_report(self.out, "raster", report.text, report.figures, draw)
 
         with TerminalProgress() as progress:
             report = run_plan(quick_plan(self.config) if self.quick else self.config, progress, keep)
@@ -70,7 +70,7 @@ class BenchQuery:
 def write_report(
     out: Path, name: str, text: str, figures: Any, plot: Callable[[Path], None] | None = None
 ) -> None:
-    """Write `name`.md, `name`.json and, with `plot`, `name`.png into the folder `out`, each whole or not at all."""
+    """Write `name`.md, .json and, with `plot`, .png into the folder `out`, each whole or not at all."""
     with atomic_path(out / f"{name}.md") as path:
         path.write_text(text, encoding="utf-8")
     with atomic_path(out / f"{name}.json") as path:
