@@ -5,7 +5,11 @@ and parts. Their names and colours it never sees: those come from the encoder.
 """
 
 from pathlib import Path
+from typing import Literal
 
+from assets.making.config import Tier
+from assets.making.dataset import write_dataset
+from assets.making.truth import TruthMasks, read_truth
 from langsplat_core.compaction.compact import compact_scene
 from langsplat_core.config import (
     ClipConfig,
@@ -15,10 +19,6 @@ from langsplat_core.config import (
     RadianceConfig,
     TrainConfig,
 )
-from langsplat_core.lab.config import MaskOrigin, Tier
-from langsplat_core.lab.rooms.oracles import TruthMasks
-from langsplat_core.lab.rooms.truth import read_truth
-from langsplat_core.lab.world.photographs import write_dataset
 from langsplat_core.pipeline.train import train_scene
 from langsplat_core.progress import Progress, silent
 
@@ -28,7 +28,7 @@ SIZE = (640, 480)
 MAX_LOSS = 0.25  # dB that compaction may cost
 
 
-def demo_config(steps: int) -> TrainConfig:
+def scene_config(steps: int) -> TrainConfig:
     """Settings of the bundled scene: a low SH degree and a cap on the count keep the file small."""
     return TrainConfig(
         dataset=DatasetConfig(max_side=max(SIZE), test_every=9),
@@ -38,11 +38,11 @@ def demo_config(steps: int) -> TrainConfig:
     )
 
 
-def build_demo(
+def build_scene(
     out: Path,
     seed: int = SEED,
     tier: Tier = "clutter",
-    masks: MaskOrigin = "truth",
+    masks: Literal["truth", "graph"] = "truth",
     steps: int = 6_000,
     gaussians: Path | None = None,
     progress: Progress = silent,
@@ -59,7 +59,7 @@ def build_demo(
     if not (photographs / "transforms.json").exists():
         write_dataset(photographs, seed, VIEWS, SIZE, progress, tier)
     source = (lambda capture: TruthMasks(capture, read_truth(photographs))) if masks == "truth" else None
-    config = demo_config(steps)
+    config = scene_config(steps)
     made = train_scene(
         photographs,
         out if gaussians else trained,

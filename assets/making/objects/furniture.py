@@ -1,10 +1,9 @@
-"""The room around the table: floor, walls, rug, table, chair, picture. Lengths in metres, z up."""
+"""Builders of the room around the table: floor, walls, rug, furniture, picture. Metres, z up."""
 
-from langsplat_core.lab.world.geometry.shapes import ball, box, cylinder, join, rotation_about, sheet
-from langsplat_core.lab.world.geometry.solids import pillow
-from langsplat_core.lab.world.objects.kit import Kit, Piece, Thing
+from assets.making.kit import Kit, Piece, Thing
+from assets.making.shapes import ball, box, cylinder, join, pillow, sheet
 
-TABLE_TOP = 0.72  # height of the table's upper face above the floor
+TABLE_HEIGHT = 0.72  # height of the table's upper face above the floor
 ROOM = 4.6  # side of the square room
 WALL_HEIGHT = 2.2
 
@@ -12,10 +11,10 @@ WALL_HEIGHT = 2.2
 def table(kit: Kit, colour: str) -> Thing:
     w, d = 1.5, 1.15
     material = kit.wood(colour)
-    leg = box(0.07, 0.07, TABLE_TOP - 0.04, 0.06)
+    leg = box(0.07, 0.07, TABLE_HEIGHT - 0.04, 0.06)
     places = [(x * (w / 2 - 0.09), y * (d / 2 - 0.09), 0) for x in (-1, 1) for y in (-1, 1)]
     return Thing("table", colour, (
-        Piece("top", "", box(w, d, 0.04, 0.014).moved((0, 0, TABLE_TOP - 0.04)), material),
+        Piece("top", "", box(w, d, 0.04, 0.014).moved((0, 0, TABLE_HEIGHT - 0.04)), material),
         *(Piece("leg", "", leg.moved(place), material, k) for k, place in enumerate(places)),
     ))  # fmt: skip
 
@@ -23,11 +22,8 @@ def table(kit: Kit, colour: str) -> Thing:
 def chair(kit: Kit, colour: str) -> Thing:
     wood = kit.wood(kit.pick("brown", colour))
     w, seat, top = 0.42, 0.46, 0.95
-    legs = [
-        box(0.04, 0.04, seat, 0.05).moved((x * (w / 2 - 0.03), y * (w / 2 - 0.03), 0))
-        for x in (-1, 1)
-        for y in (-1, 1)
-    ]
+    legs = [box(0.04, 0.04, seat, 0.05).moved((x * (w / 2 - 0.03), y * (w / 2 - 0.03), 0))
+            for x in (-1, 1) for y in (-1, 1)]  # fmt: skip
     posts = [
         box(0.04, 0.035, top - seat, 0.05).moved((x * (w / 2 - 0.03), w / 2 - 0.02, seat)) for x in (-1, 1)
     ]
@@ -42,10 +38,7 @@ def chair(kit: Kit, colour: str) -> Thing:
 
 
 def stool(kit: Kit, colour: str) -> Thing:
-    legs = [
-        cylinder(0.018, 0.47, 14, 0.05).moved((0.12, 0, 0)).turned(rotation_about("z", 90 * k))
-        for k in range(4)
-    ]
+    legs = [cylinder(0.018, 0.47, 14, 0.05).moved((0.12, 0, 0)).spun("z", 90 * k) for k in range(4)]
     seat = cylinder(0.18, 0.05, 36, 0.03).moved((0, 0, 0.47))
     return Thing("stool", colour, (
         Piece("seat", "", seat, kit.paint(colour, "cloth", 0.02)),
@@ -64,7 +57,7 @@ def sofa(kit: Kit, colour: str) -> Thing:
     arm = pillow(0.2, d, 0.48, 4, 24)
     legs = [cylinder(0.025, 0.1, 10, 0.05).moved((x * (w / 2 - 0.14), y * (d / 2 - 0.1), 0))
             for x in (-1, 1) for y in (-1, 1)]  # fmt: skip
-    square = pillow(0.36, 0.14, 0.36, 3, 24).turned(rotation_about("x", -18))
+    square = pillow(0.36, 0.14, 0.36, 3, 24).spun("x", -18)
     throw = [square.moved((x * (w / 2 - 0.38), 0.06, 0.43)) for x in (-1, 1)]
     second = kit.cloth(kit.other(colour, "yellow", "white", "red", "turquoise", "orange", "pink"))
     return Thing("sofa", colour, (
@@ -80,17 +73,10 @@ def bed(kit: Kit, colour: str) -> Thing:
     """The head end is at +y."""
     w, n = kit.size(0.9, 1.2), kit.size(1.7, 1.9)
     wood = kit.wood(kit.pick("brown", "beige"))
-    posts = [
-        box(0.06, 0.06, 0.3, 0.06).moved((x * (w / 2 - 0.03), y * (n / 2 - 0.03), 0))
-        for x in (-1, 1)
-        for y in (-1, 1)
-    ]
-    head = join(
-        [
-            box(w, 0.05, 0.75, 0.1).moved((0, n / 2, 0.1)),
-            pillow(w + 0.06, 0.08, 0.07, 5, 20).moved((0, n / 2, 0.83)),
-        ]
-    )
+    posts = [box(0.06, 0.06, 0.3, 0.06).moved((x * (w / 2 - 0.03), y * (n / 2 - 0.03), 0))
+             for x in (-1, 1) for y in (-1, 1)]  # fmt: skip
+    head = join([box(w, 0.05, 0.75, 0.1).moved((0, n / 2, 0.1)),
+                 pillow(w + 0.06, 0.08, 0.07, 5, 20).moved((0, n / 2, 0.83))])  # fmt: skip
     foot = box(w, 0.05, 0.36, 0.1).moved((0, -n / 2, 0.1))
     frame = box(w, n, 0.16, 0.15).moved((0, 0, 0.14))
     mattress = pillow(w - 0.04, n - 0.06, 0.2, 8, 32).moved((0, 0, 0.28))
@@ -148,11 +134,8 @@ def cabinet(kit: Kit, colour: str) -> Thing:
     coat = kit.wood(colour)
     front = kit.paint(kit.pick(colour, "white", "beige"), "wood", 0.15, 8)
     brass = kit.steel(kit.pick("yellow", "gray", "black"))
-    feet = [
-        cylinder(0.025, 0.08, 12, 0.05).moved((x * (w / 2 - 0.05), y * (d / 2 - 0.05), 0))
-        for x in (-1, 1)
-        for y in (-1, 1)
-    ]
+    feet = [cylinder(0.025, 0.08, 12, 0.05).moved((x * (w / 2 - 0.05), y * (d / 2 - 0.05), 0))
+            for x in (-1, 1) for y in (-1, 1)]  # fmt: skip
     body = box(w, d, h - 0.11, 0.07).moved((0, 0, 0.08))
     lid = box(w + 0.05, d + 0.04, 0.03, 0.07).moved((0, -0.01, h - 0.03))
     door = box(w / 2 - 0.03, 0.02, 0.62 * h, 0.06)
@@ -190,7 +173,7 @@ def picture(kit: Kit, colour: str) -> Thing:
         box(b, 0.03, h, 0.04).moved((b / 2 - w / 2, 0, 0)),
         box(b, 0.03, h, 0.04).moved((w / 2 - b / 2, 0, 0)),
     ]  # fmt: skip
-    canvas = sheet(w - b, h - b, 0.03).turned(rotation_about("x", 90)).moved((0, -0.008, h / 2))
+    canvas = sheet(w - b, h - b, 0.03).spun("x", 90).moved((0, -0.008, h / 2))
     second = kit.other(colour, "blue", "green", "orange", "yellow", "turquoise")
     painting = kit.pattern(second, kit.other(second, "white", "beige", "pink", "brown"), "painting", 0.05)
     return Thing("picture", "", (
@@ -214,12 +197,10 @@ def shell(kit: Kit) -> list[Thing]:
         Thing("rug", rug.word, (Piece("rug", "", box(2.3, 1.9, 0.012, 0.05), rug),)),
     ]
     for k, word in enumerate(words):
-        upright = sheet(ROOM, WALL_HEIGHT, 0.1).turned(rotation_about("x", 90))
-        wall = upright.moved((0, ROOM / 2, WALL_HEIGHT / 2)).turned(rotation_about("z", 90 * k))
+        upright = sheet(ROOM, WALL_HEIGHT, 0.1).spun("x", 90)
+        wall = upright.moved((0, ROOM / 2, WALL_HEIGHT / 2)).spun("z", 90 * k)
         paint = kit.wall_paint(str(word))
-        skirting = (
-            box(ROOM, 0.02, 0.09, 0.1).moved((0, ROOM / 2 - 0.01, 0)).turned(rotation_about("z", 90 * k))
-        )
+        skirting = box(ROOM, 0.02, 0.09, 0.1).moved((0, ROOM / 2 - 0.01, 0)).spun("z", 90 * k)
         things.append(Thing("wall", paint.word, (
             Piece("wall", "", wall, paint),
             Piece("wall", "skirting", skirting, kit.paint("white", gloss=0.1)),

@@ -9,21 +9,13 @@ import numpy as np
 from PIL import Image, ImageFilter
 from scipy.ndimage import binary_dilation, binary_erosion
 
+from assets.making.config import TIERS, EncoderConfig
+from assets.making.kit import COLOURS, from_lch, random_colour, to_display, to_lch, to_linear
+from assets.making.render import Light, Picture, Renderer, noise
+from assets.making.vocabulary import Label
+from assets.making.world import World, build_room
 from langsplat_core.arrays import Array
 from langsplat_core.files import atomic_path
-from langsplat_core.lab.config import TIERS, DemoEncoderConfig
-from langsplat_core.lab.world.appearance.colours import (
-    COLOURS,
-    from_lch,
-    random_colour,
-    to_display,
-    to_lch,
-    to_linear,
-)
-from langsplat_core.lab.world.appearance.render import Light, Picture, Renderer
-from langsplat_core.lab.world.appearance.textures import noise
-from langsplat_core.lab.world.assembly import World, build_room
-from langsplat_core.lab.world.captions import Label
 from langsplat_core.parsing.pictures import opened
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera, look_at
@@ -32,6 +24,8 @@ from langsplat_core.semantics.crops import masked_crop
 CROP = 64  # side of a training crop, px
 _VIEW = (480, 360)  # width, height of the photographs that crops are cut from
 _LEAST = (40, 60, 90)  # px: smaller visible regions of a level are not used
+_ROOMS_PER_FILE = 10
+_HELD_OUT = 1_000_000  # room seeds from here on are never trained with
 _TIER_SHARES = (0.35, 0.5, 0.15)  # of the rooms
 _CLUTTER = Label(-1, "", "", "", "", ())  # generic: the canonical phrases are right, no other
 
@@ -58,6 +52,10 @@ class CropSet:
         for row in rows:
             row["hues"], row["materials"] = tuple(row["hues"]), tuple(row.get("materials", ()))
         return CropSet(images, tuple(Label(**row) for row in rows))
+
+    def first(self, count: int) -> "CropSet":
+        """At most `count` of the crops, from the first."""
+        return CropSet(self.images[:count], self.labels[:count])
 
     @staticmethod
     def join(sets: list["CropSet"]) -> "CropSet":
@@ -270,11 +268,7 @@ def _meaningless(rng: np.random.Generator) -> Array:
     return (np.clip(colour, 0, 1) * 255).astype(np.uint8).reshape(CROP, CROP, 3)
 
 
-_ROOMS_PER_FILE = 10
-_HELD_OUT = 1_000_000  # room seeds from here on are never trained with
-
-
-def write_crops(folder: Path, config: DemoEncoderConfig, progress: Progress) -> None:
+def write_crops(folder: Path, config: EncoderConfig, progress: Progress) -> None:
     """Render all crops of a training run into `folder`, one file per ten rooms; what is there is kept."""
     folder.mkdir(parents=True, exist_ok=True)
     jobs = [(f"held-out-{k}", _HELD_OUT + 10 * k, 10) for k in range(2)]

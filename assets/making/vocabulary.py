@@ -1,12 +1,14 @@
-"""Words for regions: which phrases are right for an object, a part, a finer region, a colour."""
+"""Words: which phrases are right for an object, a part, a finer region, a colour, a material."""
 
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
-from langsplat_core.lab.world.appearance import colours
-from langsplat_core.lab.world.geometry.shapes import Mesh
-from langsplat_core.lab.world.objects.kit import Piece, Thing
+from assets.making.kit import COLOUR_SYNONYMS, COLOURS, Piece, Thing
+from assets.making.shapes import Mesh
+from langsplat_core.arrays import Array
+from langsplat_core.scene import CANONICAL_PHRASES
 
 OBJECT_SYNONYMS: dict[str, tuple[str, ...]] = {
     "mug": ("mug", "cup"),
@@ -103,11 +105,11 @@ _GROUPS: dict[str, tuple[str, ...]] = {
     "clothing": ("hat", "shoe"),
     "furniture": ("table", "chair", "stool", "sofa", "bed", "shelf", "cabinet"),
 }
-KINDS: dict[str, tuple[str, ...]] = {
+CATEGORIES: dict[str, tuple[str, ...]] = {
     thing: tuple(kind for kind, things in _GROUPS.items() if thing in things)
     for things in _GROUPS.values()
     for thing in things
-}  # object -> the kinds of thing it is
+}  # object -> its categories
 # Substances that people name: the word before a noun, then other words for the stuff itself.
 MATERIALS: dict[str, tuple[str, ...]] = {
     "wood": ("wooden", "wood"),
@@ -142,7 +144,7 @@ def part_words(word: str) -> tuple[str, ...]:
 
 def colour_words(word: str) -> tuple[str, ...]:
     """A colour's word and its synonyms; none for ""."""
-    return colours.SYNONYMS.get(word, (word,)) if word else ()
+    return COLOUR_SYNONYMS.get(word, (word,)) if word else ()
 
 
 def colour_phrases(word: str) -> list[str]:
@@ -172,7 +174,7 @@ def material_part_phrases(part: str, thing: str, substance: str) -> list[str]:
 
 def whole_phrases(thing: str, colour: str) -> list[str]:
     """Phrases right for a whole object, without the bare colour."""
-    names = [*object_words(thing), *KINDS.get(thing, ())]
+    names = [*object_words(thing), *CATEGORIES.get(thing, ())]
     return [*names, *(f"{hue} {name}" for hue in colour_words(colour) for name in names)]
 
 
@@ -255,3 +257,77 @@ def _area(mesh: Mesh) -> float:
     """Square metres."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.triangles], 1, 0)
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+BOOK_KINDS = ("colour", "material", "object", "colour+object", "material+object", "part")
+
+
+@dataclass(frozen=True, eq=False)
+class PhraseBook:
+    """All phrases of a training run and how each fits each distinct label."""
+
+    phrases: tuple[str, ...]  # P; the four canonical phrases come first
+    kinds: tuple[str, ...]  # (P) "canonical", one of BOOK_KINDS
+    labels: tuple[Label, ...]  # U distinct labels
+    fits: Array  # (U, P) int8: 1 right, 0 wrong, -1 neither (left out of the loss)
+
+
+def phrase_book(labels: list[Label]) -> PhraseBook:
+    """The phrases for a set of labels, and every object in every colour beside them."""
+    distinct = tuple(dict.fromkeys(labels))
+    kinds = _kinds(distinct)
+    phrases = tuple(kinds)
+    column = {phrase: k for k, phrase in enumerate(phrases)}
+    fits = np.stack([_row(label, column) for label in distinct])
+    return PhraseBook(phrases, tuple(kinds.values()), distinct, fits)
+
+
+def _kinds(labels: tuple[Label, ...]) -> dict[str, str]:
+    """Every phrase and its kind, the canonical ones first; a phrase of several kinds has the first."""
+    kinds: dict[str, str] = dict.fromkeys(CANONICAL_PHRASES, "canonical")
+    for colour in COLOURS:
+        kinds.update(dict.fromkeys(colour_phrases(colour), "colour"))
+    for material in sorted({label.material for label in labels if label.material}):
+        kinds.update(dict.fromkeys(material_phrases(material), "material"))
+    for thing in sorted({label.thing for label in labels if label.thing}):
+        kinds.update({name: kinds.get(name, "object") for name in whole_phrases(thing, "")})
+        for colour in COLOURS:
+            for name in whole_phrases(thing, colour):
+                kinds.setdefault(name, "colour+object")
+    wholes = [label for label in labels if label.level == 2]
+    for name in chain.from_iterable(material_whole_phrases(label.thing, label.material) for label in wholes):
+        kinds.setdefault(name, "material+object")
+    for name in chain.from_iterable(label.names for label in labels):
+        kinds.setdefault(name, "part")
+    return kinds
+
+
+def _row(label: Label, column: dict[str, int]) -> Array:
+    """(P,) int8 of one label: 1 right, 0 wrong, -1 neither."""
+    row = np.zeros(len(column), np.int8)
+
+    def mark(phrases: list[str] | tuple[str, ...], value: int) -> None:
+        row[[column[phrase] for phrase in phrases if phrase in column]] = value
+
+    if label.thing and label.level < 2 and label.word in BULK:
+        for colour in ("", label.colour, label.thing_colour):  # the body of a mug may pass for a mug
+            mark(whole_phrases(label.thing, colour), -1)
+    if label.level == 2:
+        for bulk in BULK:
+            mark(part_phrases(bulk, label.thing, label.colour, label.colour), -1)
+    unknown = COLOURS if not label.colour else label.hues
+    for hue in unknown:
+        mark(colour_phrases(hue), -1)
+        if not label.colour:
+            mark([f"{hue} {name}" for name in (*object_words(label.thing), label.word)], -1)
+    known = label.materials and "" not in label.materials
+    for material in label.materials if known else MATERIALS:
+        mark(material_phrases(material), -1)
+        mark(material_whole_phrases(label.thing, material), -1)
+        mark(material_part_phrases(label.word, label.thing, material), -1)
+    mark(label.names, 1)
+    mark(colour_phrases(label.colour), 1)
+    mark(material_phrases(label.material), 1)
+    if label.level == -1 and not label.colour:
+        mark(CANONICAL_PHRASES, 1)
+    return row

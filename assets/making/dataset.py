@@ -1,18 +1,23 @@
-"""A folder of photographs of a procedural room, with cameras, sparse points and ground truth."""
+"""Folders of photographs of a procedural room, with cameras, points and ground truth in three layouts."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from PIL import Image
+from scipy.ndimage import binary_fill_holes, find_objects
+from scipy.ndimage import label as connected
 
+from assets.making.config import LabelLayout, Tier
+from assets.making.render import Light, Picture, Renderer
+from assets.making.truth import Phrase, Truth, read_truth
+from assets.making.world import World, build_room
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.files import atomic_path
-from langsplat_core.lab.config import Tier
-from langsplat_core.lab.world.appearance.render import Light, Picture, Renderer
-from langsplat_core.lab.world.assembly import World, build_room
 from langsplat_core.progress import Progress
 from langsplat_core.scene import LEVELS, Camera, look_at
 
@@ -189,3 +194,118 @@ def _write_transforms(cameras: list[Camera], suffix: str, path: Path) -> None:
     }
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+SCENE = "room"  # the benchmark's name for it
+LABELLED_EVERY = 8  # views; those that training holds out unless told otherwise
+NAMES: Mapping[LabelLayout, Naming] = MappingProxyType(
+    {"plain": PLAIN, "lerf-ovs": Naming("frame_{:05d}", ".jpg", 1), "3d-ovs": Naming("{:02d}", ".jpg")}
+)
+ASKED = ("object", "colour+object", "part")  # kinds of phrases that LERF-OVS's labels are like
+MIN_PIXELS = 150  # a thing with fewer visible pixels in a view is not asked for there
+PIECES = np.ones((3, 3), int)  # pixels that touch at a corner are of one piece
+EDGE = 0.999  # height at which a mask's edge is traced: within a thousandth of the centres of its own pixels
+
+
+def write_labelled(
+    out: Path,
+    layout: LabelLayout,
+    seed: int,
+    views: int,
+    size: tuple[int, int],
+    progress: Progress,
+    tier: Tier = "clutter",
+) -> Path:
+    """Render a room as `write_dataset` does, into `out` itself or, in a benchmark's layout, into `out`/room,
+    and label every eighth view in that layout. Returns the photographs' folder. Raises as `write_dataset`."""
+    folder = out if layout == "plain" else out / SCENE
+    write_dataset(folder, seed, views, size, progress, tier, NAMES[layout])
+    if layout == "plain":
+        return folder
+    truth = read_truth(folder)
+    names = sorted(path.stem for path in (folder / "truth").glob("*.npz"))[::LABELLED_EVERY]
+    if layout == "lerf-ovs":
+        write_lerf_ovs(folder, out / "label" / SCENE, truth, names)
+    else:
+        write_3d_ovs(folder, truth, names)
+    return folder
+
+
+def _visible(truth: Truth, name: str, kinds: tuple[str, ...]) -> dict[Phrase, Array]:
+    """The phrases that are true for enough of a view to be asked there, and where."""
+    labels = truth.labels(name)
+    masks = {p: np.asarray(np.isin(labels, p.ids).any(axis=0)) for p in truth.phrases if p.kind in kinds}
+    return {phrase: mask for phrase, mask in masks.items() if mask.sum() >= MIN_PIXELS}
+
+
+def write_lerf_ovs(dataset: Path, labels: Path, truth: Truth, names: list[str]) -> None:
+    """label/<scene>/<frame>.json and .jpg. A mask of several pieces, or with holes, becomes several objects
+    of one category, whose polygons joined are the mask."""
+    for name in names:
+        photograph = (dataset / "images" / f"{name}.jpg").read_bytes()
+        with atomic_path(labels / f"{name}.jpg") as path:
+            path.write_bytes(photograph)
+        height, width = truth.labels(name).shape[1:]
+        objects = [
+            {"category": phrase.text, "bbox": box, "segmentation": polygon}
+            for phrase, mask in _visible(truth, name, ASKED).items()
+            for polygon, box in _objects(mask)
+        ]
+        info = {"name": f"{name}.jpg", "width": width, "height": height}
+        with atomic_path(labels / f"{name}.json") as path:
+            path.write_text(json.dumps({"info": info, "objects": objects}) + "\n", encoding="utf-8")
+
+
+def _objects(mask: Array) -> list[tuple[list[list[int]], list[int]]]:
+    """(polygon, box) of every piece of a mask; what a piece is cut into for its holes keeps its box."""
+    pieces, _ = connected(mask, PIECES)
+    found = []
+    for number, (rows, columns) in enumerate(find_objects(pieces), 1):
+        box = [columns.start, rows.start, columns.stop - 1, rows.stop - 1]
+        found += [(polygon.tolist(), box) for polygon in outlines(pieces == number)]
+    return found
+
+
+def write_3d_ovs(dataset: Path, truth: Truth, names: list[str]) -> None:
+    """segmentations/<view>/<class>.png and, last, classes.txt; a class is what one calls a whole thing."""
+    folder = dataset / "segmentations"
+    classes: dict[str, None] = {}
+    for name in names:
+        for phrase, mask in _visible(truth, name, ("object",)).items():
+            classes[phrase.text] = None
+            with atomic_path(folder / name / f"{phrase.text}.png") as path:
+                Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(path)
+    with atomic_path(folder / "classes.txt") as path:
+        path.write_text("\n".join(sorted(classes)) + "\n", encoding="utf-8")
+
+
+def outlines(mask: Array) -> list[Array]:
+    """(H, W) bool -> polygons, (K, 2) int x, y each, K >= 3, which filled, border included, give the mask.
+
+    A piece with a hole is cut through it into pieces without one.
+    """
+    found = []
+    pieces, _ = connected(mask, PIECES)
+    for number, part in enumerate(find_objects(pieces), 1):
+        piece = pieces[part] == number
+        corner = np.array([part[1].start, part[0].start])
+        holes = binary_fill_holes(piece) & ~piece
+        if holes.any():
+            column = int(np.flatnonzero(holes.any(0))[0])
+            left, right = piece.copy(), piece.copy()
+            left[:, column + 1 :], right[:, : column + 1] = False, False
+            found += [polygon + corner for polygon in outlines(left) + outlines(right)]
+        else:
+            found.append(_trace(piece) + corner)
+    return found
+
+
+def _trace(piece: Array) -> Array:
+    """(K, 2) the border of one piece without holes, pixel by pixel."""
+    from skimage.measure import find_contours
+
+    contours = find_contours(np.pad(piece.astype(float), 1), EDGE, fully_connected="high")
+    longest = max(contours, key=len)
+    corners = np.rint(longest - 1).astype(int)[:, ::-1]
+    corners = corners[np.r_[True, (np.diff(corners, axis=0) != 0).any(1)]]
+    return np.concatenate([corners, np.repeat(corners[-1:], max(0, 3 - len(corners)), 0)])

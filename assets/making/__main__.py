@@ -1,23 +1,26 @@
-"""`langsplat demo`: make the bundled scene, its photographs and its encoder again.
+"""`python -m assets.making dataset|encoder|build`: make photographs, the demo encoder, the demo scene.
 
 The work is imported when it is done: torch and open3d take seconds that --help need not pay.
 """
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
+from assets.making.config import EncoderConfig, LabelLayout, Size, Tier
 from langsplat_core.cli.checks import OutFile, OutFolder
+from langsplat_core.cli.run import Command, main, parsed
 from langsplat_core.config import Count, Seed
-from langsplat_core.files import atomic_path
-from langsplat_core.lab.config import DemoEncoderConfig, LabelLayout, MaskOrigin, Pixels, Size, Tier
 from langsplat_core.progress import TerminalProgress
+
+PROGRAM = "python -m assets.making"
 
 
 @dataclass(frozen=True)
-class DemoDataset:
+class Dataset:
     """Render a procedural room: photographs, cameras, points, and the truth at three levels."""
 
     out: OutFolder
@@ -34,7 +37,7 @@ class DemoDataset:
     """lerf-ovs, 3d-ovs: the photographs in OUT/room, and every eighth labelled as in that benchmark."""
 
     def run(self) -> None:
-        from langsplat_core.lab.rooms.label_layouts import write_labelled
+        from assets.making.dataset import write_labelled
 
         with TerminalProgress() as progress:
             folder = write_labelled(
@@ -44,23 +47,23 @@ class DemoDataset:
 
 
 @dataclass(frozen=True)
-class DemoEncoder:
-    """Train the small demo CLIP on procedural crops. Resumes when interrupted."""
+class Encoder:
+    """Train the demo encoder on procedural crops, and measure it in new rooms. Resumes when interrupted."""
 
     out: OutFolder
     """Folder to write: model, tokenizer, vocabulary."""
-    config: Annotated[DemoEncoderConfig, tyro.conf.arg(name="")] = field(default_factory=DemoEncoderConfig)
+    config: Annotated[EncoderConfig, tyro.conf.arg(name="")] = field(default_factory=EncoderConfig)
 
     def run(self) -> None:
-        from langsplat_core.lab.encoder.train import train_demo_encoder
+        from assets.making.encoder import report_table, train_encoder
 
         with TerminalProgress() as progress:
-            train_demo_encoder(self.out, self.config, progress)
-        print(f"{self.out}: demo encoder")
+            rows = train_encoder(self.out, self.config, progress)
+        print(report_table(rows))
 
 
 @dataclass(frozen=True)
-class DemoBuild:
+class Build:
     """Make the demo scene: render its photographs, train it with the ordinary pipeline, compact it."""
 
     out: OutFile
@@ -69,7 +72,7 @@ class DemoBuild:
     """Another seed is another room."""
     tier: Tier = "clutter"
     """How hard the room is: objects apart, cluttered, or packed with look-alikes."""
-    masks: MaskOrigin = "truth"
+    masks: Literal["truth", "graph"] = "truth"
     """Outlines as a perfect segmenter would find them, or those of the weight-free segmenter."""
     steps: Count = 6_000
     """Steps of radiance training."""
@@ -77,35 +80,20 @@ class DemoBuild:
     """Keep the Gaussians of this scene of the same room, and make only their language field again."""
 
     def run(self) -> None:
-        from langsplat_core.lab.demo import build_demo
+        from assets.making.scene import build_scene
 
         with TerminalProgress() as progress:
-            made = build_demo(
+            made = build_scene(
                 self.out, self.seed, self.tier, self.masks, self.steps, self.gaussians, progress
             )
         print(f"{self.out}: {made}")
 
 
-@dataclass(frozen=True)
-class DemoSheet:
-    """Draw every class of object that the generator knows, so that one sees what its words mean."""
+def parse(args: list[str]) -> Command:
+    """The command that the words of a command line name; SystemExit as tyro raises it."""
+    command: Command = parsed(PROGRAM, Dataset | Encoder | Build, args, "Make the bundled files again.")
+    return command
 
-    out: OutFile
-    """The picture to write, *.png."""
-    seed: Seed = 0
-    """Another seed draws other examples."""
-    side: Pixels = 128
-    """Pixels per example."""
-    instances: Count = 3
-    """Examples of every class."""
 
-    def run(self) -> None:
-        from PIL import Image
-
-        from langsplat_core.lab.world.sheet import contact_sheet
-
-        with TerminalProgress() as progress:
-            picture = contact_sheet(self.instances, self.side, self.seed, progress)
-        with atomic_path(self.out) as path:
-            Image.fromarray(picture).save(path, "PNG")
-        print(f"{self.out}: {picture.shape[1]}x{picture.shape[0]} pixels")
+if __name__ == "__main__":
+    sys.exit(main(PROGRAM, lambda: parse(sys.argv[1:] or ["--help"])))
