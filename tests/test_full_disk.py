@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from assets.making.crops import CropSet
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
 from langsplat_core.evaluation.protocols.report import write_json
@@ -19,7 +20,6 @@ from langsplat_core.formats.checkpoints.writing import write_autoencoder, write_
 from langsplat_core.formats.langsplat_features import write_features
 from langsplat_core.formats.language import write_language
 from langsplat_core.formats.shapes import write_points
-from langsplat_core.lab.encoder.crops import CropSet
 from langsplat_core.lab.rooms.report import save_json as save_rooms
 from langsplat_core.pipeline.stages import kept, kept_array
 from langsplat_core.scene import Scene

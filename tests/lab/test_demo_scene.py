@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from assets.making.dataset import LIGHT, orbit_cameras, photographed_room, truth_ids
+from assets.making.render import Renderer
+from assets.making.scene import SEED, SIZE, VIEWS
 from langsplat_core.config import PictureConfig
 from langsplat_core.evaluation.metrics import intersection_over_union, majority
 from langsplat_core.formats import load_scene
-from langsplat_core.lab.demo import SEED, SIZE, VIEWS
-from langsplat_core.lab.world.appearance.render import Renderer
-from langsplat_core.lab.world.photographs import LIGHT, orbit_cameras, photographed_room, truth_ids
 from langsplat_core.query.cut import cut_level
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.pixels import splatted_relevancy

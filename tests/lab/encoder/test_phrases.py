@@ -5,10 +5,11 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from langsplat_core.lab.world import captions
-from langsplat_core.lab.world.appearance.colours import COLOURS
-from langsplat_core.lab.world.appearance.colours import SYNONYMS as COLOUR_SYNONYMS
-from langsplat_core.lab.world.captions import (
+from assets.making import vocabulary as captions
+from assets.making.kit import COLOURS, Kit
+from assets.making.kit import SYNONYMS as COLOUR_SYNONYMS
+from assets.making.objects import EVERYTHING, FURNITURE, TABLE_TOP
+from assets.making.vocabulary import (
     KINDS,
     MATERIALS,
     OBJECT_SYNONYMS,
@@ -16,8 +17,6 @@ from langsplat_core.lab.world.captions import (
     object_words,
     part_words,
 )
-from langsplat_core.lab.world.objects.catalogue import EVERYTHING, FURNITURE, TABLE_TOP
-from langsplat_core.lab.world.objects.kit import Kit
 from langsplat_core.lab.world.sheet import contact_sheet, portrait
 from langsplat_core.scene import CANONICAL_PHRASES
 

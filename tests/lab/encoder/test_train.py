@@ -6,16 +6,22 @@ import torch
 from safetensors.torch import load_file
 from transformers import CLIPTokenizerFast
 
+from assets.making import encoder as demo_encoder
+from assets.making.crops import CropSet, plain_crops, room_crops
+from assets.making.encoder import (
+    CANONICAL_COSINE,
+    begin_from,
+    build_model,
+    calibrate_canonical,
+    loss_of,
+    report,
+    text_vectors,
+    train_demo_encoder,
+)
+from assets.making.kit import COLOURS
+from assets.making.vocabulary import Label, phrase_book, vocabulary, word_merges, write_tokenizer
 from langsplat_core.errors import EncoderError
 from langsplat_core.lab.config import DemoEncoderConfig
-from langsplat_core.lab.encoder import train as demo_encoder
-from langsplat_core.lab.encoder.crops import CropSet, plain_crops, room_crops
-from langsplat_core.lab.encoder.model import begin_from, build_model, calibrate_canonical, text_vectors
-from langsplat_core.lab.encoder.phrases import phrase_book, vocabulary, word_merges, write_tokenizer
-from langsplat_core.lab.encoder.report import report
-from langsplat_core.lab.encoder.train import CANONICAL_COSINE, loss_of, train_demo_encoder
-from langsplat_core.lab.world.appearance.colours import COLOURS
-from langsplat_core.lab.world.captions import Label
 from langsplat_core.progress import Cancelled, silent
 from langsplat_core.scene import CANONICAL_PHRASES
 from langsplat_core.semantics.encoders import load_encoder, model_path
@@ -149,7 +155,7 @@ def test_crops_of_a_room(unseen_room, tmp_path):
 
 
 def test_plain_crops_have_their_colour():
-    from langsplat_core.lab.world.appearance.colours import to_lch
+    from assets.making.kit import to_lch
 
     crops = plain_crops(60, 1)
     for image, label in zip(crops.images, crops.labels, strict=True):

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from assets.making import dataset as photographs
+from assets.making.dataset import outlines, write_labelled
+from assets.making.truth import read_truth
 from langsplat_core.cli.app import parse
 from langsplat_core.evaluation.protocols.labels import Outlines
 from langsplat_core.evaluation.protocols.lerf_ovs import read_lerf_ovs
 from langsplat_core.evaluation.protocols.ovs3d import read_3d_ovs
-from langsplat_core.lab.rooms.label_layouts import write_labelled
-from langsplat_core.lab.rooms.outlines import outlines
 from langsplat_core.lab.rooms.scoring import MIN_PIXELS
-from langsplat_core.lab.rooms.truth import read_truth
-from langsplat_core.lab.world import photographs
 from langsplat_core.progress import silent
 
 SEED, VIEWS, SIZE = 2, 9, (160, 120)  # the room of the bundled scene

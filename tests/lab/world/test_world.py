@@ -6,18 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from assets.making import dataset, shapes
+from assets.making.dataset import write_dataset
+from assets.making.kit import COLOURS, colour_word, from_lch, random_colour, to_lch
+from assets.making.render import Light, Renderer, Tracer, bake, noise
+from assets.making.world import apart, build_room, footprint, furnished
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.errors import InputError
-from langsplat_core.lab.world import photographs as dataset
-from langsplat_core.lab.world.appearance.colours import COLOURS, colour_word, from_lch, random_colour, to_lch
-from langsplat_core.lab.world.appearance.light import Tracer, bake
-from langsplat_core.lab.world.appearance.render import Light, Renderer
-from langsplat_core.lab.world.appearance.textures import noise
-from langsplat_core.lab.world.assembly import build_room
-from langsplat_core.lab.world.geometry import shapes
-from langsplat_core.lab.world.photographs import write_dataset
-from langsplat_core.lab.world.placement import apart, footprint
-from langsplat_core.lab.world.rooms import furnished
 from langsplat_core.progress import silent
 from langsplat_core.scene import look_at
 
