@@ -1,23 +1,16 @@
-"""Every class of the demo world: builds, stands, nests, has words of its own."""
+"""Every class of object: builds, stands, nests, has words of its own."""
 
 from collections import defaultdict
+from itertools import chain
 
 import numpy as np
 import pytest
 
-from assets.making import vocabulary as captions
-from assets.making.kit import COLOURS, Kit
-from assets.making.kit import SYNONYMS as COLOUR_SYNONYMS
+from assets.making import vocabulary
+from assets.making.kit import COLOUR_SYNONYMS, COLOURS, Kit
 from assets.making.objects import EVERYTHING, FURNITURE, TABLE_TOP
-from assets.making.vocabulary import (
-    KINDS,
-    MATERIALS,
-    OBJECT_SYNONYMS,
-    label_region,
-    object_words,
-    part_words,
-)
-from langsplat_core.lab.world.sheet import contact_sheet, portrait
+from assets.making.vocabulary import CATEGORIES, MATERIALS, label_region, object_words, part_words
+from assets.making.world import bounds
 from langsplat_core.scene import CANONICAL_PHRASES
 
 pytestmark = pytest.mark.long
@@ -33,16 +26,26 @@ def build(name, seed):
     return builder(Kit(np.random.default_rng((seed, 17))), words[seed % len(words)])
 
 
+def radius_of(thing):
+    return max(np.linalg.norm(piece.mesh.vertices[:, :2], axis=1).max() for piece in thing.pieces)
+
+
+def labels_of(thing, piece):
+    return [label_region(level, thing, piece) for level in range(3)]
+
+
 @pytest.fixture(scope="module")
 def things():
     return {name: [build(name, seed) for seed in range(SEEDS)] for name in EVERYTHING}
 
 
-def test_there_are_enough_classes():
+def test_tables_of_words_agree():
     assert len(TABLE_TOP) >= 50
     assert len(EVERYTHING) == len(TABLE_TOP) + len(FURNITURE)
-    assert set(OBJECT_SYNONYMS) | set(KINDS) <= set(EVERYTHING) | {"rug", "floor", "wall"}
+    assert set(vocabulary.OBJECT_SYNONYMS) | set(CATEGORIES) <= set(EVERYTHING) | {"rug", "floor", "wall"}
     assert all(set(colours) <= set(COLOURS) for _, colours in EVERYTHING.values())
+    for table in (vocabulary.OBJECT_SYNONYMS, vocabulary.PART_SYNONYMS):
+        assert all(words[0] == word and len(set(words)) == len(words) for word, words in table.items())
 
 
 @pytest.mark.parametrize("name", EVERYTHING)
@@ -50,7 +53,6 @@ def test_meshes_are_sound_and_stand_where_they_should(name, things):
     for thing in things[name]:
         assert thing.word == name
         assert thing.colour in ("", *COLOURS)
-        triangles = 0
         for piece in thing.pieces:
             mesh = piece.mesh
             assert len(mesh.triangles) > 0
@@ -58,27 +60,24 @@ def test_meshes_are_sound_and_stand_where_they_should(name, things):
             np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-6)
             assert mesh.triangles.min() >= 0
             assert mesh.triangles.max() < len(mesh.vertices)
-            triangles += len(mesh.triangles)
+        triangles = sum(len(piece.mesh.triangles) for piece in thing.pieces)
         assert triangles < (6500 if name != "table" else 45_000)  # its top shows fine shadows
-        lowest = min(piece.mesh.vertices[:, 2].min() for piece in thing.pieces)
+        (_, _, lowest), (_, _, height) = bounds(thing)
+        radius = radius_of(thing)
         assert -0.006 < lowest < 0.02
-        if name in TABLE_TOP:
-            assert 0.04 < thing.radius < 0.26
-            assert 0.01 < thing.height < 0.4
-        else:
-            assert 0.15 < thing.radius < 1.4
-            assert 0.4 < thing.height < 1.6
-
-
-@pytest.mark.parametrize("name", EVERYTHING)
-def test_triangles_face_the_way_their_normals_do(name, things):
-    for piece in things[name][0].pieces:
+        assert (0.04 < radius < 0.26) if name in TABLE_TOP else (0.15 < radius < 1.4)
+        assert (0.01 < height < 0.4) if name in TABLE_TOP else (0.4 < height < 1.6)
+    thing = things[name][0]
+    extent = max(radius_of(thing), bounds(thing)[1][2] / 2)
+    for piece in thing.pieces:
         p = piece.mesh.vertices[piece.mesh.triangles]
         face = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
         against = (face * piece.mesh.normals[piece.mesh.triangles].mean(1)).sum(1) < 0
         area = np.linalg.norm(face, axis=1)
         # A few slivers of round ends and ruffles may disagree.
         assert area[against].sum() < 0.02 * area.sum(), (piece.part, piece.subpart)
+        # A region far below a hundredth of its thing would be no use in any picture.
+        assert np.ptp(piece.mesh.vertices, axis=0).max() / extent > 0.05, (piece.part, piece.subpart)
 
 
 @pytest.mark.parametrize("name", EVERYTHING)
@@ -87,14 +86,12 @@ def test_parts_are_named_and_nested(name, things):
     assert len(names[0]) >= 2
     assert all(other == names[0] for other in names)  # the same words whatever the seed
     for part, subpart in names[0]:
-        assert part
-        assert subpart != part
-        assert part != name
+        assert part not in ("", subpart, name)
         assert part.replace(" ", "").isalpha()
         assert subpart.replace(" ", "").isalpha() or not subpart
     for thing in things[name][:2]:
         for piece in thing.pieces:
-            labels = [label_region(level, thing, piece) for level in range(3)]
+            labels = labels_of(thing, piece)
             assert [label.thing for label in labels] == [name] * 3
             assert labels[2].word == name
             assert set(labels[0].hues) <= set(labels[1].hues) <= set(labels[2].hues)
@@ -104,26 +101,16 @@ def test_parts_are_named_and_nested(name, things):
 
 @pytest.mark.parametrize("name", EVERYTHING)
 def test_a_seed_always_gives_the_same_thing(name, things):
-    again = build(name, 3)
-    for one, other in zip(things[name][3].pieces, again.pieces, strict=True):
+    again, different = build(name, 3).pieces, things[name][4].pieces
+    for one, other in zip(things[name][3].pieces, again, strict=True):
         np.testing.assert_array_equal(one.mesh.vertices, other.mesh.vertices)
         np.testing.assert_array_equal(one.material.colour, other.material.colour)
-    different = things[name][4].pieces
     assert any(
         one.mesh.vertices.shape != other.mesh.vertices.shape
         or not np.allclose(one.mesh.vertices, other.mesh.vertices)
         or not np.allclose(one.material.colour, other.material.colour)
-        for one, other in zip(again.pieces, different, strict=False)
+        for one, other in zip(again, different, strict=False)
     )
-
-
-def test_every_part_takes_up_room(things):
-    """At a thing's own scale: a region far below a hundredth of it would be no use in any picture."""
-    for name, (thing, *_) in things.items():
-        extent = max(thing.radius, thing.height / 2)
-        for piece in thing.pieces:
-            size = np.ptp(piece.mesh.vertices, axis=0).max() / extent
-            assert size > 0.05, (name, piece.part, piece.subpart)
 
 
 def test_no_word_stands_for_two_different_things(things):
@@ -131,21 +118,19 @@ def test_no_word_stands_for_two_different_things(things):
     for name in [*EVERYTHING, "rug", "floor", "wall"]:
         for word in object_words(name):
             meant[word].add(("object", name))
-    for kind in {kind for kinds in KINDS.values() for kind in kinds}:
-        meant[kind].add(("kind", kind))
-    for word in [*COLOURS, *(other for words in COLOUR_SYNONYMS.values() for other in words)]:
-        meant[word].add(("colour", word))
-    for words in MATERIALS.values():
-        for word in words:
-            meant[word].add(("material", word))
-    for word in CANONICAL_PHRASES:
-        meant[word].add(("canonical", word))
     pieces = [piece for group in things.values() for piece in group[0].pieces]
-    for region in {name for piece in pieces for name in (piece.part, piece.subpart)} - {""}:
-        for word in part_words(region):
-            meant[word].add(("part", ""))  # parts of two objects may share a word: both have handles
-    clashes = {word for word, roles in meant.items() if len(roles) > 1}
-    assert clashes <= SHARED
+    regions = {name for piece in pieces for name in (piece.part, piece.subpart)} - {""}
+    # Parts of two objects may share a word: both have handles.
+    for role, words in {
+        "category": set(chain.from_iterable(CATEGORIES.values())),
+        "colour": {*COLOURS, *chain.from_iterable(COLOUR_SYNONYMS.values())},
+        "material": set(chain.from_iterable(MATERIALS.values())),
+        "canonical": set(CANONICAL_PHRASES),
+        "part": {word for region in regions for word in part_words(region)},
+    }.items():
+        for word in words:
+            meant[word].add((role, "" if role == "part" else word))
+    assert {word for word, roles in meant.items() if len(roles) > 1} <= SHARED
 
 
 def test_no_phrase_names_a_whole_and_a_part(things):
@@ -154,15 +139,10 @@ def test_no_phrase_names_a_whole_and_a_part(things):
     for group in things.values():
         for thing in group[:3]:
             for piece in thing.pieces:
-                labels = [label_region(level, thing, piece) for level in range(3)]
-                wholes.update(labels[2].names)
-                parts.update(labels[0].names, labels[1].names)
+                subpart, part, whole = labels_of(thing, piece)
+                wholes.update(whole.names)
+                parts.update(subpart.names, part.names)
     assert {phrase for phrase in wholes & parts if phrase.split()[-1] != "hat"} == set()
-
-
-def test_synonym_tables_start_with_their_own_word():
-    for table in (captions.OBJECT_SYNONYMS, captions.PART_SYNONYMS):
-        assert all(words[0] == word and len(set(words)) == len(words) for word, words in table.items())
 
 
 def test_materials_are_said():
@@ -175,15 +155,3 @@ def test_materials_are_said():
     assert "glass bottle" in label_region(2, bottle, bottle.pieces[0]).words
     apple = build("apple", 0)
     assert label_region(2, apple, apple.pieces[0]).material == ""
-
-
-def test_contact_sheet_shows_things_in_their_colour(monkeypatch):
-    red = portrait(EVERYTHING["drum"][0](Kit(np.random.default_rng(1)), "red"), 48, 20.0)
-    assert red.shape == (48, 48, 3)
-    middle = red[14:34, 14:34].reshape(-1, 3).astype(int)
-    assert ((middle[:, 0] > middle[:, 1] + 60) & (middle[:, 0] > middle[:, 2] + 30)).mean() > 0.1
-    from langsplat_core.lab.world import sheet
-
-    monkeypatch.setattr(sheet, "EVERYTHING", {name: EVERYTHING[name] for name in ("mug", "snail")})
-    picture = contact_sheet(1, 32)
-    assert picture.shape == (46, 5 * 38, 3)
