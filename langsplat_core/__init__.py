@@ -6,11 +6,11 @@ The public names below load on first use, so that importing the package costs no
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from langsplat_core.extras import optional_imports
+from langsplat_core.errors import optional_imports
 
 if TYPE_CHECKING:
     from langsplat_core.config import TrainConfig
-    from langsplat_core.formats import load_scene, save_scene
+    from langsplat_core.io import load_scene, save_scene
     from langsplat_core.pipeline.train import train_scene
     from langsplat_core.query.answers import QueryResult
     from langsplat_core.query.engine import QueryEngine
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
-    "load_scene": "langsplat_core.formats",
-    "save_scene": "langsplat_core.formats",
+    "load_scene": "langsplat_core.io",
+    "save_scene": "langsplat_core.io",
     "render": "langsplat_core.raster.render",
     "Rendering": "langsplat_core.raster.render",
     "load_rasterizer": "langsplat_core.raster",

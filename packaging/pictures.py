@@ -10,7 +10,7 @@ from typing import Any
 from imgui_bundle import hello_imgui, imgui  # isort: skip  (before glfw)
 from imgui_bundle.immapp import testing  # isort: skip
 
-from langsplat_core.parsing.pictures import opened
+from langsplat_core.io.hostile import opened
 from langsplat_viewer import actions
 from langsplat_viewer.drawing.frame import FrameRenderer
 from langsplat_viewer.options import scene_path, services

@@ -22,19 +22,12 @@ LAYERS = [
     ["langsplat_viewer.output"],
     ["langsplat_viewer.options"],
     ["langsplat_viewer.viewer"],
-    ["langsplat_viewer.pictures", "langsplat_viewer.visits"],
+    ["langsplat_viewer.staging"],
     ["langsplat_viewer.state"],
-    ["langsplat_viewer.recording", "langsplat_viewer.training"],
     ["langsplat_viewer.files"],
-    ["langsplat_viewer.camera", "langsplat_viewer.drawing", "langsplat_viewer.marks"],
-    [
-        "langsplat_viewer.jobs",
-        "langsplat_viewer.keys",
-        "langsplat_viewer.timing",
-        "langsplat_viewer.fonts",
-        "langsplat_viewer.parallel",
-    ],
-    ["langsplat_viewer.memory"],
+    ["langsplat_viewer.drawing", "langsplat_viewer.marks"],
+    ["langsplat_viewer.camera"],
+    ["langsplat_viewer.jobs", "langsplat_viewer.keys", "langsplat_viewer.fonts"],
     ["langsplat_core.__main__"],
     ["langsplat_core.cli"],
     ["langsplat_core.lab"],
@@ -46,11 +39,11 @@ LAYERS = [
         "langsplat_core.display",
         "langsplat_core.semantics",
         "langsplat_core.datasets",
-        "langsplat_core.formats",
     ],
-    ["langsplat_core.scene", "langsplat_core.parsing"],
-    ["langsplat_core.config", "langsplat_core.progress", "langsplat_core.files", "langsplat_core.compiled"],
-    ["langsplat_core.arrays", "langsplat_core.ranges", "langsplat_core.stopwatch", "langsplat_core.extras"],
+    ["langsplat_core.io"],
+    ["langsplat_core.scene"],
+    ["langsplat_core.config", "langsplat_core.compiled"],
+    ["langsplat_core.arrays", "langsplat_core.progress"],
     ["langsplat_core.errors"],
 ]
 FACADE = "langsplat_core.__init__"  # the public names; it may reach anything below the command line
@@ -195,9 +188,9 @@ def test_the_rule_itself_can_fail():
 
 def test_opening_a_scene_imports_nothing_heavy():
     code = (
-        "import sys, langsplat_core, langsplat_core.formats, langsplat_core.scene,"
+        "import sys, langsplat_core, langsplat_core.io, langsplat_core.scene,"
         " langsplat_core.query.engine,"
-        " langsplat_core.display.compose, langsplat_core.raster;"
+        " langsplat_core.display.displays, langsplat_core.raster;"
         f"print([m for m in {HEAVY!r} if m in sys.modules])"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

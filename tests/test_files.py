@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from langsplat_core.errors import InputError
-from langsplat_core.files import atomic_path, check_output_file, check_output_folder, name_max, shown
+from langsplat_core.io.files import atomic_path, check_output_file, check_output_folder, name_max, shown
 from tests.support.another_user import bound_by_permissions
 
 CHECKS = [check_output_file, check_output_folder]
@@ -83,7 +83,7 @@ def test_where_one_may_not_write(tmp_path: Path) -> None:
     closed = tmp_path / "closed"
     closed.mkdir(mode=0o555)
     code = (
-        "import sys\nfrom pathlib import Path\nfrom langsplat_core.files import *\n"
+        "import sys\nfrom pathlib import Path\nfrom langsplat_core.io.files import *\n"
         "from langsplat_core.errors import InputError\n"
         "for check in (check_output_file, check_output_folder):\n"
         "    try: check(Path(sys.argv[1]))\n"

@@ -13,23 +13,21 @@ import pytest
 from assets.making.crops import CropSet
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
-from langsplat_core.evaluation.protocols.report import write_json
-from langsplat_core.files import atomic_path
-from langsplat_core.formats import save_scene, write_cameras, write_ply
-from langsplat_core.formats.checkpoints.writing import write_autoencoder, write_checkpoint
-from langsplat_core.formats.langsplat_features import write_features
-from langsplat_core.formats.language import write_language
-from langsplat_core.formats.shapes import write_points
+from langsplat_core.evaluation.report import write_json
+from langsplat_core.io import save_scene, write_cameras, write_ply
+from langsplat_core.io.files import atomic_path
+from langsplat_core.io.langsplat_files import write_autoencoder, write_checkpoint, write_features
+from langsplat_core.io.language import write_language
+from langsplat_core.io.shapes import write_points
 from langsplat_core.lab.rooms.report import save_json as save_rooms
 from langsplat_core.pipeline.stages import kept, kept_array
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
-from langsplat_core.training.radiance.checkpoint import save_checkpoint
-from langsplat_viewer.files.bookmarks import Bookmark, Shelf
-from langsplat_viewer.files.flight_files import write_flight
+from langsplat_core.training.radiance.state import save_checkpoint
+from langsplat_viewer.files.browsing import QuerySet, SavedQuery, write_queries
+from langsplat_viewer.files.flight_files import Bookmark, Shelf, write_flight
 from langsplat_viewer.files.preferences import Preferences, save_preferences
-from langsplat_viewer.files.querysets import QuerySet, SavedQuery, write_queries
-from langsplat_viewer.output.film_files import Film, write_film
+from langsplat_viewer.output.film import Film, write_film
 from langsplat_viewer.output.saving import save_png
 from tests.support.file_samples import random_codec, random_field
 from tests.support.flights import flight as some_flight

@@ -8,7 +8,7 @@ from types import ModuleType
 
 import pytest
 
-from langsplat_core.raster.opengl.context import create_egl_context
+from langsplat_core.raster.opengl.scene_textures import create_egl_context
 
 ROOT = Path(__file__).resolve().parents[1]
 GPU = ROOT / "packaging" / "gpu"

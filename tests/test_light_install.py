@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from langsplat_core import load_scene
-from langsplat_core.extras import EXTRAS
+from langsplat_core.errors import EXTRAS
 
 pytestmark = pytest.mark.long
 

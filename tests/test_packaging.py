@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from langsplat_viewer.files.browsing import SCENE_SUFFIXES
-from langsplat_viewer.training import TrainingRequest, command
+from langsplat_viewer.viewer import TrainingRequest, command
 
 PACKAGING = Path(__file__).resolve().parents[1] / "packaging"
 DESKTOP = PACKAGING / "desktop"

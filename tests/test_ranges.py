@@ -11,11 +11,19 @@ import pytest
 from langsplat_core import config
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
-from langsplat_core.config import CodecConfig, LiftConfig, RadianceConfig, TrainConfig
+from langsplat_core.config import (
+    CodecConfig,
+    LiftConfig,
+    RadianceConfig,
+    Range,
+    Setting,
+    TrainConfig,
+    check_settings,
+    numeric_settings,
+)
 from langsplat_core.errors import InputError
 from langsplat_core.lab import config as lab_config
 from langsplat_core.pipeline.train import train_scene
-from langsplat_core.ranges import Range, Setting, check_settings, numeric_settings
 
 CONFIGS = {
     name: value

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from langsplat_core import config
+from langsplat_core.config import Range
 from langsplat_core.lab import config as lab_config
-from langsplat_core.ranges import Range
 
 ROOT = Path(__file__).parent.parent
 SOURCES = [*ROOT.glob("langsplat_core/**/*.py"), *ROOT.glob("app/**/*.py")]

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from langsplat_core.stopwatch import lap, watched
+from langsplat_core.progress import lap, watched
 
 
 def test_laps_of_one_name_are_summed():

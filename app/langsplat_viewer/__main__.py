@@ -11,14 +11,13 @@ from typing import Annotated, Literal
 import tyro
 
 from langsplat_core.cli.run import main, parsed
-from langsplat_core.config import ColourMap, LevelChoice, NotNegative, PictureConfig, Positive, Share
-from langsplat_core.display.colour_maps import MAX_QUERIES
+from langsplat_core.config import ColourMap, LevelChoice, NotNegative, PictureConfig, Positive, Range, Share
+from langsplat_core.display.displays import MAX_QUERIES
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, TerminalProgress, silent
-from langsplat_core.ranges import Range
 from langsplat_viewer.camera.flight import SPAN_LIMITS
+from langsplat_viewer.drawing.channels import Clip
 from langsplat_viewer.drawing.frame import Backend
-from langsplat_viewer.drawing.seeing import Clip
 from langsplat_viewer.files.preferences import preferences_folder
 from langsplat_viewer.options import (
     DisplayChoice,
@@ -102,8 +101,7 @@ class ViewerCommand:
             self._window(path, size)
 
     def _without_window(self, path: Path, size: tuple[int, int] | None) -> None:
-        from langsplat_viewer.output.film import FilmRequest, draw_film
-        from langsplat_viewer.output.film_files import check_film
+        from langsplat_viewer.output.film import FilmRequest, check_film, draw_film
         from langsplat_viewer.output.still import StillRequest, check_out, draw_still
 
         if self.path is not None and self.turntable is not None:

@@ -14,23 +14,24 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import BackendError
+from langsplat_core.progress import watched
 from langsplat_core.scene import Camera
-from langsplat_core.scene.merging import Merged
-from langsplat_core.stopwatch import watched
-from langsplat_viewer import actions
+from langsplat_core.scene.gaussians import Merged
+from langsplat_viewer import actions, staging
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.commands import with_key
-from langsplat_viewer.drawing.channels import Layers
-from langsplat_viewer.drawing.looking import why_nothing, why_undrawable
-from langsplat_viewer.drawing.pacing import FINE, Level, Pace
-from langsplat_viewer.drawing.renderer import Rasterized, Renderer
-from langsplat_viewer.drawing.seeing import UNCLIPPED
+from langsplat_viewer.drawing.channels import UNCLIPPED, Layers, why_nothing, why_undrawable
+from langsplat_viewer.drawing.renderer import FINE, Level, Pace, Rasterized, Renderer
 from langsplat_viewer.keys import Changed
-from langsplat_viewer.pictures import splitting
-from langsplat_viewer.pictures.background import Background
-from langsplat_viewer.pictures.depiction import Depiction, depiction
-from langsplat_viewer.pictures.marked_scene import MarkedScene, marked_scene
-from langsplat_viewer.pictures.staging import Merger, Stage
+from langsplat_viewer.staging import (
+    Background,
+    Depiction,
+    MarkedScene,
+    Merger,
+    Stage,
+    depiction,
+    marked_scene,
+)
 from langsplat_viewer.state import FrameStats, ViewerState
 
 REST_SECONDS = 0.1  # without a move, after which the fine picture is drawn
@@ -92,7 +93,7 @@ class Canvas:
             self._view = state.view
         moving = now - self._moved < REST_SECONDS
         coarse = moving and state.coarse_while_moving
-        shown = splitting.pictures(state)
+        shown = staging.shown_pictures(state)
         wanted = depiction(state, shown)
         if self._begins_timing(state, moving):
             self._drawn = None
@@ -253,7 +254,7 @@ class Canvas:
         """See `viewer.Surface`."""
         if self._camera is None or self._state is None:
             return None
-        u = splitting.within_picture(self._state.seeing.split, u)
+        u = staging.within_picture(self._state.seeing.split, u)
         pixel = (u * self._camera.width, v * self._camera.height)
         depth = self._renderer.depth_at(*pixel)
         return None if depth is None or depth <= 0 else self._camera.unproject(pixel, depth)
@@ -264,7 +265,7 @@ class Canvas:
 
     def capture(self, state: ViewerState) -> Array:
         """See `viewer.Surface`."""
-        shown = splitting.pictures(state)
+        shown = staging.shown_pictures(state)
         wanted = depiction(state, shown)
         if state is not self._state:  # of another size: what is on screen is drawn again
             self._drawn = None
@@ -274,4 +275,4 @@ class Canvas:
             np.asarray(self._renderer.read(camera, look.picture, look.heat_ranges, layers))
             for look, layers in zip(wanted.looks, prepared, strict=True)
         ]
-        return splitting.joined(state.seeing.split, images)
+        return staging.joined(state.seeing.split, images)

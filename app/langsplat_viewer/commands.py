@@ -9,11 +9,11 @@ from langsplat_core.config import Display
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions
-from langsplat_viewer.actions.exporting import Part
+from langsplat_viewer.actions.selecting import Part
 from langsplat_viewer.camera.controls import Side, adopt_up, level
-from langsplat_viewer.drawing.seeing import Overlay
+from langsplat_viewer.drawing.channels import Overlay
 from langsplat_viewer.keys import Changed
-from langsplat_viewer.marks.selecting import TOOLS, Tool
+from langsplat_viewer.marks import TOOLS, Tool
 from langsplat_viewer.output import saving
 from langsplat_viewer.viewer import Viewer
 

@@ -8,9 +8,9 @@ from typing import Literal
 from langsplat_core.config import Display, LevelChoice
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import InputError
-from langsplat_core.formats import load_scene
-from langsplat_core.formats.cameras_json import read_cameras
-from langsplat_core.formats.sog import META_NAME
+from langsplat_core.io import load_scene
+from langsplat_core.io.cameras import read_cameras
+from langsplat_core.io.sog import META_NAME
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import LEVELS, Camera, Scene
@@ -99,8 +99,7 @@ def warm_up(scene: Scene, backend: str, progress: Progress = silent) -> None:
     if backend == "cpu":
         say_compiling(progress)
         from langsplat_core.raster import load_rasterizer
-        from langsplat_viewer.drawing.channels import ArrayChannels, Layers
-        from langsplat_viewer.drawing.sight import Sight
+        from langsplat_viewer.drawing.channels import ArrayChannels, Layers, Sight
 
         channels, sight = ArrayChannels(load_rasterizer("cpu")), Sight(scene, scene.framing_camera((16, 16)))
         channels.render(sight, Layers(), "none")

@@ -1,29 +1,125 @@
-"""Everything a frame depends on, as one dataclass: actions change it, panels and the canvas read it."""
+"""Where the time goes, and how right the picture is: what the panel "Timing" knows."""
 
+import math
+from collections import deque
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
+from statistics import median
+
+import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice, PictureConfig, TrainPreset
-from langsplat_core.display.colour_maps import MAX_QUERIES
-from langsplat_core.display.compose import HeatRanges
-from langsplat_core.display.displays import DISPLAYS
+from langsplat_core.display.displays import DISPLAYS, MAX_QUERIES, HeatRanges
 from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.describe import Pointed, Suggestions
 from langsplat_core.query.instances import Instance
-from langsplat_core.query.pointing import Pointed
-from langsplat_core.query.suggestions import Suggestions
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
-from langsplat_viewer.drawing import painting
-from langsplat_viewer.drawing.seeing import Seeing
-from langsplat_viewer.files.bookmarks import Bookmark
+from langsplat_viewer.camera.flight import Flight, Keyframe
+from langsplat_viewer.drawing import channels
+from langsplat_viewer.drawing.channels import Seeing
 from langsplat_viewer.files.browsing import Listing
+from langsplat_viewer.files.flight_files import Bookmark
 from langsplat_viewer.files.photographs import Photograph
 from langsplat_viewer.files.preferences import Preferences
 from langsplat_viewer.keys import Keying
-from langsplat_viewer.marks.selecting import Selection
-from langsplat_viewer.recording import Recording
-from langsplat_viewer.timing import Timing
+from langsplat_viewer.marks import Selection
+
+KEPT = 31  # measurements of which the median is told
+STEPS = {  # names of laps, and what they are called; in the order of the panel
+    "projection": "Projection",
+    "sort": "Sort",
+    "blend": "Blend",
+    "upload": "Upload",
+    "compose": "Compose",
+    "picture": "Picture, all of it",
+    "panels": "Panels",
+    "search": "Search",
+}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What is shown against the reference, at a small size; errors in display values, 0 to 255."""
+
+    size: tuple[int, int]  # pixels
+    largest: int
+    mean: float
+    psnr: float  # dB; infinite where they are the same
+    backend: str  # that was compared
+
+
+def compared(shown: Array, reference: Array, backend: str) -> Comparison:
+    """Of two (H, W, C) uint8 pictures of one size."""
+    errors = np.abs(shown.astype(np.float64) - reference)
+    squared = float((errors**2).mean())
+    psnr = math.inf if squared == 0 else 10 * math.log10(255**2 / squared)
+    height, width = shown.shape[:2]
+    return Comparison((width, height), int(errors.max()), float(errors.mean()), psnr, backend)
+
+
+@dataclass(eq=False)
+class Timing:
+    """A part of the viewer's state."""
+
+    wanted: bool = False  # this frame is measured: the panel is seen
+    laps: dict[str, deque[float]] = field(default_factory=dict)  # milliseconds by the names of STEPS
+    comparison: Comparison | None = None  # the last one
+
+    def add(self, name: str, milliseconds: float) -> None:
+        """One measurement more."""
+        self.laps.setdefault(name, deque(maxlen=KEPT)).append(milliseconds)
+
+    def medians(self) -> list[tuple[str, float]]:
+        """What was measured, in words, and the median of its last measurements in milliseconds."""
+        return [(title, median(self.laps[name])) for name, title in STEPS.items() if self.laps.get(name)]
+
+
+def memory_bytes() -> int | None:
+    """What this process holds in memory; None where the system does not tell."""
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    resident = [line for line in lines if line.startswith("VmRSS:")]
+    return 1024 * int(resident[0].split()[1]) if resident else None
+
+
+# What the panel "Record" knows: a camera path, where it is played, and what film is wanted of it.
+
+SPACING = 2.0  # seconds from the last keyframe to one that is added
+TURN_SECONDS = 8.0
+FPS_CHOICES = (10.0, 24.0, 25.0, 30.0, 60.0)
+
+
+@dataclass(eq=False)
+class Recording:
+    """A part of the viewer's state."""
+
+    keyframes: tuple[Keyframe, ...] = ()  # in the order of time
+    chosen: Keyframe | None = None  # in the list
+    at: float = 0.0  # seconds: where on the path the view is
+    began: float | None = None  # when `at` was 0, seconds on the window's clock; None while nothing is played
+    loops: bool = False
+    turns: bool = False  # once around in place of the keyframes
+    turn_seconds: float = TURN_SECONDS
+    turn_from: OrbitCamera | None = None  # where the turn that is played began
+    size: tuple[int, int] = (1280, 720)  # of films, and of pictures that are no screenshots, pixels
+    fps: float = 30.0
+    film_typed: str = ""  # where the film goes; empty: a new name
+    path_typed: str = ""  # a file with a path
+    clipboard: str = ""  # put there at the next frame
+
+
+@lru_cache(maxsize=2)
+def flight_of(keyframes: tuple[Keyframe, ...]) -> Flight:
+    """The path through them; its curve is computed once for many frames of a window."""
+    return Flight(keyframes)
+
+
+# Everything a frame depends on, as one dataclass: actions change it, panels and the canvas read it.
 
 SLOTS = MAX_QUERIES  # queries shown at a time: one colour each
 MAX_MESSAGES = 50
@@ -180,11 +276,11 @@ class ViewerState:
 
     def heat_ranges(self) -> HeatRanges:
         """The values at which the heat of each slot is 0 and 1."""
-        return painting.heat_ranges(self.shown_results(), self.picture.display)
+        return channels.heat_ranges(self.shown_results(), self.picture.display)
 
     def shown_picture(self) -> PictureConfig:
         """The settings of the picture with what follows from the answers."""
-        return painting.fitted(self.picture, self.shown_results())
+        return channels.fitted(self.picture, self.shown_results())
 
     def layers_key(self) -> tuple[object, ...]:
         """Changes exactly when `latent_rgb`, `relevancies` or the marks would. Holds the objects themselves:
@@ -208,4 +304,4 @@ class ViewerState:
         """(N, Q) float32 of the shown queries, see `painting.columns`."""
         if self.scene is None:
             return None
-        return painting.columns(self.shown_results(), self.picture.display, len(self.scene.gaussians))
+        return channels.columns(self.shown_results(), self.picture.display, len(self.scene.gaussians))

@@ -20,9 +20,8 @@ from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.display_probe import probe_gl
 from langsplat_viewer.drawing.frame import Backend, FrameRenderer
 from langsplat_viewer.drawing.renderer import Renderer
-from langsplat_viewer.files.bookmarks import Shelf
-from langsplat_viewer.jobs import one_line
-from langsplat_viewer.memory import give_memory_back, share_one_heap
+from langsplat_viewer.files.flight_files import Shelf
+from langsplat_viewer.jobs import give_memory_back, one_line, share_one_heap
 from langsplat_viewer.options import chosen_camera, latent_level
 from langsplat_viewer.panels import keyboard, layout, menu, navigation, over, photograph, pictures
 from langsplat_viewer.panels.area import scene_area

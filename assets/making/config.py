@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from langsplat_core.config import Count, CountOrZero, Rate, Seed
-from langsplat_core.ranges import Range
+from langsplat_core.config import Count, CountOrZero, Range, Rate, Seed
 
 Tier = Literal["separate", "clutter", "occlusion"]  # objects apart, cluttered, packed with look-alikes
 TIERS: tuple[Tier, ...] = get_args(Tier)

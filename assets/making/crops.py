@@ -15,11 +15,11 @@ from assets.making.render import Light, Picture, Renderer, noise
 from assets.making.vocabulary import Label
 from assets.making.world import World, build_room
 from langsplat_core.arrays import Array
-from langsplat_core.files import atomic_path
-from langsplat_core.parsing.pictures import opened
+from langsplat_core.io.files import atomic_path
+from langsplat_core.io.hostile import opened
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera, look_at
-from langsplat_core.semantics.crops import masked_crop
+from langsplat_core.semantics.store import masked_crop
 
 CROP = 64  # side of a training crop, px
 _VIEW = (480, 360)  # width, height of the photographs that crops are cut from

@@ -17,7 +17,7 @@ from assets.making.truth import Phrase, Truth, read_truth
 from assets.making.world import World, build_room
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
-from langsplat_core.files import atomic_path
+from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import Progress
 from langsplat_core.scene import LEVELS, Camera, look_at
 

@@ -26,7 +26,7 @@ from assets.making.crops import CROP, CropSet, read_crops, write_crops
 from assets.making.objects import TABLE_TOP
 from assets.making.vocabulary import BOOK_KINDS, PhraseBook, phrase_book
 from langsplat_core.arrays import Array
-from langsplat_core.files import atomic_path
+from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import Progress
 from langsplat_core.scene import CANONICAL_PHRASES
 from langsplat_core.semantics.encoders import Encoder as ImageTextEncoder

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from langsplat_core.files import atomic_path
+from langsplat_core.io.files import atomic_path
 
 
 def save_figures(out: Path, name: str, table: str, figures: Any) -> None:

@@ -8,7 +8,7 @@ import tyro
 
 from langsplat_core.cli.bench_files import save_figures
 from langsplat_core.cli.checks import OutFolder
-from langsplat_core.files import atomic_path
+from langsplat_core.io.files import atomic_path
 from langsplat_core.lab.config import LiftBenchConfig
 from langsplat_core.progress import TerminalProgress
 

@@ -6,10 +6,9 @@ from typing import Annotated
 
 from langsplat_core.cli.bench_files import save_figures
 from langsplat_core.cli.checks import OutFolder
-from langsplat_core.config import Count
+from langsplat_core.config import Count, Range
 from langsplat_core.lab.config import Size
 from langsplat_core.progress import TerminalProgress
-from langsplat_core.ranges import Range
 
 Sizes = Annotated[tuple[tuple[Count, Count], ...], Range(1, 1_000_000_000, some=True)]
 

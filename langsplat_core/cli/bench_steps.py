@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from langsplat_core.cli.checks import OutFolder
-from langsplat_core.files import atomic_path
+from langsplat_core.io.files import atomic_path
 from langsplat_core.lab.config import KernelStepsConfig
 from langsplat_core.progress import TerminalProgress
 

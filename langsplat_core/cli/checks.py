@@ -1,12 +1,25 @@
-"""What is said of a command's arguments before it does anything: numbers, texts, places to write to."""
+"""Tables on standard output."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+from rich.console import Console
+
+from langsplat_core.config import annotations, check_settings, named_values
 from langsplat_core.errors import InputError
-from langsplat_core.files import check_output_file, check_output_folder
-from langsplat_core.ranges import annotations, check_settings, named_values
+from langsplat_core.io.files import check_output_file, check_output_folder
+
+
+class OutputConsole(Console):
+    """A console that leaves to `cli.run` what happens when nobody reads any more; rich's own ends with 1."""
+
+    def on_broken_pipe(self) -> None:
+        """Raise BrokenPipeError, as `print` does."""
+        raise BrokenPipeError
+
+
+# What is said of a command's arguments before it does anything: numbers, texts, places to write to.
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import tyro
 
 from langsplat_core.cli.checks import OutFile, OutFolder
 from langsplat_core.errors import InputError
-from langsplat_core.files import check_output_folder
+from langsplat_core.io.files import check_output_folder
 from langsplat_core.lab.config import BenchmarkConfig
 from langsplat_core.progress import TerminalProgress
 

@@ -9,18 +9,12 @@ import tyro
 from langsplat_core.cli.checks import OutFile, OutFolder
 from langsplat_core.config import ClipConfig, MaskConfig, TrainConfig, TrainPreset, with_preset
 from langsplat_core.errors import InputError
-from langsplat_core.evaluation.protocols.profiles import (
-    LERF_PROFILES,
-    OVS_PROFILES,
-    LerfProtocol,
-    OvsProtocol,
-    Profile,
-)
-from langsplat_core.formats.language import SUFFIX
+from langsplat_core.evaluation.profiles import LERF_PROFILES, OVS_PROFILES, LerfProtocol, OvsProtocol, Profile
+from langsplat_core.io.language import SUFFIX
 from langsplat_core.progress import TerminalProgress
 
 if TYPE_CHECKING:
-    from langsplat_core.evaluation.protocols.labels import Benchmark
+    from langsplat_core.evaluation.labels import Benchmark
 
 SceneAndData = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[SCENE] DATA")]
 
@@ -77,9 +71,8 @@ class _EvalLabels(_Eval):
 
     def evaluate(self, benchmark: "Benchmark", profile: Profile) -> None:
         """Train where that is asked for, score, print the tables, write what was asked for."""
-        from langsplat_core.evaluation.protocols.published import beside_published
-        from langsplat_core.evaluation.protocols.report import save_json, table
-        from langsplat_core.evaluation.protocols.run import Subject, run_benchmark
+        from langsplat_core.evaluation.report import beside_published, save_json, table
+        from langsplat_core.evaluation.run import Subject, run_benchmark
         from langsplat_core.semantics.encoders import load_text_encoder
 
         failed = self._train(benchmark) if self.train else {}
@@ -131,7 +124,7 @@ class EvalLerfOvs(_EvalLabels):
     """Whose constants: filters, cut and choice of level; docs/evaluating.md lists them."""
 
     def run(self) -> None:
-        from langsplat_core.evaluation.protocols.lerf_ovs import read_lerf_ovs
+        from langsplat_core.evaluation.labels import read_lerf_ovs
 
         self.evaluate(read_lerf_ovs(self.scene_and_data()[1]), LERF_PROFILES[self.protocol])
 
@@ -146,7 +139,7 @@ class EvalOvs3d(_EvalLabels):
     """Whose constants: cut and choice of level; docs/evaluating.md lists them."""
 
     def run(self) -> None:
-        from langsplat_core.evaluation.protocols.ovs3d import read_3d_ovs
+        from langsplat_core.evaluation.labels import read_3d_ovs
 
         self.evaluate(read_3d_ovs(self.scene_and_data()[1]), OVS_PROFILES[self.protocol])
 
@@ -158,9 +151,8 @@ class EvalScanNet(_Eval):
     DATA is a folder of NAME/NAME_vh_clean_2.labels.ply; maps are NAME.npy, one class id per vertex."""
 
     def run(self) -> None:
-        from langsplat_core.evaluation.protocols.run import Subject
-        from langsplat_core.evaluation.protocols.scannet import read_scannet
-        from langsplat_core.evaluation.protocols.scannet_run import point_table, run_scannet, save_point_json
+        from langsplat_core.evaluation.run import Subject
+        from langsplat_core.evaluation.scannet import point_table, read_scannet, run_scannet, save_point_json
         from langsplat_core.semantics.encoders import load_text_encoder
 
         scene, data = self.scene_and_data()

@@ -2,27 +2,33 @@
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
+from rich.table import Table
 
-from langsplat_core.cli.instances import instance_json, table, unit_of
-from langsplat_core.config import CountOrZero, LevelChoice, PictureConfig, Positive
+from langsplat_core.arrays import Array
+from langsplat_core.cli.checks import OutputConsole
+from langsplat_core.config import Count, CountOrZero, LevelChoice, PictureConfig, Positive
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
-from langsplat_core.formats import load_scene
-from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.compose import check_phrase, run_phrase
+from langsplat_core.io import load_scene
+from langsplat_core.progress import Progress, TerminalProgress
+from langsplat_core.query.answers import QueryResult, peak_pixel
+from langsplat_core.query.compose import check_phrase, combine, run_phrase
+from langsplat_core.query.describe import Describer, Entry, Levels, Spot, Word, Words
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, no_field
-from langsplat_core.query.phrase_tree import Atom
-from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
-from langsplat_core.query.places import peak_pixel
-from langsplat_core.raster import load_rasterizer
+from langsplat_core.query.grammar import Atom
+from langsplat_core.query.instances import Instance, find_instances
+from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
+from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
 from langsplat_core.scene import LEVELS, Camera, Scene
-from langsplat_core.scene.phrases import split_phrases
+from langsplat_core.scene.language import split_phrases
 from langsplat_core.semantics.encoders import load_text_encoder
+from langsplat_core.semantics.vocabulary import read_vocabulary
 
 PAPER_FILTER = 20  # px, mean filter before the peak is taken (paper, implementation details)
 
@@ -178,3 +184,294 @@ def _answer(
         column, row, score = peak_pixel(np.asarray(relevancy[..., 0]), PAPER_FILTER)
         answer |= {"pixel": [column, row], "pixel_score": score}
     return answer
+
+
+# Instances of an answer, for people and as JSON.
+
+HEADING = ("", "score", "share", "Gaussians", "centre", "size")
+
+
+@dataclass(frozen=True)
+class Unit:
+    """The unit that lengths are printed and given in."""
+
+    name: str  # "m" or "units"
+    length: float  # world units -> this
+
+    def format(self, values: Array, between: str = " ") -> str:
+        """World units as text, in this unit, without it."""
+        return between.join(f"{self.length * value:.3f}" for value in values)
+
+
+def unit_of(scene: Scene, metres_per_unit: float | None = None) -> Unit:
+    """Metres by `metres_per_unit`, else by the scene's own, else world units. InputError unless > 0."""
+    if metres_per_unit is not None and not 0 < metres_per_unit < float("inf"):
+        raise InputError(f"--scale {metres_per_unit:g}: must be above 0, metres per unit")
+    metres = metres_per_unit or scene.metres_per_unit
+    return Unit("units", 1.0) if metres is None else Unit("m", metres)
+
+
+def table(instances: Sequence[Instance], unit: Unit, first: int = 1) -> list[str]:
+    """Aligned lines under a heading, one for each instance, numbered from `first`; none without instances."""
+    if not instances:
+        return []
+    rows = [(*HEADING[:4], f"{HEADING[4]}, {unit.name}", f"{HEADING[5]}, {unit.name}")]
+    rows += [
+        (
+            str(number),
+            f"{instance.score:.3f}",
+            f"{100 * instance.share:.0f} %",
+            f"{instance.count}",
+            unit.format(instance.centre),
+            unit.format(instance.size, " x "),
+        )
+        for number, instance in enumerate(instances, first)
+    ]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  " + "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows
+    ]
+
+
+def instance_json(instance: Instance, number: int) -> dict[str, Any]:
+    """Lengths in world units."""
+    box = instance.oriented
+    return {
+        "number": number,
+        "score": instance.score,
+        "mean": instance.mean,
+        "share": instance.share,
+        "gaussians": instance.count,
+        "centre": instance.centre.tolist(),
+        "size": instance.size.tolist(),
+        "box": instance.box.tolist(),
+        "oriented_box": {
+            "centre": box.centre.tolist(),
+            "rotation": box.axes.tolist(),
+            "half_extents": box.half_extents.tolist(),
+        },
+    }
+
+
+def chosen(found: Sequence[Instance], numbers: Sequence[int]) -> Sequence[Instance]:
+    """The instances of these numbers, the best is 1; all without numbers. Raises InputError for another."""
+    if not found:
+        raise InputError("what was found lies nowhere on a surface: nothing to select")
+    for number in numbers:
+        if not 1 <= number <= len(found):
+            raise InputError(f"--instance {number}: there are {len(found)}, numbered from 1")
+    return [found[number - 1] for number in numbers] or found
+
+
+# `langsplat describe`: words for what is in a scene.
+
+Level = Literal["subpart", "part", "whole"]
+WIDTH = 118  # characters of a table that is not written to a terminal
+
+
+@dataclass(frozen=True)
+class Describe:
+    """What is here? The best words of a vocabulary for a pixel, a Gaussian or a thing that a phrase finds, or
+    the scene's inventory."""
+
+    scene: tyro.conf.Positional[Path]
+    """A trained scene, *.ply with its language field beside it."""
+    camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX")] = 0
+    """Training view in which --pixel is meant."""
+    pixel: Annotated[tuple[CountOrZero, CountOrZero] | None, tyro.conf.arg(metavar="X Y")] = None
+    """Column and row, counted from the top left pixel, 0 0."""
+    gaussian: Annotated[CountOrZero | None, tyro.conf.arg(metavar="NUMBER")] = None
+    """One Gaussian, by its row in the file, from 0."""
+    phrase: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
+    """A thing that this phrase finds."""
+    instance: Annotated[Count, tyro.conf.arg(metavar="NUMBER")] = 1
+    """Which of the things that --phrase finds, as `langsplat query` lists them; the best is 1."""
+    level: Level | None = None
+    """This semantic level alone."""
+    top: Count = 5
+    """Words per level."""
+    vocabulary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Your own list, one phrase per line, in place of the bundled everyday things and parts."""
+    encoder: str = ""
+    """Text encoder folder or hub id, in place of the one the scene names."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self) -> None:
+        phrases = None if self.vocabulary is None else read_vocabulary(self.vocabulary)
+        scene = load_scene(self.scene)
+        self._check(scene)
+        with TerminalProgress() as progress:
+            engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
+            describer = Describer(engine, phrases, progress)
+            answer = self._entries(describer, progress) if self._everything else self._words(describer)
+        answer |= {"encoder": engine.basis.encoder, "calibration": engine.basis.calibration}
+        if self.json:
+            json.dump(answer, sys.stdout, indent=1)
+            print()
+            return
+        if self._everything:
+            _print_inventory(answer["inventory"])
+        else:
+            _print_words(answer["levels"])
+        print(f"answers: {engine.basis.long}")
+        if describer.left_out:
+            names = ", ".join(describer.left_out[:3]) + (" ..." if len(describer.left_out) > 3 else "")
+            print(
+                f"{answer['asked']} phrases were compared; {len(describer.left_out)} were left out, because "
+                f"the encoder was never taught their words ({names})"
+            )
+
+    @property
+    def _everything(self) -> bool:
+        return self._asked_of == []
+
+    @property
+    def _asked_of(self) -> list[str]:
+        """The options that name a place."""
+        given = {"--pixel": self.pixel, "--gaussian": self.gaussian, "--phrase": self.phrase}
+        return [option for option, value in given.items() if value is not None]
+
+    def _check(self, scene: Scene) -> None:
+        """InputError for arguments that do not go with the scene or each other, before anything is loaded."""
+        if scene.language is None:
+            raise InputError(f"{self.scene}: {no_field(scene)}")
+        if len(self._asked_of) > 1:
+            raise InputError(f"{' and '.join(self._asked_of)} are several questions; ask one of them")
+        if self.phrase is None and self.instance != 1:
+            raise InputError(f"--instance {self.instance} needs a --phrase that finds it")
+        count = len(scene.gaussians)
+        if self.gaussian is not None and not 0 <= self.gaussian < count:
+            raise InputError(f"--gaussian {self.gaussian}: the scene has Gaussians 0 to {count - 1}")
+        if self.pixel is None:
+            if self.camera != 0:
+                raise InputError(f"--camera {self.camera} needs a --pixel X Y in it")
+            return
+        if not scene.cameras:
+            raise InputError(f"{self.scene}: has no cameras, so --pixel means nothing; ask by --gaussian")
+        if not 0 <= self.camera < len(scene.cameras):
+            raise InputError(f"--camera {self.camera}: the scene has cameras 0 to {len(scene.cameras) - 1}")
+        camera, (column, row) = scene.cameras[self.camera], self.pixel
+        if not (0 <= column < camera.width and 0 <= row < camera.height):
+            raise InputError(
+                f"--pixel {column} {row}: camera {self.camera} has columns 0 to {camera.width - 1} and rows "
+                f"0 to {camera.height - 1}"
+            )
+
+    def _entries(self, describer: Describer, progress: Progress) -> dict[str, Any]:
+        """The inventory, ready for JSON."""
+        sure = describer.engine.basis.calibration is not None
+        entries = [
+            _entry(entry, sure)
+            for entry in describer.inventory(progress)
+            if self.level in (None, LEVELS[entry.level])
+        ]
+        return _asked(describer) | {"inventory": entries}
+
+    def _words(self, describer: Describer) -> dict[str, Any]:
+        """Words of the pixel or Gaussian, ready for JSON."""
+        scene = describer.engine.scene
+        levels: Levels
+        if self.pixel is not None:
+            camera = scene.cameras[self.camera]
+            levels = describer.at_pixel(load_lifting_rasterizer("cpu"), camera, self.pixel, self.top)
+            place: dict[str, Any] = {"camera": self.camera, "view": camera.name, "pixel": list(self.pixel)}
+        elif self.phrase is not None:
+            thing = self._thing(describer.engine, self.phrase)
+            levels = describer.at_gaussians(thing.members, top=self.top)
+            place = {"phrase": self.phrase, "thing": instance_json(thing, self.instance)}
+        else:
+            levels = describer.at_gaussians(np.array([self.gaussian]), np.ones(1), self.top)
+            place = {"gaussian": self.gaussian}
+        wanted = [words for words in levels if self.level in (None, LEVELS[words.level])]
+        sure = describer.engine.basis.calibration is not None
+        return place | _asked(describer) | {"levels": [_level(words, sure) for words in wanted]}
+
+    def _thing(self, engine: QueryEngine, phrase: str) -> Instance:
+        answer = combine([run_phrase(engine, phrase, "auto").answer], "union")
+        found = find_instances(engine.surface, engine.scene.gaussians, answer.members, answer.relevancy)
+        return chosen(found, [self.instance])[0]
+
+
+def _asked(describer: Describer) -> dict[str, Any]:
+    return {"asked": len(describer.words[0].phrases), "left_out": len(describer.left_out)}
+
+
+def _share(softmax: float, sure: bool) -> dict[str, Any]:
+    """A share of the softmax over a vocabulary, and whether that is a probability too."""
+    return {"softmax": softmax, "probability": softmax if sure else None}
+
+
+def _word(word: Word | None, sure: bool) -> dict[str, Any] | None:
+    return None if word is None else {"phrase": word.phrase, **_share(word.probability, sure)}
+
+
+def _level(words: Words, sure: bool) -> dict[str, Any]:
+    return {
+        "level": LEVELS[words.level],
+        "words": [_word(word, sure) for word in words.words],
+        "other": words.other,
+        "known": words.known,
+        "colour": _word(words.colour, sure),
+        "material": _word(words.material, sure),
+    }
+
+
+def _spot(spot: Spot, sure: bool) -> dict[str, Any]:
+    return {
+        "centre": spot.centre.tolist(),
+        "box": spot.box.tolist(),
+        "gaussians": len(spot.rows),
+        "share": spot.share,
+        "colour": _word(spot.colour, sure),
+        "material": _word(spot.material, sure),
+    }
+
+
+def _entry(entry: Entry, sure: bool) -> dict[str, Any]:
+    return {
+        "phrase": entry.phrase,
+        "also": list(entry.also),
+        "level": LEVELS[entry.level],
+        **_share(entry.probability, sure),
+        "score": entry.score,
+        "share": entry.share,
+        "spots": [_spot(spot, sure) for spot in entry.spots],
+    }
+
+
+def _looks(described: dict[str, Any]) -> str:
+    return " ".join(described[key]["phrase"] for key in ("colour", "material") if described[key] is not None)
+
+
+def _percent(described: dict[str, Any]) -> str:
+    return "" if described["probability"] is None else f" {100 * described['probability']:.0f} %"
+
+
+def _print_inventory(entries: list[dict[str, Any]]) -> None:
+    table = Table("what", "also", "level", "p %", "surface %", "looks", "centre", box=None)
+    for entry in entries:
+        names = (
+            entry["phrase"],
+            ", ".join(entry["also"]),
+            entry["level"],
+            _percent(entry).strip(" %") or "-",
+        )
+        for number, spot in enumerate(entry["spots"]):
+            centre = " ".join(f"{value:.2f}" for value in spot["centre"])
+            start = names if number == 0 else ("", "", "", "")
+            table.add_row(*start, f"{100 * spot['share']:.2f}", _looks(spot), centre)
+    console = OutputConsole()
+    OutputConsole(width=max(WIDTH, console.width)).print(table)
+    if not entries:
+        print("nothing of the vocabulary was found in the scene")
+
+
+def _print_words(levels: list[dict[str, Any]]) -> None:
+    for level in reversed(levels):
+        if not level["words"]:
+            print(f"{level['level']:<8} nothing is known here")
+            continue
+        said = ", ".join(word["phrase"] + _percent(word) for word in level["words"])
+        looks = _looks(level)
+        print(f"{level['level']:<8} {said}" + (f"; looks {looks}" if looks else ""))

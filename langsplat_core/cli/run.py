@@ -25,9 +25,8 @@ import tyro
 
 from langsplat_core import __version__
 from langsplat_core.cli.checks import check_arguments
-from langsplat_core.errors import InputError, LangSplatError, printable_line
-from langsplat_core.extras import optional_imports
-from langsplat_core.files import NO_ROOM, shown
+from langsplat_core.errors import InputError, LangSplatError, optional_imports, printable_line
+from langsplat_core.io.files import NO_ROOM, shown
 from langsplat_core.progress import Terminated
 
 log = logging.getLogger("langsplat")

@@ -12,11 +12,11 @@ import tyro
 
 from langsplat_core.arrays import Array
 from langsplat_core.cli.checks import OutFile
-from langsplat_core.cli.instances import Unit, chosen, instance_json, table, unit_of
+from langsplat_core.cli.query import Unit, chosen, instance_json, table, unit_of
 from langsplat_core.config import Count, LevelChoice, NotNegative, Positive
 from langsplat_core.errors import InputError
-from langsplat_core.formats import check_writable, load_scene, save_scene
-from langsplat_core.formats.shapes import (
+from langsplat_core.io import check_writable, load_scene, save_scene
+from langsplat_core.io.shapes import (
     MESH_SUFFIXES,
     POINT_SUFFIXES,
     base_colours,
@@ -24,11 +24,9 @@ from langsplat_core.formats.shapes import (
     write_meshes,
     write_points,
 )
-from langsplat_core.query.combined import Combination, Combined, combine
-from langsplat_core.query.compose import run_phrase
+from langsplat_core.query.compose import Combination, Combined, combine, run_phrase
 from langsplat_core.query.engine import QueryEngine, no_field
-from langsplat_core.query.hulls import hulls
-from langsplat_core.query.instances import Instance, find_instances
+from langsplat_core.query.instances import Instance, find_instances, hulls
 from langsplat_core.query.selection import grow, of_rows, shrink, union
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoders import load_text_encoder

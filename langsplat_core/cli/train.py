@@ -15,10 +15,16 @@ import tyro
 
 from langsplat_core.cli.checks import OutFile, OutFolder
 from langsplat_core.cli.run import one_line
-from langsplat_core.config import TRAIN_PROFILES, TrainConfig, TrainPreset, TrainProfile, with_preset
+from langsplat_core.config import (
+    TRAIN_PROFILES,
+    TrainConfig,
+    TrainPreset,
+    TrainProfile,
+    check_settings,
+    with_preset,
+)
 from langsplat_core.errors import InputError
 from langsplat_core.progress import LineProgress, TerminalProgress, silent
-from langsplat_core.ranges import check_settings
 
 log = logging.getLogger("langsplat")
 
@@ -49,8 +55,8 @@ class Train:
 
     def run(self) -> None:
         # They import torch: seconds that --help need not pay.
-        from langsplat_core.pipeline.crew import join_crew
         from langsplat_core.pipeline.forecast import Forecast, count_photographs, forecast_in_words, plan
+        from langsplat_core.pipeline.stages import join_crew
         from langsplat_core.pipeline.train import train_scene
         from langsplat_core.semantics.weights import torch_device
 

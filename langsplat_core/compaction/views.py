@@ -2,6 +2,7 @@
 
 import logging
 import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,13 +10,16 @@ from typing import TypeVar
 
 import numpy as np
 
-from langsplat_core.arrays import Array
-from langsplat_core.config import CompactConfig, DatasetConfig
+from langsplat_core.arrays import Array, mean_squared_error, psnr
+from langsplat_core.config import CompactConfig, DatasetConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
-from langsplat_core.progress import Progress
-from langsplat_core.ranges import check_settings
-from langsplat_core.scene import Camera, Scene, look_at
+from langsplat_core.io import load_scene, save_scene
+from langsplat_core.io.summary import disk_bytes, memory_bytes
+from langsplat_core.progress import Progress, silent
+from langsplat_core.raster.protocol import LiftingRasterizer, Rasterizer, View
+from langsplat_core.raster.render import colours_seen, splat_colours
+from langsplat_core.scene import SH_COUNTS, Camera, Scene, look_at
 
 log = logging.getLogger("langsplat")
 
@@ -147,3 +151,213 @@ def _limited(camera: Camera, max_side: int) -> Camera:
     if factor >= 1:
         return camera
     return camera.resized(max(round(camera.width * factor), 1), max(round(camera.height * factor), 1))
+
+
+# What each Gaussian contributes to the pictures of a scene, and what pictures lose without some of them.
+#
+# **Contribution.** In a view with blending weights w (a row of W per pixel p), taking Gaussian i of colour
+# c_i away changes pixel p by about w_pi (c_i - C_p): its weight times its distance from the picture C. The
+# adjoint sums this over pixels without ever listing them: with one gather of [1, C, |C|^2],
+#
+#     W_i = sum_p w_pi,    E_i = sum_p w_pi |c_i - C_p|^2 = |c_i|^2 W_i - 2 c_i . (W^T C)_i + (W^T |C|^2)_i,
+#
+# and by Cauchy-Schwarz sum_p w_pi |c_i - C_p| <= sqrt(W_i E_i), an upper bound of the total change in display
+# values times pixels. That is of one Gaussian taken away alone. Many of one colour hold a white wall up
+# together, though each has nothing but its like behind it; so every Gaussian counts as at least `ALONE` away
+# from the picture: its contribution is sqrt(W_i (E_i + ALONE^2 W_i)). Over views the largest counts, so that
+# what only one view shows is not averaged away. On the bundled scene, at 77 % of the Gaussians, the mean loss
+# (the worst view's) is 0.21 (1.3) dB; ranked by W_i it is 0.42 (1.3), by sqrt(W_i E_i) 0.30 (3.4).
+#
+# **Loss.** With photographs, the loss in PSNR is measured on them. Without, it is derived from how far the
+# compact picture lies from the original one: removing something from a trained scene is, to first order,
+# uncorrelated with what the scene already gets wrong (at a minimum of the training loss no direction helps),
+# so squared errors add. A view that the original shows with mean squared error e and that changes by d loses
+#
+#     10 log10(1 + d / e) dB.
+#
+# e is not known without photographs; it is what a scene of an assumed PSNR has. A scene that is worse than
+# assumed loses less than stated, so the assumption should be on the high side. On the bundled scene, with its
+# photographs and true e, this agreed with the measured loss within 0.03 dB at losses up to 1 dB.
+
+ALONE = 0.055  # display values, RGB distance; see above
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuringView:
+    """One view on which the loss is measured."""
+
+    camera: Camera
+    original: Array  # (H, W, 3) float32 in [0, 1], the picture of the original scene
+    photograph: Array | None = None  # (H, W, 3) float32 in [0, 1]
+
+
+def draw(rasterizer: Rasterizer, scene: Scene, camera: Camera) -> tuple[View, Array]:
+    """The projected view and its (H, W, 3) float32 picture, unclipped, without background."""
+    view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
+    return view, splat_colours(view, scene.gaussians, camera).colours
+
+
+def measuring_views(
+    rasterizer: Rasterizer, scene: Scene, cameras: Sequence[Camera], photographs: Sequence[Array | None]
+) -> list[MeasuringView]:
+    """Pictures of the original `scene`, with the (H, W, 3) uint8 photographs of the same cameras or None."""
+    views = []
+    for camera, photograph in zip(cameras, photographs, strict=True):
+        truth = None if photograph is None else photograph.astype(np.float32) / 255
+        picture = np.clip(draw(rasterizer, scene, camera)[1], 0, 1)
+        views.append(MeasuringView(camera, picture, truth))
+    return views
+
+
+def contributions(
+    rasterizer: LiftingRasterizer, scene: Scene, cameras: Sequence[Camera], progress: Progress = silent
+) -> Array:
+    """(N,) float64 >= 0: the largest contribution of each Gaussian to any of `cameras` (see above)."""
+    largest = np.zeros(len(scene.gaussians))
+    for index, camera in enumerate(cameras):
+        view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
+        own = colours_seen(scene.gaussians, camera)
+        picture = view.splat(own)[0]
+        stacked = [np.ones_like(picture[..., :1]), picture, (picture**2).sum(-1, keepdims=True)]
+        sums = view.gather(np.concatenate(stacked, -1)).astype(np.float64)
+        weight, own = sums[:, 0], own.astype(np.float64)
+        error = (own**2).sum(1) * weight - 2 * (own * sums[:, 1:4]).sum(1) + sums[:, 4]
+        score = np.sqrt(weight * (np.maximum(error, 0) + ALONE**2 * weight))
+        np.maximum(largest, score, out=largest)
+        progress("ranking Gaussians", (index + 1) / len(cameras))
+    return largest
+
+
+def psnr_losses(
+    rasterizer: Rasterizer, scene: Scene, views: Sequence[MeasuringView], assumed_psnr: float
+) -> Array:
+    """(V,) dB lost by `scene` in each view; negative where it comes nearer to a photograph.
+
+    `assumed_psnr` (dB) is the original's, used for views without a photograph.
+    """
+    losses = []
+    for view_ in views:
+        picture = np.clip(draw(rasterizer, scene, view_.camera)[1], 0, 1)
+        if view_.photograph is None:
+            change = mean_squared_error(picture, view_.original)
+            losses.append(estimated_loss(change, assumed_psnr))
+        else:
+            before, after = (psnr(image, view_.photograph) for image in (view_.original, picture))
+            losses.append(before - after)
+    return np.array(losses)
+
+
+def estimated_loss(change: float, assumed_psnr: float) -> float:
+    """dB lost when a view of `assumed_psnr` dB changes by the mean squared error `change`."""
+    return float(10 * np.log10(1 + change * 10 ** (assumed_psnr / 10)))
+
+
+def reduced(scene: Scene, rows: Array, sh_degree: int) -> Scene:
+    """The Gaussians at `rows` with spherical harmonics up to `sh_degree` at most."""
+    kept = scene.take(rows)
+    count = min(SH_COUNTS[sh_degree], kept.gaussians.sh.shape[1])
+    return replace(kept, gaussians=replace(kept.gaussians, sh=kept.gaussians.sh[:, :count]))
+
+
+# What a scene costs, and what it is worth: bytes, milliseconds, decibels.
+
+ROUNDS = 3  # timed pictures of every measuring view
+UNLIKE = 10.0  # dB: a scene that is this far from the photographs does not show what they show
+
+
+@dataclass(frozen=True)
+class Weight:
+    """What a scene costs, and what it is worth."""
+
+    gaussians: int
+    sh_degree: int
+    disk_bytes: int  # in the target format, with language field and cameras
+    memory_bytes: int  # arrays of the Gaussians, extra properties and language field
+    render_ms: float  # mean over the measuring views, CPU backend; before and after drawn in turn
+    psnr: float | None  # mean against the photographs, dB; None without
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """A scene as the target format gives it back, and the size of its files."""
+
+    scene: Scene
+    disk_bytes: int
+
+
+def check_likeness(measured: Sequence[MeasuringView]) -> None:
+    scores = [psnr(e.original, e.photograph) for e in measured if e.photograph is not None]
+    if scores and np.mean(scores) < UNLIKE:
+        raise InputError(
+            f"the photographs show something else than the scene (PSNR {np.mean(scores):.1f} dB); "
+            "give the dataset that it was trained on, or leave --photos out"
+        )
+
+
+def stored(scene: Scene, out: Path) -> Stored:
+    """The scene after a journey through a file named like `out`."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / out.name
+        save_scene(path, replace(scene, path=path))
+        return Stored(load_scene(path), disk_bytes(path))
+
+
+def weigh(
+    rasterizer: Rasterizer, pair: tuple[Stored, Stored], measured: Sequence[MeasuringView]
+) -> list[Weight]:
+    times = _render_times(rasterizer, (pair[0].scene, pair[1].scene), measured)
+    return [
+        Weight(
+            gaussians=len(stored.scene.gaussians),
+            sh_degree=stored.scene.gaussians.sh_degree,
+            disk_bytes=stored.disk_bytes,
+            memory_bytes=memory_bytes(stored.scene),
+            render_ms=milliseconds,
+            psnr=mean_psnr(rasterizer, stored.scene, measured),
+        )
+        for stored, milliseconds in zip(pair, times, strict=True)
+    ]
+
+
+def worst_loss(
+    rasterizer: Rasterizer, before: Scene, after: Scene, views: Views, psnr_before: float
+) -> float:
+    """dB lost in the ranking view that loses most; one at a time, for their pictures may be many."""
+    return max(
+        float(
+            psnr_losses(
+                rasterizer, after, measuring_views(rasterizer, before, [camera], [None]), psnr_before
+            )[0]
+        )
+        for camera in views.ranking
+    )
+
+
+def likeness(rasterizer: Rasterizer, scene: Scene, measured: Sequence[MeasuringView]) -> float:
+    pictures = [np.clip(draw(rasterizer, scene, view.camera)[1], 0, 1) for view in measured]
+    return float(np.mean([psnr(new, e.original) for new, e in zip(pictures, measured, strict=True)]))
+
+
+def mean_psnr(rasterizer: Rasterizer, scene: Scene, measured: Sequence[MeasuringView]) -> float | None:
+    scores = [
+        psnr(np.clip(draw(rasterizer, scene, e.camera)[1], 0, 1), e.photograph)
+        for e in measured
+        if e.photograph is not None
+    ]
+    return float(np.mean(scores)) if scores else None
+
+
+def _render_times(
+    rasterizer: Rasterizer, scenes: tuple[Scene, Scene], measured: Sequence[MeasuringView]
+) -> tuple[float, float]:
+    """Milliseconds of a picture of each scene (projection, colours and blending): the best of `ROUNDS` per
+    view, averaged over views. Drawn in turn, so that another program's load falls on both."""
+    seconds = np.full((len(measured), 2), np.inf)
+    for _ in range(ROUNDS):
+        for best, view in zip(seconds, measured, strict=True):
+            for which, scene in enumerate(scenes):
+                start = time.perf_counter()
+                draw(rasterizer, scene, view.camera)
+                best[which] = min(best[which], time.perf_counter() - start)
+    before, after = 1e3 * seconds.mean(0)
+    return float(before), float(after)

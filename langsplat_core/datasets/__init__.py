@@ -4,15 +4,13 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets.capture import Capture
+from langsplat_core.config import DatasetConfig, check_settings
+from langsplat_core.datasets.capture import Capture, metres_of
 from langsplat_core.datasets.colmap import find_model, load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
-from langsplat_core.datasets.places import metres_of
 from langsplat_core.errors import InputError
-from langsplat_core.files import shown
+from langsplat_core.io.files import shown
 from langsplat_core.progress import Progress, silent
-from langsplat_core.ranges import check_settings
 
 __all__ = ["Capture", "load_capture"]
 
@@ -59,7 +57,7 @@ def _load(path: Path, config: DatasetConfig, work: Path, progress: Progress) -> 
     model = find_model(path)
     if model is not None:
         return load_colmap(path, model, max_side, progress)
-    from langsplat_core.datasets.photos import load_photos, photo_folder
+    from langsplat_core.datasets.sfm import load_photos, photo_folder
 
     photos = photo_folder(path)
     if photos is None:

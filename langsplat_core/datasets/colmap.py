@@ -1,21 +1,29 @@
-"""Datasets with a COLMAP model: ``sparse/0`` (or another number) or ``sparse``, beside ``images``."""
+"""COLMAP's sparse models, binary or text, read by ourselves: pycolmap does not notice where a file ends
+and fills cameras of a truncated one with whatever lies in memory.
+
+Layout: https://colmap.github.io/format.html. Rigs and frames (COLMAP >= 3.12) add nothing here, because
+images.bin still carries every image's own pose.
+"""
 
 import logging
 import os
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
-from langsplat_core.arrays import Array
-from langsplat_core.datasets.capture import Capture, tell_of_lost_points
-from langsplat_core.datasets.colmap_model import (
-    ModelCamera,
-    SparseModel,
-    has_model,
-    read_images,
-    read_model,
+from langsplat_core.arrays import Array, rotation_matrices
+from langsplat_core.datasets.capture import (
+    Capture,
+    Photo,
+    develop,
+    find_photos,
+    shortened,
+    tell_of_lost_points,
 )
-from langsplat_core.datasets.images import Photo, develop, find_photos, shortened
 from langsplat_core.datasets.intrinsics import (
     BrownDistortion,
     ColmapDistortion,
@@ -24,8 +32,248 @@ from langsplat_core.datasets.intrinsics import (
     PhotoIntrinsics,
 )
 from langsplat_core.errors import FormatError, InputError, printable_line
-from langsplat_core.files import shown
+from langsplat_core.io.files import shown
 from langsplat_core.progress import Progress
+from langsplat_core.scene import FARTHEST
+
+Result = TypeVar("Result")
+
+MOST_DIGITS = 20  # of a whole number of 64 bits
+
+# id -> name and parameters, in file order
+CAMERA_MODELS = {
+    0: ("SIMPLE_PINHOLE", "f cx cy"),
+    1: ("PINHOLE", "fx fy cx cy"),
+    2: ("SIMPLE_RADIAL", "f cx cy k1"),
+    3: ("RADIAL", "f cx cy k1 k2"),
+    4: ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
+    5: ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4"),
+    6: ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+    7: ("FOV", "fx fy cx cy omega"),
+    8: ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1"),
+    9: ("RADIAL_FISHEYE", "f cx cy k1 k2"),
+    10: ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3"),
+    12: ("SIMPLE_DIVISION", "f cx cy k"),
+    13: ("DIVISION", "fx fy cx cy k"),
+    14: ("SIMPLE_FISHEYE", "f cx cy"),
+    15: ("FISHEYE", "fx fy cx cy"),
+    16: ("EUCM", "fx fy cx cy alpha beta"),
+}
+
+
+@dataclass(frozen=True)
+class ModelCamera:
+    """A row of cameras.bin."""
+
+    model: str  # name in CAMERA_MODELS
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def named(self) -> dict[str, float]:
+        """Parameters by name; a single focal length appears as both fx and fy."""
+        keys = next(keys for name, keys in CAMERA_MODELS.values() if name == self.model)
+        values = dict(zip(keys.split(), self.params, strict=True))
+        if "f" in values:
+            values["fx"] = values["fy"] = values.pop("f")
+        return values
+
+
+@dataclass(frozen=True, eq=False)
+class ModelImage:
+    """A row of images.bin, without its 2D points."""
+
+    name: str
+    camera_id: int
+    world_to_camera: Array  # (4, 4) float64
+
+
+@dataclass(frozen=True, eq=False)
+class SparseModel:
+    """What a COLMAP model says."""
+
+    cameras: dict[int, ModelCamera]
+    images: list[ModelImage]
+    points: Array  # (M, 3) float64 world units
+    colours: Array  # (M, 3) uint8
+    errors: Array  # (M,) float64 mean reprojection error, pixels; -1 where unknown
+    track_lengths: Array  # (M,) int64 how many images see the point; 0 where unknown
+
+
+def has_model(folder: Path) -> bool:
+    """Whether cameras and images lie in `folder`, both binary or both text."""
+    return _suffix(folder) is not None
+
+
+def _suffix_of(folder: Path) -> str:
+    """InputError where there is no model."""
+    suffix = _suffix(folder)
+    if suffix is None:
+        raise InputError(f"{folder} holds no cameras.bin and images.bin (or .txt)")
+    return suffix
+
+
+def _suffix(folder: Path) -> str | None:
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{part}{suffix}").is_file() for part in ("cameras", "images")):
+            return suffix
+    return None
+
+
+def read_images(folder: Path) -> list[ModelImage]:
+    """Those of the model in `folder`, alone. FormatError where they are damaged."""
+    suffix = _suffix_of(folder)
+    return _guarded((_BINARY if suffix == ".bin" else _TEXT)[1], folder / f"images{suffix}")
+
+
+def read_model(folder: Path) -> SparseModel:
+    """Read the model in `folder`; binary is preferred. FormatError names the file that is broken."""
+    suffix = _suffix_of(folder)
+    read_cameras, _, read_points = _BINARY if suffix == ".bin" else _TEXT
+    cameras = _guarded(read_cameras, folder / f"cameras{suffix}")
+    images = read_images(folder)
+    for image in images:
+        if image.camera_id not in cameras:
+            raise FormatError(
+                f"{folder / f'images{suffix}'}: {printable_line(image.name, 80)} was taken with camera "
+                f"{image.camera_id}, "
+                "which the model lacks; export the model again"
+            )
+    points_file = folder / f"points3D{suffix}"
+    points = _guarded(read_points, points_file) if points_file.is_file() else _points([])
+    return SparseModel(cameras, images, *points)
+
+
+def _guarded(read: Callable[[bytes], Result], path: Path) -> Result:
+    try:
+        return read(path.read_bytes())
+    except (struct.error, ValueError, IndexError, OverflowError) as error:
+        raise FormatError(
+            f"{path} is no readable COLMAP file ({printable_line(error, 120)}); export the model again"
+        ) from None
+
+
+def _image(name: str, camera_id: int, quaternion_wxyz: Array, translation: Array) -> ModelImage:
+    largest = np.abs(quaternion_wxyz).max()
+    if not ((np.abs(translation) <= FARTHEST).all() and 1e-9 < largest < 1e9):
+        raise ValueError(f"image {name} has an impossible pose")
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation_matrices(quaternion_wxyz[None])[0]
+    matrix[:3, 3] = translation
+    return ModelImage(name, camera_id, matrix)
+
+
+def _camera(model: str, width: int, height: int, params: tuple[float, ...]) -> ModelCamera:
+    if not (width > 0 and height > 0 and np.isfinite(params).all()):
+        raise ValueError(f"a {model} camera of {width}x{height} pixels with parameters {params}")
+    return ModelCamera(model, width, height, params)
+
+
+PointRow = tuple[Any, Any, float, int]  # position (3,), colour (3,), error, track length
+Points = tuple[Array, Array, Array, Array]
+
+
+def _points(rows: list[PointRow]) -> Points:
+    positions, colours, errors, tracks = zip(*rows, strict=True) if rows else ((), (), (), ())
+    return (
+        np.array(positions, np.float64).reshape(-1, 3),
+        np.array(colours, np.uint8).reshape(-1, 3),
+        np.array(errors, np.float64),
+        np.array(tracks, np.int64),
+    )
+
+
+def _binary_cameras(data: bytes) -> dict[int, ModelCamera]:
+    (count,) = struct.unpack_from("<Q", data)
+    offset, cameras = 8, {}
+    for _ in range(count):  # a count too large ends in struct.error at the end of the data
+        camera_id, model_id, width, height = struct.unpack_from("<iiQQ", data, offset)
+        if model_id not in CAMERA_MODELS:
+            raise ValueError(f"camera model number {model_id} is unknown or not a pinhole with a lens")
+        model, keys = CAMERA_MODELS[model_id]
+        params = struct.unpack_from(f"<{len(keys.split())}d", data, offset + 24)
+        cameras[camera_id] = _camera(model, width, height, params)
+        offset += 24 + 8 * len(params)
+    return cameras
+
+
+def _binary_images(data: bytes) -> list[ModelImage]:
+    (count,) = struct.unpack_from("<Q", data)
+    offset, images = 8, []
+    for _ in range(count):
+        _, *pose, camera_id = struct.unpack_from("<i7di", data, offset)
+        end = data.index(b"\0", offset + 64)
+        images.append(
+            _image(data[offset + 64 : end].decode(), camera_id, np.array(pose[:4]), np.array(pose[4:]))
+        )
+        (observations,) = struct.unpack_from("<Q", data, end + 1)
+        offset = end + 9 + 24 * observations
+        if offset > len(data):
+            raise ValueError(f"the file ends inside image {images[-1].name}")
+    return images
+
+
+def _binary_points(data: bytes) -> Points:
+    (count,) = struct.unpack_from("<Q", data)
+    offset, rows = 8, []
+    for _ in range(count):
+        _, x, y, z, r, g, b, error, track = struct.unpack_from("<Q3d3BdQ", data, offset)
+        offset += 51 + 8 * track
+        if offset > len(data):
+            raise ValueError("the file ends inside a point")
+        rows.append(((x, y, z), (r, g, b), error, track))
+    return _points(rows)
+
+
+def _lines(data: bytes) -> list[str]:
+    return [line.strip() for line in data.decode().splitlines() if not line.startswith("#")]
+
+
+def _whole(text: str) -> int:
+    """Python's own numbers have no limit, and no place in a message then."""
+    if len(text) > MOST_DIGITS:
+        raise ValueError(f"a whole number of {len(text)} digits")
+    return int(text)
+
+
+def _text_cameras(data: bytes) -> dict[int, ModelCamera]:
+    sizes = {name: len(keys.split()) for name, keys in CAMERA_MODELS.values()}
+    cameras = {}
+    for line in filter(None, _lines(data)):
+        camera_id, model, width, height, *params = line.split()
+        if len(params) != sizes.get(model):
+            raise ValueError(f"camera {camera_id}: {len(params)} parameters do not make a {model}")
+        cameras[_whole(camera_id)] = _camera(model, _whole(width), _whole(height), tuple(map(float, params)))
+    return cameras
+
+
+def _text_images(data: bytes) -> list[ModelImage]:
+    lines = _lines(data)
+    while lines and not lines[-1]:
+        lines.pop()
+    images = []
+    for line in lines[::2]:  # every second line lists 2D points, and may be empty
+        _, *pose, camera_id, name = line.split(maxsplit=9)
+        numbers = np.array(pose, np.float64)
+        images.append(_image(name, _whole(camera_id), numbers[:4], numbers[4:]))
+    return images
+
+
+def _text_points(data: bytes) -> Points:
+    rows: list[PointRow] = []
+    for line in filter(None, _lines(data)):
+        fields = line.split()
+        numbers = [float(field) for field in fields[1:4]]
+        rows.append((numbers, [_whole(c) for c in fields[4:7]], float(fields[7]), len(fields[8:]) // 2))
+    return _points(rows)
+
+
+_BINARY = (_binary_cameras, _binary_images, _binary_points)
+_TEXT = (_text_cameras, _text_images, _text_points)
+
+
+# Datasets with a COLMAP model: ``sparse/0`` (or another number) or ``sparse``, beside ``images``.
 
 log = logging.getLogger("langsplat")
 

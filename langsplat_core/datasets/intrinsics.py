@@ -1,18 +1,75 @@
-"""Intrinsics of photographs: where a photograph's pixels look, in the conventions of COLMAP and OpenCV.
+"""pycolmap, imported so that it leaves signals alone and its libraries keep to one thread.
 
-A point in the camera's frame has *normalised* coordinates (x/z, y/z). A distortion maps normalised to
-distorted coordinates, and the pixel position is ``(fx * x_d + cx, fy * y_d + cy)``, with pixel centres
-at +0.5. Formulas: OpenCV's "Camera Calibration and 3D Reconstruction" and "Fisheye camera model".
-Everything here is float64; it is the reference that resampling follows.
+Its logging library installs a handler of its own for SIGTERM, which prints a stack trace and kills the
+process. Whatever was there before is put back. Its wheel brings OpenMP (and a package of other make may bring
+OpenBLAS) of its own, which ask the environment how many threads to use when they are loaded, and never again.
+COLMAP's own threads are another matter. Import `pycolmap` from here.
 """
 
+import ctypes
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from PIL import Image
+from scipy.ndimage import map_coordinates
 
 from langsplat_core.arrays import Array
-from langsplat_core.scene import Intrinsics
+from langsplat_core.errors import InputError
+from langsplat_core.scene import Camera, Intrinsics
+
+__all__ = ["pycolmap"]
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """What is loaded meanwhile keeps to one thread."""
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _handler(number: int, handler: int | None) -> int | None:
+    """Set the C handler of a signal; returns what was there, as a pointer. Any thread may do this, unlike
+    Python's own `signal.signal`."""
+    install = ctypes.CDLL(None).signal
+    install.restype, install.argtypes = ctypes.c_void_p, (ctypes.c_int, ctypes.c_void_p)
+    before: int | None = install(number, handler)
+    return before
+
+
+if sys.platform == "win32":  # no such handler there
+    with _one_thread():
+        import pycolmap
+else:
+    _before = _handler(signal.SIGTERM, None)
+    try:
+        with _one_thread():
+            import pycolmap
+    finally:
+        _handler(signal.SIGTERM, _before)
+        signal.siginterrupt(signal.SIGTERM, True)  # as Python has it: a call that waits shall return
+
+
+# Intrinsics of photographs: where a photograph's pixels look, in the conventions of COLMAP and OpenCV.
+#
+# A point in the camera's frame has *normalised* coordinates (x/z, y/z). A distortion maps normalised to
+# distorted coordinates, and the pixel position is ``(fx * x_d + cx, fy * y_d + cy)``, with pixel centres
+# at +0.5. Formulas: OpenCV's "Camera Calibration and 3D Reconstruction" and "Fisheye camera model".
+# Everything here is float64; it is the reference that resampling follows.
 
 # What no photograph exceeds; numbers of damaged files would overflow in what is computed from them.
 MOST_SIDE = 1 << 20  # pixels
@@ -84,7 +141,6 @@ class ColmapDistortion:
     cy: float
 
     def __call__(self, xy: Array) -> Array:
-        from langsplat_core.datasets.colmap_library import pycolmap
 
         # The size plays no part in these models, but pycolmap asks for one.
         camera = pycolmap.Camera(model=self.model, width=1, height=1, params=np.array(self.params))
@@ -126,3 +182,152 @@ class PhotoIntrinsics(Intrinsics):
         """(N, 2) normalised coordinates -> (N, 2) pixel positions in the photograph."""
         distorted = xy if self.distortion is None else self.distortion(xy)
         return distorted * (self.fx, self.fy) + (self.cx, self.cy)
+
+
+# From a lens to a pinhole: the inverse of a distortion, the choice of pinhole, and the resampling.
+
+MAX_HALF_ANGLE = np.radians(65)  # from the axis; a pinhole picture stretches without bound towards 90
+BORDER_SAMPLES = 64  # per side of the photograph
+NEWTON_STEPS = 30
+
+
+def _radial_profile(distortion: Distortion) -> tuple[Array, Array]:
+    """Radii 0 to R that can be inverted, and the mean distorted radius of each.
+
+    R is the cap `MAX_HALF_ANGLE` or just inside the first radius at which the map folds over, that is
+    where its Jacobian is singular in some direction: fitted polynomials often do so beyond the corners.
+    """
+    radii = np.tan(np.linspace(0, MAX_HALF_ANGLE, 400))
+    angles = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    points = radii[:, None, None] * np.stack([np.cos(angles), np.sin(angles)], -1)
+    with np.errstate(all="ignore"):  # absurd coefficients overflow; what is not a number counts as folded
+        determinant = np.linalg.det(_jacobian(distortion, points.reshape(-1, 2)))
+        folded = ~(determinant > 0).reshape(len(radii), -1).all(1)
+        end = int(np.argmax(folded)) if folded.any() else len(radii)
+        distorted = distortion(points[:end].reshape(-1, 2)).reshape(end, -1, 2)
+        profile = np.linalg.norm(distorted, axis=-1).mean(1)
+    return radii[:end], profile
+
+
+def _jacobian(distortion: Distortion, xy: Array, step: float = 1e-6) -> Array:
+    """(N, 2, 2) by central differences; Newton's method needs no better."""
+    columns = [
+        (distortion(xy + offset) - distortion(xy - offset)) / (2 * step) for offset in np.eye(2) * step
+    ]
+    return np.stack(columns, -1)
+
+
+def undistorted_points(distortion: Distortion, distorted: Array) -> Array:
+    """(N, 2) distorted -> (N, 2) normalised coordinates, by Newton's method from the radial inverse.
+
+    Points that the lens cannot have seen within the invertible radius come back on that radius.
+    Raises ValueError if the distortion is singular on the axis itself.
+    """
+    radii, profile = _radial_profile(distortion)
+    if len(radii) < 2:
+        raise ValueError("the distortion cannot be inverted even at the centre")
+    length = np.linalg.norm(distorted, axis=-1)
+    direction = distorted / np.maximum(length, 1e-12)[:, None]
+    xy = direction * np.interp(length, profile, radii)[:, None]
+    limit = radii[-1]
+    for _ in range(NEWTON_STEPS):
+        step = np.linalg.solve(_jacobian(distortion, xy), (distortion(xy) - distorted)[:, :, None])[:, :, 0]
+        # A short step cannot leap over a fold; the radius cannot leave the invertible disc.
+        step *= np.minimum(1, 0.2 * limit / np.maximum(np.linalg.norm(step, axis=-1), 1e-300))[:, None]
+        xy = xy - step
+        xy *= np.minimum(1, limit / np.maximum(np.linalg.norm(xy, axis=-1), 1e-300))[:, None]
+        if np.abs(step).max(initial=0) < 1e-13:
+            break
+    return xy
+
+
+def pinhole_for(intrinsics: PhotoIntrinsics, max_side: int) -> Camera:
+    """The pinhole camera (identity pose) that a photograph of `lens` is resampled to.
+
+    It shows the largest upright rectangle with no pixel from outside the photograph (OpenCV's
+    ``alpha = 0``), with the lens's own central magnification, then shrunk so that the longer side has at
+    most `max_side` pixels. InputError if the lens leaves no such rectangle.
+    """
+    if intrinsics.distortion is None:
+        scale = min(1.0, max_side / max(intrinsics.width, intrinsics.height))
+        whole = Camera(
+            intrinsics.width,
+            intrinsics.height,
+            intrinsics.fx,
+            intrinsics.fy,
+            intrinsics.cx,
+            intrinsics.cy,
+            np.eye(4),
+        )
+        return whole.resized(
+            max(1, round(intrinsics.width * scale)), max(1, round(intrinsics.height * scale))
+        )
+    left, top, right, bottom = _inner_rectangle(intrinsics)
+    wide, high = intrinsics.fx * (right - left), intrinsics.fy * (bottom - top)
+    if not (wide >= 1 and high >= 1):
+        raise InputError(f"{intrinsics} leaves no picture once its distortion is removed; calibrate it again")
+    scale = min(1.0, max_side / max(wide, high))
+    width, height = max(1, int(wide * scale)), max(1, int(high * scale))
+    fx, fy = intrinsics.fx * scale, intrinsics.fy * scale
+    # Whole pixels: what is cut off is shared between both edges.
+    cx = -left * fx - (wide * scale - width) / 2
+    cy = -top * fy - (high * scale - height) / 2
+    return Camera(width, height, fx, fy, cx, cy, np.eye(4))
+
+
+def _inner_rectangle(intrinsics: PhotoIntrinsics) -> tuple[float, float, float, float]:
+    """Normalised left, top, right, bottom of a rectangle wholly inside the undistorted outline."""
+    assert intrinsics.distortion is not None
+    t = np.linspace(0, 1, BORDER_SAMPLES)
+    zero, one = np.zeros_like(t), np.ones_like(t)
+    sides = np.stack([np.stack(side, -1) for side in ((zero, t), (t, zero), (one, t), (t, one))])
+    pixels = sides.reshape(-1, 2) * (intrinsics.width, intrinsics.height)
+    distorted = (pixels - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy)
+    try:
+        xy = undistorted_points(intrinsics.distortion, distorted).reshape(4, -1, 2)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise InputError(f"{intrinsics}: {error}; calibrate it again") from None
+    left, top, right, bottom = xy
+    return (
+        float(left[:, 0].max()),
+        float(top[:, 1].max()),
+        float(right[:, 0].min()),
+        float(bottom[:, 1].min()),
+    )
+
+
+def source_positions(intrinsics: PhotoIntrinsics, camera: Camera) -> Array:
+    """(H, W, 2) float64 position in the photograph of the centre of each of the camera's pixels."""
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    grid = np.stack(np.meshgrid(x, y), -1)
+    return intrinsics.pixels(grid.reshape(-1, 2)).reshape(grid.shape)
+
+
+def resample(
+    photo: Image.Image, intrinsics: PhotoIntrinsics, camera: Camera, positions: Array | None
+) -> Array:
+    """(H, W, 3) uint8 picture of `camera` from an RGB photograph of `lens`, which has the same size.
+
+    `positions` is `source_positions(lens, camera)`, or None for a lens without distortion. The
+    photograph is first shrunk to the camera's magnification by an area-weighted filter, so that the
+    interpolation (cubic spline) that follows neither aliases nor blurs.
+    """
+    if positions is None:
+        size = (camera.width, camera.height)
+        return np.asarray(photo if photo.size == size else photo.resize(size, Image.Resampling.LANCZOS))
+    scale = camera.fx / intrinsics.fx
+    if scale < 1:
+        size = (max(1, round(intrinsics.width * scale)), max(1, round(intrinsics.height * scale)))
+        photo = photo.resize(size, Image.Resampling.LANCZOS)
+    pixels = np.asarray(photo)
+    # Array index i holds the pixel whose centre is at i + 0.5.
+    rows = positions[..., 1] * (pixels.shape[0] / intrinsics.height) - 0.5
+    columns = positions[..., 0] * (pixels.shape[1] / intrinsics.width) - 0.5
+    out = np.empty((camera.height, camera.width, 3), np.uint8)
+    for channel in range(3):
+        values = map_coordinates(
+            pixels[..., channel], [rows, columns], output=np.float32, order=3, mode="nearest"
+        )
+        out[..., channel] = np.clip(np.rint(values), 0, 255)
+    return out

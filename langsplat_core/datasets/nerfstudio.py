@@ -15,13 +15,11 @@ from typing import Any
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.capture import Capture, tell_of_lost_points
-from langsplat_core.datasets.images import Photo, develop, shortened
+from langsplat_core.datasets.capture import Capture, Photo, develop, shortened, tell_of_lost_points
 from langsplat_core.datasets.intrinsics import BrownDistortion, Distortion, FisheyeDistortion, PhotoIntrinsics
 from langsplat_core.errors import FormatError, InputError, printable_line, quoted
-from langsplat_core.parsing.cloud import read_cloud
-from langsplat_core.parsing.opening import read_json_file
-from langsplat_core.parsing.pictures import PHOTO_SUFFIXES, PictureError, picture_size
+from langsplat_core.io.hostile import PHOTO_SUFFIXES, PictureError, picture_size, read_json_file
+from langsplat_core.io.ply_table import read_cloud
 from langsplat_core.progress import Progress
 from langsplat_core.scene import FARTHEST
 

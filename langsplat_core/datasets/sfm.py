@@ -1,30 +1,88 @@
-"""pycolmap, wrapped: features, matches and triangulation, in steps that report and resume; mapping is in
-`mapping.py`.
-
-A *workspace* is a folder with small copies of the photographs (``images``), COLMAP's ``database.db`` and,
-in the end, the model (``sparse``). It is named by a digest of all that it is made from; the database keeps
-what was computed, so an interrupted run goes on, and within one machine ends with the same cameras, byte for
-byte: photographs are numbered in the order of their names, every random choice has its seed, and what adds up
-over photographs runs on one thread. Extraction and matching use all cores: one thread does a whole photograph
-or pair, and the database is the same. Another processor may round otherwise, and find other matches.
-"""
+"""What a photograph's EXIF data say of its lens, as COLMAP takes it from a smaller copy."""
 
 import errno
 import hashlib
 import json
+import logging
+import math
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
+from PIL import Image
 
-from langsplat_core.datasets.colmap_library import pycolmap
-from langsplat_core.datasets.colmap_model import read_model
-from langsplat_core.errors import FormatError
+from langsplat_core.datasets.capture import Capture, Photo, develop, find_photos, read_photo, shortened
+from langsplat_core.datasets.colmap import SparseModel, good_points, has_model, located_photos, read_model
+from langsplat_core.datasets.intrinsics import pycolmap
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.io.files import atomic_path
+from langsplat_core.io.hostile import PictureError, opened
 from langsplat_core.progress import Progress
 from langsplat_core.scene import Camera
+
+_MAIN_TAGS, _EXIF_IFD = (0x010F, 0x0110), 0x8769  # maker, model
+_FOCAL, _FOCAL_ON_FILM = 0x920A, 0xA405  # mm; mm of a lens with the same view on film of 36 x 24 mm
+_PLANE_X, _PLANE_UNIT, _WIDTH = 0xA20E, 0xA210, 0xA002  # pixels per unit on the sensor; the unit; pixels
+_MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0}  # of the unit
+_FILM = math.hypot(36, 24)  # mm, its diagonal
+_PLAUSIBLE = (1, 5_000)  # mm on film, of any lens that is sold
+
+
+def optics(path: Path) -> Image.Exif:
+    """Only what tells the focal length: other tags, orientation first of all, would be wrong for a copy.
+
+    Where a camera gives pixels per inch of its sensor instead of the length on film, that is worked out:
+    COLMAP compares those with the size of the picture, which is another for a copy.
+    """
+    kept = Image.Exif()
+    try:
+        with opened(path) as picture:
+            source = picture.getexif()
+            kept.update({tag: source[tag] for tag in _MAIN_TAGS if tag in source})
+            inner = source.get_ifd(_EXIF_IFD)
+            kept_inner = {tag: inner[tag] for tag in (_FOCAL, _FOCAL_ON_FILM) if tag in inner}
+            if not kept_inner.get(_FOCAL_ON_FILM):
+                kept_inner |= _on_film(inner, picture.size)
+            kept.get_ifd(_EXIF_IFD).update(kept_inner)
+            kept.tobytes()
+    except PictureError:
+        return Image.Exif()
+    return kept
+
+
+def _on_film(inner: dict[int, Any], size: tuple[int, int]) -> dict[int, int]:
+    """The focal length on film from the one on a sensor whose pixels are counted by the inch; `size`: of the
+    picture, pixels."""
+    try:
+        width = inner.get(_WIDTH, size[0]) * _MILLIMETRES[inner.get(_PLANE_UNIT, 2)] / inner[_PLANE_X]
+        diagonal = width * math.hypot(*size) / size[0]
+        length = float(inner[_FOCAL] / diagonal * _FILM)
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):  # absent, or not what the standard says
+        return {}
+    known = math.isfinite(length) and _PLAUSIBLE[0] <= length <= _PLAUSIBLE[1]
+    return {_FOCAL_ON_FILM: round(length)} if known else {}
+
+
+def tags(exif: Image.Exif) -> dict[int, object]:
+    """All of them, the inner ones too."""
+    return dict(exif) | dict(exif.get_ifd(_EXIF_IFD))
+
+
+# pycolmap, wrapped: features, matches and triangulation, in steps that report and resume; mapping is in
+# `mapping.py`.
+#
+# A *workspace* is a folder with small copies of the photographs (``images``), COLMAP's ``database.db`` and,
+# in the end, the model (``sparse``). It is named by a digest of all that it is made from; the database
+# keeps what was computed, so an interrupted run goes on, and within one machine ends with the same cameras,
+# byte for byte: photographs are numbered in the order of their names, every random choice has its seed, and
+# what adds up over photographs runs on one thread. Extraction and matching use all cores: one thread does a
+# whole photograph or pair, and the database is the same. Another processor may round otherwise, and find
+# other matches.
 
 EXHAUSTIVE_LIMIT = 80  # photographs; beyond, matching every pair costs too much
 SEQUENTIAL_OVERLAP = 10  # neighbours in name order that each photograph is matched with
@@ -216,3 +274,321 @@ def store_model(model: "pycolmap.Reconstruction", folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
     for name in ("images", "attempts"):
         shutil.rmtree(folder / name, ignore_errors=True)
+
+
+# Cameras from matched photographs: COLMAP's mapper in several ways, of which the best result is kept.
+#
+# The usual way begins with two photographs that see the same things from well apart, which a walk straight
+# ahead does not have; the others begin with less, or place all photographs at once.
+
+ENOUGH = 0.9  # share of the photographs; with fewer located the next way is tried
+TIE = 0.05  # of the reprojection error: ways that end at the same cameras differ by 1 to 2 %
+FEWEST_MATCHES = 15  # that COLMAP's mapper works with
+FEWEST_POINTS = 30  # that hold a camera; the incremental mapper demands as many, the global one none
+FEWEST_FEATURES = 50  # fewer rarely give `FEWEST_MATCHES`
+LEFT_OUT = "left_out.json"  # in the workspace: which photographs have no camera, and why
+# For first pairs of a walk straight ahead: degrees between rays, share of motion that is forward, matches.
+_CLOSE_PAIRS = {"init_min_tri_angle": 4.0, "init_max_forward_motion": 1.0, "init_min_num_inliers": 50}
+
+Model: TypeAlias = pycolmap.Reconstruction
+
+
+def map_cameras(folder: Path, count: int, progress: Progress) -> None:
+    """Locate the `count` photographs of a workspace that was matched.
+
+    Ways are tried until one locates `ENOUGH`; the best model (see `best_model`) becomes ``sparse``. Where no
+    two could be located there is none.
+    """
+    best: Model | None = None
+    for number, way in enumerate(WAYS):
+        check_room(folder)
+        attempts = folder / "attempts" / str(number)
+        attempts.mkdir(parents=True, exist_ok=True)
+        best = best_model(best, way(folder, attempts, _counted(count, progress)))
+        if best is not None and len(located_names(best)) >= ENOUGH * count:
+            break
+    write_left_out(folder, set() if best is None else located_names(best))
+    if best is not None:
+        store_model(best, folder)
+    progress("locating cameras", 1.0)
+
+
+def _counted(count: int, progress: Progress) -> Callable[[], None]:
+    """To be called for every photograph that is placed; the first call says that the work begins."""
+    placed = -1
+
+    def advance() -> None:
+        nonlocal placed
+        placed += 1
+        progress("locating cameras", min(placed / count, 0.99))
+
+    advance()
+    return advance
+
+
+def best_model(best: Model | None, models: Iterable[Model]) -> Model | None:
+    """The best of `best` and `models`: one that locates more than those before it, or as many with a
+    reprojection error that is less by more than `TIE`. Badly held photographs are taken out."""
+    most, least = (0, 0.0) if best is None else _worth(best)
+    for model in models:
+        _take_out_the_badly_held(model)
+        count, error = _worth(model)
+        if count > most or (count == most and error < (1 - TIE) * least):
+            best, most, least = model, count, error
+    return best
+
+
+def _worth(model: Model) -> tuple[int, float]:
+    """How many photographs are located, and the mean reprojection error, px."""
+    return len(located_names(model)), float(model.compute_mean_reprojection_error())
+
+
+def located_names(model: Model) -> set[str]:
+    """Photographs that have a camera, by their names in the workspace."""
+    return {image.name for image in model.images.values() if image.has_pose}
+
+
+def _take_out_the_badly_held(model: Model) -> None:
+    """Cameras that see fewer than `FEWEST_POINTS`: where they stand is a guess."""
+    for image in list(model.images.values()):
+        if image.has_pose and image.num_points3D < FEWEST_POINTS:
+            model.deregister_frame(image.frame_id)
+
+
+def _incremental(
+    folder: Path, attempts: Path, advance: Callable[[], None], first_pairs: dict[str, float]
+) -> Collection[Model]:
+    """One photograph after the other, onto a first pair."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = 3
+    options.max_num_models = 5
+    options.random_seed = 0
+    options.triangulation.random_seed = 0
+    options.num_threads = 1  # sums of several threads differ from run to run
+    options.mapper.mergedict(first_pairs)
+    models: dict[int, Model] = pycolmap.incremental_mapping(
+        database_path=folder / "database.db",
+        image_path=folder / "images",
+        output_path=attempts,
+        options=options,
+        next_image_callback=advance,
+    )
+    return models.values()
+
+
+def _all_at_once(folder: Path, attempts: Path, advance: Callable[[], None]) -> Collection[Model]:
+    """Rotations of all photographs first, then their places (GLOMAP)."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = 0
+    options.num_threads = 1
+    mapper = options.mapper
+    mapper.random_seed = 0
+    mapper.num_threads = 1
+    mapper.rotation_averaging.random_seed = 0
+    mapper.global_positioning.random_seed = 0
+    mapper.retriangulation.random_seed = 0
+    mapper.global_positioning.use_gpu = False
+    mapper.bundle_adjustment.ceres.use_gpu = False
+    models: dict[int, Model] = pycolmap.global_mapping(
+        database_path=folder / "database.db",
+        image_path=folder / "images",
+        output_path=attempts,
+        options=options,
+    )
+    return models.values()
+
+
+WAYS: tuple[Callable[[Path, Path, Callable[[], None]], Collection[Model]], ...] = (
+    partial(_incremental, first_pairs={}),
+    partial(_incremental, first_pairs=_CLOSE_PAIRS),
+    _all_at_once,
+)
+
+
+def left_out(folder: Path) -> dict[str, str]:
+    """Why photographs have no camera, by their names in the workspace, after `map_cameras`."""
+    why: dict[str, str] = json.loads((folder / LEFT_OUT).read_text())
+    return why
+
+
+def write_left_out(folder: Path, located: Collection[str]) -> None:
+    """Keep why photographs are not among the `located`; see `left_out`."""
+    with pycolmap.Database.open(folder / "database.db") as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        features = {number: database.num_keypoints_for_image(number) for number in names}
+        pairs, inliers = database.read_two_view_geometry_num_inliers()
+    friends: dict[int, int] = dict.fromkeys(names, 0)
+    for pair, count in zip(pairs, inliers, strict=True):
+        if count >= FEWEST_MATCHES:
+            for number in pycolmap.pair_id_to_image_pair(pair):
+                friends[number] += 1
+    why = {
+        name: _reason(features[number], friends[number])
+        for number, name in names.items()
+        if name not in located
+    }
+    with atomic_path(folder / LEFT_OUT) as temporary:
+        temporary.write_text(json.dumps(why, sort_keys=True))
+
+
+def _reason(features: int, friends: int) -> str:
+    """In words, from the number of features and of photographs that share enough of them."""
+    if features == 0:
+        return "no features (nothing but plain areas, or blurred)"
+    if features < FEWEST_FEATURES:
+        return "too few features (plain, dark, blurred or tiny)"
+    if friends == 0:
+        return "no matches with any other"
+    return "matched, but from one and the same place, or without enough overlap"
+
+
+# A plain folder of photographs: cameras by structure from motion.
+
+log = logging.getLogger("langsplat")
+
+SFM_SIDE = 1600  # px, longer side of the copies that features are sought in
+MIN_PHOTOS = 3
+FEWEST = 0.5  # share of the photographs: a scene of fewer is not of what was photographed
+UNREAD = "cannot be read"
+_ADVICE = "take more photographs, each sharing at least two thirds of its view with the next"
+
+
+@dataclass(frozen=True)
+class _Copy:
+    """A small upright copy of a photograph in the workspace."""
+
+    name: str
+    size: tuple[int, int]
+    optics: str  # maker, camera and focal length: photographs with the same share a camera
+
+
+def photo_folder(folder: Path) -> Path | None:
+    """Where the photographs of a dataset without cameras lie: in `folder` itself or one level down."""
+    candidates = (folder, folder / "images", folder / "photos")
+    return next((candidate for candidate in candidates if find_photos(candidate)), None)
+
+
+def load_photos(
+    folder: Path, max_side: int, allow_few_cameras: bool, work: Path, progress: Progress
+) -> Capture:
+    """Locate the photographs in `folder` (kept in ``work/sfm-*``) and load them; see `load_capture`."""
+    paths = find_photos(folder)
+    if len(paths) < MIN_PHOTOS:
+        raise InputError(
+            f"{folder} has {len(paths)} photographs; at least {MIN_PHOTOS} are needed: {_ADVICE}"
+        )
+    contents = [(path.name, _content(path)) for path in paths]
+    workspace = open_workspace(work, ["photographs", 3, SFM_SIDE, contents])
+    numbered = {f"{index:05d}.jpg": path for index, path in enumerate(paths)}
+    if not has_model(workspace / "sparse"):
+        _reconstruct(workspace, numbered, progress)
+    model = read_model(workspace / "sparse") if has_model(workspace / "sparse") else None
+    lost = _left_out(workspace, model, numbered, _twins(numbered, dict(contents)))
+    found = len(numbered) - sum(map(len, lost.values()))
+    if model is None or (found < max(MIN_PHOTOS, FEWEST * len(numbered)) and not allow_few_cameras):
+        anyway = "" if model is None else ", or go on without these with --dataset.allow-few-cameras"
+        raise InputError(
+            f"only {found} of {len(numbered)} photographs could be located together "
+            f"({_listed(lost, 50, 500)}); {_ADVICE}{anyway}"
+        )
+    if lost:
+        log.warning(
+            "%d of %d photographs could not be located and are left out (%s)",
+            len(numbered) - found,
+            len(numbered),
+            _listed(lost),
+        )
+    located = located_photos(model, workspace / "images", workspace / "sparse")
+    photos = [
+        Photo(numbered[p.label], numbered[p.label].name, p.intrinsics, p.world_to_camera, upright=True)
+        for p in located
+    ]
+    cameras, images, files = develop(photos, max_side, progress)
+    return Capture(cameras, images, *good_points(model), photos=files)
+
+
+def _content(path: Path) -> str:
+    """A digest of a file: photographs that were copied, moved or touched are the same. Empty for one that may
+    not be read, which is reported where it is opened."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return ""
+
+
+def _twins(numbered: dict[str, Path], contents: dict[str, str]) -> dict[str, str]:
+    """For photographs that are the same as an earlier one, which: names in the workspace -> file names."""
+    first: dict[str, str] = {}
+    return {
+        name: earlier
+        for name, path in numbered.items()
+        if (earlier := first.setdefault(contents[path.name], path.name)) != path.name
+    }
+
+
+def _left_out(
+    workspace: Path, model: SparseModel | None, numbered: dict[str, Path], twins: dict[str, str]
+) -> dict[str, list[str]]:
+    """Photographs without a camera by the reason: ``{"no features": ["a.jpg", "b.jpg"]}``."""
+    located = {image.name for image in model.images} if model else set()
+    reasons = left_out(workspace)
+    reasons |= {name: f"the same picture as {twin}" for name, twin in twins.items()}
+    groups: dict[str, list[str]] = {}
+    for name, path in numbered.items():
+        if name not in located:
+            groups.setdefault(reasons.get(name, UNREAD), []).append(path.name)
+    return groups
+
+
+def _listed(lost: dict[str, list[str]], limit: int = 5, width: int = 200) -> str:
+    """``no features: a.jpg, b.jpg; no matches with any other: c.jpg``; see `shortened`."""
+    return "; ".join(f"{reason}: {shortened(names, limit, width)}" for reason, names in lost.items())
+
+
+def _reconstruct(workspace: Path, numbered: dict[str, Path], progress: Progress) -> None:
+    copies = _small_copies(workspace / "images", numbered, progress)
+    try:
+        extract_features(workspace, _groups(copies), progress)
+        match_features(workspace, pairs_by_name([copy.name for copy in copies]), progress)
+        map_cameras(workspace, len(copies), progress)
+    except FAILURES as error:
+        reason = str(error).partition("\n")[0]
+        raise InputError(
+            f"structure from motion failed ({reason}); remove {workspace} and try again"
+        ) from None
+
+
+def _small_copies(folder: Path, numbered: dict[str, Path], progress: Progress) -> list[_Copy]:
+    """Copies that COLMAP can read and finds the same way up as we do; unreadable files are left out."""
+    copies, broken = [], []
+    for index, (name, path) in enumerate(numbered.items()):
+        progress("preparing photographs", index / len(numbered))
+        try:
+            if not (folder / name).is_file():
+                _write_copy(path, folder / name)
+            with opened(folder / name) as copy:
+                copies.append(_Copy(name, copy.size, str(tags(copy.getexif()))))
+        except PictureError as error:
+            broken.append(f"{path.name} ({error.reason})")
+    progress("preparing photographs", 1.0)
+    if broken:
+        log.warning("%d photographs cannot be read: %s", len(broken), shortened(broken))
+    if len(copies) < MIN_PHOTOS:
+        raise InputError(f"only {len(copies)} photographs can be read; at least {MIN_PHOTOS} are needed")
+    return copies
+
+
+def _write_copy(path: Path, copy: Path) -> None:
+    picture = read_photo(path, upright=True)
+    picture.thumbnail((SFM_SIDE, SFM_SIDE), Image.Resampling.LANCZOS)
+    with atomic_path(copy) as temporary:
+        picture.save(temporary, quality=95, exif=optics(path))
+
+
+def _groups(copies: list[_Copy]) -> list[Group]:
+    """One camera for all photographs of one size and one set of optics."""
+    members: dict[tuple[tuple[int, int], str], list[str]] = {}
+    for copy in copies:
+        members.setdefault((copy.size, copy.optics), []).append(copy.name)
+    return [Group(tuple(names), "SIMPLE_RADIAL", side=max(size)) for (size, _), names in members.items()]

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from assets.making.config import TIERS, Tier
-from langsplat_core.config import CodecConfig, Count, CountOrZero, LiftConfig, Positive, Seed
-from langsplat_core.query.cut import CutRule
-from langsplat_core.ranges import Range
+from langsplat_core.config import CodecConfig, Count, CountOrZero, LiftConfig, Positive, Range, Seed
+from langsplat_core.query.answers import CutRule
 
 Pixels = Annotated[int, Range(1, 65_536)]
 # The outlines a perfect segmenter would find; the same, but 15 % of the vectors are another region's; the

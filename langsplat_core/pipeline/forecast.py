@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from langsplat_core.config import MaskConfig, TrainConfig
-from langsplat_core.parsing.pictures import PHOTO_SUFFIXES
+from langsplat_core.io.hostile import PHOTO_SUFFIXES
 from langsplat_core.progress import Progress
 
 ASPECT = 0.75  # height by width of an ordinary photograph

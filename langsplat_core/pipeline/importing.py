@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.config import CodecConfig
+from langsplat_core.config import CodecConfig, check_settings
 from langsplat_core.errors import InputError
-from langsplat_core.formats.checkpoints import ForeignScene, Leaves
+from langsplat_core.io.foreign import ForeignScene, Leaves
 from langsplat_core.pipeline.language import encoded_phrases
 from langsplat_core.progress import Progress, silent
-from langsplat_core.ranges import check_settings
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     LEVELS,
@@ -25,18 +24,18 @@ from langsplat_core.scene import (
     LanguageField,
     Scene,
 )
-from langsplat_core.scene.codec import SHORTEST, latent_dtype
-from langsplat_core.scene.codec.codebook import LARGEST
+from langsplat_core.scene.codec import LARGEST, SHORTEST, latent_dtype
 from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import load_text_encoder
-from langsplat_core.semantics.everyday import everyday_vectors
-from langsplat_core.training.language.codebook_fit import codeword_colours, rounded
-from langsplat_core.training.language.codec_fit import fit_codec
-from langsplat_core.training.language.relevancy_error import (
+from langsplat_core.semantics.vocabulary import everyday_vectors
+from langsplat_core.training.language.codec_fit import (
     CodecReport,
     Vocabulary,
     codec_report,
+    codeword_colours,
     everyday_vocabulary,
+    fit_codec,
+    rounded,
 )
 
 FITTED, JUDGED = 12_000, 2_000  # Gaussians of each level that a codec is fitted to, and judged on

@@ -17,9 +17,9 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import LiftConfig, TrainConfig
 from langsplat_core.errors import InputError
-from langsplat_core.pipeline.crew import Crew
 from langsplat_core.pipeline.stages import (
     Arrays,
+    Crew,
     features_digest,
     gaussians_digest,
     kept,
@@ -40,18 +40,30 @@ from langsplat_core.scene import (
     codec_from_tensors,
 )
 from langsplat_core.scene.codec import latent_dtype
-from langsplat_core.scene.phrases import phrase_key
+from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.encoder import Encoder, PhraseEncoder
-from langsplat_core.semantics.everyday import everyday_vectors
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.codec_fit import fit_codec
-from langsplat_core.training.language.gradient_lift import lift_by_gradient
-from langsplat_core.training.language.latent_lift import lift_latents
-from langsplat_core.training.language.lift import Lifted, lift_block, lift_sample
-from langsplat_core.training.language.mask_groups import MaskGroups, group_masks
-from langsplat_core.training.language.memberships import Memberships, view_pairs
-from langsplat_core.training.language.relevancy_error import CodecReport, codec_report, everyday_vocabulary
-from langsplat_core.training.language.things import find_things
+from langsplat_core.semantics.vocabulary import everyday_vectors
+from langsplat_core.training.language.codec_fit import (
+    CodecReport,
+    codec_report,
+    everyday_vocabulary,
+    fit_codec,
+)
+from langsplat_core.training.language.lift import (
+    Lifted,
+    lift_block,
+    lift_by_gradient,
+    lift_latents,
+    lift_sample,
+)
+from langsplat_core.training.language.mask_weights import (
+    MaskGroups,
+    Memberships,
+    find_things,
+    group_masks,
+    view_pairs,
+)
 
 Views = Sequence[tuple[Camera, ImageFeatures]]  # read when needed: they may be more than memory holds
 Latents = tuple[Array, Array]  # (3, N, d) of the codec's type, (3, N) float32

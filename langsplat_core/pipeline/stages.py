@@ -1,21 +1,27 @@
 """Stages that remember: a result is stored under a key made of its settings and inputs."""
 
+import contextlib
 import hashlib
+import io
 import json
 import logging
+import os
+import socket
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields, is_dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import FormatError
-from langsplat_core.files import atomic_path
-from langsplat_core.parsing.npy import write_npy
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.io.files import atomic_path
+from langsplat_core.io.hostile import write_npy
 from langsplat_core.scene import Gaussians
 from langsplat_core.semantics.store import ImageFeatures
 
@@ -89,3 +95,124 @@ def _digest(*arrays: Array) -> str:
         digest.update(repr((array.shape, array.dtype.str)).encode())
         digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
+
+
+# One training at a time in a work folder: two would write each other's stages.
+
+try:
+    import fcntl
+except ImportError:  # Windows; there two trainings in one folder are the user's to avoid
+    fcntl = None  # type: ignore[assignment]
+
+LOCK = "in-use.lock"  # in the work folder, where it stays: only the system's lock on it counts
+
+
+@contextmanager
+def sole_use(folder: Path) -> Iterator[None]:
+    """Hold `folder`, made if it is missing, for this process alone; removed again if nothing came into it.
+
+    The lock is the operating system's: it ends with its process, however that ends, so that none is ever left
+    by a dead one. On file systems without locks nothing is held. Raises InputError where another process, or
+    another training in this one, holds the folder.
+    """
+    if fcntl is None:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+        return
+    with _locked(folder) as file:
+        with contextlib.suppress(OSError):  # a full disk is told of where something is lost by it
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+        try:
+            yield
+        finally:
+            if os.listdir(folder) == [LOCK]:
+                (folder / LOCK).unlink()
+                folder.rmdir()
+
+
+def _locked(folder: Path) -> io.FileIO:
+    """The lock's file, opened, and locked where the file system knows locks."""
+    while True:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = io.FileIO(folder / LOCK, "a+")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            holder = file.read(80).decode(errors="replace").strip() or "a process that gives no name"
+            file.close()
+            raise InputError(
+                f"{folder}: {holder} trains in this folder; wait for it, or name another one with --work"
+            ) from None
+        except OSError:  # a file system that knows no locks
+            return file
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), os.stat(folder / LOCK)):
+                return file
+        file.close()  # who held it has removed it meanwhile: this is a lock on nothing
+
+
+# Processes that share one work: on several cores, GPUs or machines that see the same work folder.
+#
+#     torchrun --nproc-per-node 2 -m langsplat_core train DATASET --out scene.ply
+#
+# What is made goes through the work folder, item by item, so that a process that is lost costs only what it
+# had not finished; here is only who does what, and where all wait for each other.
+
+PATIENCE = timedelta(days=7)  # radiance training is one process's work, and the others wait for it
+
+
+@dataclass(frozen=True)
+class Crew:
+    """This process among all of them; alone by default."""
+
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def leads(self) -> bool:
+        """Whether this is the process that does what cannot be shared, and that speaks."""
+        return self.rank == 0
+
+    def share(self, items: Sequence[T]) -> list[T]:
+        """The items that are this process's."""
+        return list(items[self.rank :: self.size])
+
+    def meet(self) -> None:
+        """Wait for all. Raises InputError where one of them is no more."""
+        if self.size < 2:
+            return
+        import torch.distributed
+
+        try:
+            torch.distributed.barrier()
+        except RuntimeError as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise InputError(
+                f"another process of this training ended ({reason[:80]}); give the same command again: what "
+                "is finished is kept"
+            ) from None
+
+    def once(self, make: Callable[[], T]) -> T:
+        """The result of `make`, which keeps it in a file: made by one process and read by the others."""
+        if self.leads:
+            result = make()
+            self.meet()
+            return result
+        self.meet()
+        return make()
+
+
+def join_crew() -> Crew:
+    """The crew that torchrun started this process in; a crew of one without it."""
+    size = int(os.environ.get("WORLD_SIZE", "1"))
+    if size < 2:
+        return Crew()
+    import torch.distributed
+
+    if not torch.distributed.is_initialized():
+        torch.distributed.init_process_group("gloo", timeout=PATIENCE)
+    if torch.cuda.is_available():
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
+    return Crew(torch.distributed.get_rank(), torch.distributed.get_world_size())

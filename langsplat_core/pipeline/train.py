@@ -1,39 +1,61 @@
-"""From photographs to a searchable scene: the whole method, one line a stage.
-
-Every stage keeps its result in the work folder under a key of its settings, so that an interrupted run
-continues where it stopped and a changed setting recomputes only what depends on it.
-"""
+"""Views with masks that are read when they are needed: hundreds of label maps are more than memory wants."""
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 
-from langsplat_core.config import RadianceConfig, TrainConfig
+from langsplat_core.config import RadianceConfig, TrainConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
-from langsplat_core.files import check_output_folder, shown
-from langsplat_core.formats import check_writable, load_scene, read_ply, save_scene, write_ply
-from langsplat_core.pipeline.crew import Crew
-from langsplat_core.pipeline.doubts import doubts
+from langsplat_core.io import check_writable, load_scene, read_ply, save_scene, write_ply
+from langsplat_core.io.files import check_output_folder, shown
 from langsplat_core.pipeline.language import check_lift, check_masks, language_field
-from langsplat_core.pipeline.lock import sole_use
-from langsplat_core.pipeline.report import TrainReport, read_report, work_folder, write_report
-from langsplat_core.pipeline.stages import stage_key
-from langsplat_core.pipeline.views import StoredViews
+from langsplat_core.pipeline.report import TrainReport, doubts, read_report, work_folder, write_report
+from langsplat_core.pipeline.stages import Crew, sole_use, stage_key
 from langsplat_core.progress import Progress, silent
-from langsplat_core.ranges import check_settings
-from langsplat_core.scene import Gaussians, Scene
+from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, load_encoder
 from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sources import load_mask_source
-from langsplat_core.semantics.store import FeatureStore, StoredFeatures, describe_capture
+from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures, describe_capture
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
+
+
+class StoredViews(Sequence[tuple[Camera, ImageFeatures]]):
+    """Cameras, and the features of what each saw."""
+
+    def __init__(self, cameras: Sequence[Camera], features: Sequence[ImageFeatures]) -> None:
+        """`features`: such as `StoredFeatures`; one per camera."""
+        if len(cameras) != len(features):
+            raise ValueError(f"{len(cameras)} cameras, {len(features)} features")
+        self._cameras, self._features = cameras, features
+
+    def __len__(self) -> int:
+        return len(self._cameras)
+
+    @overload
+    def __getitem__(self, index: int) -> tuple[Camera, ImageFeatures]: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "StoredViews": ...
+
+    def __getitem__(self, index: int | slice) -> "tuple[Camera, ImageFeatures] | StoredViews":
+        if isinstance(index, slice):
+            return StoredViews(self._cameras[index], self._features[index])
+        return self._cameras[index], self._features[index]
+
+
+# From photographs to a searchable scene: the whole method, one line a stage.
+#
+# Every stage keeps its result in the work folder under a key of its settings, so that an interrupted run
+# continues where it stopped and a changed setting recomputes only what depends on it.
 
 FEWEST_VIEWS = 3
 

@@ -1,21 +1,267 @@
-"""From relevancies to an answer: by regions of the surface, or by the peak alone, as published."""
+"""Where a relevancy map is cut, so that what lies above is the answer's mask.
 
+Absolute relevancy says little across encoders and phrases (a cosine margin of 0.1 is 0.73), so every rule
+here is relative to something measured: the floor, the scene's median, or the map's own range.
+"""
+
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
+from scipy.ndimage import uniform_filter
+from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
-from langsplat_core.query.chance import Bars, excess
-from langsplat_core.query.cut import cut_level
-from langsplat_core.query.extent import find_extent
-from langsplat_core.query.places import locate
-from langsplat_core.query.regions import Regions
-from langsplat_core.query.surface import Surface
-from langsplat_core.query.vocabulary import named
-from langsplat_core.scene import LEVELS, Calibration, Fits, Odds
-from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, Scale
+from langsplat_core.query.grammar import Named, named
+from langsplat_core.query.surface import SMALLEST, Regions, Surface
+from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField, Odds
+from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, Scale, relevancy_of
+
+CutRule = Literal["floor", "median", "range"]
+CUT_RULES: tuple[CutRule, ...] = get_args(CutRule)
+SPAN = 0.02  # the least distance between the lower end and the peak that is divided
+RANGE_SHARE = 0.7  # of the map's range: LangSplat's code maps [0, 1] to [-1, 1] and cuts at 0.4
+
+
+def cut_level(rule: CutRule, values: Array, peak: float, median: float) -> float:
+    """The relevancy above which `values` belong to the answer.
+
+    values: the map that is cut, any shape, in [0, 1], read by "range" alone; peak: the smoothed peak of the
+    whole scene at the chosen level; median: of the scene's Gaussians at that level. Rules:
+
+    * "floor": half way between the floor, no better than the canonical phrases, and the peak;
+    * "median": half way between the scene's median and the peak, since what is typical of the scene is not
+      what was asked for, wherever the encoder puts it;
+    * "range": at 0.7 of the map's range, as the public code of LangSplat does; it always finds something.
+    """
+    if rule == "range":
+        low, high = (float(values.min()), float(values.max())) if np.size(values) else (0.0, 1.0)
+        return low + RANGE_SHARE * (high - low)
+    low = FLOOR if rule == "floor" else median
+    return low + 0.5 * max(peak - low, SPAN)
+
+
+# Where a phrase is: the strongest place among the Gaussians, its extent, and its pixel in a view.
+
+PLATEAU = 1e-3  # of relevancy: what is this close to the peak is as high
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A connected set of Gaussians that answer a phrase."""
+
+    position: Array  # (3,) world units, around the middle of what is as high as the peak
+    box: Array  # (2, 3) lower and upper corner, world units, between 2 % and 98 % of the members
+    count: int  # Gaussians in it
+
+
+def locate(surface: Surface, smoothed: Array, threshold: float) -> Place | None:
+    """The connected part above `threshold` that holds the peak of `smoothed` (M,); None where all is 0."""
+    if len(smoothed) == 0:
+        return None
+    peak = int(smoothed.argmax())
+    if smoothed[peak] <= 0:
+        return None
+    inside = smoothed > threshold
+    inside[peak] = True
+    members = surface.connected(inside, peak)
+    # All of a thing may mean the very same: then its middle is the place, not whichever comes first.
+    highest = members[smoothed[members] >= smoothed[peak] - PLATEAU]
+    centre = surface.positions[highest].mean(0)
+    middle = highest[((surface.positions[highest] - centre) ** 2).sum(1).argmin()]
+    near = surface.neighbours[middle]
+    weights = surface.weights[near] * smoothed[near]
+    position = (surface.positions[near] * weights[:, None]).sum(0) / weights.sum()
+    box = np.quantile(surface.positions[members], [0.02, 0.98], axis=0)
+    return Place(position, box, len(members))
+
+
+def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
+    """Peak (column, row, value) of a relevancy map (H, W) after a mean filter of `window` px (paper: 20).
+
+    The window never exceeds the picture; borders repeat the edge pixels.
+    """
+    window = max(1, min(window, *relevancy.shape))
+    smooth = uniform_filter(np.asarray(relevancy, np.float64), size=window, mode="nearest")
+    row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
+    return int(column), int(row), float(smooth[row, column])
+
+
+# What everyday phrases fit in a scene, where most of them are not: what exceeds that is found.
+#
+# Fits are those of `semantics.relevancy.Scale`. The more places a scene has, the better the best of them
+# fits a phrase by chance; so "found" is said by the best fits of everyday phrases in the scene itself.
+
+SAMPLED = 96  # everyday phrases that are looked up in a scene without codewords, where each costs a query
+# Spreads above the median best fit of everyday phrases from which a phrase is found, among whole things and
+# at the finer levels, by what it names: where things like it are, and elsewhere, where more is asked for. One
+# absent phrase in twenty exceeds it (rooms 201 to 203, the bundled encoder and CLIP's geometry with six sets
+# of vectors). Some everyday phrases are there, which raises their median; that is in these numbers.
+FOUND: Mapping[Named | Literal["inside"], tuple[float, float]] = {
+    "thing": (1.35, 2.6),
+    "part": (2.55, 1.3),
+    "part of a thing": (2.55, 1.3),
+    "inside": (np.inf, 1.8),  # a part, among what is on a thing that is there
+}
+LOW = 0.16  # quantile one standard deviation below the median; what is there lies above, and widens nothing
+
+
+@dataclass(frozen=True)
+class Bar:
+    """What the best fit of phrases is by chance."""
+
+    median: float
+    spread: float
+
+    def excess(self, fit: float, spreads: float) -> float:
+        """By how many spreads `fit` exceeds what is so many above the median."""
+        return (fit - self.median) / max(self.spread, NARROWEST) - spreads
+
+
+Bars = tuple[Bar, Bar, Bar, Bar]  # of each level, and of the better one of the finer two
+
+
+@dataclass(frozen=True, eq=False)
+class Chance:
+    """Fits of V everyday phrases at all regions of a scene."""
+
+    fits: tuple[Array, Array, Array]  # (R, V) float32 of each level
+
+    def bars(self, rows: tuple[Array, Array, Array] | None = None) -> Bars:
+        """Of the scene, or of some regions `rows` of each level alone."""
+        chosen = (
+            self.fits if rows is None else [fits[some] for fits, some in zip(self.fits, rows, strict=True)]
+        )
+        subpart, part, whole = (fits.max(0, initial=-np.inf) for fits in chosen)
+        return _bar(subpart), _bar(part), _bar(whole), _bar(np.maximum(subpart, part))
+
+
+def _bar(best: Array) -> Bar:
+    if len(best) == 0 or not np.isfinite(best).all():
+        return Bar(np.inf, 1.0)
+    low, median = np.quantile(best, [LOW, 0.5])
+    return Bar(float(median), float(median - low))
+
+
+def excess(fits: Fits, bars: Bars, named: Named | Literal["inside"], level: LevelChoice = "auto") -> float:
+    """By how many spreads the best fits of a phrase exceed those from which it is found; it is from 0 on. At
+    one `level`, or, where that is free, at any."""
+    whole, finer = FOUND[named]
+    if level != "auto":
+        index = LEVELS.index(level)
+        return bars[index].excess(fits[index], min(whole, finer))
+    return max(bars[2].excess(fits[2], whole), bars[3].excess(max(fits[:2]), finer))
+
+
+def chance_in(
+    field: LanguageField, surface: Surface, regions: Regions, scale: Scale, lookup: Iterator[Array]
+) -> Chance:
+    """Of a scene. lookup: relevancies (3, N) of everyday phrases, which are looked at where there are no
+    codewords to compare instead."""
+    if field.codec.space == "index":
+        return _by_codewords(field, surface, regions, scale)
+    columns = [[scale.fit(means) for means in regions.means(values)] for values in lookup]
+    subpart, part, whole = (
+        _solid(np.stack(fits, 1).astype(np.float32), regions.sizes[level])
+        for level, fits in enumerate(zip(*columns, strict=True))
+    )
+    return Chance((subpart, part, whole))
+
+
+def _by_codewords(field: LanguageField, surface: Surface, regions: Regions, scale: Scale) -> Chance:
+    assert scale.everyday is not None
+    count = field.codec.index_size
+    vectors = field.codec.decode(np.arange(count, dtype=np.uint16)[:, None])
+    zero, rate = scale.of(vectors @ scale.texts.T)
+    relevancy = relevancy_of(vectors @ scale.everyday.T, zero[:, None], rate[:, None])
+    fits = []
+    for level, known in enumerate(field.known):
+        has = known[surface.rows]
+        places = regions.of[level][has], field.latents[level, surface.rows[has], 0].astype(np.int64)
+        shape = (len(regions.totals[level]), count)
+        shares = csr_matrix((surface.weights[has], places), shape=shape)
+        means = (shares @ relevancy) / regions.totals[level][:, None]
+        fits.append(_solid(scale.fit(means).astype(np.float32), regions.sizes[level]))
+    return Chance((fits[0], fits[1], fits[2]))
+
+
+def _solid(fits: Array, sizes: Array) -> Array:
+    """Crumbs do not count where there are others, as in `extent`."""
+    solid = sizes >= SMALLEST
+    return np.where(solid[:, None], fits, -np.inf) if solid.any() else fits
+
+
+# How far an answer reaches: its level, the regions that are it, and how good the best one is.
+#
+# Everything is judged by the fit of a region, in spreads of what phrases fit by chance (`chance`), so that
+# one rule serves all encoders. The numbers were chosen on rooms 201 to 203, with the bundled encoder and
+# with the geometry of CLIP, never on rooms that measure.
+
+# Spreads that each level is given before the best is chosen, by what a phrase names. A thing is one whole,
+# whatever some part of it looks like; a part is rather too fine than too coarse.
+ADVANTAGE: Mapping[Named, tuple[float, float, float]] = {
+    "thing": (0.0, 0.0, 0.5),
+    "part": (0.0, 0.0, 0.25),
+    "part of a thing": (0.0, 0.0, -0.25),
+}
+REACH = 0.4  # of the best fit: what fits less by no more than this, and by `NEAREST` to `FARTHEST`, is it too
+NEAREST, FARTHEST = 0.15, 1.0  # spreads
+
+
+@dataclass(frozen=True, eq=False)
+class Extent:
+    """What of a surface answers a phrase: some of the R regions of a level."""
+
+    level: int  # index into LEVELS
+    fits: Fits  # of the best region of each level
+    peaks: tuple[float, float, float]  # relevancy of the best region of each level
+    even: Array  # (R,) float32 relevancy, the same all over a region
+    inside: Array  # (R,) bool
+
+
+def find_extent(
+    relevancy: Array,
+    regions: Regions,
+    scale: Scale,
+    level: LevelChoice = "auto",
+    named: Named = "thing",
+) -> Extent:
+    """From the (3, N) relevancy of a phrase. level: "auto", which depends on what is `named`, or the one that
+    is wanted."""
+    means = regions.means(relevancy)
+    peaks = [_best(values, sizes) for values, sizes in zip(means, regions.sizes, strict=True)]
+    best = scale.fit(np.array(peaks))
+    chosen = _level(best, named) if level == "auto" else LEVELS.index(level)
+    return Extent(
+        level=chosen,
+        fits=(float(best[0]), float(best[1]), float(best[2])),
+        peaks=(peaks[0], peaks[1], peaks[2]),
+        even=means[chosen].astype(np.float32),
+        inside=scale.fit(means[chosen]) >= lowest(float(best[chosen])),
+    )
+
+
+def lowest(best: float, share: float = 1.0) -> float:
+    """The fit from which a region belongs to an answer whose best region has the fit `best`; share: of the
+    way that such an answer reaches."""
+    return best - share * float(np.clip(REACH * best, NEAREST, FARTHEST))
+
+
+def _best(means: Array, sizes: Array) -> float:
+    """The best region's relevancy; crumbs that no neighbour took do not count where there are others."""
+    solid = means[sizes >= SMALLEST]
+    return float((solid if len(solid) else means).max(initial=0))
+
+
+def _level(best: Array, named: Named) -> int:
+    """The best after its advantage; of equal ones the coarsest."""
+    given = best + ADVANTAGE[named]
+    return int(np.flatnonzero(given == given.max())[-1])
+
+
+# From relevancies to an answer: by regions of the surface, or by the peak alone, as published.
 
 AnswerRule = Literal["regions", "peak"]
 Verdict = Literal["found", "weak match", "not here"]

@@ -1,45 +1,400 @@
-"""Answers to phrases with structure: each phrase in the tree is asked for itself at its fitting level, and
-the answers are combined among the Gaussians (`query.combine`)."""
+"""Single things among the Gaussians that answer a phrase, and how they stand to each other.
 
+Lengths are compared with the things' own sizes, so that a scene needs no scale.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, reduce
+from typing import Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.combine import (
-    cut_inside,
-    grown,
-    joined,
-    owners,
-    placed,
-    restricted,
-    surest,
-    without,
-)
+from langsplat_core.query.answers import QueryResult, excess, locate, lowest
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.grammar import parse
-from langsplat_core.query.phrase_tree import (
+from langsplat_core.query.grammar import (
     Atom,
     Both,
+    Extreme,
     Inside,
     Relation,
+    Side,
     Superlative,
     Tree,
     Union,
     Without,
     atoms,
     children,
+    named,
+    parse,
     reading,
 )
-from langsplat_core.query.standing import Body, body, most, separate, stands, upright, viewer
-from langsplat_core.query.vocabulary import named
-from langsplat_core.scene import Camera
-from langsplat_core.scene.phrases import phrase_key, tidy
+from langsplat_core.query.instances import connected_parts
+from langsplat_core.query.selection import difference, intersection, union
+from langsplat_core.query.surface import Surface
+from langsplat_core.scene import LEVELS, NO_THING, Camera
+from langsplat_core.scene.language import phrase_key, tidy
 from langsplat_core.semantics.relevancy import FLOOR
+
+FEWEST = 8  # Gaussians; what has fewer is a speck
+SPECK = 0.1  # of the largest instance's Gaussians; so is what has fewer
+SAMPLE = 1500  # points of a thing that distances are measured with
+NEAR = 0.75  # of the smaller thing's size: the widest gap that is still near
+TOUCH = 0.1  # of the smaller thing's size: the widest gap that is still touching
+FOOT = 0.4  # of a thing's height: what it stands on touches it below
+FLAT = 0.5  # of a thing's points: what touches so many, it lies or hangs on
+HELD = 0.6  # of a thing's points: what holds so many, it is in
+SUNK = 0.25  # of a thing's height: what is in another has so much of it below the rim
+ASIDE = 0.25  # of the mean size: what is closer than this sideways or in depth is level with the other
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """The place that one thing takes, in axes of which the last is up."""
+
+    points: Array  # (P, 3) world units
+    low: Array  # (3,) 2 % quantiles
+    high: Array  # (3,) 98 % quantiles
+
+    @property
+    def centre(self) -> Array:
+        """(3,) of its box."""
+        return (self.low + self.high) / 2
+
+    @property
+    def size(self) -> float:
+        """Diagonal of its box, world units."""
+        return float(np.linalg.norm(self.high - self.low))
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of its points."""
+        return cKDTree(self.points)
+
+    @cached_property
+    def spacing(self) -> float:
+        """Median distance of a point to the nearest other, world units."""
+        return float(np.median(self.tree.query(self.points, k=2)[0][:, 1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Viewer:
+    """From where left, right, near, far, behind and in front are said."""
+
+    matrix: Array  # (4, 4) from the axes of extents to the camera's
+
+    def seen(self, extent: Body) -> tuple[float, float]:
+        """Tangent of the angle to the right of the viewing direction, and depth; NaN for what is behind."""
+        x, _, z = self.matrix[:3, :3] @ extent.centre + self.matrix[:3, 3]
+        return (float(x / z), float(z)) if z > 0 else (float("nan"), float("nan"))
+
+
+def upright(up: Array) -> Array:
+    """(3,) unit -> (3, 3) rotation of world points into axes of which the last is up."""
+    first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(up, first), up])
+
+
+def viewer(camera: Camera, frame: Array) -> Viewer:
+    """`camera` as seen in the axes of `frame` (3, 3), see `upright`."""
+    turned = np.eye(4)
+    turned[:3, :3] = frame.T
+    return Viewer(camera.world_to_camera @ turned)
+
+
+def body(positions: Array, frame: Array) -> Body:
+    """(P, 3) world points of one thing, P >= 1 -> its extent in the axes of `frame`."""
+    points = positions[:: max(1, -(-len(positions) // SAMPLE))] @ frame.T
+    low, high = np.quantile(points, [0.02, 0.98], axis=0)
+    return Body(points, low, high)
+
+
+def separate(surface: Surface, inside: Array, things: Array | None = None) -> list[Array]:
+    """(M,) bool -> surface numbers of each single thing in it, the largest first, without specks.
+
+    things: (N,) uint16, see `LanguageField.things`: what tells apart things that touch, and keeps together
+    one that is half hidden. Gaussians that are of none, or all of them where nothing is known of things, are
+    taken apart where the surface is.
+    """
+    numbers = np.flatnonzero(inside)
+    owner = np.full(len(numbers), NO_THING) if things is None else things[surface.rows[numbers]]
+    parts = connected_parts(surface, numbers[owner == NO_THING]).each()
+    parts += [numbers[owner == one] for one in np.unique(owner[owner != NO_THING])]
+    parts.sort(key=len, reverse=True)
+    return [part for part in parts if len(part) >= max(FEWEST, SPECK * len(parts[0]))]
+
+
+def gap(one: Body, other: Body) -> float:
+    """Least distance between points of two things, world units."""
+    return float(other.tree.query(one.points)[0].min())
+
+
+def stands(kind: Side, what: Body, anchor: Body, seen_by: Viewer | None) -> bool:
+    """Whether `what` stands so to `anchor`. "left of", "right of", "behind" and "in front of" are said by a
+    viewer, who is then not None."""
+    match kind:
+        case "on":
+            return _on(what, anchor)
+        case "in":
+            return _in(what, anchor)
+        case "near":
+            return gap(what, anchor) <= NEAR * min(what.size, anchor.size)
+        case "above":
+            return _above(what, anchor)
+        case "below":
+            return _above(anchor, what)
+        case _:
+            assert seen_by is not None
+            return _beside(kind, what, anchor, seen_by)
+
+
+def _on(what: Body, anchor: Body) -> bool:
+    reach = TOUCH * min(what.size, anchor.size) + anchor.spacing
+    touching = anchor.tree.query(what.points, distance_upper_bound=reach)[0] < np.inf
+    if not touching.any() or what.size > anchor.size:
+        return False
+    above = what.centre[2] > anchor.low[2] and _over(what, anchor)
+    foot = what.points[touching, 2].mean() <= what.low[2] + FOOT * (what.high[2] - what.low[2])
+    return bool((above and foot) or touching.mean() >= FLAT)
+
+
+def _over(what: Body, anchor: Body) -> bool:
+    """Whether the middle of `what`, seen from above, lies within `anchor`."""
+    return bool(((what.centre >= anchor.low) & (what.centre <= anchor.high))[:2].all())
+
+
+def _in(what: Body, anchor: Body) -> bool:
+    height = what.high[2] - what.low[2]
+    head = np.array([0, 0, 0.5 * height])  # it may look out of an open vessel
+    sunk = what.low[2] <= anchor.high[2] - SUNK * height  # and does not merely stand on a flat top
+    held = ((what.points >= anchor.low) & (what.points <= anchor.high + head)).all(1)
+    return bool(what.size < anchor.size and sunk and _over(what, anchor) and held.mean() >= HELD)
+
+
+def _above(what: Body, anchor: Body) -> bool:
+    overlap = ((what.low <= anchor.high) & (anchor.low <= what.high))[:2].all()
+    return bool(overlap and what.centre[2] > anchor.high[2] and what.low[2] > anchor.centre[2])
+
+
+def _beside(kind: Side, what: Body, anchor: Body, seen_by: Viewer) -> bool:
+    (x, z), (anchor_x, anchor_z) = seen_by.seen(what), seen_by.seen(anchor)
+    apart = ASIDE * (what.size + anchor.size) / 2
+    aside = (x - anchor_x) * anchor_z  # world units at the anchor's depth
+    if kind == "left of":
+        return aside < -apart
+    if kind == "right of":
+        return aside > apart
+    in_line = abs(aside) <= (what.size + anchor.size) / 2
+    return in_line and (z - anchor_z > apart if kind == "behind" else anchor_z - z > apart)
+
+
+def most(kind: Extreme, things: list[Body], anchors: list[Body], seen_by: Viewer | None) -> int:
+    """Number of the one of `things` (at least one) that is most so. "nearest" and "farthest" are measured
+    from any of `anchors`, and without one from the viewer, as "leftmost" and "rightmost" are; who is then not
+    None."""
+    sign = -1 if kind in ("smallest", "nearest", "lowest", "leftmost") else 1
+    return int(np.nanargmax([sign * _measure(kind, thing, anchors, seen_by) for thing in things]))
+
+
+def _measure(kind: Extreme, thing: Body, anchors: list[Body], seen_by: Viewer | None) -> float:
+    if kind in ("biggest", "smallest"):
+        return thing.size
+    if kind in ("highest", "lowest"):
+        return float(thing.centre[2])
+    if kind in ("nearest", "farthest") and anchors:
+        return min(gap(thing, anchor) for anchor in anchors)
+    assert seen_by is not None
+    if kind in ("nearest", "farthest"):
+        return float(np.linalg.norm(seen_by.matrix[:3, :3] @ thing.centre + seen_by.matrix[:3, 3]))
+    aside = seen_by.seen(thing)[0]
+    return (np.inf if kind == "leftmost" else -np.inf) if np.isnan(aside) else aside
+
+
+# The answer to several phrases at once, as one selection.
+
+Combination = Literal["union", "intersection", "difference"]
+_SELECT = {"union": union, "intersection": intersection, "difference": difference}
+
+
+@dataclass(frozen=True, eq=False)
+class Combined:
+    """What several answers make together."""
+
+    members: Array  # (N,) bool
+    relevancy: Array  # (N,) in [0, 1]: the largest of a union, the least of an intersection, else the first's
+
+
+def combine(results: Sequence[QueryResult], how: Combination) -> Combined:
+    """One or more answers in one. Raises InputError where a phrase was not found, or nothing is left."""
+    for result in results:
+        if not result.found or not result.members.any():
+            raise InputError(
+                f"'{result.phrase}' was not found (score {result.peak:.3f}): nothing to select; ask in other "
+                "words, or at another --level"
+            )
+    members = _SELECT[how]([result.members for result in results])
+    if not members.any():
+        phrases = ", ".join(f"'{result.phrase}'" for result in results)
+        raise InputError(f"the {how} of {phrases} is empty: nothing to select; try another --combine")
+    values = [result.relevancy[result.level] for result in results]
+    if how == "union":
+        return Combined(members, reduce(np.maximum, values))
+    return Combined(members, reduce(np.minimum, values) if how == "intersection" else values[0])
+
+
+# Answers to single phrases, combined among the Gaussians into one of the same form.
+#
+# The relevancy of a combined answer is zero wherever it does not hold, and the same at every level where it
+# has parts of several; its peak is that of its weakest necessary part.
+
+WHOLE = LEVELS.index("whole")
+SHARE = 0.6  # of the way from what is typical of a thing's least fitting surface to the part's peak on it
+LEAST = 0.05  # quantile of a part's relevancy on its thing that stands for "not this part"
+SPAN = 0.02  # of relevancy: the least distance that is divided
+SURE = 0.5  # of the way that an answer reaches: what fits an unwanted name so well is what was meant
+HALF = 0.5  # of the peak: what is less is no longer the place
+
+
+def grown(surface: Surface, members: Array) -> Array:
+    """(N,) bool, and what is next to it on the surface."""
+    inside = np.flatnonzero(members[surface.rows])
+    result = members.copy()
+    result[surface.rows[surface.links[inside].indices]] = True
+    return result
+
+
+def owners(surface: Surface, count: int, things: list[Array]) -> Array:
+    """(N,) number of the thing (of `things`, as surface numbers) that each of `count` Gaussians belongs to;
+    -1 for what belongs to none, as the faint Gaussians do that are not of the surface."""
+    labels = np.full(count, -1)
+    for number, thing in enumerate(things):
+        labels[surface.rows[thing]] = number
+    return labels
+
+
+def cut_inside(
+    engine: QueryEngine, asked: list[QueryResult], thing: QueryResult, there: Array, level: LevelChoice
+) -> QueryResult:
+    """What `asked` says of a part, cut anew among the Gaussians of its thing. there: (N,) bool."""
+    surface, known = engine.surface, engine.field.known
+    relevancy = np.asarray(np.mean([result.relevancy for result in asked], axis=0, dtype=np.float32))
+    even = np.where(there, engine.evened(relevancy), 0)
+    relevancy = np.where(there, relevancy, 0)
+    numbers = np.flatnonzero(there[surface.rows])
+    peaks = peaks_among(even[:, surface.rows[numbers]])
+    own = int(np.argmax(peaks[:WHOLE])) if max(peaks[:WHOLE]) > 0 else WHOLE
+    chosen = own if level == "auto" else LEVELS.index(level)
+    peak, inside = peaks[chosen], there & known[chosen]
+    own_surface = thing.members & known[chosen]  # without what it touches, which may be anything
+    low = float(np.quantile(even[chosen][own_surface], LEAST)) if own_surface.any() else peak
+    members = inside & (even[chosen] > low + SHARE * max(peak - low, SPAN))
+    subpart, part, whole = engine.scale.fit(np.array(peaks)).tolist()
+    fits, probability = (subpart, part, whole), thing.probability
+    right, above = True, None
+    if engine.calibration is not None and probability is not None:
+        odds = engine.calibration.inside
+        right = odds.probability(fits) >= odds.found
+        probability = min(probability, odds.probability(fits))
+    elif engine.chance is not None:
+        above = excess(fits, engine.chance_among(there), "inside", level)
+        right = above >= 0
+        above = _combined([above, thing.excess], min)
+    return replace(
+        asked[0],
+        level=chosen,
+        scores=peaks,
+        relevancy=relevancy,
+        even=even[chosen],
+        peak=peak,
+        fits=fits,
+        probability=_of_any(members, probability),
+        excess=above,
+        found=bool(members.any() and thing.found and right),
+        members=members,
+    )
+
+
+def peaks_among(relevancy: Array) -> tuple[float, float, float]:
+    """The highest of (3, K) relevancies per level; 0 for none."""
+    subpart, part, whole = relevancy.max(axis=1, initial=0)
+    return float(subpart), float(part), float(whole)
+
+
+def joined(answers: list[QueryResult], all_needed: bool) -> QueryResult:
+    """The union of answers, found if all are, or any is; what is not found of alternatives does not count."""
+    counting = answers if all_needed else [answer for answer in answers if answer.found] or answers
+    score = min if all_needed else max
+    values = np.max([np.where(a.members, a.relevancy[a.level], 0) for a in counting], axis=0)
+    peak = score(answer.peak for answer in counting)
+    return replace(
+        counting[0],
+        scores=(peak, peak, peak),
+        relevancy=np.tile(values.astype(np.float32), (len(LEVELS), 1)),
+        even=np.max([np.where(a.members, a.even, 0) for a in counting], axis=0),
+        peak=peak,
+        probability=_combined([answer.probability for answer in counting], score),
+        excess=_combined([answer.excess for answer in counting], score),
+        found=(all if all_needed else any)(answer.found for answer in answers),
+        members=np.any([answer.members for answer in counting], axis=0),
+    )
+
+
+def without(what: QueryResult, unwanted: QueryResult) -> QueryResult:
+    """`what` but for `unwanted`, if that is there."""
+    return restricted(what, ~unwanted.members, what) if unwanted.found else what
+
+
+def surest(engine: QueryEngine, answer: QueryResult) -> QueryResult:
+    """Those members alone that fit nearly as well as the best one does. A green mug may be in the answer to
+    "red mug", for want of a better one; it is not what "not red mug" means."""
+    fits = engine.scale.fit(answer.even)
+    best = float(fits[answer.members].max(initial=-np.inf))
+    return replace(answer, members=answer.members & (fits >= lowest(best, SURE)))
+
+
+def _combined(values: Sequence[float | None], score: Callable[[Iterable[float]], float]) -> float | None:
+    """The weakest or the best, as `score` says; None where one is not known."""
+    known = [value for value in values if value is not None]
+    return score(known) if len(known) == len(values) else None
+
+
+def _of_any(members: Array, probability: float | None) -> float | None:
+    """0 where there are no members, in a scene that has probabilities."""
+    return probability if probability is None or members.any() else 0.0
+
+
+def restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryResult:
+    """`answer` where `keep` (N,) holds alone; nothing is found without `needed`."""
+    members = answer.members & keep
+    return replace(
+        answer,
+        relevancy=np.where(members, answer.relevancy, 0),
+        even=np.where(members, answer.even, 0),
+        probability=_of_any(members, _combined([answer.probability, needed.probability], min)),
+        excess=_combined([answer.excess, needed.excess], min),
+        peak=answer.peak if members.any() else 0.0,
+        found=bool(members.any() and answer.found and needed.found),
+        members=members,
+    )
+
+
+def placed(surface: Surface, answer: QueryResult) -> QueryResult:
+    """`answer` with the place of its strongest connected members."""
+    values = np.where(answer.members, answer.relevancy[answer.level], 0)
+    smoothed = surface.smooth(np.tile(values.astype(np.float32), (len(LEVELS), 1)))[0]
+    place = locate(surface, smoothed, HALF * float(smoothed.max(initial=0)))
+    found = (None, None) if place is None else (place.position, place.box)
+    return replace(answer, place=found[0], box=found[1])
+
+
+# Answers to phrases with structure: each phrase in the tree is asked for itself at its fitting level, and
+# the answers are combined among the Gaussians (`query.combine`).
 
 SAME = 0.5  # of a thing's Gaussians: what shares so many with another is the same, and not related to it
 SAID_BY_VIEWER = ("left of", "right of", "behind", "in front of", "leftmost", "rightmost")

@@ -1,23 +1,388 @@
-"""What is here? Words for Gaussians, for a pixel, and for a whole scene."""
+"""Reverse queries: which words of a vocabulary say best what a vector of CLIP's space means.
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+    p(word | x)  =  softmax over words of  scale * (cos(x, word) - hub(word) / 2)
+
+The hub of a word is its mean cosine with the meanings of the scene that are nearest to it. Some words lie
+near every picture and would be the answer everywhere ("hubs"); what is left of the cosine says how much
+better a word fits here than where it fits anyway. It is cross-domain similarity local scaling ("Word
+translation without parallel data", Conneau et al. 2018, equation 3): 2 cos(x, w) - hub(w) - hub(x), halved,
+and without hub(x), which all words have in common.
+
+The canonical phrases ("object", "things", "stuff", "texture") compete too: their share is the chance that no
+word of the vocabulary fits.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import PictureConfig
-from langsplat_core.errors import InputError
+from langsplat_core.config import LevelChoice, PictureConfig, RasterSettings
+from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.progress import Progress, silent
+from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.inventory import Entry, take_inventory
+from langsplat_core.query.instances import connected_parts
 from langsplat_core.query.surface import surface_areas
-from langsplat_core.query.words import Word, WordScores, build_attributes, build_words, certain
-from langsplat_core.raster.one_pixel import pixel_weights
 from langsplat_core.raster.protocol import LiftingRasterizer
-from langsplat_core.scene import LEVELS, Camera
+from langsplat_core.raster.render import pixel_weights
+from langsplat_core.scene import LEVELS, Camera, Codec, LanguageField
+from langsplat_core.scene.language import phrase_key
+from langsplat_core.semantics.relevancy import FLOOR
 from langsplat_core.semantics.vocabulary import Bundled, bundled_vocabulary
+
+# Logits per spread of phrases' cosines with a meaning: a probability is then right about so often, with the
+# bundled encoder and with the geometry of CLIP (rooms 201 to 203, docs/describing.md).
+WORD_SCALE = 6.0
+ATTRIBUTE_SCALE = 3.4
+NEAREST = 10  # meanings that make a word's hub, as in the paper
+BANK = 4096  # meanings that are looked at for it, of codebooks; of other codecs fewer, since none is distinct
+SAMPLES = 512
+CERTAIN = 0.5  # probability from which a colour or material is said
+NARROWEST = 1e-6  # spread; words that are all the same have none
+CELLS = 8_000_000  # numbers of a block of meanings times words: 32 MB
+
+
+@dataclass(frozen=True)
+class Word:
+    """A phrase and how probable it is, among its vocabulary."""
+
+    phrase: str
+    probability: float  # in [0, 1]
+
+
+@dataclass(frozen=True, eq=False)
+class WordScores:
+    """A vocabulary as numbers: everything about it that does not depend on the place that is asked for."""
+
+    phrases: tuple[str, ...]  # V
+    vectors: Array  # (V + C, D) float32 unit; the last C stand for "none of these"
+    hubs: Array  # (V + C,) float32, taken half
+    scale: float  # of the softmax
+
+    def vector(self, phrase: str) -> Array:
+        """(D,) of one of the phrases."""
+        found: Array = self.vectors[self.phrases.index(phrase)]
+        return found
+
+    def take(self, chosen: Array) -> "WordScores":
+        """Those phrases for which `chosen` (V,) bool is True; the canonical ones stay."""
+        rows = np.append(chosen, np.ones(len(self.vectors) - len(chosen), bool))
+        phrases = tuple(phrase for phrase, kept in zip(self.phrases, chosen, strict=True) if kept)
+        return replace(self, phrases=phrases, vectors=self.vectors[rows], hubs=self.hubs[rows])
+
+    def probabilities(self, codec: Codec, latents: Array) -> Array:
+        """(M, d) latents with a meaning -> (M, V + C) float32, each row adding up to 1."""
+        if codec.space == "index":
+            cosines = codec.decode(latents) @ self.vectors.T
+        else:
+            cosines = codec.similarities(latents, self.vectors)
+        logits = np.float32(self.scale) * (cosines - self.hubs / 2)
+        shares = np.exp(logits - logits.max(1, keepdims=True))
+        result: Array = shares / shares.sum(1, keepdims=True)
+        return result
+
+    def mixture(self, codec: Codec, latents: Array, weights: Array) -> Array:
+        """(M, d) latents with a meaning and (M,) weights >= 0, not all zero -> (V + C,) float64: the mean of
+        their probabilities. Answers are blended, never meanings: between two things lies a third."""
+        if codec.space == "index":
+            codes, inverse = np.unique(latents[:, 0], return_inverse=True)
+            latents, weights = codes[:, None], np.bincount(inverse, weights, minlength=len(codes))
+        total = np.zeros(len(self.vectors))
+        for part in self._blocks(len(latents)):
+            total += weights[part].astype(np.float64) @ self.probabilities(codec, latents[part])
+        return total / total.sum()
+
+    def best(self, codec: Codec, latents: Array, count: int) -> tuple[Array, Array]:
+        """(M, d) latents with a meaning -> (M, count) numbers of the most probable phrases, the best first,
+        and their (M, count) float32 probabilities; fewer where the vocabulary has fewer."""
+        count = min(count, len(self.phrases))
+        if count == 0:
+            return np.empty((len(latents), 0), np.int32), np.empty((len(latents), 0), np.float32)
+        words = np.empty((len(latents), count), np.int32)
+        shares = np.empty((len(latents), count), np.float32)
+        for part in self._blocks(len(latents)):
+            found = self.probabilities(codec, latents[part])[:, : len(self.phrases)]
+            some = np.argpartition(-found, count - 1, axis=1)[:, :count]
+            order = np.argsort(-np.take_along_axis(found, some, 1), axis=1, kind="stable")
+            words[part] = np.take_along_axis(some, order, 1)
+            shares[part] = np.take_along_axis(found, words[part], 1)
+        return words, shares
+
+    def _blocks(self, count: int) -> list[slice]:
+        rows = max(1, CELLS // len(self.vectors))
+        return [slice(start, start + rows) for start in range(0, count, rows)]
+
+
+def build_words(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
+    """Names of things: V phrases and their (V, D) unit vectors."""
+    every, bank = np.concatenate([vectors, field.canonical]).astype(np.float32), meanings(field)
+    return WordScores(phrases, every, hubs(every, bank), WORD_SCALE / _spread(field, vectors, bank))
+
+
+def build_attributes(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
+    """Words of which a thing has one, such as colours: V phrases and their (V, D) unit vectors. Few and all
+    of one kind, they are no hubs."""
+    none, scale = (
+        np.zeros(len(vectors), np.float32),
+        ATTRIBUTE_SCALE / _spread(field, vectors, meanings(field)),
+    )
+    return WordScores(phrases, vectors.astype(np.float32), none, scale)
+
+
+def _spread(field: LanguageField, vectors: Array, bank: Array) -> float:
+    """Median, over meanings, of the standard deviation of cosines: of everyday phrases, else of the words."""
+    texts = vectors if field.everyday is None else field.everyday
+    spreads = (bank @ texts.T).std(1) if len(bank) and len(texts) > 1 else np.ones(1)
+    return max(float(np.median(spreads)), NARROWEST)
+
+
+def meanings(field: LanguageField) -> Array:
+    """(B, D) float32 unit vectors of what the scene's Gaussians mean: every codeword that one of them has, or
+    those of evenly spread Gaussians where there are no codewords."""
+    latents = field.latents[field.known]
+    if field.codec.space == "index":
+        latents, most = np.unique(latents)[:, None], BANK
+    else:
+        most = SAMPLES
+    chosen = np.unique(np.linspace(0, len(latents) - 1, min(most, len(latents))).astype(np.int64))
+    return field.codec.decode(latents[chosen])
+
+
+def hubs(vectors: Array, bank: Array) -> Array:
+    """(V, D) unit vectors of words, (B, D) of meanings -> (V,) float32 mean cosine with the nearest ones."""
+    count = min(NEAREST, len(bank))
+    if count == 0:
+        return np.zeros(len(vectors), np.float32)
+    near = np.partition(vectors @ bank.T, len(bank) - count, axis=1)[:, -count:]
+    found: Array = near.mean(1, dtype=np.float64).astype(np.float32)
+    return found
+
+
+def certain(words: WordScores, codec: Codec, latents: Array, weights: Array) -> Word | None:
+    """The attribute of (M, d) latents with a meaning, weighted by (M,), where it is probable enough."""
+    shares = words.mixture(codec, latents, weights)
+    best = int(shares.argmax())
+    return Word(words.phrases[best], float(shares[best])) if shares[best] >= CERTAIN else None
+
+
+# The inventory of a scene: what is in it, where, how sure.
+#
+# Every meaning of the scene has its best word, and so every Gaussian. Words that cover enough of the surface
+# are candidates; those that claim the same meanings are one thing by two names ("mug" and "cup"); and what is
+# listed was asked for, as a phrase, and found where it was claimed.
+
+LEAST_SHARE = 5e-4  # of the scene's surface that a word, with others for the same, must be the best for
+LEAST_SPOT = 0.15  # of its largest spot's surface: a smaller one is a splinter of a border
+LEAST_COUNT = 12  # Gaussians of a spot
+SAME = 0.5  # overlap of claims from which two words name the same thing
+LIKELY = 0.5  # probability from which a word is listed
+RUNNERS_UP = 5  # words per meaning that may be names for it
+MOST = 200  # candidates per level, the largest first
+
+LEVEL_NAMES: tuple[LevelChoice, ...] = (
+    "subpart",
+    "part",
+    "whole",
+)  # `LEVELS`, as `QueryEngine.run` takes them
+Attributes = tuple[WordScores | None, WordScores | None]  # colours, materials
+
+
+@dataclass(frozen=True, eq=False)
+class Spot:
+    """One connected place where a word is true."""
+
+    centre: Array  # (3,) world units
+    box: Array  # (2, 3) lower and upper corner, world units, between 2 % and 98 % of its Gaussians
+    rows: Array  # (M,) int64 numbers of its Gaussians
+    share: float  # of the scene's surface, in [0, 1]
+    colour: Word | None
+    material: Word | None
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """A word that is true in the scene."""
+
+    phrase: str
+    also: tuple[str, ...]  # other words for the same
+    level: int  # index into LEVELS
+    probability: float  # that it or a word of `also` is right, a mean over its surface
+    score: float  # peak relevancy of the phrase, as a query gives it
+    share: float  # of the scene's surface, in [0, 1]
+    spots: tuple[Spot, ...]  # the largest first
+
+
+@dataclass(frozen=True, eq=False)
+class Meanings:
+    """The M different meanings of a field, and who has which."""
+
+    latents: Array  # (M, d)
+    of: Array  # (3, N) int64 number of each Gaussian's meaning, -1 for none
+
+    def surface(self, level: int, areas: Array) -> Array:
+        """(N,) areas -> (M,) the area of each meaning at a level."""
+        has = self.of[level] >= 0
+        return np.bincount(self.of[level][has], areas[has], minlength=len(self.latents))
+
+
+@dataclass(frozen=True, eq=False)
+class _Claim:
+    """A group of words that claim the same meanings at one level."""
+
+    level: int
+    phrases: tuple[str, ...]  # the most claimed first
+    rows: Array  # (M,) int64 numbers of the Gaussians for which one of them is the best
+    probability: float
+
+
+def take_inventory(
+    engine: QueryEngine,
+    words: Sequence[WordScores],
+    attributes: Attributes,
+    areas: Array,
+    progress: Progress = silent,
+) -> list[Entry]:
+    """Every word that is true in the scene, whole things first, then by surface. A word is listed once, at
+    the coarsest level where it is claimed and found.
+
+    words: of each level; areas: (N,) as of `surface_areas`.
+    """
+    field = engine.field
+    held = field_meanings(field)
+    entries: list[Entry] = []
+    named: set[str] = set()
+    for level in reversed(range(len(LEVELS))):
+        claims = list(_claims(field, held, words[level], level, areas))
+        for done, claim in enumerate(claims):
+            progress(f"checking words: {LEVELS[level]}", done / len(claims))
+            if named.isdisjoint(claim.phrases):
+                entry = _verified(engine, words[level], attributes, areas, claim)
+                if entry is not None:
+                    entries.append(entry)
+                    named.update(claim.phrases)
+        progress(f"checking words: {LEVELS[level]}", 1.0)
+    return entries
+
+
+def field_meanings(field: LanguageField) -> Meanings:
+    """Codewords, or the meaning of every Gaussian by itself where a codec has none."""
+    if field.codec.space == "index":
+        codes = np.arange(field.codec.index_size, dtype=np.uint16)[:, None]
+        return Meanings(codes, np.where(field.known, field.latents[..., 0].astype(np.int64), -1))
+    known = field.known
+    of = np.full(known.shape, -1, np.int64)
+    of[known] = np.arange(int(known.sum()))
+    return Meanings(field.latents[known], of)
+
+
+def _claims(
+    field: LanguageField, held: Meanings, words: WordScores, level: int, areas: Array
+) -> Iterator[_Claim]:
+    """Groups of words at a level, those that cover most first."""
+    best, shares = words.best(field.codec, held.latents, RUNNERS_UP)
+    if best.size == 0:  # no words, or nothing that means anything
+        return
+    surface = held.surface(level, areas)
+    least = LEAST_SHARE * max(float(areas.sum()), 1e-300)
+    mass = np.bincount(best.ravel(), (surface[:, None] * shares).ravel())
+    order = np.argsort(-mass, kind="stable")[:MOST]
+    candidates = order[mass[order] >= least / 2]
+    names = np.zeros((len(surface), len(candidates)), np.float32)  # (M, C) probability of each candidate
+    for column, word in enumerate(candidates):
+        names[:, column] = np.where(best == word, shares, 0).sum(1)
+    for group in same_things(names, surface):
+        numbers = candidates[group]
+        winners = np.isin(best[:, 0], numbers)
+        weight = surface[winners]
+        if weight.sum() < least:
+            continue
+        probability = float(weight @ names[winners][:, group].sum(1)) / float(weight.sum())
+        if probability < LIKELY:
+            continue
+        of = held.of[level]
+        rows = np.flatnonzero((of >= 0) & winners[np.maximum(of, 0)])
+        yield _Claim(level, tuple(words.phrases[number] for number in numbers), rows, probability)
+
+
+def same_things(names: Array, surface: Array) -> list[list[int]]:
+    """(M, C) probabilities of C words, the most claimed first, for meanings of (M,) surface -> groups of
+    columns that name the same.
+
+    Two words do where most of what either claims is claimed by the other as well:
+    sum_m s_m min(p_ma, p_mb) >= SAME max(sum_m s_m p_ma, sum_m s_m p_mb). A word joins the first group whose
+    most claimed word it agrees with.
+    """
+    weighted = names.astype(np.float64) * surface[:, None]
+    totals = weighted.sum(0)
+    groups: list[list[int]] = []
+    for word in range(names.shape[1]):
+        for group in groups:
+            head = group[0]
+            common = np.minimum(weighted[:, word], weighted[:, head]).sum()
+            if common >= SAME * max(totals[word], totals[head]):
+                group.append(word)
+                break
+        else:
+            groups.append([word])
+    return groups
+
+
+def _verified(
+    engine: QueryEngine, words: WordScores, attributes: Attributes, areas: Array, claim: _Claim
+) -> Entry | None:
+    """The claim as an entry under the first of its words that a query finds there; None if it finds none."""
+    level: LevelChoice = LEVEL_NAMES[claim.level]
+    for phrase in claim.phrases:
+        result = engine.run(phrase, level, vector=words.vector(phrase))
+        agreed = claim.rows[result.relevancy[claim.level, claim.rows] > FLOOR]
+        if not result.found or 2 * areas[agreed].sum() < areas[claim.rows].sum():
+            continue
+        spots = _spots(engine, attributes, areas, claim.level, agreed)
+        if spots:
+            others = tuple(other for other in claim.phrases if other != phrase)
+            share = float(sum(spot.share for spot in spots))
+            return Entry(phrase, others, claim.level, claim.probability, result.peak, share, spots)
+    return None
+
+
+def _spots(
+    engine: QueryEngine, attributes: Attributes, areas: Array, level: int, rows: Array
+) -> tuple[Spot, ...]:
+    """The connected places of Gaussians `rows` (M,), the largest first, without splinters."""
+    total = float(areas.sum())
+    surface = engine.surface
+    numbers = np.flatnonzero(np.isin(surface.rows, rows))
+    found = [surface.rows[part] for part in connected_parts(surface, numbers).each()]
+    parts = sorted(found, key=lambda part: -areas[part].sum())
+    least = LEAST_SPOT * areas[parts[0]].sum() if parts else 0.0
+    kept = [part for part in parts if len(part) >= LEAST_COUNT and areas[part].sum() >= least]
+    return tuple(_spot(engine, attributes, areas, level, part, total) for part in kept)
+
+
+def _spot(
+    engine: QueryEngine, attributes: Attributes, areas: Array, level: int, rows: Array, total: float
+) -> Spot:
+    field, weights = engine.field, np.maximum(areas[rows], 1e-300)
+    positions = engine.scene.gaussians.means[rows].astype(np.float64)
+    latents = field.latents[level, rows]
+    colour, material = (
+        None if known is None else certain(known, field.codec, latents, weights) for known in attributes
+    )
+    return Spot(
+        centre=weights @ positions / weights.sum(),
+        box=np.quantile(positions, [0.02, 0.98], axis=0),
+        rows=rows,
+        share=float(weights.sum()) / total,
+        colour=colour,
+        material=material,
+    )
+
+
+# What is here? Words for Gaussians, for a pixel, and for a whole scene.
 
 
 @dataclass(frozen=True)
@@ -143,3 +508,117 @@ class Describer:
             colour=colour,
             material=material,
         )
+
+
+# What lies under one pixel: where it is, what it is called, and how relevant it is to what was asked.
+
+
+@dataclass(frozen=True, eq=False)
+class Pointed:
+    """The surface in one pixel."""
+
+    position: Array  # (3,) world units
+    depth: float  # camera z, world units
+    words: Levels  # at each level the most probable
+    relevancy: tuple[float, ...]  # in [0, 1], of each answer at its level
+
+
+def look_at_pixel(
+    rasterizer: LiftingRasterizer,
+    describer: Describer,
+    camera: Camera,
+    pixel: tuple[int, int],
+    results: Sequence[QueryResult] = (),
+    top: int = 3,
+    settings: RasterSettings | None = None,
+) -> Pointed | None:
+    """What `camera` sees at `pixel` (column, row) of its picture; None where that is mostly empty.
+
+    Every Gaussian counts by its blending weight there; the surface is at the median of their depths, as the
+    rasterizers have it. `settings` of image formation: by default the scene's own.
+    """
+    scene = describer.engine.scene
+    formed = settings or scene.raster_settings()
+    rows, weights = pixel_weights(rasterizer, scene.gaussians, camera, pixel, formed)
+    total = float(weights.sum())
+    if total <= PictureConfig().alpha_gate:
+        return None
+    means = scene.gaussians.means[rows].astype(np.float64)
+    depths = means @ camera.rotation[2] + camera.world_to_camera[2, 3]
+    order = np.argsort(depths, kind="stable")
+    median = order[np.searchsorted(np.cumsum(weights[order], dtype=np.float64), 0.5 * total)]
+    depth = float(depths[median])
+    centre = (pixel[0] + 0.5, pixel[1] + 0.5)
+    relevancy = (float(weights @ result.relevancy[result.level][rows]) / total for result in results)
+    return Pointed(
+        position=camera.unproject(centre, depth),
+        depth=depth,
+        words=describer.at_gaussians(rows, weights, top),
+        relevancy=tuple(relevancy),
+    )
+
+
+# What can be asked of a scene: examples that it answers, and phrases that begin like what is being typed.
+
+EXAMPLES = 6
+TRIES = 4  # candidates that are asked for each example wanted
+
+
+@dataclass(frozen=True)
+class Suggestions:
+    """Help for someone who does not know a scene."""
+
+    examples: tuple[str, ...] = ()  # each is found in the scene
+    phrases: tuple[str, ...] = ()  # that its encoder or its phrasebook knows, what is in the scene first
+
+
+def suggest(engine: QueryEngine, at_most: int = EXAMPLES, progress: Progress = silent) -> Suggestions:
+    """Examples for a scene with a language field, from its inventory and phrasebook, each asked and found;
+    none where nothing can be asked. Seconds: keep what it returns."""
+    book = tuple(engine.field.phrasebook)
+    here: tuple[str, ...] = ()
+    taught: tuple[str, ...] = ()
+    try:
+        describer = Describer(engine, progress=progress)
+        taught = describer.words[0].phrases
+        entries = sorted(describer.inventory(progress), key=lambda entry: -entry.probability)
+        here = tuple(entry.phrase for entry in entries)
+    except LangSplatError:  # no encoder here, or one that knows none of the words: the phrasebook is left
+        pass
+    candidates = tuple(dict.fromkeys((*here, *book)))
+    examples: list[str] = []
+    for phrase in candidates[: TRIES * at_most]:
+        if len(examples) == at_most:
+            break
+        if _is_found(engine, phrase):
+            examples.append(phrase)
+    return Suggestions(tuple(examples), tuple(dict.fromkeys((*candidates, *taught))))
+
+
+def _is_found(engine: QueryEngine, phrase: str) -> bool:
+    try:
+        return run_phrase(engine, phrase).answer.found
+    except LangSplatError:  # "of", in someone's phrasebook
+        return False
+
+
+def completions(text: str, phrases: Sequence[str], at_most: int = 6) -> list[str]:
+    """Phrases that go on from what was typed, in the order of `phrases`: those that begin with all of it,
+    then what was typed with its last word completed. Nothing where no text is, or a word has ended."""
+    typed = phrase_key(text)
+    if not typed or text[-1:].isspace():
+        return []
+    begun, _, last = typed.rpartition(" ")
+    whole = [phrase for phrase in phrases if phrase.startswith(typed) and phrase != typed]
+    words = dict.fromkeys(word for phrase in phrases for word in phrase.split() if word.startswith(last))
+    ended = [f"{begun} {word}" for word in words if word != last] if begun else []
+    return list(dict.fromkeys((*whole, *ended)))[:at_most]
+
+
+def corrected(text: str, near: Mapping[str, Sequence[str]]) -> str | None:
+    """`text` with every unknown word replaced by the nearest known one; None where one has none. near: as of
+    `UnknownWordError`."""
+    if not all(near.values()):
+        return None
+    words = phrase_key(text).split(" ")
+    return " ".join(near[word][0] if near.get(word) else word for word in words)

@@ -12,20 +12,27 @@ from langsplat_core.arrays import Array
 from langsplat_core.compiled import plain
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
-from langsplat_core.formats.language import SUFFIX
+from langsplat_core.io.language import SUFFIX
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import AnswerRule, QueryResult, by_peak, by_regions
-from langsplat_core.query.chance import SAMPLED, Bars, Chance, chance_in
+from langsplat_core.query.answers import (
+    SAMPLED,
+    AnswerRule,
+    Bars,
+    Chance,
+    QueryResult,
+    by_peak,
+    by_regions,
+    chance_in,
+)
+from langsplat_core.query.grammar import STOP_WORDS, check_names, only
 from langsplat_core.query.instances import Instance, find_instances
 from langsplat_core.query.lookup import Lookup, build_lookup
-from langsplat_core.query.regions import Regions, build_regions
-from langsplat_core.query.surface import Surface, build_surface
-from langsplat_core.query.vocabulary import STOP_WORDS, check_names, only
+from langsplat_core.query.surface import Regions, Surface, build_regions, build_surface
 from langsplat_core.scene import CANONICAL_PHRASES, Calibration, LanguageField, Scene
-from langsplat_core.scene.phrases import phrase_key, tidy
+from langsplat_core.scene.language import phrase_key, tidy
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE
-from langsplat_core.semantics.everyday import FEWEST, everyday_vectors
 from langsplat_core.semantics.relevancy import Scale
+from langsplat_core.semantics.vocabulary import FEWEST, everyday_vectors
 
 BATCH = 256  # phrases that are encoded, and compared with codewords, at a time
 SAME_ENCODER = 0.99  # least cosine of canonical vectors of one encoder, whatever rounds them

@@ -1,53 +1,238 @@
-"""Phrases with structure: text -> tree, by a small grammar, and a tree's reading for people.
-
-    query       = alternatives { exclusion alternatives }
-    exclusion   = ", not" | "but not" | "and not" | "not" | "without" | "except" | "other than"
-    alternatives = all { ("or" | ",") all }
-    all         = clause { ("and" | "&" | "as well as") clause }
-    clause      = [ superlative ] related [ "on the left" | "on the right" ]
-    superlative = "biggest" | "smallest" | "nearest" | "farthest" | "highest" | "lowest" | "leftmost" | ...
-    related     = thing { preposition related }      the first preposition relates all that follows it
-    preposition = "of" | "on" | "in" | "near" | "left of" | "in front of" | "nearest to" | ...
-    thing       = owner "'s" thing | words part-word | words
-
-"X of Y", "Y's X" and "Y X" with X a known part word are X inside Y; not "cup of tea" (X holds or measures
-Y), not "children's book" (Y owns X), not "red handle" (Y only describes). "Y without X", X a part word,
-leaves out the X inside Y. Words that only describe are no thing, so that "red and blue ball" stays whole.
-Wherever a side of a construction would name nothing, the grammar finds nothing there, and the words are asked
-as one phrase. A line of several queries is separated by `scene.phrases.split_phrases`. Word lists are in
-`query.vocabulary`.
-"""
+"""What a phrase with structure says, as a tree of the phrases in it, and its reading for people."""
 
 import re
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
 
 from langsplat_core.errors import InputError
-from langsplat_core.query.phrase_tree import (
-    SIDES,
-    Atom,
-    Both,
-    Extreme,
-    Inside,
-    Relation,
-    Side,
-    Superlative,
-    Tree,
-    Union,
-    Without,
-    atoms,
+from langsplat_core.scene.language import tokens as tokens_of
+
+Side = Literal["on", "in", "near", "left of", "right of", "above", "below", "behind", "in front of"]
+SIDES: tuple[Side, ...] = get_args(Side)
+Extreme = Literal["biggest", "smallest", "nearest", "farthest", "highest", "lowest", "leftmost", "rightmost"]
+EXTREMES: tuple[Extreme, ...] = get_args(Extreme)
+
+
+@dataclass(frozen=True)
+class Atom:
+    """A phrase that is asked whole."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Inside:
+    """A part, looked for on the whole alone."""
+
+    part: "Tree"
+    whole: "Tree"
+
+
+@dataclass(frozen=True)
+class Relation:
+    """Those of `what` that stand so to one of `anchor`."""
+
+    kind: Side
+    what: "Tree"
+    anchor: "Tree"
+
+
+@dataclass(frozen=True)
+class Both:
+    """All of them, each to be there."""
+
+    items: tuple["Tree", ...]
+
+
+@dataclass(frozen=True)
+class Union:
+    """Whichever of them is there."""
+
+    items: tuple["Tree", ...]
+
+
+@dataclass(frozen=True)
+class Without:
+    """What is `what` and not `unwanted`."""
+
+    what: "Tree"
+    unwanted: "Tree"
+
+
+@dataclass(frozen=True)
+class Superlative:
+    """The one of `what` that is most so; "nearest" and "farthest" are seen from `anchor`, else the viewer."""
+
+    kind: Extreme
+    what: "Tree"
+    anchor: "Tree | None" = None
+
+
+Tree = Atom | Inside | Relation | Both | Union | Without | Superlative
+
+
+def atoms(tree: Tree) -> tuple[Atom, ...]:
+    """The phrases of a tree, in the order in which they are written."""
+    if isinstance(tree, Atom):
+        return (tree,)
+    return tuple(atom for child in children(tree) for atom in atoms(child))
+
+
+def reading(tree: Tree) -> str:  # noqa: PLR0911  one row of a table each
+    """How a tree was understood, such as "handle  inside  red mug"; groups in a group stand in brackets."""
+    match tree:
+        case Atom(text):
+            return text
+        case Both(items):
+            return "  and  ".join(map(_nested, items))
+        case Union(items):
+            return "  or  ".join(map(_nested, items))
+        case Without(what, unwanted):
+            return f"{_nested(what)}  without  {_nested(unwanted)}"
+        case Inside(part, whole):
+            return f"{_nested(part)}  inside  {_nested(whole)}"
+        case Relation(kind, what, anchor):
+            return f"{_nested(what)}  {kind}  {_nested(anchor)}"
+        case Superlative(kind, what, anchor):
+            seen_from = "" if anchor is None else f"  from  {_nested(anchor)}"
+            return f"{kind}  {_nested(what)}{seen_from}"
+
+
+def _nested(tree: Tree) -> str:
+    return tree.text if isinstance(tree, Atom) else f"({reading(tree)})"
+
+
+def children(tree: Tree) -> tuple[Tree, ...]:
+    """What a tree is made of."""
+    match tree:
+        case Both(items) | Union(items):
+            return items
+        case Inside(one, other) | Without(one, other) | Relation(_, one, other):
+            return (one, other)
+        case Superlative(_, what, anchor):
+            return (what,) if anchor is None else (what, anchor)
+        case Atom():
+            return ()
+
+
+# The plain word lists by which the grammar of phrases tells a part from a thing; see `query.grammar`.
+
+Named = Literal["thing", "part", "part of a thing"]
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+ARTICLES = _words("a an the my your his her its our their this that these those some any")
+# What alone names nothing to look for.
+STOP_WORDS = ARTICLES | _words(
+    "of in on at to by from with without and or not but no nor is are was be am it as for into onto than "
+    "then there here what where which who whose how i you he she we they me us them so do does did except "
+    "please"
 )
-from langsplat_core.query.vocabulary import (
-    ADJECTIVES,
-    ALSO_NOUNS,
-    ARTICLES,
-    OWNERS,
-    STOP_WORDS,
-    check_names,
-    is_measure,
-    is_part,
-    only,
+# Words that describe and name nothing: "red handle" is one thing, "mug handle" is a part of another.
+ADJECTIVES = _words(
+    "red orange yellow green blue purple pink brown black white grey gray beige turquoise cyan magenta "
+    "violet gold golden silver maroon navy teal olive cream tan light dark bright pale deep colourful "
+    "colorful plain striped dotted checkered spotted patterned wooden wood metal metallic steel iron plastic "
+    "glass leather cloth fabric cotton paper rubber ceramic porcelain stone marble concrete wax woollen "
+    "woolen straw big large huge small little tiny tall short long wide narrow thin thick flat round square "
+    "curved straight pointed sharp soft hard smooth rough shiny matte old new broken clean dirty open closed "
+    "empty full upper lower left right front rear back middle top bottom outer inner first second third "
+    "other same very"
 )
-from langsplat_core.scene.phrases import tokens as tokens_of
+# Of these, what is a thing where no noun follows: "a mug and a glass".
+ALSO_NOUNS = _words("orange glass stone paper light cloth gold silver metal wood leather straw iron")
+# Things that are a part of another thing; plurals are found by their singular.
+PARTS = _words(
+    "handle lid leg ear wheel knob spout rim base stem shade bulb screen keyboard touchpad button dial "
+    "display strap buckle zip zipper lace sole heel toe tongue collar sleeve cuff pocket hood flap seam brim "
+    "cap cover spine page title seat backrest armrest cushion arm back headboard drawer door hinge latch "
+    "lock frame pane window roof chimney gate tower wall wing tail nose fin rudder propeller cockpit nozzle "
+    "engine hull mast sail deck funnel bumper headlight light tyre tire rim hub spoke pedal saddle handlebar "
+    "windshield mirror hood head eye mouth beak face muzzle neck belly chest body hand finger foot feet paw "
+    "claw hoof horn antenna shell whisker mane hair leaf leaves petal branch twig trunk root thorn stalk bud "
+    "blade tip edge grip trigger barrel lens flash viewfinder strings string pickguard bridge fret drumhead "
+    "hoop headband cord cable plug socket switch speaker antennae crust icing frosting topping filling peel "
+    "skin core seed seeds yolk slice scoop cone cherry sprinkles wick flame holder stand pole post bracket "
+    "rail step rung shelf board panel side corner top bottom front inside interior rind label logo ribbon "
+    "bow bristle tine prong nib eraser tread trim skirting ledge sill arch column shaft joint ring loop hook "
+    "chain clasp pendant"
+)
+# Heads of "X of Y" that hold or measure Y, and are no part of it: "cup of tea", "pair of scissors".
+MEASURES = _words(
+    "cup mug glass bottle bowl plate jar can box bag pot bucket basket pair piece bit slice loaf bunch stack "
+    "pile heap set row group kind type sort lot number handful can tin tube roll sheet bar block picture "
+    "photo painting drawing statue map model image portrait bouquet carton pack packet pitcher jug barrel "
+    "tray tank"
+)
+# Owners of which nothing is a part: "children's book" is a book.
+OWNERS = _words(
+    "children child kid kids men man women woman baby boy girl ladies lady people person player driver "
+    "reader writer painter baker fisherman valentine mother father"
+)
+
+
+def forms(word: str) -> tuple[str, ...]:
+    """A word in lower case and what it may be the plural of."""
+    low = word.lower()
+    return (low, low.removesuffix("s"), low.removesuffix("es"))
+
+
+def is_part(word: str) -> bool:
+    """Whether a noun, in either number, is a part of things."""
+    return any(form in PARTS for form in forms(word))
+
+
+def named(phrase: str) -> Named:
+    """What a phrase without structure names: "red mug" a thing, "red handle" and "keyboard" a part, "mug
+    handle" a part of a thing."""
+    *before, last = phrase.split() or [""]
+    if not is_part(last):
+        return "thing"
+    return "part" if only(ADJECTIVES | ARTICLES, before) else "part of a thing"
+
+
+def is_measure(word: str) -> bool:
+    """Whether a noun, in either number, holds or counts what follows "of"."""
+    return any(form in MEASURES for form in forms(word))
+
+
+def only(words: frozenset[str], tokens: Sequence[str]) -> bool:
+    """Whether all `tokens` are among `words`, whatever their case; true of none."""
+    return all(token.lower() in words for token in tokens)
+
+
+def check_names(words: Sequence[str]) -> None:
+    """InputError for no word, and for stop words alone, whose vectors are near anything."""
+    if not words:
+        raise InputError("the query is empty; type a word such as 'cup'")
+    if only(STOP_WORDS, words):
+        raise InputError(
+            f"'{' '.join(words)[:60]}' names nothing to look for; type a thing such as 'red mug'"
+        )
+
+
+# Phrases with structure: text -> tree, by a small grammar, and a tree's reading for people.
+#
+#     query       = alternatives { exclusion alternatives }
+#     exclusion   = ", not" | "but not" | "and not" | "not" | "without" | "except" | "other than"
+#     alternatives = all { ("or" | ",") all }
+#     all         = clause { ("and" | "&" | "as well as") clause }
+#     clause      = [ superlative ] related [ "on the left" | "on the right" ]
+#     superlative = "biggest" | "smallest" | "nearest" | "farthest" | "highest" | "lowest" | "leftmost" | ...
+#     related     = thing { preposition related }      the first preposition relates all that follows it
+#     preposition = "of" | "on" | "in" | "near" | "left of" | "in front of" | "nearest to" | ...
+#     thing       = owner "'s" thing | words part-word | words
+#
+# "X of Y", "Y's X" and "Y X" with X a known part word are X inside Y; not "cup of tea" (X holds or measures
+# Y), not "children's book" (Y owns X), not "red handle" (Y only describes). "Y without X", X a part word,
+# leaves out the X inside Y. Words that only describe are no thing, so that "red and blue ball" stays whole.
+# Wherever a side of a construction would name nothing, the grammar finds nothing there, and the words are
+# asked as one phrase. A line of several queries is separated by `scene.phrases.split_phrases`. Word lists
+# are in `query.vocabulary`.
 
 MAX_CHARACTERS = 400
 MAX_ATOMS = 12  # each is asked for itself

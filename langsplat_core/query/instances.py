@@ -1,19 +1,115 @@
-"""The instances of an answer: its Gaussians, taken apart where the surface is, with place, size and score.
+"""Boxes around points: along the world's axes, and along the points' own."""
 
-Two members belong to one instance when a walk over linked members of the surface leads from one to the
-other. What is too faint to be on the surface belongs where the surface Gaussian nearest to it belongs.
-"""
-
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.compiled import kernel, plain
-from langsplat_core.query.boxes import OrientedBox, axis_aligned_box, oriented_box
+from langsplat_core.errors import InputError
 from langsplat_core.query.surface import Surface
 from langsplat_core.scene import Gaussians
+
+INNER = (0.02, 0.98)  # a box holds the points between these quantiles of each coordinate: strays do not count
+TURNED = 256  # points, at most, that the box is turned by
+ROUNDS = 2  # of turns about each axis
+COARSE = np.radians(np.arange(0.0, 90.0, 10.0))  # beginning with 0: of equal areas the principal axes stay
+FINE = np.radians([0.0, -2.0, 2.0, -4.0, 4.0])
+
+
+@dataclass(frozen=True, eq=False)
+class OrientedBox:
+    """A box in any orientation, its longest side first."""
+
+    centre: Array  # (3,) world units
+    axes: Array  # (3, 3) rotation, right-handed; column k is the direction of side k
+    half_extents: Array  # (3,) world units, half the sides, descending, >= 0
+
+    @property
+    def corners(self) -> Array:
+        """(8, 3) world units."""
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
+        corners: Array = self.centre + (signs * self.half_extents) @ self.axes.T
+        return corners
+
+    def contains(self, points: Array) -> Array:
+        """(N, 3) -> (N,) bool; a point on a face is inside."""
+        inside: Array = (np.abs((points - self.centre) @ self.axes) <= self.half_extents * (1 + 1e-9)).all(1)
+        return inside
+
+
+def axis_aligned_box(points: Array) -> Array:
+    """(M, 3), M >= 1 -> (2, 3) float64 lower and upper corner between the `INNER` quantiles."""
+    return _inner(np.ascontiguousarray(points.T, np.float64))
+
+
+def oriented_box(points: Array) -> OrientedBox:
+    """Around (M, 3) points, M >= 1, between the `INNER` quantiles along each of its axes.
+
+    The axes begin as the principal ones of the points that are no strays, and are then turned about one
+    another to the least area of the box's faces: principal axes alone say nothing about how a square, a cube
+    or a round table top with something on it lies. Where the points leave axes open (a single point, a line)
+    they are some that fit.
+    """
+    columns = np.ascontiguousarray(points.T, np.float64)
+    low, high = axis_aligned_box(points)[..., None]
+    core = columns[:, ((columns >= low) & (columns <= high)).all(0)]
+    if core.shape[1] < 2:  # of few points the quantiles cut away all but the middle
+        core = columns
+    middle = core.mean(1, keepdims=True)
+    spread = core - middle
+    axes = np.linalg.eigh(spread @ spread.T)[1]
+    axes = _turned(spread[:, :: -(-spread.shape[1] // TURNED)], axes)
+    low, high = _inner(axes.T @ (columns - middle))
+    order = np.argsort(low - high, kind="stable")
+    axes, low, high = axes[:, order], low[order], high[order]
+    return OrientedBox(middle[:, 0] + axes @ ((low + high) / 2), _right_handed(axes), (high - low) / 2)
+
+
+def _inner(columns: Array) -> Array:
+    """(3, M) -> (2, 3) the `INNER` quantiles of each row."""
+    inner: Array = np.quantile(columns, INNER, axis=1)
+    return inner
+
+
+def _turned(columns: Array, axes: Array) -> Array:
+    """`axes` turned about each of them in turn, the shortest side's first; columns: (3, M) points."""
+    axes = axes.copy()
+    for one, other in ((1, 2), (0, 2), (0, 1)) * ROUNDS:
+        pair = axes[:, [one, other]]
+        for angles in (COARSE, FINE):
+            along, across = pair.T @ columns
+            cos, sin = np.cos(angles), np.sin(angles)
+            areas = _widths(np.outer(cos, along) + np.outer(sin, across))
+            areas = areas * _widths(np.outer(cos, across) - np.outer(sin, along))
+            best = areas.argmin()
+            pair = pair @ np.array([[cos[best], -sin[best]], [sin[best], cos[best]]])
+        axes[:, [one, other]] = pair
+    return axes
+
+
+def _widths(rows: Array) -> Array:
+    """(A, M) -> (A,) between the `INNER` quantiles of each row, to the nearest point."""
+    low, high = (round(q * (rows.shape[1] - 1)) for q in INNER)
+    rows.partition((low, high), axis=1)
+    widths: Array = rows[:, high] - rows[:, low]
+    return widths
+
+
+def _right_handed(axes: Array) -> Array:
+    """The same axes with settled signs: the largest entry of the first two is positive."""
+    signs = np.sign(axes[np.abs(axes).argmax(0), range(3)])
+    signs[2] = signs[0] * signs[1] * np.sign(np.linalg.det(axes))
+    return axes * signs
+
+
+# The instances of an answer: its Gaussians, taken apart where the surface is, with place, size and score.
+#
+# Two members belong to one instance when a walk over linked members of the surface leads from one to the
+# other. What is too faint to be on the surface belongs where the surface Gaussian nearest to it belongs.
 
 CRUMB_COUNT = 8  # half of the neighbourhood that relevancy is smoothed over
 CRUMB_SHARE = 0.01  # of the largest instance's extent on the surface
@@ -181,3 +277,63 @@ def _smooth_some(
             value += weights[j] * values[rows[j]]
             total += weights[j]
         smoothed[i] = value / total
+
+
+# The convex hull of an instance, as a closed mesh.
+
+FEW = 8  # Gaussians in the box: of so few none is a stray
+THICKNESS = 1e-3  # of the longest side: what is flatter than this is given it, since a hull needs a volume
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles that close around something."""
+
+    name: str
+    vertices: Array  # (V, 3) float64 world units
+    triangles: Array  # (T, 3) int32 numbers of vertices, counter-clockwise seen from outside
+    colour: Array  # (3,) display values in [0, 1], of the whole
+
+
+def hulls(things: Sequence[Instance], gaussians: Gaussians, colours: Array, name: str) -> tuple[Mesh, ...]:
+    """One around each, named `name` and its number from 1 on. Arguments and errors as of `hull`."""
+    return tuple(hull(thing, gaussians, colours, f"{name} {k}") for k, thing in enumerate(things, 1))
+
+
+def hull(instance: Instance, gaussians: Gaussians, colours: Array, name: str) -> Mesh:
+    """Around the instance's Gaussians that lie in its oriented box: strays would stretch it.
+
+    colours: (N, 3) of the scene's Gaussians, in [0, 1]; the mesh has the mean of its own. Raises InputError
+    where all lie at one point.
+    """
+    box, rows = instance.oriented, instance.members
+    means = gaussians.means[rows].astype(np.float64)
+    inside = box.contains(means)
+    if inside.sum() < FEW:
+        inside[:] = True
+    own = (means[inside] - box.centre) @ box.axes
+    longest = 2 * float(box.half_extents[0])
+    if longest <= 0:
+        raise InputError(f"{name} is a single point, which has no hull; write it with --as points")
+    flat = 2 * box.half_extents < THICKNESS * longest
+    if flat.any():  # both sides of a sheet, all four of a line
+        for axis in np.flatnonzero(flat):
+            offset = np.eye(3)[axis] * THICKNESS * longest / 2
+            own = np.concatenate([own - offset, own + offset])
+    try:
+        found = ConvexHull(own)
+    except QhullError:
+        raise InputError(f"{name} has too few points for a hull; write it with --as points") from None
+    number = np.full(len(own), -1, np.int32)
+    number[found.vertices] = np.arange(len(found.vertices))
+    vertices = own[found.vertices]
+    triangles = _outward(vertices, number[found.simplices], found.equations[:, :3])
+    return Mesh(name, box.centre + vertices @ box.axes.T, triangles, colours[rows[inside]].mean(0))
+
+
+def _outward(vertices: Array, triangles: Array, normals: Array) -> Array:
+    """The triangles, turned where they run against their outward `normals` (T, 3)."""
+    a, b, c = vertices[triangles].transpose(1, 0, 2)
+    inward = (np.cross(b - a, c - a) * normals).sum(1) < 0
+    turned: Array = np.where(inward[:, None], triangles[:, [0, 2, 1]], triangles)
+    return turned

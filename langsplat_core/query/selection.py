@@ -5,16 +5,18 @@ be on it go where the one goes that they are nearest to (`Surface.anchors`); tho
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import InputError
-from langsplat_core.query.boxes import OrientedBox
-from langsplat_core.query.regions import Regions
-from langsplat_core.query.surface import Surface
+from langsplat_core.query.instances import OrientedBox
+from langsplat_core.query.surface import Regions, Surface
+from langsplat_core.scene import Camera
 
 
 def of_rows(rows: Array, count: int) -> Array:
@@ -132,3 +134,111 @@ def _lengths(surface: Surface) -> csr_matrix:
 def _check(name: str, value: float) -> None:
     if not 0 <= value < float("inf"):
         raise InputError(f"a {name} of {value:g} cannot be walked along the surface; give 0 or more")
+
+
+# Selections drawn on a picture: the Gaussians whose centres a camera sees inside an outline or a stroke.
+#
+# Places are pixels of the camera, x to the right and y down, the centre of the first pixel at (0.5, 0.5).
+# What lies on or behind the camera's plane, or has no finite place, is never inside.
+
+BEHIND = 0.03  # of the surface's depth: a centre no farther behind it is on the surface that one sees
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """Where N centres lie in one picture."""
+
+    pixels: Array  # (N, 2) float64
+    depths: Array  # (N,) float64 camera z, world units; -1 where there is no place
+
+    @property
+    def ahead(self) -> Array:
+        """(N,) bool: before the camera."""
+        return self.depths > 0
+
+
+def project(means: Array, camera: Camera) -> Projected:
+    """(N, 3) world points as `camera` sees them."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        pixels, depths = camera.project(np.asarray(means, np.float64))
+        known = (depths > 0) & np.isfinite(depths) & np.isfinite(pixels).all(1)
+    return Projected(np.where(known[:, None], pixels, -1.0), np.where(known, depths, -1.0))
+
+
+def in_rectangle(seen: Projected, corner: Array, opposite: Array) -> Array:
+    """(N,) bool: between two opposite corners (2,), pixels, borders included."""
+    corners = np.stack([corner, opposite]).astype(np.float64)
+    low, high = corners.min(0), corners.max(0)
+    inside: Array = seen.ahead & ((seen.pixels >= low) & (seen.pixels <= high)).all(1)
+    return inside
+
+
+def in_polygon(seen: Projected, outline: Array) -> Array:
+    """(N,) bool: inside the closed `outline` (K, 2), pixels, by the even-odd rule; nothing for fewer than
+    three corners. What lies exactly on an edge may count either way.
+
+    A ray from the centre to the right crosses an odd number of edges (Shimrat 1962, Algorithm 112). Centres
+    are sorted by height once, so that an edge meets only those that are level with it.
+    """
+    outline = np.asarray(outline, np.float64)
+    check_array("outline", outline, ("K", 2))
+    inside = np.zeros(len(seen.depths), bool)
+    if len(outline) < 3:
+        return inside
+    near = np.flatnonzero(in_rectangle(seen, outline.min(0), outline.max(0)))
+    near = near[np.argsort(seen.pixels[near, 1], kind="stable")]
+    x, y = seen.pixels[near].T
+    odd = np.zeros(len(near), bool)
+    for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        first, last = np.searchsorted(y, (min(y0, y1), max(y0, y1)))
+        level = slice(first, last)
+        if first < last:  # also: the edge is not level itself
+            odd[level] ^= x[level] < x0 + (y[level] - y0) * ((x1 - x0) / (y1 - y0))
+    inside[near] = odd
+    return inside
+
+
+def in_stroke(seen: Projected, path: Array, radius: float) -> Array:
+    """(N,) bool: at most `radius` pixels from the line through `path` (K, 2), pixels, K >= 1; of one place, a
+    disk. Between two places of a fast mouse there is no gap."""
+    path = np.asarray(path, np.float64)
+    check_array("path", path, ("K", 2))
+    inside = np.zeros(len(seen.depths), bool)
+    near = np.flatnonzero(_in_reach(seen, path, radius))
+    if len(near) == 0:
+        return inside
+    pixels = seen.pixels[near]
+    tree = cKDTree(pixels)
+    swept = np.zeros(len(near), bool)
+    for start, end in zip(path, path[1:] if len(path) > 1 else path, strict=False):
+        half = (end - start) / 2
+        around = 1.001 * (radius + np.hypot(*half)) + 1e-9  # a little more: what counts is decided below
+        some = np.array(tree.query_ball_point(start + half, around, return_sorted=False), np.intp)
+        offsets = pixels[some] - start
+        share = np.clip(offsets @ (2 * half) / max(4 * half @ half, 1e-300), 0, 1)
+        swept[some] |= ((offsets - share[:, None] * (2 * half)) ** 2).sum(1) <= radius**2
+    inside[near] = swept
+    return inside
+
+
+def _in_reach(seen: Projected, path: Array, radius: float) -> Array:
+    if len(path) == 0:
+        return np.zeros(len(seen.depths), bool)
+    return in_rectangle(seen, path.min(0) - radius, path.max(0) + radius)
+
+
+def on_surface(seen: Projected, depths: Array, size: tuple[int, int], behind: float = BEHIND) -> Array:
+    """(N,) bool: in the picture and not hidden there: the depth of the centre is at most that of the surface
+    in its pixel and `behind` of it more. Where nothing is drawn, nothing hides.
+
+    depths: (H, W) camera z of the surface, world units, 0 where nothing is drawn; it may be coarser or finer
+    than the `size` (width, height) of the picture that the centres were projected into.
+    """
+    check_array("depths", depths, ("H", "W"))
+    height, width = depths.shape
+    columns, rows = np.floor(seen.pixels * (width / size[0], height / size[1])).T
+    inside = seen.ahead & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    numbers = np.flatnonzero(inside)
+    there = depths[rows[numbers].astype(np.intp), columns[numbers].astype(np.intp)].astype(np.float64)
+    inside[numbers] = (there <= 0) | (seen.depths[numbers] <= there * (1 + behind))
+    return inside

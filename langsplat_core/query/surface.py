@@ -7,9 +7,9 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from langsplat_core.arrays import Array, sigmoid
+from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.compiled import kernel, plain, shared_workers
-from langsplat_core.scene import LEVELS, Gaussians
+from langsplat_core.scene import LEVELS, NO_THING, Gaussians, LanguageField
 
 NEIGHBOURS = 16
 FAINTEST = 1e-3  # weight of a Gaussian whose opacity is less, so that no mean divides by nothing
@@ -147,3 +147,181 @@ def _walk(indptr: Array, indices: Array, waiting: Array, seed: int, reached: Arr
                 reached[found] = there
                 found += 1
     return found
+
+
+# Regions: patches of the surface that mean the same, at each level.
+#
+# Gaussians vary, things do not: an answer made of whole regions has the borders of the things and no
+# speckles, and its peak is a mean over a patch instead of one lucky Gaussian. Regions are found once for a
+# scene, on the graph of neighbours along its surface, by the criterion of Felzenszwalb and Huttenlocher
+# (2004): two patches merge where the step between their meanings is no larger than the steps within either.
+# Where a scene knows which thing a Gaussian belongs to (`LanguageField.things`), these are the borders of
+# the coarsest level: the encoder may see the front and the back of a thing differently, and it stays one.
+
+SCALE = 6.8  # of the criterion, in typical steps times Gaussians: larger prefers larger regions
+SMALLEST = 10  # Gaussians; smaller patches join the neighbour that means the most similar
+BORDER = 0.6  # added to the step between two things, in typical steps
+UNKNOWN = 2.0  # step between a Gaussian with a meaning and one without: as much as between opposites
+CHUNK = 65_536  # links whose ends are compared at a time
+PIECES = 4  # that a level is summed in, so that more than three cores have work
+STEPS = 65_535 / (UNKNOWN + 2 * BORDER)  # of 1 - cosine that are told apart: 16 bits sort in linear time
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """Regions of the M Gaussians of a surface, and of the N of its scene."""
+
+    of: Array  # (3, M) int32 number of the region at each level, from 0
+    sizes: tuple[Array, Array, Array]  # (R,) Gaussians in each region of a level
+    everywhere: Array  # (3, N) int32 the same of all Gaussians, faint ones with the nearest; -1: none is near
+    weights: Array  # (N,) float32 opacity of the surface's Gaussians, 0 for all others
+    totals: tuple[Array, Array, Array]  # (R,) float64 sums of these weights
+
+    def means(self, values: Array) -> tuple[Array, Array, Array]:
+        """(3, N) values of all Gaussians -> of every level the (R,) float64 opacity-weighted means.
+
+        In the order of the Gaussians and not of the surface: memory is read from front to back.
+        """
+        longest = max(len(total) for total in self.totals)
+        sums = np.zeros((len(LEVELS) * PIECES, longest))
+        workers = shared_workers()
+        workers.run(_sum_pieces, len(sums), plain(values), self.everywhere, self.weights, sums)
+        levels = sums.reshape(len(LEVELS), PIECES, longest).sum(1)
+        made = [row[: len(total)] / total for row, total in zip(levels, self.totals, strict=True)]
+        return made[0], made[1], made[2]
+
+    def spread(self, level: int, values: Array, others: Array) -> Array:
+        """(R,) values of a level's regions -> (N,) of all Gaussians: of a faint one what is next to it, and
+        where nothing is, its own of `others` (N,) of the same type."""
+        spread = np.empty_like(others)
+        shared_workers().run(_spread, len(others), self.everywhere[level], values, others, spread)
+        return spread
+
+
+def build_regions(surface: Surface, field: LanguageField) -> Regions:
+    """Of a scene's surface; once for a scene."""
+    links = surface.links.tocoo()
+    once = links.row < links.col
+    ends = links.row[once].astype(np.int32), links.col[once].astype(np.int32)
+    of = []
+    for level in range(len(LEVELS)):
+        steps = _steps(field, level, surface.rows, ends)
+        typical = _typical_step(field, level, surface.rows)
+        if level == len(LEVELS) - 1 and field.things is not None:
+            steps = _along_things(steps, field.things[surface.rows], ends, BORDER * typical)
+        ranks = np.round(steps * STEPS).astype(np.uint16)
+        order = np.argsort(ranks, kind="stable").astype(np.int32)
+        roots = _merge(len(surface.rows), *ends, steps.astype(np.float32), order, SCALE * typical, SMALLEST)
+        of.append(np.unique(roots, return_inverse=True)[1].astype(np.int32).reshape(-1))
+    return regions_from(surface, np.stack(of))
+
+
+def regions_from(surface: Surface, of: Array) -> Regions:
+    """From the (3, M) int32 number of each Gaussian's region at each level, counted from 0."""
+    everywhere = np.full((len(LEVELS), len(surface.anchors)), -1, np.int32)
+    near = surface.anchors >= 0
+    everywhere[:, near] = of[:, surface.anchors[near]]
+    weights = np.zeros(len(surface.anchors), np.float32)
+    weights[surface.rows] = surface.weights
+    sizes = [np.bincount(row) for row in of]
+    totals = [np.bincount(row, surface.weights) for row in of]
+    return Regions(of, (sizes[0], sizes[1], sizes[2]), everywhere, weights, (totals[0], totals[1], totals[2]))
+
+
+def _steps(field: LanguageField, level: int, rows: Array, ends: tuple[Array, Array]) -> Array:
+    """(E,) 1 - cosine between what the two ends of each link mean, in [0, 2]."""
+    known, latents = field.known[level][rows], field.latents[level][rows]
+    a, b = ends
+    if field.codec.space == "index":
+        directions = field.codec.decode(np.arange(field.codec.index_size, dtype=np.uint16)[:, None])
+        steps = _apart(directions, latents[a, 0], latents[b, 0])
+    else:
+        steps = _apart(unit(latents.astype(np.float32)), a, b)
+    both, neither = known[a] & known[b], ~known[a] & ~known[b]
+    return np.asarray(np.where(both, steps, np.where(neither, 0.0, UNKNOWN)).clip(0, UNKNOWN))
+
+
+def _typical_step(field: LanguageField, level: int, rows: Array) -> float:
+    """The mean of 1 - cosine between two Gaussians drawn by chance: what is far in this encoder's space. It
+    is 1 minus the squared length of their mean vector."""
+    latents = field.latents[level][rows[field.known[level][rows]]]
+    if len(latents) == 0:
+        return 1.0
+    if field.codec.space == "index":
+        counts = np.bincount(latents[:, 0], minlength=field.codec.index_size)
+        mean = counts @ field.codec.decode(np.arange(len(counts), dtype=np.uint16)[:, None]) / len(latents)
+    else:
+        mean = unit(latents.astype(np.float32)).mean(0, dtype=np.float64)
+    return max(1 - float(mean @ mean), 0.0)
+
+
+def _apart(directions: Array, first: Array, second: Array) -> Array:
+    """(E,) 1 - cosine of pairs among (K, D) unit vectors, from a table of all where that is smaller."""
+    if len(directions) ** 2 <= len(first):
+        return np.asarray((1 - directions @ directions.T)[first, second])
+    steps = np.empty(len(first), np.float32)
+    for start in range(0, len(first), CHUNK):  # the vectors may be as long as the encoder's
+        part = slice(start, start + CHUNK)
+        steps[part] = 1 - np.einsum("ed,ed->e", directions[first[part]], directions[second[part]])
+    return steps
+
+
+def _along_things(steps: Array, things: Array, ends: tuple[Array, Array], border: float) -> Array:
+    """No step within a thing, a larger one between two."""
+    a, b = things[ends[0]], things[ends[1]]
+    told = (a != NO_THING) & (b != NO_THING)
+    return np.where(told, np.where(a == b, 0, steps + border), steps)
+
+
+@kernel
+def _merge(
+    count: int, first: Array, second: Array, steps: Array, order: Array, scale: float, smallest: int
+) -> Array:
+    """(M,) a member of each Gaussian's region, the same for all of a region. order: of the links, by rising
+    step."""
+    parent, size = np.arange(count, dtype=np.int32), np.ones(count, np.int32)
+    largest = np.zeros(count, np.float32)  # step within each region
+    for gathering in range(2):  # the criterion, then the small ones
+        for link in order:
+            a, b = first[link], second[link]
+            while parent[a] != a:
+                parent[a] = parent[parent[a]]
+                a = parent[a]
+            while parent[b] != b:
+                parent[b] = parent[parent[b]]
+                b = parent[b]
+            if a == b:
+                continue
+            if gathering == 0:
+                join = steps[link] <= min(largest[a] + scale / size[a], largest[b] + scale / size[b])
+            else:
+                join = size[a] < smallest or size[b] < smallest
+            if join:
+                parent[b] = a
+                size[a] += size[b]
+                largest[a] = max(steps[link], largest[a], largest[b])
+    for item in range(count):
+        root = item
+        while parent[root] != root:
+            root = parent[root]
+        parent[item] = root
+    return parent
+
+
+@kernel
+def _sum_pieces(first: int, last: int, values: Array, everywhere: Array, weights: Array, sums: Array) -> None:
+    """Rows [first, last) of `sums` (3 P, R): of a level's P pieces the weighted sums over its regions."""
+    count, pieces = len(weights), len(sums) // len(values)
+    for row in range(first, last):
+        level, piece = row // pieces, row % pieces
+        for i in range(count * piece // pieces, count * (piece + 1) // pieces):
+            if weights[i] > 0:
+                sums[row, everywhere[level, i]] += np.float64(weights[i]) * values[level, i]
+
+
+@kernel
+def _spread(first: int, last: int, of: Array, values: Array, others: Array, spread: Array) -> None:
+    """Rows [first, last) of `spread` (N,)."""
+    for i in range(first, last):
+        region = of[i]
+        spread[i] = values[region] if region >= 0 else others[i]

@@ -6,8 +6,7 @@ from importlib.util import find_spec
 from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
-from langsplat_core.errors import BackendError, InputError
-from langsplat_core.extras import optional_imports
+from langsplat_core.errors import BackendError, InputError, optional_imports
 from langsplat_core.raster.protocol import (
     FreezableView,
     LiftingRasterizer,

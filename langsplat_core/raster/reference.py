@@ -1,27 +1,75 @@
-"""The truth: a float64 rasterizer written to be read. Every other backend is tested against it.
-
-Image formation, from top to bottom (constants in `config.RasterSettings`):
-
-1. Camera space: p = R x + t; Gaussians with p.z <= near or p.z > far are not drawn.
-2. Footprint: the perspective map is linearised at p, with p.x/p.z and p.y/p.z clamped to 1.3 times the
-   half field of view on each side of the principal point. With A = J R rotation diag(scales) (2x3) the
-   2D covariance is A A^T + 0.3 I, positive definite by construction.
-3. alpha(u) = min(0.99, opacity * exp(-1/2 (u-m)^T cov^-1 (u-m))) at pixel centres u; alphas below 1/255
-   are skipped, so a Gaussian's extent is the ellipse where alpha equals 1/255.
-4. Front to back by camera z, ties by index: weight = alpha * T, T <- T (1 - alpha); a pixel stops before
-   the Gaussian that would bring T to 1e-4 or below. The cap of 0.99 is the float32 next to it, as in every
-   kernel: two capped layers then leave T just below 1e-4, where the double nearest 0.99 leaves it just above.
-"""
+"""View-dependent colour: real spherical harmonics up to degree 3, as 3D Gaussian Splatting uses them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from langsplat_core.arrays import Array, check_array, rotation_matrices, sigmoid
+from langsplat_core.arrays import Array, check_array, rotation_matrices, sigmoid, unit
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.raster.protocol import farthest
 from langsplat_core.scene import Camera, Gaussians
+
+C0 = 0.28209479177387814  # 1 / (2 sqrt(pi))
+C1 = 0.4886025119029199  # sqrt(3 / (4 pi))
+C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+
+
+def basis(directions: Array, count: int) -> Array:
+    """(N, 3) unit directions from the camera to the Gaussians -> (N, count) basis values."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    values = [np.full_like(x, C0)]
+    if count > 1:
+        values += [-C1 * y, C1 * z, -C1 * x]
+    if count > 4:
+        values += [
+            C2[0] * x * y,
+            -C2[0] * y * z,
+            C2[1] * (2 * z * z - x * x - y * y),
+            -C2[0] * x * z,
+            C2[2] * (x * x - y * y),
+        ]
+    if count > 9:
+        values += [
+            -C3[0] * y * (3 * x * x - y * y),
+            C3[1] * x * y * z,
+            -C3[2] * y * (4 * z * z - x * x - y * y),
+            C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y),
+            -C3[2] * x * (4 * z * z - x * x - y * y),
+            C3[4] * z * (x * x - y * y),
+            -C3[0] * x * (x * x - 3 * y * y),
+        ]
+    return np.stack(values, -1)
+
+
+def colours(sh: Array, means: Array, camera_position: Array) -> Array:
+    """(N, K, 3) coefficients seen from `camera_position` -> (N, 3) float64 display colours >= 0.
+
+    Not clamped above: values over 1 are legal until the picture is quantised. Invalid rows give 0.
+    """
+    if sh.shape[1] == 1:
+        directions = np.broadcast_to(np.array([0.0, 0.0, 1.0]), means.shape)
+    else:
+        with np.errstate(invalid="ignore"):
+            directions = unit(means.astype(np.float64) - camera_position, 1e-12)
+    rgb = np.einsum("nk,nkc->nc", basis(directions, sh.shape[1]), sh.astype(np.float64)) + 0.5
+    return np.where(np.isfinite(rgb), np.maximum(rgb, 0), 0)
+
+
+# The truth: a float64 rasterizer written to be read. Every other backend is tested against it.
+#
+# Image formation, from top to bottom (constants in `config.RasterSettings`):
+#
+# 1. Camera space: p = R x + t; Gaussians with p.z <= near or p.z > far are not drawn. 2. Footprint: the
+# perspective map is linearised at p, with p.x/p.z and p.y/p.z clamped to 1.3 times the half field of view
+# on each side of the principal point. With A = J R rotation diag(scales) (2x3) the 2D covariance is A A^T +
+# 0.3 I, positive definite by construction. 3. alpha(u) = min(0.99, opacity * exp(-1/2 (u-m)^T cov^-1
+# (u-m))) at pixel centres u; alphas below 1/255 are skipped, so a Gaussian's extent is the ellipse where
+# alpha equals 1/255. 4. Front to back by camera z, ties by index: weight = alpha * T, T <- T (1 - alpha); a
+# pixel stops before the Gaussian that would bring T to 1e-4 or below. The cap of 0.99 is the float32 next
+# to it, as in every kernel: two capped layers then leave T just below 1e-4, where the double nearest 0.99
+# leaves it just above.
 
 
 @dataclass(frozen=True, eq=False)

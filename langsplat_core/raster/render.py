@@ -1,16 +1,4 @@
-"""The front door of the rasterizers: a scene and a camera in, a picture out.
-
->>> import numpy as np
->>> from langsplat_core import Gaussians, Scene, look_at, render
->>> one = Gaussians(
-...     means=np.zeros((1, 3)), log_scales=np.full((1, 3), -1.0), quats_wxyz=np.array([[1.0, 0, 0, 0]]),
-...     opacity_logits=np.array([9.0]), sh=np.full((1, 1, 3), 1.0),
-... )
->>> camera = look_at(np.array([0, 0, -4.0]), np.zeros(3), np.array([0, -1.0, 0]), (64, 48))
->>> picture = render(Scene(one), camera, backend="reference")
->>> picture.colours.shape, picture.alpha.shape, round(float(picture.alpha[24, 32]), 2)
-((48, 64, 3), (48, 64), 0.99)
-"""
+"""One row of W: which Gaussians a single pixel is made of, without drawing the others."""
 
 from dataclasses import dataclass
 
@@ -19,8 +7,80 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.protocol import View
+from langsplat_core.raster.protocol import LiftingRasterizer, View, farthest
 from langsplat_core.scene import Camera, Gaussians, Scene
+
+
+def pixel_weights(
+    rasterizer: LiftingRasterizer,
+    gaussians: Gaussians,
+    camera: Camera,
+    pixel: tuple[int, int],
+    settings: RasterSettings = INRIA,
+) -> tuple[Array, Array]:
+    """(M,) int64 numbers of the Gaussians that paint `pixel` (column, row), and their (M,) float32 weights,
+    alpha_i T_i > 0, which add up to the pixel's alpha.
+
+    Only those that could reach the pixel are projected; they keep their order, so the weights are those
+    of the whole view. The pixel must lie in the picture.
+    """
+    column, row = pixel
+    near = np.flatnonzero(_may_reach(gaussians, camera, pixel, settings))
+    view = rasterizer.view(gaussians.take(near), camera, settings)
+    chosen = np.zeros((camera.height, camera.width, 1), np.float32)
+    chosen[row, column] = 1
+    weights = np.asarray(view.gather(chosen))[:, 0]
+    painting = weights > 0
+    return near[painting], weights[painting]
+
+
+def _may_reach(
+    gaussians: Gaussians, camera: Camera, pixel: tuple[int, int], settings: RasterSettings
+) -> Array:
+    """(N,) bool, True for every Gaussian whose footprint may cover the pixel, and for few others.
+
+    The footprint's covariance is J R S S R^T J^T + dilation, J the Jacobian (EWA splatting), so its largest
+    eigenvalue is at most |J|^2 s_max^2 + dilation with |J|^2 <= (f/z)^2 (1 + (x/z)^2 + (y/z)^2); beyond
+    sqrt(2 ln(1 / alpha_min)) deviations alpha is below the cut-off, whatever the opacity. J is taken at
+    a clamped x/z and y/z, which only makes it smaller.
+    """
+    x, y, z = np.ascontiguousarray(_in_camera(gaussians, camera).T)
+    scale_x, scale_y, scale_z = gaussians.log_scales.T
+    with np.errstate(all="ignore"):  # invalid rows are dropped by the view
+        x, y = x / z, y / z
+        focal = np.float32(max(camera.fx, camera.fy)) / z
+        largest = np.exp(np.maximum(np.maximum(scale_x, scale_y), scale_z))
+        variance = (focal * largest) ** 2 * (1 + x * x + y * y) + np.float32(settings.dilation)
+        reach = np.sqrt(np.float32(2 * np.log(1 / settings.alpha_min)) * variance) + 1
+        away = np.maximum(
+            np.abs(camera.fx * x + np.float32(camera.cx - pixel[0] - 0.5)),
+            np.abs(camera.fy * y + np.float32(camera.cy - pixel[1] - 0.5)),
+        )
+        inside: Array = (
+            (z > 0.999 * settings.near) & (z < 1.001 * farthest(settings)) & ~(away > 1.01 * reach)
+        )
+    return inside
+
+
+def _in_camera(gaussians: Gaussians, camera: Camera) -> Array:
+    """(N, 3) float32: this is a sieve with room for rounding, not a projection."""
+    with np.errstate(all="ignore"):
+        points: Array = gaussians.means @ camera.rotation.T.astype(np.float32)
+        return points + camera.world_to_camera[:3, 3].astype(np.float32)
+
+
+# The front door of the rasterizers: a scene and a camera in, a picture out.
+#
+# >>> import numpy as np
+# >>> from langsplat_core import Gaussians, Scene, look_at, render
+# >>> one = Gaussians(
+# ...     means=np.zeros((1, 3)), log_scales=np.full((1, 3), -1.0), quats_wxyz=np.array([[1.0, 0, 0, 0]]),
+# ...     opacity_logits=np.array([9.0]), sh=np.full((1, 1, 3), 1.0),
+# ... )
+# >>> camera = look_at(np.array([0, 0, -4.0]), np.zeros(3), np.array([0, -1.0, 0]), (64, 48))
+# >>> picture = render(Scene(one), camera, backend="reference")
+# >>> picture.colours.shape, picture.alpha.shape, round(float(picture.alpha[24, 32]), 2)
+# ((48, 64, 3), (48, 64), 0.99)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +121,6 @@ def splat_colours(view: View, gaussians: Gaussians, camera: Camera, values: Arra
 
 def colours_seen(gaussians: Gaussians, camera: Camera) -> Array:
     """(N, 3) float32 display colours >= 0 of the Gaussians as seen from the camera; invalid rows are 0."""
-    from langsplat_core.raster.cpu.colour import colours  # numba: a second that OpenGL need not wait for
+    from langsplat_core.raster.cpu.projection import colours  # numba: a second that OpenGL need not wait for
 
     return colours(gaussians.sh, gaussians.means, camera.position)

@@ -1,6 +1,6 @@
 """The nouns of the project: plain typed data, no behaviour that needs a device or a file."""
 
-from langsplat_core.scene.camera import FARTHEST, Camera, look_at
+from langsplat_core.scene.camera import FARTHEST, Camera, Intrinsics, look_at
 from langsplat_core.scene.codec import (
     AutoencoderCodec,
     CodebookCodec,
@@ -9,14 +9,16 @@ from langsplat_core.scene.codec import (
     codec_from_tensors,
 )
 from langsplat_core.scene.gaussians import SH_COUNTS, Gaussians
-from langsplat_core.scene.intrinsics import Intrinsics
 from langsplat_core.scene.language import (
     CANONICAL_PHRASES,
     LEVELS,
     NO_THING,
+    Calibration,
+    Fits,
     LanguageField,
+    Odds,
+    Reading,
 )
-from langsplat_core.scene.reading import Calibration, Fits, Odds, Reading
 from langsplat_core.scene.scene import Scene
 
 __all__ = [

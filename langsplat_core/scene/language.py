@@ -1,14 +1,131 @@
-"""The language field: what every Gaussian means, at three levels."""
+"""How phrases are written: the one place that says which marks of a text count, where one phrase ends and the
+next begins, and when two of them are the same.
 
+Quotes and punctuation around words are marks of writing and no part of a phrase: an encoder that met them
+would answer another question, and the demo encoder's tokenizer would end the phrase there.
+"""
+
+import re
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from langsplat_core.arrays import Array, check_array
+from langsplat_core.arrays import Array, check_array, sigmoid
 from langsplat_core.scene.codec import Codec, latent_dtype, meaningful
-from langsplat_core.scene.phrases import phrase_key
-from langsplat_core.scene.reading import Reading
+
+_SEPARATE = re.compile(r"[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)", re.IGNORECASE)
+_APOSTROPHES = str.maketrans(dict.fromkeys("’‘ʼ′＇´`", "'"))
+
+
+def split_phrases(text: str) -> list[str]:
+    """The phrases in a line, tidy, separated by ";" or ","; "mug, not red" is one. Empty ones are left
+    out."""
+    return [part for part in (tidy(part) for part in _SEPARATE.split(text)) if part]
+
+
+def tidy(text: str) -> str:
+    """A phrase as it is shown: words without quotes and punctuation around them, single spaces; commas stay
+    behind their words."""
+    return " ".join(tokens(text)).replace(" ,", ",").lstrip(", ")
+
+
+def phrase_key(text: str) -> str:
+    """What a phrase is looked up and encoded by: its words, in lower case as CLIP's tokenizers have them."""
+    return " ".join(token for token in tokens(text) if token != ",").lower()
+
+
+def tokens(text: str) -> list[str]:
+    """Words without quotes and punctuation around them, and commas, none at the end."""
+    text = "".join(
+        " " if unicodedata.category(mark) in ("Cc", "Cs") else mark for mark in text.translate(_APOSTROPHES)
+    )
+    text = re.sub(r"(?<=\w)\s+'s\b", "'s", text)
+    found = []
+    for piece in re.findall(r",|[^\s,;]+", text):
+        word = "," if piece == "," else _bare(piece)
+        if word:
+            found.append(word)
+    while found and found[-1] == ",":
+        found.pop()
+    return found
+
+
+def _bare(word: str) -> str:
+    """`word` without punctuation around it; a possessive's apostrophe stays. "" where it is nothing else."""
+    if word == "&":
+        return word
+    kinds = [unicodedata.category(mark) for mark in word]
+    marks = [kind[0] in "PZ" or kind == "Cf" for kind in kinds]
+    if all(marks):
+        return ""
+    first, last = marks.index(False), len(marks) - marks[::-1].index(False)
+    if all(kind in ("Cf", "Po", "Mn") for kind in kinds[first:last]):
+        return ""
+    owns = word[last : last + 1] == "'" and first == 0 and word[last - 1] == "s"
+    return word[first:last] + ("'" if owns else "")
+
+
+# How the cosines of one text encoder are read, and what they say about whether a thing is there at all.
+
+Fits = tuple[float, float, float]  # of each level, the best, see `query.chance.Scale.fit`
+
+
+@dataclass(frozen=True)
+class Odds:
+    """A logistic function of the best fits of an answer (Platt 1999):
+    ``probability = sigmoid(constant + whole * fit of whole things + finer * the better one of the finer
+    levels)``, present and absent being as likely beforehand."""
+
+    constant: float
+    whole: float
+    finer: float
+    found: float = 0.75  # probability from which a phrase counts as found; 0.5 up to here is a weak match
+
+    def __post_init__(self) -> None:
+        slopes = (self.whole, self.finer)
+        if not (np.isfinite([self.constant, *slopes]).all() and sum(slopes) > 0 and 0.5 <= self.found <= 1):
+            raise ValueError(f"{self}: expected finite numbers, rising with fits, and found in [0.5, 1]")
+
+    def probability(self, fits: Fits) -> float:
+        """That what is asked for is there, in (0, 1)."""
+        subpart, part, whole = fits
+        logit = self.constant + self.whole * whole + self.finer * max(subpart, part)
+        return float(sigmoid(np.array(logit)))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The odds of the three ways in which something is looked for: fits of each have another spread."""
+
+    thing: Odds  # "mug": anything, among all that there is
+    part: Odds  # "handle": a part of whatever has one
+    inside: Odds  # "handle of the mug": a part, among what is on a thing that is there
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How cosines of one text encoder are read: other encoders have another scale."""
+
+    temperature: float = 10.0  # of the softmax; 10 in the public code of LERF and LangSplat, for CLIP
+    found: float = 0.6  # peak relevancy, as published, from which a phrase counts as present
+    calibration: Calibration | None = None  # in drawn rooms, the only ones whose truth is known
+
+    @property
+    def elsewhere(self) -> "Reading":
+        """The same for scenes other than drawn rooms: no probability is known to hold there."""
+        return replace(self, calibration=None)
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.temperature) and self.temperature > 0 and 0 <= self.found <= 1):
+            raise ValueError(
+                f"reading: temperature {self.temperature} and found {self.found}; expected a positive number "
+                "and one in [0, 1]"
+            )
+
+
+# The language field: what every Gaussian means, at three levels.
 
 LEVELS = ("subpart", "part", "whole")  # index 0, 1, 2 wherever a level axis appears
 CANONICAL_PHRASES = ("object", "things", "stuff", "texture")  # LERF's negatives, used by LangSplat

@@ -1,26 +1,371 @@
-"""Masks by a model of the SAM family: a grid of points, three masks a point, filtered.
-
-The three answers to one point are taken as the levels subpart, part and whole (LangSplat section 3.1). The
-picture is seen once, as a whole; the method's public code, not its paper, sees 2 x 2 crops of it too.
-"""
+"""What segmenters of the SAM family do alike: a picture is seen once and then asked about points."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any
+from math import ceil
+from types import MappingProxyType
+from typing import Any, Protocol
 
 import numpy as np
+from PIL import Image
+from scipy import ndimage
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import MaskConfig
+from langsplat_core.errors import EncoderError
 from langsplat_core.progress import Progress
-from langsplat_core.semantics.crop_layers import crop_boxes, cut_by_crop
-from langsplat_core.semantics.mask_filters import box_nms, clean_regions, mask_boxes, mask_nms
+from langsplat_core.semantics.layouts import open_weights
 from langsplat_core.semantics.masks import LevelMasks
-from langsplat_core.semantics.segmenter import LEVELS, Look, Segmenter
-from langsplat_core.semantics.segmenters import load_segmenter
-from langsplat_core.semantics.weights import torch_device
+from langsplat_core.semantics.weights import (
+    Weights,
+    load_config,
+    load_model,
+    model_type,
+    torch_device,
+    weights_path,
+)
+
+PIXEL_MEAN = (123.675, 116.28, 103.53)  # ImageNet's, values 0..255; of every model here
+PIXEL_STD = (58.395, 57.12, 57.375)
+LEVELS = 3  # masks per point
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A picture as a model has seen it."""
+
+    model: Any  # a transformers model
+    seen: Mapping[str, Any]  # arguments of the model that stand for the picture
+    side: int  # of the square that the model sees, px
+    size: tuple[int, int] | None  # (height, width) of the picture in it; None where it fills the square
+    shape: tuple[int, int]  # (height, width) of the picture itself, px
+    ordered: bool  # whether the three answers to a point are subpart, part, whole, in this order
+
+    def ask(self, points: Array) -> tuple[Any, Any]:
+        """(P, 2) float32 points x, y, px of the picture -> (P, 3) predicted IoU and (P, 3, h, w) logits, low
+        resolution, of the masks subpart, part, whole at each point."""
+        import torch
+
+        height, width = self.size or (self.side, self.side)
+        scaled = points * np.array([width / self.shape[1], height / self.shape[0]], np.float32)
+        given = torch.from_numpy(scaled)[None, :, None].to(self.model.device)
+        answer = self.model(**self.seen, input_points=given, multimask_output=True)
+        ious, logits = answer.iou_scores[0], answer.pred_masks[0]
+        return (ious, logits) if self.ordered else by_area(ious, logits)
+
+    def enlarge(self, logits: Any) -> Any:
+        """(B, h, w) low-resolution logits -> (B, H, W) of the picture."""
+        return upscale(logits, self.side, self.size, self.shape)
+
+
+class Segmenter(Protocol):
+    """A model that finds masks at points."""
+
+    @property
+    def name(self) -> str:
+        """What the user is told, such as "SAM 2"."""
+
+    def look(self, image: Array) -> Look:
+        """See (H, W, 3) uint8 once."""
+
+
+def by_area(ious: Any, logits: Any) -> tuple[Any, Any]:
+    """The (P, 3) scores and (P, 3, h, w) masks of each point from the smallest mask to the largest."""
+    import torch
+
+    order = torch.argsort((logits > 0).flatten(2).sum(2), dim=1, stable=True)
+    points = torch.arange(len(order), device=order.device)[:, None]
+    return ious[points, order], logits[points, order]
+
+
+def padded(image: Array, side: int) -> tuple[Array, tuple[int, int]]:
+    """Scale the longer side of (H, W, 3) uint8 to `side`, normalise, pad with zeros to the right and below.
+
+    Returns (1, 3, side, side) float32 and the (height, width) of the picture in it, px.
+    """
+    height, width = image.shape[:2]
+    scale = side / max(height, width)
+    size = max(1, int(height * scale + 0.5)), max(1, int(width * scale + 0.5))
+    pixels = np.zeros((side, side, 3), np.float32)
+    pixels[: size[0], : size[1]] = _normalised(image, size)
+    return np.ascontiguousarray(pixels.transpose(2, 0, 1)[None]), size
+
+
+def squashed(image: Array, side: int) -> Array:
+    """(H, W, 3) uint8 -> (1, 3, side, side) float32, normalised; a picture's proportions are lost."""
+    return np.ascontiguousarray(_normalised(image, (side, side)).transpose(2, 0, 1)[None])
+
+
+def _normalised(image: Array, size: tuple[int, int]) -> Array:
+    resized = Image.fromarray(image).resize((size[1], size[0]), Image.Resampling.BILINEAR)
+    scaled: Array = (np.asarray(resized, np.float32) - PIXEL_MEAN) / PIXEL_STD
+    return scaled.astype(np.float32)
+
+
+def upscale(logits: Any, side: int, size: tuple[int, int] | None, shape: tuple[int, int]) -> Any:
+    """(B, h, w) low-resolution logits of the square -> (B, H, W) of the photograph; `size` as in `Look`."""
+    from torch.nn.functional import interpolate
+
+    square = logits[:, None].float()
+    if size is not None:  # the padding can only be cut off at the resolution of its pixels
+        square = interpolate(square, (side, side), mode="bilinear", align_corners=False)
+        square = square[..., : size[0], : size[1]]
+    return interpolate(square, shape, mode="bilinear", align_corners=False)[:, 0]
+
+
+# Segment Anything (Kirillov et al. 2023), and SAM-HQ (Ke et al. 2023), which refines its masks.
+
+EPSILON = 1e-5  # of the norms between attentions in segment_anything, PyTorch's; transformers has 1e-6 there
+
+
+class Sam:
+    """A `Segmenter`. Its three masks of a point are subpart, part and whole (LangSplat section 3.1)."""
+
+    name = "SAM"
+
+    def __init__(self, weights: Weights) -> None:
+        from transformers import SamConfig, SamModel
+
+        self._model = _load(SamModel, SamConfig, weights, self.name)
+
+    def look(self, image: Array) -> Look:
+        """See `Segmenter`."""
+        pixels, side, size = _seen(self._model, image)
+        seen = {"image_embeddings": self._model.get_image_embeddings(pixels)}
+        return Look(self._model, seen, side, size, image.shape[:2], ordered=True)
+
+
+class SamHq:
+    """A `Segmenter`. transformers gives its masks by falling score, so their size must tell the level; and
+    one refinement is added to all three, which brings them closer together than SAM's are."""
+
+    name = "SAM-HQ"
+
+    def __init__(self, weights: Weights) -> None:
+        from transformers import SamHQConfig, SamHQModel
+
+        self._model = _load(SamHQModel, SamHQConfig, weights, self.name)
+
+    def look(self, image: Array) -> Look:
+        """See `Segmenter`."""
+        pixels, side, size = _seen(self._model, image)
+        embedding, inner = self._model.get_image_embeddings(pixels)
+        seen = {"image_embeddings": embedding, "intermediate_embeddings": inner}
+        return Look(self._model, seen, side, size, image.shape[:2], ordered=False)
+
+
+def _load(kind: Any, config: Any, weights: Weights, name: str) -> Any:
+    settings = load_config(config, weights, name)
+    settings.mask_decoder_config.layer_norm_eps = EPSILON
+    return load_model(kind, weights, settings)
+
+
+def _seen(model: Any, image: Array) -> tuple[Any, int, tuple[int, int]]:
+    import torch
+
+    side = int(model.config.vision_config.image_size)
+    pixels, size = padded(image, side)
+    return torch.from_numpy(pixels).to(model.device), side, size
+
+
+# SAM 2 and 2.1 (Ravi et al. 2024) on single pictures, by the image half of their video model.
+
+
+class Sam2:
+    """A `Segmenter`. The order of its three masks of a point means nothing, so their size tells the level."""
+
+    name = "SAM 2"
+
+    def __init__(self, weights: Weights) -> None:
+        from transformers import Sam2Config, Sam2Model
+
+        # The hub's files state the video model's configuration.
+        self._model: Any = load_model(Sam2Model, weights, load_config(Sam2Config, weights, self.name))
+
+    def look(self, image: Array) -> Look:
+        """See `Segmenter`."""
+        import torch
+
+        side = int(self._model.config.prompt_encoder_config.image_size)
+        pixels = torch.from_numpy(squashed(image, side)).to(self._model.device)
+        seen = {"image_embeddings": self._model.get_image_embeddings(pixels)}
+        return Look(self._model, seen, side, None, image.shape[:2], ordered=False)
+
+
+# Segmenters by hub id, folder or file: a new family is one file and one row here.
+
+FAMILIES: Mapping[str, Callable[[Weights], Segmenter]] = MappingProxyType(  # by `model_type` of config.json
+    {"sam": Sam, "sam2": Sam2, "sam2_video": Sam2, "sam_hq": SamHq}
+)
+
+
+def load_segmenter(model: str, device: str = "auto") -> Segmenter:
+    """Load `model`: a folder in Hugging Face layout, a file of segment_anything or sam2, or a hub id.
+
+    Raises EncoderError where the weights are absent or are those of no family here.
+    """
+    weights = open_weights(model, weights_path(model, "--masks.sam"), torch_device(device))
+    named = model_type(weights)
+    if named not in FAMILIES:
+        known = ", ".join(FAMILIES)
+        raise EncoderError(f"{model}: its {named!r} model is no segmenter known here; known are {known}")
+    return FAMILIES[named](weights)
+
+
+# SAM's layers of crops: parts of a photograph that are looked at for themselves, for masks of small things.
+#
+# Source: the mask generator of segment-anything, with the settings of LangSplat's public code.
+
+OVERLAP = 512 / 1500  # of neighbouring crops, as a share of the picture's shorter side, in the first layer
+EDGE = 20.0  # px: a box that ends this near to an edge touches it
+
+
+def crop_boxes(shape: tuple[int, int], layers: int) -> Array:
+    """(C, 4) int64 left, top, right, bottom, px, of the whole picture and its crops; the last two exclusive.
+
+    shape: (height, width); layer k cuts 2^k x 2^k crops that overlap. The whole picture comes first.
+    """
+    height, width = shape
+    boxes = [(0, 0, width, height)]
+    for layer in range(1, layers + 1):
+        count = 2**layer
+        overlap = int(OVERLAP * min(shape) * 2 / count)
+        columns, rows = _spans(width, count, overlap), _spans(height, count, overlap)
+        boxes += [(left, top, right, bottom) for left, right in columns for top, bottom in rows]
+    return np.array(boxes, np.int64)
+
+
+def _spans(length: int, count: int, overlap: int) -> list[tuple[int, int]]:
+    """`count` equal pieces that cover `length` px and share `overlap` px with the next."""
+    size = ceil((overlap * (count - 1) + length) / count)
+    starts = [int((size - overlap) * i) for i in range(count)]
+    return [(start, min(start + size, length)) for start in starts if start < length]
+
+
+def cut_by_crop(boxes: Array, crop: Array, shape: tuple[int, int]) -> Array:
+    """(...,) bool: whether a mask's box ends at an edge of the crop that is no edge of the picture: what it
+    shows goes on outside, and the next crop or the whole picture shows it better.
+
+    boxes: (..., 4); crop: (4,) left, top, right, bottom, px of the picture; shape: its (height, width).
+    """
+    picture = np.array([0, 0, shape[1], shape[0]])
+    at_crop, at_picture = np.abs(boxes - crop) <= EDGE, np.abs(boxes - picture) <= EDGE
+    cut: Array = (at_crop & ~at_picture).any(axis=-1)
+    return cut
+
+
+# Which of many proposed masks are kept: suppression by box and by pixels, and the removal of crumbs.
+
+CONTAINED = 0.85  # of a mask's area inside another one: it counts as inside
+DOMINATED = 0.5  # a mask that covers less than this of the one around it is small beside it
+PIXELS_PER_PRODUCT = 1 << 16  # columns of the matrix product that counts common pixels
+EIGHT = np.ones((3, 3), bool)  # diagonal neighbours are connected, as in SAM's own clean-up
+
+
+def mask_boxes(masks: Array) -> Array:
+    """(M, H, W) bool, none empty -> (M, 4) int64 left, top, right, bottom; the last two exclusive."""
+    boxes = np.zeros((len(masks), 4), np.int64)
+    for box, mask in zip(boxes, masks, strict=True):
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        box[:] = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
+    return boxes
+
+
+def box_nms(boxes: Array, scores: Array, iou: float) -> Array:
+    """Greedy non-maximum suppression: (K,) indices kept, by falling score; ties by index.
+
+    boxes: (M, 4) left, top, right, bottom, non-empty; a box goes when its IoU with a kept one is > `iou`.
+    """
+    order = np.argsort(-scores, kind="stable")
+    left, top, right, bottom = boxes.astype(float).T
+    area = (right - left) * (bottom - top)
+    kept = []
+    while len(order):
+        best, rest = order[0], order[1:]
+        kept.append(int(best))
+        width = np.minimum(right[best], right[rest]) - np.maximum(left[best], left[rest])
+        height = np.minimum(bottom[best], bottom[rest]) - np.maximum(top[best], top[rest])
+        common = np.maximum(width, 0) * np.maximum(height, 0)
+        order = rest[common / (area[best] + area[rest] - common) <= iou]
+    return np.array(kept, int)
+
+
+def clean_regions(mask: Array, min_region: int) -> tuple[Array, bool]:
+    """Fill holes below `min_region` px, then drop islands below it; the largest island always stays.
+
+    mask: (H, W) bool, not empty. Returns the mask and whether anything changed. As SAM's
+    `remove_small_regions`; only the surroundings of the mask are looked at, which changes nothing else.
+    """
+    (left, top, right, bottom), (height, width) = mask_boxes(mask[None])[0], mask.shape
+    gaps = np.array([top * width, (height - bottom) * width, left * height, (width - right) * height])
+    if ((gaps > 0) & (gaps < min_region)).any():  # what lies beyond the box may itself be a small hole
+        window = np.s_[0:height, 0:width]
+        gaps[:] = 0
+    else:
+        window = np.s_[max(top - 1, 0) : bottom + 1, max(left - 1, 0) : right + 1]
+    cleaned = np.zeros_like(mask)
+    cleaned[window] = _drop_islands(_fill_holes(mask[window], min_region, gaps > 0), min_region)
+    return cleaned, not np.array_equal(cleaned, mask)
+
+
+def _fill_holes(mask: Array, min_region: int, open_sides: Array) -> Array:
+    """open_sides: (4,) bool top, bottom, left, right: whether the background goes on for long there."""
+    holes, count = ndimage.label(~mask, EIGHT)
+    small = np.bincount(holes.ravel(), minlength=count + 1) < min_region
+    for side, is_open in zip((holes[0], holes[-1], holes[:, 0], holes[:, -1]), open_sides, strict=True):
+        if is_open:
+            small[side] = False
+    small[0] = False  # the mask itself
+    return mask | small[holes]
+
+
+def _drop_islands(mask: Array, min_region: int) -> Array:
+    islands, count = ndimage.label(mask, EIGHT)
+    sizes = np.bincount(islands.ravel(), minlength=count + 1)
+    keep = sizes >= min_region
+    if not keep[1:].any():
+        keep[1 + np.argmax(sizes[1:])] = True
+    keep[0] = False
+    return keep[islands]
+
+
+def common_pixels(masks: Array) -> Array:
+    """(M, H, W) bool -> (M, M) int64: pixels in both masks; areas on the diagonal."""
+    flat = masks.reshape(len(masks), -1)
+    total = np.zeros((len(masks), len(masks)), np.int64)
+    for start in range(0, flat.shape[1], PIXELS_PER_PRODUCT):
+        part = flat[:, start : start + PIXELS_PER_PRODUCT].astype(np.float32)
+        total += (part @ part.T).astype(np.int64)  # exact: counts stay below 2**24
+    return total
+
+
+def mask_nms(masks: Array, scores: Array, config: MaskConfig) -> Array:
+    """(K,) indices of the masks that stay, rising.
+
+    masks: (M, H, W) bool, none empty; scores: (M,) stability times predicted IoU. A mask goes when its IoU
+    with any higher-scored mask, gone or not, is > nms_iou; when its score is <= nms_score; or when it lies
+    inside another mask, whatever the scores, so that 1 - (its share in both areas multiplied) > nms_inner.
+    Source: `mask_nms` of LangSplat's preprocessing, with the thresholds that it passes.
+    """
+    common = common_pixels(masks)
+    area = np.diag(common)
+    order = np.argsort(-scores, kind="stable")
+    rank = np.empty(len(scores), int)
+    rank[order] = np.arange(len(scores))
+    iou = common / np.maximum(area[:, None] + area[None] - common, 1)
+    rival = (iou > config.nms_iou) & (rank[None] < rank[:, None])
+    share = common / np.maximum(area[:, None], 1)  # of the row's mask that lies in the column's
+    inside = (share >= CONTAINED) & (share.T < DOMINATED) & (1 - share * share.T > config.nms_inner)
+    keep = (scores > config.nms_score) & ~rival.any(axis=1) & ~inside.any(axis=1)
+    return np.flatnonzero(keep)
+
+
+# Masks by a model of the SAM family: a grid of points, three masks a point, filtered.
+#
+# The three answers to one point are taken as the levels subpart, part and whole (LangSplat section 3.1). The
+# picture is seen once, as a whole; the method's public code, not its paper, sees 2 x 2 crops of it too.
 
 VERSION = 2
 # Full-size masks of float logits held at one time: on a CPU 16 take twice as long as four times 4, since the

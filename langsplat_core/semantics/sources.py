@@ -10,7 +10,7 @@ from langsplat_core.semantics.masks import MaskSource
 
 
 def _graph(config: MaskConfig, device: str) -> MaskSource:
-    from langsplat_core.semantics.graph import GraphMasks  # scikit-image: a second
+    from langsplat_core.semantics.masks import GraphMasks  # scikit-image: a second
 
     return GraphMasks()
 

@@ -1,4 +1,4 @@
-"""What is known of every photograph, one compact file each, so that an interrupted run can continue."""
+"""The picture that CLIP is shown of one mask."""
 
 import hashlib
 import json
@@ -8,19 +8,77 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
+from typing import Protocol, overload
 from urllib.parse import quote, unquote
 
 import numpy as np
+from PIL import Image
+from scipy import ndimage
 
 from langsplat_core.arrays import Array, check_array, unit
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.files import atomic_path
-from langsplat_core.parsing.npy import read_npz
-from langsplat_core.parsing.opening import exists
+from langsplat_core.io.files import atomic_path
+from langsplat_core.io.hostile import exists, read_npz
 from langsplat_core.progress import Progress, silent
-from langsplat_core.semantics.embed import ImageEncoder, embed_regions
 from langsplat_core.semantics.masks import LevelMasks, MaskSource, SplitMaskSource, label_maps
+
+
+def masked_crop(image: Array, mask: Array, size: int) -> Array:
+    """Cut one region out: black outside the mask, bounding box, centred on a black square, resized.
+
+    image: (H, W, 3) uint8; mask: (H, W) bool with at least one pixel set; size: side of the result, px.
+    Returns (size, size, 3) uint8. Bilinear, with antialiasing when shrinking. This is the crop of the
+    method's public code (LangSplat `preprocess.py`), which the encoder must also be trained with.
+    Raises ValueError for an empty mask, which has no bounding box.
+    """
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if rows.size == 0:
+        raise ValueError("masked_crop: the mask is empty")
+    box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    patch = np.where(mask[box][..., None], image[box], np.uint8(0))
+    height, width = patch.shape[:2]
+    side = max(height, width)
+    square = np.zeros((side, side, 3), np.uint8)
+    top, left = (side - height) // 2, (side - width) // 2
+    square[top : top + height, left : left + width] = patch
+    if side == size:
+        return square
+    return np.asarray(Image.fromarray(square).resize((size, size), Image.Resampling.BILINEAR))
+
+
+# CLIP vectors of the regions of a photograph.
+
+
+class ImageEncoder(Protocol):
+    """The image half of a CLIP model, with its name."""
+
+    @property
+    def id(self) -> str:
+        """Hub id or folder."""
+
+    @property
+    def image_size(self) -> int:
+        """Side of the pictures it takes, px."""
+
+    def encode_images(self, crops: Array) -> Array:
+        """(M, S, S, 3) uint8 -> (M, D) float32 unit vectors."""
+
+
+def embed_regions(image: Array, label_maps: Array, encoder: ImageEncoder) -> Array:
+    """(M, D) float32 unit vectors of the M regions that `label_maps` numbers.
+
+    image: (H, W, 3) uint8; label_maps: (3, H, W) int32 as of `masks.label_maps`. A region is shown as it
+    is visible in its map, on black; where masks of one level overlap, LangSplat shows the covered part too.
+    """
+    crops = np.zeros((int(label_maps.max()) + 1, encoder.image_size, encoder.image_size, 3), np.uint8)
+    for labels in label_maps:
+        for row, box in enumerate(ndimage.find_objects(labels + 1)):
+            if box is not None:  # a row of another level
+                crops[row] = masked_crop(image[box], labels[box] == row, encoder.image_size)
+    return encoder.encode_images(crops)
+
+
+# What is known of every photograph, one compact file each, so that an interrupted run can continue.
 
 VERSION = 1
 SUFFIX = ".features.npz"

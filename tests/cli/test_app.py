@@ -11,7 +11,7 @@ from tyro.extras import get_parser
 
 from langsplat_core import __version__
 from langsplat_core.cli.app import COMMANDS, GROUPS, entry, load_command, parse
-from langsplat_core.cli.inspect import Doctor
+from langsplat_core.cli.scenes import Doctor
 from langsplat_core.errors import InputError
 from langsplat_viewer.__main__ import ViewerCommand
 from langsplat_viewer.__main__ import entry as viewer_entry

@@ -8,7 +8,7 @@ import pytest
 
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
-from langsplat_core.formats import save_scene
+from langsplat_core.io import save_scene
 from langsplat_core.scene import Scene
 from tests.support.blob_words import NAMES, named_scene
 from tests.support.fakes import FakeEncoder
@@ -25,7 +25,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "empty.txt").write_text("# nothing\n")
     (tmp_path / "bad.txt").write_text("mug\n???\n")
     (tmp_path / "sofas.txt").write_text("sofa\n")
-    monkeypatch.setattr("langsplat_core.cli.describe.load_text_encoder", lambda _: FakeEncoder())
+    monkeypatch.setattr("langsplat_core.cli.query.load_text_encoder", lambda _: FakeEncoder())
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

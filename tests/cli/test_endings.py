@@ -13,7 +13,7 @@ import pytest
 from langsplat_core.cli.app import COMMANDS, GROUPS, parse
 from langsplat_core.cli.checks import Written
 from langsplat_core.cli.run import main
-from langsplat_core.ranges import annotations, named_values
+from langsplat_core.config import annotations, named_values
 from tests.support.another_user import bound_by_permissions
 from tests.support.sinks import SINKS, Case, Ended, run_all
 

@@ -9,7 +9,7 @@ import pytest
 from langsplat_core.cli import evaluate_labels
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
-from langsplat_core.evaluation.protocols.published import PUBLISHED
+from langsplat_core.evaluation.report import PUBLISHED
 from tests.support.label_files import block, lerf_frame, mask_map, rectangle
 from tests.support.tiny_room import tiny_room, tiny_settings
 

@@ -7,24 +7,25 @@ import pytest
 
 from langsplat_core.arrays import psnr
 from langsplat_core.cli import run as command_line
-from langsplat_core.cli.compact import Compact
+from langsplat_core.cli.scenes import Compact
 from langsplat_core.compaction import compact
 from langsplat_core.compaction import views as compact_views
-from langsplat_core.compaction.compact import compact_scene
-from langsplat_core.compaction.contribution import (
+from langsplat_core.compaction.compact import Choice, compact_scene, select, smallest
+from langsplat_core.compaction.views import (
     ALONE,
+    HOLD_OUT,
+    choose_views,
     contributions,
     draw,
     estimated_loss,
     measuring_views,
     psnr_losses,
+    ring_cameras,
 )
-from langsplat_core.compaction.selection import Choice, select, smallest
-from langsplat_core.compaction.views import HOLD_OUT, choose_views, ring_cameras
 from langsplat_core.config import CompactConfig
 from langsplat_core.datasets import Capture
 from langsplat_core.errors import InputError
-from langsplat_core.formats import load_scene, save_scene
+from langsplat_core.io import load_scene, save_scene
 from langsplat_core.progress import silent
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer

@@ -5,7 +5,7 @@ import errno
 import numpy as np
 import pytest
 
-from langsplat_core.datasets.album import Album
+from langsplat_core.datasets.capture import Album
 from tests.support.full_disk import files_of_at_most
 
 

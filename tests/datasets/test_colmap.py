@@ -10,8 +10,7 @@ from PIL import Image
 
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture
-from langsplat_core.datasets.colmap import find_model, good_points
-from langsplat_core.datasets.colmap_model import read_model
+from langsplat_core.datasets.colmap import find_model, good_points, read_model
 from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
 from langsplat_core.errors import InputError
 from tests.support.photographed import (

@@ -8,7 +8,7 @@ import pytest
 
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture
-from langsplat_core.datasets.colmap_model import read_model
+from langsplat_core.datasets.colmap import read_model
 from langsplat_core.errors import FormatError, InputError
 from tests.support.small_datasets import (
     CONFIG,

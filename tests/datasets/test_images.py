@@ -8,7 +8,7 @@ import pytest
 from PIL import Image, ImageOps
 
 from langsplat_core.datasets import load_capture
-from langsplat_core.datasets.images import read_photo, unique_names
+from langsplat_core.datasets.capture import read_photo, unique_names
 from tests.support.small_datasets import CONFIG, refuse, write_colmap, write_picture
 
 

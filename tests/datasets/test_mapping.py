@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets import load_capture, mapping
-from langsplat_core.datasets.images import find_photos
+from langsplat_core.datasets import load_capture, sfm
+from langsplat_core.datasets.capture import find_photos
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled
@@ -72,8 +72,8 @@ def test_every_way_gives_the_same_bytes_again(way: int, found: int, matched: Pat
     for name in ("first", "second"):
         folder = tmp_path / name
         folder.mkdir()
-        models = mapping.WAYS[way](matched, folder, advance)
-        assert max((len(mapping.located_names(model)) for model in models), default=0) == found
+        models = sfm.WAYS[way](matched, folder, advance)
+        assert max((len(sfm.located_names(model)) for model in models), default=0) == found
         for model in models:
             model.write_binary(folder)
         written.append({path.name: path.read_bytes() for path in sorted(folder.glob("*.bin"))})
@@ -92,12 +92,12 @@ def synthetic(images: int, points: int) -> "pycolmap.Reconstruction":
 
 def test_the_model_with_most_well_held_photographs_is_kept() -> None:
     small, large = synthetic(4, 100), synthetic(6, 100)
-    assert mapping.best_model(None, [small, large]) is large
+    assert sfm.best_model(None, [small, large]) is large
     again = pycolmap.Reconstruction(large)
-    assert mapping.best_model(large, [small, again]) is large  # equal: the earlier way
-    wobbly = synthetic(7, mapping.FEWEST_POINTS - 1)  # all of its cameras are guesses
-    assert mapping.best_model(large, [wobbly]) is large
-    assert mapping.best_model(None, [wobbly]) is None
+    assert sfm.best_model(large, [small, again]) is large  # equal: the earlier way
+    wobbly = synthetic(7, sfm.FEWEST_POINTS - 1)  # all of its cameras are guesses
+    assert sfm.best_model(large, [wobbly]) is large
+    assert sfm.best_model(None, [wobbly]) is None
 
 
 def test_of_models_about_as_good_the_first_is_kept() -> None:
@@ -108,16 +108,16 @@ def test_of_models_about_as_good_the_first_is_kept() -> None:
         return model
 
     first, better, more = erring(6, 1.0), erring(6, 0.94), erring(7, 2.0)
-    assert mapping.best_model(first, [erring(6, 0.96)]) is first
-    assert mapping.best_model(None, [first, erring(6, 0.96), better]) is better
-    assert mapping.best_model(None, [better, more, first]) is more
+    assert sfm.best_model(first, [erring(6, 0.96)]) is first
+    assert sfm.best_model(None, [first, erring(6, 0.96), better]) is better
+    assert sfm.best_model(None, [better, more, first]) is more
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_libraries_inside_of_pycolmap_keep_to_one_thread_and_others_do_not() -> None:
     code = """
 import ctypes, os
-from langsplat_core.datasets.colmap_library import pycolmap
+from langsplat_core.datasets.intrinsics import pycolmap
 libraries = {line.split()[-1] for line in open("/proc/self/maps") if "pycolmap.libs/libgomp" in line}
 print([ctypes.CDLL(path).omp_get_max_threads() for path in libraries], os.environ["OMP_NUM_THREADS"])
 """
@@ -149,7 +149,7 @@ def test_below_half_is_refused_each_time_unless_told_otherwise(mostly_noise: Pat
     told = DatasetConfig(max_side=64, allow_few_cameras=True)
     assert len(load_capture(mostly_noise, told, tmp_path)) == 4
     (stage,) = tmp_path.glob("sfm-*")
-    assert len(json.loads((stage / mapping.LEFT_OUT).read_text())) == 5
+    assert len(json.loads((stage / sfm.LEFT_OUT).read_text())) == 5
 
 
 def test_two_views_are_refused_although_they_are_half(
@@ -163,10 +163,10 @@ def test_two_views_are_refused_although_they_are_half(
         model = synthetic(2, 100)
         for number, image in sorted(model.images.items()):
             image.name = f"{number - 1:05d}.jpg"
-        mapping.write_left_out(folder, mapping.located_names(model))
-        mapping.store_model(model, folder)
+        sfm.write_left_out(folder, sfm.located_names(model))
+        sfm.store_model(model, folder)
 
-    monkeypatch.setattr(mapping, "map_cameras", gives_up)
+    monkeypatch.setattr(sfm, "map_cameras", gives_up)
     for _ in range(2):
         with pytest.raises(InputError, match="only 2 of 4 photographs"):
             load_capture(tmp_path, CONFIG, tmp_path / "work")
@@ -198,7 +198,7 @@ def test_a_model_that_was_cut_off_is_not_kept(tmp_path: Path) -> None:
             files_of_at_most((tmp_path / "whole" / name).stat().st_size - 1),
             pytest.raises(OSError, match="No space"),
         ):
-            mapping.store_model(model, tmp_path)
+            sfm.store_model(model, tmp_path)
         assert not (tmp_path / "sparse").exists()
-    mapping.store_model(model, tmp_path)
+    sfm.store_model(model, tmp_path)
     assert (tmp_path / "sparse").is_dir()

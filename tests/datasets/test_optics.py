@@ -9,7 +9,7 @@ from PIL import Image
 
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture
-from langsplat_core.datasets.optics import optics
+from langsplat_core.datasets.sfm import optics
 from langsplat_core.progress import Cancelled
 
 FOCAL, ON_FILM, PLANE_X, PLANE_UNIT, WIDTH = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002

@@ -12,8 +12,8 @@ from PIL.TiffImagePlugin import IFDRational
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture
+from langsplat_core.datasets.capture import metres_per_unit, on_the_ground, place
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
-from langsplat_core.datasets.places import metres_per_unit, on_the_ground, place
 from tests.support.photographed import colmap_reconstruction, poses, write_photos
 
 HERE = (47.3769, 8.5417)  # degrees

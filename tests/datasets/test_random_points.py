@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.random_points import inside, look_distance, random_points
+from langsplat_core.datasets.known_poses import inside, look_distance, random_points
 from langsplat_core.scene import Camera, look_at
 
 UP = np.array([0.0, -1.0, 0.0])

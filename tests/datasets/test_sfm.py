@@ -21,7 +21,7 @@ from PIL import Image
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets import load_capture, mapping
+from langsplat_core.datasets import load_capture, sfm
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
 from langsplat_core.datasets.known_poses import add_points, neighbouring_views
@@ -69,8 +69,8 @@ def recorded(folder: Path) -> Iterator[None]:
     """Keeps in `folder` what every way of the mapper is given and gives: ``0.db``, ``0-0/cameras.bin`` ..."""
     folder.mkdir(parents=True)
 
-    def watched(number: int, way: Callable[..., Collection[mapping.Model]]) -> Callable[..., object]:
-        def run(workspace: Path, attempts: Path, advance: Callable[[], None]) -> Collection[mapping.Model]:
+    def watched(number: int, way: Callable[..., Collection[sfm.Model]]) -> Callable[..., object]:
+        def run(workspace: Path, attempts: Path, advance: Callable[[], None]) -> Collection[sfm.Model]:
             models = list(way(workspace, attempts, advance))
             with closing(sqlite3.connect(workspace / "database.db")) as database:
                 database.execute("VACUUM INTO ?", (str(folder / f"{number}.db"),))
@@ -82,7 +82,7 @@ def recorded(folder: Path) -> Iterator[None]:
         return run
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mapping, "WAYS", tuple(watched(*each) for each in enumerate(mapping.WAYS)))
+        patch.setattr(sfm, "WAYS", tuple(watched(*each) for each in enumerate(sfm.WAYS)))
         yield
 
 

@@ -6,10 +6,11 @@ import pytest
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.colmap import intrinsics_of
-from langsplat_core.datasets.colmap_model import CAMERA_MODELS, ModelCamera
-from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, PhotoIntrinsics
-from langsplat_core.datasets.undistort import (
+from langsplat_core.datasets.colmap import CAMERA_MODELS, ModelCamera, intrinsics_of
+from langsplat_core.datasets.intrinsics import (
+    BrownDistortion,
+    FisheyeDistortion,
+    PhotoIntrinsics,
     pinhole_for,
     resample,
     source_positions,

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.config import ColourMap, PictureConfig
-from langsplat_core.display.colour_maps import COLOUR_MAPS, NODES, TURBO, mapped
-from langsplat_core.display.compose import Channels, compose
-from langsplat_core.display.displays import DISPLAYS
+from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, NODES, TURBO, Channels, compose, mapped
 
 PICTURE = PictureConfig()
 

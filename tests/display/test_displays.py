@@ -4,9 +4,8 @@ import re
 from typing import get_args
 
 from langsplat_core.config import Display
-from langsplat_core.display.compose import shader_defines
-from langsplat_core.display.displays import DISPLAYS, NUMBERS, Extra
-from langsplat_core.raster.opengl.draw import shader
+from langsplat_core.display.displays import DISPLAYS, NUMBERS, Extra, shader_defines
+from langsplat_core.raster.opengl.scene_textures import shader
 
 SHADER = shader("compose.frag", 330, "langsplat_core.display", **shader_defines())
 

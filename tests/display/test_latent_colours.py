@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from langsplat_core.display.latent_colours import latent_colours
+from langsplat_core.display.displays import latent_colours
 from langsplat_core.scene import LanguageField, LinearCodec
 
 

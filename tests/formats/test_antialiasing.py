@@ -4,13 +4,7 @@ import json
 
 import pytest
 
-from langsplat_core.formats import (
-    load_scene,
-    read_ply_scene,
-    read_sog_scene,
-    save_scene,
-    write_ply,
-)
+from langsplat_core.io import load_scene, read_ply_scene, read_sog_scene, save_scene, write_ply
 from langsplat_core.scene import Scene
 from tests.support.file_samples import (
     compressed_ply,

@@ -3,7 +3,7 @@
 import pytest
 
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.formats import read_ply
+from langsplat_core.io import read_ply
 from tests.support.file_samples import (
     inria_names,
     ply_bytes,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.formats import read_cameras, write_cameras
+from langsplat_core.io import read_cameras, write_cameras
 from tests.support.scenes import random_camera
 
 

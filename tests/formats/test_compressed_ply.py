@@ -5,7 +5,7 @@ import pytest
 
 from langsplat_core.arrays import rotation_matrices, sigmoid
 from langsplat_core.errors import FormatError
-from langsplat_core.formats import read_ply
+from langsplat_core.io import read_ply
 from tests.support.file_samples import C0, SHARED_DATA, compressed_ply
 from tests.support.scenes import random_gaussians
 

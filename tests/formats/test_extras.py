@@ -8,12 +8,7 @@ import plyfile
 import pytest
 
 from langsplat_core.errors import InputError
-from langsplat_core.formats import (
-    load_scene,
-    read_ply_scene,
-    save_scene,
-    write_ply,
-)
+from langsplat_core.io import load_scene, read_ply_scene, save_scene, write_ply
 from langsplat_core.scene import Scene
 from tests.support.extras import random_extras
 from tests.support.file_samples import (

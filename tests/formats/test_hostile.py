@@ -9,7 +9,7 @@ import pytest
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.formats import (
+from langsplat_core.io import (
     read_cameras,
     read_features,
     read_ksplat,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.formats import antialiasing, read_ply, read_ply_scene, write_ply
+from langsplat_core.io import ply, read_ply, read_ply_scene, write_ply
 from langsplat_core.scene import Gaussians, Scene
 from tests.support.file_samples import (
     ascii_ply,
@@ -205,7 +205,7 @@ def test_compressed_files_that_fuzzing_found(reader):
 
 def assert_survives_writing(scene: Scene, path: Path) -> None:
     """What was read can be written and is read back the same, NaN included."""
-    write_ply(path, scene.gaussians, (antialiasing.COMMENT,) * scene.antialiased, scene.extras)
+    write_ply(path, scene.gaussians, (ply.COMMENT,) * scene.antialiased, scene.extras)
     again = read_ply_scene(path)
     assert again.antialiased == scene.antialiased
     assert list(again.extras) == list(scene.extras)

@@ -14,7 +14,7 @@ import zstandard
 from PIL import Image
 
 from langsplat_core.errors import FormatError
-from langsplat_core.formats import (
+from langsplat_core.io import (
     load_gaussians,
     read_cameras,
     read_ksplat,

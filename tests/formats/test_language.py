@@ -10,13 +10,8 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.formats import (
-    language,
-    read_language,
-    rematch_language,
-    write_language,
-)
-from langsplat_core.formats.packed_positions import pack_positions, step, unpack_positions
+from langsplat_core.io import language, read_language, rematch_language, write_language
+from langsplat_core.io.ply import pack_positions, step, unpack_positions
 from langsplat_core.scene import CodebookCodec, Reading
 from tests.support.file_samples import random_field
 from tests.support.same import assert_same_field

@@ -12,7 +12,7 @@ from safetensors.numpy import load_file, save_file
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError
-from langsplat_core.formats import read_language, rematch_language, write_language
+from langsplat_core.io import read_language, rematch_language, write_language
 from langsplat_core.scene import NO_THING, Calibration, LanguageField, Odds, Reading
 from tests.support.file_samples import random_field
 from tests.support.same import assert_same_field

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.formats import load_scene, save_scene, write_metres
-from langsplat_core.formats.metres import metres_by_comments, metres_comment
+from langsplat_core.io import load_scene, save_scene, write_metres
+from langsplat_core.io.ply import metres_by_comments, metres_comment
 from langsplat_core.scene import Scene
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import compressed_ply

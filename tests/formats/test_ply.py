@@ -7,7 +7,7 @@ import plyfile
 import pytest
 
 from langsplat_core.errors import InputError
-from langsplat_core.formats import ply, read_ply, write_ply
+from langsplat_core.io import ply, read_ply, write_ply
 from tests.support.file_samples import (
     ascii_ply,
     columns,

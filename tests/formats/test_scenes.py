@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.errors import InputError
-from langsplat_core.formats import (
+from langsplat_core.io import (
     companion_path,
     language,
     load_gaussians,
@@ -107,7 +107,7 @@ def test_a_failure_while_writing_changes_nothing(tmp_path, monkeypatch):
     def full_disk(*args):
         raise OSError("No space left on device")
 
-    monkeypatch.setattr("langsplat_core.formats.write_ply", full_disk)
+    monkeypatch.setattr("langsplat_core.io.write_ply", full_disk)
     with pytest.raises(OSError, match="No space"):
         save_scene(path, full_scene(1))
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before

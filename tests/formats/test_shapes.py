@@ -7,7 +7,7 @@ import pytest
 from plyfile import PlyData
 
 from langsplat_core.errors import InputError
-from langsplat_core.formats.shapes import base_colours, write_meshes, write_points
+from langsplat_core.io.shapes import base_colours, write_meshes, write_points
 from tests.support.scenes import random_gaussians
 
 TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)

@@ -7,7 +7,7 @@ import pytest
 
 from langsplat_core.arrays import rotation_matrices, sigmoid
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.formats import read_ksplat, read_splat, write_splat
+from langsplat_core.io import read_ksplat, read_splat, write_splat
 from langsplat_core.scene import Gaussians
 from tests.support.file_samples import C0
 from tests.support.scenes import covariances, random_gaussians

@@ -9,8 +9,8 @@ import zstandard
 
 from langsplat_core.arrays import rotation_matrices, sigmoid
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.formats import read_splat, read_spz_scene, write_spz
-from langsplat_core.raster.spherical_harmonics import colours
+from langsplat_core.io import read_splat, read_spz_scene, write_spz
+from langsplat_core.raster.reference import colours
 from langsplat_core.scene import Gaussians
 from tests.support.scenes import covariances, random_gaussians
 from tests.support.splat_samples import spz_bytes

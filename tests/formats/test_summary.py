@@ -6,9 +6,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from langsplat_core.cli.inspect import Inspect
-from langsplat_core.formats import save_scene
-from langsplat_core.formats.summary import disk_bytes, duplicates, summarise
+from langsplat_core.cli.scenes import Inspect
+from langsplat_core.io import save_scene
+from langsplat_core.io.summary import disk_bytes, duplicates, summarise
 from langsplat_core.scene import NO_THING, Calibration, Gaussians, Odds, Reading, Scene
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_camera, random_gaussians

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from langsplat_core.cli.inspect import Inspect
 from langsplat_core.cli.query import QueryScene
+from langsplat_core.cli.scenes import Inspect
 from langsplat_core.errors import InputError
-from langsplat_core.formats import load_scene, load_without_language, save_scene
+from langsplat_core.io import load_scene, load_without_language, save_scene
 from langsplat_core.query.engine import NO_FIELD, QueryEngine
 from tests.support.fakes import blob_scene
 

@@ -10,9 +10,7 @@ from assets.making import dataset as photographs
 from assets.making.dataset import outlines, write_labelled
 from assets.making.truth import read_truth
 from langsplat_core.cli.app import parse
-from langsplat_core.evaluation.protocols.labels import Outlines
-from langsplat_core.evaluation.protocols.lerf_ovs import read_lerf_ovs
-from langsplat_core.evaluation.protocols.ovs3d import read_3d_ovs
+from langsplat_core.evaluation.labels import Outlines, read_3d_ovs, read_lerf_ovs
 from langsplat_core.lab.rooms.scoring import MIN_PIXELS
 from langsplat_core.progress import silent
 

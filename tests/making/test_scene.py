@@ -15,12 +15,11 @@ from assets.making.dataset import LIGHT, orbit_cameras, photographed_room, truth
 from assets.making.render import Renderer
 from assets.making.scene import SEED, SIZE, VIEWS
 from langsplat_core.config import PictureConfig
-from langsplat_core.evaluation.metrics import intersection_over_union, majority
-from langsplat_core.formats import load_scene
-from langsplat_core.query.cut import cut_level
+from langsplat_core.evaluation.scoring import intersection_over_union, majority
+from langsplat_core.io import load_scene
+from langsplat_core.query.answers import cut_level, peak_pixel
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.pixels import splatted_relevancy
-from langsplat_core.query.places import peak_pixel
+from langsplat_core.query.lookup import splatted_relevancy
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.encoders import load_text_encoder

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.errors import FormatError
-from langsplat_core.parsing.archives import opened_archive
-from langsplat_core.parsing.npy import read_npz
+from langsplat_core.io.hostile import opened_archive, read_npz
 
 
 def packed(method: int, name: str = "a", content: bytes = b"content" * 100) -> bytes:

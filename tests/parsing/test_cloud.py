@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.errors import FormatError
-from langsplat_core.parsing.cloud import GREY, read_cloud
+from langsplat_core.io.ply_table import GREY, read_cloud
 
 
 def ascii_cloud(folder: Path, colour: str, *rows: str) -> Path:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.errors import FormatError
-from langsplat_core.parsing.npy import read_npy
+from langsplat_core.io.hostile import read_npy
 
 
 def npy(shape: str, values: int = 0) -> bytes:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import EpsImagePlugin, Image
 
-from langsplat_core.datasets.images import find_photos, read_photo
+from langsplat_core.datasets.capture import find_photos, read_photo
 from langsplat_core.errors import FormatError
-from langsplat_core.parsing.pictures import MOST_PIXELS, PictureError, opened, picture_size
+from langsplat_core.io.hostile import MOST_PIXELS, PictureError, opened, picture_size
 
 ROOT = Path(__file__).parents[2]
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\nshowpage\n%%EOF\n"
@@ -39,7 +39,7 @@ def test_nothing_else_opens_pictures() -> None:
     ]
     openers = [path.name for path in sources if re.search(r"\bImage\.open\(", path.read_text())]
     assert openers == ["pictures.py"]
-    assert (ROOT / "langsplat_core/parsing/pictures.py") in sources
+    assert (ROOT / "langsplat_core/io/hostile.py") in sources
 
 
 def test_postscript_starts_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_core.pipeline.doubts import APART, camera_groups, doubts
-from langsplat_core.pipeline.report import REPORT, stated_doubts, work_folder
+from langsplat_core.pipeline.report import APART, REPORT, camera_groups, doubts, stated_doubts, work_folder
 from langsplat_core.scene import Camera, look_at
 from langsplat_core.training.radiance.train import ViewScore
 

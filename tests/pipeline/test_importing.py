@@ -12,8 +12,8 @@ import torch
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CodecConfig
 from langsplat_core.errors import EncoderError, FormatError, InputError
-from langsplat_core.formats import load_scene, read_features, save_scene, write_features
-from langsplat_core.formats.checkpoints import read_foreign
+from langsplat_core.io import load_scene, read_features, save_scene, write_features
+from langsplat_core.io.foreign import read_foreign
 from langsplat_core.pipeline.exporting import (
     export_langsplat,
     export_occam,
@@ -24,7 +24,7 @@ from langsplat_core.pipeline.importing import import_scene
 from langsplat_core.scene import CANONICAL_PHRASES, AutoencoderCodec, LanguageField, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
-from langsplat_core.training.language.relevancy_error import everyday_vocabulary
+from langsplat_core.training.language.codec_fit import everyday_vocabulary
 from tests.support.file_samples import random_field
 from tests.support.foreign_files import autoencoder, save_model, tensor
 from tests.support.same import assert_same

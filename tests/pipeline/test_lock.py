@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from langsplat_core.errors import InputError
-from langsplat_core.pipeline.lock import LOCK, sole_use
+from langsplat_core.pipeline.stages import LOCK, sole_use
 
 HOLD = (
-    "import sys, time\nfrom pathlib import Path\nfrom langsplat_core.pipeline.lock import sole_use\n"
+    "import sys, time\nfrom pathlib import Path\nfrom langsplat_core.pipeline.stages import sole_use\n"
     "with sole_use(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)\n"
 )
 

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import sigmoid
-from langsplat_core.query.answers import QueryResult, by_peak, by_regions
-from langsplat_core.query.chance import chance_in
+from langsplat_core.query.answers import QueryResult, by_peak, by_regions, chance_in
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import build_lookup
-from langsplat_core.query.regions import SMALLEST, build_regions
-from langsplat_core.query.surface import Surface, build_surface
+from langsplat_core.query.surface import SMALLEST, Surface, build_regions, build_surface
 from langsplat_core.scene import LEVELS, Calibration, Gaussians, LanguageField, Odds, Reading, Scene
 from langsplat_core.semantics.relevancy import FLOOR, Scale
 from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, blob_scene, blobs, language

@@ -11,7 +11,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import CANONICAL_PHRASES, Calibration, Odds, Reading, Scene
 from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import DEMO
-from langsplat_core.semantics.everyday import FEWEST
+from langsplat_core.semantics.vocabulary import FEWEST
 from tests.support.blob_words import named_scene
 from tests.support.fakes import DIM, WORDS, FakeEncoder, axis
 

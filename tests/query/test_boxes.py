@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array, rotation_matrices
-from langsplat_core.query.boxes import INNER, OrientedBox, axis_aligned_box, oriented_box
+from langsplat_core.query.instances import INNER, OrientedBox, axis_aligned_box, oriented_box
 
 INSIDE = INNER[1] - INNER[0]  # of a side, where points are spread evenly over it
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from langsplat_core.query import chance as chance_module
-from langsplat_core.query.chance import FOUND, Bar, Chance, chance_in, excess
+from langsplat_core.query import answers as chance_module
+from langsplat_core.query.answers import FOUND, Bar, Chance, chance_in, excess
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.regions import SMALLEST
+from langsplat_core.query.surface import SMALLEST
 from langsplat_core.scene import LEVELS, Reading, Scene
 from tests.support.fakes import FakeEncoder, blob_scene, language
 from tests.support.file_samples import random_field

@@ -5,8 +5,7 @@ import pytest
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.query.combine import grown, peaks_among
-from langsplat_core.query.compose import run_phrase
+from langsplat_core.query.compose import grown, peaks_among, run_phrase
 from langsplat_core.query.engine import QueryEngine
 from tests.support.laid_table import PlainEncoder, front_camera, laid_table, meaning
 

@@ -7,10 +7,9 @@ import pytest
 
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.query import describe
-from langsplat_core.query.describe import Describer
+from langsplat_core.query.describe import Describer, field_meanings, same_things
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.instances import connected_parts
-from langsplat_core.query.inventory import field_meanings, same_things
 from langsplat_core.query.surface import surface_areas
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Gaussians, Scene

@@ -5,12 +5,18 @@ import pytest
 
 from langsplat_core.arrays import unit
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
+from langsplat_core.query.answers import locate, peak_pixel
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
-from langsplat_core.query.places import locate, peak_pixel
+from langsplat_core.query.lookup import (
+    build_table,
+    decoded_relevancy,
+    octahedral_to_sphere,
+    sphere_to_octahedral,
+    splatted_relevancy,
+    suits_table,
+)
 from langsplat_core.query.surface import build_surface
-from langsplat_core.query.table import build_table, octahedral_to_sphere, sphere_to_octahedral, suits_table
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import LanguageField, LinearCodec, Scene
 from langsplat_core.semantics.relevancy import FLOOR, Scale, latent_relevancy, relevancy

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array, sigmoid
-from langsplat_core.query.extent import ADVANTAGE, FARTHEST, NEAREST, REACH, find_extent, lowest
-from langsplat_core.query.regions import SMALLEST, Regions, regions_from
-from langsplat_core.query.surface import Surface, build_surface
-from langsplat_core.query.vocabulary import Named
+from langsplat_core.query.answers import ADVANTAGE, FARTHEST, NEAREST, REACH, find_extent, lowest
+from langsplat_core.query.grammar import Named
+from langsplat_core.query.surface import SMALLEST, Regions, Surface, build_surface, regions_from
 from langsplat_core.scene import LEVELS
 from langsplat_core.semantics.relevancy import Scale
 from tests.support.scenes import random_gaussians

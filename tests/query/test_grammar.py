@@ -5,8 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from langsplat_core.errors import InputError
-from langsplat_core.query.grammar import MAX_ATOMS, MAX_CHARACTERS, parse
-from langsplat_core.query.phrase_tree import (
+from langsplat_core.query.grammar import (
+    MAX_ATOMS,
+    MAX_CHARACTERS,
     Atom,
     Both,
     Inside,
@@ -15,9 +16,10 @@ from langsplat_core.query.phrase_tree import (
     Union,
     Without,
     atoms,
+    parse,
     reading,
 )
-from langsplat_core.scene.phrases import split_phrases
+from langsplat_core.scene.language import split_phrases
 
 MUG, BOOK, TABLE = Atom("mug"), Atom("book"), Atom("table")
 HANDLE = Atom("handle")

@@ -8,9 +8,7 @@ from scipy.spatial import ConvexHull
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
-from langsplat_core.query.boxes import INNER
-from langsplat_core.query.hulls import Mesh, hull, hulls
-from langsplat_core.query.instances import Instance
+from langsplat_core.query.instances import INNER, Instance, Mesh, hull, hulls
 from langsplat_core.scene import Gaussians
 
 

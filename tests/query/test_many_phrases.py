@@ -6,8 +6,7 @@ import pytest
 from langsplat_core.arrays import unit
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.regions import Regions, build_regions
-from langsplat_core.query.surface import Surface, build_surface
+from langsplat_core.query.surface import Regions, Surface, build_regions, build_surface
 from langsplat_core.scene import LanguageField, Scene
 from tests.support.fakes import FakeEncoder, blob_scene
 from tests.support.file_samples import random_field

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from langsplat_core.query.describe import Describer
+from langsplat_core.query.describe import Describer, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.pointing import look_at_pixel
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from tests.support.fakes import CENTRES, FakeEncoder, blob_scene

@@ -7,8 +7,17 @@ import pytest
 from scipy.sparse.csgraph import connected_components
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.query.regions import BORDER, SCALE, SMALLEST, STEPS, UNKNOWN, Regions, build_regions
-from langsplat_core.query.surface import Surface, build_surface
+from langsplat_core.query.surface import (
+    BORDER,
+    SCALE,
+    SMALLEST,
+    STEPS,
+    UNKNOWN,
+    Regions,
+    Surface,
+    build_regions,
+    build_surface,
+)
 from langsplat_core.scene import NO_THING, Gaussians, LanguageField
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_gaussians

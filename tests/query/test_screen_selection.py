@@ -5,14 +5,7 @@ from math import cos, hypot, inf, nan, pi, sin
 import numpy as np
 import pytest
 
-from langsplat_core.query.screen_selection import (
-    Projected,
-    in_polygon,
-    in_rectangle,
-    in_stroke,
-    on_surface,
-    project,
-)
+from langsplat_core.query.selection import Projected, in_polygon, in_rectangle, in_stroke, on_surface, project
 from langsplat_core.scene import look_at
 
 SIZE = (80, 60)

@@ -8,9 +8,8 @@ import pytest
 
 from langsplat_core.errors import InputError
 from langsplat_core.query import selection
-from langsplat_core.query.boxes import OrientedBox
-from langsplat_core.query.regions import build_regions
-from langsplat_core.query.surface import Surface, build_surface
+from langsplat_core.query.instances import OrientedBox
+from langsplat_core.query.surface import Surface, build_regions, build_surface
 from langsplat_core.scene import Gaussians
 from tests.support.scenes import random_gaussians
 from tests.support.two_blobs import two_blob_scene

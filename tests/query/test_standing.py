@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array
-from langsplat_core.query.standing import Body, body, gap, most, separate, stands, upright, viewer
+from langsplat_core.query.compose import Body, body, gap, most, separate, stands, upright, viewer
 from langsplat_core.query.surface import build_surface
 from langsplat_core.scene import NO_THING, look_at
 from tests.support.laid_table import UP, laid_table

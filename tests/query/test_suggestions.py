@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from langsplat_core.query.describe import completions, corrected, suggest
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.suggestions import completions, corrected, suggest
 from tests.support.fakes import FakeEncoder, axis, blob_scene, language
 
 PHRASES = ("teddy bear", "tea pot", "red mug", "teapot", "mug")

@@ -2,7 +2,7 @@
 
 import pytest
 
-from langsplat_core.query.vocabulary import named
+from langsplat_core.query.grammar import named
 
 
 @pytest.mark.parametrize(

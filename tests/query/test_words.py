@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.query import words as words_module
-from langsplat_core.query.words import (
+from langsplat_core.query import describe as words_module
+from langsplat_core.query.describe import (
     NEAREST,
     WordScores,
     build_attributes,

@@ -10,8 +10,8 @@ import pytest
 
 from langsplat_core.arrays import Array, rotation_matrices
 from langsplat_core.config import GSPLAT
-from langsplat_core.raster import spherical_harmonics
-from langsplat_core.raster.cpu import colour as cpu_colour
+from langsplat_core.raster import reference
+from langsplat_core.raster.cpu import projection as cpu_colour
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import project
 from langsplat_core.scene import Camera, Gaussians
@@ -87,7 +87,7 @@ def test_spherical_harmonics(degree: int) -> None:
     want = spherical_harmonics_of_gsplat(degree, directions, double(gaussians.sh)).numpy() + 0.5
     want = np.maximum(want, 0)
     assert (want == 0).any()
-    ours = spherical_harmonics.colours(gaussians.sh, gaussians.means, eye)
+    ours = reference.colours(gaussians.sh, gaussians.means, eye)
     np.testing.assert_allclose(ours, want, atol=1e-6)
     np.testing.assert_allclose(cpu_colour.colours(gaussians.sh, gaussians.means, eye), want, atol=2e-6)
 

@@ -15,9 +15,8 @@ from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import gsplat, load_lifting_rasterizer, load_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.training.language.memberships import find_memberships
-from langsplat_core.training.radiance.differentiable import CpuRenderer, DifferentiableRenderer
-from langsplat_core.training.radiance.differentiable_cuda import CudaRenderer
+from langsplat_core.training.language.mask_weights import find_memberships
+from langsplat_core.training.radiance.differentiable import CpuRenderer, CudaRenderer, DifferentiableRenderer
 from langsplat_core.training.radiance.state import PARAMETERS, start
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 from tests.support import gsplat_twin as twin

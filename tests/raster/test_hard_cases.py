@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from langsplat_core.errors import BackendError
-from langsplat_core.raster import MedianDepth, load_rasterizer, spherical_harmonics
-from langsplat_core.raster.cpu import colour as cpu_colour
+from langsplat_core.raster import MedianDepth, load_rasterizer
+from langsplat_core.raster.cpu import projection as cpu_colour
 from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.raster.reference import colours as true_colours
 from tests.support.backends import Backend
 from tests.support.close import assert_adjoint
 from tests.support.hard_cases.cases import CASES, HUGE_IMAGE, ROW
@@ -148,7 +149,7 @@ def test_colours_that_overflow(backend: Backend, coefficient: float) -> None:
     """Finite, 0 where they would be negative, and no gradient there."""
     drawing = altered("sh", ROW, coefficient * np.array([1.0, -1.0, 0.0]), sh_degree=3)
     sh, means, eye = drawing.gaussians.sh, drawing.gaussians.means, drawing.camera.position
-    want = spherical_harmonics.colours(sh, means, eye)
+    want = true_colours(sh, means, eye)
     assert want.min() == 0
     assert want.max() > 1e3
     if backend.name == "cpu":

@@ -5,7 +5,7 @@ import pytest
 
 from langsplat_core.config import INRIA
 from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_core.raster.one_pixel import pixel_weights
+from langsplat_core.raster.render import pixel_weights
 from langsplat_core.scene import Gaussians, look_at
 from tests.support.scenes import random_gaussians
 

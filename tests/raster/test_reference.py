@@ -7,8 +7,7 @@ import pytest
 
 from langsplat_core.arrays import logit
 from langsplat_core.config import GSPLAT, INRIA
-from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.raster.spherical_harmonics import colours
+from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians
 from tests.support.close import BAND, assert_adjoint, assert_close_off_cuts, assert_gradient
 from tests.support.golden import load_golden

@@ -9,7 +9,7 @@ import langsplat_core
 from langsplat_core import Scene, render
 from langsplat_core.config import GSPLAT
 from langsplat_core.errors import BackendError, InputError
-from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer, spherical_harmonics
+from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer, reference
 from langsplat_core.raster import render as front_door
 from langsplat_core.raster.render import splat_colours
 from tests.support.scenes import random_camera, random_gaussians, random_values
@@ -27,7 +27,7 @@ def test_a_picture_is_project_colours_and_splat(backend: str) -> None:
     values = random_values(80, 2)
     picture = render(Scene(G), CAMERA, values, backend=backend)
     view = load_rasterizer("reference").view(G, CAMERA)
-    colours = spherical_harmonics.colours(G.sh, G.means, CAMERA.position)
+    colours = reference.colours(G.sh, G.means, CAMERA.position)
     want, alpha = view.splat(np.concatenate([colours, values], 1))
     np.testing.assert_allclose(picture.colours, want[..., :3], atol=2e-5)
     np.testing.assert_allclose(picture.values, want[..., 3:], atol=2e-5)

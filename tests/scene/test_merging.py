@@ -10,7 +10,7 @@ from langsplat_core.lab.speed.queries import repeated
 from langsplat_core.progress import Cancelled
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Gaussians, Scene
-from langsplat_core.scene.merging import GROUP, merged
+from langsplat_core.scene.gaussians import GROUP, merged
 from tests.support.scenes import random_camera, random_gaussians
 
 
@@ -87,7 +87,7 @@ def test_every_row_counts_once(dense):
 
 def test_blocks_do_not_show(dense, monkeypatch):
     whole = merged(dense)
-    monkeypatch.setattr("langsplat_core.scene.merging.BLOCK", 37)
+    monkeypatch.setattr("langsplat_core.scene.gaussians.BLOCK", 37)
     blocks = merged(dense)
     order = np.lexsort(whole.gaussians.means.T), np.lexsort(blocks.gaussians.means.T)
     for name in ("means", "log_scales", "sh"):

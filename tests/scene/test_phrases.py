@@ -4,7 +4,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from langsplat_core.scene.phrases import phrase_key, split_phrases, tidy, tokens
+from langsplat_core.scene.language import phrase_key, split_phrases, tidy, tokens
 
 SAME = (
     "red mug",

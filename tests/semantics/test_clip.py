@@ -10,8 +10,7 @@ from transformers import CLIPModel, CLIPTokenizer
 
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.scene import Calibration, Odds, Reading
-from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
-from langsplat_core.semantics.families.clip import CLIP_MEAN, CLIP_STD
+from langsplat_core.semantics.encoders import CLIP_MEAN, CLIP_STD, load_encoder, load_text_encoder
 from tests.support.tiny_clip import SIDE, WORDS, tiny_clip
 
 pytestmark = pytest.mark.long  # transformers alone takes seconds to load

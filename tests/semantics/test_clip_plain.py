@@ -16,15 +16,14 @@ from tokenizers import Tokenizer
 from transformers import CLIPModel, CLIPTokenizerFast
 
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.semantics.encoders import load_text_encoder
-from langsplat_core.semantics.families.clip import ClipText, clip_text
-from langsplat_core.semantics.families.clip_plain import (
+from langsplat_core.semantics.clip_plain import (
     BYTES,
     PlainClipText,
     TextConfig,
     plain_text_tower,
     read_pair_tokenizer,
 )
+from langsplat_core.semantics.encoders import ClipText, clip_text, load_text_encoder
 from langsplat_core.semantics.weights import Weights
 from tests.support.tiny_clip import tiny_clip
 

@@ -6,8 +6,7 @@ import torch
 
 from langsplat_core.config import MaskConfig
 from langsplat_core.progress import silent
-from langsplat_core.semantics.crop_layers import crop_boxes, cut_by_crop
-from langsplat_core.semantics.sam import SamMasks
+from langsplat_core.semantics.sam import SamMasks, crop_boxes, cut_by_crop
 
 pytestmark = pytest.mark.long  # torch alone takes seconds to load
 

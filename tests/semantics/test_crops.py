@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from langsplat_core.semantics.crops import masked_crop
+from langsplat_core.semantics.store import masked_crop
 
 
 def test_a_square_region_of_the_right_size_is_copied_exactly() -> None:

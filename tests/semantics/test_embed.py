@@ -11,12 +11,12 @@ import pytest
 from langsplat_core.arrays import unit
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.progress import Cancelled, Progress, silent
-from langsplat_core.semantics.embed import embed_regions
 from langsplat_core.semantics.masks import LevelMasks
 from langsplat_core.semantics.store import (
     FeatureStore,
     ImageFeatures,
     describe_capture,
+    embed_regions,
     feature_key,
     fingerprint,
 )

@@ -10,7 +10,7 @@ import torch
 
 from langsplat_core.errors import EncoderError
 from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
-from langsplat_core.semantics.segmenters import load_segmenter
+from langsplat_core.semantics.sam import load_segmenter
 from tests.support.tiny_clip import tiny_clip
 from tests.support.tiny_sam import tiny_sam
 

@@ -16,9 +16,8 @@ from transformers import CLIPTokenizer
 
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.semantics import layouts
-from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
-from langsplat_core.semantics.families.clip import CLIP_MEAN, CLIP_STD
-from langsplat_core.semantics.segmenters import load_segmenter
+from langsplat_core.semantics.encoders import CLIP_MEAN, CLIP_STD, load_encoder, load_text_encoder
+from langsplat_core.semantics.sam import load_segmenter
 from tests.semantics.test_hostile_weights import Runs
 from tests.support.other_layouts import (
     SIDE,

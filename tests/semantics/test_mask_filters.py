@@ -5,13 +5,7 @@ import pytest
 from scipy import ndimage
 
 from langsplat_core.config import MaskConfig
-from langsplat_core.semantics.mask_filters import (
-    box_nms,
-    clean_regions,
-    common_pixels,
-    mask_boxes,
-    mask_nms,
-)
+from langsplat_core.semantics.sam import box_nms, clean_regions, common_pixels, mask_boxes, mask_nms
 from tests.support.plain_filters import plain_box_nms, plain_mask_nms
 
 

@@ -9,9 +9,7 @@ import pytest
 from PIL import Image
 
 from langsplat_core.progress import silent
-from langsplat_core.semantics.graph import GraphMasks, nested_partitions
-from langsplat_core.semantics.masks import LevelMasks, label_maps
-from langsplat_core.semantics.region_graph import RegionGraph
+from langsplat_core.semantics.masks import GraphMasks, LevelMasks, RegionGraph, label_maps, nested_partitions
 
 pytestmark = pytest.mark.long
 

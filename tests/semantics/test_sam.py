@@ -17,10 +17,19 @@ from langsplat_core.config import MaskConfig
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import silent
 from langsplat_core.semantics import sam
-from langsplat_core.semantics.mask_filters import clean_regions, mask_boxes
-from langsplat_core.semantics.sam import SamMasks, grid_points, load_sam
-from langsplat_core.semantics.segmenter import Look, by_area, padded, squashed, upscale
-from langsplat_core.semantics.segmenters import load_segmenter
+from langsplat_core.semantics.sam import (
+    Look,
+    SamMasks,
+    by_area,
+    clean_regions,
+    grid_points,
+    load_sam,
+    load_segmenter,
+    mask_boxes,
+    padded,
+    squashed,
+    upscale,
+)
 from langsplat_core.semantics.sources import load_mask_source
 from tests.support.plain_filters import plain_box_nms, plain_mask_nms
 from tests.support.tiny_sam import SIDE, tiny_sam, tiny_sam2, tiny_sam2_video, tiny_sam_hq

@@ -140,8 +140,7 @@ def measure_segmenter(folder: Path) -> dict[str, float]:
     """Seconds of each step on one photograph; every mask of a batch is enlarged, as if all passed."""
     import torch
 
-    from langsplat_core.semantics.sam import grid_points
-    from langsplat_core.semantics.segmenters import load_segmenter
+    from langsplat_core.semantics.sam import grid_points, load_segmenter
 
     seconds = Stopwatch()
     segmenter = load_segmenter(str(folder), "cpu")

@@ -9,7 +9,7 @@ import pytest
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import BackendError
-from langsplat_core.raster.opengl.context import create_egl_context
+from langsplat_core.raster.opengl.scene_textures import create_egl_context
 
 
 @pytest.fixture(scope="session")

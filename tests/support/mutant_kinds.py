@@ -10,12 +10,17 @@ import numpy as np
 from PIL import Image
 
 from langsplat_core.arrays import unit
-from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.capture import Capture, read_photo
 from langsplat_core.datasets.colmap import load_colmap
-from langsplat_core.datasets.images import read_photo
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
-from langsplat_core.formats import load_scene, read_cameras, read_language, write_cameras, write_language
-from langsplat_core.parsing.pictures import picture_size
+from langsplat_core.io import (
+    load_scene,
+    read_cameras,
+    read_language,
+    write_cameras,
+    write_language,
+)
+from langsplat_core.io.hostile import picture_size
 from langsplat_core.progress import silent
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from tests.support.file_samples import (

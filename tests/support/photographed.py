@@ -10,8 +10,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from langsplat_core import arrays
 from langsplat_core.arrays import Array
-from langsplat_core.datasets.intrinsics import PhotoIntrinsics
-from langsplat_core.datasets.undistort import undistorted_points
+from langsplat_core.datasets.intrinsics import PhotoIntrinsics, undistorted_points
 from langsplat_core.scene import Camera, look_at
 
 ROOM = 4.0  # world units; the floor is z = 0, the walls are x = ROOM and y = ROOM, all seen from inside

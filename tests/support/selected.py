@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from langsplat_viewer.marks.selecting import Marks
+from langsplat_viewer.marks import Marks
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import PER_BLOB, WORDS
 

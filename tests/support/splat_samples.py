@@ -9,7 +9,7 @@ import numpy as np
 import zstandard
 
 from langsplat_core.arrays import Array
-from langsplat_core.raster.spherical_harmonics import basis
+from langsplat_core.raster.reference import basis
 from langsplat_core.scene import Gaussians
 from tests.support.file_samples import C0
 

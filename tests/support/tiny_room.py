@@ -18,7 +18,7 @@ from langsplat_core.config import (
 )
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Scene, look_at
-from langsplat_core.training.language import codebook_fit
+from langsplat_core.training.language import codec_fit
 from tests.support.scenes import random_gaussians
 from tests.support.tiny_clip import tiny_clip
 
@@ -67,5 +67,5 @@ def tiny_settings(room: Path) -> TrainConfig:
 def rough_colours() -> Iterator[None]:
     """A third of a tiny training's time is else the colours of its codewords."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(codebook_fit, "COLOUR_STEPS", 20)
+        patch.setattr(codec_fit, "COLOUR_STEPS", 20)
         yield

@@ -4,7 +4,7 @@ import numpy as np
 
 from langsplat_core.arrays import unit
 from langsplat_core.semantics.relevancy import Scale
-from langsplat_core.training.language.relevancy_error import Vocabulary
+from langsplat_core.training.language.codec_fit import Vocabulary
 
 
 def random_vocabulary(dim: int, phrases: int = 20, seed: int = 9) -> Vocabulary:

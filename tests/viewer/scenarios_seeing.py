@@ -10,9 +10,8 @@ from PIL import Image
 
 from imgui_bundle import imgui  # isort: skip
 from langsplat_viewer import actions
-from langsplat_viewer.camera.labels import Label
-from langsplat_viewer.camera.view_cube import visible_faces
-from langsplat_viewer.drawing import pacing
+from langsplat_viewer.camera.overlays import Label, visible_faces
+from langsplat_viewer.drawing import renderer
 from langsplat_viewer.drawing.channels import ArrayChannels
 from langsplat_viewer.panels import over
 from langsplat_viewer.panels.area import Area, scene_area
@@ -195,7 +194,7 @@ def rasterize_elsewhere(s: Any) -> None:
         return rasterize(self, *arguments)
 
     ArrayChannels.render_all = gated
-    pacing.MOVING_BUDGET = 0.0  # everything is slow
+    renderer.MOVING_BUDGET = 0.0  # everything is slow
     begin(s)
     s.drag((600, 300), (656, 279))
     s.wait(lambda: s.window.viewer.surface.waits)

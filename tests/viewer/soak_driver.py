@@ -25,10 +25,10 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
 from langsplat_viewer import actions
 from langsplat_viewer.commands import COMMANDS
+from langsplat_viewer.drawing.channels import Clip, Splats
 from langsplat_viewer.drawing.frame import Backend, FrameRenderer
-from langsplat_viewer.drawing.seeing import Clip, Splats
 from langsplat_viewer.panels.layout import PANELS
-from langsplat_viewer.timing import memory_bytes
+from langsplat_viewer.state import memory_bytes
 from tests.viewer.window_driver import Session
 
 SCENES = ("blobs.ply", "plain.ply", "many.ply", "bare.ply", "few.ply")

@@ -6,16 +6,12 @@ import numpy as np
 import pytest
 
 from langsplat_core.config import INRIA, PictureConfig
-from langsplat_core.formats import (
-    load_scene,
-    write_ply,
-)
+from langsplat_core.io import load_scene, write_ply
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Scene
-from langsplat_viewer.drawing.channels import ArrayChannels, Layers
+from langsplat_viewer.drawing.channels import ArrayChannels, Layers, Sight
 from langsplat_viewer.drawing.frame import FrameRenderer
-from langsplat_viewer.drawing.sight import Sight
 from tests.support.scenes import random_camera, random_gaussians
 
 PICTURE = PictureConfig(display="alpha")

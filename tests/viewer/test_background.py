@@ -17,9 +17,9 @@ from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
 from langsplat_viewer import actions
 from langsplat_viewer.canvas import Canvas
-from langsplat_viewer.drawing import frame, pacing
+from langsplat_viewer.drawing import frame, renderer
+from langsplat_viewer.drawing.channels import Clip, Splats
 from langsplat_viewer.drawing.frame import FrameRenderer
-from langsplat_viewer.drawing.seeing import Clip, Splats
 from langsplat_viewer.viewer import Viewer
 from tests.support.windowless import FakeRenderer, rest, settle
 
@@ -51,7 +51,7 @@ def gated(monkeypatch: pytest.MonkeyPatch) -> Gated:
     """What "cpu" is; every picture is held to be slow before it was drawn, and found so."""
     made = Gated()
     monkeypatch.setattr(frame, "load_rasterizer", lambda name: made)
-    monkeypatch.setattr(pacing, "GUESS", 1.0)
+    monkeypatch.setattr(renderer, "GUESS", 1.0)
     return made
 
 
@@ -210,7 +210,7 @@ def test_until_it_is_there_merged_gaussians_show_what_was_changed(gl, asked, gat
     rest(canvas, asked.state, 0.0)
     until(lambda: not canvas.is_running)
     gated.gate.clear()
-    monkeypatch.setattr(pacing, "MERGED_SHARE", 1e-3)
+    monkeypatch.setattr(renderer, "MERGED_SHARE", 1e-3)
     actions.set_splats(asked, Splats(0.5))
     for now in (1.0, 2.0, 3.0):
         assert canvas.update(asked.state, now)

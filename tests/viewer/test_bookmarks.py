@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from langsplat_viewer import actions
 from langsplat_viewer.camera.controls import OrbitCamera, from_side, look, orbit, symmetric_intrinsics, walk
-from langsplat_viewer.files.bookmarks import FILE_NAME, MOST, MOST_SCENES, Shelf
+from langsplat_viewer.files.flight_files import FILE_NAME, MOST_SCENES, MOST_VIEWS, Shelf
 from tests.support.windowless import arrive, errors, settle
 
 
@@ -50,9 +50,9 @@ def test_names_are_numbers_or_replaced_and_end_somewhere(opened):
     actions.add_bookmark(opened)
     actions.add_bookmark(opened, "view 2")
     assert names(opened) == ["view 1", "view 3", "view 2"]
-    for _ in range(MOST):
+    for _ in range(MOST_VIEWS):
         actions.add_bookmark(opened)
-    assert len(names(opened)) == MOST
+    assert len(names(opened)) == MOST_VIEWS
     assert "at most" in errors(opened)[-1]
 
 

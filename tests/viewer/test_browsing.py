@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from langsplat_viewer import actions
-from langsplat_viewer.files.browsing import MOST, Entry, list_folder
+from langsplat_viewer.files.browsing import MOST_LISTED, Entry, list_folder
 from langsplat_viewer.panels.browser import in_words
 from tests.support.windowless import SCENES, errors, settle
 
@@ -50,7 +50,7 @@ def test_a_crowded_folder_is_cut(tmp_path, monkeypatch):
         (tmp_path / f"{number}.ply").write_bytes(b"")
     listing = list_folder(tmp_path)
     assert (len(listing.entries), listing.left_out) == (3, 2)
-    assert MOST > 100
+    assert MOST_LISTED > 100
 
 
 def test_one_goes_into_folders_and_opens_scenes(viewer, folder, monkeypatch):

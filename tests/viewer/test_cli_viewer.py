@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from langsplat_core.config import Display
-from langsplat_core.formats import companion_path, language, save_scene, write_cameras
+from langsplat_core.io import companion_path, language, save_scene, write_cameras
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer import __main__ as program
 from langsplat_viewer import options

@@ -14,11 +14,9 @@ from langsplat_viewer import actions
 from langsplat_viewer.actions.filming import subject_of
 from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.canvas import NOTHING_BETWEEN, Canvas
-from langsplat_viewer.drawing.channels import depth_range
+from langsplat_viewer.drawing.channels import UNCLIPPED, Clip, depth_range, looking_settings
 from langsplat_viewer.drawing.frame import FrameRenderer
-from langsplat_viewer.drawing.looking import looking_settings
-from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
-from langsplat_viewer.output.headless import painter
+from langsplat_viewer.output.still import painter
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.selected import marked
 from tests.support.windowless import rest, settle

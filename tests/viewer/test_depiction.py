@@ -5,20 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from langsplat_viewer import actions
+from langsplat_viewer import actions, staging
 from langsplat_viewer.canvas import Canvas
+from langsplat_viewer.drawing.channels import Clip, LastView, Sight, Splats
 from langsplat_viewer.drawing.frame import FrameRenderer
-from langsplat_viewer.drawing.seeing import Clip, Splats
-from langsplat_viewer.drawing.sight import LastView, Sight
-from langsplat_viewer.pictures import splitting
-from langsplat_viewer.pictures.depiction import Depiction, depiction
+from langsplat_viewer.staging import Depiction, depiction
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
 from tests.support.windowless import settle
 
 
 def depicted(viewer: Viewer) -> Depiction:
-    return depiction(viewer.state, splitting.pictures(viewer.state))
+    return depiction(viewer.state, staging.shown_pictures(viewer.state))
 
 
 CHANGES = {

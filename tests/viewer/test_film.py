@@ -13,17 +13,16 @@ import pytest
 from PIL import Image
 
 from langsplat_core.errors import InputError
-from langsplat_core.formats import save_scene
+from langsplat_core.io import save_scene
 from langsplat_core.progress import Cancelled
 from langsplat_viewer import __main__ as program
 from langsplat_viewer import options
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.files.flight_files import write_flight
-from langsplat_viewer.output import film_files
-from langsplat_viewer.output.film import Shot, cameras_of, fingerprint, make_film
-from langsplat_viewer.output.film_files import find_ffmpeg
-from langsplat_viewer.output.headless import Subject, render_picture
+from langsplat_viewer.output import film
+from langsplat_viewer.output.film import Shot, cameras_of, find_ffmpeg, fingerprint, make_film
+from langsplat_viewer.output.still import Subject, render_picture
 from tests.support.fakes import FakeEncoder, blob_scene
 from tests.support.flights import flight
 
@@ -62,7 +61,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_flight(tmp_path / "away.json", flight(1.0))
     (tmp_path / "broken.json").write_text('{"langsplat_flight": 1}')
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(film_files, "find_ffmpeg", lambda: None)
+    monkeypatch.setattr(film, "find_ffmpeg", lambda: None)
     return tmp_path
 
 
@@ -76,7 +75,7 @@ def ffmpeg(folder: Path, monkeypatch: pytest.MonkeyPatch):
         path.write_text(source)
         path.chmod(0o755)
         monkeypatch.setenv("PATH", f"{path.parent}{os.pathsep}{os.environ['PATH']}")
-        monkeypatch.setattr(film_files, "find_ffmpeg", find_ffmpeg)
+        monkeypatch.setattr(film, "find_ffmpeg", find_ffmpeg)
 
     return put
 
@@ -220,7 +219,7 @@ def test_a_stopped_video_leaves_nothing(ffmpeg, folder):
 
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="this system has no ffmpeg")
 def test_the_systems_ffmpeg_makes_a_film(folder, monkeypatch):
-    monkeypatch.setattr(film_files, "find_ffmpeg", find_ffmpeg)
+    monkeypatch.setattr(film, "find_ffmpeg", find_ffmpeg)
     make_film(shot(), folder / "a.mp4")
     assert (folder / "a.mp4").read_bytes()[4:8] == b"ftyp"
 

@@ -10,14 +10,12 @@ import pytest
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
-from langsplat_core.display.colour_maps import COLOUR_MAPS
-from langsplat_core.display.compose import Channels, compose
-from langsplat_core.display.displays import DISPLAYS
+from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, Channels, compose
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Gaussians, Scene, look_at
-from langsplat_viewer.drawing.channel_textures import ArraySource, GlSource
 from langsplat_viewer.drawing.channels import ArrayChannels, Layers, depth_range
 from langsplat_viewer.drawing.frame import FrameRenderer, suits_opengl
+from langsplat_viewer.drawing.renderer import ArraySource, GlSource
 from tests.support.gl_context import gl_state
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
@@ -120,7 +118,7 @@ def test_the_picture_is_that_of_the_reference(frame, display):
 
 
 def reference_picture(picture: PictureConfig) -> Array:
-    from langsplat_core.raster.spherical_harmonics import colours
+    from langsplat_core.raster.reference import colours
 
     gaussians = SCENE.gaussians
     view = ReferenceRasterizer().view(gaussians, CAMERA)

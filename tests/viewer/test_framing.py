@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import Camera, Intrinsics
-from langsplat_viewer.camera.framing import SHARE, Sample, framing_eye, median_depth, reach, sample_of
+from langsplat_viewer.camera.controls import SHARE, Sample, framing_eye, median_depth, reach, sample_of
 from tests.support.scenes import random_gaussians
 
 ROTATION = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]

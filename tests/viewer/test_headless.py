@@ -10,7 +10,7 @@ import pytest
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.scene import Scene
-from langsplat_viewer.output.headless import render_picture
+from langsplat_viewer.output.still import render_picture
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
 SCENE = Scene(random_gaussians(150, sh_degree=3))
@@ -34,7 +34,7 @@ def test_headless_pictures_agree(gl, display):
 NO_DRIVER = """
 import sys
 from langsplat_core.errors import BackendError
-from langsplat_viewer.output.headless import render_picture
+from langsplat_viewer.output.still import render_picture
 from langsplat_core.config import PictureConfig
 from langsplat_core.scene import Scene
 from tests.support.scenes import random_camera, random_gaussians

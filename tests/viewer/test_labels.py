@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from langsplat_viewer.camera.labels import Label, placed
+from langsplat_viewer.camera.overlays import Label, placed
 
 SIZE = (400.0, 300.0)
 

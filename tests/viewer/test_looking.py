@@ -9,13 +9,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 from langsplat_core.config import INRIA, PictureConfig
-from langsplat_core.formats import save_scene, write_cameras
+from langsplat_core.io import save_scene, write_cameras
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_viewer import __main__ as program
 from langsplat_viewer.camera.controls import default_view, extent_of
+from langsplat_viewer.drawing.channels import near_plane, why_nothing, why_undrawable
 from langsplat_viewer.drawing.frame import FrameRenderer
-from langsplat_viewer.drawing.looking import near_plane, why_nothing, why_undrawable
-from langsplat_viewer.output.headless import render_picture
+from langsplat_viewer.output.still import render_picture
 from tests.support.fakes import blob_scene
 
 SIZE = (160, 120)

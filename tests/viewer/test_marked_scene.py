@@ -7,8 +7,8 @@ import pytest
 
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.render import splat_colours
-from langsplat_viewer.marks.selecting import Marks, unmarked
-from langsplat_viewer.pictures.marked_scene import STRENGTH, TINT, marked_scene
+from langsplat_viewer.marks import Marks, unmarked
+from langsplat_viewer.staging import STRENGTH, TINT, marked_scene
 from tests.support.fakes import blob_scene, cameras
 from tests.support.scenes import random_gaussians
 from tests.support.selected import blob

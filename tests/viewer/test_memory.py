@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from langsplat_viewer.timing import memory_bytes
+from langsplat_viewer.state import memory_bytes
 from tests.viewer import memory_driver
 
 HEAPS = """
 import ctypes, sys, threading
-from langsplat_viewer.memory import share_one_heap
+from langsplat_viewer.jobs import share_one_heap
 if sys.argv[1] == "one":
     share_one_heap()
 library = ctypes.CDLL(None)
@@ -52,7 +52,7 @@ def test_the_kinds_of_memory_are_all_of_it():
 PAGED_OUT = """
 import mmap, re, sys
 from pathlib import Path
-from langsplat_viewer.memory import give_memory_back
+from langsplat_viewer.jobs import give_memory_back
 def held():
     text = Path("/proc/self/smaps").read_text()
     return int(re.search(r"libLLVM-test.so[^|]*?Rss: *([0-9]+) kB", text)[1])

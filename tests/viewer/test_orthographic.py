@@ -8,10 +8,10 @@ from numpy.testing import assert_allclose
 
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions
-from langsplat_viewer.actions.photographs import standing_at
+from langsplat_viewer.actions.opening import standing_at
 from langsplat_viewer.camera.controls import from_side, zoom
 from langsplat_viewer.commands import COMMANDS, keys_of
-from langsplat_viewer.files.bookmarks import Shelf
+from langsplat_viewer.files.flight_files import Shelf
 from langsplat_viewer.panels.pointing import figures
 from langsplat_viewer.state import GLIDE_SECONDS
 from langsplat_viewer.viewer import Viewer

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from langsplat_core.query import boxes
+from langsplat_core.query import instances
 from langsplat_core.scene import look_at
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import extent_of, frame_of
@@ -120,7 +120,7 @@ def test_the_grid_lies_level_below_the_scene_at_round_distances(scale):
 
 
 def test_the_edges_of_a_box_join_neighbouring_corners():
-    box = boxes.OrientedBox(np.array([1.0, 2, 3]), np.eye(3), np.array([3.0, 2, 1]))
+    box = instances.OrientedBox(np.array([1.0, 2, 3]), np.eye(3), np.array([3.0, 2, 1]))
     edges = overlays.box_edges(box.corners)
     lengths = np.sort(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1))
     np.testing.assert_allclose(lengths, [2.0] * 4 + [4.0] * 4 + [6.0] * 4)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from langsplat_viewer.drawing.pacing import FINE, MOVING_BUDGET, Level, Pace
+from langsplat_viewer.drawing.renderer import FINE, MOVING_BUDGET, Level, Pace
 
 HALF, QUARTER = Level(0.5), Level(0.25)
 MERGED, COARSEST = Level(0.5, merged=True), Level(0.25, merged=True)

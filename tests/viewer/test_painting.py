@@ -7,11 +7,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from langsplat_core.config import PictureConfig
-from langsplat_core.display.colour_maps import QUERY_COLOURS
-from langsplat_core.display.compose import SEGMENT_OPACITY, Channels, compose
+from langsplat_core.display.displays import QUERY_COLOURS, SEGMENT_OPACITY, Channels, compose
 from langsplat_core.query.answers import QueryResult
 from langsplat_viewer import actions
-from langsplat_viewer.drawing import painting
+from langsplat_viewer.drawing import channels
 from langsplat_viewer.output.still import describe
 from langsplat_viewer.panels.legend import STEPS, bar_colours
 from tests.support.windowless import settle
@@ -29,26 +28,26 @@ def answers(opened) -> dict[str, QueryResult]:
 
 @pytest.mark.parametrize("display", ["relevancy", "segmentation"])
 def test_nothing_is_painted_of_what_is_not_here(answers, display):
-    assert painting.columns((answers["not here"],), display, 360) is None
+    assert channels.columns((answers["not here"],), display, 360) is None
     both = (answers["not here"], answers["found"])
-    assert not painting.columns(both, display, 360)[:, 0].any()
-    assert painting.columns(both, display, 360)[:, 1].any()
-    assert painting.heat_ranges(both, display)[0] == painting.NO_HEAT
-    assert not painting.fitted(PictureConfig(), both).own_colours
+    assert not channels.columns(both, display, 360)[:, 0].any()
+    assert channels.columns(both, display, 360)[:, 1].any()
+    assert channels.heat_ranges(both, display)[0] == channels.NO_HEAT
+    assert not channels.fitted(PictureConfig(), both).own_colours
 
 
 def test_a_weak_match_is_never_hotter_than_half(answers):
     found, weak = answers["found"], answers["weak match"]
-    (low, high), (weak_low, weak_high) = painting.heat_ranges((found, weak), "relevancy")
+    (low, high), (weak_low, weak_high) = channels.heat_ranges((found, weak), "relevancy")
     assert (low, high) == found.heat_range
     assert (high - weak_low) / (weak_high - weak_low) == pytest.approx(0.5)
-    assert painting.fitted(PictureConfig(), (found, weak)).own_colours
+    assert channels.fitted(PictureConfig(), (found, weak)).own_colours
 
 
 def test_a_segmentation_is_made_of_the_members(answers):
     odd = replace(answers["found"], members=np.arange(360) % 7 == 0)  # whatever their relevancy
-    assert_allclose(painting.columns((odd,), "segmentation", 360)[:, 0], odd.members)
-    assert_allclose(painting.columns((odd,), "relevancy", 360)[:, 0], odd.relevancy[odd.level])
+    assert_allclose(channels.columns((odd,), "segmentation", 360)[:, 0], odd.members)
+    assert_allclose(channels.columns((odd,), "relevancy", 360)[:, 0], odd.relevancy[odd.level])
 
 
 def test_no_coordinates_are_said_of_what_is_not_here(answers):

@@ -7,15 +7,17 @@ import pytest
 from numpy.testing import assert_allclose
 
 from langsplat_core.config import PictureConfig
-from langsplat_core.formats import load_scene
+from langsplat_core.io import load_scene
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.scene import Camera
 from langsplat_viewer.camera.controls import (
     FARTHEST,
+    FarCamera,
     OrbitCamera,
     between,
     default_view,
     extent_of,
+    eye_depth,
     frame_all,
     from_camera,
     from_side,
@@ -25,13 +27,10 @@ from langsplat_viewer.camera.controls import (
     zoom,
 )
 from langsplat_viewer.camera.flight import Flight, Keyframe, camera_of, pose_at, pose_of, turntable, view_of
-from langsplat_viewer.drawing.channels import depth_range
+from langsplat_viewer.drawing.channels import Clip, depth_range, looking_settings, why_nothing
 from langsplat_viewer.drawing.frame import FrameRenderer
-from langsplat_viewer.drawing.looking import looking_settings, why_nothing
-from langsplat_viewer.drawing.seeing import Clip
 from langsplat_viewer.options import scene_path
-from langsplat_viewer.output.headless import render_picture
-from langsplat_viewer.parallel import FarCamera, eye_depth
+from langsplat_viewer.output.still import render_picture
 from tests.support.fakes import CENTRES, blob_scene
 
 SIZE = (1280, 720)

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from langsplat_core.query.describe import Describer
+from langsplat_core.query.describe import Describer, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.pointing import look_at_pixel
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_viewer import actions
 from langsplat_viewer.panels.pointing import figures, said

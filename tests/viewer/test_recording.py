@@ -11,15 +11,15 @@ from numpy.testing import assert_allclose
 from PIL import Image
 
 from langsplat_core.config import PictureConfig
-from langsplat_core.formats import save_scene
+from langsplat_core.io import save_scene
 from langsplat_viewer import __main__ as program
 from langsplat_viewer import actions, options
 from langsplat_viewer.actions.filming import subject_of
 from langsplat_viewer.camera.controls import orbit, zoom
-from langsplat_viewer.drawing.seeing import Clip, Splats
+from langsplat_viewer.drawing.channels import Clip, Splats
 from langsplat_viewer.files.flight_files import read_flight
-from langsplat_viewer.output import film_files
-from langsplat_viewer.output.headless import Subject, draw_something, painter
+from langsplat_viewer.output import film
+from langsplat_viewer.output.still import Subject, draw_something, painter
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import FakeEncoder, blob_scene
 from tests.support.windowless import arrive, errors, settle
@@ -55,7 +55,7 @@ def times(viewer: Viewer) -> list[float]:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(film_files, "find_ffmpeg", lambda: None)
+    monkeypatch.setattr(film, "find_ffmpeg", lambda: None)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

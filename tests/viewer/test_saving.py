@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from PIL import Image
 
-from langsplat_core.formats.cameras_json import read_cameras
+from langsplat_core.io.cameras import read_cameras
 from langsplat_viewer.output import saving
 from tests.support.windowless import errors
 

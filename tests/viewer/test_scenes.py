@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from langsplat_viewer import actions
-from langsplat_viewer.actions.scenes import MOST
-from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
+from langsplat_viewer.actions.opening import MOST
+from langsplat_viewer.drawing.channels import UNCLIPPED, Clip
 from langsplat_viewer.files.browsing import list_folder
 from langsplat_viewer.panels.browser import has_several
 from tests.support.windowless import SCENES, arrive, errors, settle

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from langsplat_core.scene import Reading
 from langsplat_viewer import actions
-from langsplat_viewer.drawing.painting import NO_HEAT
+from langsplat_viewer.drawing.channels import NO_HEAT
 from langsplat_viewer.output.still import describe
 from langsplat_viewer.panels.query_box import hint
 from tests.support.fakes import CENTRES, blob_scene, calibrated_for, language

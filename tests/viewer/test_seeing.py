@@ -8,9 +8,8 @@ from langsplat_core.scene import Scene
 from langsplat_viewer import actions
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import OVERLAY_TITLES, matching
+from langsplat_viewer.drawing.channels import OVERLAYS, Ruler, Splats, drawn_scene
 from langsplat_viewer.drawing.frame import FrameRenderer
-from langsplat_viewer.drawing.looking import drawn_scene
-from langsplat_viewer.drawing.seeing import OVERLAYS, Ruler, Splats
 from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.output import saving
 from tests.support.scenes import random_gaussians

@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_viewer import actions
+from langsplat_viewer import actions, marks
 from langsplat_viewer.actions.selecting import NOTHING, take
-from langsplat_viewer.marks import selecting
 from langsplat_viewer.panels.select import counts
 from tests.support.selected import blob, marked, marks_of, names
 from tests.support.windowless import errors, settle
@@ -205,9 +204,9 @@ def test_another_scene_has_no_marks_but_the_tool_stays(opened):
 def test_settings_keep_their_limits(opened):
     actions.set_brush(opened, 9.0)
     actions.set_reach(opened, 0.0)
-    assert opened.state.selection.brush == selecting.BRUSHES[1]
-    assert opened.state.selection.reach == selecting.REACHES[0]
-    assert actions.reach(opened) == pytest.approx(selecting.REACHES[0] * opened.state.extent.radius)
+    assert opened.state.selection.brush == marks.BRUSHES[1]
+    assert opened.state.selection.reach == marks.REACHES[0]
+    assert actions.reach(opened) == pytest.approx(marks.REACHES[0] * opened.state.extent.radius)
 
 
 def test_counts_are_said(opened):
@@ -215,5 +214,5 @@ def test_counts_are_said(opened):
     actions.delete_selected(opened)
     take(opened, blob("book"))
     assert counts(marks_of(opened)) == "120 of 360 selected, 0 hidden, 120 deleted"
-    assert counts(selecting.unmarked(0)) == "0 of 0 selected, 0 hidden, 0 deleted"
+    assert counts(marks.unmarked(0)) == "0 of 0 selected, 0 hidden, 0 deleted"
     assert names(blob("book")) == "book"

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_core.formats import load_scene
-from langsplat_core.query.screen_selection import in_polygon, in_rectangle, in_stroke, on_surface, project
-from langsplat_viewer.marks.selecting import unmarked
-from langsplat_viewer.pictures.marked_scene import marked_scene
+from langsplat_core.io import load_scene
+from langsplat_core.query.selection import in_polygon, in_rectangle, in_stroke, on_surface, project
+from langsplat_viewer.marks import unmarked
+from langsplat_viewer.staging import marked_scene
 from tests.support.measured import Measure
 
 DEMO = Path(__file__).parents[2] / "assets" / "demo" / "scene.ply"

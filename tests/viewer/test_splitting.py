@@ -8,15 +8,13 @@ import pytest
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.scene import Scene
-from langsplat_viewer import actions
+from langsplat_viewer import actions, staging
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import COMMANDS
-from langsplat_viewer.drawing.channel_textures import ArraySource, GlSource
-from langsplat_viewer.drawing.channels import Layers
+from langsplat_viewer.drawing.channels import AT_RANGE, Layers, Split
 from langsplat_viewer.drawing.frame import FrameRenderer
-from langsplat_viewer.drawing.seeing import AT_RANGE, Split
+from langsplat_viewer.drawing.renderer import ArraySource, GlSource
 from langsplat_viewer.panels.view import compared_name
-from langsplat_viewer.pictures import splitting
 from tests.support.scenes import random_camera, random_gaussians, random_values
 from tests.support.windowless import errors, rest, settle
 
@@ -38,15 +36,15 @@ def ask(viewer, phrase: str) -> None:
 
 
 def test_one_picture_is_the_state_itself(opened):
-    assert splitting.pictures(opened.state) == (opened.state,)
-    assert splitting.columns(opened.state.seeing.split) == 1
+    assert staging.shown_pictures(opened.state) == (opened.state,)
+    assert staging.columns(opened.state.seeing.split) == 1
 
 
 def test_the_second_picture_is_what_the_state_would_show(opened):
     ask(opened, "plant")
     actions.set_display(opened, "rgb")
     actions.compare_with(opened, "relevancy")
-    first, second = splitting.pictures(opened.state)
+    first, second = staging.shown_pictures(opened.state)
     assert first is opened.state
     assert (opened.state.picture.display, second.picture.display) == ("rgb", "relevancy")
     actions.show_one(opened)
@@ -58,26 +56,26 @@ def test_the_second_picture_is_what_the_state_would_show(opened):
 
 def test_three_levels_of_latents(opened):
     actions.toggle_levels(opened)
-    shown = splitting.pictures(opened.state)
+    shown = staging.shown_pictures(opened.state)
     for level, one in enumerate(shown):
         np.testing.assert_array_equal(one.latent_rgb(), opened.state.latent[level])
-    assert splitting.labels(opened.state) == ("Latent, subpart", "Latent, part", "Latent, whole")
+    assert staging.labels(opened.state) == ("Latent, subpart", "Latent, part", "Latent, whole")
     opened.state.size = (200, 90)
-    assert splitting.picture_size(opened.state) == (66, 90)
+    assert staging.picture_size(opened.state) == (66, 90)
     actions.toggle_levels(opened)
-    assert splitting.labels(opened.state) == ("Colours",)
+    assert staging.labels(opened.state) == ("Colours",)
 
 
 def test_three_levels_of_an_answer_share_one_scale(opened):
     ask(opened, "plant")
     actions.set_display(opened, "segmentation")
     actions.toggle_levels(opened)
-    shown = splitting.pictures(opened.state)
+    shown = staging.shown_pictures(opened.state)
     result = opened.state.queries[0].result
     for level, one in enumerate(shown):
         np.testing.assert_array_equal(one.relevancies()[:, 0], result.relevancy[level])
     assert len({one.heat_ranges() for one in shown}) == 1
-    again = splitting.pictures(opened.state)  # the same objects: nothing is drawn anew at rest
+    again = staging.shown_pictures(opened.state)  # the same objects: nothing is drawn anew at rest
     assert [one.layers_key() for one in again] == [one.layers_key() for one in shown]
     assert opened.state.queries[0].result is result
 
@@ -113,16 +111,16 @@ def test_every_display_has_a_name_of_its_own_beside_another():
 
 @pytest.mark.parametrize(("u", "inside"), [(0.0, 0.0), (0.2, 0.6), (0.5, 0.5), (1.0, 1.0)])
 def test_a_place_in_a_column(u, inside):
-    assert splitting.within_picture(Split("levels"), u) == pytest.approx(inside)
-    assert splitting.within_picture(Split("wipe"), u) == u
+    assert staging.within_picture(Split("levels"), u) == pytest.approx(inside)
+    assert staging.within_picture(Split("wipe"), u) == u
 
 
 def test_pictures_are_joined_as_they_are_shown():
     dark, light = np.zeros((2, 10, 3), np.uint8), np.full((2, 10, 3), 9, np.uint8)
-    wiped = splitting.joined(Split("wipe", at=0.3), [dark, light])
+    wiped = staging.joined(Split("wipe", at=0.3), [dark, light])
     assert wiped[0, :, 0].tolist() == [0] * 3 + [9] * 7
-    assert splitting.joined(Split("levels"), [dark, light, dark]).shape == (2, 30, 3)
-    assert splitting.joined(Split(), [light]) is not None
+    assert staging.joined(Split("levels"), [dark, light, dark]).shape == (2, 30, 3)
+    assert staging.joined(Split(), [light]) is not None
 
 
 @pytest.mark.parametrize("backend", ["opengl", "cpu"])

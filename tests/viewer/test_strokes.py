@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 
 from langsplat_core.scene import look_at
-from langsplat_viewer import actions
+from langsplat_viewer import actions, marks
 from langsplat_viewer.camera.controls import from_camera
-from langsplat_viewer.drawing.seeing import Clip
-from langsplat_viewer.marks import strokes
-from langsplat_viewer.marks.selecting import Stroke
-from langsplat_viewer.marks.strokes import Drawn, caught, outlines
+from langsplat_viewer.drawing.channels import Clip
+from langsplat_viewer.marks import Drawn, Stroke, caught, outlines
 from tests.support.fakes import CENTRES, PER_BLOB
 from tests.support.selected import marked, marks_of
 from tests.support.windowless import FakeSurface, errors, settle
@@ -202,4 +200,4 @@ def test_a_body_without_a_centre_holds_nothing():
     means = np.zeros((3, 3))
     assert not caught(drawn("sphere", [(0.5, 0.5)]), means).any()
     assert not caught(drawn("thing", [(0.5, 0.5)]), means).any()
-    assert strokes.ON_SCREEN == ("rectangle", "lasso", "brush")
+    assert marks.ON_SCREEN == ("rectangle", "lasso", "brush")

@@ -12,12 +12,12 @@ import pytest
 from safetensors.numpy import save_file
 
 from langsplat_core.cli.app import parse
-from langsplat_core.formats import load_scene
+from langsplat_core.io import load_scene
 from langsplat_core.pipeline.report import REPORT
 from langsplat_core.scene import Scene
-from langsplat_viewer import actions, training
-from langsplat_viewer.files.preview import IN_TRAINING, NAME, write_preview
-from langsplat_viewer.training import PREVIEW_EVERY, TrainingProgress, TrainingRequest, command
+from langsplat_viewer import actions, viewer
+from langsplat_viewer.files.watching import IN_TRAINING, NAME, write_preview
+from langsplat_viewer.viewer import PREVIEW_EVERY, TrainingProgress, TrainingRequest, command
 from tests.support.fakes import blob_scene
 from tests.support.scenes import random_gaussians
 from tests.support.windowless import SCENES, errors, settle
@@ -43,7 +43,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def trains(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
-    monkeypatch.setattr(training, "command", lambda request: [sys.executable, "-c", script])
+    monkeypatch.setattr(viewer, "command", lambda request: [sys.executable, "-c", script])
 
 
 def finish(viewer, seconds: float = 20.0) -> None:
@@ -240,8 +240,7 @@ def test_gaussians_in_training_are_looked_at_and_followed(training_now, folder):
 def test_a_checkpoint_of_training_itself_is_read(tmp_path):
     import torch
 
-    from langsplat_core.training.radiance.checkpoint import save_checkpoint
-    from langsplat_core.training.radiance.state import start
+    from langsplat_core.training.radiance.state import save_checkpoint, start
 
     gaussians = random_gaussians(40, sh_degree=2)
     path = tmp_path / f"radiance-0{IN_TRAINING}"

@@ -12,8 +12,8 @@ import pytest
 from langsplat_viewer import actions
 from langsplat_viewer.actions.history import GESTURE, LONGEST
 from langsplat_viewer.actions.selecting import mark
-from langsplat_viewer.drawing.seeing import Clip, Splats
-from langsplat_viewer.marks.selecting import Marks, hiding, unmarked
+from langsplat_viewer.drawing.channels import Clip, Splats
+from langsplat_viewer.marks import Marks, hiding, unmarked
 from tests.support.windowless import settle
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from langsplat_viewer import actions
 from langsplat_viewer.camera.controls import default_view, extent_of, from_side, orbit
-from langsplat_viewer.camera.view_cube import FACES, face_at, facing, visible_faces, world_axes
+from langsplat_viewer.camera.overlays import FACES, face_at, facing, visible_faces, world_axes
 from tests.support.fakes import blob_scene
 from tests.support.windowless import arrive
 

@@ -11,11 +11,11 @@ import moderngl
 import numpy as np
 import pytest
 
-from langsplat_core.formats import save_scene
+from langsplat_core.io import save_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
 from langsplat_viewer.canvas import NOTHING_LEFT, REST_SECONDS, Canvas
-from langsplat_viewer.marks.selecting import unmarked
+from langsplat_viewer.marks import unmarked
 from langsplat_viewer.state import ViewerState
 from tests.support.fakes import blob_scene
 from tests.support.on_display import Cast

@@ -1,27 +1,41 @@
+# ruff: noqa: F401
 """What the viewer can do: the functions that buttons, keys, dropped files and tests call.
 
 Each takes the `Viewer` and changes its state; long work goes to the worker. None of them raises for
 something a user did: the reason appears in the messages area.
 """
 
-from langsplat_viewer.actions.asking import load_queries as load_queries
-from langsplat_viewer.actions.asking import save_queries as save_queries
-from langsplat_viewer.actions.asking import set_canonical as set_canonical
-from langsplat_viewer.actions.asking import set_cut as set_cut
-from langsplat_viewer.actions.asking import type_canonical as type_canonical
-from langsplat_viewer.actions.bookmarks import add_bookmark as add_bookmark
-from langsplat_viewer.actions.bookmarks import delete_bookmark as delete_bookmark
-from langsplat_viewer.actions.bookmarks import go_to_bookmark as go_to_bookmark
-from langsplat_viewer.actions.bookmarks import type_bookmark as type_bookmark
 from langsplat_viewer.actions.browsing import ask_for_file as ask_for_file
 from langsplat_viewer.actions.browsing import browse as browse
 from langsplat_viewer.actions.browsing import choose as choose
+from langsplat_viewer.actions.browsing import (
+    choose_photographs,
+    fill_in,
+    look_at_training,
+    start_training,
+    stop_training,
+    watch_training,
+)
 from langsplat_viewer.actions.browsing import close_browser as close_browser
 from langsplat_viewer.actions.browsing import open_all as open_all
 from langsplat_viewer.actions.browsing import open_dropped as open_dropped
 from langsplat_viewer.actions.browsing import open_recent as open_recent
 from langsplat_viewer.actions.browsing import open_typed as open_typed
 from langsplat_viewer.actions.browsing import type_path as type_path
+from langsplat_viewer.actions.camera import (
+    add_bookmark,
+    compare_with_reference,
+    delete_bookmark,
+    go_to_bookmark,
+    hover,
+    measure_frame,
+    path_seconds,
+    scrub,
+    stop_comparing,
+    toggle_playing,
+    toggle_pointing,
+    type_bookmark,
+)
 from langsplat_viewer.actions.camera import focus_pixel as focus_pixel
 from langsplat_viewer.actions.camera import focus_result as focus_result
 from langsplat_viewer.actions.camera import frame_scene as frame_scene
@@ -40,8 +54,21 @@ from langsplat_viewer.actions.camera import tick as tick
 from langsplat_viewer.actions.camera import toggle_orthographic as toggle_orthographic
 from langsplat_viewer.actions.camera import toggle_walking as toggle_walking
 from langsplat_viewer.actions.camera import zoom_by as zoom_by
-from langsplat_viewer.actions.exporting import export as export
-from langsplat_viewer.actions.exporting import finish_writing as finish_writing
+from langsplat_viewer.actions.filming import (
+    add_keyframe,
+    choose_keyframe,
+    clear_path,
+    delete_keyframe,
+    load_path,
+    load_typed_path,
+    move_keyframe,
+    replace_keyframe,
+    save_path,
+    set_looping,
+    set_path_seconds,
+    set_turning,
+    type_path_file,
+)
 from langsplat_viewer.actions.filming import cancel_film as cancel_film
 from langsplat_viewer.actions.filming import copy_command as copy_command
 from langsplat_viewer.actions.filming import save_film as save_film
@@ -50,28 +77,34 @@ from langsplat_viewer.actions.filming import set_film_fps as set_film_fps
 from langsplat_viewer.actions.filming import set_film_size as set_film_size
 from langsplat_viewer.actions.filming import take_clipboard as take_clipboard
 from langsplat_viewer.actions.filming import type_film as type_film
-from langsplat_viewer.actions.leaving import discard_and_leave as discard_and_leave
-from langsplat_viewer.actions.leaving import may_close as may_close
-from langsplat_viewer.actions.leaving import quit_viewer as quit_viewer
-from langsplat_viewer.actions.leaving import save_and_leave as save_and_leave
-from langsplat_viewer.actions.leaving import stay as stay
-from langsplat_viewer.actions.offers import ask_offered as ask_offered
-from langsplat_viewer.actions.offers import offers as offers
-from langsplat_viewer.actions.offers import prepare_suggestions as prepare_suggestions
-from langsplat_viewer.actions.offers import recall as recall
+from langsplat_viewer.actions.opening import (
+    add_scenes,
+    ask_for_photographs,
+    choose_photograph_folder,
+    fade_photograph,
+    fetch_photograph,
+    keep_old,
+    open_scenes,
+    photograph_here,
+    reload,
+    step_scene,
+    switch_scene,
+    unlist_scene,
+)
 from langsplat_viewer.actions.opening import cancel as cancel
 from langsplat_viewer.actions.opening import open_scene as open_scene
-from langsplat_viewer.actions.photographs import ask_for_photographs as ask_for_photographs
-from langsplat_viewer.actions.photographs import choose_photograph_folder as choose_photograph_folder
-from langsplat_viewer.actions.photographs import fade_photograph as fade_photograph
-from langsplat_viewer.actions.photographs import fetch_photograph as fetch_photograph
-from langsplat_viewer.actions.photographs import photograph_here as photograph_here
-from langsplat_viewer.actions.playback import path_seconds as path_seconds
-from langsplat_viewer.actions.playback import scrub as scrub
-from langsplat_viewer.actions.playback import toggle_playing as toggle_playing
-from langsplat_viewer.actions.pointing import hover as hover
-from langsplat_viewer.actions.pointing import toggle_pointing as toggle_pointing
 from langsplat_viewer.actions.queries import ask as ask
+from langsplat_viewer.actions.queries import (
+    ask_offered,
+    load_queries,
+    offers,
+    prepare_suggestions,
+    recall,
+    save_queries,
+    set_canonical,
+    set_cut,
+    type_canonical,
+)
 from langsplat_viewer.actions.queries import ask_typed as ask_typed
 from langsplat_viewer.actions.queries import focus_search as focus_search
 from langsplat_viewer.actions.queries import hide as hide
@@ -81,39 +114,21 @@ from langsplat_viewer.actions.queries import set_level as set_level
 from langsplat_viewer.actions.queries import show as show
 from langsplat_viewer.actions.queries import take_search_focus as take_search_focus
 from langsplat_viewer.actions.queries import type_phrase as type_phrase
-from langsplat_viewer.actions.recording import add_keyframe as add_keyframe
-from langsplat_viewer.actions.recording import choose_keyframe as choose_keyframe
-from langsplat_viewer.actions.recording import clear_path as clear_path
-from langsplat_viewer.actions.recording import delete_keyframe as delete_keyframe
-from langsplat_viewer.actions.recording import load_path as load_path
-from langsplat_viewer.actions.recording import load_typed_path as load_typed_path
-from langsplat_viewer.actions.recording import move_keyframe as move_keyframe
-from langsplat_viewer.actions.recording import replace_keyframe as replace_keyframe
-from langsplat_viewer.actions.recording import save_path as save_path
-from langsplat_viewer.actions.recording import set_looping as set_looping
-from langsplat_viewer.actions.recording import set_path_seconds as set_path_seconds
-from langsplat_viewer.actions.recording import set_turning as set_turning
-from langsplat_viewer.actions.recording import type_path_file as type_path_file
-from langsplat_viewer.actions.scenes import add_scenes as add_scenes
-from langsplat_viewer.actions.scenes import open_scenes as open_scenes
-from langsplat_viewer.actions.scenes import step_scene as step_scene
-from langsplat_viewer.actions.scenes import switch_scene as switch_scene
-from langsplat_viewer.actions.scenes import unlist_scene as unlist_scene
-from langsplat_viewer.actions.seeing import compare_with as compare_with
-from langsplat_viewer.actions.seeing import measure as measure
-from langsplat_viewer.actions.seeing import measure_at as measure_at
-from langsplat_viewer.actions.seeing import move_line as move_line
-from langsplat_viewer.actions.seeing import save_transparent as save_transparent
-from langsplat_viewer.actions.seeing import set_clip as set_clip
-from langsplat_viewer.actions.seeing import set_colour_map as set_colour_map
-from langsplat_viewer.actions.seeing import set_splats as set_splats
-from langsplat_viewer.actions.seeing import show_one as show_one
-from langsplat_viewer.actions.seeing import show_overlay as show_overlay
-from langsplat_viewer.actions.seeing import toggle_levels as toggle_levels
-from langsplat_viewer.actions.seeing import toggle_measuring as toggle_measuring
-from langsplat_viewer.actions.seeing import toggle_overlay as toggle_overlay
-from langsplat_viewer.actions.seeing import toggle_wipe as toggle_wipe
-from langsplat_viewer.actions.seeing import turn_to_face as turn_to_face
+from langsplat_viewer.actions.selecting import (
+    begin_stroke,
+    cancel_stroke,
+    discard_and_leave,
+    drawn_stroke,
+    end_stroke,
+    export,
+    extend_stroke,
+    finish_writing,
+    leave_tool,
+    may_close,
+    quit_viewer,
+    save_and_leave,
+    stay,
+)
 from langsplat_viewer.actions.selecting import chosen_query as chosen_query
 from langsplat_viewer.actions.selecting import delete_selected as delete_selected
 from langsplat_viewer.actions.selecting import find_things as find_things
@@ -133,6 +148,23 @@ from langsplat_viewer.actions.selecting import set_reach as set_reach
 from langsplat_viewer.actions.selecting import show_hidden as show_hidden
 from langsplat_viewer.actions.selecting import shrink_selection as shrink_selection
 from langsplat_viewer.actions.selecting import use_tool as use_tool
+from langsplat_viewer.actions.settings import (
+    compare_with,
+    measure,
+    measure_at,
+    move_line,
+    save_transparent,
+    set_clip,
+    set_colour_map,
+    set_splats,
+    show_one,
+    show_overlay,
+    toggle_levels,
+    toggle_measuring,
+    toggle_overlay,
+    toggle_wipe,
+    turn_to_face,
+)
 from langsplat_viewer.actions.settings import edit_keys as edit_keys
 from langsplat_viewer.actions.settings import escape as escape
 from langsplat_viewer.actions.settings import mute_letters as mute_letters
@@ -152,22 +184,5 @@ from langsplat_viewer.actions.settings import toggle_help as toggle_help
 from langsplat_viewer.actions.settings import toggle_panel as toggle_panel
 from langsplat_viewer.actions.settings import type_command as type_command
 from langsplat_viewer.actions.settings import type_keys as type_keys
-from langsplat_viewer.actions.strokes import begin_stroke as begin_stroke
-from langsplat_viewer.actions.strokes import cancel_stroke as cancel_stroke
-from langsplat_viewer.actions.strokes import drawn_stroke as drawn_stroke
-from langsplat_viewer.actions.strokes import end_stroke as end_stroke
-from langsplat_viewer.actions.strokes import extend_stroke as extend_stroke
-from langsplat_viewer.actions.strokes import leave_tool as leave_tool
-from langsplat_viewer.actions.timing import compare_with_reference as compare_with_reference
-from langsplat_viewer.actions.timing import measure_frame as measure_frame
-from langsplat_viewer.actions.timing import stop_comparing as stop_comparing
-from langsplat_viewer.actions.training import choose_photographs as choose_photographs
-from langsplat_viewer.actions.training import fill_in as fill_in
-from langsplat_viewer.actions.training import look_at_training as look_at_training
-from langsplat_viewer.actions.training import start_training as start_training
-from langsplat_viewer.actions.training import stop_training as stop_training
-from langsplat_viewer.actions.training import watch_training as watch_training
 from langsplat_viewer.actions.undoing import redo as redo
 from langsplat_viewer.actions.undoing import undo as undo
-from langsplat_viewer.actions.visits import keep_old as keep_old
-from langsplat_viewer.actions.visits import reload as reload

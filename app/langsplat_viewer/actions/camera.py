@@ -1,13 +1,18 @@
-"""Time, and the camera that moves in it: at once, or gliding from view to view."""
+"""Going along the camera path: played, or by hand."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.errors import InputError
+from langsplat_core.progress import Progress
+from langsplat_core.query.describe import Describer, Pointed, look_at_pixel
+from langsplat_core.query.engine import no_field
+from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera
-from langsplat_viewer.actions.playback import advance, leave_path
 from langsplat_viewer.camera.controls import (
     OrbitCamera,
     Side,
@@ -20,11 +25,92 @@ from langsplat_viewer.camera.controls import (
     holding_distance,
     in_parallel,
     in_perspective,
+    orbit,
     spanning,
     zoom,
 )
-from langsplat_viewer.state import GLIDE_SECONDS, Glide, Query
+from langsplat_viewer.camera.flight import pose_at, pose_of, view_of
+from langsplat_viewer.drawing.channels import looking_settings
+from langsplat_viewer.files.flight_files import MOST_VIEWS, Bookmark, named
+from langsplat_viewer.jobs import one_line
+from langsplat_viewer.staging import reference_of, small
+from langsplat_viewer.state import GLIDE_SECONDS, Glide, Hover, Query, compared, flight_of
 from langsplat_viewer.viewer import Viewer
+
+
+def path_seconds(viewer: Viewer) -> float:
+    """How long the path takes; 0 without one."""
+    record = viewer.state.record
+    if record.turns:
+        return record.turn_seconds
+    return record.keyframes[-1].seconds if record.keyframes else 0.0
+
+
+def toggle_playing(viewer: Viewer) -> None:
+    """Play the path from where it is, or stop there."""
+    record = viewer.state.record
+    if record.began is not None:
+        record.began = None
+    elif viewer.state.view is None:
+        viewer.state.say("open a scene first, then play a path in it", is_error=True)
+    elif path_seconds(viewer) <= 0:
+        viewer.state.say("a path needs two keyframes: add one at the current view", is_error=True)
+    else:
+        start = 0.0 if record.at >= path_seconds(viewer) else record.at
+        scrub(viewer, start)
+        record.began = viewer.clock - start
+
+
+def scrub(viewer: Viewer, seconds: float) -> None:
+    """Show the path at a time, stopped."""
+    state, record = viewer.state, viewer.state.record
+    if state.view is None or not (record.turns or record.keyframes):
+        return
+    if record.turns and record.turn_from is None:
+        record.turn_from = state.view
+    record.began, state.glide = None, None
+    _show(viewer, min(max(seconds, 0.0), path_seconds(viewer)))
+
+
+def advance(viewer: Viewer) -> None:
+    """Move a played path on to the viewer's clock; at its end it stops, or begins again."""
+    record = viewer.state.record
+    if record.began is None:
+        return
+    seconds, at = path_seconds(viewer), viewer.clock - record.began
+    if viewer.state.view is None or seconds <= 0:
+        record.began = None
+        return
+    if at >= seconds and record.loops:
+        at %= seconds
+        record.began = viewer.clock - at
+    elif at >= seconds:
+        record.began = None
+    _show(viewer, min(at, seconds))
+
+
+def leave_path(viewer: Viewer) -> None:
+    """The view goes elsewhere: nothing is played any more, and a turn begins anew from there."""
+    viewer.state.record.began = None
+    if viewer.state.record.turn_from is not None:
+        viewer.state.record.turn_from, viewer.state.record.at = None, 0.0
+
+
+def _show(viewer: Viewer, seconds: float) -> None:
+    viewer.state.record.at = seconds
+    viewer.state.view = _view_at(viewer, seconds)
+
+
+def _view_at(viewer: Viewer, seconds: float) -> OrbitCamera | None:
+    state, record = viewer.state, viewer.state.record
+    if record.turns and record.turn_from is not None:
+        return orbit(record.turn_from, 2 * math.pi * seconds / record.turn_seconds, 0)
+    if state.extent is None or not record.keyframes:
+        return state.view
+    return view_of(pose_at(flight_of(record.keyframes), seconds), state.extent)
+
+
+# Time, and the camera that moves in it: at once, or gliding from view to view.
 
 NEAREST = 0.004  # of the scene's radius: the closest that the eye comes to its centre of turning
 
@@ -221,3 +307,167 @@ def focus_pixel(viewer: Viewer, u: float, v: float) -> None:
     # The eye stays, but in parallel projection the size of things does.
     depth = None if view.back else float((point - view.eye) @ view.rotation[2])
     glide_to(viewer, focus(view, point, depth))
+
+
+# What is under the cursor, while it rests.
+
+REST_SECONDS = 0.2  # of the mouse, after which it is asked what lies there
+
+
+def toggle_pointing(viewer: Viewer) -> None:
+    """Say what is under the cursor from now on, or no longer."""
+    state = viewer.state
+    if not state.pointing and (state.scene is None or state.scene.language is None):
+        state.say("open a scene first" if state.scene is None else no_field(state.scene), is_error=True)
+        return
+    state.pointing, state.hover = not state.pointing, None
+
+
+def hover(viewer: Viewer, pixel: tuple[int, int] | None) -> None:
+    """Once per frame: the mouse is over this pixel (column, row) of the scene's area; None: elsewhere, or it
+    drags. What lies there is asked once the mouse and the camera rest."""
+    state = viewer.state
+    if not state.pointing or state.view is None or pixel is None:
+        state.hover = None
+        return
+    width, height = state.size
+    if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
+        state.hover = None
+        return
+    before = state.hover
+    same = before is not None and (before.pixel, before.view) == (pixel, state.view)
+    if not same or before is None:
+        state.hover = Hover(pixel, state.view, viewer.clock)
+    elif not before.asked and viewer.clock - before.since >= REST_SECONDS and viewer.worker.current is None:
+        before.asked = True
+        _ask(viewer, before)
+
+
+def _ask(viewer: Viewer, place: Hover) -> None:
+    engine = viewer.engine
+    if engine is None:
+        return
+    camera = place.view.camera(*viewer.state.size)
+    shown = [query for query in viewer.state.shown() if query is not None and query.result is not None]
+    settings = looking_settings(engine.scene, camera, viewer.state.seeing.clip)
+    results = [query.result for query in shown if query.result is not None]
+
+    def work(progress: Progress) -> tuple[Describer, Pointed | None]:
+        describer = viewer.describer
+        if describer is None or describer.engine is not engine:
+            describer = Describer(engine, progress=progress)
+        rasterizer = load_lifting_rasterizer("cpu")
+        return describer, look_at_pixel(
+            rasterizer, describer, camera, place.pixel, results, settings=settings
+        )
+
+    def done(found: tuple[Describer, Pointed | None]) -> None:
+        viewer.describer, place.found = found
+        place.phrases = tuple(query.phrase for query in shown)
+
+    viewer.worker.submit(
+        "looking under the cursor", work, done, lambda reason: viewer.state.say(reason, is_error=True)
+    )
+
+
+# Views with names: kept, listed, gone to.
+
+
+def add_bookmark(viewer: Viewer, name: str = "") -> None:
+    """Keep the current view; in place of one of the same name. Without a name it gets a number."""
+    state = viewer.state
+    if state.view is None:
+        state.say("open a scene first, then bookmark a view of it", is_error=True)
+        return
+    kept = state.bookmarks
+    if not name.strip():
+        number = len(kept) + 1
+        while f"view {number}" in {bookmark.name for bookmark in kept}:
+            number += 1
+        name = f"view {number}"
+    added = Bookmark(named(name), pose_of(state.view), state.view.distance)
+    others = tuple(bookmark for bookmark in kept if bookmark.name != added.name)
+    if len(others) >= MOST_VIEWS:
+        state.say(f"a scene has at most {MOST_VIEWS} bookmarks: delete one", is_error=True)
+        return
+    state.bookmarks, state.bookmark_typed = (*others, added), ""
+    _keep(viewer)
+    state.say(f"bookmark '{added.name}'")
+
+
+def type_bookmark(viewer: Viewer, text: str) -> None:
+    """What stands in the box for a name."""
+    viewer.state.bookmark_typed = text
+
+
+def go_to_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
+    """Stand where it was made, turning around the same point."""
+    if viewer.state.extent is not None:
+        view = view_of(bookmark.pose, viewer.state.extent)
+        target = view.eye + bookmark.distance * view.rotation[2]
+        glide_to(viewer, replace(view, target=target, distance=bookmark.distance))
+
+
+def delete_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
+    """Take it off the list."""
+    viewer.state.bookmarks = tuple(other for other in viewer.state.bookmarks if other is not bookmark)
+    _keep(viewer)
+
+
+def load(viewer: Viewer) -> None:
+    """Take those of the scene that was opened."""
+    state = viewer.state
+    state.bookmarks, state.bookmark_typed = (), ""
+    if state.path is None:
+        return
+    try:
+        state.bookmarks = viewer.shelf.read(state.path)
+    except InputError as error:
+        state.say(str(error), is_error=True)
+
+
+def _keep(viewer: Viewer) -> None:
+    state = viewer.state
+    if state.path is None:
+        return
+    try:
+        viewer.shelf.write(state.path, state.bookmarks)
+    except (OSError, InputError) as error:
+        state.say(f"bookmarks not kept: {one_line(error)}", is_error=True)
+
+
+# What the panel "Timing" asks for.
+
+
+def measure_frame(viewer: Viewer) -> None:
+    """Have the steps of this frame measured: the panel is seen."""
+    viewer.state.timing.wanted = True
+
+
+def compare_with_reference(viewer: Viewer) -> None:
+    """Draw what is shown at a small size, have the reference rasterizer draw the same in the background, and
+    tell the difference."""
+    state = viewer.state
+    if state.scene is None or state.view is None or viewer.surface is None:
+        state.say("open a scene first, then compare its picture", is_error=True)
+        return
+    if viewer.recorder.current is not None:
+        state.say("a film or a comparison is being drawn; wait for it or cancel it", is_error=True)
+        return
+    here = small(state)
+    shown, draw, backend = viewer.surface.capture(here), reference_of(here), state.backend
+
+    def work(progress: Progress) -> Array:
+        return draw()
+
+    def done(reference: Array) -> None:
+        state.timing.comparison = compared(shown, reference, backend)
+
+    viewer.recorder.submit(
+        "comparing with the reference", work, done, lambda reason: state.say(reason, is_error=True)
+    )
+
+
+def stop_comparing(viewer: Viewer) -> None:
+    """Do not wait for it."""
+    viewer.recorder.cancel()

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_viewer.camera.flight import Keyframe
-from langsplat_viewer.drawing.seeing import Seeing
-from langsplat_viewer.marks.packed_marks import PackedMarks, pack
+from langsplat_viewer.drawing.channels import Seeing
+from langsplat_viewer.marks import PackedMarks, pack
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
 

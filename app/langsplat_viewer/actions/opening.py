@@ -1,33 +1,37 @@
 """Opening scenes, and stopping what is under way."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import is_compiled
-from langsplat_core.display.displays import DISPLAYS
-from langsplat_core.display.latent_colours import latent_colours
-from langsplat_core.formats import scene_files
+from langsplat_core.display.displays import DISPLAYS, latent_colours
+from langsplat_core.errors import InputError
+from langsplat_core.io import scene_files
 from langsplat_core.pipeline.report import stated_doubts
 from langsplat_core.progress import Progress
-from langsplat_core.query import regions
+from langsplat_core.query import surface
 from langsplat_core.query.engine import no_field
-from langsplat_core.scene import Scene
+from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.encoders import DEMO
-from langsplat_viewer.actions import bookmarks
+from langsplat_viewer.actions import camera
 from langsplat_viewer.actions.camera import opening_view
-from langsplat_viewer.actions.history import forget
-from langsplat_viewer.actions.leaving import leave
+from langsplat_viewer.actions.history import forget, remember
+from langsplat_viewer.actions.queries import ask_again, set_canonical
+from langsplat_viewer.actions.selecting import leave
 from langsplat_viewer.camera.controls import Extent, extent_of
-from langsplat_viewer.drawing.looking import why_undrawable
-from langsplat_viewer.drawing.seeing import UNCLIPPED, Ruler
-from langsplat_viewer.files.preferences import with_recent
+from langsplat_viewer.drawing.channels import UNCLIPPED, Ruler, why_undrawable
+from langsplat_viewer.files import photographs
+from langsplat_viewer.files.browsing import list_folder
+from langsplat_viewer.files.photographs import Photograph
+from langsplat_viewer.files.preferences import with_photographs, with_recent
 from langsplat_viewer.files.watching import Stamps, stamps
-from langsplat_viewer.marks.selecting import of_scene
-from langsplat_viewer.recording import Recording
-from langsplat_viewer.viewer import Viewer
-from langsplat_viewer.visits import visit_of
+from langsplat_viewer.marks import of_scene
+from langsplat_viewer.state import Recording, ViewerState
+from langsplat_viewer.viewer import Viewer, Visit, unanswered, visit_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +118,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     forget(viewer)
     state.preferences = with_recent(state.preferences, path.absolute())
     state.opening_camera = None
-    bookmarks.load(viewer)
+    camera.load(viewer)
     state.record = Recording(size=state.record.size, fps=state.record.fps)
     state.view, state.nothing = opening_view(viewer), why_undrawable(scene.gaussians)
     viewer.engine, viewer.describer, state.hover = viewer.services.engine(scene), None, None
@@ -138,7 +142,7 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
 def _compile_search(viewer: Viewer) -> None:
     """Have what queries run on compiled before the first one, and say so, unless an earlier run did it."""
     engine = viewer.engine
-    if engine is None or is_compiled(Path(regions.__file__)):
+    if engine is None or is_compiled(Path(surface.__file__)):
         return
     viewer.worker.submit(
         "compiling the search kernels, once per installation (half a minute)",
@@ -159,3 +163,191 @@ def _warm_up_encoder(viewer: Viewer, encoder_id: str) -> None:
         lambda encoder: None,
         lambda reason: viewer.state.say(reason, is_error=True),
     )
+
+
+# Coming back to a scene.
+
+
+def return_to(viewer: Viewer, visit: Visit) -> None:
+    """Have it again in the scene that was just opened; what was asked is asked anew."""
+    state = viewer.state
+    if state.scene is None:
+        return
+    state.view, state.opening_camera = visit.view or state.view, visit.opening_camera
+    count = len(state.scene.cameras)
+    if visit.camera_index is not None and visit.camera_index < count:
+        state.camera_index = visit.camera_index
+    state.seeing = replace(state.seeing, ruler=visit.ruler, clip=visit.clip)
+    state.record.keyframes = visit.keyframes
+    if state.scene.language is None and DISPLAYS[visit.display].needs_field:
+        return
+    state.picture = replace(state.picture, display=visit.display)
+    state.latent_level = visit.latent_level
+    if state.scene.language is None:
+        return
+    state.queries = [unanswered(query) for query in visit.queries]
+    state.selected = None if visit.selected is None else state.queries[visit.selected]
+    if visit.canonical:
+        set_canonical(viewer, ", ".join(visit.canonical))  # which asks again
+    else:
+        ask_again(viewer)
+
+
+def reload(viewer: Viewer) -> None:
+    """Read the scene's files again and stay where one is; if that fails the reason is said and the scene is
+    kept."""
+    state = viewer.state
+    path, shown = state.path, state.scene
+    if path is None or shown is None:
+        state.say("open a scene first; it can be read again when its file has changed", is_error=True)
+        return
+    if state.opening is not None:
+        return
+    known = shown.unread
+
+    def check(scene: Scene) -> None:
+        new = [reason for reason in scene.unread if reason not in known]
+        if new:  # half written, or not written yet
+            raise InputError(f"not read again, the scene stays as it was: {new[0]}")
+
+    open_scene(viewer, path, lambda viewer: return_to(viewer, viewer.visits[path.absolute()]), check)
+
+
+def keep_old(viewer: Viewer) -> None:
+    """Do not read what has changed."""
+    viewer.watch.dismiss()
+
+
+# Several scenes to switch between. One is in memory at a time; of the others it is known where one stood and
+# what was asked.
+
+MOST = 100  # scenes that are listed
+
+
+def add_scenes(viewer: Viewer, paths: Sequence[Path]) -> None:
+    """List scenes, after those that are listed already."""
+    listed = viewer.state.scenes
+    new = dict.fromkeys(path.absolute() for path in paths)
+    viewer.state.scenes = (*listed, *(path for path in new if path not in listed))[:MOST]
+
+
+def open_scenes(viewer: Viewer, paths: Sequence[Path]) -> None:
+    """Open the first of some and list them all."""
+    if paths:
+        add_scenes(viewer, paths)
+        viewer.state.browser = None
+        open_scene(viewer, paths[0])
+
+
+def switch_scene(viewer: Viewer, path: Path) -> None:
+    """Show one of the list, as it was left if it was shown before."""
+    state = viewer.state
+    if state.path is not None and path == state.path.absolute() and state.opening is None:
+        return
+
+    def back(viewer: Viewer) -> None:
+        if path in viewer.visits:
+            return_to(viewer, viewer.visits[path])
+
+    open_scene(viewer, path, back)
+
+
+def step_scene(viewer: Viewer, by: int) -> None:
+    """The next (1) or previous (-1) of the list, beyond its ends from the other one."""
+    state = viewer.state
+    others = [path for path in state.scenes if state.path is None or path != state.path.absolute()]
+    if not others:
+        state.say("no other scene is listed: drop several, or open another", is_error=True)
+        return
+    here = state.scenes.index(state.path.absolute()) if state.path and len(others) < len(state.scenes) else -1
+    switch_scene(viewer, state.scenes[(here + by) % len(state.scenes)])
+
+
+def unlist_scene(viewer: Viewer, path: Path) -> None:
+    """Take one off the list, and forget where one stood in it; the one that is shown stays."""
+    viewer.state.scenes = tuple(other for other in viewer.state.scenes if other != path)
+    viewer.visits.pop(path, None)
+
+
+# The photograph of the training camera at which one stands, laid over the picture.
+
+SAME = 1e-6  # of the scene's radius, and of a rotation: nearer is the same place
+
+
+def standing_at(state: ViewerState) -> Camera | None:
+    """The training camera whose pose the view has, whatever its field of view; None elsewhere, and without
+    perspective."""
+    scene, view, index = state.scene, state.view, state.camera_index
+    if (
+        scene is None
+        or view is None
+        or view.back
+        or state.extent is None
+        or index is None
+        or state.glide is not None
+    ):
+        return None
+    camera = scene.cameras[index]
+    is_there = np.abs(view.eye - camera.position).max() <= SAME * state.extent.radius
+    return camera if is_there and np.abs(view.rotation - camera.rotation).max() <= SAME else None
+
+
+def photograph_here(state: ViewerState) -> Photograph | None:
+    """That of the camera at which one stands, as far as it was looked for."""
+    photograph = state.photograph
+    return photograph if photograph is not None and photograph.camera is standing_at(state) else None
+
+
+def fade_photograph(viewer: Viewer, fade: float) -> None:
+    """How much of the photograph is laid over the picture, 0 to 1."""
+    fade = min(max(fade, 0.0), 1.0)
+    if fade != viewer.state.seeing.fade:
+        remember(viewer, "fade")
+        viewer.state.seeing = replace(viewer.state.seeing, fade=fade)
+
+
+def fetch_photograph(viewer: Viewer) -> None:
+    """Once per frame: have the worker look for the photograph that is wanted now and was not looked for."""
+    state = viewer.state
+    camera = standing_at(state) if state.seeing.fade > 0 else None
+    if camera is None or state.path is None:
+        return
+    path, folder = state.path, _folder(viewer)
+    before = state.photograph
+    if before is not None and before.camera is camera and before.folder == folder:
+        return
+    wanted = state.photograph = Photograph(camera, folder)
+
+    def work(progress: Progress) -> Array:
+        return photographs.read(photographs.find(camera.name, path, folder), camera)
+
+    def done(image: Array) -> None:
+        if state.photograph is wanted:
+            state.photograph = replace(wanted, image=image)
+
+    def failed(reason: str) -> None:
+        if state.photograph is wanted:
+            state.photograph = replace(wanted, reason=reason)
+
+    viewer.worker.submit(f"reading the photograph {camera.name}", work, done, failed)
+
+
+def _folder(viewer: Viewer) -> str:
+    path = viewer.state.path
+    return "" if path is None else viewer.state.preferences.photographs.get(str(path.absolute()), "")
+
+
+def ask_for_photographs(viewer: Viewer) -> None:
+    """Open the browser to choose the folder that has the photographs of the scene."""
+    state = viewer.state
+    if state.path is not None:
+        start = Path(_folder(viewer) or state.path.parent)
+        state.path_typed, state.browser, state.picks_folder = "", list_folder(start.absolute()), True
+
+
+def choose_photograph_folder(viewer: Viewer, folder: Path) -> None:
+    """Look for the photographs of this scene there from now on; remembered."""
+    state = viewer.state
+    state.browser = None
+    if state.path is not None:
+        state.preferences = with_photographs(state.preferences, state.path.absolute(), folder.absolute())

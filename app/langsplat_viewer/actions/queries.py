@@ -1,21 +1,26 @@
 """Searching: the box, the list of queries, their colours and their level."""
 
 from dataclasses import replace
+from pathlib import Path
 from time import perf_counter
 
 from langsplat_core.config import LevelChoice
 from langsplat_core.display.displays import DISPLAYS
-from langsplat_core.errors import UnknownWordError
+from langsplat_core.errors import InputError, UnknownWordError
 from langsplat_core.progress import Progress
 from langsplat_core.query.answers import QueryResult, recut
 from langsplat_core.query.compose import ComposedResult, run_phrase
-from langsplat_core.query.engine import no_field
+from langsplat_core.query.describe import Suggestions, completions, corrected, suggest
+from langsplat_core.query.engine import QueryEngine, no_field
+from langsplat_core.query.grammar import Atom
 from langsplat_core.query.instances import Instance
-from langsplat_core.query.phrase_tree import Atom
-from langsplat_core.query.suggestions import corrected
-from langsplat_core.scene.phrases import phrase_key, split_phrases
+from langsplat_core.scene.language import phrase_key, split_phrases
+from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions.history import let_go, remember
 from langsplat_viewer.actions.settings import mute_letters, open_panel
+from langsplat_viewer.files.browsing import SUFFIX, QuerySet, SavedQuery, read_queries, write_queries
+from langsplat_viewer.jobs import one_line
+from langsplat_viewer.output.saving import free_name
 from langsplat_viewer.state import SLOTS, Query
 from langsplat_viewer.viewer import Viewer
 
@@ -199,3 +204,132 @@ def set_level(viewer: Viewer, level: LevelChoice) -> None:
     remember(viewer)
     viewer.state.level = level
     ask_again(viewer)
+
+
+# How queries are asked and where they end: own cuts, canonical phrases, whole sets of queries.
+
+
+def set_cut(viewer: Viewer, query: Query, cut: float | None, *, is_new: bool = True) -> None:
+    """Let an answer end at a relevancy of one's own, or (None) where it ends by itself.
+
+    is_new: a step of its own to undo, and not a slider that moves on.
+    """
+    if query.automatic is None or cut == query.cut:
+        return
+    if is_new:
+        remember(viewer)
+    query.cut = cut
+    query.result = query.automatic if cut is None else recut(query.automatic, cut)
+
+
+def type_canonical(viewer: Viewer, text: str) -> None:
+    """What stands in the box of the canonical phrases."""
+    viewer.state.canonical_typed = text
+
+
+def set_canonical(viewer: Viewer, text: str) -> None:
+    """Compare everything with other canonical phrases, between commas; "" for the scene's own again."""
+    phrases = tuple(split_phrases(text))
+    engine, state = viewer.engine, viewer.state
+    if engine is None or state.scene is None or state.scene.language is None:
+        state.say("open a scene with a language field first", is_error=True)
+        return
+
+    def work(progress: Progress) -> tuple[str, ...]:
+        engine.compare_with(phrases, progress)
+        return engine.canonical_phrases
+
+    def done(canonical: tuple[str, ...]) -> None:
+        state.canonical, state.canonical_typed = phrases, ", ".join(canonical)
+        state.say(f"compared with {', '.join(canonical)}")
+        ask_again(viewer)
+
+    viewer.worker.submit("encoding canonical phrases", work, done, lambda reason: state.say(reason, True))
+
+
+def save_queries(viewer: Viewer, folder: Path) -> Path | None:
+    """Save the list to a new file in `folder`; returns its path, None if there is none or that failed."""
+    state = viewer.state
+    if not state.queries:
+        state.say("search for something first, then save the queries", is_error=True)
+        return None
+    path = free_name(folder, state.path.stem if state.path else "scene", SUFFIX)
+    saved = tuple(SavedQuery(query.phrase, query.cut, query.slot is not None) for query in state.queries)
+    try:
+        write_queries(path, QuerySet(saved, state.level, state.canonical))
+    except OSError as error:
+        state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
+        return None
+    state.say(f"saved {path}; open it, or drop it onto the window, to ask them again")
+    return path
+
+
+def load_queries(viewer: Viewer, path: Path) -> None:
+    """Ask everything that a file has, after what is in the list already."""
+    state = viewer.state
+    try:
+        wanted = read_queries(path)
+    except InputError as error:
+        state.say(one_line(error), is_error=True)
+        return
+    if state.scene is None or state.scene.language is None:
+        state.say(f"{path.name}: open a scene that can be searched first", is_error=True)
+        return
+    if wanted.canonical != state.canonical:
+        set_canonical(viewer, ", ".join(wanted.canonical))
+    set_level(viewer, wanted.level)
+    for query in wanted.queries:
+        ask_one(viewer, query.phrase, cut=query.cut, then_show=query.shown)
+
+
+# What is offered to a searcher: examples of the scene, completions, corrections, earlier phrases.
+
+
+def prepare_suggestions(viewer: Viewer) -> None:
+    """Have the worker find examples, once per scene, when it has nothing else to do."""
+    state, engine = viewer.state, viewer.engine
+    if state.scene is state.suggestions_of or viewer.worker.current is not None:
+        return
+    state.suggestions, state.suggestions_of = Suggestions(), state.scene
+    if engine is None or state.scene is None or state.scene.language is None:
+        return
+    scene = state.scene
+    encoder_id = viewer.services.encoder_id or state.scene.language.encoder_id
+    local = encoder_id == DEMO or Path(encoder_id).expanduser().is_dir()
+    asked = engine if local else QueryEngine(scene)  # a hub id may mean a download: the phrasebook alone
+
+    def work(progress: Progress) -> Suggestions:
+        return suggest(asked, progress=progress)
+
+    def done(found: Suggestions) -> None:
+        if viewer.state.scene is scene:
+            viewer.state.suggestions = found
+
+    viewer.worker.submit("finding examples", work, done, lambda reason: None)
+
+
+def offers(viewer: Viewer) -> tuple[str, tuple[str, ...]]:
+    """What to offer now, and its title: phrases that go on from what is typed, else a correction of the last
+    query, else, before the first query, examples."""
+    state = viewer.state
+    if state.typed.strip():
+        return "", tuple(completions(state.typed, state.suggestions.phrases))
+    last = state.queries[-1] if state.queries else None
+    if last is None:
+        return "try", state.suggestions.examples
+    return "did you mean", (last.meant,) if last.meant else ()
+
+
+def ask_offered(viewer: Viewer, phrase: str) -> None:
+    """Search for what was offered; a query that it corrects leaves the list."""
+    for query in [query for query in viewer.state.queries if query.meant == phrase]:
+        remove(viewer, query)
+    viewer.state.typed = ""
+    ask(viewer, phrase)
+
+
+def recall(viewer: Viewer, step: int) -> str:
+    """The phrase `step` places later than the last recalled, -1 for the one before; "" behind the last."""
+    state = viewer.state
+    state.recalled = min(max(state.recalled + step, 0), len(state.asked))
+    return state.asked[state.recalled] if state.recalled < len(state.asked) else ""

@@ -5,18 +5,27 @@ not.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from concurrent.futures import wait
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.io import cameras, language, save_scene
+from langsplat_core.io.shapes import write_points
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.instances import Instance
-from langsplat_core.query.selection import grow, of_rows, shrink
+from langsplat_core.query.selection import at_point, grow, of_rows, shrink
+from langsplat_core.scene import LEVELS, Scene
+from langsplat_viewer import marks
 from langsplat_viewer.actions.history import remember
-from langsplat_viewer.marks import selecting
-from langsplat_viewer.marks.selecting import Marks, Mode, Things, Tool
+from langsplat_viewer.camera.controls import eye_depth
+from langsplat_viewer.drawing.channels import UNCLIPPED
+from langsplat_viewer.marks import Drawn, Leaving, Marks, Mode, Stroke, Things, Tool
+from langsplat_viewer.output.saving import free_name
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
 
@@ -34,7 +43,7 @@ def mark(viewer: Viewer, marks: Marks) -> None:
 def take(viewer: Viewer, found: Array, mode: Mode | None = None) -> None:
     """Combine the selection with `found` (N,) bool; `mode` in place of the one that is set."""
     selection = viewer.state.selection
-    mark(viewer, selecting.combined(selection.marks, found, mode or selection.mode))
+    mark(viewer, marks.combined(selection.marks, found, mode or selection.mode))
 
 
 def has_scene(viewer: Viewer) -> bool:
@@ -75,25 +84,25 @@ def invert_selection(viewer: Viewer) -> None:
 def hide_selected(viewer: Viewer) -> None:
     """Out of the picture, until all is shown again."""
     if has_selection(viewer):
-        mark(viewer, selecting.hiding(viewer.state.selection.marks))
+        mark(viewer, marks.hiding(viewer.state.selection.marks))
 
 
 def isolate_selected(viewer: Viewer) -> None:
     """Everything else out of the picture."""
     if has_selection(viewer):
-        mark(viewer, selecting.isolating(viewer.state.selection.marks))
+        mark(viewer, marks.isolating(viewer.state.selection.marks))
 
 
 def show_hidden(viewer: Viewer) -> None:
     """All that was hidden."""
     if has_scene(viewer):
-        mark(viewer, selecting.showing_all(viewer.state.selection.marks))
+        mark(viewer, marks.showing_all(viewer.state.selection.marks))
 
 
 def delete_selected(viewer: Viewer) -> None:
     """Out of the scene, as far as it is saved from now on; the file that was opened stays as it is."""
     if has_selection(viewer):
-        mark(viewer, selecting.deleting(viewer.state.selection.marks))
+        mark(viewer, marks.deleting(viewer.state.selection.marks))
 
 
 def reach(viewer: Viewer) -> float:
@@ -189,16 +198,240 @@ def set_mode(viewer: Viewer, mode: Mode) -> None:
 
 def set_brush(viewer: Viewer, radius: float) -> None:
     """The brush's radius, of the picture's height."""
-    low, high = selecting.BRUSHES
+    low, high = marks.BRUSHES
     viewer.state.selection = replace(viewer.state.selection, brush=min(max(radius, low), high))
 
 
 def set_reach(viewer: Viewer, share: float) -> None:
     """How far growing goes, of the scene's radius."""
-    low, high = selecting.REACHES
+    low, high = marks.REACHES
     viewer.state.selection = replace(viewer.state.selection, reach=min(max(share, low), high))
 
 
 def set_only_visible(viewer: Viewer, only: bool) -> None:
     """Whether rectangle, lasso and brush leave out what lies behind something."""
     viewer.state.selection = replace(viewer.state.selection, only_visible=only)
+
+
+# Writing what is selected, the rest, or the scene without what was deleted: to new files, never over old.
+
+Part = Literal["selection", "rest", "edited"]
+COMPANIONS = (language.SUFFIX, cameras.SUFFIX)
+LONGEST_WAIT = 60.0  # seconds that a window which is closed waits for what is being written
+
+
+@dataclass(frozen=True)
+class Written:
+    """A file that was made."""
+
+    path: Path
+    count: int  # Gaussians, or points
+
+
+def rows_of(marks: Marks, part: Part) -> Array:
+    """(N,) bool: what is selected, all else that was not deleted, or all that was not deleted."""
+    match part:
+        case "selection":
+            return marks.selected
+        case "rest":
+            return marks.kept & ~marks.selected
+        case _:
+            return marks.kept
+
+
+def export(
+    viewer: Viewer,
+    folder: Path,
+    part: Part,
+    as_points: bool = False,
+    then: Callable[[Viewer], None] = lambda viewer: None,
+) -> None:
+    """Have the worker write a part of the scene to a new file in `folder`: a PLY with its language field and
+    cameras, or a point cloud. `then` runs once it is written; if that fails the reason is said."""
+    if not (has_scene(viewer) if part == "edited" else has_selection(viewer)):
+        return
+    state = viewer.state
+    scene, marks = state.scene, state.selection.marks
+    assert scene is not None
+    rows = np.flatnonzero(rows_of(marks, part))
+    if len(rows) == 0:
+        state.say(f"the {part} holds no Gaussians: nothing to write", is_error=True)
+        return
+    stem = f"{state.path.stem if state.path else 'scene'}-{part}{'-points' if as_points else ''}"
+
+    def work(progress: Progress) -> Written:
+        return _write(scene, rows, folder, stem, as_points)
+
+    def done(written: Written) -> None:
+        kind = "points" if as_points else "Gaussians"
+        state.say(f"saved {written.path}: {written.count:,} {kind}")
+        if part == "edited" and not as_points and state.scene is scene:
+            state.selection = replace(state.selection, saved=marks.deleted)
+        then(viewer)
+
+    def failed(reason: str) -> None:
+        state.say(f"not saved: {reason}", is_error=True)
+
+    job = viewer.worker.submit(f"saving the {part}", work, done, failed)
+    state.selection = replace(state.selection, writing=job.future)
+
+
+def _write(scene: Scene, rows: Array, folder: Path, stem: str, as_points: bool) -> Written:
+    """The name is chosen here, one writing after the other, so that no two choose the same."""
+    path = free_name(folder, stem, ".ply", () if as_points else COMPANIONS)
+    if as_points:
+        return Written(path, write_points(path, scene.gaussians.take(rows)))
+    save_scene(path, replace(scene.take(rows), path=path))
+    return Written(path, len(rows))
+
+
+def finish_writing(viewer: Viewer) -> None:
+    """Wait until what is being written is there: the window closes, and the worker's thread ends with it."""
+    writing = viewer.state.selection.writing
+    if writing is not None:
+        wait([writing], LONGEST_WAIT)
+
+
+# Another scene, or none: what was deleted and not saved is asked about first.
+
+
+def leave(viewer: Viewer, then: Callable[[Viewer], None], to: str) -> None:
+    """Do `then`: at once if nothing is lost by it, else when that was answered; `to` says what it is."""
+    selection = viewer.state.selection
+    if selection.is_unsaved:
+        viewer.state.selection = replace(selection, leaving=Leaving(then, to))
+    else:
+        then(viewer)
+
+
+def may_close(viewer: Viewer) -> bool:
+    """Whether the window may close now; where not, it is asked about."""
+    if not viewer.state.selection.may_close:
+        quit_viewer(viewer)
+    return viewer.state.selection.may_close
+
+
+def quit_viewer(viewer: Viewer) -> None:
+    """Have the window close at the next frame."""
+    leave(viewer, _close, "the window closes")
+
+
+def _close(viewer: Viewer) -> None:
+    viewer.state.selection = replace(viewer.state.selection, may_close=True)
+
+
+def _answered(viewer: Viewer) -> Callable[[Viewer], None] | None:
+    leaving = viewer.state.selection.leaving
+    viewer.state.selection = replace(viewer.state.selection, leaving=None)
+    return None if leaving is None else leaving.then
+
+
+def save_and_leave(viewer: Viewer, folder: Path) -> None:
+    """Write the scene without what was deleted to a new file in `folder`, and go on once it is there."""
+    then = _answered(viewer)
+    if then is not None:
+        export(viewer, folder, "edited", then=then)
+
+
+def discard_and_leave(viewer: Viewer) -> None:
+    """Go on; the file that was opened is as it was."""
+    then = _answered(viewer)
+    if then is not None:
+        then(viewer)
+
+
+def stay(viewer: Viewer) -> None:
+    """Do not go on."""
+    _answered(viewer)
+
+
+# Selecting with the mouse: a stroke begins, goes on and ends; (u, v) are fractions of the scene's area.
+
+STEP = 0.002  # of the picture: places nearer to each other are one
+LONGEST = 4000  # places of a stroke that are kept
+
+
+def begin_stroke(viewer: Viewer, u: float, v: float) -> None:
+    """The button goes down. A sphere and a box are drawn around the surface that lies there."""
+    state = viewer.state
+    tool, centre = state.selection.tool, None
+    if tool is None or state.scene is None or state.view is None:
+        return
+    if tool not in marks.ON_SCREEN:
+        point = None if viewer.surface is None else viewer.surface.point_at(u, v)
+        if point is None:
+            state.say("nothing under the cursor to select")
+            return
+        centre = (float(point[0]), float(point[1]), float(point[2]))
+    state.glide = None
+    state.selection = replace(state.selection, stroke=Stroke(((u, v),), centre))
+
+
+def extend_stroke(viewer: Viewer, u: float, v: float) -> None:
+    """The mouse is there now."""
+    selection = viewer.state.selection
+    stroke = selection.stroke
+    if stroke is None:
+        return
+    (last_u, last_v), moved = stroke.path[-1], stroke.path
+    if max(abs(u - last_u), abs(v - last_v)) >= STEP and len(moved) < LONGEST:
+        stroke = replace(stroke, path=(*moved, (u, v)))
+        viewer.state.selection = replace(selection, stroke=stroke)
+
+
+def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
+    """The button goes up: select what the stroke encloses; `mode` in place of the one that is set."""
+    state, drawn = viewer.state, drawn_stroke(viewer)
+    if drawn is None or state.scene is None:
+        return
+    cancel_stroke(viewer)
+    if drawn.tool == "thing":
+        _select_under(viewer, drawn.stroke, mode)
+        return
+    wanted = state.selection.only_visible and drawn.tool in marks.ON_SCREEN and viewer.surface is not None
+    depths = viewer.surface.depths() if wanted and viewer.surface is not None else None
+    means, clip = state.scene.gaussians.means, state.seeing.clip.beyond(eye_depth(drawn.camera))
+    found = marks.caught(drawn, means, depths)
+    if clip != UNCLIPPED and drawn.tool in marks.ON_SCREEN:  # what is not drawn lies under no outline
+        found &= clip.keeps(means @ drawn.camera.rotation[2] + drawn.camera.world_to_camera[2, 3])
+    take(viewer, found, mode)
+
+
+def drawn_stroke(viewer: Viewer) -> Drawn | None:
+    """The stroke under way, in the picture as it is; None without one."""
+    state = viewer.state
+    tool, stroke = state.selection.tool, state.selection.stroke
+    if tool is None or stroke is None or state.view is None:
+        return None
+    return Drawn(tool, stroke, state.view.camera(*state.size), state.selection.brush, reach(viewer))
+
+
+def cancel_stroke(viewer: Viewer) -> None:
+    """Select nothing by it."""
+    viewer.state.selection = replace(viewer.state.selection, stroke=None)
+
+
+def leave_tool(viewer: Viewer) -> None:
+    """Give up the stroke under way; without one, the tool."""
+    if viewer.state.selection.stroke is not None:
+        cancel_stroke(viewer)
+    else:
+        use_tool(viewer, None)
+
+
+def _select_under(viewer: Viewer, stroke: Stroke, mode: Mode | None) -> None:
+    """The thing at the stroke's centre, or the part of it if that is the level of the queries."""
+    state = viewer.state
+    if state.scene is None or stroke.centre is None:
+        return
+    if state.scene.language is None:
+        state.say("without a language field no things are known: use a brush, sphere or box", is_error=True)
+        return
+    level = LEVELS.index("whole" if state.level == "auto" else state.level)
+    centre = np.array(stroke.centre)
+    find(
+        viewer,
+        "finding the thing for",
+        lambda engine: at_point(engine.surface, engine.regions, level, centre),
+        mode,
+    )

@@ -3,10 +3,9 @@ The camera is not undone: its reset leads back."""
 
 from dataclasses import replace
 
-from langsplat_viewer.actions.asking import set_cut
 from langsplat_viewer.actions.history import Moment, let_go, now
-from langsplat_viewer.actions.queries import ask_unanswered, set_level
-from langsplat_viewer.marks.packed_marks import pack, unpack
+from langsplat_viewer.actions.queries import ask_unanswered, set_cut, set_level
+from langsplat_viewer.marks import pack, unpack
 from langsplat_viewer.viewer import Viewer
 
 

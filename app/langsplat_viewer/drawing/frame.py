@@ -14,20 +14,38 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
-from langsplat_core.display.colour_maps import COLOUR_MAPS, MAX_QUERIES, QUERY_COLOURS
-from langsplat_core.display.compose import HeatRanges, full_ranges, shader_defines
-from langsplat_core.display.displays import DISPLAYS, NUMBERS, Extra
+from langsplat_core.display.displays import (
+    COLOUR_MAPS,
+    DISPLAYS,
+    MAX_QUERIES,
+    NUMBERS,
+    QUERY_COLOURS,
+    Extra,
+    HeatRanges,
+    full_ranges,
+    shader_defines,
+)
+from langsplat_core.progress import lap
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.opengl.context import is_software
-from langsplat_core.raster.opengl.draw import drawing, set_uniforms, shader
+from langsplat_core.raster.opengl.scene_textures import drawing, is_software, set_uniforms, shader
 from langsplat_core.scene import Camera, Scene
-from langsplat_core.stopwatch import lap
-from langsplat_viewer.drawing.channel_textures import ArraySource, ChannelSource, GlSource, Textures
-from langsplat_viewer.drawing.channels import Channel, Layers, depth_range
-from langsplat_viewer.drawing.looking import VISIBLE_ALPHA
-from langsplat_viewer.drawing.renderer import Rasterized, Rasterizing
-from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
-from langsplat_viewer.drawing.sight import Sight
+from langsplat_viewer.drawing.channels import (
+    UNCLIPPED,
+    VISIBLE_ALPHA,
+    Channel,
+    Clip,
+    Layers,
+    Sight,
+    depth_range,
+)
+from langsplat_viewer.drawing.renderer import (
+    ArraySource,
+    ChannelSource,
+    GlSource,
+    Rasterized,
+    Rasterizing,
+    Textures,
+)
 
 Backend = Literal["auto", "opengl", "cpu", "cuda"]
 PICK_ALPHA = 0.1  # a pixel with less alpha shows nothing that could be picked

@@ -1,14 +1,93 @@
-"""What the file browser lists: folders, files that may be scenes, sets of queries and camera paths."""
+"""Sets of queries as files: what was asked of a scene, to be asked again of it or of another."""
 
-from dataclasses import dataclass
+import json
+import math
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, get_args
 
-from langsplat_core.formats.sog import META_NAME
+from langsplat_core.config import LevelChoice
+from langsplat_core.errors import InputError, printable_line
+from langsplat_core.io.files import atomic_path
+from langsplat_core.io.sog import META_NAME
 from langsplat_viewer.files.flight_files import SUFFIX as PATHS
-from langsplat_viewer.files.querysets import SUFFIX as QUERIES
+
+SUFFIX = ".queries.json"
+FORMAT = "langsplat-queries"
+LARGEST = 1_000_000  # bytes of a file
+MOST = 200  # queries of a set
+LONGEST = 1000  # characters of a phrase
+LEVEL_CHOICES: tuple[LevelChoice, ...] = get_args(LevelChoice)
+
+
+@dataclass(frozen=True)
+class SavedQuery:
+    """One line of the list."""
+
+    phrase: str
+    cut: float | None = None  # relevancy, where it was set by hand
+    shown: bool = True  # in a colour
+
+
+@dataclass(frozen=True)
+class QuerySet:
+    """The list, and how it was asked."""
+
+    queries: tuple[SavedQuery, ...]
+    level: LevelChoice = "auto"
+    canonical: tuple[str, ...] = ()  # phrases that everything is compared with; none: the scene's own
+
+
+def write_queries(path: Path, queries: QuerySet) -> None:
+    """Write a set, whole or not at all."""
+    with atomic_path(path) as temporary:
+        content = {"format": FORMAT, "version": 1, **asdict(queries)}
+        temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
+
+
+def read_queries(path: Path) -> QuerySet:
+    """Read a set. InputError where the file cannot be read or is none."""
+    try:
+        with open(path, "rb") as file:
+            top = json.loads(file.read(LARGEST))
+        return _checked(top)
+    except (OSError, ValueError, RecursionError) as error:
+        reason = printable_line(getattr(error, "strerror", None) or error, 100)
+        raise InputError(f"{path}: no set of queries ({reason}); save one anew") from None
+
+
+def _checked(top: Any) -> QuerySet:
+    """ValueError for what breaks a rule of the layout."""
+    if not isinstance(top, dict) or top.get("format") != FORMAT or not isinstance(top.get("queries"), list):
+        raise ValueError(f'"format" is not "{FORMAT}"')
+    canonical, level = top.get("canonical", []), top.get("level", "auto")
+    if not isinstance(canonical, list) or not all(map(_is_phrase, canonical)) or len(canonical) > MOST:
+        raise ValueError('"canonical" is not a list of phrases')
+    if level not in LEVEL_CHOICES:
+        raise ValueError('"level" is none of ' + ", ".join(LEVEL_CHOICES))
+    if len(top["queries"]) > MOST:
+        raise ValueError(f"more than {MOST} queries")
+    return QuerySet(tuple(map(_query, top["queries"])), level, tuple(canonical))
+
+
+def _query(entry: Any) -> SavedQuery:
+    if not isinstance(entry, dict) or not _is_phrase(entry.get("phrase")):
+        raise ValueError("a query without a phrase")
+    cut, shown = entry.get("cut"), entry.get("shown", True)
+    is_cut = isinstance(cut, int | float) and not isinstance(cut, bool) and math.isfinite(cut)
+    if not isinstance(shown, bool) or not (cut is None or (is_cut and 0 <= cut <= 1)):
+        raise ValueError('"cut" is a number from 0 to 1, "shown" true or false')
+    return SavedQuery(entry["phrase"], None if cut is None else float(cut), shown)
+
+
+def _is_phrase(text: Any) -> bool:
+    return isinstance(text, str) and len(text.strip()) > 0 and len(text) <= LONGEST
+
+
+# What the file browser lists: folders, files that may be scenes, sets of queries and camera paths.
 
 SCENE_SUFFIXES = (".ply", ".spz", ".splat", ".ksplat", ".sog")
-MOST = 2000  # entries of a folder that are listed
+MOST_LISTED = 2000  # entries of a folder that are listed
 
 
 @dataclass(frozen=True)
@@ -38,7 +117,7 @@ def list_folder(folder: Path) -> Listing:
     except OSError as error:
         return Listing(folder, problem=f"cannot be listed ({error.strerror or error})")
     entries.sort(key=lambda entry: entry.is_file)
-    return Listing(folder, tuple(entries[:MOST]), max(len(entries) - MOST, 0))
+    return Listing(folder, tuple(entries[:MOST_LISTED]), max(len(entries) - MOST_LISTED, 0))
 
 
 def is_scene(path: Path) -> bool:
@@ -52,7 +131,7 @@ def _entry(path: Path) -> Entry | None:
     try:
         if path.is_dir():
             return Entry(path, is_file=(path / META_NAME).is_file())
-        if path.suffix.lower() in SCENE_SUFFIXES or path.name.endswith((QUERIES, PATHS)):
+        if path.suffix.lower() in SCENE_SUFFIXES or path.name.endswith((SUFFIX, PATHS)):
             return Entry(path, True, path.stat().st_size)
     except OSError:  # it may not be looked at
         pass

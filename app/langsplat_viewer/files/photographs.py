@@ -9,7 +9,7 @@ from PIL import Image, ImageOps
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError, printable_line
-from langsplat_core.parsing.pictures import PHOTO_SUFFIXES, opened
+from langsplat_core.io.hostile import PHOTO_SUFFIXES, opened
 from langsplat_core.scene import Camera
 
 LONGEST_SIDE = 2048  # pixels of what is kept: more than an area of a window has

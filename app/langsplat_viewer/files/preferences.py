@@ -10,7 +10,7 @@ import platformdirs
 
 from langsplat_core.config import ColourMap
 from langsplat_core.errors import InputError, printable_line
-from langsplat_core.files import atomic_path
+from langsplat_core.io.files import atomic_path
 from langsplat_viewer.keys import problem
 
 Theme = Literal["dark", "light"]

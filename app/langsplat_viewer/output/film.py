@@ -1,33 +1,219 @@
-"""A film without a window: `langsplat-viewer --headless --path path.json --out film.mp4`."""
+"""Films as files: MP4 by the system's ffmpeg, animated WebP and GIF, or a folder of pictures.
+
+A file is written whole or not at all. A folder is filled picture by picture; where the same film was begun in
+it before, the pictures that are there are kept.
+"""
 
 import hashlib
+import json
 import logging
-from collections.abc import Callable, Sequence
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import InputError
+from langsplat_core.errors import InputError, printable_line
+from langsplat_core.io.files import atomic_path, check_output_file, check_output_folder
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Camera
 from langsplat_viewer.camera.controls import Extent, extent_of, focus, from_camera, holding_distance
 from langsplat_viewer.camera.flight import Motion, camera_of, frame_times, turntable
+from langsplat_viewer.drawing.channels import why_nothing
 from langsplat_viewer.drawing.frame import Backend
-from langsplat_viewer.drawing.looking import why_nothing
 from langsplat_viewer.files.flight_files import read_flight
-from langsplat_viewer.output.film_files import MOST_FRAMES, VIDEO, Film, check_film, is_folder, write_film
-from langsplat_viewer.output.headless import Drawn, Subject, painter
+from langsplat_viewer.output.saving import save_png
 from langsplat_viewer.output.still import (
+    Drawn,
     Prepared,
     StillRequest,
+    Subject,
     in_one_line,
+    painter,
     prepare,
     say_drawing,
     say_unread,
 )
 from langsplat_viewer.viewer import Services
+
+VIDEO, ANIMATIONS = ".mp4", (".webp", ".gif")
+SETTINGS = "film.json"  # in a folder of pictures: what they are pictures of
+FRAME = re.compile(r"frame-\d{5,}\.png")
+MOST_FRAMES = 100_000
+END_SECONDS = 60.0  # that ffmpeg has to finish a file
+
+Draw = Callable[[int], Array]  # (H, W, 3) uint8 picture by its number from 0
+
+
+@dataclass(frozen=True)
+class Film:
+    """What is to be written."""
+
+    out: Path  # .mp4, .webp or .gif; else a folder
+    count: int  # pictures
+    size: tuple[int, int]  # width and height, pixels
+    fps: float
+    settings: str  # the same for films of the same pictures
+
+
+def check_film(out: Path | None, size: tuple[int, int] | None) -> Path:
+    """Where the film goes: `out`, or, for a video where the system has no ffmpeg, a folder of its name.
+    InputError where that cannot work, before anything slow is done."""
+    if out is None:
+        raise InputError("--headless needs somewhere to draw to; add --out film.mp4, or --out folder/")
+    if is_folder(out):
+        check_output_folder(out)
+        _check_own(out)
+        return out
+    if out.suffix.lower() not in (VIDEO, *ANIMATIONS):
+        raise InputError(f"--out {out}: a film is .mp4, .webp, .gif, or a folder of pictures")
+    if out.suffix.lower() == VIDEO and find_ffmpeg() is None:
+        return check_film(out.with_suffix(""), None)
+    if out.suffix.lower() == VIDEO and size is not None and (size[0] % 2 or size[1] % 2):
+        even = "x".join(str(max(side - side % 2, 2)) for side in size)
+        raise InputError(f"--size: the sides of a video are even numbers; choose {even}")
+    check_output_file(out)
+    return out
+
+
+def is_folder(out: Path) -> bool:
+    """Whether a film to `out` is a folder of pictures."""
+    return out.is_dir() or not out.suffix
+
+
+def find_ffmpeg() -> str | None:
+    """The system's ffmpeg, where there is one."""
+    return shutil.which("ffmpeg")
+
+
+def write_film(film: Film, draw: Draw) -> int:
+    """Draw and write all pictures; returns how many were drawn, for others were there already. Raises
+    InputError where ffmpeg or the picture library fail, OSError where nothing can be written, and what
+    `draw` does; a file is then as it was before."""
+    if is_folder(film.out):
+        return _write_pictures(film, draw)
+    if film.out.suffix.lower() == VIDEO:
+        _write_video(film, draw)
+    else:
+        _write_animation(film, draw)
+    return film.count
+
+
+def frame_name(number: int) -> str:
+    """Of a picture in a folder."""
+    return f"frame-{number:05d}.png"
+
+
+def _check_own(folder: Path) -> None:
+    """InputError where pictures in `folder` were not written by us: they would be overwritten."""
+    if folder.is_dir() and not (folder / SETTINGS).exists():
+        stranger = next((path.name for path in folder.iterdir() if FRAME.fullmatch(path.name)), None)
+        if stranger is not None:
+            raise InputError(f"--out {folder}: holds {stranger} of another program; choose another folder")
+
+
+def _write_pictures(film: Film, draw: Draw) -> int:
+    """Those that are missing."""
+    folder = film.out
+    folder.mkdir(parents=True, exist_ok=True)
+    _check_own(folder)
+    text = json.dumps({"film": film.settings, "pictures": film.count, "fps": film.fps}) + "\n"
+    if _text(folder / SETTINGS) != text:
+        for path in folder.iterdir():  # of another film, or of this one in other settings
+            if FRAME.fullmatch(path.name):
+                path.unlink()
+        with atomic_path(folder / SETTINGS) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    missing = [number for number in range(film.count) if not (folder / frame_name(number)).exists()]
+    for number in missing:
+        save_png(folder / frame_name(number), draw(number))
+    return len(missing)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return ""
+
+
+def _write_animation(film: Film, draw: Draw) -> None:
+    def rest() -> Iterator[Image.Image]:
+        for number in range(1, film.count):
+            yield Image.fromarray(draw(number))
+
+    kind = film.out.suffix[1:].upper()
+    options = {"save_all": True, "append_images": rest(), "duration": 1000 / film.fps, "loop": 0}
+    if kind == "WEBP":
+        options |= {"quality": 85, "duration": max(round(1000 / film.fps), 1)}
+    with atomic_path(film.out) as temporary:
+        try:
+            Image.fromarray(draw(0)).save(temporary, format=kind, **options)
+        except (ValueError, KeyError, SystemError) as error:
+            reason = printable_line(error, 120)
+            raise InputError(f"{film.out}: {kind} cannot hold this film ({reason}); use .mp4") from None
+
+
+def _write_video(film: Film, draw: Draw) -> None:
+    """Raw pictures through a pipe. ffmpeg runs in a session of its own, so that Ctrl-C is ours to handle."""
+    with atomic_path(film.out) as temporary, tempfile.TemporaryFile() as complaints:
+        command = _ffmpeg(film, temporary)
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=complaints,
+            start_new_session=True,
+        )
+        assert process.stdin is not None
+        try:
+            for number in range(film.count):
+                process.stdin.write(draw(number).tobytes())
+            process.stdin.close()
+            failed = process.wait(END_SECONDS) != 0
+        except BrokenPipeError:
+            failed = True
+        except subprocess.TimeoutExpired:
+            raise InputError(f"{film.out}: ffmpeg does not end; use a folder of pictures") from None
+        finally:
+            _end(process)
+        if failed or temporary.stat().st_size == 0:
+            complaints.seek(0)
+            said = complaints.read()[-4000:].decode("utf-8", "replace").split("\n")
+            reason = next((line for line in reversed(said) if line.strip()), "it wrote nothing")
+            reason = printable_line(reason, 160)
+            raise InputError(f"{film.out}: ffmpeg failed ({reason}); use a folder of pictures, --out folder/")
+
+
+def _ffmpeg(film: Film, target: Path) -> list[str]:
+    """H.264 that every player plays; nothing is asked on the terminal."""
+    width, height = film.size
+    return [
+        *(find_ffmpeg() or "ffmpeg", "-nostdin", "-hide_banner", "-loglevel", "error", "-y"),
+        *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{film.fps:g}"),
+        *("-i", "pipe:0", "-an", "-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p"),
+        *("-movflags", "+faststart", "-f", "mp4", str(target)),
+    ]
+
+
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    """Of whatever is left of it."""
+    if process.poll() is None:
+        process.kill()
+    process.wait()
+    if process.stdin is not None and not process.stdin.closed:
+        with suppress(OSError):  # what was buffered finds nobody to read it
+            process.stdin.close()
+
+
+# A film without a window: `langsplat-viewer --headless --path path.json --out film.mp4`.
 
 log = logging.getLogger("langsplat")
 

@@ -9,8 +9,8 @@ from PIL import Image
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
-from langsplat_core.files import atomic_path
-from langsplat_core.formats.cameras_json import write_cameras
+from langsplat_core.io.cameras import write_cameras
+from langsplat_core.io.files import atomic_path
 from langsplat_viewer.camera.controls import in_perspective
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.viewer import Viewer

@@ -1,37 +1,148 @@
-"""One picture without a window: `langsplat-viewer --headless --out picture.png`."""
+"""Pictures without a window: an offscreen GL context, or none at all. Imports neither glfw nor imgui."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import moderngl
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import ColourMap, Display, LevelChoice, PictureConfig
-from langsplat_core.display.displays import DISPLAYS
-from langsplat_core.display.latent_colours import latent_colours
+from langsplat_core.display.displays import DISPLAYS, HeatRanges, compose, latent_colours
 from langsplat_core.errors import BackendError, InputError
-from langsplat_core.files import check_output_file
-from langsplat_core.formats.language import SUFFIX
+from langsplat_core.io.files import check_output_file
+from langsplat_core.io.language import SUFFIX
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult, recut
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.opengl.scene_textures import create_egl_context
 from langsplat_core.scene import LEVELS, Camera, Scene
-from langsplat_core.scene.phrases import split_phrases
+from langsplat_core.scene.language import split_phrases
 from langsplat_viewer.camera.controls import default_view, extent_of, from_camera, spanning
-from langsplat_viewer.drawing import painting
-from langsplat_viewer.drawing.channels import Layers
-from langsplat_viewer.drawing.frame import Backend
-from langsplat_viewer.drawing.looking import why_undrawable
-from langsplat_viewer.drawing.seeing import UNCLIPPED, Clip
+from langsplat_viewer.drawing import channels
+from langsplat_viewer.drawing.channels import (
+    UNCLIPPED,
+    VISIBLE_ALPHA,
+    ArrayChannels,
+    Clip,
+    Layers,
+    Sight,
+    why_nothing,
+    why_undrawable,
+)
+from langsplat_viewer.drawing.frame import Backend, FrameRenderer, suits_opengl
 from langsplat_viewer.options import check_display, chosen_camera, latent_level, say_compiling
-from langsplat_viewer.output.headless import Subject, draw_something, painter
 from langsplat_viewer.output.saving import save_png
 from langsplat_viewer.state import SLOTS
 from langsplat_viewer.viewer import Services
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """What is drawn, from wherever it is seen."""
+
+    scene: Scene
+    picture: PictureConfig = field(default_factory=PictureConfig)
+    layers: Layers = field(default_factory=Layers)
+    heat_ranges: HeatRanges = ()
+    clip: Clip = UNCLIPPED
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A picture without a window."""
+
+    image: Array  # (H, W, 3) uint8, row 0 on top
+    nothing: bool  # it shows nothing of the scene
+
+
+@contextmanager
+def painter(subject: Subject, backend: Backend = "auto") -> Iterator[Callable[[Camera], Drawn]]:
+    """Draws one subject from camera after camera, on the thread that it was made on.
+
+    Backends "cpu" and "cuda" touch no GL at all; "auto" takes "cpu" where GL is absent or software.
+    Raises BackendError where the backend cannot work, ValueError where the layers are not the scene's.
+    """
+    scene, layers = subject.scene, subject.layers
+    layers.check(len(scene.gaussians))
+    ctx = _context_for(backend)
+    if ctx is None:
+        channels = ArrayChannels(load_rasterizer("cpu" if backend == "auto" else backend))
+
+        def by_arrays(camera: Camera) -> Drawn:
+            found = channels.render(Sight(scene, camera, subject.clip), layers, layers.extra(subject.picture))
+            nothing = bool(found.alpha.max(initial=0) < VISIBLE_ALPHA)
+            return Drawn(compose(found, subject.picture, subject.heat_ranges), nothing)
+
+        yield by_arrays
+        return
+    try:
+        frame = FrameRenderer(ctx, "opengl")
+        frame.set_scene(scene)
+        frame.set_clip(subject.clip)
+        frame.set_layers(layers.latent_rgb, layers.relevancies)
+
+        def by_gl(camera: Camera) -> Drawn:
+            image = frame.read(camera, subject.picture, subject.heat_ranges)
+            return Drawn(image, frame.shows_nothing())
+
+        yield by_gl
+    finally:
+        ctx.release()
+
+
+def render_picture(
+    scene: Scene,
+    camera: Camera,
+    picture: PictureConfig,
+    *,
+    backend: Backend = "auto",
+    latent_rgb: Array | None = None,
+    relevancies: Array | None = None,
+    heat_ranges: HeatRanges = (),
+) -> Array:
+    """(H, W, 3) uint8 picture of `scene`, row 0 on top, (H, W, 4) where it is transparent; layers as in
+    `FrameRenderer.set_layers`.
+
+    Raises what `painter` does, and InputError where nothing of the scene shows.
+    """
+    subject = Subject(scene, picture, Layers(latent_rgb, relevancies), heat_ranges)
+    with painter(subject, backend) as paint:
+        return draw_something(subject, camera, paint)
+
+
+def draw_something(subject: Subject, camera: Camera, paint: Callable[[Camera], Drawn]) -> Array:
+    """(H, W, 3) uint8 picture. InputError where it shows nothing of the scene."""
+    drawn = paint(camera)
+    if drawn.nothing:
+        scene = subject.scene
+        raise InputError(
+            f"{scene.path}: {why_nothing(scene.gaussians, camera)}; try another --camera or scene"
+        )
+    return drawn.image
+
+
+def _context_for(backend: Backend) -> moderngl.Context | None:
+    """A context to draw with; None where the backend needs none."""
+    if backend not in ("auto", "opengl"):
+        return None
+    try:
+        ctx = create_egl_context()
+    except BackendError:
+        if backend == "auto":
+            return None
+        raise
+    if backend == "auto" and not suits_opengl(ctx):
+        ctx.release()
+        return None
+    return ctx
+
+
+# One picture without a window: `langsplat-viewer --headless --out picture.png`.
 
 DEFAULT_SIZE = (1280, 720)
 log = logging.getLogger("langsplat")
@@ -161,7 +272,7 @@ def slots(results: Sequence[QueryResult], colours: tuple[int, ...]) -> tuple[Que
     return tuple(by_colour.get(number) for number in range(1, max(colours) + 1))
 
 
-def _subject(scene: Scene, request: StillRequest, shown: painting.Shown) -> Subject:
+def _subject(scene: Scene, request: StillRequest, shown: channels.Shown) -> Subject:
     picture = PictureConfig(
         display=request.display,
         heat_opacity=request.heat_opacity,
@@ -169,12 +280,12 @@ def _subject(scene: Scene, request: StillRequest, shown: painting.Shown) -> Subj
         colour_map=request.colour_map,
         transparent=request.transparent,
     )
-    relevancies = painting.columns(shown, request.display, len(scene.gaussians))
+    relevancies = channels.columns(shown, request.display, len(scene.gaussians))
     return Subject(
         scene,
-        painting.fitted(picture, shown),
+        channels.fitted(picture, shown),
         Layers(_latent(scene, request), relevancies),
-        painting.heat_ranges(shown, request.display),
+        channels.heat_ranges(shown, request.display),
         request.clip,
     )
 

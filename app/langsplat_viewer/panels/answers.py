@@ -4,7 +4,7 @@ import math
 
 from imgui_bundle import ImVec2, ImVec4, imgui
 
-from langsplat_core.display.colour_maps import QUERY_COLOURS
+from langsplat_core.display.displays import QUERY_COLOURS
 from langsplat_core.scene import LEVELS
 from langsplat_viewer import actions
 from langsplat_viewer.panels import cut

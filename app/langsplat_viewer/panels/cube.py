@@ -7,7 +7,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 from langsplat_core.arrays import Array
 from langsplat_viewer import actions
 from langsplat_viewer.camera.controls import OrbitCamera
-from langsplat_viewer.camera.view_cube import Face, face_at, visible_faces, world_axes
+from langsplat_viewer.camera.overlays import Face, face_at, visible_faces, world_axes
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.panels.pictures import UNMOVED
 from langsplat_viewer.viewer import Viewer

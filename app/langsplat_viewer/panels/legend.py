@@ -7,12 +7,12 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import ColourMap
-from langsplat_core.display.colour_maps import QUERY_COLOURS, mapped
+from langsplat_core.display.displays import QUERY_COLOURS, mapped
 from langsplat_core.query.answers import QueryResult
-from langsplat_viewer.drawing import painting
+from langsplat_viewer import staging
+from langsplat_viewer.drawing import channels
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.panels.style import elided, width_of
-from langsplat_viewer.pictures import splitting
 from langsplat_viewer.viewer import Viewer
 
 STEPS = 32  # of a colour bar
@@ -31,8 +31,8 @@ def draw(viewer: Viewer, area: Area) -> None:
     """A colour bar with numbers for every query that is painted."""
     state = viewer.state
     shown = state.shown_results()
-    slots = painting.painted(shown)
-    heats = any(one.picture.display == "relevancy" for one in splitting.pictures(state))
+    slots = channels.painted(shown)
+    heats = any(one.picture.display == "relevancy" for one in staging.shown_pictures(state))
     if state.scene is None or not heats or not slots:
         return
     corner = ImVec2(
@@ -44,7 +44,7 @@ def draw(viewer: Viewer, area: Area) -> None:
     for slot in slots:
         result = shown[slot]
         if result is not None:
-            strength = painting.STRENGTH[result.verdict]
+            strength = channels.STRENGTH[result.verdict]
             _bar(result, bar_colours(slot, strength, len(slots) == 1, state.picture.colour_map))
     imgui.end()
 

@@ -6,14 +6,13 @@ import numpy as np
 from imgui_bundle import ImVec2, imgui
 
 from langsplat_core.arrays import Array
-from langsplat_core.display.colour_maps import QUERY_COLOURS
+from langsplat_core.display.displays import QUERY_COLOURS
 from langsplat_core.scene import Camera
-from langsplat_viewer import actions
+from langsplat_viewer import actions, staging
 from langsplat_viewer.camera import overlays
-from langsplat_viewer.camera.labels import Label, placed
+from langsplat_viewer.camera.overlays import Label, placed
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.panels.pictures import shade_edge, text_on_shade
-from langsplat_viewer.pictures import splitting
 from langsplat_viewer.viewer import Viewer
 
 REACH = 7.0  # window units from a line at which a click means it
@@ -36,7 +35,7 @@ def draw(viewer: Viewer, area: Area) -> None:
     state = viewer.state
     if state.scene is None or state.view is None or state.extent is None:
         return
-    count = splitting.columns(state.seeing.split)
+    count = staging.columns(state.seeing.split)
     width = area.width / count
     paint = imgui.get_background_draw_list()
     for column in range(count):

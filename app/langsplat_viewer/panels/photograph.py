@@ -4,11 +4,10 @@ import moderngl
 from imgui_bundle import ImVec2, imgui
 
 from langsplat_core.arrays import Array
-from langsplat_viewer import actions
+from langsplat_viewer import actions, staging
 from langsplat_viewer.files.photographs import corners
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.panels.style import leave_room, muted, small_wrapped, tip
-from langsplat_viewer.pictures import splitting
 from langsplat_viewer.viewer import Viewer
 
 
@@ -47,7 +46,7 @@ class Overlay:
         if state.seeing.fade == 0 or photograph is None or photograph.image is None or state.view is None:
             return
         texture = self._upload(photograph.image)
-        count = splitting.columns(state.seeing.split)
+        count = staging.columns(state.seeing.split)
         width, paint = area.width / count, imgui.get_background_draw_list()
         shown = state.view.camera(max(round(width), 1), max(round(area.height), 1))
         left, top, right, bottom = corners(photograph.camera, shown)

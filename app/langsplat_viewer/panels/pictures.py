@@ -5,9 +5,8 @@ from typing import Any
 import moderngl
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_viewer import actions
+from langsplat_viewer import actions, staging
 from langsplat_viewer.panels.area import Area
-from langsplat_viewer.pictures import splitting
 from langsplat_viewer.viewer import Viewer
 
 GRIP = 12.0  # width of what can be taken hold of, window units
@@ -62,7 +61,7 @@ def _line(area: Area, at: float) -> None:
 
 def _name(viewer: Viewer, area: Area) -> None:
     """What each picture shows, at its upper edge: left and right of the line of a wipe."""
-    split, names = viewer.state.seeing.split, splitting.labels(viewer.state)
+    split, names = viewer.state.seeing.split, staging.labels(viewer.state)
     gap, top = hello_imgui.em_size(0.6), area.top + hello_imgui.em_size(0.5)
     if split.mode == "wipe":
         x = area.left + split.at * area.width

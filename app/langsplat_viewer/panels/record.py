@@ -16,7 +16,7 @@ from langsplat_viewer.panels.style import (
     stoppable,
     tip,
 )
-from langsplat_viewer.recording import FPS_CHOICES
+from langsplat_viewer.state import FPS_CHOICES
 from langsplat_viewer.viewer import Viewer
 
 ROWS = 3.5  # of the list: the half one says that there are more

@@ -7,7 +7,7 @@ from imgui_bundle import hello_imgui, imgui
 
 from langsplat_viewer import actions
 from langsplat_viewer.commands import with_key
-from langsplat_viewer.marks.selecting import BRUSHES, MODES, REACHES, TOOLS, Marks
+from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks
 from langsplat_viewer.panels.style import (
     beside,
     beside_boxed,

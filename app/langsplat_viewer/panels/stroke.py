@@ -5,12 +5,11 @@ from typing import Any
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
-from langsplat_viewer import actions
-from langsplat_viewer.marks import strokes
-from langsplat_viewer.marks.selecting import Mode, Tool
+from langsplat_viewer import actions, marks
+from langsplat_viewer.marks import Mode, Tool
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.panels.legend import QUIET
-from langsplat_viewer.pictures.marked_scene import TINT
+from langsplat_viewer.staging import TINT
 from langsplat_viewer.viewer import Viewer
 
 HINTS: dict[Tool, str] = {
@@ -58,7 +57,7 @@ def draw(viewer: Viewer, area: Area) -> None:
     paint = imgui.get_foreground_draw_list()
     paint.push_clip_rect(ImVec2(area.left, area.top), ImVec2(area.left + area.width, area.top + area.height))
     drawn, radius = actions.drawn_stroke(viewer), selection.brush * area.height
-    for line in strokes.outlines(drawn) if drawn is not None else []:
+    for line in marks.outlines(drawn) if drawn is not None else []:
         points = _on_screen(line, area)
         if selection.tool == "brush":
             _stripe(paint, points, radius)

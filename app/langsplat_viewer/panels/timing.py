@@ -5,7 +5,7 @@ from imgui_bundle import imgui
 from langsplat_viewer import actions
 from langsplat_viewer.panels.browser import in_words
 from langsplat_viewer.panels.style import muted, small_wrapped, stoppable, tip
-from langsplat_viewer.timing import Comparison, memory_bytes
+from langsplat_viewer.state import Comparison, memory_bytes
 from langsplat_viewer.viewer import Viewer
 
 

@@ -9,8 +9,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 from langsplat_core.config import TrainPreset
 from langsplat_viewer import actions
 from langsplat_viewer.panels.style import bad, beside, beside_boxed, muted, small_wrapped, tip
-from langsplat_viewer.training import Training
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.viewer import Training, Viewer
 
 PRESETS: tuple[TrainPreset, ...] = get_args(TrainPreset)
 LOSS_EM = 5.0  # height of its plot

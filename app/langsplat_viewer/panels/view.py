@@ -6,17 +6,15 @@ from itertools import groupby
 
 from imgui_bundle import imgui
 
-from langsplat_core.display.colour_maps import COLOUR_MAPS
-from langsplat_core.display.displays import DISPLAYS, DisplayRow
+from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
-from langsplat_viewer import actions
+from langsplat_viewer import actions, staging
 from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, adopt_up, level, with_fov
 from langsplat_viewer.camera.overlays import length_text
 from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of, with_key
-from langsplat_viewer.drawing.seeing import MOST_DEGREE, SIZE_RANGE, Clip, Splats
+from langsplat_viewer.drawing.channels import MOST_DEGREE, SIZE_RANGE, Clip, Splats
 from langsplat_viewer.panels import photograph
 from langsplat_viewer.panels.style import beside, beside_boxed, leave_room, muted, small_wrapped, tip
-from langsplat_viewer.pictures import splitting
 from langsplat_viewer.viewer import Viewer
 
 CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut can be chosen
@@ -80,7 +78,7 @@ def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, flo
 
 def _colour_map(viewer: Viewer) -> None:
     """Where something is shown by it."""
-    shown = {DISPLAYS[one.picture.display].name for one in splitting.pictures(viewer.state)}
+    shown = {DISPLAYS[one.picture.display].name for one in staging.shown_pictures(viewer.state)}
     if not shown & {"relevancy", "depth"}:
         return
     names = list(COLOUR_MAPS)

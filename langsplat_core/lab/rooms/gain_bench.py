@@ -21,10 +21,9 @@ from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import CANONICAL_PHRASES, LanguageField
 from langsplat_core.semantics.encoder import Encoder
 from langsplat_core.semantics.encoders import load_encoder
-from langsplat_core.training.language.codebook_fit import fit_codebook
+from langsplat_core.training.language.codec_fit import Vocabulary, everyday_vocabulary, fit_codebook
 from langsplat_core.training.language.lift import Lifted
-from langsplat_core.training.language.memberships import find_memberships
-from langsplat_core.training.language.relevancy_error import Vocabulary, everyday_vocabulary
+from langsplat_core.training.language.mask_weights import find_memberships
 
 SAMPLE = 36_000  # lifted vectors that a codebook is fitted to
 

@@ -13,9 +13,12 @@ import numpy as np
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.scene import LEVELS, Gaussians
 from langsplat_core.training.language.lift import Lifted, lift_block
-from langsplat_core.training.language.mask_groups import MaskGroups, group_masks
-from langsplat_core.training.language.memberships import Memberships
-from langsplat_core.training.language.things import masks_of_things
+from langsplat_core.training.language.mask_weights import (
+    MaskGroups,
+    Memberships,
+    group_masks,
+    masks_of_things,
+)
 
 TINY = 1.0  # pixels: largest weight in any view below which a Gaussian is taken for an accident
 GATE = 0.1  # share of its largest weight in a view below which a Gaussian does not count as seen there

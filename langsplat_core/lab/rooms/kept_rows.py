@@ -8,7 +8,7 @@ from typing import Any
 from langsplat_core.errors import FormatError
 from langsplat_core.lab.rooms.report import Measured
 from langsplat_core.lab.rooms.scoring import DirectScore, Score
-from langsplat_core.training.language.relevancy_error import CodecReport
+from langsplat_core.training.language.codec_fit import CodecReport
 
 
 class KeptRows:

@@ -7,7 +7,7 @@ from assets.making.truth import read_truth
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
-from langsplat_core.formats import load_scene
+from langsplat_core.io import load_scene
 from langsplat_core.lab.rooms.scoring import Reading, ask, evaluate, found_rate
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryEngine, no_field

@@ -12,8 +12,7 @@ from langsplat_core.query.engine import TextEncoder
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import LEVELS, Camera, Gaussians
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.mask_groups import MaskGroups
-from langsplat_core.training.language.memberships import find_memberships
+from langsplat_core.training.language.mask_weights import MaskGroups, find_memberships
 
 
 def oracle_vectors(features: ImageFeatures, ids: Array, vectors: Mapping[int, Array]) -> ImageFeatures:

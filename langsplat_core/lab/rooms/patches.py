@@ -17,9 +17,8 @@ from langsplat_core.lab.rooms.scoring import Answer, masks_of_maps
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.protocol import LiftingRasterizer, View
 from langsplat_core.scene import Camera, Gaussians
-from langsplat_core.semantics.crops import masked_crop
-from langsplat_core.semantics.embed import ImageEncoder
 from langsplat_core.semantics.relevancy import relevancy
+from langsplat_core.semantics.store import ImageEncoder, masked_crop
 
 SCALES = tuple(float(scale) for scale in np.linspace(0.05, 0.5, 7))  # LERF's; it interpolates between them
 OVERLAP = 0.5  # of neighbouring patches

@@ -10,8 +10,8 @@ from assets.making.truth import Truth
 from assets.making.vocabulary import CATEGORIES
 from assets.making.world import World
 from langsplat_core.arrays import Array
-from langsplat_core.query.phrase_tree import EXTREMES, SIDES
-from langsplat_core.query.standing import Body, Viewer, body, most, stands
+from langsplat_core.query.compose import Body, Viewer, body, most, stands
+from langsplat_core.query.grammar import EXTREMES, SIDES
 
 POINTS = 3000  # on the surface of every thing, by which it is measured
 MOST_CASES = 16  # of one construction, drawn at random

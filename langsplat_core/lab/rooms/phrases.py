@@ -11,7 +11,7 @@ import numpy as np
 from assets.making.dataset import MIN_PIXELS, photographed_room
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
-from langsplat_core.evaluation.metrics import intersection_over_union
+from langsplat_core.evaluation.scoring import intersection_over_union
 from langsplat_core.lab.config import BenchmarkConfig, PhraseBenchConfig
 from langsplat_core.lab.rooms.phrase_cases import CONSTRUCTIONS, Case, cases, things_in
 from langsplat_core.lab.rooms.room import HOLD_OUT, Room, weights_digest
@@ -19,11 +19,9 @@ from langsplat_core.lab.rooms.scoring import MIN_GAUSSIANS, masks_and_peaks
 from langsplat_core.lab.rooms.variants import variants
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.compose import run_phrase
+from langsplat_core.query.compose import run_phrase, upright, viewer
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.grammar import parse
-from langsplat_core.query.phrase_tree import atoms
-from langsplat_core.query.standing import upright, viewer
+from langsplat_core.query.grammar import atoms, parse
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.encoders import load_encoder

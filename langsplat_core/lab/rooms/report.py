@@ -10,10 +10,10 @@ import numpy as np
 
 from assets.making.truth import PHRASE_KINDS, Truth
 from langsplat_core.arrays import Array
-from langsplat_core.files import atomic_path
+from langsplat_core.io.files import atomic_path
 from langsplat_core.lab.rooms.scoring import Asked, DirectScore, Score, found_rate
 from langsplat_core.scene import Codec
-from langsplat_core.training.language.relevancy_error import CodecReport
+from langsplat_core.training.language.codec_fit import CodecReport
 
 
 @dataclass(frozen=True)

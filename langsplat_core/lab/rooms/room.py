@@ -27,7 +27,8 @@ from langsplat_core.config import (
 )
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.formats.language import means_checksum
+from langsplat_core.io.hostile import write_npy
+from langsplat_core.io.language import means_checksum
 from langsplat_core.lab.config import BenchmarkConfig, MaskOrigin, Tier
 from langsplat_core.lab.rooms.clip_geometry import ClipGeometry, read_geometry
 from langsplat_core.lab.rooms.oracles import (
@@ -48,14 +49,13 @@ from langsplat_core.lab.rooms.scoring import (
 )
 from langsplat_core.lab.rooms.tiles import TileMasks
 from langsplat_core.lab.rooms.variants import Variant, variants
-from langsplat_core.parsing.npy import write_npy
 from langsplat_core.pipeline.language import Views, language_field
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import trained_gaussians
 from langsplat_core.progress import Progress
 from langsplat_core.query.answers import AnswerRule
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
+from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import LEVELS, Camera, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.encoder import Encoder
@@ -63,7 +63,7 @@ from langsplat_core.semantics.encoders import load_encoder, model_path
 from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sources import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture
-from langsplat_core.training.language.relevancy_error import CodecReport
+from langsplat_core.training.language.codec_fit import CodecReport
 from langsplat_core.training.radiance.train import evaluate_views
 
 HOLD_OUT = 8  # every so many views, one is not trained on

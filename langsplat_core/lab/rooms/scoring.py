@@ -16,14 +16,12 @@ from assets.making.dataset import MIN_PIXELS
 from assets.making.truth import PHRASE_KINDS, Phrase, Truth
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice, PictureConfig
-from langsplat_core.evaluation.metrics import intersection_over_union, majority
+from langsplat_core.evaluation.scoring import intersection_over_union, majority
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.cut import CutRule, cut_level
+from langsplat_core.query.answers import CutRule, QueryResult, cut_level, peak_pixel
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
-from langsplat_core.query.places import peak_pixel
-from langsplat_core.query.regions import Regions
+from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
+from langsplat_core.query.surface import Regions
 from langsplat_core.raster.protocol import Rasterizer, View
 from langsplat_core.scene import Camera
 from langsplat_core.semantics.relevancy import FLOOR

@@ -23,7 +23,7 @@ from assets.making.truth import Region
 from assets.making.vocabulary import part_words
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
-from langsplat_core.files import atomic_path
+from langsplat_core.io.files import atomic_path
 from langsplat_core.lab.config import BenchmarkConfig, VerdictBenchConfig
 from langsplat_core.lab.rooms.report import separation
 from langsplat_core.lab.rooms.room import Room, room_encoder
@@ -33,7 +33,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import WEAK, QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.vocabulary import PARTS, forms, is_part
+from langsplat_core.query.grammar import PARTS, forms, is_part
 from langsplat_core.scene import Calibration, Fits, Odds, Scene
 
 REJECTED = 0.95  # of what is absent, in the rooms that a calibration is fitted to

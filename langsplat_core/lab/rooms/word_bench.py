@@ -17,10 +17,8 @@ from langsplat_core.lab.rooms.room import Room, weights_digest
 from langsplat_core.lab.rooms.scoring import MIN_GAUSSIANS
 from langsplat_core.lab.rooms.variants import Variant
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.describe import Describer
+from langsplat_core.query.describe import Describer, Entry, WordScores
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.inventory import Entry
-from langsplat_core.query.words import WordScores
 from langsplat_core.scene import LEVELS, Scene
 from langsplat_core.semantics.encoders import load_encoder
 

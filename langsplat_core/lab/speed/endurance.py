@@ -14,7 +14,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryEngine, TextEncoder
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Scene
-from langsplat_core.semantics.everyday import ADJECTIVES, NOUNS
+from langsplat_core.semantics.vocabulary import ADJECTIVES, NOUNS
 
 PARTS = 4  # that phrases and pictures are measured in: what grows is seen from one to the next
 

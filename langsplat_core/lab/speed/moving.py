@@ -22,7 +22,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Camera, Gaussians, Scene
-from langsplat_core.scene.merging import merged
+from langsplat_core.scene.gaussians import merged
 
 WAYS = ((1.0, False), (0.5, False), (0.25, False), (0.5, True), (0.25, True))  # resolution, whether merged
 

@@ -21,13 +21,13 @@ from langsplat_core.errors import InputError
 from langsplat_core.lab.config import QueryBenchConfig
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryEngine, TextEncoder
-from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
+from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.protocol import View
 from langsplat_core.scene import LEVELS, Camera, CodebookCodec, Codec, LanguageField, Scene
-from langsplat_core.semantics.everyday import everyday_phrases
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
-from langsplat_core.training.language.autoencoder_fit import train_autoencoder
+from langsplat_core.semantics.vocabulary import everyday_phrases
+from langsplat_core.training.language.codec_fit import train_autoencoder
 
 GATE = PictureConfig().alpha_gate
 PAPER = "paper's order"

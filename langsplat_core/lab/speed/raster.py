@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from langsplat_core.errors import BackendError
-from langsplat_core.files import atomic_path
-from langsplat_core.formats import load_scene
+from langsplat_core.io import load_scene
+from langsplat_core.io.files import atomic_path
 from langsplat_core.lab.config import RasterBenchConfig
 from langsplat_core.lab.speed import report as tables
 from langsplat_core.lab.speed.cases import Case, default_camera, random_scene, sweep
@@ -23,7 +23,7 @@ from langsplat_core.lab.speed.torch_baseline import TorchRasterizer
 from langsplat_core.lab.speed.truth import make_truth
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import load_rasterizer
-from langsplat_core.raster.opengl.context import create_egl_context
+from langsplat_core.raster.opengl.scene_textures import create_egl_context
 from langsplat_core.raster.protocol import Rasterizer
 
 

@@ -14,15 +14,13 @@ from scipy import sparse
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.compiled import Workers, plain, shared_workers
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster.cpu import blend, blend_backward, projection, projection_backward
+from langsplat_core.progress import lap
+from langsplat_core.raster.cpu import backward, blend, projection
+from langsplat_core.raster.cpu.blend import TileOperator, gather_labels, in_fours
 from langsplat_core.raster.cpu.frozen import FrozenView
-from langsplat_core.raster.cpu.labels import gather_labels
-from langsplat_core.raster.cpu.operator import TileOperator, in_fours
-from langsplat_core.raster.cpu.tiles import bin_tiles, depth_order
-from langsplat_core.raster.cpu.walk import make_cutoffs
-from langsplat_core.raster.memory import check_picture
+from langsplat_core.raster.cpu.tiles import bin_tiles, depth_order, make_cutoffs
+from langsplat_core.raster.protocol import check_picture
 from langsplat_core.scene import Camera, Gaussians
-from langsplat_core.stopwatch import lap
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,14 +117,14 @@ class CpuView(TileOperator):
         check_array("alpha_grad", alpha_grad, (height, width))
         ordered = in_fours(values[self.order])
         grads = (plain(image_grad), plain(alpha_grad)[..., None])
-        moments = blend_backward.MOMENTS
+        moments = backward.MOMENTS
         partial = np.empty((len(self.tiles.ranks), moments + ordered.shape[1]), np.float32)
-        self._over_tiles(blend_backward.backward, ordered, grads, self._cutoffs, partial)
-        out = projection_backward.ParameterGradients(
+        self._over_tiles(backward.backward, ordered, grads, self._cutoffs, partial)
+        out = backward.ParameterGradients(
             *(np.zeros((n, *shape), np.float32) for shape in ((3,), (3,), (4,), (), (channels,), (2,)))
         )
         self.workers.run(
-            projection_backward.to_parameters,
+            backward.to_parameters,
             len(self.order),
             self.tiles,
             self.order,

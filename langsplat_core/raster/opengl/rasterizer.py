@@ -15,13 +15,21 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
-from langsplat_core.raster.opengl.depth_sort import Sort, chosen_sorter
-from langsplat_core.raster.opengl.draw import Targets, drawing, set_uniforms, shader
-from langsplat_core.raster.opengl.draw_order import DrawOrder, draw_order
-from langsplat_core.raster.opengl.scene_textures import HALF_MAX, SceneTextures
+from langsplat_core.progress import lap
+from langsplat_core.raster.opengl.scene_textures import (
+    HALF_MAX,
+    DrawOrder,
+    SceneTextures,
+    Sort,
+    Targets,
+    chosen_sorter,
+    draw_order,
+    drawing,
+    set_uniforms,
+    shader,
+)
 from langsplat_core.raster.protocol import farthest
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
-from langsplat_core.stopwatch import lap
 
 MAX_TARGETS = 4  # colour attachments of one pass, three values each
 NOT_CURRENT = "its context is not current in this thread: render inside `with ctx:`"

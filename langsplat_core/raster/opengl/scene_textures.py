@@ -1,18 +1,266 @@
-"""A scene in the memory of an OpenGL 4.1 device: one texel per Gaussian, in layers of 2D textures.
-
-Textures, because OpenGL 4.1 (macOS) has no storage buffers, and moderngl no buffer textures. Invalid
-rows (`Gaussians.valid`) are left out here; `rows` says which are kept.
-"""
+"""An OpenGL context without a window or a display, and what kind of driver is behind one."""
 
 import math
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.resources import files
+from itertools import product
+from typing import Any, Literal, Protocol
 
 import moderngl
 import numpy as np
 
 from langsplat_core.arrays import Array, sigmoid, unit
+from langsplat_core.config import RasterSettings
 from langsplat_core.errors import BackendError
-from langsplat_core.raster.opengl.depth_sort import DepthSorter, SortBuffers
+from langsplat_core.progress import lap
+from langsplat_core.raster.protocol import farthest
 from langsplat_core.scene import Camera, Gaussians
+
+# glcontext looks for libGL.so first; images without development packages have only the versioned names.
+_VERSIONED = {"libgl": "libGL.so.1", "libegl": "libEGL.so.1"}
+VERSIONS = (430, 410)  # 4.3 sorts on the device; some drivers give no more than what is asked for
+SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swr ", "software", "swiftshader", "basic render")
+
+
+def is_software(ctx: moderngl.Context) -> bool:
+    """Whether the driver draws on the CPU."""
+    renderer = ctx.info["GL_RENDERER"].lower()
+    return any(name in renderer for name in SOFTWARE_RENDERERS)
+
+
+def create_egl_context() -> moderngl.Context:
+    """An OpenGL context of 4.1 or newer that needs no display: EGL on Linux, the system's own way elsewhere.
+
+    Raises BackendError where there is no driver for one.
+    """
+    linux = sys.platform.startswith("linux")
+    attempts: list[dict[str, Any]] = [{"backend": "egl"}, {"backend": "egl", **_VERSIONED}] if linux else [{}]
+    problem: Exception | None = None
+    for version, options in product(VERSIONS, attempts):
+        try:
+            return moderngl.create_context(standalone=True, require=version, **options)
+        except Exception as error:  # noqa: BLE001  glcontext raises nothing more specific
+            problem = error
+    advice = "install libegl1 and libgl1-mesa-dri (Debian's names)" if linux else "update the graphics driver"
+    raise BackendError(f"no offscreen OpenGL 4.1 ({problem}); {advice}, or use --backend cpu")
+
+
+# Small tools for drawing with moderngl: sources, uniforms, a pass that leaves the state as it was.
+
+SHADERS = "langsplat_core.raster.opengl.shaders"
+
+
+def shader(name: str, version: int = 410, package: str = SHADERS, **defines: int | float) -> str:
+    """Source of `name`.glsl in `package` with its GLSL version and `defines` in front."""
+    head = [f"#version {version} core", *(f"#define {key} {value}" for key, value in defines.items())]
+    return "\n".join([*head, files(package).joinpath(f"{name}.glsl").read_text(encoding="utf-8")])
+
+
+def set_uniforms(program: moderngl.Program | moderngl.ComputeShader, values: dict[str, object]) -> None:
+    """Set uniforms by name; names that the compiler removed as unused are passed over."""
+    for name, value in values.items():
+        uniform = program.get(name, None)
+        if isinstance(uniform, moderngl.Uniform):
+            if isinstance(value, bytes):
+                uniform.write(value)
+            else:
+                uniform.value = value
+
+
+@contextmanager
+def drawing(ctx: moderngl.Context, framebuffer: moderngl.Framebuffer, flags: int) -> Iterator[None]:
+    """Draw into `framebuffer` with only `flags` enabled, then bind again what was bound before.
+
+    Blending and all other switches end up off, the blend function is moderngl's default and the colour
+    masks are those of the framebuffer bound before: a user interface drawn next finds a plain state.
+    """
+    # A standalone context begins with nothing bound. moderngl binds the last framebuffer again whenever it
+    # makes one, which fails if that was released meanwhile: so the default one is bound, never ours.
+    before = ctx.fbo or ctx.detect_framebuffer(0)
+    framebuffer.use()
+    ctx.enable_only(flags)
+    try:
+        yield
+    finally:
+        ctx.enable_only(moderngl.NOTHING)
+        ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
+        before.use()
+
+
+class Targets:
+    """The images that one pass draws: RGBA, then depth as RG (sum of weight * camera z, alpha)."""
+
+    def __init__(self, ctx: moderngl.Context, key: tuple[int, int, int, bool], dtype: str) -> None:
+        self.key = key
+        width, height, values, depth = key
+        images = [ctx.texture((width, height), 4, dtype=dtype) for _ in range(values)]
+        if depth:  # always single: half floats would give it 11 bits, and none beyond 65504 units
+            images.append(ctx.texture((width, height), 2, dtype="f4"))
+        for image in images:
+            image.repeat_x = image.repeat_y = False
+        self.images = tuple(images)
+        self.framebuffer = ctx.framebuffer(images)
+
+    def release(self) -> None:
+        """Give the device memory back."""
+        self.framebuffer.release()
+        for image in self.images:
+            image.release()
+
+
+# The draw order found on the device: a radix sort in compute shaders, OpenGL 4.3.
+#
+# It is the order of `front_to_back`, reversed, to the last bit: camera z is computed in double precision with
+# the same operations, and the sort is stable. Only `depth_sort.comp.glsl` knows how.
+
+GROUP, ROUNDS = 256, 8  # threads of a workgroup, and items that each of them takes
+STEPS = ("keys", "count", "scan", "scatter")  # numbered as in the shader
+DIGITS, KEY_BITS, DIGIT_BITS = 256, 64, 8
+MEAN_BYTES = 24  # of one Gaussian, in the largest buffer
+Sort = Literal["auto", "cpu", "device"]  # who finds the draw order
+_PROBE = 5000  # points sorted to see whether the driver does it right
+
+
+class SortBuffers:
+    """Device memory to sort n points: 60 bytes each. `rows` becomes the order, `command` the draw of it."""
+
+    def __init__(self, ctx: moderngl.Context, means: Array, rows: moderngl.Buffer) -> None:
+        """means: (n, 3) world units; rows: room for n indices, which stays its owner's."""
+        n = self.count = len(means)
+        self.groups = max(-(-n // (GROUP * ROUNDS)), 1)
+        self.rows = rows
+        points = np.ascontiguousarray(means, np.float64).tobytes() or bytes(MEAN_BYTES)
+        self.means = ctx.buffer(points)
+        self.keys, self.other_keys = (ctx.buffer(reserve=8 * max(n, 1)) for _ in range(2))
+        self.other_rows = ctx.buffer(reserve=4 * max(n, 1))
+        self.counts, self.totals = (
+            ctx.buffer(reserve=4 * DIGITS * self.groups),
+            ctx.buffer(reserve=4 * DIGITS),
+        )
+        self.command = ctx.buffer(reserve=20)  # moderngl's stride; the last four bytes are not read
+
+    def order(self) -> Array:
+        """(m,) int32 rows of the points that are drawn, back to front, read from the device."""
+        drawn = int(np.frombuffer(self.command.read(16), np.uint32)[1])
+        return np.frombuffer(self.rows.read(4 * drawn), np.int32) if drawn else np.zeros(0, np.int32)
+
+    def release(self) -> None:
+        """Give the device memory back, all but `rows`."""
+        own = (
+            self.means,
+            self.keys,
+            self.other_keys,
+            self.other_rows,
+            self.counts,
+            self.totals,
+            self.command,
+        )
+        for buffer in own:
+            buffer.release()
+
+
+class DepthSorter:
+    """The compiled sort of one context. Raises moderngl.Error where the driver cannot compile it."""
+
+    def __init__(self, ctx: moderngl.Context) -> None:
+        self._ctx = ctx
+        self._programs: Mapping[str, moderngl.ComputeShader] = {
+            name: ctx.compute_shader(shader("depth_sort.comp", 430, STEP=number, GROUP=GROUP, ROUNDS=ROUNDS))
+            for number, name in enumerate(STEPS)
+        }
+
+    def holds(self, count: int) -> bool:
+        """Whether the driver's buffers are large enough for so many points."""
+        return bool(MEAN_BYTES * count <= self._ctx.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"])
+
+    def sort(self, buffers: SortBuffers, plane: Array, near: float, far: float) -> None:
+        """Order by camera z, far ones first, ties by descending index, those within (near, far] alone.
+
+        plane: (4,) third row of the camera's world to camera matrix.
+        """
+        b = buffers
+        b.command.write(np.array([4, 0, 0, 0, 0], np.uint32))
+        for binding, buffer in ((0, b.means), (5, b.counts), (6, b.totals), (7, b.command)):
+            buffer.bind_to_storage_buffer(binding)
+        self._bind(b.keys, b.rows, b.other_keys, b.other_rows)
+        values: dict[str, object] = {
+            "plane": tuple(plane),
+            "near": near,
+            "far": far,
+            "items": b.count,
+            "groups": b.groups,
+        }
+        self._run("keys", max(-(-b.count // GROUP), 1), values)
+        here, there = (b.keys, b.rows), (b.other_keys, b.other_rows)
+        for shift in range(0, KEY_BITS, DIGIT_BITS):  # an even number of passes: they end in `rows`
+            self._bind(*here, *there)
+            digit = values | {"digit_word": shift // 32, "digit_shift": shift % 32}
+            for step, groups in (("count", b.groups), ("scan", DIGITS), ("scatter", b.groups)):
+                self._run(step, groups, digit)
+            here, there = there, here
+
+    @staticmethod
+    def _bind(*buffers: moderngl.Buffer) -> None:
+        for binding, buffer in enumerate(buffers, 1):
+            buffer.bind_to_storage_buffer(binding)
+
+    def _run(self, step: str, groups: int, values: dict[str, object]) -> None:
+        set_uniforms(self._programs[step], values)
+        self._programs[step].run(groups)
+        self._ctx.memory_barrier()
+
+    def is_right(self) -> bool:
+        """Whether a small sort comes out right: drivers are known to get such shaders wrong."""
+        depths = np.random.default_rng(0).integers(-2, 60, _PROBE) * np.pi
+        means = np.zeros((_PROBE, 3))
+        means[:, 2] = depths
+        rows = self._ctx.buffer(reserve=4 * _PROBE)
+        buffers = SortBuffers(self._ctx, means, rows)
+        self.sort(buffers, np.array([0.0, 0.0, 1.0, 0.0]), 0.2, 150.0)
+        found = buffers.order()
+        buffers.release()
+        rows.release()
+        ahead = np.flatnonzero((depths > 0.2) & (depths <= 150.0))
+        return np.array_equal(found, ahead[np.argsort(depths[ahead], kind="stable")][::-1])
+
+    def release(self) -> None:
+        """Give the programs back."""
+        for program in self._programs.values():
+            program.release()
+
+
+def working_sorter(ctx: moderngl.Context) -> DepthSorter | None:
+    """A sorter that was seen to sort; None where the driver has no compute shaders or fails at them."""
+    if ctx.version_code < 430:
+        return None
+    try:
+        sorter = DepthSorter(ctx)
+    except moderngl.Error:
+        return None
+    if sorter.is_right():
+        return sorter
+    sorter.release()
+    return None
+
+
+def chosen_sorter(ctx: moderngl.Context, sort: Sort) -> DepthSorter | None:
+    """None where the CPU is to sort. "auto": a sorter that works, but none on a driver that runs on the CPU,
+    where NumPy is faster. BackendError for "device" where there is none."""
+    if sort == "cpu" or (sort == "auto" and is_software(ctx)):
+        return None
+    sorter = working_sorter(ctx)
+    if sorter is None and sort == "device":
+        raise BackendError("this driver cannot sort: older than OpenGL 4.3, or its compute shaders fail")
+    return sorter
+
+
+# A scene in the memory of an OpenGL 4.1 device: one texel per Gaussian, in layers of 2D textures.
+#
+# Textures, because OpenGL 4.1 (macOS) has no storage buffers, and moderngl no buffer textures. Invalid
+# rows (`Gaussians.valid`) are left out here; `rows` says which are kept.
 
 COLUMNS = 4096  # texels per row; 16384 rows, which every 4.1 device allows, then hold 67 million
 HALF_MAX = 65504.0
@@ -93,3 +341,88 @@ class SceneTextures:
         self.order.release()
         if self.sort is not None:
             self.sort.release()
+
+
+# In which order the Gaussians of a view are drawn: back to front, found on the CPU or on the device.
+
+
+def front_to_back(depths: Array) -> Array:
+    """(n,) float64 depths -> (n,) indices by ascending depth, ties by index.
+
+    NumPy's default sort is vectorised and about six times faster than its stable one, so equal depths
+    are put right afterwards: they are few, and already neighbours.
+    """
+    order = np.argsort(depths)
+    ascending = depths[order]
+    equal = ascending[1:] == ascending[:-1]
+    if equal.any():
+        tied = np.flatnonzero(np.concatenate([[False], equal]) | np.concatenate([equal, [False]]))
+        order[tied] = order[tied][np.lexsort((order[tied], ascending[tied]))]
+    return order
+
+
+class DrawOrder(Protocol):
+    """Of the Gaussians ahead of one camera."""
+
+    def write(self, scene: SceneTextures) -> None:
+        """Make `scene.order` this order."""
+
+    def rows(self, scene: SceneTextures) -> Array:
+        """(m,) int32 texels, back to front; this order must be the one written last."""
+
+    def draw(self, scene: SceneTextures, quads: moderngl.VertexArray) -> None:
+        """A quad for each of them; this order must be the one written last."""
+
+
+@dataclass(frozen=True, eq=False)
+class CpuOrder:
+    """Sorted by NumPy."""
+
+    texels: Array  # (m,) int32, back to front
+
+    def write(self, scene: SceneTextures) -> None:
+        scene.order.write(self.texels)
+
+    def rows(self, scene: SceneTextures) -> Array:
+        return self.texels
+
+    def draw(self, scene: SceneTextures, quads: moderngl.VertexArray) -> None:
+        if len(self.texels):
+            quads.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(self.texels))
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceOrder:
+    """Sorted on the device when it is written; not even their number comes back to draw them."""
+
+    sorter: DepthSorter
+    plane: Array  # (4,) see `DepthSorter.sort`
+    near: float
+    far: float
+
+    def write(self, scene: SceneTextures) -> None:
+        self.sorter.sort(_buffers(scene), self.plane, self.near, self.far)
+
+    def rows(self, scene: SceneTextures) -> Array:
+        return _buffers(scene).order()
+
+    def draw(self, scene: SceneTextures, quads: moderngl.VertexArray) -> None:
+        quads.render_indirect(_buffers(scene).command, moderngl.TRIANGLE_STRIP, 1)
+
+
+def _buffers(scene: SceneTextures) -> SortBuffers:
+    assert scene.sort is not None  # as in `draw_order`; a scene that is uploaded again gets the same
+    return scene.sort
+
+
+def draw_order(
+    scene: SceneTextures, camera: Camera, settings: RasterSettings, sorter: DepthSorter | None
+) -> DrawOrder:
+    """By camera z between the near and the far plane, ties by index; both ways give the same."""
+    near, far = settings.near, farthest(settings)
+    if sorter is not None and scene.sort is not None:
+        return DeviceOrder(sorter, camera.world_to_camera[2], near, far)
+    with lap("sort"):
+        depths = scene.depths(camera)
+        ahead = np.flatnonzero((depths > near) & (depths <= far))
+        return CpuOrder(ahead[front_to_back(depths[ahead])][::-1].astype(np.int32))

@@ -1,18 +1,283 @@
-"""Fitting a codec to the CLIP vectors of one scene."""
+"""What a codec costs in the only currency that counts: the relevancy of phrases."""
 
+import logging
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
+import torch
+from torch import nn
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import CodecConfig
+from langsplat_core.config import CodecConfig, check_settings
 from langsplat_core.progress import Progress, silent
-from langsplat_core.ranges import check_settings
-from langsplat_core.scene import AutoencoderCodec, CodebookCodec, Codec, LinearCodec
-from langsplat_core.training.language.autoencoder_fit import train_autoencoder
-from langsplat_core.training.language.codebook_fit import fit_codebook
-from langsplat_core.training.language.relevancy_error import Vocabulary
+from langsplat_core.scene import CANONICAL_PHRASES, AutoencoderCodec, CodebookCodec, Codec, LinearCodec
+from langsplat_core.scene.codec import principal_colours, stretched
+from langsplat_core.semantics.encoder import Encoder, PhraseEncoder
+from langsplat_core.semantics.relevancy import Scale, relevancy_of
+from langsplat_core.semantics.vocabulary import everyday_phrases, everyday_vectors
+from langsplat_core.training.language.mask_weights import nearest_centres, spherical_kmeans
+
+CHUNK = 4_096  # vectors judged at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Vocabulary:
+    """The phrases that errors are measured with, and against which relevancy is read."""
+
+    phrases: Array  # (Q, D) float32 unit text vectors
+    scale: Scale
+
+    def relevancy(self, vectors: Array) -> Array:
+        """(M, D) unit vectors -> (M, Q) in [0, 1]."""
+        zero, rate = self.scale.of(vectors @ self.scale.texts.T)
+        return relevancy_of(vectors @ self.phrases.T, zero[:, None], rate[:, None])
+
+
+@dataclass(frozen=True)
+class RelevancyError:
+    """Absolute differences to the relevancy of the unquantised vectors, over vectors and phrases."""
+
+    mean: float
+    p99: float
+
+
+def everyday_vocabulary(encoder: Encoder | PhraseEncoder, phrases: tuple[str, ...] = ()) -> Vocabulary:
+    """`phrases` and everyday ones, as `encoder` writes them."""
+    texts = list(dict.fromkeys([*phrases, *everyday_phrases(encoder.unknown_words)]))
+    canonical = encoder.encode_texts(list(CANONICAL_PHRASES))
+    scale = Scale(canonical, everyday_vectors(encoder), encoder.temperature)
+    return Vocabulary(encoder.encode_texts(texts) if texts else canonical, scale)
+
+
+def relevancy_error(made: Array, vectors: Array, vocabulary: Vocabulary) -> RelevancyError:
+    """Of (M, D) `made` in place of (M, D) `vectors`, both float32 unit vectors; 0 where M = 0."""
+    differences = [
+        np.abs(vocabulary.relevancy(made[i : i + CHUNK]) - vocabulary.relevancy(vectors[i : i + CHUNK]))
+        for i in range(0, len(vectors), CHUNK)
+    ]
+    if not differences:
+        return RelevancyError(0.0, 0.0)
+    errors = np.concatenate([part.astype(np.float32).ravel() for part in differences])
+    return RelevancyError(float(errors.mean(dtype=np.float64)), float(np.quantile(errors, 0.99)))
+
+
+@dataclass(frozen=True)
+class CodecReport:
+    """What a codec loses of vectors that it was not fitted to."""
+
+    cosine: float  # mean, of a vector with what the codec makes of it
+    error_mean: float  # of relevancy, see `RelevancyError`
+    error_p99: float
+
+
+def codec_report(codec: Codec, vectors: Array, vocabulary: Vocabulary) -> CodecReport:
+    """Of (M, D) float32 unit vectors."""
+    made = codec.decode(codec.encode(vectors))
+    error = relevancy_error(made, vectors, vocabulary)
+    cosine = float((made * vectors).sum(1).mean()) if len(vectors) else 1.0
+    return CodecReport(cosine, error.mean, error.p99)
+
+
+# The paper's codec: an autoencoder of one scene's CLIP vectors.
+#
+# LangSplat section 3.2, with the layer widths of its public code (512-256-128-64-32-d with
+# batch normalisation and ReLU, latent normalised to length 1; decoder d-16-32-64-128-256-256-512 with
+# ReLU) and the paper's loss, L1 plus cosine distance.
+
+ENCODER_WIDTHS = (256, 128, 64, 32)
+DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
+
+
+def train_autoencoder(
+    vectors: Array,
+    latent_dim: int = 3,
+    steps: int = CodecConfig.steps,
+    batch: int = CodecConfig.batch,
+    lr: float = CodecConfig.lr,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> AutoencoderCodec:
+    """The autoencoder of (M, D) unit vectors: Adam with a cosine schedule on random batches; progress shows
+    the batch's mean cosine. Deterministic for a given seed on one machine."""
+    # Layers this small are slower on several threads than on one, and many times slower on a busy machine.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return _train(vectors, latent_dim, (steps, batch, lr, seed), progress)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _train(
+    vectors: Array, latent_dim: int, settings: tuple[int, int, float, int], progress: Progress
+) -> AutoencoderCodec:
+    steps, size, lr, seed = settings
+    torch.manual_seed(seed)
+    data = torch.from_numpy(np.ascontiguousarray(vectors, np.float32))
+    encoder, decoder = networks(data.shape[1], latent_dim)
+    parameters = [*encoder.parameters(), *decoder.parameters()]
+    optimiser = torch.optim.Adam(parameters, lr=lr, fused=True)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    generator = torch.Generator().manual_seed(seed)
+    for step in range(steps):
+        batch = data[torch.randint(len(data), (size,), generator=generator)]
+        latent = nn.functional.normalize(encoder(batch), dim=1, eps=1e-6)
+        output = nn.functional.normalize(decoder(latent), dim=1, eps=1e-6)
+        cosine = (output * batch).sum(1).mean()
+        loss = nn.functional.l1_loss(output, batch) + (1 - cosine)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+        if step % 50 == 0 or step + 1 == steps:
+            progress(f"codec: cosine {cosine.item():.3f}", (step + 1) / steps)
+    _settle_statistics(encoder, data)
+    return AutoencoderCodec(folded_layers(encoder), folded_layers(decoder))
+
+
+def networks(dim: int, latent_dim: int) -> tuple[nn.Sequential, nn.Sequential]:
+    encoder: list[nn.Module] = []
+    width = dim
+    for size in ENCODER_WIDTHS:
+        encoder += [nn.Linear(width, size), nn.BatchNorm1d(size), nn.ReLU()]
+        width = size
+    encoder.append(nn.Linear(width, latent_dim))
+    decoder: list[nn.Module] = []
+    width = latent_dim
+    for size in DECODER_WIDTHS:
+        decoder += [nn.Linear(width, size), nn.ReLU()]
+        width = size
+    decoder.append(nn.Linear(width, dim))
+    return nn.Sequential(*encoder), nn.Sequential(*decoder)
+
+
+def _settle_statistics(encoder: nn.Sequential, data: torch.Tensor) -> None:
+    """Recompute batch statistics over the data with final weights: running averages lag behind them,
+    and with few vectors that lag is most of the reconstruction error."""
+    for module in encoder:
+        if isinstance(module, nn.BatchNorm1d):
+            module.reset_running_stats()
+            module.momentum = None  # cumulative average
+    encoder.train()
+    with torch.no_grad():
+        for chunk in data.split(max(2, 8192)):
+            if len(chunk) > 1:
+                encoder(chunk)
+    encoder.eval()
+
+
+def folded_layers(network: nn.Sequential) -> tuple[tuple[Array, Array], ...]:
+    """Weights as (out, in), bias pairs, with each batch normalisation folded into the layer before it."""
+    layers: list[tuple[Array, Array]] = []
+    for module in network:
+        if isinstance(module, nn.Linear):
+            weight, bias = module.weight.detach().double(), module.bias.detach().double()
+            layers.append((weight.numpy(), bias.numpy()))
+        elif isinstance(module, nn.BatchNorm1d):
+            assert module.running_mean is not None
+            assert module.running_var is not None
+            scale = (module.weight / torch.sqrt(module.running_var + module.eps)).detach().double().numpy()
+            shift = module.bias.detach().double().numpy() - module.running_mean.double().numpy() * scale
+            last_weight, last_bias = layers[-1]
+            layers[-1] = (last_weight * scale[:, None], last_bias * scale + shift)
+    return tuple((w.astype(np.float32), b.astype(np.float32)) for w, b in layers)
+
+
+# A scene's own codebook: as many codewords as its meanings need, and not more.
+
+log = logging.getLogger("langsplat")
+
+SMALLEST = 64  # codewords that are tried first
+LARGEST_SHARE = 4  # vectors per codeword, at least: with fewer, a codebook is a copy
+JUDGED = 5  # every so many vectors, one is kept from the fit and judges it
+FIRST_ROUNDS, FURTHER_ROUNDS = 8, 4
+REFINEMENTS = 2  # halvings of the interval that holds the smallest codebook, by ratio
+COLOUR_STEPS, COLOUR_BATCH = 300, 64  # of the autoencoder of 3 numbers whose latents are the colours
+FEWEST_FOR_COLOURS = 16  # codewords; fewer have their principal axes for colours
+
+
+def fit_codebook(
+    vectors: Array, config: CodecConfig, vocabulary: Vocabulary, progress: Progress = silent
+) -> CodebookCodec:
+    """The codebook of (M, D) float32 unit vectors: of `config.size` codewords, or, where that is 0, the
+    smallest that keeps the mean relevancy error on vectors it was not fitted to within
+    `config.max_relevancy_error`. Codewords are float16 numbers, so that a file can hold them as such."""
+    order = np.random.default_rng(config.seed).permutation(len(vectors))
+    judged = vectors[order[::JUDGED]] if len(vectors) > 4 * JUDGED else vectors
+    fitted = vectors[np.delete(order, np.s_[::JUDGED])] if len(vectors) > 4 * JUDGED else vectors
+    generator = np.random.default_rng(config.seed)
+
+    def grow(size: int, start: Array | None) -> Array:
+        progress(f"codebook: {size} codewords", 0.1 + 0.6 * min(size / 2_048, 1))
+        rounds = FIRST_ROUNDS if start is None else FURTHER_ROUNDS
+        return rounded(spherical_kmeans(fitted, size, rounds, start, generator))
+
+    if config.size:
+        codewords = grow(config.size, None)
+    else:
+        codewords = _smallest(grow, judged, len(fitted), config.max_relevancy_error, vocabulary)
+    progress("colours of the codewords", 0.8)
+    nearest, _ = nearest_centres(fitted, codewords)
+    usage = np.bincount(nearest, minlength=len(codewords)).astype(np.float64)
+    return CodebookCodec(codewords, rounded(codeword_colours(codewords, usage, config)))
+
+
+def _smallest(
+    grow: Callable[[int, Array | None], Array],
+    judged: Array,
+    available: int,
+    budget: float,
+    vocabulary: Vocabulary,
+) -> Array:
+    """Doubled until good enough, then halved between the last two sizes."""
+    most = max(min(available // LARGEST_SHARE, 65_535), 1)
+    size, smaller, codewords = min(SMALLEST, most), None, np.zeros((0, 0), np.float32)
+    while True:
+        codewords = grow(size, smaller)
+        error = codebook_error(codewords, judged, vocabulary)
+        if error.mean <= budget or size == most or len(codewords) < size:
+            break
+        smaller, size = codewords, min(2 * size, most)
+    if error.mean > budget and size == most:
+        log.warning(
+            "codebook: %d codewords still have a mean relevancy error of %.4f", len(codewords), error.mean
+        )
+    if smaller is None or error.mean > budget:
+        return codewords
+    low, high = len(smaller), len(codewords)
+    for _ in range(REFINEMENTS):
+        middle = round((low * high) ** 0.5)
+        tried = grow(middle, smaller)
+        if codebook_error(tried, judged, vocabulary).mean <= budget:
+            codewords, high = tried, middle
+        else:
+            smaller, low = tried, middle
+    return codewords
+
+
+def codebook_error(codewords: Array, vectors: Array, vocabulary: Vocabulary) -> RelevancyError:
+    """Of every vector's nearest codeword in its place."""
+    nearest, _ = nearest_centres(vectors, codewords)
+    return relevancy_error(codewords[nearest], vectors, vocabulary)
+
+
+def codeword_colours(codewords: Array, usage: Array, config: CodecConfig) -> Array:
+    """(K, 3) float32 in [0, 1]: latents of the paper's autoencoder of 3 numbers, fitted to the (K, D)
+    codewords, each axis stretched over what (K,) usage says occurs."""
+    if len(codewords) < FEWEST_FOR_COLOURS:
+        return principal_colours(codewords, usage)
+    codec = train_autoencoder(codewords, 3, COLOUR_STEPS, COLOUR_BATCH, config.lr, config.seed)
+    return stretched(codec.encode(codewords), usage)
+
+
+def rounded(numbers: Array) -> Array:
+    """float32 numbers, each moved to the nearest float16 one."""
+    return numbers.astype(np.float16).astype(np.float32)
+
+
+# Fitting a codec to the CLIP vectors of one scene.
 
 
 def fit_codec(

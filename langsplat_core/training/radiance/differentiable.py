@@ -6,14 +6,16 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster.cpu.colour import colours, colours_backward
+from langsplat_core.errors import BackendError
+from langsplat_core.raster import gsplat
+from langsplat_core.raster.cpu.projection import colours, colours_backward
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer, CpuView
 from langsplat_core.scene import Camera, Gaussians
 
@@ -119,3 +121,47 @@ class CpuRenderer:
             probe,
         )
         return Rendered(image, alpha, visible[0], probe)
+
+
+# The `DifferentiableRenderer` on CUDA: gsplat's rasterizer and its gradients.
+
+
+class CudaRenderer:
+    """Draws with gsplat; how it differs from the CPU kernels says `raster.gsplat`."""
+
+    def __init__(self, settings: RasterSettings = INRIA) -> None:
+        self.device = torch.device(gsplat.DEVICE)
+        self._settings = settings
+        try:
+            gsplat.require_device()
+        except BackendError as error:
+            raise BackendError(f"backend cuda: {error}; use --backend cpu") from error
+
+    def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> Rendered:
+        """See `DifferentiableRenderer.render`."""
+        names = ("means", "log_scales", "quats_wxyz", "opacity_logits")
+        gaussians = gsplat.DeviceGaussians(**{name: parameters[name] for name in names})
+        colours = sh_coefficients(parameters, sh_degree)
+        drawn = gsplat.draw(gaussians, colours, camera, self._settings, sh_degree)
+        return Rendered(drawn.image, drawn.alpha, drawn.visible, drawn.means_px)
+
+
+# Which renderer a training draws with.
+
+Backend = Literal["auto", "cpu", "cuda"]
+
+
+def renderer_for(backend: Backend) -> DifferentiableRenderer:
+    """The renderer a user asked for; `auto` takes CUDA where gsplat really draws there, else the CPU.
+
+    Raises BackendError when `cuda` is asked for and cannot work.
+    """
+    if backend == "cpu" or (backend == "auto" and not torch.cuda.is_available()):
+        return CpuRenderer()
+
+    try:
+        return CudaRenderer()
+    except BackendError:
+        if backend == "cuda":
+            raise
+        return CpuRenderer()

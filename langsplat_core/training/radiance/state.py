@@ -1,17 +1,103 @@
-"""What radiance training changes from step to step: parameters, Adam's moments, statistics.
+"""Gaussians to begin with: one per structure-from-motion point (Kerbl et al. 2023, section 5.1)."""
 
-All of it has one row per Gaussian, so that adding and removing Gaussians is one operation (`rearrange`)
-that cannot leave the optimiser behind the parameters.
-"""
-
-from dataclasses import dataclass, field
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.optim.adam import adam
 
-from langsplat_core.scene import Gaussians
+from langsplat_core.arrays import Array, logit
+from langsplat_core.config import RadianceConfig
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.known_poses import TELLING_POINTS, inside, random_points
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.io.files import atomic_path
+from langsplat_core.raster.reference import C0
+from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
+
+INITIAL_OPACITY = 0.1
+NEIGHBOURS = 3
+SMALLEST_DISTANCE = 1e-7**0.5  # world units; INRIA bounds the squared distance by 1e-7
+ISOLATED = 10.0  # a point is an outlier when its neighbours are this many times the median distance away
+# Fewer points are topped up to this number: features are found where there is detail, and what lies between
+# is covered from random ones better than by splitting what is elsewhere (docs/photographs.md) ...
+FEWEST_POINTS = 3_000
+RANDOM_POINTS = 10_000  # ... or to this one, when they are too few to show where the scene is
+
+
+def initial_gaussians(
+    capture: Capture, train_indices: Sequence[int], sh_degree: int, max_gaussians: int, seed: int
+) -> Gaussians:
+    """Isotropic Gaussians at the capture's points, as large as the mean distance to three neighbours.
+
+    Points that no training camera sees, repeated points and isolated outliers are left out. Too few
+    points are topped up with random ones from the volume that the training cameras see.
+    """
+    rng = np.random.default_rng(seed)
+    cameras = [capture.cameras[i] for i in train_indices]
+    points, rgb = _usable_points(capture.points, capture.colours / 255.0, cameras)
+    if len(points) > max_gaussians:
+        chosen = np.sort(rng.choice(len(points), max_gaussians, replace=False))
+        points, rgb = points[chosen], rgb[chosen]
+    wanted = FEWEST_POINTS if len(points) >= TELLING_POINTS else RANDOM_POINTS
+    missing = min(wanted, max_gaussians) - len(points)
+    if missing > 0:
+        images = [capture.images[i] for i in train_indices]
+        more, colours = random_points(missing, points, cameras, images, rng)
+        points, rgb = np.concatenate([points, more]), np.concatenate([rgb, colours / 255.0])
+
+    count = len(points)
+    sh = np.zeros((count, SH_COUNTS[sh_degree], 3), np.float32)
+    sh[:, 0] = (rgb - 0.5) / C0
+    return Gaussians(
+        means=points,
+        log_scales=np.repeat(np.log(_neighbour_distance(points))[:, None], 3, axis=1),
+        quats_wxyz=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        opacity_logits=np.full(count, logit(np.array(INITIAL_OPACITY))),
+        sh=sh,
+    )
+
+
+def _usable_points(points: Array, rgb: Array, cameras: Sequence[Camera]) -> tuple[Array, Array]:
+    """The points (and colours) worth starting from; see `initial_gaussians`."""
+    keep = np.isfinite(points).all(1)
+    points, rgb = points[keep], rgb[keep]
+    _, first = np.unique(points, axis=0, return_index=True)
+    first.sort()
+    points, rgb = points[first], rgb[first]
+    seen = np.zeros(len(points), bool)
+    for camera in cameras:
+        seen |= inside(camera, points)
+    points, rgb = points[seen], rgb[seen]
+    if len(points) > NEIGHBOURS:
+        distance = _neighbour_distance(points)
+        keep = distance <= ISOLATED * np.median(distance)
+        points, rgb = points[keep], rgb[keep]
+    return points, rgb
+
+
+def _neighbour_distance(points: Array) -> Array:
+    """(N,) root mean square distance to the three nearest other points, world units, > 0."""
+    if len(points) < 2:
+        return np.ones(len(points))
+    neighbours = min(NEIGHBOURS, len(points) - 1)
+    distances, _ = cKDTree(points).query(points, k=neighbours + 1)
+    return np.maximum(np.sqrt((distances[:, 1:] ** 2).mean(1)), SMALLEST_DISTANCE)
+
+
+# What radiance training changes from step to step: parameters, Adam's moments, statistics.
+#
+# All of it has one row per Gaussian, so that adding and removing Gaussians is one operation (`rearrange`)
+# that cannot leave the optimiser behind the parameters.
 
 PARAMETERS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh_dc", "sh_rest")
 ADAM_BETAS = (0.9, 0.999)
@@ -130,3 +216,194 @@ def adam_step(state: TrainingState, learning_rates: dict[str, float]) -> None:
             )
         state.updates[name] += 1
         value.grad = None
+
+
+# Checkpoints of radiance training: one safetensors file, written atomically, resumed exactly.
+#
+# Tensors: ``values.*``, ``first.*``, ``second.*`` for every parameter, ``grad_sum`` and ``seen``; everything
+# else is JSON in the header. No pickle is involved, so a checkpoint from elsewhere cannot run code.
+
+KIND = "langsplat-radiance-checkpoint-1"
+
+
+def fingerprint(capture: Capture, config: RadianceConfig, train_indices: Sequence[int]) -> str:
+    """A digest of everything that decides the result of a training, photographs included.
+
+    The backend and how often checkpoints are written are left out: a run may go on elsewhere.
+    """
+    settings = asdict(config)
+    settings.pop("checkpoint_every")
+    settings.pop("backend")
+    every = [camera.world_to_camera.tolist() for camera in capture.cameras]  # their spread sets the rates
+    facts = [settings, every, capture.digest(train_indices)]
+    return hashlib.blake2b(json.dumps(facts, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+def save_checkpoint(path: Path, state: TrainingState, made_from: str) -> None:
+    """Write `state`; `made_from` is the run's `fingerprint`."""
+    tensors = {"grad_sum": state.grad_sum, "seen": state.seen}
+    for name in PARAMETERS:
+        tensors[f"values.{name}"] = state.values[name].detach()
+        tensors[f"first.{name}"] = state.first[name]
+        tensors[f"second.{name}"] = state.second[name]
+    header = {
+        "fingerprint": made_from,
+        "step": state.step,
+        "updates": state.updates,
+        "queue": state.queue,
+        "non_finite": state.non_finite,
+        "rng": state.rng.bit_generator.state,
+    }
+    with atomic_path(path) as temporary:
+        save_file(
+            {name: tensor.contiguous().cpu() for name, tensor in tensors.items()},
+            temporary,
+            metadata={"kind": KIND, "state": json.dumps(header)},
+        )
+
+
+def load_checkpoint(path: Path, made_from: str, device: torch.device) -> TrainingState:
+    """Read what `save_checkpoint` wrote.
+
+    Raises FormatError for a file that is no checkpoint and InputError for one of another run.
+    """
+    tensors: dict[str, torch.Tensor] = {}
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name).to(device) for name in file.keys()}  # noqa: SIM118
+        if metadata.get("kind") != KIND:
+            raise ValueError(f"kind {metadata.get('kind')!r}")
+        header = json.loads(metadata["state"])
+        if header["fingerprint"] != made_from:
+            raise InputError(
+                f"{path}: this checkpoint belongs to other photographs or settings; "
+                "delete it to train afresh, or give the arguments it was made with"
+            )
+        return _rebuild(tensors, header)
+    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+        problem = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise FormatError(f"{path}: not a usable checkpoint ({problem}); delete it to train afresh") from None
+
+
+def _rebuild(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> TrainingState:
+    rng = np.random.default_rng()
+    rng.bit_generator.state = header["rng"]
+    return TrainingState(
+        values={name: tensors[f"values.{name}"].requires_grad_() for name in PARAMETERS},
+        first={name: tensors[f"first.{name}"] for name in PARAMETERS},
+        second={name: tensors[f"second.{name}"] for name in PARAMETERS},
+        updates={name: int(header["updates"][name]) for name in PARAMETERS},
+        grad_sum=tensors["grad_sum"],
+        seen=tensors["seen"],
+        rng=rng,
+        step=int(header["step"]),
+        queue=[int(index) for index in header["queue"]],
+        non_finite=int(header["non_finite"]),
+    )
+
+
+# Adaptive density control: where Gaussians are added and removed (Kerbl et al. 2023, section 5.2).
+#
+# The statistic is INRIA's: the norm of the loss gradient by the projected mean, in normalised device
+# coordinates (the gradient per pixel times half the picture's width and height), averaged over the steps
+# in which the Gaussian was visible.
+
+SPLIT_SHRINK = 1.6  # children of a split are smaller by this factor
+SPLIT_CHILDREN = 2
+RESET_OPACITY = 0.01
+LARGE_SCALE = 0.1  # of the extent: Gaussians above are removed once the schedule says so
+FEWEST_GAUSSIANS = 64  # pruning never leaves fewer; the most opaque ones stay
+
+
+@dataclass(frozen=True)
+class DensifyReport:
+    """What one round did, in Gaussians."""
+
+    cloned: int
+    split: int  # parents, each replaced by two children
+    pruned: int
+
+
+def accumulate(state: TrainingState, means_px_grad: Tensor, visible: Tensor, size: tuple[int, int]) -> None:
+    """Add one step to the statistic.
+
+    `means_px_grad` (N, 2) is the loss gradient per pixel of mean position, `visible` (N,) bool, `size`
+    the rendered (width, height).
+    """
+    to_ndc = means_px_grad.new_tensor([0.5 * size[0], 0.5 * size[1]])
+    x, y = (torch.nan_to_num(means_px_grad, 0.0, 0.0, 0.0) * to_ndc).unbind(1)
+    state.grad_sum += torch.hypot(x, y) * visible
+    state.seen += visible
+
+
+def densify(state: TrainingState, config: RadianceConfig, extent: float, prune_large: bool) -> DensifyReport:
+    """One round: clone small and split large Gaussians with large gradients, remove faint ones.
+
+    `extent` is the cameras' extent in world units. When the cap of `config.max_gaussians` is near, the
+    largest gradients go first.
+    """
+    values = {name: value.detach() for name, value in state.values.items()}
+    largest_scale = values["log_scales"].amax(1).exp()
+    too_large = largest_scale > LARGE_SCALE * extent if prune_large else torch.zeros_like(largest_scale) > 0
+    remove = torch.sigmoid(values["opacity_logits"]) < config.prune_opacity
+    gradient = torch.where(remove, -1.0, state.grad_sum / state.seen.clamp(min=1))
+    room = config.max_gaussians - int((~remove).sum())
+    grows = _above(gradient, config.densify_grad, room)
+    splits = grows & (largest_scale > config.percent_dense * extent)
+    clones = grows & ~splits
+
+    children = _children(values, splits, state)
+    if prune_large:
+        small_enough = children["log_scales"].amax(1).exp() <= LARGE_SCALE * extent
+        children = {name: child[small_enough] for name, child in children.items()}
+    added = {name: torch.cat([values[name][clones & ~too_large], children[name]]) for name in PARAMETERS}
+    remove |= too_large & ~splits
+    keep = _keep_some(~(remove | splits), values["opacity_logits"], len(added["means"]))
+    report = DensifyReport(int(clones.sum()), int(splits.sum()), int(remove.sum()))
+    rearrange(state, keep.nonzero()[:, 0], added)
+    return report
+
+
+def reset_opacities(state: TrainingState) -> None:
+    """Cap every opacity at 0.01 and forget its moments, so that floaters can be told from surfaces."""
+    value = state.values["opacity_logits"].detach()
+    cap = torch.logit(value.new_tensor(RESET_OPACITY))
+    state.values["opacity_logits"] = torch.minimum(value, cap).requires_grad_()
+    state.first["opacity_logits"].zero_()
+    state.second["opacity_logits"].zero_()
+
+
+def _above(gradient: Tensor, threshold: float, room: int) -> Tensor:
+    """(N,) True for the at most `room` rows with the largest gradient >= threshold."""
+    chosen = gradient >= threshold
+    if int(chosen.sum()) <= room:
+        return chosen
+    order = torch.argsort(gradient, descending=True, stable=True)[: max(room, 0)]
+    return torch.zeros_like(chosen).index_fill_(0, order, True)
+
+
+def _children(values: dict[str, Tensor], splits: Tensor, state: TrainingState) -> dict[str, Tensor]:
+    """Two children per split Gaussian: means drawn from the parent itself, scales divided by 1.6."""
+    parents = {name: value[splits].repeat_interleave(SPLIT_CHILDREN, dim=0) for name, value in values.items()}
+    draws = state.rng.standard_normal((len(parents["means"]), 3), dtype="float32")
+    offsets = torch.from_numpy(draws).to(state.device) * parents["log_scales"].exp()
+    parents["means"] = parents["means"] + _rotate(parents["quats_wxyz"], offsets)
+    parents["log_scales"] = parents["log_scales"] - torch.log(offsets.new_tensor(SPLIT_SHRINK))
+    return parents
+
+
+def _rotate(quats_wxyz: Tensor, vectors: Tensor) -> Tensor:
+    """(N, 4) quaternions of any length turn (N, 3) vectors: v + 2 w (q x v) + 2 q x (q x v)."""
+    unit = torch.nn.functional.normalize(quats_wxyz, dim=1)
+    w, q = unit[:, :1], unit[:, 1:]
+    cross = torch.linalg.cross(q, vectors)
+    return vectors + 2 * (w * cross + torch.linalg.cross(q, cross))
+
+
+def _keep_some(keep: Tensor, opacity_logits: Tensor, added: int) -> Tensor:
+    """`keep`, widened to the most opaque rows when hardly any Gaussian would be left."""
+    if int(keep.sum()) + added >= FEWEST_GAUSSIANS:
+        return keep
+    best = torch.argsort(opacity_logits, descending=True, stable=True)[:FEWEST_GAUSSIANS]
+    return keep.clone().index_fill_(0, best, True)

@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 
 from gpu_sections import PLANS, Missing
-from langsplat_core.files import atomic_path
+from langsplat_core.io.files import atomic_path
 
 ABSENT = 3
 

@@ -13,8 +13,7 @@ from gpu_sections import Plan, forget_peak, need_cuda, peak_mib, table, wait
 from langsplat_core.arrays import Array
 from langsplat_core.raster import gsplat
 from langsplat_core.semantics.encoders import load_encoder
-from langsplat_core.semantics.sam import grid_points
-from langsplat_core.semantics.segmenters import load_segmenter
+from langsplat_core.semantics.sam import grid_points, load_segmenter
 from tests.support.full_size import MODELS, PHOTOGRAPH
 
 REPEATS = 5  # of a batch of crops: 320, about as many regions as a photograph has

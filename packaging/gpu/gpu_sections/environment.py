@@ -53,7 +53,7 @@ def machine() -> dict[str, object]:
 
 def renderer() -> str:
     """Of the driver that EGL finds."""
-    from langsplat_core.raster.opengl.context import create_egl_context
+    from langsplat_core.raster.opengl.scene_textures import create_egl_context
 
     try:
         context = create_egl_context()

@@ -9,7 +9,7 @@ from gpu_sections import Plan, need_cuda, table
 from gpu_sections.pictures import bundled_scene, masked_views
 from langsplat_core.config import INRIA
 from langsplat_core.raster import gsplat, load_lifting_rasterizer
-from langsplat_core.training.language.memberships import find_memberships
+from langsplat_core.training.language.mask_weights import find_memberships
 
 
 def measure(plan: Plan) -> Iterator[str]:

@@ -7,9 +7,7 @@ import pytest
 from PIL import Image
 
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.evaluation.protocols.labels import without_suffix
-from langsplat_core.evaluation.protocols.lerf_ovs import read_lerf_ovs
-from langsplat_core.evaluation.protocols.ovs3d import read_3d_ovs
+from langsplat_core.evaluation.labels import read_3d_ovs, read_lerf_ovs, without_suffix
 from tests.support.label_files import SIZE, block, lerf_frame, ovs_view, rectangle
 
 

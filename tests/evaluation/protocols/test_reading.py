@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
-from langsplat_core.evaluation.protocols.profiles import (
+from langsplat_core.evaluation.profiles import (
     LERF_PROFILES,
     OVS_PROFILES,
     MapRule,
     SilhouetteRule,
-)
-from langsplat_core.evaluation.protocols.reading import (
     mean_filtered,
     peak_pixels,
     read_maps,

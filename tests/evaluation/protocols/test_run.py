@@ -9,13 +9,12 @@ import pytest
 from PIL import Image
 
 from langsplat_core.errors import InputError
-from langsplat_core.evaluation.protocols.lerf_ovs import read_lerf_ovs
-from langsplat_core.evaluation.protocols.ovs3d import read_3d_ovs
-from langsplat_core.evaluation.protocols.profiles import LERF_PROFILES, OVS_PROFILES
-from langsplat_core.evaluation.protocols.report import save_json, summary, table
-from langsplat_core.evaluation.protocols.run import Subject, run_benchmark
-from langsplat_core.evaluation.protocols.scoring import inside_any_box, scored_size
-from langsplat_core.formats import save_scene
+from langsplat_core.evaluation.labels import read_3d_ovs, read_lerf_ovs
+from langsplat_core.evaluation.profiles import LERF_PROFILES, OVS_PROFILES
+from langsplat_core.evaluation.report import save_json, summary, table
+from langsplat_core.evaluation.run import Subject, run_benchmark
+from langsplat_core.evaluation.scoring import inside_any_box, scored_size
+from langsplat_core.io import save_scene
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Scene
 from tests.support.fakes import PER_BLOB, WORDS, FakeEncoder, blob_scene, cameras

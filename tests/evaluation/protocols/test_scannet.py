@@ -8,16 +8,18 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.evaluation.protocols.run import Subject
-from langsplat_core.evaluation.protocols.scannet import (
+from langsplat_core.evaluation.run import Subject
+from langsplat_core.evaluation.scannet import (
     NYU40,
     PointProfile,
+    point_table,
     read_points,
     read_scannet,
+    run_scannet,
+    save_point_json,
     scene_classes,
 )
-from langsplat_core.evaluation.protocols.scannet_run import point_table, run_scannet, save_point_json
-from langsplat_core.formats import save_scene
+from langsplat_core.io import save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
 from tests.support.fakes import CENTRES, axis, blobs, language

@@ -10,8 +10,8 @@ import torch
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.formats import write_ply
-from langsplat_core.formats.checkpoints import ForeignScene, read_foreign
+from langsplat_core.io import write_ply
+from langsplat_core.io.foreign import ForeignScene, read_foreign
 from langsplat_core.scene import Gaussians
 from tests.support.foreign_files import (
     autoencoder,

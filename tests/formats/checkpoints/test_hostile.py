@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from langsplat_core.formats.checkpoints.unpickling import load_torch, plain_array
+from langsplat_core.io.unpickling import load_torch, plain_array
 from tests.support.foreign_files import geometry, training_state
 from tests.support.mutants import mutant
 from tests.support.scenes import random_gaussians

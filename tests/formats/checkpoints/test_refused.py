@@ -10,7 +10,7 @@ import torch
 
 from langsplat_core.arrays import unit
 from langsplat_core.errors import InputError
-from langsplat_core.formats.checkpoints import read_foreign
+from langsplat_core.io.foreign import read_foreign
 from langsplat_core.scene import Gaussians
 from tests.support.foreign_files import (
     autoencoder,

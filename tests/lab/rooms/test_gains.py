@@ -8,7 +8,7 @@ from langsplat_core.lab.rooms.gains import GAINS, Material, same_things
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import LEVELS, look_at
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.memberships import PAIR, Memberships, find_memberships
+from langsplat_core.training.language.mask_weights import PAIR, Memberships, find_memberships
 from tests.support.fakes import PER_BLOB, blobs
 
 D = 16

@@ -9,9 +9,8 @@ from assets.making.truth import Truth, read_truth
 from assets.making.world import World, build_room
 from langsplat_core.lab.rooms.phrase_cases import CONSTRUCTIONS, Case, cases, things_in
 from langsplat_core.lab.rooms.phrases import PhraseScore, phrase_table
-from langsplat_core.query.grammar import parse
-from langsplat_core.query.phrase_tree import Atom
-from langsplat_core.query.standing import upright, viewer
+from langsplat_core.query.compose import upright, viewer
+from langsplat_core.query.grammar import Atom, parse
 from langsplat_core.scene import look_at
 
 UP = np.array([0.0, 0.0, 1.0])

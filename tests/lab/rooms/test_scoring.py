@@ -17,9 +17,9 @@ from langsplat_core.lab.rooms.scoring import (
     found_rate,
     relevancy_maps,
 )
-from langsplat_core.query.cut import CUT_RULES, cut_level
+from langsplat_core.query.answers import CUT_RULES, cut_level
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.pixels import decoded_relevancy, splatted_relevancy
+from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import CANONICAL_PHRASES, LanguageField, Scene
 from langsplat_core.semantics.relevancy import latent_relevancy

@@ -14,7 +14,7 @@ from langsplat_core.lab.rooms.word_bench import (
     score_inventory,
     word_table,
 )
-from langsplat_core.query.inventory import Entry, Spot
+from langsplat_core.query.describe import Entry, Spot
 
 TRUTH = {
     0: Region("whole", "mug", "mug", words=("mug", "cup", "red mug")),

@@ -11,8 +11,8 @@ import pytest
 
 from langsplat_core.config import GSPLAT, INRIA
 from langsplat_core.errors import BackendError, InputError
-from langsplat_core.raster import BACKENDS, load_rasterizer, spherical_harmonics
-from langsplat_core.raster.cpu.colour import colours, colours_backward
+from langsplat_core.raster import BACKENDS, load_rasterizer, reference
+from langsplat_core.raster.cpu.projection import colours, colours_backward
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.cpu.tiles import depth_order
 from langsplat_core.raster.reference import ReferenceRasterizer
@@ -183,14 +183,14 @@ def test_colours_and_their_gradient(degree):
     gaussians, eye = random_gaussians(200, 22, degree), np.array([0.3, -2.0, 0.5])
     gaussians = replace(gaussians, sh=2 * gaussians.sh)
     sh, means = gaussians.sh.astype(np.float64), gaussians.means.astype(np.float64)
-    want = spherical_harmonics.colours(sh, means, eye)
+    want = reference.colours(sh, means, eye)
     np.testing.assert_allclose(colours(gaussians.sh, gaussians.means, eye), want, atol=1e-6)
     assert (want == 0).any()  # some are clamped
     grad = np.random.default_rng(0).normal(size=want.shape).astype(np.float32)
     sh_grad, means_grad = colours_backward(gaussians.sh, gaussians.means, eye, grad)
 
     def loss(sh, means):
-        return (spherical_harmonics.colours(sh, means, eye) * grad).sum(1)
+        return (reference.colours(sh, means, eye) * grad).sum(1)
 
     step = 1e-6
     for axis in np.eye(3) * step:
@@ -209,7 +209,7 @@ def test_colours_of_invalid_and_coincident_rows():
     sh, means = gaussians.sh.copy(), gaussians.means.copy()
     sh[0, 1, 1], means[1] = np.nan, 0
     got = colours(sh, means, np.zeros(3))
-    np.testing.assert_allclose(got, spherical_harmonics.colours(sh, means, np.zeros(3)), atol=1e-6)
+    np.testing.assert_allclose(got, reference.colours(sh, means, np.zeros(3)), atol=1e-6)
     sh_grad, means_grad = colours_backward(sh, means, np.zeros(3), np.ones((3, 3)))
     assert np.isfinite(sh_grad).all()
     assert np.isfinite(means_grad).all()

@@ -12,15 +12,21 @@ import pytest
 from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA
 from langsplat_core.errors import BackendError
-from langsplat_core.raster.opengl import depth_sort
-from langsplat_core.raster.opengl.depth_sort import DepthSorter, SortBuffers, chosen_sorter, working_sorter
-from langsplat_core.raster.opengl.draw_order import CpuOrder, DeviceOrder
+from langsplat_core.raster.opengl import scene_textures
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
+from langsplat_core.raster.opengl.scene_textures import (
+    CpuOrder,
+    DepthSorter,
+    DeviceOrder,
+    SortBuffers,
+    chosen_sorter,
+    working_sorter,
+)
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
 FORWARD = np.array([0.0, 0.0, 1.0, 0.0])
 RNG = np.random.default_rng(0)
-TILE = depth_sort.GROUP * depth_sort.ROUNDS
+TILE = scene_textures.GROUP * scene_textures.ROUNDS
 BIG, TINY = 3.4e38, 1e-45  # near the ends of float32; the latter is denormal
 
 
@@ -174,7 +180,7 @@ def test_a_driver_that_cannot_compile_it_is_not_used(gl, monkeypatch):
 
 @pytest.mark.parametrize("software", [True, False])
 def test_a_software_driver_leaves_it_to_numpy(gl, monkeypatch, software):
-    monkeypatch.setattr(depth_sort, "is_software", lambda _: software)
+    monkeypatch.setattr(scene_textures, "is_software", lambda _: software)
     found = chosen_sorter(gl, "auto")
     assert (found is None) == software
     if found is not None:
@@ -190,8 +196,8 @@ def test_scenes_beyond_the_drivers_buffers_are_sorted_by_numpy(gl, both, monkeyp
 
 
 OLDER = """
-from langsplat_core.raster.opengl.context import create_egl_context
-from langsplat_core.raster.opengl.depth_sort import working_sorter
+from langsplat_core.raster.opengl.scene_textures import create_egl_context
+from langsplat_core.raster.opengl.scene_textures import working_sorter
 ctx = create_egl_context()
 print(ctx.version_code, working_sorter(ctx), ctx.error)
 """

@@ -10,12 +10,10 @@ import pytest
 
 from langsplat_core.config import GSPLAT, INRIA, RasterSettings
 from langsplat_core.errors import BackendError
-from langsplat_core.raster.opengl.context import create_egl_context
-from langsplat_core.raster.opengl.draw_order import front_to_back
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
+from langsplat_core.raster.opengl.scene_textures import create_egl_context, front_to_back
 from langsplat_core.raster.protocol import MedianDepth
-from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.raster.spherical_harmonics import colours
+from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians
 from tests.support.gl_context import gl_state
 from tests.support.scenes import random_camera, random_gaussians, random_values
@@ -229,7 +227,7 @@ MAC = """
 import numpy as np, moderngl
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.raster.opengl.context import create_egl_context
+from langsplat_core.raster.opengl.scene_textures import create_egl_context
 from tests.support.scenes import random_camera, random_gaussians, random_values
 ctx = create_egl_context()
 assert ctx.version_code == 410, ctx.version_code

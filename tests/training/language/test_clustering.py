@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import unit
-from langsplat_core.training.language.clustering import nearest_centres, spherical_kmeans
+from langsplat_core.training.language.mask_weights import nearest_centres, spherical_kmeans
 
 
 def clusters(count: int, each: int, dim: int = 32, noise: float = 0.02) -> tuple[np.ndarray, np.ndarray]:

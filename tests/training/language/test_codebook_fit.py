@@ -7,9 +7,14 @@ import pytest
 
 from langsplat_core.arrays import unit
 from langsplat_core.config import CodecConfig
-from langsplat_core.training.language import codebook_fit
-from langsplat_core.training.language.codebook_fit import codebook_error, fit_codebook, rounded
-from langsplat_core.training.language.relevancy_error import codec_report, relevancy_error
+from langsplat_core.training.language import codec_fit
+from langsplat_core.training.language.codec_fit import (
+    codebook_error,
+    codec_report,
+    fit_codebook,
+    relevancy_error,
+    rounded,
+)
 from tests.support.vocabulary import random_vocabulary
 
 pytestmark = pytest.mark.long
@@ -22,7 +27,7 @@ WORDS = random_vocabulary(D)
 def quick_colours(monkeypatch, request):
     """What is not about colours does not wait for them."""
     if "colours" not in request.node.name:
-        monkeypatch.setattr(codebook_fit, "COLOUR_STEPS", 20)
+        monkeypatch.setattr(codec_fit, "COLOUR_STEPS", 20)
 
 
 def meanings(count: int = 100, each: int = 20, noise: float = 0.05, seed: int = 0) -> np.ndarray:

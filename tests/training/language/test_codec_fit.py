@@ -10,9 +10,13 @@ from langsplat_core.arrays import unit
 from langsplat_core.config import CodecConfig
 from langsplat_core.scene import AutoencoderCodec, LinearCodec, codec_from_tensors
 from langsplat_core.scene.codec import KINDS
-from langsplat_core.training.language.autoencoder_fit import folded_layers, networks
-from langsplat_core.training.language.codec_fit import FITTERS, fit_codec
-from langsplat_core.training.language.relevancy_error import codec_report
+from langsplat_core.training.language.codec_fit import (
+    FITTERS,
+    codec_report,
+    fit_codec,
+    folded_layers,
+    networks,
+)
 from tests.support.vocabulary import random_vocabulary
 
 pytestmark = pytest.mark.long

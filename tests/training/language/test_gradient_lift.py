@@ -13,8 +13,13 @@ from langsplat_core.progress import Cancelled
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera, LinearCodec
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.gradient_lift import AdamState, blended, by_features, lift_by_gradient
-from langsplat_core.training.language.latent_lift import lift_latents
+from langsplat_core.training.language.lift import (
+    AdamState,
+    blended,
+    by_features,
+    lift_by_gradient,
+    lift_latents,
+)
 from tests.support.scenes import random_camera, random_gaussians
 
 pytestmark = pytest.mark.long

@@ -5,7 +5,7 @@ import numpy as np
 from langsplat_core.arrays import unit
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import LinearCodec
-from langsplat_core.training.language.latent_lift import lift_latents
+from langsplat_core.training.language.lift import lift_latents
 from tests.support.lifting import D, dense_weights, make_views
 from tests.support.scenes import random_gaussians
 

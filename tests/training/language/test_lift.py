@@ -7,10 +7,9 @@ from scipy.sparse import csr_matrix
 from langsplat_core.arrays import unit
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language import memberships as blocks
+from langsplat_core.training.language import mask_weights as blocks
 from langsplat_core.training.language.lift import lift_block, lift_sample, lift_weights
-from langsplat_core.training.language.mask_groups import group_masks
-from langsplat_core.training.language.memberships import find_memberships
+from langsplat_core.training.language.mask_weights import find_memberships, group_masks
 from tests.support.lifting import D, dense_weights, make_views
 from tests.support.scenes import random_camera, random_gaussians
 

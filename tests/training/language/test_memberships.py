@@ -7,9 +7,8 @@ from langsplat_core.arrays import unit
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language import memberships as module
-from langsplat_core.training.language.mask_groups import group_masks
-from langsplat_core.training.language.memberships import PAIR, find_memberships, view_pairs
+from langsplat_core.training.language import mask_weights as module
+from langsplat_core.training.language.mask_weights import PAIR, find_memberships, group_masks, view_pairs
 from tests.support.lifting import D, dense_weights, make_views
 from tests.support.scenes import random_camera, random_gaussians
 

@@ -7,10 +7,15 @@ import pytest
 
 from langsplat_core.arrays import Array
 from langsplat_core.scene import LEVELS, NO_THING
-from langsplat_core.training.language import memberships as blocks
-from langsplat_core.training.language import things as module
-from langsplat_core.training.language.memberships import PAIR, Memberships
-from langsplat_core.training.language.things import SAME, find_things, masks_of_things
+from langsplat_core.training.language import mask_weights as blocks
+from langsplat_core.training.language import mask_weights as module
+from langsplat_core.training.language.mask_weights import (
+    PAIR,
+    SAME,
+    Memberships,
+    find_things,
+    masks_of_things,
+)
 
 WHOLE = len(LEVELS) - 1
 UNSEEN = -1

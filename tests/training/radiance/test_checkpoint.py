@@ -12,8 +12,14 @@ from langsplat_core.config import RadianceConfig
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.scene import Gaussians, look_at
-from langsplat_core.training.radiance.checkpoint import fingerprint, load_checkpoint, save_checkpoint
-from langsplat_core.training.radiance.state import PARAMETERS, TrainingState, start
+from langsplat_core.training.radiance.state import (
+    PARAMETERS,
+    TrainingState,
+    fingerprint,
+    load_checkpoint,
+    save_checkpoint,
+    start,
+)
 
 CPU = torch.device("cpu")
 

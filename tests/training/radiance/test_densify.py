@@ -9,15 +9,17 @@ import torch
 
 from langsplat_core.config import RadianceConfig
 from langsplat_core.scene import Gaussians
-from langsplat_core.training.radiance.densify import accumulate, densify, reset_opacities
-from langsplat_core.training.radiance.schedule import schedule_for
 from langsplat_core.training.radiance.state import (
     PARAMETERS,
     TrainingState,
+    accumulate,
     adam_step,
     clean_gradients,
+    densify,
+    reset_opacities,
     start,
 )
+from langsplat_core.training.radiance.train import schedule_for
 
 CONFIG = RadianceConfig(densify_grad=1.0)
 EXTENT = 1.0  # so that Gaussians above 0.01 split and smaller ones are cloned

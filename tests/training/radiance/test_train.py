@@ -16,13 +16,16 @@ from langsplat_core.config import INRIA, RadianceConfig, RasterSettings
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError, InputError
 from langsplat_core.progress import Cancelled
-from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.raster.spherical_harmonics import C0, colours
+from langsplat_core.raster.reference import C0, ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians, look_at
-from langsplat_core.training.radiance.differentiable import CpuRenderer
-from langsplat_core.training.radiance.initialise import initial_gaussians
-from langsplat_core.training.radiance.renderers import renderer_for
-from langsplat_core.training.radiance.state import PARAMETERS, TrainingState, add_opacity_decay, start
+from langsplat_core.training.radiance.differentiable import CpuRenderer, renderer_for
+from langsplat_core.training.radiance.state import (
+    PARAMETERS,
+    TrainingState,
+    add_opacity_decay,
+    initial_gaussians,
+    start,
+)
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 
 SIZE = (48, 48)

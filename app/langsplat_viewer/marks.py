@@ -1,0 +1,323 @@
+"""Which Gaussians are selected, hidden and deleted, and the tools that say so."""
+
+import math
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field, fields, replace
+from itertools import combinations
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.query.instances import Instance
+from langsplat_core.query.selection import (
+    in_box,
+    in_polygon,
+    in_rectangle,
+    in_sphere,
+    in_stroke,
+    on_surface,
+    project,
+)
+from langsplat_core.scene import Camera
+from langsplat_viewer.camera.controls import eye_depth
+
+# Which Gaussians of the scene are selected, hidden and deleted, and the tool that selects with the mouse.
+#
+# The scene itself is never changed: deleting marks, and what is marked is left out of pictures and of what is
+# saved. So everything can be undone, and an answer's numbers per Gaussian keep their places.
+
+Tool = Literal["thing", "rectangle", "lasso", "brush", "sphere", "box"]
+Mode = Literal["replace", "add", "remove", "intersect"]
+TOOLS: tuple[Tool, ...] = get_args(Tool)
+MODES: tuple[Mode, ...] = get_args(Mode)
+BRUSHES = (0.005, 0.25)  # least and largest radius of the brush, of the picture's height
+REACHES = (0.001, 1.0)  # least and largest reach, scene radii
+
+
+@dataclass(frozen=True, eq=False)
+class Marks:
+    """What is marked among a scene's N Gaussians. Nothing that is hidden or deleted is selected."""
+
+    selected: Array  # (N,) bool
+    hidden: Array  # (N,) bool: in no picture until it is shown again
+    deleted: Array  # (N,) bool: in no picture, and in nothing that is saved
+
+    @property
+    def shown(self) -> Array:
+        """(N,) bool: neither hidden nor deleted."""
+        return ~(self.hidden | self.deleted)
+
+    @property
+    def kept(self) -> Array:
+        """(N,) bool: not deleted."""
+        return ~self.deleted
+
+    def same(self, other: "Marks") -> bool:
+        """Whether the same are marked in both."""
+        return all(
+            a is b or np.array_equal(a, b)
+            for a, b in (
+                (self.selected, other.selected),
+                (self.hidden, other.hidden),
+                (self.deleted, other.deleted),
+            )
+        )
+
+
+def unmarked(count: int) -> Marks:
+    """Of a scene that was just opened."""
+    nothing = np.zeros(count, bool)
+    return Marks(nothing, nothing, nothing)
+
+
+def combined(marks: Marks, found: Array, mode: Mode) -> Marks:
+    """Marks with the selection replaced by `found` (N,) bool, or combined with it; of what is shown."""
+    match mode:
+        case "add":
+            selected = marks.selected | found
+        case "remove":
+            selected = marks.selected & ~found
+        case "intersect":
+            selected = marks.selected & found
+        case _:
+            selected = found
+    return replace(marks, selected=selected & marks.shown)
+
+
+def hiding(marks: Marks) -> Marks:
+    """With the selection hidden, and nothing selected."""
+    return Marks(np.zeros_like(marks.selected), marks.hidden | marks.selected, marks.deleted)
+
+
+def isolating(marks: Marks) -> Marks:
+    """With everything else hidden."""
+    return replace(marks, hidden=~marks.selected & marks.kept)
+
+
+def showing_all(marks: Marks) -> Marks:
+    """With nothing hidden."""
+    return replace(marks, hidden=np.zeros_like(marks.hidden))
+
+
+def deleting(marks: Marks) -> Marks:
+    """With the selection deleted, and nothing selected."""
+    return Marks(np.zeros_like(marks.selected), marks.hidden, marks.deleted | marks.selected)
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """What is being drawn with the mouse. Places are fractions of the picture, (0, 0) its top left corner."""
+
+    path: tuple[tuple[float, float], ...]  # where the mouse was, one place or more
+    centre: tuple[float, float, float] | None = None  # of a sphere or box: on the surface, world units
+
+
+@dataclass(frozen=True, eq=False)
+class Things:
+    """The instances of an answer, to be selected one by one."""
+
+    phrase: str
+    result: Any  # the `QueryResult` whose they are
+    found: tuple[Instance, ...]  # best first
+
+
+@dataclass(frozen=True, eq=False)
+class Leaving:
+    """What waits for an answer to whether deletions are to be saved."""
+
+    then: Callable[[Any], None]  # takes the `Viewer`
+    to: str  # what it does, in words: "the window closes"
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """All there is to know about selecting; replaced as a whole at every change."""
+
+    marks: Marks = field(default_factory=lambda: unmarked(0))
+    saved: Array | None = None  # (N,) what was deleted when the scene was last saved; None: not yet
+    tool: Tool | None = None  # what a drag in the scene does; None: it turns the camera
+    mode: Mode = "replace"
+    brush: float = 0.03  # radius, of the picture's height, within BRUSHES
+    reach: float = 0.05  # how far growing goes, and how large a sphere of one click is; of the scene's radius
+    only_visible: bool = True  # rectangle, lasso and brush leave out what lies behind something
+    stroke: Stroke | None = None
+    things: Things | None = None
+    leaving: Leaving | None = None
+    writing: Future[Any] | None = None  # what was last written, or is being written
+    may_close: bool = False  # the window closes at the next frame
+
+    @property
+    def is_unsaved(self) -> bool:
+        """Whether something was deleted since the scene was opened or saved."""
+        deleted = self.marks.deleted
+        return bool(deleted.any()) and (self.saved is None or not np.array_equal(deleted, self.saved))
+
+
+def of_scene(selection: Selection, count: int) -> Selection:
+    """For another scene, of `count` Gaussians: the tool and its settings stay."""
+    return replace(selection, marks=unmarked(count), saved=None, stroke=None, things=None, leaving=None)
+
+
+# Marks as history keeps them: one bit each, and none for what is not marked at all.
+
+NAMES = tuple(field.name for field in fields(Marks))
+
+
+@dataclass(frozen=True, eq=False)
+class PackedMarks:
+    """The three masks of `Marks`, of `count` Gaussians each."""
+
+    count: int
+    masks: tuple[Array | None, ...]  # ceil(count / 8) bytes, in the order of NAMES; None: nothing is marked
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """The same marks, packed and as they are."""
+
+    marks: Marks
+    packed: PackedMarks
+
+
+def pack(marks: Marks, before: Pair | None) -> Pair:
+    """`before`, the pair that was made last, lends the masks that are the same objects."""
+    if before is not None and before.marks is marks:
+        return before
+    masks = tuple(_packed(getattr(marks, name), name, before) for name in NAMES)
+    return Pair(marks, PackedMarks(len(marks.selected), masks))
+
+
+def _packed(mask: Array, name: str, before: Pair | None) -> Array | None:
+    if before is not None and getattr(before.marks, name) is mask:
+        return before.packed.masks[NAMES.index(name)]
+    return np.packbits(mask) if mask.any() else None
+
+
+def unpack(packed: PackedMarks, now: Pair) -> Marks:
+    """The marks again; `now`, of the same scene, lends the masks that are the same, so that nothing is drawn
+    anew for those."""
+    if now.packed is packed:
+        return now.marks
+    return Marks(*(_unpacked(packed, place, now) for place in range(len(NAMES))))
+
+
+def _unpacked(packed: PackedMarks, place: int, now: Pair) -> Array:
+    bits, current = packed.masks[place], now.packed.masks[place]
+    if bits is current:
+        mask: Array = getattr(now.marks, NAMES[place])
+        return mask
+    if bits is None:
+        return np.zeros(packed.count, bool)
+    return np.unpackbits(bits, count=packed.count).astype(bool)
+
+
+# What a drag with a tool encloses: the Gaussians in it, and its outline. Plain maths, no window.
+#
+# Places are fractions of the picture, (0, 0) its top left corner.
+
+CLICK = 0.006  # of the picture's height: a shorter drag is a click
+ROUND = 48  # corners of a circle
+ON_SCREEN: tuple[Tool, ...] = ("rectangle", "lasso", "brush")  # the others are bodies in the scene
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A stroke in the picture that it is drawn in."""
+
+    tool: Tool
+    stroke: Stroke
+    camera: Camera
+    brush: float  # radius, of the picture's height
+    reach: float  # world units: radius of a sphere and half the side of a box that were only clicked
+
+    @property
+    def pixels(self) -> Array:
+        """(K, 2) where the mouse was."""
+        return np.array(self.stroke.path, np.float64) * (self.camera.width, self.camera.height)
+
+    @property
+    def radius(self) -> float:
+        """Of a sphere, or half the side of a box: how far the drag leads from its centre, world units."""
+        first, last = self.pixels[[0, -1]]
+        if np.linalg.norm(last - first) < CLICK * self.camera.height:
+            return self.reach
+        (_,), (depth,) = self.camera.project(self.centre[None])
+        ends = [self.camera.unproject((float(x), float(y)), float(depth)) for x, y in (first, last)]
+        return float(np.linalg.norm(ends[1] - ends[0]))
+
+    @property
+    def centre(self) -> Array:
+        """(3,) of a sphere or box."""
+        return np.array(self.stroke.centre, np.float64)
+
+
+def caught(drawn: Drawn, means: Array, depths: Array | None = None) -> Array:
+    """(N, 3) means -> (N,) bool, those inside. depths: (H, W) of the surface, as `Surface.depths` has them,
+    to leave out what a rectangle, lasso or brush meets behind it; None: all the way through."""
+    if drawn.tool not in ON_SCREEN:
+        return _in_body(drawn, means)
+    camera, pixels = drawn.camera, drawn.pixels
+    seen = project(means, camera)
+    if drawn.tool == "rectangle":
+        inside = in_rectangle(seen, pixels[0], pixels[-1])
+    elif drawn.tool == "lasso":
+        inside = in_polygon(seen, pixels)
+    else:
+        inside = in_stroke(seen, pixels, drawn.brush * camera.height)
+    if depths is None:
+        return inside
+    plane = eye_depth(camera)  # what counts as hidden is a share of the depth from the eye
+    seen = replace(seen, depths=seen.depths - plane)
+    depths = np.where(depths > 0, depths - plane, 0)
+    return inside & on_surface(seen, depths, (camera.width, camera.height))
+
+
+def _in_body(drawn: Drawn, means: Array) -> Array:
+    if drawn.stroke.centre is None:
+        return np.zeros(len(means), bool)
+    if drawn.tool == "sphere":
+        return in_sphere(means, drawn.centre, drawn.radius)
+    return in_box(means, drawn.centre - drawn.radius, drawn.centre + drawn.radius)
+
+
+def outlines(drawn: Drawn) -> list[Array]:
+    """Lines (K, 2) that show what is being enclosed; of a brush the way it took."""
+    first, last = drawn.stroke.path[0], drawn.stroke.path[-1]
+    match drawn.tool:
+        case "rectangle":
+            corners = [first, (last[0], first[1]), last, (first[0], last[1]), first]
+            return [np.array(corners)]
+        case "lasso":
+            return [np.array([*drawn.stroke.path, first])]
+        case "brush":
+            return [np.array(drawn.stroke.path)]
+        case "sphere" | "box" if drawn.stroke.centre is not None:
+            return _of_sphere(drawn) if drawn.tool == "sphere" else _of_box(drawn)
+    return []
+
+
+def _of_sphere(drawn: Drawn) -> list[Array]:
+    """The circle around its centre that faces the camera."""
+    turns = np.linspace(0, 2 * math.pi, ROUND + 1)
+    right, down, _ = drawn.camera.rotation
+    around = np.cos(turns)[:, None] * right + np.sin(turns)[:, None] * down
+    return _projected(drawn, [drawn.centre + drawn.radius * around])
+
+
+def _of_box(drawn: Drawn) -> list[Array]:
+    """Its twelve edges."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
+    edges = [np.stack(ends) for ends in combinations(corners, 2) if np.abs(ends[0] - ends[1]).sum() == 2]
+    return _projected(drawn, [drawn.centre + drawn.radius * edge for edge in edges])
+
+
+def _projected(drawn: Drawn, lines: list[Array]) -> list[Array]:
+    """Lines of world points in the picture; none that reaches behind the camera."""
+    camera, found = drawn.camera, []
+    for line in lines:
+        pixels, depths = camera.project(line)
+        if (depths > 1e-6 * drawn.radius).all():
+            found.append(pixels / (camera.width, camera.height))
+    return found

@@ -1,1 +1,0 @@
-"""Which Gaussians are selected, hidden and deleted, and the tools that say so."""

@@ -1,1 +1,0 @@
-"""Which pictures the state asks for, and what they depend on."""

@@ -1,0 +1,315 @@
+"""What the benchmarks label: phrases in frames, and where they are true. Masks are drawn when asked for."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeGuard
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.io.hostile import PHOTO_SUFFIXES, opened, picture_size, read_json_file
+
+Size = tuple[int, int]  # width and height, pixels
+SAME_SHAPE = 0.02  # relative difference of aspect up to which two sizes may be of one picture
+
+
+class Truth(Protocol):
+    """Where something is in a frame."""
+
+    def draw(self, size: Size) -> Array:
+        """(H, W) bool on a grid of `size`; by the nearest pixel where that is not the label's own grid."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """Polygons on the label's grid; several of one category in a frame are joined."""
+
+    size: Size
+    polygons: tuple[Array, ...]  # (K, 2) float x, y each, K >= 3
+
+    def draw(self, size: Size) -> Array:
+        """See `Truth`. Corners are cut to whole pixels and the outline belongs to the inside."""
+        canvas = Image.new("L", self.size)
+        brush = ImageDraw.Draw(canvas)
+        for polygon in self.polygons:
+            brush.polygon([(int(x), int(y)) for x, y in polygon], fill=1, outline=1)
+        return resized(np.asarray(canvas) > 0, size)
+
+
+@dataclass(frozen=True)
+class MaskFile:
+    """A picture that is bright inside."""
+
+    path: Path
+
+    def draw(self, size: Size) -> Array:
+        """See `Truth`. Bright is above half of 255, or above 0 where the file holds no more than 0 and 1."""
+        grey = read_grey(self.path)
+        return resized(grey > (127 if grey.max(initial=0) > 1 else 0), size)
+
+
+@dataclass(frozen=True, eq=False)
+class Label:
+    """One phrase that is asked in one frame."""
+
+    phrase: str
+    truth: Truth
+    boxes: (
+        Array | None
+    )  # (B, 4) left, top, right, bottom on the label's grid, inclusive; None: no place is scored
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A labelled view."""
+
+    name: str  # of its photograph, without extension; dots inside belong to it
+    size: Size  # of the label's grid
+    labels: tuple[Label, ...]
+    photograph: Path | None = None  # to draw on
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledScene:
+    """A scene of a benchmark."""
+
+    name: str
+    frames: tuple[Frame, ...]
+    dataset: Path  # where its photographs and cameras lie, if it has them
+    left_out: tuple[str, ...] = ()  # labels that cannot be asked, each "frame: phrase (why)"
+
+
+@dataclass(frozen=True, eq=False)
+class Benchmark:
+    """All scenes that a folder holds."""
+
+    name: str
+    scenes: Mapping[str, LabelledScene]
+
+
+def read_grey(path: Path) -> Array:
+    """(H, W) uint8 brightness of a picture file; FormatError where it cannot be read."""
+    with opened(path) as picture:
+        return np.asarray(picture.convert("L"))
+
+
+def resized(mask: Array, size: Size) -> Array:
+    """(H, W) bool on a grid of `size`, each pixel the nearest one's."""
+    if mask.shape == (size[1], size[0]):
+        return mask
+    picture = Image.fromarray(mask.astype(np.uint8))
+    return np.asarray(picture.resize(size, Image.Resampling.NEAREST)) > 0
+
+
+def check_same_picture(frame: str, drawn: Size, labelled: Size) -> None:
+    """InputError where a map or camera cannot show the labelled picture: another shape."""
+    (columns, rows), (width, height) = drawn, labelled
+    slack = max(SAME_SHAPE * width * rows, width, height, columns, rows)  # a pixel of rounding is allowed
+    if abs(columns * height - width * rows) > slack:
+        raise InputError(
+            f"frame {frame}: the view is {columns}x{rows}, the labels are {width}x{height}: not of one "
+            "picture; use views and labels of the same photographs"
+        )
+
+
+def without_suffix(name: str) -> str:
+    """A view's name without a photograph's extension; other dots stay."""
+    stem, dot, suffix = name.rpartition(".")
+    return stem if dot and f".{suffix.lower()}" in PHOTO_SUFFIXES else name
+
+
+def photograph_of(folder: Path, name: str) -> Path | None:
+    """The photograph called `name` in a folder, whatever its kind."""
+    candidates = (folder / f"{name}{suffix}" for suffix in (*PHOTO_SUFFIXES, ".JPG", ".JPEG", ".PNG"))
+    return next((path for path in candidates if path.is_file()), None)
+
+
+# LERF-OVS as LangSplat released it: polygons in JSON files of the ISAT tool.
+#
+# lerf_ovs/label/<scene>/<frame>.json  info {name, width, height}, objects [{category, bbox [x1, y1, x2,
+# y2], segmentation [[x, y]...]}] lerf_ovs/label/<scene>/<frame>.jpg   the photograph again (not needed)
+# lerf_ovs/<scene>/                    photographs and cameras
+#
+# An object has one polygon; a category that occurs several times in a frame is one query with all its
+# polygons.
+
+LIMIT = 2**26  # bytes of a label file; real ones have some hundred kilobytes
+MAX_SIDE = 20_000  # px of a label's grid
+WANTED = "expected label/<scene>/<frame>.json in it, or one scene's folder of those"
+
+
+def read_lerf_ovs(folder: Path) -> Benchmark:
+    """The labels in `folder`: the benchmark's, one scene's of `label`, or one scene's dataset beside `label`.
+
+    Raises InputError for a folder of another layout and FormatError for a file that breaks it.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; {WANTED}")
+    if (folder / "label").is_dir():
+        folders = {path.name: (path, folder / path.name) for path in sorted((folder / "label").iterdir())}
+        found = {name: pair for name, pair in folders.items() if any(pair[0].glob("*.json"))}
+    elif (folder.parent / "label" / folder.name).is_dir():
+        found = {folder.name: (folder.parent / "label" / folder.name, folder)}
+    elif _holds_labels(folder):
+        found = {folder.name: (folder, folder.parent.parent / folder.name)}
+    else:
+        found = {}
+    if not found:
+        other = (folder / "segmentations").is_dir() or any(folder.glob("*/segmentations"))
+        hint = "it looks like 3D-OVS: use `langsplat eval 3d-ovs`; " if other else ""
+        raise InputError(f"{folder}: not in the layout of LERF-OVS; {hint}{WANTED}")
+    return Benchmark("lerf-ovs", {name: _read_scene(name, *pair) for name, pair in found.items()})
+
+
+def _holds_labels(folder: Path) -> bool:
+    first = min((path for path in folder.glob("*.json") if path.name != "transforms.json"), default=None)
+    if first is None:
+        return False
+    content = read_json_file(first, LIMIT)
+    return isinstance(content, dict) and "objects" in content
+
+
+def _read_scene(name: str, labels: Path, dataset: Path) -> LabelledScene:
+    frames, left_out = [], []
+    for path in sorted(labels.glob("*.json")):
+        frame, without = _read_frame(path, dataset)
+        frames.append(frame)
+        left_out += [f"{frame.name}: {phrase} (no outline)" for phrase in without]
+    if not any(frame.labels for frame in frames):
+        raise FormatError(f"{labels}: its files label nothing; expected objects with a polygon each")
+    return LabelledScene(name, tuple(frames), dataset, tuple(left_out))
+
+
+def _read_frame(path: Path, dataset: Path) -> tuple[Frame, list[str]]:
+    """The frame, and the categories of it that have no polygon with an inside."""
+    content = read_json_file(path, LIMIT)
+    size = _size(content, path)
+    objects = content.get("objects")
+    if not isinstance(objects, list):
+        raise FormatError(f'{path}: no list of "objects"; it is not a label file of LERF-OVS')
+    polygons: dict[str, list[Array]] = {}
+    boxes: dict[str, list[Array]] = {}
+    for number, item in enumerate(objects):
+        phrase, polygon = _object(item, f"{path}: object {number}")
+        polygons.setdefault(phrase, [])
+        if len(polygon) >= 3:
+            polygons[phrase].append(polygon)
+            boxes.setdefault(phrase, []).append(_box(item.get("bbox"), polygon))
+    labels = tuple(
+        Label(phrase, Outlines(size, tuple(outlines)), np.stack(boxes[phrase]))
+        for phrase, outlines in polygons.items()
+        if outlines
+    )
+    photograph = photograph_of(path.parent, path.stem) or photograph_of(dataset / "images", path.stem)
+    without = [phrase for phrase, outlines in polygons.items() if not outlines]
+    return Frame(path.stem, size, labels, photograph), without
+
+
+def _size(content: Any, path: Path) -> Size:
+    info = content.get("info") if isinstance(content, dict) else None
+    width, height = (info.get("width"), info.get("height")) if isinstance(info, dict) else (0, 0)
+    if not (_is_side(width) and _is_side(height)):
+        raise FormatError(
+            f'{path}: no "info" with width and height in pixels; it is not a label file of LERF-OVS'
+        )
+    return width, height
+
+
+def _is_side(value: Any) -> TypeGuard[int]:
+    return isinstance(value, int) and 0 < value <= MAX_SIDE
+
+
+def _object(item: Any, where: str) -> tuple[str, Array]:
+    """Category, and (K, 2) corners."""
+    if (
+        not isinstance(item, dict)
+        or not isinstance(item.get("category"), str)
+        or not item["category"].strip()
+    ):
+        raise FormatError(f'{where} has no "category"')
+    try:
+        corners = np.array(item.get("segmentation", []), np.float64).reshape(-1, 2)
+    except (TypeError, ValueError):
+        raise FormatError(f'{where}: "segmentation" is not one polygon [[x, y], ...]') from None
+    if not (np.abs(corners) <= 10 * MAX_SIDE).all():  # NaN fails too
+        raise FormatError(f'{where}: "segmentation" has corners far outside of any picture')
+    return item["category"].strip(), corners
+
+
+def _box(stored: Any, polygon: Array) -> Array:
+    """(4,) the label's box, the polygon's own where there is none."""
+    try:
+        box = np.array(stored, np.float64)
+    except (TypeError, ValueError):
+        box = np.empty(0)
+    if box.shape == (4,) and np.isfinite(box).all():
+        return box
+    return np.concatenate([polygon.min(0), polygon.max(0)])
+
+
+# 3D-OVS (Liu et al. 2023): one mask picture per view and class.
+#
+# <scene>/segmentations/classes.txt           one class a line
+# <scene>/segmentations/<view>/<class>.png    bright inside, of any size
+# <scene>/images/<view>.jpg                   the photograph, whose grid is scored
+
+WANTED_PICTURES = "expected segmentations/classes.txt in it, or in folders of it, one per scene"
+
+
+def read_3d_ovs(folder: Path) -> Benchmark:
+    """The labels in `folder`: one scene's, or several scenes' folders.
+
+    What a view has a picture of is asked there. Raises InputError for a folder of another layout and
+    FormatError for a scene that breaks it.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; {WANTED_PICTURES}")
+    scenes = [folder] if _is_scene(folder) else [path for path in sorted(folder.iterdir()) if _is_scene(path)]
+    if not scenes:
+        other = (folder / "label").is_dir() or (folder.parent / "label" / folder.name).is_dir()
+        hint = "it looks like LERF-OVS: use `langsplat eval lerf-ovs`; " if other else ""
+        raise InputError(f"{folder}: not in the layout of 3D-OVS; {hint}{WANTED_PICTURES}")
+    return Benchmark("3d-ovs", {scene.resolve().name: _read_ovs3d_scene(scene) for scene in scenes})
+
+
+def _is_scene(folder: Path) -> bool:
+    return (folder / "segmentations" / "classes.txt").is_file()
+
+
+def _read_ovs3d_scene(folder: Path) -> LabelledScene:
+    classes = read_classes(folder / "segmentations" / "classes.txt")
+    views = sorted(path for path in (folder / "segmentations").iterdir() if path.is_dir())
+    stray = [
+        f"{view.name}: {path.stem} (not in classes.txt)"
+        for view in views
+        for path in sorted(view.glob("*.png"))
+        if path.stem not in classes
+    ]
+    frames = [_read_ovs3d_frame(folder, view, classes) for view in views]
+    labelled = tuple(frame for frame in frames if frame.labels)
+    if not labelled:
+        raise FormatError(f"{folder / 'segmentations'}: no <view>/<class>.png for any line of classes.txt")
+    return LabelledScene(folder.resolve().name, labelled, folder, tuple(stray))
+
+
+def read_classes(path: Path) -> tuple[str, ...]:
+    """One class a line, each once; FormatError where there is none or the file is no text."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise FormatError(f"{path}: not a text file; expected one class a line") from None
+    classes = tuple(dict.fromkeys(line.strip() for line in lines if line.strip()))
+    if not classes:
+        raise FormatError(f"{path}: is empty; expected one class a line")
+    return classes
+
+
+def _read_ovs3d_frame(folder: Path, view: Path, classes: tuple[str, ...]) -> Frame:
+    files = {name: view / f"{name}.png" for name in classes if (view / f"{name}.png").is_file()}
+    photograph = photograph_of(folder / "images", view.name)
+    grid = photograph or next(iter(files.values()), None)
+    labels = tuple(Label(name, MaskFile(path), None) for name, path in files.items())
+    return Frame(view.name, (1, 1) if grid is None else picture_size(grid), labels, photograph)

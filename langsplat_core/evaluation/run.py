@@ -1,0 +1,158 @@
+"""A benchmark's labels, and whoever answers them, brought together by names."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from langsplat_core.datasets.capture import shortened
+from langsplat_core.datasets.colmap import find_model, load_colmap
+from langsplat_core.datasets.nerfstudio import load_nerfstudio
+from langsplat_core.errors import InputError
+from langsplat_core.evaluation.labels import Benchmark, LabelledScene, without_suffix
+from langsplat_core.evaluation.profiles import MapRule, OwnRule, Profile
+from langsplat_core.evaluation.report import BenchmarkReport
+from langsplat_core.evaluation.scoring import score_scene
+from langsplat_core.evaluation.sources import MapSource, SceneSource, Source
+from langsplat_core.io import load_scene
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, no_field
+from langsplat_core.raster import load_rasterizer
+from langsplat_core.scene import Camera
+
+log = logging.getLogger("langsplat")
+FULL_SIZE = 100_000  # px: photographs are read for their cameras alone and not shrunk
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Who is measured: exactly one of `scene` and `maps`."""
+
+    scene: Path | None = None  # a scene file, or a folder of <benchmark's scene>.ply
+    maps: Path | None = None  # <view>/<phrase>..., or <benchmark's scene>/<view>/<phrase>...
+    encoder: str = ""  # in place of the one that the scene names
+    paper_order: bool = False
+
+
+def run_benchmark(
+    benchmark: Benchmark,
+    profile: Profile,
+    subject: Subject,
+    load_encoder: LoadEncoder,
+    only: Sequence[str] = (),
+    pictures: Path | None = None,
+    progress: Progress = silent,
+) -> BenchmarkReport:
+    """Score `subject` on the scenes of `benchmark`, or those named by `only`.
+
+    Raises InputError for a scene or maps that do not belong to the labels, EncoderError where the text
+    encoder cannot be loaded.
+    """
+    if subject.paper_order and (subject.maps is not None or not isinstance(profile.rule, MapRule)):
+        raise InputError(
+            "--paper-order is for a scene under a protocol that reads relevancy maps; leave it out"
+        )
+    scenes = _chosen(benchmark, only, subject)
+    scores = {}
+    for name, labelled in scenes.items():
+        source = _source(labelled, len(scenes), profile, subject, load_encoder, progress)
+        scores[name] = score_scene(labelled, source, profile, pictures, progress)
+    order = ", latents blended and every pixel decoded (the paper's order)" if subject.paper_order else ""
+    return BenchmarkReport(benchmark.name, profile, f"{subject.scene or subject.maps}{order}", scores)
+
+
+def _chosen(benchmark: Benchmark, only: Sequence[str], subject: Subject) -> Mapping[str, LabelledScene]:
+    scenes = dict(benchmark.scenes)
+    wrong = [name for name in only if name not in scenes]
+    if wrong:
+        raise InputError(f"--only {wrong[0]}: no such labelled scene; there are {', '.join(scenes)}")
+    if only:
+        return {name: scenes[name] for name in only}
+    if subject.scene is not None and not subject.scene.is_dir() and len(scenes) > 1:
+        if subject.scene.stem not in scenes:
+            raise InputError(
+                f"{subject.scene} could be any labelled scene of {', '.join(scenes)}; say which with --only"
+            )
+        return {subject.scene.stem: scenes[subject.scene.stem]}
+    return scenes
+
+
+def _source(
+    labelled: LabelledScene,
+    count: int,
+    profile: Profile,
+    subject: Subject,
+    load_encoder: LoadEncoder,
+    progress: Progress,
+) -> Source:
+    if subject.maps is not None:
+        return _map_source(labelled, count, profile, subject.maps)
+    assert subject.scene is not None
+    path = subject.scene / f"{labelled.name}.ply" if subject.scene.is_dir() else subject.scene
+    if not path.exists():
+        raise InputError(
+            f"{path}: no such scene; leave {labelled.name} out with --only, or name the right folder"
+        )
+    scene = load_scene(path)
+    if scene.language is None:
+        raise InputError(f"{path}: {no_field(scene)}")
+    own = {without_suffix(camera.name): camera for camera in scene.cameras}
+    others = _other_cameras(own, labelled, path, progress)
+    # With no name in common the scene's views are named by another rule: nothing is known of training.
+    related = not own.keys().isdisjoint([*others, *(frame.name for frame in labelled.frames)])
+    return SceneSource(
+        QueryEngine(
+            scene,
+            load_encoder,
+            encoder_id=subject.encoder,
+            rule="peak" if isinstance(profile.rule, MapRule) else "regions",  # published maps as published
+        ),
+        load_rasterizer("cpu"),
+        {**others, **own},
+        frozenset(own) if related else None,
+        profile,
+        subject.paper_order,
+    )
+
+
+def _map_source(labelled: LabelledScene, count: int, profile: Profile, maps: Path) -> MapSource:
+    if isinstance(profile.rule, OwnRule):
+        raise InputError("--protocol ours reads a scene's own answer; score maps by another protocol")
+    candidates = (maps / labelled.name, maps) if count == 1 else (maps / labelled.name,)
+    names = [frame.name for frame in labelled.frames]
+    for folder in candidates:
+        if any((folder / name).is_dir() for name in names):
+            return MapSource(folder, profile.rule)
+    raise InputError(
+        f"{candidates[0]}: no folder is named after a labelled frame ({shortened(names, 3)}); "
+        "expected <view>/<phrase>.npy or .png in it"
+    )
+
+
+def _other_cameras(
+    own: Mapping[str, Camera], labelled: LabelledScene, path: Path, progress: Progress
+) -> Mapping[str, Camera]:
+    """The dataset's views by name, read where the scene lacks a labelled one; they share its world.
+    InputError where no labelled frame is among either."""
+    wanted = [frame.name for frame in labelled.frames]
+    if all(name in own for name in wanted):
+        return {}
+    others = {camera.name: camera for camera in _dataset_cameras(labelled.dataset, progress)}
+    missing = [name for name in wanted if name not in own and name not in others]
+    if len(missing) == len(wanted):
+        raise InputError(
+            f"{path}: none of its views ({shortened(own, 3) or 'it has none'}) is a labelled frame "
+            f"({shortened(wanted, 3)}); views are matched by name, never by number; put the photographs with "
+            f"their cameras into {labelled.dataset}"
+        )
+    if missing:
+        log.warning("%d labelled frames have no camera: %s", len(missing), shortened(missing))
+    return others
+
+
+def _dataset_cameras(folder: Path, progress: Progress) -> tuple[Camera, ...]:
+    """Of a dataset that came with cameras; none otherwise."""
+    if (folder / "transforms.json").is_file():
+        return load_nerfstudio(folder / "transforms.json", FULL_SIZE, progress).cameras
+    model = find_model(folder)
+    return () if model is None else load_colmap(folder, model, FULL_SIZE, progress).cameras

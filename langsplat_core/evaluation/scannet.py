@@ -1,0 +1,259 @@
+"""ScanNet, direct in 3D: every labelled vertex takes the class of the Gaussian nearest to it.
+
+    <scene>/<scene>_vh_clean_2.labels.ply     vertices with x, y, z and `label`, an id of the NYU40 classes
+
+Scored are 19, 15 and 10 classes (OpenGaussian), each time by an argmax over those phrases alone, among the
+vertices whose true class is one of them. mIoU and mAcc are means over the classes that the scene has.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.evaluation.report import FIXED, write_json
+from langsplat_core.evaluation.run import Subject
+from langsplat_core.io import load_scene
+from langsplat_core.io.hostile import open_for_reading, read_npy
+from langsplat_core.io.ply_table import fill_columns, iterate_rows, read_ply_header
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, no_field
+
+ENDING = "_vh_clean_2.labels.ply"
+WANTED = f"expected <scene>/<scene>{ENDING} in it, one scene's folder, or such a file"
+NYU40: Mapping[str, int] = MappingProxyType(
+    {
+        "wall": 1,
+        "floor": 2,
+        "cabinet": 3,
+        "bed": 4,
+        "chair": 5,
+        "sofa": 6,
+        "table": 7,
+        "door": 8,
+        "window": 9,
+        "bookshelf": 10,
+        "picture": 11,
+        "counter": 12,
+        "desk": 14,
+        "curtain": 16,
+        "refrigerator": 24,
+        "shower curtain": 28,
+        "toilet": 33,
+        "sink": 34,
+        "bathtub": 36,
+    }
+)
+_NOT_IN_15 = ("picture", "refrigerator", "shower curtain", "bathtub")
+_NOT_IN_10 = (*_NOT_IN_15, "cabinet", "counter", "desk", "curtain", "sink")
+
+
+@dataclass(frozen=True)
+class PointProfile:
+    """The constants of the protocol."""
+
+    name: str = "direct-3d"
+    source: str = (
+        "OpenGaussian's task, as VALA and others report it: argmax over the class names per Gaussian, the "
+        "highest of its levels; a vertex takes the nearest Gaussian that has a meaning, since ours do not "
+        "stay on the vertices"
+    )
+    class_sets: tuple[tuple[str, ...], ...] = (
+        tuple(NYU40),
+        tuple(name for name in NYU40 if name not in _NOT_IN_15),
+        tuple(name for name in NYU40 if name not in _NOT_IN_10),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledPoints:
+    """One scene's vertices."""
+
+    name: str
+    positions: Array  # (V, 3) float32 world units
+    labels: Array  # (V,) int32 ids of NYU40; 0: none
+
+
+@dataclass(frozen=True)
+class PointScore:
+    """One scene and one set of classes."""
+
+    scene: str
+    classes: int  # in the set
+    present: int  # of them in the scene
+    points: int  # vertices that are scored
+    iou: float  # mean over the present classes
+    accuracy: float  # mean over the present classes of the share of their vertices that is right
+    unknown: tuple[
+        str, ...
+    ] = ()  # present classes whose words the encoder was never taught: wrong everywhere
+
+
+def read_scannet(folder: Path) -> dict[str, Path]:
+    """scene -> its file of labels. InputError for another layout."""
+    if folder.is_file() and folder.name.endswith(ENDING):
+        files = [folder]
+    else:
+        files = sorted([*folder.glob(f"*{ENDING}"), *folder.glob(f"*/*{ENDING}")]) if folder.is_dir() else []
+    if not files:
+        raise InputError(f"{folder}: not in the layout of ScanNet; {WANTED}")
+    return {path.name.removesuffix(ENDING): path for path in files}
+
+
+def read_points(path: Path, name: str) -> LabelledPoints:
+    """The labelled vertices of a scene; raises as the PLY reader does."""
+    file, size = open_for_reading(path)
+    with file:
+        header = read_ply_header(file, path)
+        vertex = header.element("vertex")
+        names = [] if vertex is None else [prop.name for prop in vertex.properties if not prop.count_code]
+        if vertex is None or not {"x", "y", "z", "label"} <= set(names):
+            raise FormatError(f"{path}: its vertices lack x, y, z or label; it is no label file of ScanNet")
+        chunks = iterate_rows(file, size, header, vertex, path)
+        positions = np.empty((vertex.count, 3), np.float32)
+        labels = np.empty(vertex.count, np.int32)
+        fill_columns(chunks, vertex, {("x", "y", "z"): positions}, {"label": labels})
+    if not np.isfinite(positions).all():
+        raise FormatError(f"{path}: holds positions that are not finite")
+    return LabelledPoints(name, positions, labels)
+
+
+def scene_classes(
+    engine: QueryEngine, points: LabelledPoints, profile: PointProfile
+) -> tuple[list[Array], tuple[str, ...]]:
+    """Per set of classes (V,) int32 the id that every vertex is given, 0 for none, without a look at the
+    labels; and the class names with words that the encoder was never taught."""
+    field, gaussians = engine.field, engine.scene.gaussians
+    rows = np.flatnonzero(field.known.any(0) & gaussians.valid())
+    if not len(rows):
+        raise InputError("no Gaussian of the scene has a meaning; make its language field again")
+    _, nearest = cKDTree(gaussians.means[rows]).query(points.positions)
+    names = sorted({name for names in profile.class_sets for name in names}, key=list(NYU40).index)
+    unknown = tuple(name for name in names if engine.unknown_words(name))
+    values = np.full((len(names), len(rows)), -1.0, np.float32)
+    for row, name in enumerate(names):
+        if name not in unknown:
+            values[row] = engine.relevancy(engine.text_vector(name)).max(0)[rows]
+    found = []
+    for chosen in profile.class_sets:
+        part = [names.index(name) for name in chosen]
+        ids = np.array([NYU40[name] for name in chosen], np.int32)
+        best = values[part].argmax(0)
+        found.append(np.where(values[part].max(0) >= 0, ids[best], 0)[nearest].astype(np.int32))
+    return found, unknown
+
+
+def map_classes(folder: Path, points: LabelledPoints, profile: PointProfile) -> list[Array]:
+    """Another system's answer, `folder`/<scene>.npy: (V,) whole ids of NYU40 in the vertices' order, or
+    (S, V) with one row per set of classes."""
+    path = folder / f"{points.name}.npy"
+    ids = read_npy(path)
+    count = len(profile.class_sets)
+    if ids.dtype.kind not in "iu" or ids.shape not in ((len(points.labels),), (count, len(points.labels))):
+        raise FormatError(
+            f"{path}: {ids.dtype} {ids.shape}; expected whole numbers of shape ({len(points.labels)},), one "
+            f"per vertex, or ({count}, {len(points.labels)})"
+        )
+    return [ids] * count if ids.ndim == 1 else list(ids)
+
+
+def score_points(
+    points: LabelledPoints, found: list[Array], profile: PointProfile, unknown: tuple[str, ...] = ()
+) -> list[PointScore]:
+    """One score per set of classes."""
+    scores = []
+    for names, ids in zip(profile.class_sets, found, strict=True):
+        counted = np.isin(points.labels, [NYU40[name] for name in names])
+        truth, given = points.labels[counted], ids[counted]
+        present = [name for name in names if (truth == NYU40[name]).any()]
+        ious, accuracies = [], []
+        for name in present:
+            right, said = truth == NYU40[name], given == NYU40[name]
+            ious.append((right & said).sum() / (right | said).sum())
+            accuracies.append(said[right].mean())
+        mean_iou = float(np.mean(ious)) if ious else 0.0
+        accuracy = float(np.mean(accuracies)) if accuracies else 0.0
+        lost = tuple(name for name in present if name in unknown)
+        scores.append(PointScore(points.name, len(names), len(present), len(truth), mean_iou, accuracy, lost))
+    return scores
+
+
+# ScanNet's scenes, whoever answers them, and the report.
+
+
+@dataclass(frozen=True)
+class PointReport:
+    """One system on ScanNet."""
+
+    profile: PointProfile
+    subject: str
+    scores: tuple[PointScore, ...]
+
+
+def run_scannet(
+    files: Mapping[str, Path],
+    subject: Subject,
+    load_encoder: LoadEncoder,
+    only: Sequence[str] = (),
+    progress: Progress = silent,
+) -> PointReport:
+    """Score `subject` on the scenes whose label files are given, or those named by `only`. Raises InputError
+    for a scene or maps that do not belong to them."""
+    profile = PointProfile()
+    wrong = [name for name in only if name not in files]
+    if wrong:
+        raise InputError(f"--only {wrong[0]}: no such labelled scene; there are {', '.join(files)}")
+    names = list(only or files)
+    if subject.scene is not None and not subject.scene.is_dir() and len(names) > 1:
+        names = [name for name in names if name == subject.scene.stem]
+        if not names:
+            raise InputError(f"{subject.scene} could be any labelled scene; say which with --only")
+    scores: list[PointScore] = []
+    for done, name in enumerate(names):
+        points = read_points(files[name], name)
+        if subject.maps is not None:
+            scores += score_points(points, map_classes(subject.maps, points, profile), profile)
+        else:
+            assert subject.scene is not None
+            path = subject.scene / f"{name}.ply" if subject.scene.is_dir() else subject.scene
+            scene = load_scene(path)
+            if scene.language is None:
+                raise InputError(f"{path}: {no_field(scene)}")
+            engine = QueryEngine(scene, load_encoder, encoder_id=subject.encoder)
+            found, unknown = scene_classes(engine, points, profile)
+            scores += score_points(points, found, profile, unknown)
+        progress("asking classes", (done + 1) / len(names))
+    return PointReport(profile, str(subject.scene or subject.maps), tuple(scores))
+
+
+def point_table(report: PointReport) -> str:
+    """Markdown, and below it what a reader has to know."""
+    lines = ["| | classes | of them present | vertices | mIoU % | mAcc % |", "|---|---|---|---|---|---|"]
+    for s in report.scores:
+        shares = f"{100 * s.iou:.1f} | {100 * s.accuracy:.1f}"
+        lines.append(f"| {s.scene} | {s.classes} | {s.present} | {s.points} | {shares} |")
+    for classes in dict.fromkeys(score.classes for score in report.scores):
+        rows = [score for score in report.scores if score.classes == classes]
+        shares = (
+            f"{100 * np.mean([s.iou for s in rows]):.1f} | {100 * np.mean([s.accuracy for s in rows]):.1f}"
+        )
+        total = sum(score.points for score in rows)
+        lines.append(f"| macro, mean of scenes | {classes} | | {total} | {shares} |")
+    lines += ["", f"scannet, protocol {report.profile.name}: {report.profile.source}"]
+    lines += [f"scored: {report.subject}", FIXED]
+    unknown = dict.fromkeys(name for score in report.scores for name in score.unknown)
+    if unknown:
+        lines.append(
+            f"the encoder does not know {', '.join(unknown)}: counted as wrong at each of their vertices"
+        )
+    return "\n".join(lines)
+
+
+def save_point_json(path: Path, report: PointReport) -> None:
+    """All of it."""
+    write_json(path, asdict(report))

@@ -1,0 +1,345 @@
+"""Reading files that nobody vouches for: whatever is wrong with one is a single InputError or FormatError,
+and no memory is taken on the word of a header."""
+
+import ctypes
+import io
+import json
+import logging
+import math
+import re
+import stat
+import threading
+import warnings
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from PIL import Image, _imaging, features
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import FormatError, InputError, LangSplatError, printable_line, quoted
+from langsplat_core.io.files import atomic_path
+
+# Files of plain NumPy arrays of numbers or texts, .npy and .npz, read without pickles and without belief in
+# their headers; and .npy written.
+
+MAGIC = b"\x93NUMPY"
+HEADER_LIMIT = 10_000  # bytes; NumPy writes 118
+MEMBER_LIMIT = 2**31  # bytes of one array in an .npz: packed ones may be a thousand times their file
+# What NumPy writes, to the letter. Its own reader evaluates the text as a Python literal, and on damaged
+# headers raises tokenizer errors and warnings. A comma stands between two sizes: were it optional, a run of a
+# hundred digits could be divided in so many ways that trying them takes minutes.
+_HEADER = re.compile(
+    rb"\{'descr': '(?P<dtype>[<>|](?:[iu][1248]|f[248]|U[1-9]\d{0,3}))', "
+    rb"'fortran_order': (?P<order>True|False), "
+    rb"'shape': \((?P<shape>(?:\d{1,18}(?:, ?\d{1,18}){0,7},?)?)\), ?\} *\n?$"
+)
+
+
+def write_npy(path: Path, array: Array) -> None:
+    """Write an array of numbers, whole or not at all.
+
+    `np.save` hands the numbers to C's library, and where the disk takes all but the end nobody is told.
+    """
+    whole = np.asarray(array, order="C")
+    header = np.lib.format.header_data_from_array_1_0(whole)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, header)
+        file.write(whole.reshape(-1).view(np.uint8).data)
+
+
+def read_npy(path: Path) -> Array:
+    """The array of numbers in a .npy file. Raises InputError where it cannot be opened, else FormatError."""
+    file, size = open_for_reading(path)
+    with file:
+        return _parse(file, size, str(path))
+
+
+def read_npz(path: Path) -> dict[str, Array]:
+    """The arrays in an .npz file, by their names without .npy. Raises as `read_npy` does."""
+    arrays = {}
+    with opened_archive(path, ".npz file") as archive:
+        for member in archive.names:
+            data = archive.read(member, MEMBER_LIMIT)
+            name = member.removesuffix(".npy")
+            arrays[name] = _parse(io.BytesIO(data), len(data), f"{path}: {quoted(name, 60)}")
+    return arrays
+
+
+def _parse(file: BinaryIO, size: int, name: str) -> Array:
+    """`numpy.load` that believes the header only as far as `size` bytes of `file` go; `name` for messages."""
+    prefix = file.read(8)
+    version = prefix[6] if len(prefix) == 8 and prefix.startswith(MAGIC) else 0
+    length_size = {1: 2, 2: 4, 3: 4}.get(version, 0)
+    length = int.from_bytes(file.read(length_size), "little")
+    header = _HEADER.match(file.read(min(length, HEADER_LIMIT)))
+    if header is None:
+        raise FormatError(f"{name}: not a .npy file of plain numbers; was it made by another program?")
+    dtype = np.dtype(header["dtype"].decode())
+    shape = tuple(int(number) for number in header["shape"].split(b",") if number.strip())
+    needed = math.prod(shape) * dtype.itemsize
+    if file.tell() + needed != size:
+        raise FormatError(
+            f"{name}: truncated or damaged: shape {shape} needs {needed} bytes, "
+            f"the file has {size - file.tell()}"
+        )
+    data = np.frombuffer(file.read(), dtype)
+    if dtype.kind == "U" and data.size and not _is_text(data):
+        raise FormatError(f"{name}: holds a text that is not Unicode")
+    return data.reshape(shape, order="F" if header["order"] == b"True" else "C")
+
+
+def _is_text(data: Array) -> bool:
+    """Whether every code point of a text array exists; NumPy raises SystemError over one that does not."""
+    codes = data.view(data.dtype.byteorder.replace("|", "=") + "u4")
+    return bool(((codes < 0xD800) | (codes > 0xDFFF) & (codes <= 0x10FFFF)).all())
+
+
+# Opening a file for reading, with every way it can fail as one line for the user.
+
+
+def open_for_reading(path: Path) -> tuple[BinaryIO, int]:
+    """An ordinary file opened in binary mode, and its size in bytes.
+
+    Raises InputError for a path that does not exist, is a folder, a device or a pipe (which could block
+    or never end), or may not be read.
+    """
+    try:
+        status = path.stat()
+        if stat.S_ISDIR(status.st_mode):
+            raise InputError(f"{path}: is a folder; name a file in it")
+        if not stat.S_ISREG(status.st_mode):
+            raise InputError(f"{path}: is not an ordinary file")
+        return path.open("rb"), status.st_size
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the spelling and the folder") from None
+    except PermissionError:
+        raise InputError(f"{path}: may not be read; change its permissions") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise InputError(f"{path}: cannot be opened ({error})") from None
+
+
+def exists(path: Path) -> bool:
+    """`Path.exists`, where a name too long or a folder that may not be searched means no."""
+    try:
+        return path.exists()
+    except OSError:
+        return False
+
+
+def read_json_file(path: Path, limit: int) -> Any:
+    """The value in a JSON file of at most `limit` bytes. Raises InputError and FormatError."""
+    file, size = open_for_reading(path)
+    with file:
+        if size > limit:
+            raise FormatError(f"{path}: {size} bytes; a file of this kind never exceeds {limit}")
+        return parse_json(file.read(size), path)
+
+
+def parse_json(text: bytes, path: Path) -> Any:
+    """`json.loads` with its failures as FormatError: bad syntax, bad UTF-8, endless nesting or digits."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise FormatError(f"{path}: not readable as JSON (nested too deeply)") from None
+    except ValueError as error:
+        raise FormatError(f"{path}: not readable as JSON ({str(error)[:80]})") from None
+
+
+# Zip archives without belief in their directories.
+#
+# `zipfile` lets through what its decompressors and its own parsing meet in damaged archives (LZMAError,
+# IndexError, struct.error, NotImplementedError, zlib.error ...), so every exception here means an unreadable
+# archive. Only stored and deflated members are unpacked: no format that is read here uses other methods.
+
+METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+
+
+class Archive:
+    """The members of an open archive."""
+
+    def __init__(self, archive: zipfile.ZipFile, path: Path, size: int) -> None:
+        self._archive, self.path, self.size = archive, path, size  # size of the file, bytes
+
+    @property
+    def names(self) -> list[str]:
+        """Of all members, in the directory's order."""
+        return self._archive.namelist()
+
+    def read(self, name: str, limit: int) -> bytes:
+        """The content of a member; FormatError where there is none, or where it unfolds to more than `limit`
+        bytes, which is noticed before more are held."""
+        try:
+            info = self._archive.getinfo(name)
+        except KeyError:
+            raise FormatError(f"{self.path}: has no {quoted(name, 60)} inside") from None
+        if info.compress_type not in METHODS:
+            raise FormatError(
+                f"{self.path}: {quoted(name, 60)} inside is packed by method {info.compress_type}; "
+                "pack the archive again with deflate"
+            )
+        with self._archive.open(info) as member:
+            content = member.read(limit + 1)
+        if len(content) > limit:
+            raise FormatError(f"{self.path}: {quoted(name, 60)} inside has more than {limit} bytes")
+        return content
+
+
+@contextmanager
+def opened_archive(path: Path, kind: str) -> Iterator[Archive]:
+    """The archive in a file; `kind` is for messages ("SOG archive"). Raises InputError where the file cannot
+    be opened, and FormatError for whatever zipfile raises inside the block."""
+    file, size = open_for_reading(path)
+    with file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                yield Archive(archive, path, size)
+        except LangSplatError:
+            raise
+        except Exception as error:  # noqa: BLE001  any at all, see the top of this file
+            what = str(error)[:80] or type(error).__name__
+            raise FormatError(f"{path}: not a readable {kind} ({what})") from None
+
+
+# Opening picture files: the one place of the project that hands a file to Pillow.
+#
+# The kind is told by the content, and only the kinds below are tried: others (EPS, WMF, FITS ...) make
+# Pillow start other programs or allocate what a header of a few bytes asks for. The size that the header
+# declares is judged before a pixel is decoded. Pillow lets through whatever its decoders meet in damaged
+# data (IndexError, AssertionError, TypeError, NotImplementedError ...), so here every exception means an
+# unreadable picture, and its warnings about damaged metadata are silenced: a picture is either read or
+# refused.
+
+KINDS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # always; AVIF and HEIF where Pillow has a codec
+# HEIF is named where it cannot be read, too: the message then says why such photographs are left out
+PHOTO_SUFFIXES = (
+    *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif"),
+    *(".heic", ".heif"),
+)
+MOST_PIXELS = 178_000_000  # of any picture: 0.7 GB once decoded. The largest cameras make 151 million
+# Declared pixels beyond these need a file of a fitting size: photographs keep 2 to 100 pixels a byte, what is
+# made to exhaust memory a million. The decoders of WebP and AVIF hold two more copies of the picture.
+FREE_PIXELS, FREE_PIXELS_COPIED, PIXELS_PER_BYTE = 16_000_000, 8_000_000, 128
+
+
+class PictureError(FormatError):
+    """A picture that cannot be read; `reason` is the message without the file's name."""
+
+    def __init__(self, name: object, reason: str) -> None:
+        self.reason = reason
+        super().__init__(f"{name}: not a readable picture ({reason})")
+
+
+@contextmanager
+def opened(
+    source: Path | bytes, name: str | None = None, kinds: tuple[str, ...] | None = None
+) -> Iterator[Image.Image]:
+    """The picture in a file or in bytes, not decoded yet; inside the block it may be.
+
+    `name` is for messages, by default the path. Raises PictureError for what cannot be opened, is of none of
+    the `kinds` (default: all that are read) or declares too many pixels, and for whatever Pillow raises
+    inside the block.
+    """
+    name = name or (str(source) if isinstance(source, Path) else "a picture in memory")
+    try:
+        file, size = _file(source)
+    except InputError as error:
+        raise PictureError(name, str(error).removeprefix(f"{name}: ")) from None
+    with file, _quiet:
+        try:
+            # Image.open looks at the first bytes only to choose the kind; the name's ending plays no part
+            with Image.open(file, formats=kinds or readable_kinds()) as picture:
+                _check_size(name, picture, size)
+                yield picture
+        except LangSplatError:
+            raise
+        except Image.UnidentifiedImageError:
+            read = ", ".join(kinds or readable_kinds())
+            raise PictureError(name, f"the content is none of {read}, or damaged") from None
+        except Exception as error:  # noqa: BLE001  any at all, see the top of this file
+            raise PictureError(name, _reason(error)) from None
+
+
+def readable_kinds() -> tuple[str, ...]:
+    """Pillow's names of the kinds that are read on this machine."""
+    # pillow_heif, where somebody has registered it, adds HEIF
+    return KINDS + ("AVIF",) * bool(features.check("avif")) + ("HEIF",) * ("HEIF" in Image.OPEN)
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """(width, height) in pixels as the header declares them. Raises PictureError."""
+    with opened(path) as picture:
+        return picture.size
+
+
+def _file(source: Path | bytes) -> tuple[BinaryIO, int]:
+    if isinstance(source, bytes):
+        return io.BytesIO(source), len(source)
+    return open_for_reading(source)
+
+
+def _check_size(name: str, picture: Image.Image, file_size: int) -> None:
+    free = FREE_PIXELS_COPIED if picture.format in ("WEBP", "AVIF", "HEIF") else FREE_PIXELS
+    most = min(MOST_PIXELS, free + PIXELS_PER_BYTE * file_size)
+    if picture.width * picture.height > most:
+        raise PictureError(
+            name,
+            f"declares {picture.width}x{picture.height} pixels; at most {most // 10**6} million are read "
+            f"from a file of {file_size} bytes",
+        )
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, Image.DecompressionBombError):
+        return f"declares more than {MOST_PIXELS // 10**6} million pixels"
+    text = printable_line(error, 80)
+    # these say what is wrong with the file; others, such as IndexError, with Pillow's handling of it
+    telling = isinstance(error, OSError | SyntaxError | ValueError) and text
+    return text if telling else f"damaged: {text or type(error).__name__}"
+
+
+class _Quiet:
+    """No Python warnings while any thread is inside.
+
+    `warnings.catch_warnings` alone is not safe where threads overlap: the one that leaves last would restore
+    what another had set.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._inside = threading.Lock(), 0
+        self._filters = warnings.catch_warnings()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self._inside += 1
+            if self._inside == 1:
+                self._filters = warnings.catch_warnings()
+                self._filters.__enter__()
+                warnings.simplefilter("ignore")
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._filters.__exit__(None, None, None)
+
+
+_quiet = _Quiet()
+
+
+def _silence() -> None:
+    """Pillow's loggers and libtiff itself write to the standard error what they then raise as well."""
+    logging.getLogger("PIL").setLevel(logging.CRITICAL)
+    library = ctypes.CDLL(_imaging.__file__)  # the copy that Pillow is linked to
+    for kind in ("Error", "Warning"):
+        # absent where libtiff is linked in without names
+        set_handler = getattr(library, f"TIFFSet{kind}Handler", None)
+        if set_handler is not None:
+            set_handler.argtypes, set_handler.restype = (ctypes.c_void_p,), ctypes.c_void_p
+            set_handler(None)
+
+
+_silence()

@@ -1,0 +1,337 @@
+"""The tensors of a language sidecar, read and checked; the layout stands in `language`."""
+
+import hashlib
+import json
+import struct
+from dataclasses import astuple, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from langsplat_core.arrays import Array, check_array
+from langsplat_core.errors import FormatError, printable_line, quoted
+from langsplat_core.io.files import atomic_path
+from langsplat_core.io.hostile import open_for_reading, parse_json
+from langsplat_core.io.ply import pack_positions, step, unpack_positions
+from langsplat_core.scene import (
+    CANONICAL_PHRASES,
+    LEVELS,
+    NO_THING,
+    Calibration,
+    LanguageField,
+    Odds,
+    Reading,
+    codec_from_tensors,
+)
+from langsplat_core.scene.codec import KINDS
+
+FORMAT, VERSION = "langsplat", "2"
+CODEC = "codec."
+WAYS = len(fields(Calibration))  # to look for something, each with odds of its own
+_KEYS = {
+    "1": ("encoder", "levels", "codec", "d", "gaussians", "means_blake2b", "phrases"),
+    "2": (
+        *("encoder", "levels", "codec", "d", "gaussians", "means_blake2b", "phrases"),
+        *("temperature", "found"),
+    ),
+}
+_FLOATS = {"1": ("F32",), "2": ("F32", "F16")}
+_WHOLE = {"codes": "U16", "things": "U16", "positions": "U64"}  # tensors that hold no floating-point numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """What a sidecar holds."""
+
+    field: LanguageField
+    means: Array  # (N, 3) positions of the Gaussians it was made for, world units; NaN for those not finite
+    precision: float  # of these positions, world units
+    checksum: str  # of the means of the PLY
+
+
+def read_stored(path: Path) -> Stored:
+    """Everything in the sidecar `path`. Raises InputError when it cannot be opened and FormatError when it
+    breaks a rule of the layout."""
+    open_for_reading(path)[0].close()  # the same messages for a missing file as everywhere
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            _check_metadata(metadata, path)
+            tensors = {}
+            for name in file.keys():  # noqa: SIM118 (not a dictionary)
+                kind = file.get_slice(name).get_dtype()
+                wanted = (_WHOLE[name],) if name in _WHOLE else _FLOATS[metadata["version"]]
+                if kind not in wanted:
+                    raise FormatError(
+                        f"{path}: tensor {quoted(name)} is {kind}; expected {' or '.join(wanted)}"
+                    )
+                tensor = file.get_tensor(name)
+                tensors[name] = tensor if name in _WHOLE else tensor.astype(np.float32)
+    except SafetensorError as error:
+        raise FormatError(f"{path}: not a whole safetensors file ({printable_line(error, 80)})") from None
+    return _assemble(tensors, metadata, path)
+
+
+def _check_metadata(metadata: dict[str, str], path: Path) -> None:
+    if metadata.get("format") != FORMAT:
+        raise FormatError(f"{path}: a safetensors file, but not a language field of this program")
+    version = metadata.get("version")
+    if version not in _KEYS:
+        raise FormatError(
+            f"{path}: language format version {quoted(version)}; this program reads {' and '.join(_KEYS)}, "
+            "update it"
+        )
+    for key in _KEYS[version]:
+        if key not in metadata:
+            raise FormatError(f"{path}: the header has no {key!r}")
+    if metadata["levels"] != ",".join(LEVELS):
+        raise FormatError(f"{path}: levels {quoted(metadata['levels'], 60)}; expected {','.join(LEVELS)!r}")
+
+
+def _assemble(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> Stored:
+    kind = KINDS.get(metadata["codec"])
+    latents_name = "codes" if kind is not None and kind.space == "index" else "latents"
+    places = ("means",) if metadata["version"] == "1" else ("positions", "corners")
+    for name in (latents_name, "confidence", "canonical", *places):
+        if name not in tensors:
+            raise FormatError(f"{path}: tensor {name!r} is missing")
+    for name, tensor in tensors.items():
+        if name != "means" and not np.isfinite(tensor).all():
+            raise FormatError(f"{path}: tensor {quoted(name)} holds numbers that are not finite")
+    try:
+        field = _field(tensors, metadata, latents_name, path)
+        means, precision = _means(tensors, len(field))
+    except (ValueError, TypeError, IndexError) as error:
+        raise FormatError(f"{path}: {error}") from None
+    if (metadata["d"], metadata["gaussians"]) != (str(field.codec.latent_dim), str(len(field))):
+        raise FormatError(f"{path}: the header's d or number of Gaussians is not that of the tensors")
+    if (field.confidence < 0).any():
+        raise FormatError(f"{path}: tensor 'confidence' holds negative numbers")
+    return Stored(field, means, precision, metadata["means_blake2b"])
+
+
+def _field(
+    tensors: dict[str, Array], metadata: dict[str, str], latents_name: str, path: Path
+) -> LanguageField:
+    weights = {name.removeprefix(CODEC): t for name, t in tensors.items() if name.startswith(CODEC)}
+    codec = codec_from_tensors(metadata["codec"], weights)
+    latents = tensors[latents_name]
+    if latents_name == "codes":
+        check_array("codes", latents, (len(LEVELS), "N"))
+        latents = latents[..., None]
+    phrases = _phrases(metadata, path)
+    vectors = tensors.get("phrasebook", np.zeros((0, codec.vector_dim), np.float32))
+    check_array("phrasebook", vectors, (len(phrases), codec.vector_dim))
+    check_array("canonical", tensors["canonical"], (len(CANONICAL_PHRASES), codec.vector_dim))
+    reading = Reading()
+    if metadata["version"] != "1":
+        calibration = _calibration(metadata, path)
+        reading = Reading(float(metadata["temperature"]), float(metadata["found"]), calibration)
+    return LanguageField(
+        latents,
+        tensors["confidence"],
+        codec,
+        tensors["canonical"],
+        metadata["encoder"],
+        dict(zip(phrases, vectors, strict=True)),
+        reading,
+        tensors.get("things"),
+        tensors.get("everyday"),
+    )
+
+
+def _calibration(metadata: dict[str, str], path: Path) -> Calibration | None:
+    if "odds" not in metadata:
+        return None
+    odds = parse_json(metadata["odds"].encode(), path)
+    if not isinstance(odds, list) or len(odds) != WAYS or not all(map(_four, odds)):
+        raise FormatError(f"{path}: the header's 'odds' are not {WAYS} lists of four numbers")
+    return Calibration(*(Odds(*numbers) for numbers in odds))
+
+
+def _four(numbers: object) -> bool:
+    return isinstance(numbers, list) and len(numbers) == 4 and all(isinstance(n, float) for n in numbers)
+
+
+def _means(tensors: dict[str, Array], count: int) -> tuple[Array, float]:
+    """Positions of the Gaussians, and how precise they are."""
+    if "means" in tensors:
+        check_array("means", tensors["means"], (count, 3))
+        return tensors["means"], 0.0
+    check_array("positions", tensors["positions"], (count,))
+    check_array("corners", tensors["corners"], (2, 3))
+    corners = tensors["corners"]
+    return unpack_positions(tensors["positions"], corners), step(corners)
+
+
+def _phrases(metadata: dict[str, str], path: Path) -> list[str]:
+    phrases = parse_json(metadata["phrases"].encode(), path)
+    if not isinstance(phrases, list) or not all(isinstance(phrase, str) for phrase in phrases):
+        raise FormatError(f"{path}: the header's 'phrases' are not a list of texts")
+    if len(set(phrases)) != len(phrases):
+        raise FormatError(f"{path}: the header's 'phrases' name one phrase twice")
+    return phrases
+
+
+def save_tensors(path: Path, tensors: dict[str, Array], metadata: dict[str, str]) -> None:
+    """Write a safetensors file that is the same, byte for byte, whenever its content is.
+
+    The library writes the metadata in an order of its own, another one each time; here they are sorted.
+    """
+    save_file({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}, path, metadata)
+    with open(path, "r+b") as file:
+        (size,) = struct.unpack("<Q", file.read(8))
+        header = json.loads(file.read(size))
+        header["__metadata__"] = dict(sorted(metadata.items()))
+        text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+        if len(text) <= size:  # always, unless the library begins to write JSON in another way
+            file.seek(8)
+            file.write(text.ljust(size))
+
+
+# The language field of a scene: `scene.langsplat.safetensors` beside `scene.ply`.
+#
+# A safetensors file (an 8-byte length, a JSON header, raw little-endian tensors: nothing in it is ever
+# executed). Version 2, for N Gaussians, CLIP vectors of D numbers and P phrases:
+#
+# tensor           type     shape      meaning codes            uint16   (3, N)     number of the codeword
+# at subpart, part, whole: of a codebook latents          float    (3, N, d)  instead, of another codec;
+# zero where never observed confidence       float    (3, N)     total blending weight of the observations,
+# >= 0; 0 for no meaning things           uint16   (N,)       number of the thing a Gaussian belongs to,
+# 65535 for none; absent where it is not known positions        uint64   (N,)       of the Gaussians that
+# the field belongs to, see `packed_positions` corners          float32  (2, 3)     of the box of these
+# positions canonical        float    (4, D)     unit text vectors of "object", "things", "stuff", "texture"
+# everyday         float    (V, D)     unit text vectors of phrases most of which name nothing in the scene;
+# absent where the encoder knows too few phrasebook       float    (P, D)     unit text vectors of
+# `phrases`; absent when P = 0 codec.*          float               of a codebook vectors (K, D) and colours
+# (K, 3); basis (d, D) of a linear codec; of an autoencoder {encoder,decoder}.{layer}.{weight,bias}
+#
+# metadata         value format           "langsplat" version          "2" encoder          hub id or folder
+# of the text encoder levels           "subpart,part,whole" codec            "codebook", "autoencoder" or
+# "linear" d                latent dimension, decimal gaussians        N, decimal means_blake2b
+# BLAKE2b-128 of the means of the PLY, as float32 little endian, hexadecimal phrases          JSON list of
+# the P phrases temperature      of the softmax that reads this encoder's cosines, decimal found
+# relevancy from which a phrase counts as present, decimal odds             JSON: a list of numbers for each
+# of the three `Odds` of `scene.Calibration`; absent where the encoder has none ("calibration" of older
+# files is of another scale, and is not read)
+#
+# "float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
+# like the one in memory. With a codebook as `langsplat train` makes it that is 22 bytes per Gaussian, 6 of
+# them codes.
+#
+# The PLY stays a plain file that other programs edit; the checksum notices it, and the positions let
+# `rematch_language` carry the field over to an edited PLY. Version 1 is read too: everything float32, `means`
+# (N, 3) in place of positions and corners, no temperature and no found.
+
+SUFFIX = ".langsplat.safetensors"
+
+
+def means_checksum(means: Array) -> str:
+    """Of (N, 3) float32 positions; every bit counts, so that any edit or reordering is noticed."""
+    data = np.ascontiguousarray(means, dtype="<f4")
+    return hashlib.blake2b(data.tobytes(), digest_size=16).hexdigest()
+
+
+def write_language(path: Path | str, field: LanguageField, means: Array) -> None:
+    """Write `field` for the Gaussians at `means` (N, 3), atomically."""
+    check_array("means", means, (len(field), 3), dtype=np.float32)
+    positions, corners = pack_positions(means)
+    indexed = field.codec.space == "index"
+    floats = {
+        "confidence": field.confidence,
+        "canonical": field.canonical,
+        **({} if indexed else {"latents": field.latents}),
+        **({} if field.everyday is None else {"everyday": field.everyday}),
+        **({"phrasebook": np.stack(list(field.phrasebook.values()))} if field.phrasebook else {}),
+        **{CODEC + name: tensor for name, tensor in field.codec.tensors().items()},
+    }
+    tensors = {name: _narrow(tensor) for name, tensor in floats.items()}
+    tensors |= {"positions": positions, "corners": corners}
+    if indexed:
+        tensors["codes"] = field.latents[..., 0]
+    if field.things is not None:
+        tensors["things"] = field.things
+    metadata = {
+        "format": FORMAT,
+        "version": VERSION,
+        "encoder": field.encoder_id,
+        "levels": ",".join(LEVELS),
+        "codec": field.codec.kind,
+        "d": str(field.codec.latent_dim),
+        "gaussians": str(len(field)),
+        "means_blake2b": means_checksum(means),
+        "phrases": json.dumps(list(field.phrasebook), ensure_ascii=False),
+        "temperature": repr(field.reading.temperature),
+        "found": repr(field.reading.found),
+    }
+    if field.reading.calibration is not None:
+        odds = astuple(field.reading.calibration)
+        metadata["odds"] = json.dumps([[float(n) for n in numbers] for numbers in odds])
+    with atomic_path(path) as temporary:
+        save_tensors(temporary, tensors, metadata)
+
+
+def _narrow(tensor: Array) -> Array:
+    """As float16 where that loses nothing."""
+    with np.errstate(over="ignore"):
+        half = tensor.astype(np.float16)
+    return half if np.array_equal(half.astype(np.float32), tensor) else tensor
+
+
+def read_language(path: Path | str, means: Array) -> LanguageField:
+    """The field in the sidecar `path`, which must belong to the Gaussians at `means` (N, 3) float32.
+
+    Raises InputError when it cannot be opened and FormatError when it breaks a rule of the layout or was
+    made for other Gaussians.
+    """
+    path = Path(path)
+    stored = read_stored(path)
+    mend = f"; if the PLY was edited, run 'langsplat convert EDITED.ply NEW.ply --rematch {path}'"
+    if len(stored.field) != len(means):
+        raise FormatError(f"{path}: made for {len(stored.field)} Gaussians, the scene has {len(means)}{mend}")
+    if stored.checksum != means_checksum(means):
+        raise FormatError(f"{path}: made for Gaussians at other positions than the scene's{mend}")
+    return stored.field
+
+
+def rematch_language(
+    sidecar: Path | str, new_means: Array, max_distance: float | None = None
+) -> LanguageField:
+    """The field in `sidecar`, carried over to Gaussians at `new_means` (N, 3) by nearest position.
+
+    `max_distance` is in world units; by default the median distance of the old Gaussians to their nearest
+    neighbours, so that positions may have been rounded (a compressed PLY does) but what was added or
+    moved far gets no meaning. A Gaussian without a partner has confidence 0 and zero latents.
+    """
+    from scipy.spatial import cKDTree  # 0.2 s to import, and only this function needs it
+
+    stored: Stored = read_stored(Path(sidecar))
+    field, old_means = stored.field, stored.means
+    old_rows = np.flatnonzero(np.isfinite(old_means).all(1))
+    new_rows = np.flatnonzero(np.isfinite(new_means).all(1))
+    latents = np.zeros((len(LEVELS), len(new_means), field.latents.shape[2]), field.latents.dtype)
+    confidence = np.zeros((len(LEVELS), len(new_means)), np.float32)
+    things = np.full(len(new_means), NO_THING, np.uint16)
+    if len(old_rows) and len(new_rows):
+        tree = cKDTree(old_means[old_rows])
+        if max_distance is None:
+            max_distance = _median_spacing(tree)
+        distance, partner = tree.query(new_means[new_rows])
+        found = distance <= max_distance + stored.precision
+        to, source = new_rows[found], old_rows[partner[found]]
+        latents[:, to], confidence[:, to] = field.latents[:, source], field.confidence[:, source]
+        if field.things is not None:
+            things[to] = field.things[source]
+    return replace(
+        field, latents=latents, confidence=confidence, things=None if field.things is None else things
+    )
+
+
+def _median_spacing(tree: Any) -> float:
+    """Median distance of (a sample of) the tree's points to their nearest neighbours; 0 for a single one."""
+    sample = tree.data[:: max(1, len(tree.data) // 10_000)]
+    distances = tree.query(sample, k=2)[0][:, 1]  # infinite where there is no second point
+    return float(np.median(np.where(np.isfinite(distances), distances, 0)))

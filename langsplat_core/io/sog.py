@@ -1,0 +1,211 @@
+"""Reading SOG version 2 (PlayCanvas "spatially ordered Gaussians"): images of quantised columns.
+
+`meta.json` names the images; they lie beside it in a folder, or with it in one `.sog` (zip). Pixel i, row
+by row, belongs to Gaussian i:
+
+    means[0], means[1]   low and high bytes of 16-bit fractions between `mins` and `maxs`, of
+                         sign(x) log(1 + |x|) per axis
+    quats                the three smaller of w x y z as fractions of [-sqrt(1/2), sqrt(1/2)]; alpha - 252
+                         says which one is left out (it is positive)
+    scales               indices into `codebook` of log scales
+    sh0                  rgb: indices into `codebook` of f_dc; alpha: opacity (not a logit)
+    shN, optional        files[1]: 16-bit number of a palette entry; files[0]: the palette, 64 entries a
+                         row, one pixel per coefficient, rgb: indices into `codebook`
+
+Opacities of 0 and 1 become logits of -infinity and +infinity. `model: "antialiased"`, in older files
+`antialias: true`, says that the Gaussians were trained with Mip-Splatting's compensation. Source:
+PlayCanvas' public specification.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from langsplat_core.arrays import Array, logit
+from langsplat_core.errors import FormatError, quoted
+from langsplat_core.io.hostile import Archive, open_for_reading, opened, opened_archive, parse_json
+from langsplat_core.io.ply import smallest_three
+from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
+
+META_NAME = "meta.json"
+META_LIMIT = 1024 * 1024  # bytes; a real one has three codebooks, 15 kB
+PALETTE_ROW, PALETTE_ROWS = 64, 1024  # entries a row, most rows
+IMAGE_LIMIT = 1 << 30  # bytes of one image file
+# The low bytes of positions are close to noise: lossless compression gains 3 to 1 at best. An image that
+# claims to have gained 64 to 1 is made to exhaust memory.
+PIXELS_PER_BYTE = 64
+SLACK_PIXELS = 65536
+
+Fetch = Callable[[str, int], bytes]  # (file name, most bytes) -> content
+
+
+def read_sog(path: Path | str) -> Gaussians:
+    """The Gaussians of a SOG folder, its `meta.json`, or a `.sog` file. Raises as `read_sog_scene` does."""
+    return read_sog_scene(path).gaussians
+
+
+def read_sog_scene(path: Path | str) -> Scene:
+    """The Gaussians, as `read_sog` gives them, and whether they are to be drawn antialiased.
+
+    Raises InputError when a file cannot be opened and FormatError when it breaks a rule of the format.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _decode(_folder_reader(path), path / META_NAME)
+    if path.suffix.lower() == ".json":
+        return _decode(_folder_reader(path.parent), path)
+    with opened_archive(path, "SOG archive") as archive:
+        return _decode(_archive_reader(archive), path / META_NAME)
+
+
+def _folder_reader(folder: Path) -> Fetch:
+    def fetch(name: str, limit: int) -> bytes:
+        file, size = open_for_reading(folder / name)
+        with file:
+            if size > limit:
+                raise FormatError(f"{folder / name}: {size} bytes; expected at most {limit}")
+            return file.read(size)
+
+    return fetch
+
+
+def _archive_reader(archive: Archive) -> Fetch:
+    # The images are compressed already, so a member far larger than its archive is a trap.
+    return lambda name, limit: archive.read(name, min(limit, 16 * archive.size + META_LIMIT))
+
+
+def _decode(fetch: Fetch, meta_path: Path) -> Scene:
+    """`meta_path` is for messages; the name of the meta file is its last part."""
+    meta = _Meta(parse_json(fetch(meta_path.name, META_LIMIT), meta_path), meta_path)
+    meta.check_version()
+    return Scene(_gaussians(fetch, meta), antialiased=meta.antialiased())
+
+
+def _gaussians(fetch: Fetch, meta: "_Meta") -> Gaussians:
+    count = meta.whole_number("count", least=0, most=2**32)
+    planes = _Planes(fetch, meta, count)
+    low, high = planes.of_gaussians("means", 0), planes.of_gaussians("means", 1)
+    fractions = (low[:, :3] + high[:, :3].astype(np.uint32) * 256) / 65535
+    mins, maxs = (meta.numbers("means", key, 3) for key in ("mins", "maxs"))
+    logs = mins + (maxs - mins) * fractions
+    quats = planes.of_gaussians("quats", 0)
+    if count and quats[:, 3].min() < 252:
+        raise FormatError(f"{meta.path}: 'quats' holds an alpha below 252; was the image saved lossily?")
+    sh0 = planes.of_gaussians("sh0", 0)
+    base = meta.numbers("sh0", "codebook", 256)[sh0[:, :3]]
+    with np.errstate(over="ignore"):  # overflow to infinity makes rows that are dropped later
+        means = np.sign(logs) * np.expm1(np.abs(logs))
+    return Gaussians(
+        means=means,
+        log_scales=meta.numbers("scales", "codebook", 256)[planes.of_gaussians("scales", 0)[:, :3]],
+        quats_wxyz=smallest_three((quats[:, :3] / 255 - 0.5) * np.sqrt(2), quats[:, 3] - 252),
+        opacity_logits=logit(sh0[:, 3] / 255),
+        sh=np.concatenate([base[:, None], _rest(planes, meta)], axis=1),
+    )
+
+
+def _rest(planes: "_Planes", meta: "_Meta") -> Array:
+    """(N, K - 1, 3) higher coefficients, from the palette."""
+    if "shN" not in meta.content:
+        return np.zeros((planes.count, 0, 3))
+    bands = meta.whole_number("shN", "bands", least=1, most=3)
+    entries = meta.whole_number("shN", "count", least=1, most=65536)
+    coefficients = SH_COUNTS[bands] - 1
+    palette = planes.palette(coefficients, entries)
+    labels = planes.of_gaussians("shN", 1)
+    entry = labels[:, 0] + labels[:, 1].astype(np.uint32) * 256
+    if planes.count and entry.max() >= entries:
+        raise FormatError(
+            f"{meta.path}: a label of 'shN' is {entry.max()}; the palette has {entries} entries"
+        )
+    return meta.numbers("shN", "codebook", 256)[palette[entry]]
+
+
+class _Planes:
+    """The images, each checked before it is decoded."""
+
+    def __init__(self, fetch: Fetch, meta: "_Meta", count: int) -> None:
+        self._fetch, self._meta, self.count = fetch, meta, count
+
+    def of_gaussians(self, key: str, index: int) -> Array:
+        """(N, 4) uint8 rgba of image `index` of property `key`."""
+        pixels = self._image(key, index, lambda w, h: self.count <= w * h <= 2 * self.count + SLACK_PIXELS)
+        return pixels.reshape(-1, 4)[: self.count]
+
+    def palette(self, coefficients: int, entries: int) -> Array:
+        """(entries, coefficients, 3) uint8 codes of the image shN.files[0]."""
+        rows = -(-entries // PALETTE_ROW)
+        width = PALETTE_ROW * coefficients
+        pixels = self._image("shN", 0, lambda w, h: w == width and rows <= h <= PALETTE_ROWS)
+        return pixels[:rows].reshape(rows * PALETTE_ROW, coefficients, 4)[:entries, :, :3]
+
+    def _image(self, key: str, index: int, suits: Callable[[int, int], bool]) -> Array:
+        """(H, W, 4) uint8; `suits` judges (width, height) before anything is decoded."""
+        name = self._meta.file_name(key, index)
+        what = f"{self._meta.path}: image {quoted(name)} of {key!r}"
+        data = self._fetch(name, IMAGE_LIMIT)
+        if key == "means" and self.count > PIXELS_PER_BYTE * len(data) + SLACK_PIXELS:
+            raise FormatError(f"{what} has {len(data)} bytes, too few for {self.count} Gaussians")
+        with opened(data, what, ("WEBP", "PNG")) as image:
+            if not suits(*image.size):
+                raise FormatError(
+                    f"{what} has {image.width}x{image.height} pixels, which does not suit "
+                    f"{self.count} Gaussians"
+                )
+            # A lossless image of full opacity is stored without alpha: convert makes it 255 again.
+            return np.asarray(image.convert("RGBA"))
+
+
+class _Meta:
+    """`meta.json`, whose every entry is checked when it is asked for."""
+
+    def __init__(self, content: Any, path: Path) -> None:
+        if not isinstance(content, dict):
+            raise FormatError(f"{path}: expected a JSON object")
+        self.content, self.path = content, path
+
+    def check_version(self) -> None:
+        version = self.content.get("version", 1)
+        if version != 2:
+            raise FormatError(
+                f"{self.path}: SOG version {quoted(version)}; only 2 is read, export the scene again"
+            )
+
+    def antialiased(self) -> bool:
+        return self.content.get("model") == "antialiased" or self.content.get("antialias") is True
+
+    def whole_number(self, *keys: str, least: int, most: int) -> int:
+        value = self._at(keys)
+        if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
+            raise FormatError(f"{self.path}: {'.'.join(keys)} is not a whole number from {least} to {most}")
+        return value
+
+    def numbers(self, group: str, key: str, count: int) -> Array:
+        """(count,) finite float64."""
+        value = self._at((group, key))
+        if not isinstance(value, list) or len(value) != count or not all(map(_is_finite_number, value)):
+            raise FormatError(f"{self.path}: {group}.{key} is not a list of {count} numbers")
+        return np.array(value, dtype=np.float64)
+
+    def file_name(self, group: str, index: int) -> str:
+        """A plain file name: a path could lead out of the scene's folder."""
+        files = self._at((group, "files"))
+        name = files[index] if isinstance(files, list) and len(files) > index else None
+        if not isinstance(name, str) or not name or set(name) & set("/\\:\0") or name in (".", ".."):
+            raise FormatError(f"{self.path}: {group}.files has no plain file name at place {index}")
+        return name
+
+    def _at(self, keys: tuple[str, ...]) -> Any:
+        value: Any = self.content
+        for key in keys:
+            if not isinstance(value, dict) or key not in value:
+                raise FormatError(f"{self.path}: {'.'.join(keys)} is missing")
+            value = value[key]
+        return value
+
+
+def _is_finite_number(value: Any) -> bool:
+    # Python's integers have no limit: one beyond float64 must not reach NumPy
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300

@@ -1,0 +1,372 @@
+"""The container of .spz files (Niantic): from the file to one block of bytes per attribute, and back.
+
+Versions 1 to 3 are one gzip stream (a few tools write it without gzip) of a 16-byte header and the blocks
+in the order of `widths`. Version 4 is a header of 32 bytes, extension records up to the byte that the
+header names, a table of (compressed, whole) sizes as uint64, and one Zstandard frame per block. In
+versions 2 and 3 extension records lie behind the last block. A record is a uint32 type, a uint32 length
+and so many bytes; the only one that changes how a file is to be read is the axes', an index into
+LDB RDB LUB RUB LDF RDF LUF RUF (left or right, down or up, back or forward), from 1. Without it a file is
+RUB: x to the right, y up, z backwards.
+
+Source of the layout: README, extensions and loader of nianticlabs/spz; the code here is our own.
+"""
+
+import gzip
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from langsplat_core.arrays import Array, logit, sigmoid, unit
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.io.files import atomic_path
+from langsplat_core.io.hostile import open_for_reading
+from langsplat_core.io.ply import smallest_three
+from langsplat_core.io.splat import to_bytes
+from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
+
+MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
+HEADER_SIZE, HEADER_SIZE_4 = 16, 32
+ANTIALIASED, EXTENDED = 0x1, 0x2  # flags
+AXES_RECORD, AXES_RUB = 0xADBE0003, 4
+SPZ_SH_COUNTS = (1, 4, 9, 16, 25)  # of degree 0 to 4, the base colour included
+# Quantised Gaussians compress 3 to 1 at best. A file that claims to have gained 64 to 1 is made to
+# exhaust memory.
+BYTES_PER_BYTE = 64
+PIECE = 65536  # bytes read at once behind the blocks; extension records have some tens
+SLACK = 1024 * 1024  # bytes, for small files of equal Gaussians
+
+
+@dataclass(frozen=True, eq=False)
+class Packed:
+    """The content of a .spz file, unpacked but still quantised."""
+
+    version: int  # 1 to 4
+    sh_degree: int  # 0 to 4
+    fractional_bits: int  # of positions, from version 2 on
+    antialiased: bool
+    axes: int  # 1 to 8, see above
+    blocks: dict[str, Array]  # attribute -> (N, bytes of one Gaussian) uint8
+
+
+def widths(version: int, sh_degree: int) -> dict[str, int]:
+    """Attribute -> bytes of one Gaussian, in the order of the file."""
+    return {
+        "positions": 6 if version == 1 else 9,
+        "alphas": 1,
+        "colours": 3,
+        "scales": 3,
+        "rotations": 3 if version < 3 else 4,
+        "sh": 3 * (SPZ_SH_COUNTS[sh_degree] - 1),
+    }
+
+
+def read_packed(path: Path) -> Packed:
+    """Raises InputError when the file cannot be opened and FormatError when it breaks a rule."""
+    file, size = open_for_reading(path)
+    with file:
+        start = file.read(8)
+        file.seek(0)
+        if start.startswith(GZIP_MAGIC):
+            try:
+                with gzip.GzipFile(fileobj=file) as unzipped:
+                    return _read_one_stream(unzipped, BYTES_PER_BYTE * size + SLACK, path)  # type: ignore[arg-type]
+            except (OSError, EOFError, zlib.error) as error:
+                raise FormatError(
+                    f"{path}: not a whole gzip stream ({str(error)[:80]}); fetch it again"
+                ) from None
+        if start == MAGIC + b"\x04\0\0\0":
+            return _read_streams(file, size, path)
+        return _read_one_stream(file, size, path)
+
+
+@dataclass(frozen=True)
+class _Header:
+    version: int
+    count: int
+    sh_degree: int
+    fractional_bits: int
+    flags: int
+    streams: int  # of version 4
+
+    def packed(self, axes: int, blocks: list[bytes]) -> Packed:
+        named = zip(widths(self.version, self.sh_degree).items(), blocks, strict=True)
+        arrays = {name: np.frombuffer(b, np.uint8).reshape(self.count, width) for (name, width), b in named}
+        antialiased = bool(self.flags & ANTIALIASED)
+        return Packed(self.version, self.sh_degree, self.fractional_bits, antialiased, axes, arrays)
+
+
+def _header(data: bytes, path: Path) -> _Header:
+    if len(data) < HEADER_SIZE or not data.startswith(MAGIC):
+        raise FormatError(
+            f"{path}: not an .spz file: it does not begin with {MAGIC.decode()}, nor does what is zipped"
+        )
+    header = _Header(*struct.unpack_from("<IIBBBB", data, 4))
+    if not 1 <= header.version <= 4 or header.sh_degree >= len(SPZ_SH_COUNTS):
+        raise FormatError(
+            f"{path}: .spz version {header.version}, SH degree {header.sh_degree}; only versions 1 to 4 "
+            "of degree 0 to 4 are read, export the scene again"
+        )
+    return header
+
+
+def _read_one_stream(file: BinaryIO, limit: int, path: Path) -> Packed:
+    """Versions 1 to 3, unzipped; `limit` is the most bytes that the stream can honestly have."""
+    header = _header(file.read(HEADER_SIZE), path)
+    sizes = [header.count * width for width in widths(header.version, header.sh_degree).values()]
+    if HEADER_SIZE + sum(sizes) > limit:
+        raise FormatError(
+            f"{path}: truncated: {header.count} Gaussians need {sum(sizes)} bytes, the file can hold {limit}"
+        )
+    blocks = [file.read(size) for size in sizes]
+    if sum(map(len, blocks)) < sum(sizes):
+        raise FormatError(f"{path}: truncated: {header.count} Gaussians need {sum(sizes)} bytes")
+    behind = file.read(PIECE)
+    _read_to_the_end(file, limit - HEADER_SIZE - sum(sizes) - len(behind), path)
+    return header.packed(_axes(behind if header.flags & EXTENDED else b"", path), blocks)
+
+
+def _read_to_the_end(file: BinaryIO, limit: int, path: Path) -> None:
+    """Where gzip has its checksum. Other programs' data may lie before it, of at most `limit` bytes."""
+    while piece := file.read(PIECE):
+        limit -= len(piece)
+        if limit < 0:
+            raise FormatError(f"{path}: too many bytes behind its Gaussians; the file is damaged")
+
+
+def _read_streams(file: BinaryIO, file_size: int, path: Path) -> Packed:
+    """Version 4."""
+    start = file.read(HEADER_SIZE_4)
+    header = _header(start, path)
+    if len(start) < HEADER_SIZE_4:
+        raise FormatError(f"{path}: truncated: an .spz of version 4 has a header of {HEADER_SIZE_4} bytes")
+    table_at = struct.unpack_from("<I", start, 16)[0]
+    records_size = table_at - HEADER_SIZE_4
+    if not 0 <= records_size <= file_size:
+        raise FormatError(f"{path}: its table at byte {table_at} of {file_size}; the file is damaged")
+    records = file.read(records_size)
+    sizes = [header.count * width for width in widths(4, header.sh_degree).values()]
+    stored = [size for size in sizes if size]  # blocks without a byte have no stream
+    table = np.frombuffer(_exactly(file, 16 * header.streams, path), "<u8").reshape(-1, 2).tolist()
+    if [whole for _, whole in table if whole] != stored:
+        raise FormatError(f"{path}: the sizes in its table are not those of {header.count} Gaussians")
+    if sum(stored) > BYTES_PER_BYTE * file_size + SLACK:
+        raise FormatError(f"{path}: {sum(stored)} bytes cannot be in a file of {file_size}; it is damaged")
+    left = file_size - file.tell()
+    if sum(zipped for zipped, _ in table) > left:
+        raise FormatError(f"{path}: truncated: its streams do not fit into the {left} bytes behind its table")
+    streams = iter([_unpacked(file.read(zipped), whole, path) for zipped, whole in table if whole])
+    blocks = [next(streams) if size else b"" for size in sizes]
+    return header.packed(_axes(records if header.flags & EXTENDED else b"", path), blocks)
+
+
+def _exactly(file: BinaryIO, size: int, path: Path) -> bytes:
+    data = file.read(size)
+    if len(data) < size:
+        raise FormatError(f"{path}: truncated: {size - len(data)} bytes are missing")
+    return data
+
+
+def _unpacked(data: bytes, size: int, path: Path) -> bytes:
+    """A Zstandard frame that holds exactly `size` bytes; never more of it is unpacked than one byte more."""
+    import zstandard  # needed by version 4 alone
+
+    try:
+        with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data) as reader:
+            out = reader.read(size + 1)
+    except zstandard.ZstdError as error:
+        raise FormatError(f"{path}: a stream cannot be unpacked ({str(error)[:80]})") from None
+    if len(out) != size:
+        raise FormatError(f"{path}: a stream holds fewer or more than the {size} bytes of the table")
+    return bytes(out)
+
+
+def _axes(records: bytes, path: Path) -> int:
+    """What the extension records say about the axes. Records of other layouts, which older programs wrote,
+    end the search."""
+    at = 0
+    while at + 8 <= len(records):
+        kind, length = struct.unpack_from("<II", records, at)
+        if kind == AXES_RECORD and length == 4 and at + 12 <= len(records):
+            axes = int(struct.unpack_from("<I", records, at + 8)[0]) or AXES_RUB
+            if axes > 8:
+                raise FormatError(f"{path}: its axes are of kind {axes}; export the scene with axes RUB")
+            return axes
+        at += 8 + length
+    return AXES_RUB
+
+
+def write_packed(path: Path | str, packed: Packed) -> None:
+    """Write version 2 or 3, atomically, without extensions: axes RUB."""
+    count = len(packed.blocks["alphas"])
+    flags = ANTIALIASED if packed.antialiased else 0
+    numbers = (packed.version, count, packed.sh_degree, packed.fractional_bits, flags, 0)
+    blocks = [packed.blocks[name].tobytes() for name in widths(packed.version, packed.sh_degree)]
+    content = b"".join([MAGIC, struct.pack("<IIBBBB", *numbers), *blocks])
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(gzip.compress(content, mtime=0))  # mtime: the same scene, the same bytes
+
+
+# The .spz file of Niantic: quantised Gaussians, about ten times smaller than the PLY.
+#
+#     positions   three 24-bit fixed-point numbers; the header says how many bits are behind the point
+#                 (version 1: three float16)
+#     alphas      opacity in 8 bits
+#     colours     0.5 + 0.15 f_dc in 8 bits each
+#     scales      16 (logarithm + 10) in 8 bits each
+#     rotations   from version 3 on: 2 bits for which of x y z w is largest and left out (it is positive),
+#                 and a sign and 9 bits of magnitude over sqrt(1/2) for each of the others; before: x y z in 8
+#                 bits over [-1, 1] each (w is positive)
+#     sh          128 + 128 times the coefficient, red green blue of one coefficient after the other
+#
+# The axes are right, up, back (RUB), unless the file says otherwise: half a turn about x from the axes of
+# the PLY, which changes signs of positions, of quaternions and of coefficients. What is read are versions 1
+# to 4; degree 4, which nothing here can draw, is left out.
+#
+# Version 3 is written. Its rotations are exact to 0.1 degrees where those of version 2 err by up to a degree,
+# and every program that reads the newer version 4 reads it too, while many that read it do not know 4, which
+# differs in the container alone. Source: nianticlabs/spz; the code here is our own.
+
+COLOUR_SCALE = 0.15
+FRACTIONAL_BITS = 12  # what other writers use: steps of 1/4096, up to 2048
+# Whether each spherical harmonic from degree 1 on is odd in x, y, z
+_ODD = np.array(
+    [
+        *([0, 1, 0], [0, 0, 1], [1, 0, 0]),
+        *([1, 1, 0], [0, 1, 1], [0, 0, 0], [1, 0, 1], [0, 0, 0]),
+        *([0, 1, 0], [1, 1, 1], [0, 1, 0], [0, 0, 1], [1, 0, 0], [0, 0, 1], [1, 0, 0]),
+    ],
+    dtype=bool,
+)
+
+
+def read_spz_scene(path: Path | str) -> Scene:
+    """The Gaussians of a .spz file, and whether they are to be drawn antialiased.
+
+    Raises InputError when the file cannot be opened and FormatError when it breaks a rule of the format.
+    """
+    packed = read_packed(Path(path))
+    blocks, signs = packed.blocks, _signs_to_rdf(packed.axes)
+    count, degree = len(blocks["alphas"]), min(packed.sh_degree, 3)
+    rest = blocks["sh"].reshape(count, blocks["sh"].shape[1] // 3, 3)[:, : SH_COUNTS[degree] - 1]
+    rest = (rest.astype(np.float32) - 128) / 128 * _coefficient_signs(signs, rest.shape[1])[:, None]
+    base = (blocks["colours"] / 255 - 0.5) / COLOUR_SCALE
+    with np.errstate(invalid="ignore"):  # signalling NaN in half floats become ordinary ones
+        means = _positions(packed) * signs
+    gaussians = Gaussians(
+        means=means,
+        log_scales=blocks["scales"].astype(np.float32) / 16 - 10,
+        quats_wxyz=_rotations(packed) * _quaternion_signs(signs),
+        opacity_logits=logit(blocks["alphas"][:, 0] / 255),
+        sh=np.concatenate([base[:, None], rest], axis=1),
+    )
+    return Scene(gaussians, antialiased=packed.antialiased)
+
+
+def write_spz(path: Path | str, gaussians: Gaussians, antialiased: bool = False) -> None:
+    """Write .spz version 3, atomically; rows keep their order.
+
+    Positions are rounded to 1/4096 world unit, or finer where the Gaussians are smaller than that; scales
+    to 1/16 in the logarithm, within e^-10 to e^5.9; coefficients to 1/128, within -1 to 1 (other
+    writers round them to 1/16 and 1/8, for still smaller files); colours and opacities to 1/255. A row that
+    cannot be drawn is written with opacity 0. Raises InputError for a scene so large that 24 bits cannot tell
+    its positions apart.
+    """
+    valid = gaussians.valid()
+    drawn = gaussians.take(valid)
+    bits = _fractional_bits(drawn, Path(path))
+    signs = _signs_to_rdf(AXES_RUB)  # half a turn, its own inverse
+    codes = np.rint(drawn.means.astype(np.float64) * signs * 2.0**bits).astype("<i4")
+    rest = drawn.sh[:, 1:] * _coefficient_signs(signs, drawn.sh.shape[1] - 1)[:, None]
+    coded = {
+        "positions": codes[..., None].view(np.uint8)[..., :3].reshape(-1, 9),
+        "alphas": to_bytes(sigmoid(drawn.opacity_logits) * 255)[:, None],
+        "colours": to_bytes((drawn.sh[:, 0] * COLOUR_SCALE + 0.5) * 255),
+        "scales": to_bytes((drawn.log_scales + 10) * 16),
+        "rotations": _rotation_codes(drawn.quats_wxyz * _quaternion_signs(signs)),
+        "sh": to_bytes(rest.reshape(len(rest), 3 * rest.shape[1]) * 128 + 128),
+    }
+    blocks = {name: np.zeros((len(valid), code.shape[1]), np.uint8) for name, code in coded.items()}
+    for name, code in coded.items():
+        blocks[name][valid] = code
+    write_packed(path, Packed(3, gaussians.sh_degree, bits, antialiased, AXES_RUB, blocks))
+
+
+def _fractional_bits(drawn: Gaussians, path: Path) -> int:
+    """As many as other writers use, more for a small scene, fewer for a large one."""
+    if len(drawn) == 0:
+        return FRACTIONAL_BITS
+    reach = max(float(np.abs(drawn.means).max()), 1e-30)
+    most = int(np.floor(np.log2((2**23 - 1) / reach)))
+    size = float(np.median(drawn.log_scales.max(axis=1)))  # logarithm of a typical Gaussian's longest axis
+    least = int(np.ceil(-size / np.log(2))) if np.isfinite(size) else 0  # a step of its size
+    if most < min(least, FRACTIONAL_BITS):
+        raise InputError(
+            f"{path}: positions up to {reach:.3g} of Gaussians as small as {np.exp(size):.3g} are beyond the "
+            "24 bits of .spz; write .ply, or crop what lies far off"
+        )
+    # The median Gaussian keeps its place to a sixteenth of its size. 24 bits hold the scene, and beyond
+    # 30 bits behind the point other readers overflow.
+    return max(0, min(most, max(FRACTIONAL_BITS, least + 4), 30))
+
+
+def _positions(packed: Packed) -> Array:
+    """(N, 3) along the axes of the file."""
+    data = packed.blocks["positions"]
+    if packed.version == 1:
+        return np.ascontiguousarray(data).view("<f2").astype(np.float32)
+    parts = data.reshape(len(data), 3, 3)
+    codes = (
+        parts[..., 0]
+        | parts[..., 1].astype(np.int32) << 8
+        | parts[..., 2].astype(np.int8).astype(np.int32) << 16
+    )
+    return codes / 2.0**packed.fractional_bits
+
+
+def _rotations(packed: Packed) -> Array:
+    """(N, 4) unit quaternions w x y z."""
+    data = packed.blocks["rotations"]
+    if packed.version < 3:
+        xyz = data / 127.5 - 1
+        w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(axis=1, keepdims=True)))
+        return np.concatenate([w, xyz], axis=1)
+    words = np.ascontiguousarray(data).view("<u4")[:, 0]
+    three = np.stack([words >> shift & 1023 for shift in (20, 10, 0)], axis=1)
+    magnitudes = (three & 511) / 511 * np.sqrt(0.5)
+    xyzw = smallest_three(np.where(three & 512, -magnitudes, magnitudes), words >> 30)
+    return xyzw[:, [3, 0, 1, 2]]
+
+
+def _rotation_codes(quats_wxyz: Array) -> Array:
+    """(N, 4) quaternions of any length -> (N, 4) bytes of version 3."""
+    xyzw = unit(quats_wxyz.astype(np.float64), 1e-30)[:, [1, 2, 3, 0]]
+    largest = np.abs(xyzw).argmax(axis=1)
+    words = largest.astype(np.uint32)
+    xyzw *= np.where(np.take_along_axis(xyzw, largest[:, None], 1) < 0, -1, 1)
+    codes = np.rint(np.abs(xyzw) * np.sqrt(2) * 511).clip(0, 511).astype(np.uint32) | (xyzw < 0) * np.uint32(
+        512
+    )
+    for component in range(4):
+        words = np.where(component == largest, words, words << np.uint32(10) | codes[:, component])
+    return words.astype("<u4")[:, None].view(np.uint8)
+
+
+def _signs_to_rdf(axes: int) -> Array:
+    """(3,) 1 or -1: what turns coordinates of a file into right, down, front, those of the PLY. `axes` - 1
+    has a bit each for right, up, front."""
+    right, up, front = (axes - 1 >> bit & 1 for bit in range(3))
+    return np.array([1 if right else -1, -1 if up else 1, 1 if front else -1])
+
+
+def _quaternion_signs(signs: Array) -> Array:
+    """Of w x y z: mirroring an axis turns the two rotations about the others round."""
+    return np.array([1, signs[1] * signs[2], signs[0] * signs[2], signs[0] * signs[1]])
+
+
+def _coefficient_signs(signs: Array, count: int) -> Array:
+    """(count,) of the coefficients from degree 1 on."""
+    return np.where(_ODD, signs, 1).prod(axis=1)[:count]

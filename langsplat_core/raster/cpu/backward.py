@@ -1,0 +1,351 @@
+"""Gradients of blending on the CPU: from an image's gradient to each footprint.
+
+A tile is walked front to back once, as in `walk`, and alpha and T of every row touched are written to
+a tape. The tape is then read from its end. With weight w_i = alpha_i T_i, s_i = <image gradient, x_i> +
+alpha gradient (per pixel), and behind_i = sum over j > i of w_j s_j,
+
+    d loss / d alpha_i = T_i s_i - behind_i / (1 - alpha_i),
+
+a sum of positive products where s is: nothing is subtracted from a total, T is never divided back.
+Alpha at its cap has no gradient. As log2(alpha) is a quadratic in the whitened coordinates (w, v) of
+`projection`, a footprint's gradient needs only the moments of q = alpha d loss / d alpha in (w, v).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.compiled import helper, kernel
+from langsplat_core.raster.cpu import projection as cp
+from langsplat_core.raster.cpu.blend import sum_over_tiles
+from langsplat_core.raster.cpu.lanes import (
+    lanes,
+    load,
+    prefetch,
+    reciprocal,
+    store,
+    store_totals,
+    where_greater,
+)
+from langsplat_core.raster.cpu.tiles import (
+    AHEAD,
+    CHECK_EVERY,
+    PIXELS,
+    TILE,
+    Cutoffs,
+    Tiles,
+    begin_rows,
+    blend_row,
+    correlate,
+    enter,
+    load_tile,
+    rows_to_blend,
+    running_rows,
+    spread,
+    start_tile,
+)
+
+# Columns of the partial sums (two are unused); the gradient by the values follows them.
+Q, QW, QV, QWW, QWV, QVV = range(6)
+MOMENTS = 8
+_ENTRY = 2 * TILE  # numbers of tape per row: alpha and T
+_TAPE = 128 * TILE * _ENTRY  # its first length: 128 Gaussians that fill the tile
+
+
+@helper
+def _grown(tape: Array, used: int) -> Array:
+    """The tape, with room for one more Gaussian behind `used` numbers."""
+    if used + TILE * _ENTRY <= tape.shape[0]:
+        return tape
+    longer = np.empty(2 * tape.shape[0], np.float32)
+    for n in range(used):
+        longer[n] = tape[n]
+    return longer
+
+
+@helper
+def _record(
+    tile: int, tiles: Tiles, geometry: Array, cutoffs: Cutoffs, state: Array, spans: Array, tape: Array
+) -> tuple[Array, int, int]:
+    """`walk`, but with a tape that may have to grow on the way; returns it (a longer one where it was full),
+    its length and the end of the intersections visited.
+
+    spans[s - first] <- rows [low, high) of each intersection that were blended.
+    """
+    x, y = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
+    first, last = tiles.starts[tile], tiles.starts[tile + 1]
+    used = 0
+    top, bottom = 0, TILE
+    for s in range(first, last):
+        if (s - first) % CHECK_EVERY == CHECK_EVERY - 1:
+            top, bottom = running_rows(state, top, bottom)
+            if top >= bottom:
+                return tape, used, s
+        tape = _grown(tape, used)
+        low, high = rows_to_blend(tiles.rows[s], top, bottom)
+        spans[s - first, 0], spans[s - first, 1] = low, high
+        g = enter(geometry, tiles, s, min(s + AHEAD, last - 1))
+        step, peak, w, v, w_step, v_step = begin_rows(g, x, y + low)
+        for row in range(low, high):
+            added, before = blend_row(state, row * TILE, step + w, peak - v * v, cutoffs)
+            w, v = w + w_step, v + v_step
+            store(tape, used, added)
+            store(tape, used + TILE, before)
+            used += _ENTRY
+    return tape, used, last
+
+
+@helper
+def _backward_tile(
+    tile: int,
+    tiles: Tiles,
+    geometry: Array,
+    values: Array,
+    grads: tuple[Array, Array],
+    cutoffs: Cutoffs,
+    partial: Array,
+    tape: Array,
+) -> Array:
+    """One tile; returns the tape, for the next tile to write over."""
+    image_grad, alpha_grad = grads
+    height, width, _ = image_grad.shape
+    lines, columns = values.shape[1], partial.shape[1]
+    left, top = tile % tiles.columns * TILE + 0.5, tile // tiles.columns * TILE + 0.5
+    first, last = tiles.starts[tile], tiles.starts[tile + 1]
+    state = start_tile(tile, tiles, width, height)
+    spans = np.zeros((last - first, 2), np.int64)
+    tape, used, end = _record(tile, tiles, geometry, cutoffs, state, spans, tape)
+    partial[end:last] = 0
+    planes, plane = np.empty(PIXELS * lines, np.float32), np.empty(PIXELS, np.float32)
+    load_tile(planes, image_grad, tile, tiles.columns)
+    load_tile(plane, alpha_grad, tile, tiles.columns)
+    weights = np.empty(PIXELS, np.float32)
+    behind = state
+    behind[:] = 0
+    for s in range(end - 1, first - 1, -1):
+        low, high = max(spans[s - first, 0], 0), spans[s - first, 1]
+        used -= max(high - low, 0) * _ENTRY
+        g = enter(geometry, tiles, s, max(s - AHEAD, first))
+        x = values[tiles.ranks[s]]
+        step, _, offset, v, w_step, v_step = begin_rows(g, left, top + low)
+        q0 = qw = qv = qww = qwv = qvv = none = lanes(np.float32(0))
+        for row in range(low, high):
+            w = step + offset
+            at = used + (row - low) * _ENTRY
+            alpha, before = load(tape, at), load(tape, at + TILE)
+            weight = alpha * before
+            store(weights, (row - low) * TILE, weight)
+            slope = load(plane, row * TILE)
+            for line in range(lines):
+                slope = slope + load(planes, (row * lines + line) * TILE) * x[line]
+            hidden = load(behind, row * TILE)
+            store(behind, row * TILE, hidden + weight * slope)
+            q = weight * slope - hidden * alpha * reciprocal(1.0 - alpha)
+            q = where_greater(cutoffs.alpha_max, alpha, q, 0.0)
+            moved, lifted = q * w, q * v
+            q0, qw, qv = q0 + q, qw + moved, qv + lifted
+            qww, qwv, qvv = qww + moved * w, qwv + moved * v, qvv + lifted * v
+            offset, v = offset + w_step, v + v_step
+        store_totals(partial, s * columns, q0, qw, qv, qww)
+        store_totals(partial, s * columns + QWV, qwv, qvv, none, none)
+        correlate(planes, lines, weights, low, high, partial, s, MOMENTS)
+    return tape
+
+
+@kernel
+def backward(
+    first: int,
+    last: int,
+    tiles: Tiles,
+    geometry: Array,
+    values: Array,
+    grads: tuple[Array, Array],
+    cutoffs: Cutoffs,
+    partial: Array,
+) -> None:
+    """(M, padded(C)) values in depth order; gradients (H, W, C) and (H, W, 1) by image and alpha; fills
+    (I, 8 + padded(C)) partial sums. All float32, for tiles [first, last)."""
+    count = tiles.starts.shape[0] - 1
+    tape = np.empty(_TAPE, np.float32)
+    for i in range(first, last):
+        tape = _backward_tile(spread(i, count), tiles, geometry, values, grads, cutoffs, partial, tape)
+
+
+# Gradients of the CPU backend, second half: from a footprint back to the Gaussian's parameters.
+
+
+class ParameterGradients(NamedTuple):
+    """What `to_parameters` fills in, float32; rows that are not drawn are left alone."""
+
+    means: Array  # (N, 3)
+    log_scales: Array  # (N, 3)
+    quats_wxyz: Array  # (N, 4)
+    opacity_logits: Array  # (N,)
+    values: Array  # (N, C)
+    means_px: Array  # (N, 2)
+
+
+@helper
+def _fetch(i: int, rows: cp.Rows, out: ParameterGradients) -> None:
+    """Ask for the rows of Gaussian `i`: depth order is a random order in memory."""
+    row = np.int64(i)
+    prefetch(rows.means, 3 * row)
+    prefetch(rows.log_scales, 3 * row)
+    prefetch(rows.quats_wxyz, 4 * row)
+    prefetch(rows.opacity_logits, row)
+    prefetch(out.means, 3 * row)
+    prefetch(out.log_scales, 3 * row)
+    prefetch(out.quats_wxyz, 4 * row)
+    prefetch(out.values, out.values.shape[1] * row)
+
+
+@helper
+def _footprint_gradient(g: Array, moments: Array) -> tuple[float, float, cp.Point]:
+    """Gradient by the 2D mean, and by the 2D covariance (a symmetric matrix's xx, xy, yy).
+
+    With M = [[a, -a k], [0, c]] and u = (w, v) = M (pixel - mean):
+    ln alpha = const - ln2 |u|^2, so d/d mean = 2 ln2 M^T u and d/d cov = 2 ln2^2 M^T u u^T M.
+    """
+    a, b, c = g[cp.FACTOR_A], -g[cp.FACTOR_A] * g[cp.FACTOR_K], g[cp.FACTOR_C]
+    ww, wv, vv = moments[QWW], moments[QWV], moments[QVV]
+    twice = 2 * cp.LN2
+    scale = twice * cp.LN2
+    return (
+        twice * a * moments[QW],
+        twice * (b * moments[QW] + c * moments[QV]),
+        (
+            scale * a * a * ww,
+            scale * a * (b * ww + c * wv),
+            scale * (b * b * ww + 2 * b * c * wv + c * c * vv),
+        ),
+    )
+
+
+@helper
+def _with_compensation(by_covariance: cp.Point, a: Array, camera: cp.KernelCamera, q: float) -> cp.Point:
+    """Adds the gradient of Mip-Splatting's factor sqrt(det sharp / det dilated) to that by the covariance."""
+    xx, xy, yy, det, sharp = cp.covariance(a, camera.dilation)
+    if not camera.antialiased or sharp / det <= cp.COMPENSATION_MIN:
+        return by_covariance
+    gxx, gxy, gyy = by_covariance
+    half = 0.5 * q
+    return (
+        gxx + half * ((yy - camera.dilation) / sharp - yy / det),
+        gxy + half * (xy / det - xy / sharp),
+        gyy + half * ((xx - camera.dilation) / sharp - xx / det),
+    )
+
+
+@helper
+def _quat_gradient(quat: Array, inverse: float, d: Array) -> tuple[float, float, float, float]:
+    """Gradient by the raw quaternion from `d`, that by its rotation matrix."""
+    w, x, y, z = quat[0] * inverse, quat[1] * inverse, quat[2] * inverse, quat[3] * inverse
+    gw = 2 * (z * (d[1, 0] - d[0, 1]) + y * (d[0, 2] - d[2, 0]) + x * (d[2, 1] - d[1, 2]))
+    gx = 2 * (
+        y * (d[0, 1] + d[1, 0])
+        + z * (d[0, 2] + d[2, 0])
+        + w * (d[2, 1] - d[1, 2])
+        - 2 * x * (d[1, 1] + d[2, 2])
+    )
+    gy = 2 * (
+        x * (d[0, 1] + d[1, 0])
+        + z * (d[1, 2] + d[2, 1])
+        + w * (d[0, 2] - d[2, 0])
+        - 2 * y * (d[0, 0] + d[2, 2])
+    )
+    gz = 2 * (
+        x * (d[0, 2] + d[2, 0])
+        + y * (d[1, 2] + d[2, 1])
+        + w * (d[1, 0] - d[0, 1])
+        - 2 * z * (d[0, 0] + d[1, 1])
+    )
+    along = gw * w + gx * x + gy * y + gz * z
+    return (
+        (gw - along * w) * inverse,
+        (gx - along * x) * inverse,
+        (gy - along * y) * inverse,
+        (gz - along * z) * inverse,
+    )
+
+
+@helper
+def _point_gradient(point: cp.Point, camera: cp.KernelCamera, du: float, dv: float, db: Array) -> cp.Point:
+    """Gradient by the camera-space point from those by its pixel and by B = J R (two rows).
+
+    A clamped coordinate is a constant multiple of z in the Jacobian, so it gets no gradient there.
+    """
+    x, y, z = point
+    r = camera.rotation
+    j00 = db[0, 0] * r[0, 0] + db[0, 1] * r[0, 1] + db[0, 2] * r[0, 2]
+    j02 = db[0, 0] * r[2, 0] + db[0, 1] * r[2, 1] + db[0, 2] * r[2, 2]
+    j11 = db[1, 0] * r[1, 0] + db[1, 1] * r[1, 1] + db[1, 2] * r[1, 2]
+    j12 = db[1, 0] * r[2, 0] + db[1, 1] * r[2, 1] + db[1, 2] * r[2, 2]
+    sx, sy = camera.fx / (z * z), camera.fy / (z * z)
+    tx, ty = min(max(x / z, -camera.left), camera.right), min(max(y / z, -camera.top), camera.bottom)
+    dx, dy = du * camera.fx / z, dv * camera.fy / z
+    dz = -du * sx * x - dv * sy * y - j00 * sx - j11 * sy + j02 * sx * tx + j12 * sy * ty
+    if tx == x / z:
+        dx -= j02 * sx
+        dz += j02 * sx * tx
+    if ty == y / z:
+        dy -= j12 * sy
+        dz += j12 * sy * ty
+    return dx, dy, dz
+
+
+@helper
+def _axes_gradient(
+    work: Array, scales: cp.Point, by_covariance: cp.Point, by_turn: Array, by_b: Array, by_log_scale: Array
+) -> None:
+    """A = B turn diag(s) gets 2 G A from the covariance's gradient G; from there to B, turn and log(s)."""
+    turn, b, a = work[0], work[1], work[2]
+    gxx, gxy, gyy = by_covariance
+    by_b[:] = 0
+    for k in range(3):
+        d0, d1 = 2 * (gxx * a[0, k] + gxy * a[1, k]), 2 * (gxy * a[0, k] + gyy * a[1, k])
+        by_log_scale[k] = d0 * a[0, k] + d1 * a[1, k]
+        d0, d1 = d0 * scales[k], d1 * scales[k]
+        for m in range(3):
+            by_turn[m, k] = b[0, m] * d0 + b[1, m] * d1
+            by_b[0, m] += d0 * turn[m, k]
+            by_b[1, m] += d1 * turn[m, k]
+
+
+@kernel
+def to_parameters(
+    first: int,
+    last: int,
+    tiles: Tiles,
+    order: Array,
+    geometry: Array,
+    partial: Array,
+    rows: cp.Rows,
+    camera: cp.KernelCamera,
+    out: ParameterGradients,
+) -> None:
+    """For drawn Gaussians [first, last) in depth order: sum what `backward` left, in the order of the tiles,
+    and pull the moments back through the projection."""
+    sums = np.empty(partial.shape[1])
+    moments = sums[:MOMENTS]
+    work, by_b, by_turn = np.empty((3, 3, 3)), np.empty((2, 3)), np.empty((3, 3))
+    r = camera.rotation
+    for rank in range(first, last):
+        _fetch(order[min(rank + AHEAD, last - 1)], rows, out)
+        i = order[rank]
+        sum_over_tiles(rank, tiles, partial, sums)
+        for channel in range(out.values.shape[1]):
+            out.values[i, channel] = sums[MOMENTS + channel]
+        du, dv, by_covariance = _footprint_gradient(geometry[rank], moments)
+        out.means_px[i, 0], out.means_px[i, 1] = du, dv
+        out.opacity_logits[i] = moments[Q] * (1 - cp.opacity_of(rows.opacity_logits[i]))
+        point = cp.camera_point(rows.means[i], camera)
+        scales, inverse = cp.fill_axes(point, rows.log_scales[i], rows.quats_wxyz[i], camera, work)
+        by_covariance = _with_compensation(by_covariance, work[2], camera, moments[Q])
+        _axes_gradient(work, scales, by_covariance, by_turn, by_b, out.log_scales[i])
+        dx, dy, dz = _point_gradient(point, camera, du, dv, by_b)
+        for n in range(3):
+            out.means[i, n] = dx * r[0, n] + dy * r[1, n] + dz * r[2, n]
+        gw, gx, gy, gz = _quat_gradient(rows.quats_wxyz[i], inverse, by_turn)
+        quat = out.quats_wxyz[i]
+        quat[0], quat[1], quat[2], quat[3] = gw, gx, gy, gz

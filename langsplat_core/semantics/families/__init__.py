@@ -1,1 +1,0 @@
-"""One file for each architecture that `encoders.py` and `segmenters.py` can load."""

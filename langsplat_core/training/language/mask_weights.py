@@ -1,0 +1,359 @@
+"""Spherical k-means: few unit vectors that many lie close to (Dhillon and Modha 2001)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from langsplat_core.arrays import Array, unit
+from langsplat_core.config import INRIA, RasterSettings
+from langsplat_core.progress import Progress, silent
+from langsplat_core.raster.protocol import LabelView, LiftingRasterizer, LiftingView
+from langsplat_core.scene import LEVELS, NO_THING, Camera, Gaussians
+from langsplat_core.semantics.store import ImageFeatures
+
+CHUNK = 8_192  # vectors compared with all centres at a time
+HELPING = 8  # one in so many centres is added, or given up, at a time
+EXTRA = 0.25  # of the new centres: are tried beyond those asked for
+
+
+def nearest_centres(vectors: Array, centres: Array) -> tuple[Array, Array]:
+    """(M, D) and (K, D) float32 unit vectors -> (M,) int64 the nearest centre and (M,) float32 its cosine."""
+    nearest, cosines = np.empty(len(vectors), np.int64), np.empty(len(vectors), np.float32)
+    for start in range(0, len(vectors), CHUNK):
+        part = slice(start, start + CHUNK)
+        products = vectors[part] @ centres.T
+        nearest[part] = products.argmax(1)
+        cosines[part] = np.take_along_axis(products, nearest[part, None], 1)[:, 0]
+    return nearest, cosines
+
+
+def spherical_kmeans(
+    vectors: Array,
+    count: int,
+    rounds: int = 8,
+    start: Array | None = None,
+    generator: np.random.Generator | None = None,
+) -> Array:
+    """At most `count` unit centres (K, D) float32 of (M, D) float32 unit vectors.
+
+    Begins at `start` (K' <= count centres) and adds vectors that these fit badly, drawn by their distance: a
+    quarter more than asked for, of which those are given up again, round by round, that would be missed
+    least. That finds the gaps which plain k-means leaves where two clusters share a centre. Fewer than
+    `count` come back where fewer different vectors are there.
+    """
+    generator = generator or np.random.default_rng(0)
+    centres = np.zeros((0, vectors.shape[1]), np.float32) if start is None else start
+    extra = (count - len(centres)) * EXTRA
+    centres = _grown(vectors, centres, count + round(extra), generator)
+    for done in range(1, rounds + 1):
+        nearest, counts, missed = _assigned(vectors, centres)
+        size = count + round(extra * max(1 - 2 * done / rounds, 0))
+        kept = _without_spare(missed, size)
+        centres = _means(vectors, nearest, counts)[kept & (counts > 0)]
+    while True:
+        _, counts, missed = _assigned(vectors, centres)
+        kept = _without_spare(missed, count) & (counts > 0)
+        if kept.all():
+            return centres
+        centres = centres[kept]
+
+
+def _without_spare(missed: Array, size: int) -> Array:
+    """(K,) bool: all but those missed least, where there are more than `size`; only one in `HELPING` at a
+    time, because of two that are alike neither is missed."""
+    spare = min(max(len(missed) - size, 0), 1 + len(missed) // HELPING)
+    kept = np.ones(len(missed), bool)
+    kept[np.argsort(missed, kind="stable")[:spare]] = False
+    return kept
+
+
+def _assigned(vectors: Array, centres: Array) -> tuple[Array, Array, Array]:
+    """(M,) nearest centre of every vector, (K,) vectors of every centre, and (K,) by how much the sum of
+    cosines would fall without that centre."""
+    nearest = np.empty(len(vectors), np.int64)
+    gain = np.zeros(len(vectors), np.float32)
+    for start in range(0, len(vectors), CHUNK):
+        part = slice(start, start + CHUNK)
+        products = vectors[part] @ centres.T
+        nearest[part] = products.argmax(1)
+        best = np.take_along_axis(products, nearest[part, None], 1)
+        np.put_along_axis(products, nearest[part, None], -1, 1)
+        gain[part] = best[:, 0] - products.max(1)
+    counts = np.bincount(nearest, minlength=len(centres))
+    return nearest, counts, np.bincount(nearest, gain, len(centres))
+
+
+def _grown(vectors: Array, centres: Array, count: int, generator: np.random.Generator) -> Array:
+    """`centres` and badly fitted vectors, in small helpings: one gap is not filled ten times."""
+    distance = np.full(len(vectors), 2, np.float32)
+    new = centres if len(centres) else vectors[_badly_fitted(distance, 1, generator)]
+    while True:
+        distance = np.minimum(distance, 1 - nearest_centres(vectors, new)[1])
+        centres = np.concatenate([centres, new]) if new is not centres else centres
+        rows = _badly_fitted(distance, min(count - len(centres), 1 + len(centres) // HELPING), generator)
+        if len(rows) == 0:
+            return centres
+        new = vectors[rows]
+
+
+def _badly_fitted(distance: Array, count: int, generator: np.random.Generator) -> Array:
+    """Up to `count` rows, drawn without repetition in proportion to (M,) distances; none that fit."""
+    weights = np.where(distance > 1e-5, distance, 0).astype(np.float64)
+    possible = int((weights > 0).sum())
+    if possible == 0:
+        return np.zeros(0, np.int64)
+    return generator.choice(len(weights), min(count, possible), replace=False, p=weights / weights.sum())
+
+
+def _means(vectors: Array, nearest: Array, counts: Array) -> Array:
+    """(K, D) float32 directions of the sums over each centre's vectors."""
+    order = np.argsort(nearest, kind="stable")
+    used = np.flatnonzero(counts)
+    firsts = np.concatenate([[0], np.cumsum(counts[used])[:-1]])
+    means = np.zeros((len(counts), vectors.shape[1]), np.float32)
+    means[used] = unit(np.add.reduceat(vectors[order], firsts, axis=0))
+    return means
+
+
+# Groups of masks that say the same: one vector for hundreds of crops of one thing.
+#
+# A Gaussian is seen by a hundred masks in a hundred photographs, and most say one of a few things; grouped
+# first, its median is taken over a few vectors instead.
+
+GROUPS = 2_048
+ROUNDS = 6
+SAMPLE = 16_384  # masks that the groups are found with
+
+
+@dataclass(frozen=True, eq=False)
+class MaskGroups:
+    """To which of G groups every mask of every view belongs."""
+
+    of_mask: tuple[Array, ...]  # of each view, (M,) int32
+    vectors: Array  # (G, D) float32 unit vectors
+
+
+def group_masks(vectors: Sequence[Array], groups: int = GROUPS, seed: int = 0) -> MaskGroups:
+    """vectors: of each view, (M, D) float32 unit CLIP vectors. At most `groups` groups; where there are not
+    more masks than that, each is its own."""
+    counts = [len(view) for view in vectors]
+    joined = np.concatenate(vectors)
+    if len(joined) <= groups:
+        return MaskGroups(_per_view(np.arange(len(joined)), counts), joined)
+    generator = np.random.default_rng(seed)
+    sample = joined[np.sort(generator.permutation(len(joined))[:SAMPLE])]
+    centres = spherical_kmeans(sample, groups, ROUNDS, generator=generator)
+    return MaskGroups(_per_view(nearest_centres(joined, centres)[0], counts), centres)
+
+
+def _per_view(groups: Array, counts: list[int]) -> tuple[Array, ...]:
+    return tuple(np.split(groups.astype(np.int32), np.cumsum(counts)[:-1]))
+
+
+# Memberships: how much of every mask in every photograph each Gaussian paints, ``W^T onehot(mask)``.
+#
+# Targets are constant on masks, so this sparse matrix carries vectors of any length from photographs onto
+# Gaussians. It is kept view by view, as pairs sorted by Gaussian, in memory or in files, and read block by
+# block: what is held at a time does not grow with the number of photographs.
+
+MIN_WEIGHT = 1e-3  # a Gaussian's weight in a mask, in pixels, below which the pair is not stored
+BLOCK = 16_384  # Gaussians handled at a time
+PAIR = np.dtype([("row", "<u4"), ("mask", "<u2"), ("level", "<u2"), ("weight", "<f4")])
+
+
+@dataclass(frozen=True, eq=False)
+class Memberships:
+    """How strongly `count` Gaussians belong to the masks of all views."""
+
+    pairs: Sequence[Array]  # of each view, of type PAIR, by rising row: Gaussian, mask, its level, pixels
+    count: int
+
+    @property
+    def blocks(self) -> list[tuple[int, int]]:
+        """First Gaussian, and the one after the last, of every block."""
+        return [(first, min(first + BLOCK, self.count)) for first in range(0, self.count, BLOCK)]
+
+    @cached_property
+    def _edges(self) -> list[Array]:
+        """Of each view, where each block begins in its pairs, and where the last ends."""
+        firsts = np.arange(0, self.count + BLOCK, BLOCK)
+        return [np.searchsorted(view["row"], firsts) for view in self.pairs]
+
+    def block(self, number: int, groups: MaskGroups) -> sparse.csr_matrix:
+        """(n, 3 G) float32 weights, in pixels, of the Gaussians of a block in the G groups at each level."""
+        first, last = self.blocks[number]
+        rows, columns, weights = [], [], []
+        for pairs, edges, group in zip(self.pairs, self._edges, groups.of_mask, strict=True):
+            part = pairs[edges[number] : edges[number + 1]]
+            rows.append(part["row"].astype(np.int32) - first)
+            columns.append(part["level"].astype(np.int32) * len(groups.vectors) + group[part["mask"]])
+            weights.append(part["weight"])
+        shape = (last - first, len(LEVELS) * len(groups.vectors))
+        if not rows:
+            return sparse.csr_matrix(shape, dtype=np.float32)
+        entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
+        return sparse.coo_matrix(entries, shape).tocsr()  # which adds up what falls on one place
+
+
+def find_memberships(
+    rasterizer: LiftingRasterizer,
+    gaussians: Gaussians,
+    views: Sequence[tuple[Camera, ImageFeatures]],
+    chunk: int = 32,
+    settings: RasterSettings = INRIA,
+    progress: Progress = silent,
+) -> Memberships:
+    """Of all views, in memory."""
+    pairs = []
+    for camera, features in views:
+        pairs.append(view_pairs(rasterizer, gaussians, camera, features, chunk, settings))
+        progress("lifting masks onto the Gaussians", len(pairs) / len(views))
+    return Memberships(pairs, len(gaussians))
+
+
+def view_pairs(
+    rasterizer: LiftingRasterizer,
+    gaussians: Gaussians,
+    camera: Camera,
+    features: ImageFeatures,
+    chunk: int = 32,
+    settings: RasterSettings = INRIA,
+) -> Array:
+    """The pairs of one view, of type PAIR, by rising row.
+
+    Where a backend cannot lift label maps in one walk, `chunk` masks travel through one gather pass.
+    """
+    if len(features.vectors) == 0:
+        return np.zeros(0, PAIR)
+    if len(features.vectors) > np.iinfo(PAIR["mask"]).max:
+        raise ValueError(f"{camera.name}: {len(features.vectors)} masks; at most 65 535 can be numbered")
+    view = rasterizer.view(gaussians, camera, settings)
+    weights = _weights_in_masks(view, features, chunk).tocsr()
+    pairs = np.empty(weights.nnz, PAIR)
+    pairs["row"] = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
+    pairs["mask"] = weights.indices
+    pairs["level"] = _row_levels(features)[weights.indices]
+    pairs["weight"] = weights.data
+    return pairs
+
+
+def _weights_in_masks(view: LiftingView, features: ImageFeatures, chunk: int) -> sparse.csr_matrix:
+    """(N, M) float32 weight of every Gaussian in the masks of one view, where it exceeds `MIN_WEIGHT`."""
+    count = len(features.vectors)
+    if isinstance(view, LabelView):
+        return view.gather_labels(features.labels, count, MIN_WEIGHT)
+    columns = []
+    for start in range(0, count, chunk):
+        weights = view.gather(_onehot(features.labels, start, min(chunk, count - start)))
+        columns.append(sparse.csr_matrix(np.where(weights > MIN_WEIGHT, weights, 0).astype(np.float32)))
+    return sparse.hstack(columns, format="csr")
+
+
+def _onehot(labels: Array, start: int, size: int) -> Array:
+    """(3, H, W) global row ids -> (H, W, size) float32 indicator of rows start .. start + size."""
+    height, width = labels.shape[1:]
+    image = np.zeros((height * width, size), np.float32)
+    for level in labels.reshape(len(LEVELS), -1):
+        inside = np.flatnonzero((level >= start) & (level < start + size))  # -1, no mask, is never inside
+        image[inside, level[inside] - start] = 1
+    return image.reshape(height, width, size)
+
+
+def _row_levels(features: ImageFeatures) -> Array:
+    """(M,) the level each global row belongs to."""
+    levels = np.zeros(len(features.vectors), np.uint16)
+    for index, labels in enumerate(features.labels):
+        levels[np.unique(labels[labels >= 0])] = index
+    return levels
+
+
+# Things: which masks of different photographs show one and the same, and so which Gaussians belong together.
+#
+# Two masks of different views are of one thing where most of what they claim, among the Gaussians that both
+# views see, is claimed by both; masks linked so, directly or not, are one thing, and a Gaussian belongs to
+# the thing whose masks it paints most of. No vector is looked at: that the front and the back of a thing
+# mean slightly different things to the encoder does not tear it apart. (Clustering masks by what they claim
+# in 3D is known from MaskClustering, Yan et al. 2024; this is its plainest form.)
+
+SAME = 0.6  # overlap over union of what two masks claim from which they are one thing
+THING_SAMPLE = (
+    50_000  # Gaussians that decide which masks go together: what is compared grows with views squared
+)
+
+
+def find_things(members: Memberships, counts: Sequence[int]) -> Array:
+    """(N,) uint16 number of the thing that each Gaussian belongs to, at the coarsest level.
+
+    NO_THING where no mask of that level shows it, or where a scene has more things than can be numbered.
+
+    counts: number of masks of each view. Things are numbered from the largest, by number of Gaussians.
+    """
+    level = len(LEVELS) - 1
+    numbers = masks_of_things(members, counts, level)
+    size = int(numbers.max(initial=-1)) + 1
+    of_mask = np.split(np.where(numbers >= 0, numbers, size).astype(np.int32), np.cumsum(counts)[:-1])
+    groups = MaskGroups(tuple(of_mask), np.zeros((size + 1, 1), np.float32))
+    things = np.full(members.count, size, np.int64)
+    for number, (first, last) in enumerate(members.blocks):
+        weights = members.block(number, groups)[:, level * (size + 1) : (level + 1) * (size + 1)].tocsr()
+        if weights.nnz:
+            known = np.diff(weights.indptr) > 0
+            things[first:last] = np.where(known, np.asarray(weights.argmax(axis=1)).ravel(), size)
+    order = np.argsort(-np.bincount(things, minlength=size + 1)[:size], kind="stable")
+    rank = np.full(size + 1, NO_THING)
+    rank[order] = np.minimum(np.arange(size), NO_THING)
+    return np.asarray(rank[things].astype(np.uint16))
+
+
+def masks_of_things(members: Memberships, counts: Sequence[int], level: int) -> Array:
+    """(M,) number of the thing that each mask of all views shows, from 0; -1 for masks of other levels and
+    for those that claim nothing."""
+    firsts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    claims, views = _claims(members, firsts, level)
+    _, found = connected_components(_overlapping(claims, views), directed=False)
+    numbers = np.full(int(firsts[-1]), -1)
+    at_level = np.flatnonzero(np.diff(claims.tocsc().indptr) > 0)
+    numbers[at_level] = np.unique(found[at_level], return_inverse=True)[1]
+    return numbers
+
+
+def _claims(members: Memberships, firsts: Array, level: int) -> tuple[sparse.csr_matrix, Array]:
+    """(n, M) ones where a mask holds more than half of a sampled Gaussian's weight in its view and level."""
+    chosen = np.full(members.count, -1)
+    sample = np.random.default_rng(0).permutation(members.count)[:THING_SAMPLE]
+    chosen[np.sort(sample)] = np.arange(len(sample))
+    rows, columns = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for view, pairs in enumerate(members.pairs):
+        here = pairs[(pairs["level"] == level) & (chosen[pairs["row"]] >= 0)]
+        row = chosen[here["row"]]
+        total = np.bincount(row, here["weight"], len(sample))
+        strong = here["weight"] > 0.5 * total[row]
+        rows.append(row[strong])
+        columns.append(firsts[view] + here["mask"][strong].astype(np.int64))
+    joined_rows, joined_columns = np.concatenate(rows), np.concatenate(columns)
+    ones = np.ones(len(joined_rows), np.float32)
+    shape = (len(sample), int(firsts[-1]))
+    views = np.searchsorted(firsts, np.arange(firsts[-1]), side="right") - 1
+    return sparse.csr_matrix((ones, (joined_rows, joined_columns)), shape), views
+
+
+def _overlapping(claims: sparse.csr_matrix, views: Array) -> sparse.csr_matrix:
+    """(M, M) links between masks of different views whose overlap over union, where both see, is large."""
+    both = (claims.T @ claims).tocoo()
+    shape = len(views), int(views.max(initial=-1)) + 1
+    of_view = sparse.csr_matrix((np.ones(len(views), np.float32), (np.arange(len(views)), views)), shape)
+    seen = claims @ of_view  # (n, V): is the Gaussian claimed in the view at all
+    visible = (claims.T @ seen).tocsr()  # (M, V): Gaussians of the mask that the view sees
+    a, b = both.row, both.col
+    union = _at(visible, a, views[b]) + _at(visible, b, views[a]) - both.data
+    same = (views[a] != views[b]) & (both.data > SAME * union)
+    square = (len(views), len(views))
+    return sparse.csr_matrix((np.ones(int(same.sum()), bool), (a[same], b[same])), square)
+
+
+def _at(matrix: sparse.csr_matrix, rows: Array, columns: Array) -> Array:
+    return np.asarray(matrix[rows, columns]).ravel() if len(rows) else np.zeros(0, np.float32)
