@@ -29,7 +29,9 @@ system: $(STAMP)
 	@$(PYTHON) packaging/system_libraries.py
 
 demo: system  ## install everything and open the bundled scene (without a display: pictures in demo_out/)
-	$(BIN)/python packaging/demo.py
+	if [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ] || [ "$$(uname)" != Linux ]; then $(BIN)/langsplat-viewer; \
+	else echo "No display: rendering the bundled scene to pictures instead of opening a window."; \
+	  $(BIN)/langsplat demo; fi
 
 quick: check  ## lint, types, and the tests that take no time: the loop while working
 	$(PYTEST) -m "not long"

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from assets.making.crops import CropSet
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
 from langsplat_core.evaluation.report import write_json
@@ -18,7 +19,6 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.io.langsplat_files import write_autoencoder, write_checkpoint, write_features
 from langsplat_core.io.language import write_language
 from langsplat_core.io.shapes import write_points
-from langsplat_core.lab.encoder.crops import CropSet
 from langsplat_core.lab.rooms.report import save_json as save_rooms
 from langsplat_core.pipeline.stages import kept, kept_array
 from langsplat_core.scene import Scene

@@ -27,20 +27,12 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
         "compact": "compact.Compact",
         "inspect": "inspect.Inspect",
         "doctor": "inspect.Doctor",
+        "demo": "demo.Demo",
     }
 )
 # Name -> what it is about, and its commands.
 GROUPS: Mapping[str, tuple[str, Mapping[str, str]]] = MappingProxyType(
     {
-        "demo": (
-            "Make the bundled scene, its photographs and its encoder.",
-            {
-                "build": "demo.DemoBuild",
-                "dataset": "demo.DemoDataset",
-                "encoder": "demo.DemoEncoder",
-                "sheet": "demo.DemoSheet",
-            },
-        ),
         "eval": (
             "Measure a scene against ground truth.",
             {

@@ -1,1 +1,1 @@
-"""The workshop: our own world, the demo encoder, measurements of ourselves. Only `cli` imports it."""
+"""Measurements of ourselves. Only `cli` imports it."""

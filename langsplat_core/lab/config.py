@@ -2,14 +2,13 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
-from langsplat_core.config import CodecConfig, Count, CountOrZero, LiftConfig, Positive, Range, Rate, Seed
+from assets.making.config import TIERS, Tier
+from langsplat_core.config import CodecConfig, Count, CountOrZero, LiftConfig, Positive, Range, Seed
 from langsplat_core.query.answers import CutRule
 
 Pixels = Annotated[int, Range(1, 65_536)]
-Tier = Literal["separate", "clutter", "occlusion"]  # objects apart, cluttered, packed with look-alikes
-TIERS: tuple[Tier, ...] = get_args(Tier)
 # The outlines a perfect segmenter would find; the same, but 15 % of the vectors are another region's; the
 # weight-free segmenter's; squares in place of masks.
 MaskOrigin = Literal["truth", "wrong", "graph", "tiles"]
@@ -19,22 +18,6 @@ Channels = Annotated[int, Range(1, 4_096)]  # values per Gaussian
 Views = Annotated[int, Range(8, 100_000)]  # photographs of a room, of which every eighth is held out
 Size = tuple[Pixels, Pixels]  # width and height of a picture
 Seeds = Annotated[tuple[Seed, ...], Range(0, 2**32 - 1, some=True)]
-LabelLayout = Literal["plain", "lerf-ovs", "3d-ovs"]  # how a rendered room's truth is written
-
-
-@dataclass(frozen=True)
-class DemoEncoderConfig:
-    """Training of the small CLIP that comes with the program (`langsplat demo encoder`)."""
-
-    start: Path | None = None  # folder of an earlier demo encoder to begin from; None: random weights
-    rooms: Count = 400  # random rooms that crops are rendered from
-    views: Count = 3  # photographs of each room
-    plain_crops: CountOrZero = 8_000  # crops of nothing but a colour or a texture
-    steps: Count = 8_000  # of training
-    batch: Count = 128  # crops per step
-    phrases: Count = 192  # phrases per step
-    lr: Rate = 1e-3  # largest learning rate
-    seed: Seed = 0  # of random numbers
 
 
 @dataclass(frozen=True)

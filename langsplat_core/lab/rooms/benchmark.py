@@ -3,10 +3,10 @@ truth; and an error budget, which swaps one stage at a time for one that makes n
 
 from pathlib import Path
 
+from assets.making.scene import SEED
 from langsplat_core.config import check_settings
 from langsplat_core.errors import InputError
 from langsplat_core.lab.config import BenchmarkConfig
-from langsplat_core.lab.demo import SEED
 from langsplat_core.lab.rooms.report import RoomReport
 from langsplat_core.lab.rooms.room import Room, labelled, room_encoder
 from langsplat_core.progress import Progress, silent

@@ -22,11 +22,11 @@ from pathlib import Path
 
 import numpy as np
 
+from assets.making.truth import Region, Truth
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import InputError
 from langsplat_core.io.hostile import read_npy
 from langsplat_core.lab.rooms.oracles import with_wrong_vectors
-from langsplat_core.lab.rooms.truth import Region, Truth
 from langsplat_core.scene import Reading
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.store import ImageFeatures

@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
+from assets.making.objects import EVERYTHING
+from assets.making.truth import read_truth
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
 from langsplat_core.io import load_scene
 from langsplat_core.lab.rooms.scoring import Reading, ask, evaluate, found_rate
-from langsplat_core.lab.rooms.truth import read_truth
-from langsplat_core.lab.world.objects.catalogue import EVERYTHING
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.raster import load_rasterizer

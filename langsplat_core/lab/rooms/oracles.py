@@ -1,57 +1,18 @@
 """What each stage of the method would give if it made no mistake, from a procedural room's ground truth."""
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from assets.making.truth import Truth
 from langsplat_core.arrays import Array, unit
-from langsplat_core.datasets.capture import Capture
-from langsplat_core.errors import InputError
-from langsplat_core.lab.rooms.truth import Truth
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import TextEncoder
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import LEVELS, Camera, Gaussians
-from langsplat_core.semantics.masks import LevelMasks
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.mask_weights import MaskGroups, find_memberships
-
-MIN_REGION = 16  # px: of a smaller region not even an oracle's crop shows anything
-
-
-class TruthMasks:
-    """A `semantics.masks.MaskSource` that knows: the regions of the truth, at its three levels.
-
-    A photograph is recognised by its content, since a mask source is given nothing else.
-    """
-
-    name = "truth"
-    key = json.dumps(["truth", 1, MIN_REGION])
-
-    def __init__(self, capture: Capture, truth: Truth) -> None:
-        self._truth = truth
-        pairs = zip(capture.images, capture.cameras, strict=True)
-        self._names = {_digest(image): camera.name for image, camera in pairs}
-
-    def __call__(self, image: Array, progress: Progress) -> LevelMasks:
-        """Masks of an image (H, W, 3) uint8 of the capture; InputError for any other."""
-        name = self._names.get(_digest(image))
-        if name is None:
-            raise InputError(f"{self._truth.folder}: has no truth for this photograph; render the room again")
-        stacks = []
-        for ids in self._truth.labels(name):
-            found, pixels = np.unique(ids[ids >= 0], return_counts=True)
-            stacks.append(ids == found[pixels >= MIN_REGION][:, None, None])
-        progress("reading the truth", 1.0)
-        subpart, part, whole = (np.ones(len(stack), np.float32) for stack in stacks)
-        return LevelMasks((stacks[0], stacks[1], stacks[2]), (subpart, part, whole))
-
-
-def _digest(image: Array) -> str:
-    return hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest()
 
 
 def oracle_vectors(features: ImageFeatures, ids: Array, vectors: Mapping[int, Array]) -> ImageFeatures:

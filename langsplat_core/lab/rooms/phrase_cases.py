@@ -6,10 +6,10 @@ from itertools import pairwise, product
 
 import numpy as np
 
+from assets.making.truth import Truth
+from assets.making.vocabulary import CATEGORIES
+from assets.making.world import World
 from langsplat_core.arrays import Array
-from langsplat_core.lab.rooms.truth import Truth
-from langsplat_core.lab.world.assembly import World
-from langsplat_core.lab.world.captions import KINDS
 from langsplat_core.query.compose import Body, Viewer, body, most, stands
 from langsplat_core.query.grammar import EXTREMES, SIDES
 
@@ -49,7 +49,7 @@ class Things:
 
     def called(self, word: str) -> list[int]:
         """Ids of those that are of this word or kind."""
-        return [number for number, own in self.words.items() if word in (own, *KINDS.get(own, ()))]
+        return [number for number, own in self.words.items() if word in (own, *CATEGORIES.get(own, ()))]
 
 
 def things_in(world: World, frame: Array, seed: int = 0) -> Things:
@@ -120,7 +120,7 @@ def _sets(things: Things, rng: np.random.Generator) -> Iterator[Case]:
 
 
 def _kinds(things: Things) -> list[str]:
-    return sorted({kind for word in things.words.values() for kind in KINDS.get(word, ())})
+    return sorted({kind for word in things.words.values() for kind in CATEGORIES.get(word, ())})
 
 
 def _relations(things: Things, seen_by: Viewer) -> Iterator[Case]:

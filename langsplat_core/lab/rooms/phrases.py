@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from assets.making.dataset import MIN_PIXELS, photographed_room
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.evaluation.scoring import intersection_over_union
 from langsplat_core.lab.config import BenchmarkConfig, PhraseBenchConfig
 from langsplat_core.lab.rooms.phrase_cases import CONSTRUCTIONS, Case, cases, things_in
 from langsplat_core.lab.rooms.room import HOLD_OUT, Room, weights_digest
-from langsplat_core.lab.rooms.scoring import MIN_GAUSSIANS, MIN_PIXELS, masks_and_peaks
+from langsplat_core.lab.rooms.scoring import MIN_GAUSSIANS, masks_and_peaks
 from langsplat_core.lab.rooms.variants import variants
-from langsplat_core.lab.world.photographs import photographed_room
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase, upright, viewer

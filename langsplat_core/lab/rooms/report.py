@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 
+from assets.making.truth import PHRASE_KINDS, Truth
 from langsplat_core.arrays import Array
 from langsplat_core.io.files import atomic_path
 from langsplat_core.lab.rooms.scoring import Asked, DirectScore, Score, found_rate
-from langsplat_core.lab.rooms.truth import KINDS, Truth
 from langsplat_core.scene import Codec
 from langsplat_core.training.language.codec_fit import CodecReport
 
@@ -114,7 +114,7 @@ def score_table(reports: Sequence[RoomReport]) -> str:
     head = ("tier", "phrases", "queries", "mIoU %", "localisation %", "3D IoU %", "right regions: 3D IoU %")
     lines = [_row(head), "|" + "---|" * len(head)]
     for tier, rooms in _by_tier(reports):
-        for kind in (*KINDS, "all"):
+        for kind in (*PHRASE_KINDS, "all"):
             of_rooms = [of_kind(room.measured[0], kind) for room in rooms]
             count = sum(queries for queries, *_ in of_rooms)
             if count:

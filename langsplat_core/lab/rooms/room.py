@@ -13,6 +13,9 @@ from typing import cast
 
 import numpy as np
 
+from assets.making.dataset import write_dataset
+from assets.making.objects import EVERYTHING
+from assets.making.truth import Truth, TruthMasks, read_truth
 from langsplat_core.arrays import Array
 from langsplat_core.config import (
     ClipConfig,
@@ -29,7 +32,6 @@ from langsplat_core.io.language import means_checksum
 from langsplat_core.lab.config import BenchmarkConfig, MaskOrigin, Tier
 from langsplat_core.lab.rooms.clip_geometry import ClipGeometry, read_geometry
 from langsplat_core.lab.rooms.oracles import (
-    TruthMasks,
     moved_to_pictures,
     oracle_vectors,
     phrase_vectors,
@@ -46,10 +48,7 @@ from langsplat_core.lab.rooms.scoring import (
     evaluate_direct,
 )
 from langsplat_core.lab.rooms.tiles import TileMasks
-from langsplat_core.lab.rooms.truth import Truth, read_truth
 from langsplat_core.lab.rooms.variants import Variant, variants
-from langsplat_core.lab.world.objects.catalogue import EVERYTHING
-from langsplat_core.lab.world.photographs import write_dataset
 from langsplat_core.pipeline.language import Views, language_field
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import trained_gaussians

@@ -12,10 +12,11 @@ from typing import Literal
 
 import numpy as np
 
+from assets.making.dataset import MIN_PIXELS
+from assets.making.truth import PHRASE_KINDS, Phrase, Truth
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.evaluation.scoring import intersection_over_union, majority
-from langsplat_core.lab.rooms.truth import KINDS, Phrase, Truth
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import CutRule, QueryResult, cut_level, peak_pixel
 from langsplat_core.query.engine import QueryEngine
@@ -25,7 +26,6 @@ from langsplat_core.raster.protocol import Rasterizer, View
 from langsplat_core.scene import Camera
 from langsplat_core.semantics.relevancy import FLOOR
 
-MIN_PIXELS = 150  # a thing with fewer visible pixels in a view is not asked for there
 MIN_GAUSSIANS = 20  # nor one with fewer Gaussians directly
 # px: the paper's mean filter for localisation, and its code's majority vote over a mask, both of pictures of
 # 731 rows; smaller pictures get smaller windows, or a part would be lost in one
@@ -152,7 +152,7 @@ def evaluate(
         progress("asking phrases", (done + 1) / len(cameras))
     return [
         Score(kind, len(rows), float(np.mean([r[0] for r in rows])), float(np.mean([r[1] for r in rows])))
-        for kind, rows in sorted(results.items(), key=lambda item: KINDS.index(item[0]))
+        for kind, rows in sorted(results.items(), key=lambda item: PHRASE_KINDS.index(item[0]))
     ]
 
 
@@ -249,7 +249,7 @@ def evaluate_direct(
         DirectScore(
             kind, len(rows), float(np.mean([r[0] for r in rows])), float(np.mean([r[1] for r in rows]))
         )
-        for kind, rows in sorted(results.items(), key=lambda item: KINDS.index(item[0]))
+        for kind, rows in sorted(results.items(), key=lambda item: PHRASE_KINDS.index(item[0]))
     ]
 
 

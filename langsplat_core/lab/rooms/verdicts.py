@@ -18,6 +18,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
+from assets.making.objects import EVERYTHING
+from assets.making.truth import Region
+from assets.making.vocabulary import part_words
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path
@@ -25,10 +28,7 @@ from langsplat_core.lab.config import BenchmarkConfig, VerdictBenchConfig
 from langsplat_core.lab.rooms.report import separation
 from langsplat_core.lab.rooms.room import Room, room_encoder
 from langsplat_core.lab.rooms.scoring import MIN_GAUSSIANS
-from langsplat_core.lab.rooms.truth import Region
 from langsplat_core.lab.rooms.variants import Variant
-from langsplat_core.lab.world.captions import part_words
-from langsplat_core.lab.world.objects.catalogue import EVERYTHING
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import WEAK, QueryResult
 from langsplat_core.query.compose import run_phrase

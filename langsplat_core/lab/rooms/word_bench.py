@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from assets.making.truth import Region
+from assets.making.vocabulary import colour_words, object_words
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.lab.config import BenchmarkConfig, WordBenchConfig
 from langsplat_core.lab.rooms.room import Room, weights_digest
 from langsplat_core.lab.rooms.scoring import MIN_GAUSSIANS
-from langsplat_core.lab.rooms.truth import Region
 from langsplat_core.lab.rooms.variants import Variant
-from langsplat_core.lab.world.captions import colour_words, object_words
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.describe import Describer, Entry, WordScores
 from langsplat_core.query.engine import QueryEngine

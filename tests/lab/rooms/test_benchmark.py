@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from assets.making import dataset
+from assets.making.scene import SEED
+from assets.making.truth import read_truth
 from langsplat_core.cli.evaluate import EvalSynthetic
 from langsplat_core.cli.run import main
 from langsplat_core.config import CodecConfig, DatasetConfig
@@ -15,7 +18,6 @@ from langsplat_core.datasets import load_capture
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io import save_scene
 from langsplat_core.lab.config import BenchmarkConfig, GainBenchConfig, LiftBenchConfig, PaperBenchConfig
-from langsplat_core.lab.demo import SEED
 from langsplat_core.lab.rooms import patches, tiles
 from langsplat_core.lab.rooms import scoring as synthetic
 from langsplat_core.lab.rooms.benchmark import run_benchmark
@@ -28,9 +30,7 @@ from langsplat_core.lab.rooms.oracles import (
 )
 from langsplat_core.lab.rooms.paper_tables import measure_paper
 from langsplat_core.lab.rooms.room import HOLD_OUT, Room, weights_digest
-from langsplat_core.lab.rooms.truth import read_truth
 from langsplat_core.lab.rooms.variants import liftings, variants
-from langsplat_core.lab.world import photographs as dataset
 from langsplat_core.progress import silent
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoders import load_encoder

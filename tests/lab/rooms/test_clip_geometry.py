@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from assets.making.truth import Region, Truth
 from langsplat_core.errors import InputError
 from langsplat_core.lab.rooms.clip_geometry import OTHER, PROMPTS, ClipGeometry, read_geometry
-from langsplat_core.lab.rooms.truth import Region, Truth
 from langsplat_core.semantics.store import ImageFeatures
 
 THINGS = [3 * letter for letter in "abcdefghijklmnopqrtuvwxyz"]

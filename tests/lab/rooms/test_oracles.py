@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from assets.making.truth import Region, Truth
+from assets.making.world import build_room
 from langsplat_core.arrays import unit
 from langsplat_core.lab.rooms.oracles import (
     moved_to_pictures,
@@ -11,8 +13,6 @@ from langsplat_core.lab.rooms.oracles import (
     phrase_vectors,
     true_labels,
 )
-from langsplat_core.lab.rooms.truth import Region, Truth
-from langsplat_core.lab.world.assembly import build_room
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.semantics.store import ImageFeatures
 from tests.support.scenes import random_camera

@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
+from assets.making.truth import Truth, read_truth
+from assets.making.world import World, build_room
 from langsplat_core.lab.rooms.phrase_cases import CONSTRUCTIONS, Case, cases, things_in
 from langsplat_core.lab.rooms.phrases import PhraseScore, phrase_table
-from langsplat_core.lab.rooms.truth import Truth, read_truth
-from langsplat_core.lab.world.assembly import World, build_room
 from langsplat_core.query.compose import upright, viewer
 from langsplat_core.query.grammar import Atom, parse
 from langsplat_core.scene import look_at

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from assets.making.truth import Phrase, Region, Truth
 from langsplat_core.arrays import unit
 from langsplat_core.lab.rooms import scoring as synthetic
 from langsplat_core.lab.rooms.report import separation
@@ -16,7 +17,6 @@ from langsplat_core.lab.rooms.scoring import (
     found_rate,
     relevancy_maps,
 )
-from langsplat_core.lab.rooms.truth import Phrase, Region, Truth
 from langsplat_core.query.answers import CUT_RULES, cut_level
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy

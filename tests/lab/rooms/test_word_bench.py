@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from assets.making.truth import Region
 from langsplat_core.errors import InputError
 from langsplat_core.lab.config import WordBenchConfig
-from langsplat_core.lab.rooms.truth import Region
 from langsplat_core.lab.rooms.word_bench import (
     InventoryScore,
     LevelNames,
