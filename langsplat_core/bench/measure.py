@@ -8,19 +8,17 @@
   software OpenGL driver holds. Linux only; elsewhere unknown.
 """
 
-import ctypes
-import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.sparse
 
 from langsplat_core.arrays import Array
+from langsplat_core.bench.memory import peak_memory, restart_peak
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.raster.protocol import FreezableView, LabelView, Rasterizer
 from langsplat_core.raster.reference import Footprints, ReferenceView, project, rim
@@ -30,7 +28,6 @@ GRIDS = ((16, 12), (8, 6), (4, 3))  # cells of subparts, parts and wholes: 252 l
 MIB = 2**20
 _CALLS, _BUDGET_S = 15, 0.3  # at most this many calls, begun within this time
 _ONCE_S = 2.0  # a call that takes longer is its own measurement
-_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _WINDOW = 64  # pixels a side
 _PLACES = ((0.5, 0.5), (0.3, 0.42), (0.64, 0.7))  # centres of the windows, as fractions of the image
 _BAND = 1e-3  # relative distance to a cut-off; float32 footprints of a GPU are within about 3e-4 of it
@@ -293,39 +290,6 @@ def _timed(call: Callable[[], Any]) -> tuple[list[float], float | None]:
         times.append(time.perf_counter() - start)
         del kept
     return times, peak
-
-
-def resident_memory() -> int | None:
-    """Bytes of this process now; None where the system does not tell."""
-    return _status("VmRSS")
-
-
-def peak_memory() -> int | None:
-    """Most bytes of this process since it began or since `restart_peak`. Not getrusage: its maximum is
-    inherited from the parent process on Linux."""
-    return _status("VmHWM")
-
-
-def restart_peak() -> int | None:
-    """Give free pages back and forget the peak; returns the bytes now, None where that cannot be done."""
-    if not (sys.platform.startswith("linux") and _CLEAR.exists()):
-        return None
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc has it
-    try:
-        if trim is not None:
-            trim(0)
-        _CLEAR.write_text("5")
-    except OSError:
-        return None
-    return resident_memory()
-
-
-def _status(key: str) -> int | None:
-    try:
-        found = re.search(rf"{key}:\s*(\d+) kB", _STATUS.read_text())
-    except OSError:
-        return None
-    return int(found[1]) * 1024 if found else None
 
 
 @dataclass(frozen=True, eq=False)

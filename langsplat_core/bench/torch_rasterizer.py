@@ -4,8 +4,8 @@ It is what one would write without compiled kernels, made as fast as tensors all
 Gaussians at once, a radix sort into tiles of 16x16 pixels, tiles of like length blended together in steps
 that stay in cache, tiles that are opaque dropped after every step, one group of tiles per thread (PyTorch's
 own threads meet after every operation, which here takes less time than the meeting), and gradients group by
-group through autograd, so that no image's worth of weights is ever held. Image formation is that of `raster/reference.py`. In float64
-its gradients, which autograd derives and nobody wrote, serve the benchmark as the truth.
+group through autograd, so that no image's worth of weights is ever held. Image formation is that of
+`raster/reference.py`. In float64 its gradients, which autograd derives, serve the benchmark as the truth.
 """
 
 from collections.abc import Callable, Iterator, Sequence

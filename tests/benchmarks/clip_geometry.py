@@ -26,10 +26,10 @@ from assets.making.truth import Region, Truth
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import InputError
 from langsplat_core.io.hostile import read_npy
-from langsplat_core.lab.rooms.oracles import with_wrong_vectors
 from langsplat_core.scene import Reading
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.store import ImageFeatures
+from tests.benchmarks.oracles import with_wrong_vectors
 
 PREFIX = "clip-geometry:"
 VERSION = 2  # of the simulation

@@ -1,4 +1,4 @@
-"""How far "found" and "not here" can be trusted (`langsplat bench verdict`), and how they are calibrated.
+"""The report `verdicts`: how far "found" and "not here" can be trusted, and the calibration of both.
 
 In rooms whose truth is known every thing that is there is asked for, and every thing of the catalogue that is
 not; every part alone, and part words that nothing in the room is called by; every part of a thing, and as
@@ -9,11 +9,10 @@ targets); it is fair only to rooms that it was not fitted to.
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -22,19 +21,20 @@ from assets.making.objects import EVERYTHING
 from assets.making.truth import Region
 from assets.making.vocabulary import part_words
 from langsplat_core.arrays import Array
+from langsplat_core.bench.measure import markdown
+from langsplat_core.cli.checks import OutFile
+from langsplat_core.config import CodecConfig
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.lab.config import BenchmarkConfig, VerdictBenchConfig
-from langsplat_core.lab.rooms.report import separation
-from langsplat_core.lab.rooms.room import Room, room_encoder
-from langsplat_core.lab.rooms.scoring import MIN_GAUSSIANS
-from langsplat_core.lab.rooms.variants import Variant
-from langsplat_core.progress import Progress, silent
+from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.answers import WEAK, QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import PARTS, forms, is_part
 from langsplat_core.scene import Calibration, Fits, Odds, Scene
+from tests.benchmarks.files import publish
+from tests.benchmarks.room import InRooms, MaskOrigin, Room, Variant
+from tests.benchmarks.scoring import MIN_GAUSSIANS, separation
 
 REJECTED = 0.95  # of what is absent, in the rooms that a calibration is fitted to
 BINS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)  # of probability
@@ -44,6 +44,28 @@ PAIRS = {  # what is looked for -> the kinds of phrases that are there and that 
     "part": ("part", "absent part"),
     "inside": ("part of thing", "absent part of thing"),
 }
+
+
+@dataclass(frozen=True)
+class Verdicts(InRooms):
+    """Things that are there and things that are not, asked for in rooms with known truth: accept and reject
+    rates, the ROC curve's area, and how well the probabilities are calibrated."""
+
+    masks: MaskOrigin = "truth"  # where outlines come from
+    codec: CodecConfig = field(default_factory=CodecConfig)
+    fit: OutFile | None = None
+    """Fit the encoder's calibration to these rooms and write it into this reading.json; measure elsewhere."""
+
+    def run(self) -> None:
+        with TerminalProgress() as progress:
+            variant = Variant("the method", self.masks, codec=self.codec)
+            rows = [row for room in self.rooms(progress) for row in measure_verdicts(room, variant)]
+        if self.fit is not None:
+            calibration = fit_calibration(rows)
+            write_calibration(self.fit, calibration)
+            print(f"{self.fit}: {calibration}")
+        tables = "\n".join([verdict_table(rows), *(curve_table(rows, asked) for asked in PAIRS)])
+        publish(self, "verdicts", "Verdicts: accept and reject rates, and calibration", tables, rows)
 
 
 @dataclass(frozen=True)
@@ -60,24 +82,10 @@ class Verdict:
     excess: float | None = None  # see `QueryResult`
 
 
-def measure_verdicts(config: VerdictBenchConfig, work: Path, progress: Progress = silent) -> list[Verdict]:
-    """Every room, every thing. Rooms that are not in `work` are made. Raises InputError without a room."""
-    if not config.seeds or not config.tiers:
-        raise InputError("bench verdict: name at least one of --tiers and one of --seeds")
-    encoder = room_encoder(config.encoder, config.text_vectors)
-    settings = BenchmarkConfig()
-    variant = Variant("the method", config.masks, codec=config.codec)
-    rows: list[Verdict] = []
-    for tier in config.tiers:
-        for seed in config.seeds:
-            room = Room(settings, tier, seed, work, encoder, progress)
-            field, _, _ = room.field(variant)
-            rows += _of_room(room, QueryEngine(Scene(room.gaussians, field), lambda _: encoder[0]))
-            progress(f"{tier} {seed}", 1.0)
-    return rows
-
-
-def _of_room(room: Room, engine: QueryEngine) -> list[Verdict]:
+def measure_verdicts(room: Room, variant: Variant) -> list[Verdict]:
+    """Every phrase of one room, present and absent, asked of the field of a variant."""
+    field, _, _ = room.field(variant)
+    engine = QueryEngine(Scene(room.gaussians, field), lambda _: room.encoder)
     parts, absent_parts = _part_words(room)
     asked = [(p.text, p.kind) for p in room.truth.phrases if p.kind in ("object", "colour+object")]
     asked += [(text, "absent") for text in room.truth.absent(EVERYTHING)]
@@ -128,19 +136,19 @@ def _part(region: Region) -> bool:
 
 
 def _uncalled(words: Iterable[str], called: AbstractSet[str]) -> list[str]:
-    """Those of `words` that neither in this number nor in the other one are among `called`."""
+    """The `words` that neither in this number nor in the other one are among `called`."""
     return sorted(word for word in words if called.isdisjoint({*forms(word), f"{word}s", *part_words(word)}))
 
 
 def fit_calibration(rows: Sequence[Verdict]) -> Calibration:
-    """To all kinds of phrases. Raises as `fit_odds` does."""
+    """Odds of all kinds of phrases. Raises as `fit_odds` does."""
     return Calibration(
         **{name: fit_odds(fits_of(rows, there), fits_of(rows, not_)) for name, (there, not_) in PAIRS.items()}
     )
 
 
 def fit_odds(present: Array, absent: Array) -> Odds:
-    """Of fits (P, 3) of things that are there and (A, 3) of things that are not, which weigh the same.
+    """Odds from fits (P, 3) of things that are there and (A, 3) of things that are not, which weigh the same.
 
     Raises InputError where there are fewer than ten of either, or the fits do not tell them apart.
     """
@@ -169,7 +177,7 @@ def fit_odds(present: Array, absent: Array) -> Odds:
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Into a `reading.json`, whose other fields stay."""
+    """Write a calibration into a `reading.json`, whose other fields stay."""
     stated = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     stated["calibration"] = asdict(calibration)
     with atomic_path(path) as temporary:
@@ -182,22 +190,20 @@ def fits_of(rows: Sequence[Verdict], kind: str) -> Array:
 
 
 def verdict_table(rows: Sequence[Verdict]) -> str:
-    """Markdown: what is accepted and rejected, and the area under the curve, per tier; means over rooms with
-    their standard deviation."""
+    """Markdown: what is accepted and rejected, and the area under the ROC curve, per tier; means over rooms
+    with their standard deviation."""
     at = (f"accepted at {100 * share:.0f} % rejected" for share in SHARES)
     head = ("tier", "asked for", "phrases", "accepted %", "absent rejected %", "ROC area %", *at)
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines = []
     asked = {"thing": PAIRS["thing"], "colour + thing": ("colour+object", "absent"), **PAIRS}
     for tier in dict.fromkeys(row.tier for row in rows):
         for name, pair in asked.items():
             here = [row for row in rows if row.tier == tier and row.kind in pair]
-            rooms = [
-                [row for row in here if row.seed == seed] for seed in dict.fromkeys(r.seed for r in here)
-            ]
+            seeds = dict.fromkeys(row.seed for row in here)
+            rooms = [[row for row in here if row.seed == seed] for seed in seeds]
             if any(row.kind == pair[0] for row in here):
-                cells = (tier, name, str(len(here)), *_spreads([_shares(room, pair) for room in rooms]))
-                lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+                lines.append((tier, name, len(here), *_spreads([_shares(room, pair) for room in rooms])))
+    return markdown(head, lines)
 
 
 def _shares(rows: Sequence[Verdict], pair: tuple[str, str]) -> tuple[float, ...]:
@@ -216,7 +222,7 @@ def _mean(values: Sequence[bool]) -> float:
 
 
 def _score(row: Verdict) -> float:
-    """What a threshold would be put on."""
+    """Value that a threshold would be put on."""
     if row.probability is not None:
         return row.probability
     return max(row.fits) if row.excess is None else row.excess
@@ -234,7 +240,7 @@ def _spread(values: Array) -> str:
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """What was said with a probability from `low` to `high`; present and absent weigh the same in all."""
+    """Answers with a probability from `low` to `high`; present and absent weigh the same in all."""
 
     low: float
     high: float
@@ -262,12 +268,8 @@ def curve(rows: Sequence[Verdict], asked: str = "thing") -> list[CurvePoint]:
 
 def curve_table(rows: Sequence[Verdict], asked: str = "thing") -> str:
     """`curve` as Markdown."""
-    lines = [f"| probability of a {asked} said | phrases | mean said % | there % |", "|---|---|---|---|"]
-    for p in curve(rows, asked):
-        lines.append(f"| {p.low:g} to {p.high:g} | {p.phrases} | {100 * p.said:.0f} | {100 * p.there:.0f} |")
-    return "\n".join(lines) + "\n"
-
-
-def figures(config: VerdictBenchConfig, rows: Sequence[Verdict]) -> dict[str, Any]:
-    """All figures."""
-    return {"settings": asdict(config), "rows": [asdict(row) for row in rows]}
+    lines = (
+        (f"{p.low:g} to {p.high:g}", p.phrases, f"{100 * p.said:.0f}", f"{100 * p.there:.0f}")
+        for p in curve(rows, asked)
+    )
+    return markdown((f"probability of a {asked} said", "phrases", "mean said %", "there %"), lines)

@@ -23,8 +23,9 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.surface import Regions
 from langsplat_core.raster.protocol import Rasterizer, View
-from langsplat_core.scene import Camera
+from langsplat_core.scene import Camera, Codec
 from langsplat_core.semantics.relevancy import FLOOR
+from langsplat_core.training.language.codec_fit import CodecReport
 
 MIN_GAUSSIANS = 20  # nor one with fewer Gaussians directly
 # px: the paper's mean filter for localisation, and its code's majority vote over a mask, both of pictures of
@@ -37,7 +38,7 @@ HALF = 0.5  # of what a pixel shows: from there it belongs to an answer's Gaussi
 
 
 @dataclass(frozen=True)
-class Reading:
+class MaskRule:
     """How an answer becomes a map and a mask."""
 
     paper_order: bool = False  # blend latents and decode pixels, instead of blending relevancies
@@ -130,12 +131,12 @@ def evaluate(
     rasterizer: Rasterizer,
     cameras: Sequence[Camera],
     truth: Truth,
-    reading: Reading | None = None,
+    rule: MaskRule | None = None,
     progress: Progress = silent,
     judge: Judge | None = None,
 ) -> list[Score]:
-    """Every phrase that was asked, in every view where its thing is visible. judge: in place of `reading`."""
-    settled, scene = reading or Reading(), asked.engine.scene
+    """Every phrase that was asked, in every view where its thing is visible. judge: in place of `rule`."""
+    settled, scene = rule or MaskRule(), asked.engine.scene
     judge = judge or (lambda view, answers: _judged(asked.engine, view, answers, settled))
     results: dict[str, list[tuple[float, bool]]] = {}
     for done, camera in enumerate(cameras):
@@ -182,17 +183,17 @@ def _mask(labels: Array, phrase: Phrase) -> Array:
 
 
 def _judged(
-    engine: QueryEngine, view: View, answers: Sequence[Answer], reading: Reading
+    engine: QueryEngine, view: View, answers: Sequence[Answer], rule: MaskRule
 ) -> Iterator[tuple[Array, tuple[int, int]]]:
     """The mask (H, W) of each answer, and the row and column of its peak."""
-    if reading.cut == "regions" and not reading.paper_order:
+    if rule.cut == "regions" and not rule.paper_order:
         yield from masks_and_peaks(view, [(answer.even, answer.members) for answer in answers])
         return
-    rule: CutRule = "floor" if reading.cut == "regions" else reading.cut
+    level: CutRule = "floor" if rule.cut == "regions" else rule.cut
     for answer, relevancy in zip(
-        answers, relevancy_maps(engine, view, answers, reading.paper_order), strict=True
+        answers, relevancy_maps(engine, view, answers, rule.paper_order), strict=True
     ):
-        cut = cut_level(rule, relevancy, answer.peak, answer.median)
+        cut = cut_level(level, relevancy, answer.peak, answer.median)
         yield _smoothed_mask(relevancy > cut), _peak(relevancy)
 
 
@@ -271,3 +272,101 @@ def found_rate(asked: Asked, texts: Iterable[str]) -> tuple[float, int]:
     """Share of `texts` that were answered with a place, and of how many; unknown phrases do not count."""
     found = [asked.answers[text].found for text in texts if text in asked.answers]
     return (float(np.mean(found)) if found else 0.0), len(found)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One variant of the method in one room."""
+
+    scores: tuple[Score, ...]
+    direct: tuple[DirectScore, ...]
+    accepted: float  # share of the room's objects that are answered with a place
+    objects: int  # that were asked
+    rejected: float  # share of absent objects that are answered with "not here"
+    absent: int  # that were asked
+    separation: (
+        float  # chance that a present object's peak exceeds an absent one's: 1 where a threshold exists
+    )
+    peaks: dict[str, float]  # smoothed peak relevancy of every object that was asked, absent ones included
+    unknown: tuple[str, ...]  # phrases left out, because the encoder was never taught their words
+    query_ms: float  # median, from text to place
+    name: str = ""
+    masks: str = ""
+    vectors: str = ""
+    codec: str = ""
+    query: str = ""
+    bytes_per_gaussian: float = 0.0  # of its meanings at three levels
+    codec_loss: CodecReport = CodecReport(1.0, 0.0, 0.0)  # noqa: RUF009 (frozen)
+    fit_seconds: float = 0.0  # from masks to latents; what an earlier run has made is not in it
+    frame_ms: float = 0.0  # median, one phrase into one view
+
+
+def measured(
+    asked: Asked, truth: Truth, absent: Sequence[str], scores: Sequence[Score], direct: Sequence[DirectScore]
+) -> Measured:
+    """Collect what was asked of a scene."""
+    present = [phrase.text for phrase in truth.phrases if phrase.kind == "object"]
+    accepted, objects = found_rate(asked, present)
+    found, count = found_rate(asked, absent)
+    peaks = {
+        text: round(asked.answers[text].peak, 4) for text in [*present, *absent] if text in asked.answers
+    }
+    inside = np.array([peaks[text] for text in present if text in peaks])
+    outside = np.array([peaks[text] for text in absent if text in peaks])
+    return Measured(
+        scores=tuple(scores),
+        direct=tuple(direct),
+        accepted=accepted,
+        objects=objects,
+        rejected=1 - found,
+        absent=count,
+        separation=separation(inside, outside),
+        peaks=peaks,
+        unknown=asked.unknown,
+        query_ms=1000 * asked.seconds,
+    )
+
+
+def codec_name(codec: Codec) -> str:
+    """Such as "codebook 512" or "autoencoder 3"."""
+    return f"{codec.kind} {codec.index_size or codec.latent_dim}"
+
+
+def separation(present: Array, absent: Array) -> float:
+    """Chance that one of `present` (P,) exceeds one of `absent` (A,), ties half; 1 without either."""
+    if len(present) == 0 or len(absent) == 0:
+        return 1.0
+    above = (present[:, None] > absent).mean() + 0.5 * (present[:, None] == absent).mean()
+    return float(above)
+
+
+def pooled(scores: Iterable[Score]) -> tuple[int, float, float]:
+    """Number of queries, mean IoU and localisation over all of them; 0 where nothing was asked."""
+    rows = list(scores)
+    count = sum(score.queries for score in rows)
+    weights = [score.queries / max(count, 1) for score in rows]
+    iou = float(np.dot(weights, [score.mean_iou for score in rows])) if rows else 0.0
+    localisation = float(np.dot(weights, [score.localisation for score in rows])) if rows else 0.0
+    return count, iou, localisation
+
+
+def of_kind(measured: Measured, kind: str) -> tuple[int, float, float, float]:
+    """Queries, mean IoU, localisation and 3-D IoU of one kind of phrase, or of all."""
+    direct = direct_share(measured, kind, "mean_iou")
+    return (*pooled(s for s in measured.scores if kind in (s.kind, "all")), direct)
+
+
+def loss_cells(measured: Sequence[Measured]) -> tuple[str, str, str]:
+    """Codec, its relevancy error, and its bytes per Gaussian, means over the rooms."""
+    mean = np.mean([m.codec_loss.error_mean for m in measured])
+    p99 = np.mean([m.codec_loss.error_p99 for m in measured])
+    names = dict.fromkeys(m.codec for m in measured)
+    bytes_each = np.mean([m.bytes_per_gaussian for m in measured])
+    return ", ".join(names), f"{mean:.4f} / {p99:.3f}", f"{bytes_each:.0f}"
+
+
+def direct_share(measured: Measured, kind: str, name: Literal["mean_iou", "ceiling"]) -> float:
+    """Mean over the phrases of a kind, or of all, among the Gaussians."""
+    scores = [score for score in measured.direct if kind in (score.kind, "all")]
+    count = sum(score.phrases for score in scores)
+    return float(sum(getattr(score, name) * score.phrases for score in scores) / max(count, 1))

@@ -1,4 +1,4 @@
-"""LERF's way to an answer, without masks: CLIP vectors of square patches at several scales, and a search of
+"""LERF's method, without masks: CLIP vectors of square patches at several scales, and a search of
 the scale that fits the phrase best (Kerr et al. 2023, sections 3.1 and 3.3).
 
 LERF trains a field of vectors over position and scale; here the same vectors are averaged onto Gaussians that
@@ -13,12 +13,12 @@ import numpy as np
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import PictureConfig
-from langsplat_core.lab.rooms.scoring import Answer, masks_of_maps
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.protocol import LiftingRasterizer, View
 from langsplat_core.scene import Camera, Gaussians
 from langsplat_core.semantics.relevancy import relevancy
 from langsplat_core.semantics.store import ImageEncoder, masked_crop
+from tests.benchmarks.scoring import Answer, masks_of_maps
 
 SCALES = tuple(float(scale) for scale in np.linspace(0.05, 0.5, 7))  # LERF's; it interpolates between them
 OVERLAP = 0.5  # of neighbouring patches
@@ -27,7 +27,7 @@ CHANNELS = 32  # of a picture of vectors that are splatted or gathered at a time
 
 @dataclass(frozen=True, eq=False)
 class PatchField:
-    """What Gaussians mean at every scale."""
+    """CLIP vectors of Gaussians at every scale."""
 
     vectors: Array  # (S, N, D) float32 unit; zero where never seen
     canonical: Array  # (C, D) float32 unit

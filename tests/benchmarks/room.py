@@ -1,59 +1,51 @@
-"""One procedural room: photographs, Gaussians, masks, meanings and answers, each made once, by the ordinary
-pipeline, and compared with the truth."""
+"""One procedural room: photographs, Gaussians, masks, language fields and answers, each made once, by the
+ordinary pipeline, and compared with the truth."""
 
 import hashlib
 import statistics
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import cast
+from typing import Annotated, Literal, cast
 
 import numpy as np
+import tyro
 
+from assets.making.config import Size, Tier
 from assets.making.dataset import write_dataset
 from assets.making.objects import EVERYTHING
+from assets.making.scene import SEED
 from assets.making.truth import Truth, TruthMasks, read_truth
 from langsplat_core.arrays import Array
+from langsplat_core.cli.checks import OutFolder
 from langsplat_core.config import (
     ClipConfig,
+    CodecConfig,
+    Count,
     DatasetConfig,
+    LevelChoice,
+    LiftConfig,
     MaskConfig,
     PictureConfig,
     RadianceConfig,
+    Range,
+    Seed,
     TrainConfig,
+    check_settings,
 )
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
+from langsplat_core.errors import InputError
 from langsplat_core.io.hostile import write_npy
 from langsplat_core.io.language import means_checksum
-from langsplat_core.lab.config import BenchmarkConfig, MaskOrigin, Tier
-from langsplat_core.lab.rooms.clip_geometry import ClipGeometry, read_geometry
-from langsplat_core.lab.rooms.oracles import (
-    moved_to_pictures,
-    oracle_vectors,
-    phrase_vectors,
-    true_labels,
-    with_wrong_vectors,
-)
-from langsplat_core.lab.rooms.report import Measured, RoomReport, codec_name, measured
-from langsplat_core.lab.rooms.scoring import (
-    Asked,
-    Judge,
-    Reading,
-    ask,
-    evaluate,
-    evaluate_direct,
-)
-from langsplat_core.lab.rooms.tiles import TileMasks
-from langsplat_core.lab.rooms.variants import Variant, variants
 from langsplat_core.pipeline.language import Views, language_field
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import trained_gaussians
 from langsplat_core.progress import Progress
-from langsplat_core.query.answers import AnswerRule
+from langsplat_core.query.answers import AnswerRule, CutRule
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
@@ -64,14 +56,77 @@ from langsplat_core.semantics.masks import MaskSource
 from langsplat_core.semantics.sources import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture
 from langsplat_core.training.language.codec_fit import CodecReport
-from langsplat_core.training.radiance.train import evaluate_views
+from tests.benchmarks.clip_geometry import ClipGeometry, read_geometry
+from tests.benchmarks.oracles import (
+    TileMasks,
+    moved_to_pictures,
+    oracle_vectors,
+    phrase_vectors,
+    true_labels,
+    with_wrong_vectors,
+)
+from tests.benchmarks.scoring import (
+    Asked,
+    Judge,
+    MaskRule,
+    Measured,
+    ask,
+    codec_name,
+    evaluate,
+    evaluate_direct,
+    measured,
+)
 
 HOLD_OUT = 8  # every so many views, one is not trained on
-FRAMES = 5  # timed pictures of one phrase
+FRAMES = 5  # timed images of one phrase
+ViewCount = Annotated[int, Range(8, 100_000)]
+Seeds = Annotated[tuple[Seed, ...], Range(0, 2**32 - 1, some=True)]
+# The outlines a perfect segmenter would find; the same, but 15 % of the vectors are another region's; the
+# weight-free segmenter's; squares in place of masks.
+MaskOrigin = Literal["truth", "wrong", "graph", "tiles"]
+
+
+@dataclass(frozen=True)
+class RoomSettings:
+    """How rooms are photographed, trained and asked."""
+
+    views: ViewCount = 48  # photographs of each room; every eighth is held out
+    size: Size = (400, 300)  # width and height, pixels
+    steps: Count = 1_500  # of radiance training
+    max_gaussians: Count = 50_000  # of a room
+    encoder: str = "demo"
+    """"demo" for the bundled one, a folder, a hub id, or clip-geometry:OWN[,ALIKE]: vectors made from truth
+    with the geometry of CLIP, OWN being the cosine of an image with its words (0.22 to 0.32)."""
+    text_vectors: Path | None = None  # .npy of real text vectors for clip-geometry, names in a .txt beside it
+    cut: CutRule | Literal["regions"] = "regions"
+    """How an answer becomes a mask: whole regions, or a rule of `query.answers.cut_level` for the map."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One method: each stage the ordinary one, one that makes no mistake, or another's."""
+
+    name: str
+    masks: MaskOrigin
+    vectors: Literal["image", "text"] = "image"  # text: of every region's true words
+    codec: CodecConfig = CodecConfig()  # noqa: RUF009 (frozen)
+    lift: LiftConfig = LiftConfig()  # noqa: RUF009
+    query: Literal["blend answers", "paper"] = "blend answers"  # paper: blend latents, then decode
+    level: LevelChoice = "auto"  # that is asked
+
+
+def autoencoder(d: int = 3, steps: int = CodecConfig.steps) -> CodecConfig:
+    """The paper's codec."""
+    return CodecConfig(kind="autoencoder", latent_dim=d, steps=steps)
+
+
+def ceiling(dim: int) -> CodecConfig:
+    """A codec that loses nothing: all `dim` numbers."""
+    return CodecConfig(kind="linear", latent_dim=dim)
 
 
 def weights_digest(model: str) -> str:
-    """Of an encoder's weights: a folder may be filled with others under the same name."""
+    """Digest of an encoder's weights: a folder may be filled with others under the same name."""
     found, digest = model_path(model, "--encoder"), hashlib.sha256()
     for path in sorted([*found.glob("*.safetensors"), *found.glob("*.bin")]) if found.is_dir() else [found]:
         digest.update(path.read_bytes())
@@ -86,21 +141,42 @@ def room_encoder(model: str, text_vectors: Path | None = None) -> tuple[Encoder 
     return geometry, geometry.digest
 
 
-def train_config(config: BenchmarkConfig) -> TrainConfig:
-    """The settings with which every room is trained."""
-    return TrainConfig(
-        dataset=DatasetConfig(max_side=max(config.size), test_every=HOLD_OUT),
-        radiance=RadianceConfig(steps=config.steps, sh_degree=1, max_gaussians=config.max_gaussians),
-        clip=ClipConfig(model=config.encoder),
-    )
+@dataclass(frozen=True)
+class InRooms:
+    """Options of every report that is measured in rooms with known truth."""
+
+    tiers: tuple[Tier, ...] = ("clutter",)  # how crowded the rooms are
+    seeds: Seeds = (301, 302, 303, 304, 305)
+    """One room of every tier each; never the bundled scene's. 201 to 203 calibrate the demo encoder."""
+    settings: Annotated[RoomSettings, tyro.conf.arg(name="")] = field(default_factory=RoomSettings)
+    work: OutFolder = Path("eval_out")
+    """Folder for the rooms and all intermediate results: an interrupted run goes on."""
+    out: OutFolder = Path("bench_out")
+    """Folder for the report: its tables (.md) and figures (.json, some .png)."""
+
+    def rooms(self, progress: Progress) -> "Iterator[Room]":
+        """Every room, not yet made. Raises InputError for settings without a room that can be measured."""
+        check_settings(self)
+        if not self.tiers:
+            raise InputError("name at least one of --tiers")
+        if SEED in self.seeds:
+            raise InputError(
+                f"--seeds {SEED} is the bundled scene's room, on which things were tuned; take another seed"
+            )
+        encoder = room_encoder(self.settings.encoder, self.settings.text_vectors)
+        for tier in self.tiers:
+            for seed in self.seeds:
+                yield Room(
+                    self.settings, tier, seed, self.work, encoder, labelled(progress, f"{tier} {seed}, ")
+                )
 
 
 class Room:
-    """One room and everything that is derived from it, each made once, when it is first needed."""
+    """One room and everything that is derived from it; each part is made once, when it is first needed."""
 
     def __init__(
         self,
-        config: BenchmarkConfig,
+        config: RoomSettings,
         tier: Tier,
         seed: int,
         work: Path,
@@ -111,12 +187,16 @@ class Room:
         self.config, self.tier, self.seed, self.progress = config, tier, seed, progress
         self.encoder, self.weights = encoder
         self.folder = work / f"{tier}-{seed}-{config.views}x{width}x{height}"
-        self.settings = train_config(config)
+        self.settings = TrainConfig(
+            dataset=DatasetConfig(max_side=max(config.size), test_every=HOLD_OUT),
+            radiance=RadianceConfig(steps=config.steps, sh_degree=1, max_gaussians=config.max_gaussians),
+            clip=ClipConfig(model=config.encoder),
+        )
         self.seconds: dict[str, float] = {}
 
     @cached_property
     def photographs(self) -> Path:
-        """Their folder, rendered if need be, with the truth in it."""
+        """Folder of the photographs, rendered if need be, with the truth in it."""
         folder, start = self.folder / "photographs", time.perf_counter()
         if not (folder / "transforms.json").exists():
             write_dataset(folder, self.seed, self.config.views, self.config.size, self.progress, self.tier)
@@ -125,7 +205,7 @@ class Room:
 
     @cached_property
     def capture(self) -> Capture:
-        """The photographs."""
+        """The photographs with their cameras."""
         start = time.perf_counter()
         capture = load_capture(self.photographs, self.settings.dataset, self.folder, self.progress)
         self._lap("photographs", start)
@@ -133,12 +213,12 @@ class Room:
 
     @cached_property
     def truth(self) -> Truth:
-        """What is in them."""
+        """Regions of the photographs and the phrases that are right for them."""
         return read_truth(self.photographs)
 
     @cached_property
     def gaussians(self) -> Gaussians:
-        """Trained without the held-out views."""
+        """Gaussians that were trained without the held-out views."""
         train, _ = self.capture.split(HOLD_OUT)
         start = time.perf_counter()
         gaussians = trained_gaussians(self.capture, train, self.settings, self.folder, self.progress)
@@ -147,7 +227,7 @@ class Room:
 
     @cached_property
     def labels(self) -> Array:
-        """(3, N) what every Gaussian truly is."""
+        """(3, N) truth ids of every Gaussian."""
         path = self.folder / f"{stage_key('labels', 1, means_checksum(self.gaussians.means))}.npy"
         if not path.exists():
             start = time.perf_counter()
@@ -196,7 +276,7 @@ class Room:
         return TileMasks() if outlines == "tiles" else TruthMasks(self.capture, self.truth)
 
     def field(self, variant: Variant, fresh: bool = False) -> tuple[LanguageField, CodecReport, float]:
-        """What the Gaussians mean, what the codec loses, and seconds; `fresh` takes nothing that was kept."""
+        """The language field, what its codec loses, and seconds; `fresh` takes nothing that was kept."""
         views, start = self.views(variant), time.perf_counter()
         settings = replace(self.settings, codec=variant.codec, lift=variant.lift)
         with TemporaryDirectory(dir=self.folder) as empty:
@@ -207,16 +287,16 @@ class Room:
         return *made, round(time.perf_counter() - start, 1)
 
     def measure(self, variant: Variant, fresh: bool = False) -> Measured:
-        """Ask everything; the method's own order of work but for what `variant` says. fresh: see `field`."""
+        """Ask everything of a variant's field. fresh: take nothing that was kept, so that seconds count."""
         field, loss, seconds = self.field(variant, fresh)
         return replace(self.measure_field(field, variant), codec_loss=loss, fit_seconds=seconds)
 
     def rule(self, variant: Variant) -> AnswerRule:
-        """How answers are read; the paper's own ones by their peak."""
+        """How the engine answers; the paper's own order by the peak."""
         return "regions" if self.config.cut == "regions" and variant.query != "paper" else "peak"
 
     def measure_field(self, field: LanguageField, variant: Variant) -> Measured:
-        """Ask everything of what the Gaussians are said to mean."""
+        """Ask everything of a language field."""
         start = time.perf_counter()
         # What is no codec has its numbers at hand; going through a codec's interface takes seconds a phrase.
         whole = field.codec.latent_dim == field.codec.vector_dim
@@ -235,16 +315,16 @@ class Room:
 
     @cached_property
     def texts(self) -> list[str]:
-        """What is asked: everything that is there, and things that are not."""
+        """Phrases that are asked: everything that is there, and things that are not."""
         return [*(phrase.text for phrase in self.truth.phrases), *self.truth.absent(EVERYTHING)]
 
     def measure_asked(self, asked: Asked, variant: Variant, judge: Judge | None = None) -> Measured:
-        """Compare answers to `texts` with the truth. judge: see `scoring.evaluate`; the answers are then cut
-        half way between the floor and their peak among the Gaussians too."""
+        """Compare answers to `texts` with the truth. judge: of another system's answers (`scoring.evaluate`),
+        which are then cut half way between the floor and their peak among the Gaussians too."""
         start = time.perf_counter()
-        reading = Reading(variant.query == "paper", self.config.cut)
+        rule = MaskRule(variant.query == "paper", self.config.cut)
         progress = labelled(self.progress, f"{variant.name}: ")
-        scores = evaluate(asked, CpuRasterizer(), self.held_out, self.truth, reading, progress, judge)
+        scores = evaluate(asked, CpuRasterizer(), self.held_out, self.truth, rule, progress, judge)
         direct = evaluate_direct(asked, self.labels, self.truth, "floor" if judge else self.config.cut)
         result = measured(asked, self.truth, self.truth.absent(EVERYTHING), scores, direct)
         self._lap(f"queries ({variant.name})", start)
@@ -270,35 +350,17 @@ class Room:
                 view, asked.engine.field, level, answer.vector[None], PictureConfig().alpha_gate
             )
 
-    def report(self) -> RoomReport:
-        """Measure what the settings ask for."""
-        _, held_out = self.capture.split(HOLD_OUT)
-        rows = [self.measure(variant) for variant in variants(self.config, self.encoder.dim)]
-        views = evaluate_views(self.gaussians, self.capture, held_out)
-        return RoomReport(
-            tier=self.tier,
-            seed=self.seed,
-            views=len(self.capture) - len(held_out),
-            held_out=len(held_out),
-            gaussians=len(self.gaussians),
-            psnr=float(np.mean([view.psnr for view in views])),
-            encoder=self.encoder.id,
-            cut=self.config.cut,
-            measured=tuple(rows),
-            seconds=self.seconds,
-        )
-
     def _lap(self, name: str, start: float) -> None:
         self.seconds[name] = round(self.seconds.get(name, 0.0) + time.perf_counter() - start, 1)
 
 
 def labelled(progress: Progress, prefix: str) -> Progress:
-    """Reports under labels that begin with `prefix`."""
+    """`progress` under labels that begin with `prefix`."""
     return lambda label, fraction: progress(prefix + label, fraction)
 
 
 def median_seconds(work: Callable[[], object]) -> float:
-    """Of several runs; PyTorch's first takes longer."""
+    """Median of several runs; PyTorch's first takes longer."""
     times = []
     for _ in range(FRAMES):
         start = time.perf_counter()

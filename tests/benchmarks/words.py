@@ -1,29 +1,23 @@
-"""How well a vocabulary names what is in rooms whose truth is known (`langsplat bench words`)."""
+"""Names of regions and inventories against the truth of a room (the second table of the report `phrases`)."""
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from assets.making.truth import Region
 from assets.making.vocabulary import colour_words, object_words
 from langsplat_core.arrays import Array
-from langsplat_core.errors import InputError
-from langsplat_core.lab.config import BenchmarkConfig, WordBenchConfig
-from langsplat_core.lab.rooms.room import Room, weights_digest
-from langsplat_core.lab.rooms.scoring import MIN_GAUSSIANS
-from langsplat_core.lab.rooms.variants import Variant
-from langsplat_core.progress import Progress, silent
+from langsplat_core.bench.measure import markdown
 from langsplat_core.query.describe import Describer, Entry, WordScores
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.scene import LEVELS, Scene
-from langsplat_core.semantics.encoders import load_encoder
+from langsplat_core.scene import LEVELS, LanguageField, Scene
+from tests.benchmarks.room import Room
+from tests.benchmarks.scoring import MIN_GAUSSIANS
 
 TOP = 5
-Truth = Mapping[int, Region]  # by truth id
+Regions = Mapping[int, Region]  # by truth id
 
 
 @dataclass(frozen=True)
@@ -60,23 +54,10 @@ class RoomWords:
     inventory: InventoryScore
 
 
-def measure_words(
-    config: WordBenchConfig, work: Path, progress: Progress = silent, rooms: BenchmarkConfig | None = None
-) -> list[RoomWords]:
-    """Every room, as `langsplat eval synthetic` trains it; `rooms`: how. Raises InputError without a room."""
-    if not config.seeds:
-        raise InputError("bench words: name at least one of --seeds")
-    encoder, found = load_encoder("demo"), []
-    settings = rooms or BenchmarkConfig()
-    for seed in config.seeds:
-        room = Room(settings, config.tier, seed, work, (encoder, weights_digest("demo")), progress)
-        field, _, _ = room.field(Variant("the method", settings.masks, codec=settings.codec))
-        describer = Describer(QueryEngine(Scene(room.gaussians, field), lambda _: encoder))
-        found.append(_room(seed, describer, room.labels, room.truth.regions))
-    return found
-
-
-def _room(seed: int, describer: Describer, labels: Array, truth: Truth) -> RoomWords:
+def name_regions(room: Room, field: LanguageField) -> RoomWords:
+    """Words for every region of one room, and its inventory."""
+    describer = Describer(QueryEngine(Scene(room.gaussians, field), lambda _: room.encoder))
+    labels, truth = room.labels, room.truth.regions
     names = []
     for how, words in _ways(describer).items():
         for level in reversed(range(len(LEVELS))):
@@ -86,7 +67,7 @@ def _room(seed: int, describer: Describer, labels: Array, truth: Truth) -> RoomW
     seconds = time.perf_counter() - start
     score = score_inventory(entries, labels, truth, describer.areas, describer.words[2].phrases)
     colour = _colours(describer, _regions(labels[2]), truth)
-    return RoomWords(seed, tuple(names), colour, replace(score, seconds=seconds))
+    return RoomWords(room.seed, tuple(names), colour, replace(score, seconds=seconds))
 
 
 def _ways(describer: Describer) -> dict[str, Sequence[WordScores]]:
@@ -101,7 +82,12 @@ def _regions(labels: Array) -> dict[int, Array]:
 
 
 def _names(
-    how: str, words: WordScores, describer: Describer, level: int, regions: Mapping[int, Array], truth: Truth
+    how: str,
+    words: WordScores,
+    describer: Describer,
+    level: int,
+    regions: Mapping[int, Array],
+    truth: Regions,
 ) -> LevelNames:
     field, known, rows = describer.engine.field, describer.engine.field.known[level], []
     for key, members in regions.items():
@@ -117,7 +103,7 @@ def _names(
     return LevelNames(how, LEVELS[level], len(rows), *(float(value) for value in mean))
 
 
-def _colours(describer: Describer, regions: Mapping[int, Array], truth: Truth) -> float:
+def _colours(describer: Describer, regions: Mapping[int, Array], truth: Regions) -> float:
     hits = []
     for key, members in regions.items():
         colour = truth[key].colour
@@ -128,7 +114,7 @@ def _colours(describer: Describer, regions: Mapping[int, Array], truth: Truth) -
 
 
 def score_inventory(
-    entries: Sequence[Entry], labels: Array, truth: Truth, areas: Array, phrases: Sequence[str]
+    entries: Sequence[Entry], labels: Array, truth: Regions, areas: Array, phrases: Sequence[str]
 ) -> InventoryScore:
     """Entries of whole things against (3, N) truth ids; seconds are left 0."""
     wholes, named = [entry for entry in entries if entry.level == 2], set()
@@ -152,29 +138,18 @@ def score_inventory(
 
 
 def word_table(rooms: Sequence[RoomWords]) -> str:
-    """Markdown."""
-    lines = [
-        "| room | words | level | regions | first right % | one of five % | p of first | p of right |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for room in rooms:
-        for row in room.names:
-            shares = (
-                f"{100 * row.first:.0f} | {100 * row.among:.0f} | {row.probability:.2f} | {row.right:.2f}"
-            )
-            lines.append(f"| {room.seed} | {row.how} | {row.level} | {row.regions} | {shares} |")
-    lines += [
-        "",
-        "| room | listed | true % | things | named % | colour right % | seconds |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for room in rooms:
-        score = room.inventory
-        shares = f"{score.entries} | {100 * score.true:.0f} | {score.things} | {100 * score.named:.0f}"
-        lines.append(f"| {room.seed} | {shares} | {100 * room.colour:.0f} | {score.seconds:.1f} |")
-    return "\n".join(lines) + "\n"
-
-
-def figures(config: WordBenchConfig, rooms: Sequence[RoomWords]) -> dict[str, Any]:
-    """All figures."""
-    return {"settings": asdict(config), "rooms": [asdict(room) for room in rooms]}
+    """Both tables as Markdown: names of regions, and inventories."""
+    head = ("room", "words", "level", "regions", "first right %", "one of five %", "p of first", "p of right")
+    names = (
+        (room.seed, row.how, row.level, row.regions, f"{100 * row.first:.0f}", f"{100 * row.among:.0f}")
+        + (f"{row.probability:.2f}", f"{row.right:.2f}")
+        for room in rooms
+        for row in room.names
+    )
+    inventories = (
+        (room.seed, room.inventory.entries, f"{100 * room.inventory.true:.0f}", room.inventory.things)
+        + (f"{100 * room.inventory.named:.0f}", f"{100 * room.colour:.0f}", f"{room.inventory.seconds:.1f}")
+        for room in rooms
+    )
+    listed = ("room", "listed", "true %", "things", "named %", "colour right %", "seconds")
+    return f"{markdown(head, names)}\n{markdown(listed, inventories)}"

@@ -1,1 +1,0 @@
-"""Measurements of ourselves. Only `cli` imports it."""
