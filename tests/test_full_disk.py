@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from assets.making.crops import CropSet
+from langsplat_core.cli.bench import write_report
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
 from langsplat_core.evaluation.report import write_json
@@ -19,7 +20,6 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.io.langsplat_files import write_autoencoder, write_checkpoint, write_features
 from langsplat_core.io.language import write_language
 from langsplat_core.io.shapes import write_points
-from langsplat_core.lab.rooms.report import save_json as save_rooms
 from langsplat_core.pipeline.stages import kept, kept_array
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
@@ -103,7 +103,7 @@ WRITERS: dict[str, Write] = {
     "stage": stage,
     "stage's array": lambda folder: kept_array(folder / "a.npy", lambda: np.ones(999)),
     "crops": crops,
-    "report of rooms": lambda folder: save_rooms(folder / "r.json", {"seed": 1}, []),
+    "report of a benchmark": lambda folder: write_report(folder, "r", "text", list(range(999))),
     "report of scores": lambda folder: write_json(folder / "r.json", list(range(999))),
     "picture": lambda folder: save_png(
         folder / "p.png", np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8)

@@ -63,7 +63,7 @@ def test_versions(program, run, monkeypatch, capsys):
 @pytest.mark.parametrize(("flag", "level"), [("-q", "ERROR"), ("--verbose", "DEBUG")])
 def test_how_much_is_said_stands_anywhere(flag, level):
     log = logging.getLogger("langsplat")
-    for words in ([flag, "doctor"], ["doctor", flag], ["bench", flag, "load"], ["bench", "load", flag]):
+    for words in ([flag, "doctor"], ["doctor", flag], ["bench", flag, "raster"], ["bench", "raster", flag]):
         log.setLevel(logging.INFO)
         parse(words)
         assert logging.getLevelName(log.level) == level
@@ -82,7 +82,7 @@ try() {
   echo "${COMPREPLY[@]}"
 }
 try langsplat q
-try langsplat bench v
+try langsplat bench r
 try langsplat train --max
 try langsplat train --preset g
 """
@@ -102,7 +102,7 @@ def test_bash_completes_commands_options_and_choices(capsys):
         check=True,
         env=terminal,
     )
-    assert done.stdout.splitlines() == ["query", "verdict", "--max-relevancy-error", "good"]
+    assert done.stdout.splitlines() == ["query", "raster", "--max-relevancy-error", "good"]
 
 
 def test_a_shell_without_completion_is_named():
