@@ -12,6 +12,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 # From top to bottom; packages of one row never import each other.
 LAYERS = [
+    ["assets.making"],
     ["langsplat_viewer.__main__"],
     ["langsplat_viewer.window"],
     ["langsplat_viewer.display_probe", "langsplat_viewer.remembered"],
@@ -96,7 +97,9 @@ def violations(module: str, imports: list[str]) -> list[str]:
     return found
 
 
-SOURCES = [*ROOT.glob("langsplat_core/**/*.py"), *ROOT.glob("app/**/*.py")]
+SOURCES = [
+    *ROOT.glob("langsplat_core/**/*.py"), *ROOT.glob("app/**/*.py"), *ROOT.glob("assets/making/**/*.py"),
+]  # fmt: skip
 
 
 def test_imports_run_strictly_downward():
@@ -168,6 +171,12 @@ def test_only_the_command_line_knows_the_workshop():
     ]
     assert not strangers
     assert any(module_name(path).startswith(lab) for path in SOURCES)
+
+
+def test_only_tests_import_how_the_bundled_files_were_made():
+    folders = ("langsplat_core", "app", "packaging", "docs")
+    files = [path for folder in folders for path in ROOT.glob(f"{folder}/**/*.py")]
+    assert not [path for path in files if any(name.startswith("assets") for name in imported_modules(path))]
 
 
 def test_every_module_has_a_layer():

@@ -45,10 +45,6 @@ COMMANDS = [
     "scale s.ply",
     "convert s.ply t.ply",
     "compact s.ply",
-    "demo build --out s.ply",
-    "demo dataset --out d",
-    "demo encoder --out d",
-    "demo sheet --out s.png",
     "eval synthetic",
     "bench raster",
     "bench gains",
@@ -140,7 +136,6 @@ def test_every_number_of_every_command_has_a_range(line: str) -> None:
         ("eval synthetic --codec.batch 1", "--codec.batch 1"),
         ("eval synthetic --steps 0", "--steps 0: must be 1 to"),
         ("bench raster --sizes 320 240 0 7", "--sizes 320 240 0 7"),
-        ("demo sheet --out s.png --side 0", "--side 0"),
     ],
 )
 def test_the_command_line_names_the_option_as_typed(
