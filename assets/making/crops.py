@@ -53,10 +53,6 @@ class CropSet:
             row["hues"], row["materials"] = tuple(row["hues"]), tuple(row.get("materials", ()))
         return CropSet(images, tuple(Label(**row) for row in rows))
 
-    def first(self, count: int) -> "CropSet":
-        """At most `count` of the crops, from the first."""
-        return CropSet(self.images[:count], self.labels[:count])
-
     @staticmethod
     def join(sets: list["CropSet"]) -> "CropSet":
         """All crops of several sets."""

@@ -28,7 +28,7 @@ class EvalSynthetic:
     scene: Path | None = None
     """Measure this scene, trained on --dataset, instead of fresh rooms; of the settings, --cut applies."""
     dataset: Path | None = None
-    """The room that --scene shows, as written by `langsplat demo dataset`."""
+    """The room that --scene shows, as written by `python -m assets.making dataset`."""
     paper_order: bool = False
     """With --scene: blend latents and decode every pixel, as the paper does, not the relevancies."""
 
