@@ -29,7 +29,7 @@ CONFIGS = {
     name: value
     for module in (config, lab_config)
     for name, value in vars(module).items()
-    if dataclasses.is_dataclass(value) and isinstance(value, type) and value is not Range
+    if dataclasses.is_dataclass(value) and isinstance(value, type) and value not in (Range, Setting)
 }
 SETTINGS = [
     (name, setting)

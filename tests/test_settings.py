@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from langsplat_core import config
-from langsplat_core.config import Range
+from langsplat_core.config import Range, Setting
 from langsplat_core.lab import config as lab_config
 
 ROOT = Path(__file__).parent.parent
@@ -22,7 +22,7 @@ CONFIGS = {
     name: value
     for module in (config, lab_config)
     for name, value in vars(module).items()
-    if dataclasses.is_dataclass(value) and isinstance(value, type) and value is not Range
+    if dataclasses.is_dataclass(value) and isinstance(value, type) and value not in (Range, Setting)
 }
 FIELDS = {
     name: {key: getattr(kind, "__name__", "") for key, kind in typing.get_type_hints(cls).items()}
