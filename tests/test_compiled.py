@@ -11,7 +11,7 @@ import pytest
 
 from langsplat_core import compiled
 from langsplat_core.compiled import Workers, digest_of_sources, kernel_folder
-from langsplat_core.raster.cpu import blend, tiles
+from langsplat_core.raster.cpu import backward, blend, tiles
 from tests.support.another_user import bound_by_permissions
 from tests.support.full_disk import files_of_at_most
 
@@ -65,7 +65,7 @@ def test_the_key_follows_imports_and_nothing_else(tmp_path: Path) -> None:
     digest_of_sources.cache_clear()
     lonely.write_text("import numpy  # changed\n")
     assert digest_of_sources(lonely) != before
-    sources = [Path(module.__file__ or "") for module in (blend, tiles, tiles)]
+    sources = [Path(module.__file__ or "") for module in (blend, tiles, backward)]
     assert len({digest_of_sources(source) for source in sources}) == 3
     folder = kernel_folder(sources[0])
     assert folder is not None

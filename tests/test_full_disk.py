@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from assets.making.crops import CropSet
 from langsplat_core.cli.bench import write_report
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
@@ -58,12 +57,6 @@ def checkpoint(folder: Path) -> None:
     save_checkpoint(folder / "c.safetensors", start(GAUSSIANS, 5, torch.device("cpu")), "abc")
 
 
-def crops(folder: Path) -> None:
-    CropSet(np.random.default_rng(0).integers(0, 255, (3, 64, 64, 3), dtype=np.uint8), ()).save(
-        folder / "c.npz"
-    )
-
-
 def features(folder: Path) -> None:
     described = ImageFeatures(np.zeros((3, 8, 8), np.int32), np.ones((1, 512), np.float32))
     FeatureStore(folder).save("photo", described, "key")
@@ -102,7 +95,6 @@ WRITERS: dict[str, Write] = {
     "checkpoint": checkpoint,
     "stage": stage,
     "stage's array": lambda folder: kept_array(folder / "a.npy", lambda: np.ones(999)),
-    "crops": crops,
     "report of a benchmark": lambda folder: write_report(folder, "r", "text", list(range(999))),
     "report of scores": lambda folder: write_json(folder / "r.json", list(range(999))),
     "picture": lambda folder: save_png(

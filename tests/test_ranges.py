@@ -28,7 +28,7 @@ CONFIGS = {
     name: value
     for module in (config, bench)
     for name, value in vars(module).items()
-    if dataclasses.is_dataclass(value) and isinstance(value, type) and value is not Range
+    if dataclasses.is_dataclass(value) and isinstance(value, type) and value not in (Range, Setting)
 }
 SETTINGS = [
     (name, setting)
@@ -44,10 +44,6 @@ COMMANDS = [
     "scale s.ply",
     "convert s.ply t.ply",
     "compact s.ply",
-    "demo build --out s.ply",
-    "demo dataset --out d",
-    "demo encoder --out d",
-    "demo sheet --out s.png",
     "bench raster",
     "bench query s.ply",
 ]
@@ -128,7 +124,6 @@ def test_every_number_of_every_command_has_a_range(line: str) -> None:
         ("train {d} --out {d}/s.ply --dataset.max-side 3", "--dataset.max-side 3"),
         ("convert a.npz b.ply --codec.steps 0", "--codec.steps 0"),
         ("bench raster --sizes 320 240 0 7", "--sizes 320 240 0 7"),
-        ("demo sheet --out s.png --side 0", "--side 0"),
     ],
 )
 def test_the_command_line_names_the_option_as_typed(

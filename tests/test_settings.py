@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from langsplat_core import bench, config
-from langsplat_core.config import Range
+from langsplat_core.config import Range, Setting
 
 ROOT = Path(__file__).parent.parent
 SOURCES = [*ROOT.glob("langsplat_core/**/*.py"), *ROOT.glob("app/**/*.py")]
@@ -21,7 +21,7 @@ CONFIGS = {
     name: value
     for module in (config, bench)
     for name, value in vars(module).items()
-    if dataclasses.is_dataclass(value) and isinstance(value, type) and value is not Range
+    if dataclasses.is_dataclass(value) and isinstance(value, type) and value not in (Range, Setting)
 }
 FIELDS = {
     name: {key: getattr(kind, "__name__", "") for key, kind in typing.get_type_hints(cls).items()}

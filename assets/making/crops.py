@@ -53,13 +53,9 @@ class CropSet:
             row["hues"], row["materials"] = tuple(row["hues"]), tuple(row.get("materials", ()))
         return CropSet(images, tuple(Label(**row) for row in rows))
 
-    def first(self, count: int) -> "CropSet":
-        """At most `count` of the crops, from the first."""
-        return CropSet(self.images[:count], self.labels[:count])
-
     @staticmethod
     def join(sets: list["CropSet"]) -> "CropSet":
-        """All crops of several sets."""
+        """One set of the crops of several."""
         labels = tuple(label for one in sets for label in one.labels)
         return CropSet(np.concatenate([one.images for one in sets]), labels)
 
@@ -161,7 +157,7 @@ def _window(mask: Array, margin: int) -> tuple[slice, slice]:
 
 
 def _imperfect(mask: Array, rng: np.random.Generator) -> Array:
-    """What a segmenter might return for a region: grown, shrunk, cut, holed, leaking; never empty."""
+    """Mask that a segmenter might return for a region: grown, shrunk, cut, holed, leaking; never empty."""
     box = _window(mask, 8)
     part = mask[box].copy()
     kind = rng.random()

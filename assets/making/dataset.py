@@ -33,7 +33,7 @@ _RINGS = ((0.3, 23.0, 1.5, 0.0), (0.3, 42.0, 1.25, 0.02), (0.25, 36.0, 1.0, 0.05
 
 @dataclass(frozen=True)
 class Naming:
-    """What photographs are called."""
+    """File names of photographs."""
 
     stem: str = "view_{:03d}"
     suffix: str = ".png"
@@ -126,15 +126,9 @@ def _write_view(renderer: Renderer, world: World, camera: Camera, out: Path, suf
 
 
 def _write_labels(world: World, path: Path) -> None:
+    stated = ("word", "thing", "colour", "phrase", "words")
     rows = {
-        str(number): {
-            "level": LEVELS[label.level],
-            "word": label.word,
-            "thing": label.thing,
-            "colour": label.colour,
-            "phrase": label.phrase,
-            "words": label.words,
-        }
+        str(number): {"level": LEVELS[label.level], **{name: getattr(label, name) for name in stated}}
         for number, label in enumerate(world.labels)
     }
     with atomic_path(path) as temporary:

@@ -48,7 +48,6 @@ _AVERAGING = 0.998  # decay of the running mean of the weights, which is what is
 SAVE_EVERY = 250  # steps
 FLOOR_COSINE = 0.20  # of a nameable crop with the canonical phrases once trained: relevancy 0.5 lies there
 _CALIBRATION_CROPS = 2_500
-_REPORTED_CROPS = 1_500
 
 
 def word_list(book: PhraseBook) -> list[str]:
@@ -425,7 +424,7 @@ def train_encoder(out: Path, config: EncoderConfig, progress: Progress) -> list[
     canonical = tokenizer(list(CANONICAL_PHRASES), return_tensors="pt", padding=True).input_ids
     calibrate_canonical(run.mean, canonical, _nameable(run.mean, crops, config.seed), FLOOR_COSINE)
     export(run.mean, out)
-    return report(load_encoder(str(out), "cpu"), held_out.first(_REPORTED_CROPS))
+    return report(load_encoder(str(out), "cpu"), held_out)
 
 
 def _nameable(model: Any, crops: CropSet, seed: int) -> Tensor:

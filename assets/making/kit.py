@@ -1,4 +1,4 @@
-"""What things are made of: colours and their words, materials, labelled pieces, and the kit of the builders.
+"""Colours and their words, materials, labelled pieces of things, and the kit that builders work with.
 
 Colour words are judged in CIE LCh (lightness, chroma, hue of CIE L*a*b*, D65). The borders follow where
 English speakers change words in naming experiments (Berlin and Kay's eleven basic terms, beige and
@@ -105,7 +105,7 @@ def random_colour(word: str, rng: np.random.Generator) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """How a surface looks. Textures are functions of the point in the object's own frame."""
+    """Appearance of a surface. Textures are functions of the point in the object's own frame."""
 
     word: str  # the colour word that fits, "" where none does
     colour: Array  # (3,) sRGB in [0, 1]
@@ -258,7 +258,7 @@ _RELIEF = {
 
 
 def finish_of(material: Material) -> Finish:
-    """What a material is made of, or what its texture and gloss suggest."""
+    """Finish of the substance a material is made of, or else of the one its texture and gloss suggest."""
     by_gloss = "glass" if material.gloss >= 0.85 else "ceramic" if material.gloss >= 0.5 else "plastic"
     if material.gloss < 0.2:
         by_gloss = "paper"

@@ -65,7 +65,7 @@ class Truth:
             return np.asarray(stored["ids"]).astype(np.int64)
 
     def absent(self, things: Iterable[str]) -> list[str]:
-        """Those of `things` that nothing in the room may be called by, nor by a synonym of theirs."""
+        """Words of `things` by which, or by whose synonyms, nothing in the room may be called."""
         return sorted(thing for thing in things if self.words.isdisjoint(object_words(thing)))
 
 

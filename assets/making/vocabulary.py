@@ -10,86 +10,32 @@ from assets.making.shapes import Mesh
 from langsplat_core.arrays import Array
 from langsplat_core.scene import CANONICAL_PHRASES
 
+# Word -> other words for the same.
 OBJECT_SYNONYMS: dict[str, tuple[str, ...]] = {
-    "mug": ("mug", "cup"),
-    "teapot": ("teapot", "tea pot"),
-    "plate": ("plate", "dish"),
-    "vase": ("vase", "flower vase"),
-    "plant": ("plant", "potted plant"),
-    "lamp": ("lamp", "table lamp"),
-    "clock": ("clock", "alarm clock"),
-    "car": ("car", "toy car"),
-    "block": ("block", "toy block"),
-    "gift": ("gift", "present"),
-    "duck": ("duck", "toy duck"),
-    "house": ("house", "toy house"),
-    "robot": ("robot", "toy robot"),
-    "pan": ("pan", "frying pan"),
-    "wine glass": ("wine glass", "goblet"),
-    "basket": ("basket", "wicker basket"),
-    "cake": ("cake", "birthday cake"),
-    "donut": ("donut", "doughnut"),
-    "ice cream": ("ice cream", "icecream"),
-    "burger": ("burger", "hamburger"),
-    "train": ("train", "locomotive"),
-    "truck": ("truck", "lorry"),
-    "airplane": ("airplane", "plane", "aeroplane"),
-    "boat": ("boat", "sailing boat"),
-    "rocket": ("rocket", "spaceship"),
-    "teddy bear": ("teddy bear", "teddy"),
-    "rabbit": ("rabbit", "bunny"),
-    "scissors": ("scissors", "pair of scissors"),
-    "umbrella": ("umbrella", "parasol"),
-    "laptop": ("laptop", "computer"),
-    "headphones": ("headphones", "headset"),
-    "globe": ("globe", "world globe"),
-    "guitar": ("guitar", "acoustic guitar"),
-    "hat": ("hat", "sun hat"),
-    "shoe": ("shoe", "sneaker"),
-    "backpack": ("backpack", "rucksack"),
-    "windmill": ("windmill", "mill"),
-    "castle": ("castle", "fortress"),
-    "sofa": ("sofa", "couch"),
-    "shelf": ("shelf", "bookcase"),
-    "cabinet": ("cabinet", "cupboard"),
-    "rug": ("rug", "carpet"),
-    "picture": ("picture", "wall picture"),
-    "floor": ("floor", "ground"),
-}
+    "mug": ("cup",), "teapot": ("tea pot",), "plate": ("dish",), "vase": ("flower vase",),
+    "plant": ("potted plant",), "lamp": ("table lamp",), "clock": ("alarm clock",), "car": ("toy car",),
+    "block": ("toy block",), "gift": ("present",), "duck": ("toy duck",), "house": ("toy house",),
+    "robot": ("toy robot",), "pan": ("frying pan",), "wine glass": ("goblet",),
+    "basket": ("wicker basket",), "cake": ("birthday cake",), "donut": ("doughnut",),
+    "ice cream": ("icecream",), "burger": ("hamburger",), "train": ("locomotive",), "truck": ("lorry",),
+    "airplane": ("plane", "aeroplane"), "boat": ("sailing boat",), "rocket": ("spaceship",),
+    "teddy bear": ("teddy",), "rabbit": ("bunny",), "scissors": ("pair of scissors",),
+    "umbrella": ("parasol",), "laptop": ("computer",), "headphones": ("headset",),
+    "globe": ("world globe",), "guitar": ("acoustic guitar",), "hat": ("sun hat",), "shoe": ("sneaker",),
+    "backpack": ("rucksack",), "windmill": ("mill",), "castle": ("fortress",), "sofa": ("couch",),
+    "shelf": ("bookcase",), "cabinet": ("cupboard",), "rug": ("carpet",), "picture": ("wall picture",),
+    "floor": ("ground",),
+}  # fmt: skip
 PART_SYNONYMS: dict[str, tuple[str, ...]] = {
-    "shade": ("shade", "lampshade"),
-    "bulb": ("bulb", "light bulb"),
-    "pole": ("pole", "stand"),
-    "cap": ("cap", "bottle top"),
-    "face": ("face", "dial"),
-    "leaves": ("leaves", "leaf"),
-    "leaf": ("leaf", "leaves"),
-    "petals": ("petals", "blossom"),
-    "wheel": ("wheel", "wheels"),
-    "leg": ("leg", "legs"),
-    "arm": ("arm", "arms"),
-    "armrest": ("armrest", "armrests"),
-    "window": ("window", "windows"),
-    "wing": ("wing", "wings"),
-    "fin": ("fin", "fins"),
-    "sail": ("sail", "sails"),
-    "ears": ("ears", "ear"),
-    "paw": ("paw", "paws"),
-    "eyes": ("eyes", "eye"),
-    "blade": ("blade", "blades"),
-    "strings": ("strings", "string"),
-    "strap": ("strap", "straps"),
-    "keys": ("keys", "buttons"),
-    "icing": ("icing", "frosting"),
-    "slice": ("slice", "sponge"),
-    "scoop": ("scoop", "ice cream scoop"),
-    "cone": ("cone", "waffle cone"),
-    "funnel": ("funnel", "smokestack"),
-    "screen": ("screen", "monitor"),
-    "blanket": ("blanket", "quilt"),
-    "bracket": ("bracket", "arc"),
-    "drumstick": ("drumstick", "stick"),
-}
+    "shade": ("lampshade",), "bulb": ("light bulb",), "pole": ("stand",), "cap": ("bottle top",),
+    "face": ("dial",), "leaves": ("leaf",), "leaf": ("leaves",), "petals": ("blossom",),
+    "wheel": ("wheels",), "leg": ("legs",), "arm": ("arms",), "armrest": ("armrests",),
+    "window": ("windows",), "wing": ("wings",), "fin": ("fins",), "sail": ("sails",), "ears": ("ear",),
+    "paw": ("paws",), "eyes": ("eye",), "blade": ("blades",), "strings": ("string",), "strap": ("straps",),
+    "keys": ("buttons",), "icing": ("frosting",), "slice": ("sponge",), "scoop": ("ice cream scoop",),
+    "cone": ("waffle cone",), "funnel": ("smokestack",), "screen": ("monitor",), "blanket": ("quilt",),
+    "bracket": ("arc",), "drumstick": ("stick",),
+}  # fmt: skip
 _TOYS = (
     "car", "block", "ball", "duck", "house", "robot", "train", "truck", "airplane", "boat", "rocket",
     "teddy bear", "rabbit", "penguin", "fish", "snail", "snowman", "windmill", "castle", "drum",
@@ -134,12 +80,12 @@ BULK = frozenset(
 
 def object_words(word: str) -> tuple[str, ...]:
     """An object's word and its synonyms."""
-    return OBJECT_SYNONYMS.get(word, (word,))
+    return (word, *OBJECT_SYNONYMS.get(word, ()))
 
 
 def part_words(word: str) -> tuple[str, ...]:
     """A part's word and its synonyms."""
-    return PART_SYNONYMS.get(word, (word,))
+    return (word, *PART_SYNONYMS.get(word, ()))
 
 
 def colour_words(word: str) -> tuple[str, ...]:
@@ -196,7 +142,7 @@ def part_phrases(part: str, thing: str, colour: str, thing_colour: str) -> list[
 
 @dataclass(frozen=True)
 class Label:
-    """What one region shows. An empty word stands for "no single word fits"."""
+    """Words for one region. An empty word stands for "no single word fits"."""
 
     level: int  # 0 subpart, 1 part, 2 whole; -1 for pictures that show no object
     word: str  # the region's own word: the object's at level 2, else the part's

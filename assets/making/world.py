@@ -127,7 +127,7 @@ def furnished(seed: int, tier: Tier) -> list[Placed]:
 
 
 def _area(thing: Thing) -> float:
-    """Of the box around a thing as it stands in the room, seen from above, square metres."""
+    """Footprint of the box around a thing as it stands in the room, square metres."""
     low, high = bounds(thing)
     return float(np.prod((high - low)[:2])) * ENLARGED**2
 

@@ -20,13 +20,13 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
     {
         "train": "train.Train",
         "query": "query.QueryScene",
-        "describe": "describe.Describe",
+        "describe": "query.Describe",
         "select": "select.Select",
-        "scale": "scale.Scale",
-        "convert": "convert.Convert",
-        "compact": "compact.Compact",
-        "inspect": "inspect.Inspect",
-        "doctor": "inspect.Doctor",
+        "scale": "scenes.Scale",
+        "convert": "scenes.Convert",
+        "compact": "scenes.Compact",
+        "inspect": "scenes.Inspect",
+        "doctor": "scenes.Doctor",
         "demo": "demo.Demo",
     }
 )

@@ -4,17 +4,18 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
-from scipy.spatial.distance import pdist, squareform
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError, printable_line
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.scene import Camera
-from langsplat_core.training.radiance.train import ViewScore
+
+if TYPE_CHECKING:
+    from langsplat_core.training.radiance.train import ViewScore
 
 REPORT = "report.json"
 LIMIT = 1_000_000  # bytes; a report has about a thousand
@@ -81,7 +82,7 @@ LEAST_COVERED = 0.5  # of a picture's pixels
 APART = 10.0  # times the median step to a neighbouring camera; captures that went well have at most 5
 
 
-def doubts(scores: Sequence[ViewScore], cameras: Sequence[Camera]) -> tuple[str, ...]:
+def doubts(scores: Sequence["ViewScore"], cameras: Sequence[Camera]) -> tuple[str, ...]:
     """One sentence each, with the remedy; none where nothing speaks against the scene.
 
     scores: of held-out views, or none; cameras: all that were trained on.
@@ -113,6 +114,9 @@ def doubts(scores: Sequence[ViewScore], cameras: Sequence[Camera]) -> tuple[str,
 def camera_groups(positions: Array) -> tuple[int, ...]:
     """Sizes of the groups of (M, 3) positions that lie `APART`, largest first; one where they are together.
     A single camera on its own is no group."""
+    from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+    from scipy.spatial.distance import pdist, squareform
+
     if len(positions) < 4:
         return (len(positions),)
     tree = minimum_spanning_tree(squareform(pdist(positions))).toarray()

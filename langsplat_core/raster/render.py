@@ -1,4 +1,16 @@
-"""One row of W: which Gaussians a single pixel is made of, without drawing the others."""
+"""The front door of the rasterizers: a scene and a camera in, a picture out.
+
+>>> import numpy as np
+>>> from langsplat_core import Gaussians, Scene, look_at, render
+>>> one = Gaussians(
+...     means=np.zeros((1, 3)), log_scales=np.full((1, 3), -1.0), quats_wxyz=np.array([[1.0, 0, 0, 0]]),
+...     opacity_logits=np.array([9.0]), sh=np.full((1, 1, 3), 1.0),
+... )
+>>> camera = look_at(np.array([0, 0, -4.0]), np.zeros(3), np.array([0, -1.0, 0]), (64, 48))
+>>> picture = render(Scene(one), camera, backend="reference")
+>>> picture.colours.shape, picture.alpha.shape, round(float(picture.alpha[24, 32]), 2)
+((48, 64, 3), (48, 64), 0.99)
+"""
 
 from dataclasses import dataclass
 
@@ -67,20 +79,6 @@ def _in_camera(gaussians: Gaussians, camera: Camera) -> Array:
     with np.errstate(all="ignore"):
         points: Array = gaussians.means @ camera.rotation.T.astype(np.float32)
         return points + camera.world_to_camera[:3, 3].astype(np.float32)
-
-
-# The front door of the rasterizers: a scene and a camera in, a picture out.
-#
-# >>> import numpy as np
-# >>> from langsplat_core import Gaussians, Scene, look_at, render
-# >>> one = Gaussians(
-# ...     means=np.zeros((1, 3)), log_scales=np.full((1, 3), -1.0), quats_wxyz=np.array([[1.0, 0, 0, 0]]),
-# ...     opacity_logits=np.array([9.0]), sh=np.full((1, 1, 3), 1.0),
-# ... )
-# >>> camera = look_at(np.array([0, 0, -4.0]), np.zeros(3), np.array([0, -1.0, 0]), (64, 48))
-# >>> picture = render(Scene(one), camera, backend="reference")
-# >>> picture.colours.shape, picture.alpha.shape, round(float(picture.alpha[24, 32]), 2)
-# ((48, 64, 3), (48, 64), 0.99)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy import sparse
-from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 from langsplat_core.arrays import Array, check_array, logit, rotation_matrices, sigmoid
 from langsplat_core.progress import Progress, silent
@@ -108,7 +109,7 @@ class Merged:
     """M Gaussians in place of N."""
 
     gaussians: Gaussians
-    weights: sparse.csr_matrix  # (M, N) float32: what each is made of; rows sum to 1
+    weights: "sparse.csr_matrix"  # (M, N) float32: what each is made of; rows sum to 1
 
     def values(self, values: Array | None) -> Array | None:
         """(N, C) values of the original Gaussians -> (M, C) float32."""
@@ -138,6 +139,8 @@ def merged(gaussians: Gaussians, progress: Progress = silent) -> Merged:
     sources = np.concatenate([part.sources for part in parts])
     starts = np.arange(0, weights.size + 1, GROUP)
     shape = (len(weights), len(gaussians))
+    from scipy import sparse  # here, since every program that opens a scene imports this module
+
     matrix = sparse.csr_matrix((weights.astype(np.float32).ravel(), sources.ravel(), starts), shape=shape)
     return Merged(Gaussians(*joined), matrix)
 
@@ -198,6 +201,8 @@ def _ellipsoids(covariances: Array) -> tuple[Array, Array, Array]:
     """(G, 3, 3) -> (G, 3) logarithms of the scales, (G, 4) quaternions wxyz, (G,) `_area`."""
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, no reflection
+    from scipy.spatial.transform import Rotation
+
     quats = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1) if len(axes) else np.zeros((0, 4))
     scales = np.sqrt(np.maximum(variances, _TINY))
     return np.minimum(np.log(scales), 80.0), quats, _area(scales)

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
-from transformers import CLIPTokenizerFast
+from transformers import AutoTokenizer, CLIPTokenizerFast
 
 from assets.making import encoder as demo_encoder
+from assets.making.config import EncoderConfig
 from assets.making.crops import CropSet, plain_crops, room_crops
 from assets.making.encoder import (
     CANONICAL_COSINE,
@@ -15,16 +16,19 @@ from assets.making.encoder import (
     calibrate_canonical,
     loss_of,
     report,
+    report_table,
     text_vectors,
-    train_demo_encoder,
+    train_encoder,
+    word_list,
+    word_merges,
+    write_tokenizer,
 )
-from assets.making.kit import COLOURS
-from assets.making.vocabulary import Label, phrase_book, vocabulary, word_merges, write_tokenizer
+from assets.making.kit import COLOURS, to_lch
+from assets.making.vocabulary import Label, phrase_book
 from langsplat_core.errors import EncoderError
-from langsplat_core.lab.config import DemoEncoderConfig
 from langsplat_core.progress import Cancelled, silent
 from langsplat_core.scene import CANONICAL_PHRASES
-from langsplat_core.semantics.encoders import load_encoder, model_path
+from langsplat_core.semantics.encoders import load_encoder
 
 pytestmark = pytest.mark.long
 
@@ -94,9 +98,7 @@ def test_which_phrases_are_right(book, label, phrase, expected):
 
 
 def test_every_word_is_one_token_and_reloads(book, tmp_path):
-    from transformers import AutoTokenizer, CLIPTokenizerFast
-
-    words = vocabulary(book)
+    words = word_list(book)
     assert {"of", "the", *CANONICAL_PHRASES, *COLOURS} <= set(words)
     write_tokenizer(words, tmp_path)
     for kind in (CLIPTokenizerFast, AutoTokenizer):
@@ -113,7 +115,7 @@ def test_every_word_is_one_token_and_reloads(book, tmp_path):
 def test_token_numbers_depend_on_the_words_alone(book, tmp_path):
     """A resumed training must find its embeddings where they were."""
     for name in ("one", "two"):
-        write_tokenizer(vocabulary(book), tmp_path / name)
+        write_tokenizer(word_list(book), tmp_path / name)
     assert (tmp_path / "one" / "tokenizer.json").read_bytes() == (
         tmp_path / "two" / "tokenizer.json"
     ).read_bytes()
@@ -155,8 +157,6 @@ def test_crops_of_a_room(unseen_room, tmp_path):
 
 
 def test_plain_crops_have_their_colour():
-    from assets.making.kit import to_lch
-
     crops = plain_crops(60, 1)
     for image, label in zip(crops.images, crops.labels, strict=True):
         if label.colour == "green":
@@ -166,26 +166,33 @@ def test_plain_crops_have_their_colour():
     assert {label.colour for label in crops.labels} > {"red", "blue", ""}
 
 
-def test_training_in_miniature(monkeypatch, tmp_path):
-    """Two steps, an interruption, the rest: what is written loads and answers; all steps were taken."""
+@pytest.fixture
+def few_crops(monkeypatch):
+    """Crops that are trained with in place of those of 400 rooms."""
     crops = plain_crops(40, 2)
     monkeypatch.setattr(demo_encoder, "write_crops", lambda folder, config, progress: None)
     monkeypatch.setattr(demo_encoder, "read_crops", lambda folder: (crops, crops))
+    return crops
+
+
+def test_training_in_miniature(monkeypatch, few_crops, tmp_path):
+    """Two steps, an interruption, the rest: what is written loads and answers; all steps were taken."""
     monkeypatch.setattr(demo_encoder, "SAVE_EVERY", 2)
-    config = DemoEncoderConfig(steps=4, batch=8, phrases=8)
+    config = EncoderConfig(steps=4, batch=8, phrases=8)
 
     def interrupt(label: str, fraction: float) -> None:
         if fraction > 0.7:
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        train_demo_encoder(tmp_path, config, interrupt)
+        train_encoder(tmp_path, config, interrupt)
     seen = []
-    train_demo_encoder(tmp_path, config, lambda label, fraction: seen.append(fraction))
+    figures = train_encoder(tmp_path, config, lambda label, fraction: seen.append(fraction))
+    assert "| colour |" in report_table(figures)
     assert seen == [0.75, 1.0]  # went on at step 3 of 4
     encoder = load_encoder(str(tmp_path), "cpu")
     assert (encoder.dim, encoder.image_size) == (512, 64)
-    vectors = encoder.encode_images(crops.images[:3])
+    vectors = encoder.encode_images(few_crops.images[:3])
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-5)
     with pytest.raises(EncoderError, match="xylophone"):
         encoder.encode_texts(["red xylophone"])
@@ -193,15 +200,12 @@ def test_training_in_miniature(monkeypatch, tmp_path):
     assert size < 12e6
 
 
-def test_training_twice_gives_the_same_model(monkeypatch, tmp_path):
-    crops = plain_crops(30, 3)
-    monkeypatch.setattr(demo_encoder, "write_crops", lambda folder, config, progress: None)
-    monkeypatch.setattr(demo_encoder, "read_crops", lambda folder: (crops, crops))
+def test_training_twice_gives_the_same_model(few_crops, tmp_path):
     weights = []
     for name, seed in (("one", 0), ("two", 0), ("other", 1)):
         # The learning rate starts at a 300th of this: steps large enough to be seen in half precision.
-        config = DemoEncoderConfig(steps=2, batch=8, phrases=8, lr=0.1, seed=seed)
-        train_demo_encoder(tmp_path / name, config, silent)
+        config = EncoderConfig(steps=2, batch=8, phrases=8, lr=0.1, seed=seed)
+        train_encoder(tmp_path / name, config, silent)
         tensors = load_file(tmp_path / name / "model.safetensors")
         weights.append(np.concatenate([tensor.float().numpy().ravel() for tensor in tensors.values()]))
     # Not all: sums in bfloat16 may be added in another order, and Adam enlarges gradients that are zero
@@ -210,12 +214,9 @@ def test_training_twice_gives_the_same_model(monkeypatch, tmp_path):
     assert np.isclose(weights[0], weights[2], atol=1e-3).mean() < 0.5
 
 
-def test_training_may_begin_from_an_earlier_encoder(monkeypatch, tmp_path):
+def test_training_may_begin_from_an_earlier_encoder(few_crops, tmp_path):
     """Weights are taken over, and so is the vector of every token that the earlier vocabulary had."""
-    crops = plain_crops(12, 4)
-    monkeypatch.setattr(demo_encoder, "write_crops", lambda folder, config, progress: None)
-    monkeypatch.setattr(demo_encoder, "read_crops", lambda folder: (crops, crops))
-    train_demo_encoder(tmp_path / "old", DemoEncoderConfig(steps=1, batch=8, phrases=8), silent)
+    train_encoder(tmp_path / "old", EncoderConfig(steps=1, batch=8, phrases=8), silent)
     write_tokenizer(["red", "zebra"], tmp_path / "new")
     tokenizer = CLIPTokenizerFast.from_pretrained(tmp_path / "new")
     model = build_model(len(tokenizer), tokenizer.bos_token_id, tokenizer.eos_token_id)
@@ -250,23 +251,12 @@ def test_calibration_moves_the_canonical_phrases_only(tmp_path):
     torch.testing.assert_close(after[4], before[4])
 
 
-@pytest.fixture(scope="module")
-def bundled():
-    try:
-        model_path("demo", "--encoder")
-    except EncoderError:
-        pytest.skip("the bundled demo encoder is not there")
-    return load_encoder("demo", "cpu")
-
-
-def test_bundled_encoder_in_a_room_it_never_saw(bundled, unseen_room):
+def test_bundled_encoder_in_a_room_it_never_saw(unseen_room):
+    bundled = load_encoder("demo", "cpu")
     figures = {row.kind: row for row in report(bundled, unseen_room)}
     for kind, top1, separation in (("colour", 0.82, 0.97), ("object", 0.75, 0.88)):
         assert figures[kind].top1 > top1
         assert figures[kind].separation > separation
     assert figures["object"].wrong_found < 0.07
-
-
-def test_bundled_encoder_knows_its_words(bundled):
     assert bundled.unknown_words("the handle of a red mug with stuff and things") == ()
     assert bundled.unknown_words("xylophone") == ("xylophone",)

@@ -1,24 +1,32 @@
-"""The procedural demo world: geometry, names, pictures, and the folder it is written to."""
+"""Procedural rooms: geometry, colours, light, pictures, and the folders they are written to."""
 
 import json
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 
 from assets.making import dataset, shapes
-from assets.making.dataset import write_dataset
+from assets.making.__main__ import PROGRAM, parse
+from assets.making.dataset import MIN_PIXELS, outlines, write_dataset, write_labelled
 from assets.making.kit import COLOURS, colour_word, from_lch, random_colour, to_lch
 from assets.making.render import Light, Renderer, Tracer, bake, noise
+from assets.making.truth import read_truth
 from assets.making.world import apart, build_room, footprint, furnished
+from langsplat_core.cli.app import parse as parse_product
+from langsplat_core.cli.run import main
+from langsplat_core.config import numeric_settings
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.errors import InputError
+from langsplat_core.evaluation.labels import Outlines, read_3d_ovs, read_lerf_ovs
 from langsplat_core.progress import silent
 from langsplat_core.scene import look_at
 
 pytestmark = pytest.mark.long
 
 UP = np.array([0.0, 0.0, 1.0])
+SEED, VIEWS, SIZE = 2, 9, (160, 120)  # the room of the bundled scene
 
 
 @pytest.fixture
@@ -59,24 +67,12 @@ def test_solids_face_outwards_and_hold_their_volume(mesh, expected):
     assert ratio == pytest.approx(1, rel=0.01) or (0.64 < ratio < 0.68 and mesh.vertices[:, 2].max() == 1)
 
 
-def test_normals_point_along_the_faces():
-    for mesh in (shapes.box(0.2, 0.3, 0.4), shapes.ball(0.1), shapes.slab([(0, 0), (1, 0), (0, 1)], 0.2)):
-        p = mesh.vertices[mesh.triangles]
-        face = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
-        area = np.linalg.norm(face, axis=1)
-        cosine = (face * mesh.normals[mesh.triangles].mean(1)).sum(1)[area > 1e-9] / area[area > 1e-9]
-        assert cosine.min() > 0.9
-
-
 def test_colour_words_cover_what_they_draw():
     rng = np.random.default_rng(0)
     for word in COLOURS:
         assert {colour_word(random_colour(word, rng)) for _ in range(20)} == {word}
     assert colour_word(np.array([0.9, 0.6, 0.15])) in ("orange", None)
-
-
-def test_lch_round_trip():
-    display = np.random.default_rng(1).uniform(0, 1, (50, 3))
+    display = rng.uniform(0, 1, (50, 3))
     np.testing.assert_allclose(from_lch(to_lch(display)), display, atol=1e-6)
 
 
@@ -95,13 +91,6 @@ def test_truth_is_nested(world):
     assert [world.labels[i].level for i in world.ids[0]] == [0, 1, 2]
     assert len(np.unique(world.ids)) == len(world.labels)
     assert world.piece_of.max() + 1 == len(world.ids) == len(world.materials)
-
-
-def test_labels_say_what_is_right(world):
-    chair = next(label for label in world.labels if label.level == 2 and label.word == "chair")
-    assert {"chair", f"{chair.colour} chair", chair.colour} <= set(chair.words)
-    leg = next(label for label in world.labels if label.word == "leg" and label.thing == "chair")
-    assert {"leg", "chair leg", f"leg of the {chair.colour} chair"} <= set(leg.words)
 
 
 def test_same_seed_same_world_other_seed_other_world(world):
@@ -178,16 +167,28 @@ def test_interrupted_dataset_goes_on(tmp_path, coarse_light):
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "images" / "view_002.png")), image)
 
 
-def test_dataset_refuses_useless_sizes(tmp_path):
+def small_things(placed):
+    """Things put down on the table or the floor, without the fruit in bowls and on plates."""
+    hosts = [p for p in placed if p.scale != 1.0]
+    held = {"orange", "apple"}
+    return [p for p in hosts if p.thing.word not in held or p.offset[2] < 0.004]
+
+
+def test_a_room_of_too_few_views_is_refused(tmp_path):
     with pytest.raises(InputError, match="at least 4 views"):
         write_dataset(tmp_path, 0, 2, (64, 48), silent)
 
 
-def small_things(placed):
-    """What was put down on the table or the floor, without the fruit in bowls and on plates."""
-    hosts = [p for p in placed if p.scale != 1.0]
-    held = {"orange", "apple"}
-    return [p for p in hosts if p.thing.word not in held or p.offset[2] < 0.004]
+@pytest.mark.parametrize(
+    ("line", "wrong"),
+    [("dataset --out d", "--views 0"), ("encoder --out d", "--batch 0"), ("build --out s.ply", "--steps 0")],
+)
+def test_commands_refuse_what_lies_outside_a_range(line, wrong, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert all(setting.range for setting in numeric_settings(parse(line.split())))
+    assert main(PROGRAM, lambda: parse(f"{line} {wrong}".split())) == 2
+    assert f"{wrong}: must be" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("tier", ["separate", "clutter", "occlusion"])
@@ -228,9 +229,8 @@ def test_tiers_grow_harder():
     np.testing.assert_array_equal(again.vertices, rooms["occlusion"].vertices)
 
 
-def test_baked_light_agrees_with_what_it_is_made_of():
+def test_baked_light_agrees_with_what_it_is_made_of(world):
     """An open table under the lamp: no bounce but the sky's; the lattice agrees with the vertices."""
-    world = build_room(3)
     light = Light(np.array([-0.9, -1.0, 1.7]))
     tracer = Tracer(world)
     coarse, fine = bake(tracer, world, light, 6, 0.0), bake(tracer, world, light, 6, 0.006)
@@ -246,3 +246,75 @@ def test_baked_light_agrees_with_what_it_is_made_of():
     np.testing.assert_allclose(fine.lattice[corners], fine.vertices[world.triangles[rows]], atol=1e-5)
     assert fine.lattice.min() >= 0
     assert fine.lattice[:, 3].max() <= 1.6
+
+
+def drawn(mask):
+    polygons = outlines(mask)
+    assert all(len(polygon) >= 3 for polygon in polygons)
+    size = (mask.shape[1], mask.shape[0])
+    return Outlines(size, tuple(polygon.astype(float) for polygon in polygons)).draw(size)
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("sigma", [0.0, 0.7, 2.0])
+def test_polygons_give_back_the_mask(seed, sigma):
+    """Pieces, holes, islands in holes, single pixels, diagonal lines, the picture's border."""
+    values = gaussian_filter(np.random.default_rng(seed).normal(size=(40, 50)), sigma)
+    mask = values > np.quantile(values, 0.35 if seed % 2 else 0.6)
+    np.testing.assert_array_equal(drawn(mask), mask)
+
+
+def test_polygons_of_simple_shapes():
+    ring = np.zeros((9, 9), bool)
+    ring[1:8, 1:8], ring[3:6, 3:6] = True, False
+    for mask in (ring, ~ring, np.eye(6, dtype=bool), np.ones((3, 4), bool), np.ones((1, 1), bool)):
+        np.testing.assert_array_equal(drawn(mask), mask)
+    assert outlines(np.zeros((4, 4), bool)) == []
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    """The same room in both layouts, in plain light."""
+    out = tmp_path_factory.mktemp("rooms")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dataset, "LIGHT_SAMPLES", 2)
+        patch.setattr(dataset, "LIGHT_CELL", 0.0)
+        for layout in ("lerf-ovs", "3d-ovs"):
+            write_labelled(out / layout, layout, SEED, VIEWS, SIZE, silent)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("layout", "read", "kinds", "names"),
+    [
+        ("lerf-ovs", read_lerf_ovs, ("object", "colour+object", "part"), ["frame_00001", "frame_00009"]),
+        ("3d-ovs", read_3d_ovs, ("object",), ["00", "08"]),
+    ],
+)
+def test_labels_are_the_truth(rooms, layout, read, kinds, names):
+    (scene,) = read(rooms / layout).scenes.values()
+    assert [frame.name for frame in scene.frames] == names
+    truth, several = read_truth(scene.dataset), 0
+    for frame in scene.frames:
+        labels = truth.labels(frame.name)
+        masks = {p.text: np.isin(labels, p.ids).any(0) for p in truth.phrases if p.kind in kinds}
+        masks = {text: mask for text, mask in masks.items() if mask.sum() >= MIN_PIXELS}
+        assert {label.phrase for label in frame.labels} == set(masks)
+        for label in frame.labels:
+            np.testing.assert_array_equal(label.truth.draw(SIZE), masks[label.phrase])
+            several += layout == "lerf-ovs" and len(label.boxes) > 1
+    assert several > 5 or layout == "3d-ovs"
+
+
+@pytest.mark.parametrize(("layout", "protocol"), [("lerf-ovs", "langsplat-code"), ("3d-ovs", "ours")])
+def test_the_whole_command_on_a_complete_set(rooms, tmp_path, capsys, layout, protocol):
+    """The bundled scene shows the same room; it has never seen these views, whose cameras the dataset has."""
+    out = tmp_path / "out.json"
+    words = ["eval", layout, "assets/demo/scene.ply", str(rooms / layout), "--protocol", protocol]
+    parse_product([*words, "--json", str(out), "--pictures", str(tmp_path / "pictures")]).run()
+    content = json.loads(out.read_text())
+    micro = content["means"]["micro, mean of queries"]
+    assert micro["queries"] == len(content["queries"]) > 20
+    assert micro["iou"] > 0.4
+    assert "macro, mean of frames" in capsys.readouterr().out
+    assert len(list((tmp_path / "pictures").rglob("*.png"))) == micro["queries"]

@@ -210,7 +210,7 @@ def test_until_it_is_there_merged_gaussians_show_what_was_changed(gl, asked, gat
     rest(canvas, asked.state, 0.0)
     until(lambda: not canvas.is_running)
     gated.gate.clear()
-    monkeypatch.setattr(renderer, "MERGED_SHARE", 1e-3)
+    monkeypatch.setattr("langsplat_viewer.drawing.renderer.MERGED_SHARE", 1e-3)
     actions.set_splats(asked, Splats(0.5))
     for now in (1.0, 2.0, 3.0):
         assert canvas.update(asked.state, now)

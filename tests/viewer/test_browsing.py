@@ -45,7 +45,7 @@ def _file(folder: Path) -> Path:
 
 
 def test_a_crowded_folder_is_cut(tmp_path, monkeypatch):
-    monkeypatch.setattr("langsplat_viewer.files.browsing.MOST", 3)
+    monkeypatch.setattr("langsplat_viewer.files.browsing.MOST_LISTED", 3)
     for number in range(5):
         (tmp_path / f"{number}.ply").write_bytes(b"")
     listing = list_folder(tmp_path)

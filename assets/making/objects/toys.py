@@ -40,10 +40,8 @@ def car(kit: Kit, colour: str) -> Thing:
     )
     paint, tyre = kit.paint(colour, gloss=0.8, substance="plastic"), kit.paint("black", substance="rubber")
     glass = kit.paint("turquoise", gloss=0.9, substance="glass")
-    hub_paint, side = (
-        kit.paint(kit.pick("gray", "white", "yellow"), substance="plastic"),
-        rotation_about("x", 90),
-    )
+    hub_paint = kit.paint(kit.pick("gray", "white", "yellow"), substance="plastic")
+    side = rotation_about("x", 90)
     pieces = []
     for k, (x, y) in enumerate([(-0.3, -1), (0.3, -1), (-0.3, 1), (0.3, 1)]):
         wheel = cylinder(r, 0.03, 24).moved((0, 0, -0.015)).turned(side)
@@ -124,10 +122,8 @@ def house(kit: Kit, colour: str) -> Thing:
     tiles = [plank.moved((x * span / 2, 0, 0)).spun("y", x * slope).moved((0, 0, peak)) for x in (-1, 1)]
     stack = box(0.026, 0.026, 0.06).moved((w * 0.25, 0, h + 0.03))
     roof = kit.paint(kit.other(colour, "red", "brown", "blue", "gray"), "striped", 0.1)
-    glass, door = (
-        kit.paint(kit.other(colour, "turquoise", "white", "yellow"), substance="glass"),
-        kit.paint(kit.other(colour, "brown", "green", "red"), substance="wood"),
-    )
+    glass = kit.paint(kit.other(colour, "turquoise", "white", "yellow"), substance="glass")
+    door = kit.paint(kit.other(colour, "brown", "green", "red"), substance="wood")
     panes = [box(0.03, 0.004, 0.032).moved((x * w * 0.28, -d / 2, h * 0.52)) for x in (-1, 1)]
     panes += [box(0.004, 0.03, 0.032).moved((x * w / 2, 0, h * 0.52)) for x in (-1, 1)]
     return Thing("house", colour, (
@@ -180,10 +176,8 @@ def _wheel(radius: float, width: float, x: float, y: float) -> tuple[Mesh, Mesh]
 def train(kit: Kit, colour: str) -> Thing:
     """A steam engine: boiler with funnel, driver's cab, wheels."""
     n, w = kit.size(0.21, 0.24), 0.075
-    coat, second = (
-        kit.plastic(colour),
-        kit.plastic(kit.other(colour, "red", "blue", "yellow", "green", "black")),
-    )
+    coat = kit.plastic(colour)
+    second = kit.plastic(kit.other(colour, "red", "blue", "yellow", "green", "black"))
     r = 0.036
     boiler = cylinder(r, 0.6 * n, 28).spun("y", 90).moved((-n / 2 + 0.008, 0, 0.1))
     nose = cylinder(0.82 * r, 0.006, 28).spun("y", 90).moved((-n / 2 + 0.003, 0, 0.1))
@@ -214,10 +208,8 @@ def train(kit: Kit, colour: str) -> Thing:
 
 def airplane(kit: Kit, colour: str) -> Thing:
     n = kit.size(0.23, 0.26)
-    coat, second = (
-        kit.plastic(colour),
-        kit.plastic(kit.other(colour, "white", "red", "yellow", "blue", "orange")),
-    )
+    coat = kit.plastic(colour)
+    second = kit.plastic(kit.other(colour, "white", "red", "yellow", "blue", "orange"))
     up, r = 0.075, 0.028
     place = np.linspace(0, 1, 16)
     line = np.stack([n * (place - 0.5), 0 * place, up + 0.018 * place**3], 1)

@@ -190,7 +190,7 @@ def test_a_sample_is_enough_to_tell_things_apart(monkeypatch, sample):
     truth = np.repeat([0, 1, 2], [300, 100, 200])
     views = [view(np.array(order)[truth]) for order in ([0, 1, 2], [2, 0, 1])]
     whole = found(views, 600)
-    monkeypatch.setattr(module, "SAMPLE", sample)
+    monkeypatch.setattr(module, "THING_SAMPLE", sample)
     np.testing.assert_array_equal(found(views, 600), whole)
     np.testing.assert_array_equal(found(views, 600), found(views, 600))
 
@@ -200,7 +200,7 @@ def test_a_mask_that_the_sample_misses_shows_no_thing(monkeypatch):
     of_row[7] = 1
     assert found([view(of_row)], 200)[7] == 1
     missed = [s for s in range(1, 200) if 7 not in np.random.default_rng(0).permutation(200)[:s]]
-    monkeypatch.setattr(module, "SAMPLE", missed[-1])
+    monkeypatch.setattr(module, "THING_SAMPLE", missed[-1])
     assert found([view(of_row)], 200)[7] == NO_THING
 
 
