@@ -1,4 +1,4 @@
-"""`langsplat bench query` on a scene of nothing: that it measures what it says. No time is asserted."""
+"""The query benchmark on a tiny scene. No test looks at a time."""
 
 import json
 from dataclasses import replace
@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from langsplat_core.bench import QueryBenchConfig
+from langsplat_core.bench.query import measure_queries, query_table, repeated, with_codec
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
-from langsplat_core.lab.config import QueryBenchConfig
-from langsplat_core.lab.speed.queries import measure_queries, query_table, repeated, with_codec
 from langsplat_core.scene import CodebookCodec, LanguageField, Scene
 from tests.support.fakes import DIM, PER_BLOB, FakeEncoder, axis, blob_scene
 from tests.support.file_samples import random_codec
@@ -74,19 +74,8 @@ def test_another_codec_encodes_the_codewords():
 
 @pytest.mark.long
 def test_the_command_writes_what_it_measured(tmp_path, capsys):
-    words = [
-        "bench",
-        "query",
-        "assets/demo/scene.ply",
-        "--size",
-        "64",
-        "48",
-        "--phrases",
-        "2",
-        "--together",
-        "2",
-    ]
-    words += ["--repeats", "1", "--codec-steps", "30", "--out", str(tmp_path)]
+    small = "--size 64 48 --phrases 2 --together 2 --repeats 1 --codec-steps 30"
+    words = ["bench", "query", "assets/demo/scene.ply", *small.split(), "--out", str(tmp_path)]
     assert main("langsplat", lambda: parse(words)) == 0
     report = json.loads((tmp_path / "query.json").read_text())["report"]
     assert report["size"] == [64, 48]
