@@ -161,7 +161,10 @@ def method_table(rows: Sequence[MethodRow]) -> str:
         same = [row for row in rows if (row.measured.masks, row.measured.name) == (masks, name)]
         cells = [_cell(np.array([of_kind(row.measured, kind)[1:] for row in same])) for kind in KINDS]
         seconds = np.mean([row.measured.fit_seconds for row in same])
-        times = ("-" if np.isnan(seconds) else f"{seconds:.0f}", f"{np.mean([row.image_ms for row in same]):.0f}")
+        times = (
+            "-" if np.isnan(seconds) else f"{seconds:.0f}",
+            f"{np.mean([row.image_ms for row in same]):.0f}",
+        )
         lines.append((masks, name, *cells, *loss_cells([row.measured for row in same]), *times))
     shares = (f"{kind}: mIoU / loc / 3D %" for kind in KINDS)
     codec = ("codec", "relevancy error mean / p99", "bytes/Gaussian", "s to fit", "ms from phrase to image")

@@ -115,7 +115,7 @@ class Variant:
     level: LevelChoice = "auto"  # that is asked
 
 
-def autoencoder(d: int = 3, steps: int = CodecConfig.steps) -> CodecConfig:
+def autoencoder(d: int = 3, steps: int = 4_000) -> CodecConfig:
     """The paper's codec."""
     return CodecConfig(kind="autoencoder", latent_dim=d, steps=steps)
 

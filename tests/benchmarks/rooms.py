@@ -11,7 +11,7 @@ from assets.making.config import TIERS, Tier
 from assets.making.objects import EVERYTHING
 from assets.making.truth import PHRASE_KINDS, read_truth
 from langsplat_core.bench.measure import markdown
-from langsplat_core.config import CodecConfig, DatasetConfig, LiftConfig
+from langsplat_core.config import CodecConfig, Count, DatasetConfig, LiftConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
 from langsplat_core.io import load_scene
@@ -60,6 +60,7 @@ class Rooms(InRooms):
     lift: LiftConfig = field(default_factory=LiftConfig)
     ceiling: bool = False  # also keep all of the encoder's numbers, by which a codec is judged
     budget: bool = False  # also swap one stage at a time for one that makes no mistake
+    codec_steps: Count = 4_000  # of training the autoencoder of --budget
     scene: Path | None = None
     """Measure this scene, trained on --dataset, instead of fresh rooms; of the settings, --cut applies."""
     dataset: Path | None = None
@@ -112,7 +113,7 @@ def variants(command: Rooms, dim: int) -> list[Variant]:
     if not command.budget:
         return [method, replace(method, name="no codec", codec=ceiling(dim))][: 1 + command.ceiling]
     perfect = [replace(method, name="perfect masks", masks="truth")] if command.masks != "truth" else []
-    decoded = replace(method, name="autoencoder, d = 3", codec=autoencoder(steps=command.codec.steps))
+    decoded = replace(method, name="autoencoder, d = 3", codec=autoencoder(steps=command.codec_steps))
     return [
         method,
         *perfect,

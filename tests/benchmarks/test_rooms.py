@@ -12,7 +12,7 @@ from assets.making import dataset
 from assets.making.scene import SEED
 from assets.making.truth import MIN_REGION, TruthMasks, read_truth
 from langsplat_core.cli.run import main
-from langsplat_core.config import CodecConfig, DatasetConfig, numeric_settings
+from langsplat_core.config import DatasetConfig, numeric_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io import save_scene
@@ -39,7 +39,7 @@ from tests.benchmarks.scoring import DirectScore, Measured, Score
 from tests.benchmarks.verdicts import measure_verdicts
 
 SETTINGS = RoomSettings(views=8, size=(64, 48), steps=60, max_gaussians=3_000)
-TINY = Rooms(tiers=("separate",), seeds=(101,), settings=SETTINGS, budget=True, codec=CodecConfig(steps=60))
+TINY = Rooms(tiers=("separate",), seeds=(101,), settings=SETTINGS, budget=True, codec_steps=60)
 DECODED, PAPER = "autoencoder, d = 3", "autoencoder, the paper's order"
 BUDGET = ("the method", "perfect embeddings", "no codec", DECODED, PAPER)
 
