@@ -24,7 +24,7 @@ from langsplat_core.bench.measure import (
 )
 from langsplat_core.bench.torch_rasterizer import TorchRasterizer
 from langsplat_core.errors import BackendError
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.opengl.scene_textures import create_egl_context

@@ -12,8 +12,8 @@ import tyro
 from langsplat_core.bench import QueryBenchConfig, RasterBenchConfig
 from langsplat_core.cli.checks import OutFolder
 from langsplat_core.errors import InputError
-from langsplat_core.io import load_scene
 from langsplat_core.io.files import atomic_path
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import no_field
 from langsplat_core.semantics.encoders import load_text_encoder

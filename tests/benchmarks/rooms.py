@@ -14,7 +14,7 @@ from langsplat_core.bench.measure import markdown
 from langsplat_core.config import CodecConfig, Count, DatasetConfig, LiftConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.raster import load_rasterizer

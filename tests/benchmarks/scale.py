@@ -33,7 +33,7 @@ from langsplat_core.bench.query import repeated
 from langsplat_core.cli.checks import OutFolder
 from langsplat_core.config import Count, CountOrZero, Range, RasterSettings
 from langsplat_core.errors import InputError
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer

@@ -15,7 +15,7 @@ from langsplat_core.cli.run import main
 from langsplat_core.config import DatasetConfig, numeric_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.progress import silent
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.masks import label_maps

@@ -6,7 +6,7 @@ import tempfile
 import pytest
 
 from langsplat_core.cli.run import main
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from tests.benchmarks.__main__ import PROGRAM, parse
 from tests.benchmarks.fresh import MEANINGS, RandomEncoder, RandomViews
 from tests.benchmarks.scale import COARSE, PARTS, PROPERTIES, parts

@@ -16,7 +16,7 @@ from assets.making.render import Renderer
 from assets.making.scene import SEED, SIZE, VIEWS
 from langsplat_core.config import PictureConfig
 from langsplat_core.evaluation.scoring import intersection_over_union, majority
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.query.answers import cut_level, peak_pixel
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import splatted_relevancy

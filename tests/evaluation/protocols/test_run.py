@@ -14,7 +14,7 @@ from langsplat_core.evaluation.profiles import LERF_PROFILES, OVS_PROFILES
 from langsplat_core.evaluation.report import save_json, summary, table
 from langsplat_core.evaluation.run import Subject, run_benchmark
 from langsplat_core.evaluation.scoring import inside_any_box, scored_size
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Scene
 from tests.support.fakes import PER_BLOB, WORDS, FakeEncoder, blob_scene, cameras
