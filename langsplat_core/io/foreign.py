@@ -168,7 +168,9 @@ def _of_levels(
     if len(featured) > len(LEVELS):
         raise InputError(f"{featured[-1].path}: a fourth checkpoint with features; there are three levels")
     if method == OPEN_GAUSSIAN:
-        f"{featured[0].path}: of OpenGaussian; its features are in cluster_lang.npz, name it too"
+        raise InputError(
+            f"{featured[0].path}: of OpenGaussian; its features are in cluster_lang.npz, name it too"
+        )
     numbers, how = _numbers(featured, asked)
     base = _geometry(plain, featured)
     levels: list[Features | None] = [None] * len(LEVELS)
