@@ -32,7 +32,6 @@ from langsplat_core.io.language import read_language, write_language
 from langsplat_core.io.ply import read_ply
 from langsplat_core.io.ply_table import GREY, read_cloud
 from langsplat_core.io.scenes import load_gaussians
-from langsplat_core.io.sog import read_sog
 from langsplat_core.io.spz import read_spz_scene
 from tests.support.file_samples import (
     plain_ply,
@@ -67,19 +66,6 @@ def test_what_unfolds_beyond_the_limit_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="has more than 699 bytes"):
         read(tmp_path, packed(zipfile.ZIP_DEFLATED), limit=699)
     assert len(read(tmp_path, packed(zipfile.ZIP_DEFLATED), limit=700)) == 700
-
-
-def test_every_changed_byte_is_one_error_or_none(tmp_path: Path) -> None:
-    """zipfile raises IndexError, struct.error, zlib.error, NotImplementedError ... over these."""
-    good, messages = packed(zipfile.ZIP_DEFLATED), []
-    for place in range(len(good)):
-        for value in (0, 255, good[place] ^ 1):
-            try:
-                read(tmp_path, good[:place] + bytes([value]) + good[place + 1 :])
-            except FormatError as error:
-                messages.append(str(error))
-    assert len(messages) > len(good)
-    assert all(message.isprintable() for message in messages)
 
 
 def test_an_array_of_text_that_is_none(tmp_path: Path) -> None:
@@ -263,24 +249,6 @@ def test_whatever_a_decoder_raises_is_one_error(tmp_path: Path, error: type[Exce
     assert caught.value.reason == "damaged: inside Pillow"
 
 
-def test_damaged_tiff_says_nothing_on_the_standard_error(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], recwarn: pytest.WarningsRecorder
-) -> None:
-    """libtiff's own messages, Pillow's loggers and its warnings about tags."""
-    good = saved("TIFF", compression="tiff_lzw")
-    rng = np.random.default_rng(0)
-    refused = 0
-    for place in range(8, len(good), 31):
-        (tmp_path / "a.tif").write_bytes(good[:place] + rng.bytes(3) + good[place + 3 :])
-        try:
-            read_photo(tmp_path / "a.tif", upright=True)
-        except PictureError:
-            refused += 1
-    assert refused > 3
-    assert capfd.readouterr().err == ""
-    assert not recwarn.list
-
-
 def test_warnings_are_back_when_the_last_picture_is_closed() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -322,7 +290,7 @@ def test_images_that_unfold_to_gigabytes(tmp_path, bounded, name, width):
     files = sog_files(SCENE)
     files[name] = webp_that_claims(width, 16384)
     with pytest.raises(FormatError, match=name):
-        read_sog(write_folder(tmp_path / "a", files))
+        load_gaussians(write_folder(tmp_path / "a", files))
 
 
 def test_a_count_that_the_images_would_have_to_be_bombs_for(tmp_path, bounded):
@@ -333,7 +301,7 @@ def test_a_count_that_the_images_would_have_to_be_bombs_for(tmp_path, bounded):
         files[name] = webp_that_claims(16384, 16384)
     files["meta.json"] = json.dumps(meta).encode()
     with pytest.raises(FormatError, match="too few for 268435456 Gaussians"):
-        read_sog(write_folder(tmp_path / "a", files))
+        load_gaussians(write_folder(tmp_path / "a", files))
 
 
 @pytest.mark.long
@@ -349,7 +317,7 @@ def test_an_archive_that_unfolds_to_gigabytes(tmp_path, bounded):
                 member.write(bytes(1 << 20))
     assert path.stat().st_size < 1 << 20
     with pytest.raises(FormatError, match=r"'quats\.webp' inside has more than"):
-        read_sog(path)
+        load_gaussians(path)
 
 
 def test_a_meta_of_gigabytes(tmp_path, bounded):
@@ -358,7 +326,7 @@ def test_a_meta_of_gigabytes(tmp_path, bounded):
     with (folder / "meta.json").open("wb") as file:
         file.truncate(3 << 30)  # a hole: takes no room on the disk
     with pytest.raises(FormatError, match=r"meta\.json: 3221225472 bytes; expected at most"):
-        read_sog(folder)
+        load_gaussians(folder)
     with pytest.raises(FormatError, match="never exceeds"):
         read_cameras(folder / "meta.json")
 
