@@ -179,8 +179,7 @@ class Convert:
     checkpoints."""
 
     source: tyro.conf.Positional[Path]
-    """Scene to read: .ply, compressed .ply, .spz, .splat, .ksplat, SOG folder, meta.json or .sog; or the
-    first of the files that another method has of one scene."""
+    """Scene to read, of any format; or the first of the files that another method has of one scene."""
     rest: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[MORE...] OUT")]]
     """The other method's further files, in any order, and last the scene to write: .ply, .spz or .splat; with
     --to the folder."""

@@ -38,8 +38,7 @@ LOOKED_AT = 4096  # rows of a large scene, evenly taken, that tell whether most 
 class SceneFormat:
     """A format of scenes: one row of `FORMATS`."""
 
-    name: str  # for people
-    suffix: str  # of its files, lower case
+    suffix: str  # of its files, lower case; its name for people too
     read: Callable[[Path], Scene]
     write: Callable[[Path, Scene], None] | None = None  # None: read only
     loses: tuple[str, ...] = ()  # what a written file cannot hold, in words of `LOSSES`
@@ -48,7 +47,7 @@ class SceneFormat:
     mime: str = "model/x-gaussian-splat"
 
 
-# What of a scene a format may be unable to hold, or, where it is the precision, not to the last bit
+# Parts of a scene that a format may be unable to hold; without "precision" numbers are rounded
 LOSSES = ("precision", "view dependence", "antialiasing", "metres per unit", "extra properties")
 
 
@@ -60,9 +59,8 @@ def _write_ply(path: Path, scene: Scene) -> None:
 
 
 FORMATS = (
-    SceneFormat("3DGS PLY, plain or compressed", ".ply", read_ply_scene, _write_ply, mime="model/x-ply"),
+    SceneFormat(".ply", read_ply_scene, _write_ply, mime="model/x-ply"),  # plain and compressed
     SceneFormat(
-        "Niantic's SPZ",
         ".spz",
         read_spz_scene,
         lambda path, scene: write_spz(path, scene.gaussians, scene.antialiased),
@@ -70,15 +68,14 @@ FORMATS = (
         own_companions=True,
     ),
     SceneFormat(
-        "antimatter15's .splat",
         ".splat",
         lambda path: Scene(read_splat(path)),
         lambda path, scene: write_splat(path, scene.gaussians),
         loses=LOSSES,
         own_companions=True,
     ),
-    SceneFormat("mkkellogg's .ksplat", ".ksplat", lambda path: Scene(read_ksplat(path)), own_companions=True),
-    SceneFormat("PlayCanvas' SOG", ".sog", read_sog_scene, folder_file=META_NAME),
+    SceneFormat(".ksplat", lambda path: Scene(read_ksplat(path)), own_companions=True),
+    SceneFormat(".sog", read_sog_scene, folder_file=META_NAME),
 )
 WRITABLE = tuple(row.suffix for row in FORMATS if row.write is not None)
 SUPPORTED = ", ".join(
