@@ -1,10 +1,11 @@
-"""Where a relevancy map is cut, so that what lies above is the answer's mask.
+"""From the relevancies of a phrase to its answer: the regions of the surface that are it, or its peak alone.
 
-Absolute relevancy says little across encoders and phrases (a cosine margin of 0.1 is 0.73), so every rule
-here is relative to something measured: the floor, the scene's median, or the map's own range.
+Absolute relevancy says little across encoders and phrases (a cosine margin of 0.1 is 0.73). So whether a
+phrase is found is judged by what everyday phrases fit in the same scene, and how far it reaches by its best
+region.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -15,10 +16,12 @@ from scipy.sparse import csr_matrix
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.grammar import Named, named
+from langsplat_core.query.lookup import codewords
 from langsplat_core.query.surface import SMALLEST, Regions, Surface
 from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField, Odds
-from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, Scale, relevancy_of
+from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, Scale
 
+Triple = tuple[float, float, float]  # one number a level
 CutRule = Literal["floor", "median", "range"]
 CUT_RULES: tuple[CutRule, ...] = get_args(CutRule)
 SPAN = 0.02  # the least distance between the lower end and the peak that is divided
@@ -43,27 +46,24 @@ def cut_level(rule: CutRule, values: Array, peak: float, median: float) -> float
     return low + 0.5 * max(peak - low, SPAN)
 
 
-# Where a phrase is: the strongest place among the Gaussians, its extent, and its pixel in a view.
+def triple(values: Iterable[float]) -> Triple:
+    """Three values as plain numbers."""
+    subpart, part, whole = values
+    return float(subpart), float(part), float(whole)
+
+
+# Where a phrase is: the strongest place among the Gaussians, and its pixel in a view.
 
 PLATEAU = 1e-3  # of relevancy: what is this close to the peak is as high
 
 
-@dataclass(frozen=True, eq=False)
-class Place:
-    """A connected set of Gaussians that answer a phrase."""
-
-    position: Array  # (3,) world units, around the middle of what is as high as the peak
-    box: Array  # (2, 3) lower and upper corner, world units, between 2 % and 98 % of the members
-    count: int  # Gaussians in it
-
-
-def locate(surface: Surface, smoothed: Array, threshold: float) -> Place | None:
-    """The connected part above `threshold` that holds the peak of `smoothed` (M,); None where all is 0."""
-    if len(smoothed) == 0:
-        return None
+def locate(surface: Surface, smoothed: Array, threshold: float) -> tuple[Array, Array] | tuple[None, None]:
+    """Place and box, world units, of the connected part above `threshold` that holds the peak of `smoothed`
+    (M,): (3,) around the middle of what is as high as the peak, and (2, 3) lower and upper corner between 2 %
+    and 98 % of its Gaussians. None where all is 0."""
+    if smoothed.max(initial=0) <= 0:
+        return None, None
     peak = int(smoothed.argmax())
-    if smoothed[peak] <= 0:
-        return None
     inside = smoothed > threshold
     inside[peak] = True
     members = surface.connected(inside, peak)
@@ -74,8 +74,7 @@ def locate(surface: Surface, smoothed: Array, threshold: float) -> Place | None:
     near = surface.neighbours[middle]
     weights = surface.weights[near] * smoothed[near]
     position = (surface.positions[near] * weights[:, None]).sum(0) / weights.sum()
-    box = np.quantile(surface.positions[members], [0.02, 0.98], axis=0)
-    return Place(position, box, len(members))
+    return position, np.quantile(surface.positions[members], [0.02, 0.98], axis=0)
 
 
 def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
@@ -116,7 +115,7 @@ class Bar:
     spread: float
 
     def excess(self, fit: float, spreads: float) -> float:
-        """By how many spreads `fit` exceeds what is so many above the median."""
+        """Spreads by which `fit` exceeds what is so many above the median."""
         return (fit - self.median) / max(self.spread, NARROWEST) - spreads
 
 
@@ -130,10 +129,8 @@ class Chance:
     fits: tuple[Array, Array, Array]  # (R, V) float32 of each level
 
     def bars(self, rows: tuple[Array, Array, Array] | None = None) -> Bars:
-        """Of the scene, or of some regions `rows` of each level alone."""
-        chosen = (
-            self.fits if rows is None else [fits[some] for fits, some in zip(self.fits, rows, strict=True)]
-        )
+        """The bars of the scene, or of some regions `rows` of each level alone."""
+        chosen = [f if rows is None else f[rows[level]] for level, f in enumerate(self.fits)]
         subpart, part, whole = (fits.max(0, initial=-np.inf) for fits in chosen)
         return _bar(subpart), _bar(part), _bar(whole), _bar(np.maximum(subpart, part))
 
@@ -146,8 +143,8 @@ def _bar(best: Array) -> Bar:
 
 
 def excess(fits: Fits, bars: Bars, named: Named | Literal["inside"], level: LevelChoice = "auto") -> float:
-    """By how many spreads the best fits of a phrase exceed those from which it is found; it is from 0 on. At
-    one `level`, or, where that is free, at any."""
+    """Spreads by which the best fits of a phrase exceed those from which it is found; it is from 0 on. At one
+    `level`, or, where that is free, at any."""
     whole, finer = FOUND[named]
     if level != "auto":
         index = LEVELS.index(level)
@@ -158,8 +155,8 @@ def excess(fits: Fits, bars: Bars, named: Named | Literal["inside"], level: Leve
 def chance_in(
     field: LanguageField, surface: Surface, regions: Regions, scale: Scale, lookup: Iterator[Array]
 ) -> Chance:
-    """Of a scene. lookup: relevancies (3, N) of everyday phrases, which are looked at where there are no
-    codewords to compare instead."""
+    """The fits of everyday phrases in a scene. lookup: their relevancies (3, N), which are looked at where
+    there are no codewords to compare instead."""
     if field.codec.space == "index":
         return _by_codewords(field, surface, regions, scale)
     columns = [[scale.fit(means) for means in regions.means(values)] for values in lookup]
@@ -172,15 +169,12 @@ def chance_in(
 
 def _by_codewords(field: LanguageField, surface: Surface, regions: Regions, scale: Scale) -> Chance:
     assert scale.everyday is not None
-    count = field.codec.index_size
-    vectors = field.codec.decode(np.arange(count, dtype=np.uint16)[:, None])
-    zero, rate = scale.of(vectors @ scale.texts.T)
-    relevancy = relevancy_of(vectors @ scale.everyday.T, zero[:, None], rate[:, None])
+    relevancy = codewords(field.codec, scale).relevancies(scale.everyday)
     fits = []
     for level, known in enumerate(field.known):
         has = known[surface.rows]
         places = regions.of[level][has], field.latents[level, surface.rows[has], 0].astype(np.int64)
-        shape = (len(regions.totals[level]), count)
+        shape = (len(regions.totals[level]), len(relevancy))
         shares = csr_matrix((surface.weights[has], places), shape=shape)
         means = (shares @ relevancy) / regions.totals[level][:, None]
         fits.append(_solid(scale.fit(means).astype(np.float32), regions.sizes[level]))
@@ -212,11 +206,11 @@ NEAREST, FARTHEST = 0.15, 1.0  # spreads
 
 @dataclass(frozen=True, eq=False)
 class Extent:
-    """What of a surface answers a phrase: some of the R regions of a level."""
+    """The part of a surface that answers a phrase: some of the R regions of a level."""
 
     level: int  # index into LEVELS
     fits: Fits  # of the best region of each level
-    peaks: tuple[float, float, float]  # relevancy of the best region of each level
+    peaks: Triple  # relevancy of the best region of each level
     even: Array  # (R,) float32 relevancy, the same all over a region
     inside: Array  # (R,) bool
 
@@ -228,16 +222,16 @@ def find_extent(
     level: LevelChoice = "auto",
     named: Named = "thing",
 ) -> Extent:
-    """From the (3, N) relevancy of a phrase. level: "auto", which depends on what is `named`, or the one that
-    is wanted."""
+    """The extent by the (3, N) relevancy of a phrase. level: "auto", which depends on what is `named`, or the
+    one that is wanted."""
     means = regions.means(relevancy)
     peaks = [_best(values, sizes) for values, sizes in zip(means, regions.sizes, strict=True)]
     best = scale.fit(np.array(peaks))
     chosen = _level(best, named) if level == "auto" else LEVELS.index(level)
     return Extent(
         level=chosen,
-        fits=(float(best[0]), float(best[1]), float(best[2])),
-        peaks=(peaks[0], peaks[1], peaks[2]),
+        fits=triple(best),
+        peaks=triple(peaks),
         even=means[chosen].astype(np.float32),
         inside=scale.fit(means[chosen]) >= lowest(float(best[chosen])),
     )
@@ -275,7 +269,7 @@ class QueryResult:
 
     phrase: str
     level: int  # index into LEVELS
-    scores: tuple[float, float, float]  # best relevancy per level: of a region, or of a neighbourhood
+    scores: Triple  # best relevancy per level: of a region, or of a neighbourhood
     relevancy: Array  # (3, N) float32 in [0, 1] per level and Gaussian
     even: Array  # (N,) float32 relevancy at the level, the same all over a region
     peak: float  # score of the chosen level
@@ -331,7 +325,7 @@ def by_regions(
     calibration: Calibration | None,
     level: LevelChoice,
 ) -> QueryResult:
-    """Whole regions that fit nearly as well as the best one (`extent`)."""
+    """The answer of whole regions that fit nearly as well as the best one (`find_extent`)."""
     extent = find_extent(relevancy, regions, scale, level, named(phrase))
     even = regions.spread(extent.level, extent.even, relevancy[extent.level])
     peak = extent.peaks[extent.level]
@@ -345,7 +339,8 @@ def by_regions(
         probability = odds.probability(extent.fits)
         found = fits and probability >= odds.found
     solid = np.where(extent.even > np.float32(peak), 0, extent.even)  # what is above the best is a crumb
-    place = locate(surface, solid[regions.of[extent.level]], np.nextafter(np.float32(lowest), np.float32(0)))
+    reached = np.nextafter(np.float32(lowest), np.float32(0))
+    place, box = locate(surface, solid[regions.of[extent.level]], reached)
     return QueryResult(
         phrase=phrase,
         level=extent.level,
@@ -358,34 +353,34 @@ def by_regions(
         excess=above,
         found=found,
         members=regions.spread(extent.level, extent.inside, np.zeros(relevancy.shape[1], bool)),
-        place=None if place is None else place.position,
-        box=None if place is None else place.box,
+        place=place,
+        box=box,
     )
 
 
 def by_peak(
     phrase: str, relevancy: Array, surface: Surface, scale: Scale, found: float, level: LevelChoice
 ) -> QueryResult:
-    """The level with the highest smoothed peak, cut half way between the floor and that peak; relevancy is as
-    published."""
+    """The answer as published: the level with the highest smoothed peak, cut half way between the floor and
+    that peak."""
     smoothed = surface.smooth(relevancy)
-    scores = [float(values.max()) if len(values) else 0.0 for values in smoothed]
+    scores = triple(smoothed.max(1, initial=0))
     chosen = int(np.argmax(scores)) if level == "auto" else LEVELS.index(level)
-    peak, best = scores[chosen], scale.fit(np.array(scores))
-    place = locate(surface, smoothed[chosen], max(FLOOR + 0.5 * (peak - FLOOR), FLOOR))
+    peak = scores[chosen]
+    place, box = locate(surface, smoothed[chosen], max(FLOOR + 0.5 * (peak - FLOOR), FLOOR))
     return QueryResult(
         phrase=phrase,
         level=chosen,
-        scores=(scores[0], scores[1], scores[2]),
+        scores=scores,
         relevancy=relevancy,
         even=relevancy[chosen],
         peak=peak,
-        fits=(float(best[0]), float(best[1]), float(best[2])),
+        fits=triple(scale.fit(np.array(scores))),
         probability=None,
         found=peak >= FLOOR and max(scores) >= found,
         members=relevancy[chosen] > cut_level("floor", relevancy[chosen], peak, FLOOR),
-        place=None if place is None else place.position,
-        box=None if place is None else place.box,
+        place=place,
+        box=box,
     )
 
 

@@ -10,7 +10,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.lab.rooms.truth import Truth
 from langsplat_core.lab.world.assembly import World
 from langsplat_core.lab.world.captions import KINDS
-from langsplat_core.query.compose import Body, Viewer, body, most, stands
+from langsplat_core.query.compose import Body, Viewpoint, body, most, stands
 from langsplat_core.query.grammar import EXTREMES, SIDES
 
 POINTS = 3000  # on the surface of every thing, by which it is measured
@@ -68,7 +68,7 @@ def things_in(world: World, frame: Array, seed: int = 0) -> Things:
     return Things(words, extents)
 
 
-def cases(truth: Truth, things: Things, seen_by: Viewer, seed: int) -> list[Case]:
+def cases(truth: Truth, things: Things, seen_by: Viewpoint, seed: int) -> list[Case]:
     """At most `MOST_CASES` of every construction but of parts, of which there are all."""
     rng = np.random.default_rng((seed, 7))
     found: dict[str, list[Case]] = {name: [] for name in CONSTRUCTIONS}
@@ -123,7 +123,7 @@ def _kinds(things: Things) -> list[str]:
     return sorted({kind for word in things.words.values() for kind in KINDS.get(word, ())})
 
 
-def _relations(things: Things, seen_by: Viewer) -> Iterator[Case]:
+def _relations(things: Things, seen_by: Viewpoint) -> Iterator[Case]:
     """Of a kind of which some stand so and others do not; and of single things, of which none does."""
     objects = sorted(set(things.words.values()) - set(SHELL))
     for side, anchor in product(SIDES, objects):
@@ -143,7 +143,7 @@ def _relations(things: Things, seen_by: Viewer) -> Iterator[Case]:
                 yield Case(side, text, text, right)
 
 
-def _extremes(things: Things, seen_by: Viewer) -> Iterator[Case]:
+def _extremes(things: Things, seen_by: Viewpoint) -> Iterator[Case]:
     for kind, word in product(EXTREMES, _kinds(things)):
         numbers = things.called(word)
         if len(numbers) >= FEWEST:

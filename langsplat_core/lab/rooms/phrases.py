@@ -19,7 +19,7 @@ from langsplat_core.lab.rooms.variants import variants
 from langsplat_core.lab.world.photographs import photographed_room
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.compose import run_phrase, upright, viewer
+from langsplat_core.query.compose import run_phrase, upright, viewpoint
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import atoms, parse
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
@@ -76,7 +76,7 @@ def measure_room(room: Room, progress: Progress = silent) -> list[PhraseScore]:
     things = things_in(photographed_room(room.seed, room.tier), frame, room.seed)
     asked = [
         case
-        for case in cases(room.truth, things, viewer(held_out[0], frame), room.seed)
+        for case in cases(room.truth, things, viewpoint(held_out[0], frame), room.seed)
         if not any(engine.unknown_words(atom.text) for atom in atoms(parse(case.text)))
     ]
     ways: dict[str, Callable[[Case], Judged]] = {
