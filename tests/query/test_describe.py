@@ -5,16 +5,34 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.query import describe
-from langsplat_core.query.describe import Describer, field_meanings, same_things
+from langsplat_core.query import describe as words_module
+from langsplat_core.query.describe import (
+    NEAREST,
+    Describer,
+    WordScores,
+    build_attributes,
+    build_words,
+    certain,
+    completions,
+    corrected,
+    field_meanings,
+    hubs,
+    look_at_pixel,
+    meanings,
+    same_things,
+    suggest,
+)
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.instances import connected_parts
 from langsplat_core.query.surface import surface_areas
 from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_core.scene import Gaussians, Scene
+from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.scene import Gaussians, LanguageField, LinearCodec, Scene
+from langsplat_core.scene.codec import CodebookCodec
 from tests.support.blob_words import NAMES, named_field, named_scene
-from tests.support.fakes import CENTRES, PER_BLOB, WORDS, FakeEncoder, axis, blob_scene
+from tests.support.fakes import CENTRES, PER_BLOB, WORDS, FakeEncoder, axis, blob_scene, language
 
 
 @pytest.fixture(autouse=True)
@@ -155,7 +173,7 @@ def test_places_that_are_not_there():
     asked = describer(named_scene())
     with pytest.raises(InputError, match="Gaussian 360: the scene has Gaussians 0 to 359"):
         asked.at_gaussians(np.array([0, 360]))
-    with pytest.raises(InputError, match="pixel 160 3: the picture has columns 0 to 159 and rows 0 to 119"):
+    with pytest.raises(InputError, match="pixel 160 3: the image has columns 0 to 159 and rows 0 to 119"):
         asked.at_pixel(load_lifting_rasterizer("cpu"), named_scene().cameras[0], (160, 3))
 
 
@@ -192,9 +210,242 @@ def test_meanings_of_fields_without_codewords_are_the_gaussians_own():
 
 def test_parts_of_nothing_and_of_two_blobs():
     surface = QueryEngine(named_scene()).surface
-    assert connected_parts(surface, np.zeros(0, int)).each() == []
+    assert surface.parts(np.zeros(0, int)).each() == []
     rows = np.concatenate([np.arange(PER_BLOB), np.arange(2 * PER_BLOB, 3 * PER_BLOB)])  # two that are apart
     numbers = np.flatnonzero(np.isin(surface.rows, rows))
-    found = connected_parts(surface, numbers).each()
+    found = surface.parts(numbers).each()
     parts = [surface.rows[part] for part in found if len(part) > 1]
     assert {frozenset((part // PER_BLOB).tolist()) for part in parts} == {frozenset({0}), frozenset({2})}
+
+
+# Words of meanings, against a plain float64 reference.
+
+D, K, N, V = 24, 40, 90, 17
+
+
+def field(kind: str) -> LanguageField:
+    """Random meanings, by a codebook or by a linear codec; every seventh Gaussian has none."""
+    rng = np.random.default_rng(4)
+    confidence = np.ones((3, N), np.float32)
+    confidence[:, ::7] = 0
+    canonical = unit(rng.normal(size=(4, D))).astype(np.float32)
+    if kind == "codebook":
+        codec = CodebookCodec(unit(rng.normal(size=(K, D))).astype(np.float32), np.zeros((K, 3), np.float32))
+        latents = rng.integers(0, K, (3, N, 1)).astype(np.uint16)
+    else:
+        codec = LinearCodec(np.linalg.qr(rng.normal(size=(D, 6)))[0].T.astype(np.float32).copy())
+        latents = rng.normal(size=(3, N, 6)).astype(np.float32)
+    return LanguageField(latents, confidence, codec, canonical, "none")
+
+
+def phrases() -> tuple[tuple[str, ...], Array]:
+    vectors = unit(np.random.default_rng(5).normal(size=(V, D))).astype(np.float32)
+    return tuple(f"word {number}" for number in range(V)), vectors
+
+
+def plain_probabilities(made: LanguageField, vectors: Array, latents: Array, bank: Array) -> Array:
+    """The formula of the module, one meaning and one word after the other, in float64."""
+    every = [vector.astype(np.float64) for vector in (*vectors, *made.canonical)]
+    hub = []
+    for word in every:
+        cosines = sorted((float(word @ meaning) for meaning in bank.astype(np.float64)), reverse=True)
+        hub.append(np.mean(cosines[:NEAREST]))
+    spreads = [np.std([float(word @ meaning) for word in every[: len(vectors)]]) for meaning in bank]
+    rows, scale = [], words_module.WORD_SCALE / np.median(spreads)
+    for vector in made.codec.decode(latents).astype(np.float64):
+        fits = np.array([scale * (vector @ word - own / 2) for word, own in zip(every, hub, strict=True)])
+        shares = np.exp(fits - fits.max())
+        rows.append(shares / shares.sum())
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("kind", ["codebook", "linear"])
+def test_probabilities_and_mixtures_are_those_of_the_formula(kind, monkeypatch):
+    monkeypatch.setattr(words_module, "CELLS", 7 * (V + 4))  # several blocks
+    made = field(kind)
+    names, vectors = phrases()
+    words = build_words(made, names, vectors)
+    latents = made.latents[made.known][:60]
+    want = plain_probabilities(made, vectors, latents, meanings(made))
+    np.testing.assert_allclose(words.probabilities(made.codec, latents), want, atol=2e-5)
+    weights = np.random.default_rng(6).uniform(size=len(latents))
+    mixture = words.mixture(made.codec, latents, weights)
+    np.testing.assert_allclose(mixture, weights @ want / weights.sum(), atol=2e-5)
+    best, shares = words.best(made.codec, latents, 3)
+    order = np.argsort(-want[:, :V], axis=1)[:, :3]
+    assert (best == order).mean() > 0.99  # equal but for rounding
+    np.testing.assert_allclose(shares, np.take_along_axis(want, order, 1), atol=2e-5)
+
+
+def test_the_bank_holds_every_meaning_that_some_gaussian_has_once():
+    made = field("codebook")
+    used = np.unique(made.latents[made.known])
+    assert 0 < len(used) <= K
+    np.testing.assert_array_equal(meanings(made), made.codec.vectors[used])
+    assert len(meanings(field("linear"))) == field("linear").known.sum()
+
+
+def test_hubs_of_few_or_no_meanings():
+    vectors = np.eye(D, dtype=np.float32)[:2]
+    np.testing.assert_allclose(hubs(vectors, np.eye(D, dtype=np.float32)[:4]), [0.25, 0.25])
+    np.testing.assert_array_equal(hubs(vectors, np.zeros((0, D), np.float32)), [0, 0])
+
+
+def test_a_word_that_is_near_everything_is_not_the_answer_everywhere():
+    """Forty things around a common direction: "hub" is closest to most of them by the plain cosine."""
+    rng = np.random.default_rng(0)
+    centre = unit(np.ones(64))
+    things = unit(centre + 0.7 * unit(rng.normal(size=(40, 64)))).astype(np.float32)
+    names = unit(things + 0.85 * unit(rng.normal(size=(40, 64)))).astype(np.float32)
+    codec = CodebookCodec(things, np.zeros((40, 3), np.float32))
+    codes = np.tile(np.arange(40, dtype=np.uint16)[:, None], (3, 1, 1))
+    far = np.tile(unit(rng.normal(size=64)).astype(np.float32), (4, 1))
+    made = LanguageField(codes, np.ones((3, 40), np.float32), codec, far, "none")
+    vectors = np.concatenate([names, centre[None].astype(np.float32)])
+    labels = (*(f"thing {number}" for number in range(40)), "hub")
+    latents = codes[0]
+    right = (build_words(made, labels, vectors).best(codec, latents, 1)[0][:, 0] == np.arange(40)).mean()
+    plain = (build_attributes(made, labels, vectors).best(codec, latents, 1)[0][:, 0] == np.arange(40)).mean()
+    assert plain < 0.2
+    assert right > 0.8
+
+
+def test_very_different_cosines_do_not_overflow():
+    made = field("codebook")
+    names, vectors = phrases()
+    words = WordScores(names, vectors, np.zeros(V, np.float32), 1e6)
+    found = words.probabilities(made.codec, made.latents[0])
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(found.sum(1), 1, atol=1e-5)
+
+
+def test_the_canonical_phrases_take_what_no_word_fits():
+    made = field("codebook")
+    names, vectors = phrases()
+    latents = made.latents[made.known][:1]
+    like = made.codec.decode(latents)
+    nothing = LanguageField(made.latents, made.confidence, made.codec, np.repeat(like, 4, 0), "none")
+    assert build_words(nothing, names, vectors).mixture(made.codec, latents, np.ones(1))[V:].sum() > 0.9
+
+
+def test_an_attribute_is_said_where_it_is_certain():
+    made = field("codebook")
+    latents = np.array([[3], [3], [8]], np.uint16)
+    own = made.codec.vectors[[3, 8]]
+    colours = build_attributes(made, ("red", "blue"), own)
+    said = certain(colours, made.codec, latents, np.ones(3))
+    assert said is not None
+    assert said.phrase == "red"
+    assert 0.5 <= said.probability < 0.7
+    alike = build_attributes(made, ("a", "b", "c"), np.repeat(own[:1], 3, 0))
+    assert certain(alike, made.codec, latents, np.ones(3)) is None
+
+
+def test_words_that_are_taken_keep_their_numbers():
+    made = field("codebook")
+    names, vectors = phrases()
+    words = build_words(made, names, vectors)
+    few = words.take(np.arange(V) % 2 == 0)
+    assert few.phrases == names[::2]
+    assert len(few.vectors) == len(few.phrases) + 4
+    np.testing.assert_array_equal(few.vector("word 2"), words.vector("word 2"))
+    nothing = words.take(np.zeros(V, bool))
+    assert nothing.best(made.codec, made.latents[0], 5)[0].shape == (N, 0)
+
+
+# Examples of what a scene answers, and completions of what is typed.
+
+PHRASES = ("teddy bear", "tea pot", "red mug", "teapot", "mug")
+
+
+def test_every_example_is_found_in_the_scene():
+    engine = QueryEngine(blob_scene(), lambda _: FakeEncoder())
+    found = suggest(engine)
+    assert {"mug", "book", "plant"} >= set(found.examples)
+    assert found.examples
+    assert all(engine.run(phrase).found for phrase in found.examples)
+    assert set(found.examples) <= set(found.phrases)
+    assert len(suggest(engine, at_most=1).examples) == 1
+
+
+def test_without_an_encoder_the_phrasebook_is_asked():
+    nothing = (-axis(0) - axis(1) - axis(2)) / np.float32(np.sqrt(3))
+    book = {"mug": axis(0), "unicorn": nothing, "of": axis(1)}
+    scene = replace(blob_scene(), language=replace(language(), phrasebook=book))
+    found = suggest(QueryEngine(scene))
+    assert found.examples == ("mug",)
+    assert found.phrases == ("mug", "unicorn", "of")
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ("te", ["teddy bear", "tea pot", "teapot"]),
+        ("TEA ", []),
+        ("tea p", ["tea pot"]),
+        ("red te", ["red teddy", "red tea", "red teapot"]),
+        ("blue mu", ["blue mug"]),
+        ("mug", []),
+        ("", []),
+        ("zebra", []),
+    ],
+)
+def test_what_is_typed_is_completed(typed, offered):
+    assert completions(typed, PHRASES) == offered
+    assert completions(typed, PHRASES, at_most=1) == offered[:1]
+
+
+def test_a_correction_replaces_the_unknown_words_alone():
+    assert corrected("the Red mugg", {"mugg": ("mug", "muff")}) == "the red mug"
+    assert corrected("red mugg", {"mugg": ()}) is None
+
+
+# What lies under a pixel, against the whole picture of the reference rasterizer.
+
+
+@pytest.fixture(scope="module")
+def pointer() -> Describer:
+    engine = QueryEngine(blob_scene(), lambda encoder_id: FakeEncoder())
+    return Describer(engine, ("mug", "book", "plant"))
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("thing", range(3))
+def test_place_words_and_relevancy_are_those_of_the_pixel(describer, backend, thing):
+    engine, scene = describer.engine, describer.engine.scene
+    camera = scene.cameras[0].resized(160, 120)
+    (x, y), _ = (part[0] for part in camera.project(CENTRES[thing][None]))
+    pixel = (int(x), int(y))
+    results = [engine.run(phrase) for phrase in ("mug", "book", "plant")]
+    rasterizer = ReferenceRasterizer() if backend == "reference" else load_lifting_rasterizer("cpu")
+    found = look_at_pixel(rasterizer, describer, camera, pixel, results)
+
+    view = ReferenceRasterizer().view(scene.gaussians, camera, scene.raster_settings())
+    columns = np.stack([result.relevancy[result.level] for result in results], 1)
+    total, alpha = view.splat(columns.astype(np.float64))
+    expected = total[pixel[1], pixel[0]] / alpha[pixel[1], pixel[0]]
+    np.testing.assert_allclose(found.relevancy, expected, atol=2e-4)
+    assert int(np.argmax(found.relevancy)) == thing
+    assert found.words[2].words[0].phrase == ("mug", "book", "plant")[thing]
+    assert np.linalg.norm(found.position - CENTRES[thing]) < 0.6  # on the blob, towards the eye
+    np.testing.assert_allclose(camera.project(found.position[None])[0][0], np.add(pixel, 0.5), atol=1e-6)
+    assert found.depth == pytest.approx(camera.project(found.position[None])[1][0])
+
+
+def test_the_surface_is_at_the_median_of_the_weights(describer):
+    scene = describer.engine.scene
+    camera = scene.cameras[0].resized(160, 120)
+    (x, y), _ = (part[0] for part in camera.project(CENTRES[0][None]))
+    found = look_at_pixel(ReferenceRasterizer(), describer, camera, (int(x), int(y)))
+    view = ReferenceRasterizer().view(scene.gaussians, camera, scene.raster_settings())
+    one = np.zeros((120, 160, 1))
+    one[int(y), int(x)] = 1
+    weights = view.gather(one)[:, 0]
+    depths = camera.project(scene.gaussians.means.astype(np.float64))[1]
+    in_front = weights[depths < found.depth - 1e-9].sum()
+    assert in_front < weights.sum() / 2 <= in_front + weights[np.abs(depths - found.depth) < 1e-6].sum()
+
+
+def test_where_nothing_is_nothing_is_said(describer):
+    camera = describer.engine.scene.cameras[0].resized(160, 120)
+    assert look_at_pixel(load_lifting_rasterizer("cpu"), describer, camera, (0, 0)) is None

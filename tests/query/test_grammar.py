@@ -16,6 +16,7 @@ from langsplat_core.query.grammar import (
     Union,
     Without,
     atoms,
+    named,
     parse,
     reading,
 )
@@ -153,3 +154,26 @@ def test_every_text_is_read_or_refused(text):
         except InputError:
             continue
         assert all(atom.text.strip() and atom.text in reading(tree) for atom in atoms(tree))
+
+
+# What a phrase names by its words alone.
+
+
+@pytest.mark.parametrize(
+    ("phrase", "what"),
+    [
+        ("", "thing"),
+        ("mug", "thing"),
+        ("red mug", "thing"),
+        ("handle of", "thing"),
+        ("handle mug", "thing"),
+        ("handle", "part"),
+        ("Handles", "part"),
+        ("the red handle", "part"),
+        ("mug handle", "part of a thing"),
+        ("the red mug handles", "part of a thing"),
+        ("lamp shade", "part of a thing"),
+    ],
+)
+def test_a_part_word_at_the_end_names_a_part_and_a_thing_before_it_whose(phrase, what):
+    assert named(phrase) == what
