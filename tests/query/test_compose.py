@@ -1,5 +1,7 @@
 """Phrases with structure on a laid table, where every Gaussian's meaning is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.query.compose import (
     Body,
     body,
+    combine,
     gap,
     most,
     run_phrase,
@@ -228,3 +231,21 @@ def test_what_is_known_of_things_tells_apart_what_touches_and_keeps_together_wha
     apart = separate(surface, mugs[surface.rows], np.full(len(things), NO_THING, np.uint16))
     assert [list(part) for part in apart] == [list(part) for part in separate(surface, mugs[surface.rows])]
     assert len(apart) == 2
+
+
+@pytest.mark.parametrize("how", ["union", "intersection", "difference"])
+def test_answers_are_combined_as_their_members_are(table, how):
+    engine, _ = table
+    mug, red = engine.run("mug", "whole"), engine.run("red mug", "whole")
+    want = {
+        "union": mug.members | red.members,
+        "intersection": mug.members & red.members,
+        "difference": mug.members & ~red.members,
+    }[how]
+    np.testing.assert_array_equal(combine([mug, red], how).members, want)
+    assert combine([mug], how) is mug
+    if how == "union":
+        same = run_phrase(engine, "mug and red mug", "whole").answer
+        np.testing.assert_array_equal(same.members, want)
+    with pytest.raises(InputError, match="'plant' was not found"):
+        combine([mug, replace(red, phrase="plant", found=False)], how)

@@ -111,6 +111,8 @@ def test_a_pixel_that_shows_nothing_has_no_words():
     scene = named_scene()
     levels = describer(scene).at_pixel(load_lifting_rasterizer("cpu"), scene.cameras[1], (0, 0))
     assert [words.words for words in levels] == [(), (), ()]
+    asked = describer(scene)
+    assert look_at_pixel(load_lifting_rasterizer("cpu"), asked, scene.cameras[1], (0, 0)) is None
 
 
 @pytest.mark.parametrize("codebook", [True, False])
@@ -206,16 +208,6 @@ def test_meanings_of_fields_without_codewords_are_the_gaussians_own():
     held = field_meanings(made)
     assert (held.of[0] == -1).all()
     np.testing.assert_array_equal(held.latents[held.of[2]], made.latents[2])
-
-
-def test_parts_of_nothing_and_of_two_blobs():
-    surface = QueryEngine(named_scene()).surface
-    assert surface.parts(np.zeros(0, int)).each() == []
-    rows = np.concatenate([np.arange(PER_BLOB), np.arange(2 * PER_BLOB, 3 * PER_BLOB)])  # two that are apart
-    numbers = np.flatnonzero(np.isin(surface.rows, rows))
-    found = surface.parts(numbers).each()
-    parts = [surface.rows[part] for part in found if len(part) > 1]
-    assert {frozenset((part // PER_BLOB).tolist()) for part in parts} == {frozenset({0}), frozenset({2})}
 
 
 # Words of meanings, against a plain float64 reference.
@@ -403,22 +395,17 @@ def test_a_correction_replaces_the_unknown_words_alone():
 # What lies under a pixel, against the whole picture of the reference rasterizer.
 
 
-@pytest.fixture(scope="module")
-def pointer() -> Describer:
-    engine = QueryEngine(blob_scene(), lambda encoder_id: FakeEncoder())
-    return Describer(engine, ("mug", "book", "plant"))
-
-
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 @pytest.mark.parametrize("thing", range(3))
-def test_place_words_and_relevancy_are_those_of_the_pixel(describer, backend, thing):
-    engine, scene = describer.engine, describer.engine.scene
+def test_place_words_and_relevancy_are_those_of_the_pixel(backend, thing):
+    asked = describer(blob_scene(), WORDS)
+    engine, scene = asked.engine, asked.engine.scene
     camera = scene.cameras[0].resized(160, 120)
     (x, y), _ = (part[0] for part in camera.project(CENTRES[thing][None]))
     pixel = (int(x), int(y))
-    results = [engine.run(phrase) for phrase in ("mug", "book", "plant")]
+    results = [engine.run(phrase) for phrase in WORDS]
     rasterizer = ReferenceRasterizer() if backend == "reference" else load_lifting_rasterizer("cpu")
-    found = look_at_pixel(rasterizer, describer, camera, pixel, results)
+    found = look_at_pixel(rasterizer, asked, camera, pixel, results)
 
     view = ReferenceRasterizer().view(scene.gaussians, camera, scene.raster_settings())
     columns = np.stack([result.relevancy[result.level] for result in results], 1)
@@ -426,17 +413,18 @@ def test_place_words_and_relevancy_are_those_of_the_pixel(describer, backend, th
     expected = total[pixel[1], pixel[0]] / alpha[pixel[1], pixel[0]]
     np.testing.assert_allclose(found.relevancy, expected, atol=2e-4)
     assert int(np.argmax(found.relevancy)) == thing
-    assert found.words[2].words[0].phrase == ("mug", "book", "plant")[thing]
+    assert found.words[2].words[0].phrase == WORDS[thing]
     assert np.linalg.norm(found.position - CENTRES[thing]) < 0.6  # on the blob, towards the eye
     np.testing.assert_allclose(camera.project(found.position[None])[0][0], np.add(pixel, 0.5), atol=1e-6)
     assert found.depth == pytest.approx(camera.project(found.position[None])[1][0])
 
 
-def test_the_surface_is_at_the_median_of_the_weights(describer):
-    scene = describer.engine.scene
+def test_the_surface_is_at_the_median_of_the_weights():
+    scene = blob_scene()
     camera = scene.cameras[0].resized(160, 120)
     (x, y), _ = (part[0] for part in camera.project(CENTRES[0][None]))
-    found = look_at_pixel(ReferenceRasterizer(), describer, camera, (int(x), int(y)))
+    asked = describer(scene, WORDS)
+    found = look_at_pixel(ReferenceRasterizer(), asked, camera, (int(x), int(y)))
     view = ReferenceRasterizer().view(scene.gaussians, camera, scene.raster_settings())
     one = np.zeros((120, 160, 1))
     one[int(y), int(x)] = 1
@@ -444,8 +432,3 @@ def test_the_surface_is_at_the_median_of_the_weights(describer):
     depths = camera.project(scene.gaussians.means.astype(np.float64))[1]
     in_front = weights[depths < found.depth - 1e-9].sum()
     assert in_front < weights.sum() / 2 <= in_front + weights[np.abs(depths - found.depth) < 1e-6].sum()
-
-
-def test_where_nothing_is_nothing_is_said(describer):
-    camera = describer.engine.scene.cameras[0].resized(160, 120)
-    assert look_at_pixel(load_lifting_rasterizer("cpu"), describer, camera, (0, 0)) is None

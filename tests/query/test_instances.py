@@ -68,6 +68,7 @@ def test_parts_are_the_connected_components():
     grouped = np.split(parts.order, parts.starts[1:])
     assert all(set(parts.labels[group]) == {part} for part, group in enumerate(grouped))
     assert (np.delete(parts.labels, numbers) < 0).all()
+    assert surface.parts(numbers[:0]).each() == []
 
 
 def test_every_ball_is_an_instance_with_the_figures_of_a_plain_account():

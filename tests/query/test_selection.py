@@ -1,4 +1,4 @@
-"""Selections: their algebra, and growing and shrinking along the surface against plain walks."""
+"""Selections: along the surface against plain walks, and drawn on an image against plain loops."""
 
 import heapq
 from math import cos, hypot, inf, nan, pi, sin
@@ -8,7 +8,6 @@ import pytest
 
 from langsplat_core.errors import InputError
 from langsplat_core.query import selection
-from langsplat_core.query.instances import OrientedBox
 from langsplat_core.query.selection import Projected, in_polygon, in_rectangle, in_stroke, on_surface, project
 from langsplat_core.query.surface import Surface, build_regions, build_surface
 from langsplat_core.scene import Gaussians, look_at
@@ -48,27 +47,11 @@ def random_selection(n: int, seed: int = 0, share: float = 0.1) -> np.ndarray:
     return np.random.default_rng(seed).uniform(size=n) < share
 
 
-def test_algebra():
-    a, b, c = (np.array(row, bool) for row in ([1, 1, 0, 0], [1, 0, 1, 0], [1, 0, 0, 0]))
-    assert selection.union([a, b, c]).tolist() == [True, True, True, False]
-    assert selection.intersection([a, b]).tolist() == [True, False, False, False]
-    assert selection.difference([a, b, c]).tolist() == [False, True, False, False]
-    assert selection.difference([a]).tolist() == a.tolist()
-    assert selection.difference([a]) is not a
-    assert selection.invert(c).tolist() == [False, True, True, True]
-    assert selection.of_rows(np.array([0, 3]), 4).tolist() == [True, False, False, True]
-
-
 def test_spheres_and_boxes_hold_their_faces_and_nothing_without_a_place():
     means = np.array([[0, 0, 0], [1, 0, 0], [1.001, 0, 0], [nan, 0, 0], [0, -1, 1]], np.float32)
     assert selection.in_sphere(means, np.zeros(3), 1.0).tolist() == [True, True, False, False, False]
     inside = selection.in_box(means, np.array([0, -1, 0]), np.array([1, 0, 1]))
     assert inside.tolist() == [True, True, False, False, True]
-    c = np.sqrt(0.5)
-    axes = np.array([[c, -c, 0], [c, c, 0], [0, 0, 1]])
-    turned = OrientedBox(np.zeros(3), axes, np.array([2.0, 0.125, 0.125]))
-    points = np.array([[1.4, 1.4, 0], [1.4, -1.4, 0], [0, 0, 0.125], [0, 0, inf]], np.float32)
-    assert selection.in_oriented_box(points, turned).tolist() == [True, False, True, False]
 
 
 @pytest.mark.parametrize("distance", [0.0, 0.15, 0.4, 100.0])
@@ -80,17 +63,6 @@ def test_growing_by_a_distance_is_the_shortest_way(distance):
     grown = selection.grow(surface, selected, distance)
     assert grown[surface.rows].tolist() == (lengths <= distance).tolist()
     assert (grown >= selected).all()
-
-
-def test_growing_by_steps_is_the_same_as_walking():
-    gaussians = random_gaussians(300)
-    surface = build_surface(gaussians)
-    selected = random_selection(300, share=0.02)
-    reached = set(np.flatnonzero(selected[surface.rows]).tolist())
-    for steps in range(4):
-        grown = selection.grow_steps(surface, selected, steps)
-        assert set(np.flatnonzero(grown[surface.rows]).tolist()) == reached
-        reached |= {int(there) for here in reached for there in surface.links[here].indices}
 
 
 def test_shrinking_undoes_growing_on_a_sheet_and_faint_ones_follow():
@@ -107,7 +79,6 @@ def test_shrinking_undoes_growing_on_a_sheet_and_faint_ones_follow():
     assert 0 < opened.sum() < start.sum()
     assert (opened <= start).all()
     assert not selection.shrink(surface, start, 1.0).any()
-    assert not selection.shrink_steps(surface, start, 9).any()
 
 
 def test_a_faint_gaussian_that_is_not_selected_shrinks_nothing():
@@ -123,7 +94,6 @@ def test_shrinking_keeps_where_the_surface_ends():
     surface = build_surface(gaussians)
     everything = np.ones(len(gaussians), bool)
     assert selection.shrink(surface, everything, 5.0).all()
-    assert selection.shrink_steps(surface, everything, 5).all()
 
 
 def test_what_lies_nearest_to_a_point_is_selected_as_a_region():
@@ -146,8 +116,6 @@ def test_a_distance_that_cannot_be_walked(wrong):
     nothing = np.zeros(50, bool)
     with pytest.raises(InputError, match="give 0 or more"):
         selection.grow(surface, nothing, wrong)
-    with pytest.raises(InputError, match="give 0 or more"):
-        selection.shrink_steps(surface, nothing, wrong)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -155,7 +123,6 @@ def test_scenes_of_almost_nothing(count):
     surface = build_surface(random_gaussians(count), min_opacity=0.0)
     for selected in (np.zeros(count, bool), np.ones(count, bool)):
         assert selection.grow(surface, selected, 1.0).tolist() == selected.tolist()
-        assert selection.shrink_steps(surface, selected).tolist() == selected.tolist()
 
 
 # Selections drawn on a picture, against plain loops.
