@@ -4,7 +4,7 @@ own, and words for what is there."""
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -28,7 +28,7 @@ from langsplat_core.io.shapes import (
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.answers import QueryResult, peak_pixel
 from langsplat_core.query.compose import Combination, check_phrase, combine, run_phrase
-from langsplat_core.query.describe import Describer, Entry, Levels, Spot, Word, Words
+from langsplat_core.query.describe import Describer, Entry, Words
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, no_field
 from langsplat_core.query.grammar import Atom
 from langsplat_core.query.instances import Instance, hulls
@@ -345,7 +345,7 @@ class Describe:
         with TerminalProgress() as progress:
             engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
             describer = Describer(engine, phrases, progress)
-            answer = self._entries(describer, progress) if self._everything else self._words(describer)
+            answer = self._described(describer, progress)
         if self.json:
             _print_json(answer | _basis(engine))
             return
@@ -393,83 +393,52 @@ class Describe:
                 f"0 to {camera.height - 1}"
             )
 
-    def _entries(self, describer: Describer, progress: Progress) -> dict[str, Any]:
-        """The inventory, ready for JSON."""
-        sure = describer.engine.basis.calibration is not None
-        entries = [
-            _entry(entry, sure)
-            for entry in describer.inventory(progress)
-            if self.level in (None, LEVELS[entry.level])
-        ]
-        return _asked(describer) | {"inventory": entries}
-
-    def _words(self, describer: Describer) -> dict[str, Any]:
-        """Words of the pixel, Gaussian or thing, ready for JSON."""
-        scene = describer.engine.scene
-        levels: Levels
+    def _described(self, describer: Describer, progress: Progress) -> dict[str, Any]:
+        """The inventory, or the words of the place that is asked for, ready for JSON."""
+        engine = describer.engine
+        found: Sequence[Words | Entry]
+        place: dict[str, Any] = {}
         if self.pixel is not None:
-            camera = scene.cameras[self.camera]
-            levels = describer.at_pixel(load_lifting_rasterizer("cpu"), camera, self.pixel, self.top)
-            place: dict[str, Any] = {"camera": self.camera, "view": camera.name, "pixel": list(self.pixel)}
+            camera = engine.scene.cameras[self.camera]
+            found = describer.at_pixel(load_lifting_rasterizer("cpu"), camera, self.pixel, self.top)
+            place = {"camera": self.camera, "view": camera.name, "pixel": list(self.pixel)}
         elif self.phrase is not None:
-            engine = describer.engine
             answer = combine([run_phrase(engine, self.phrase).answer], "union")
             thing = _chosen(engine.instances(answer), [self.instance])[0]
-            levels = describer.at_gaussians(thing.members, top=self.top)
+            found = describer.at_gaussians(thing.members, top=self.top)
             place = {"phrase": self.phrase, "thing": _instance(thing, self.instance)}
-        else:
-            levels = describer.at_gaussians(np.array([self.gaussian]), np.ones(1), self.top)
+        elif self.gaussian is not None:
+            found = describer.at_gaussians(np.array([self.gaussian]), np.ones(1), self.top)
             place = {"gaussian": self.gaussian}
-        wanted = [words for words in levels if self.level in (None, LEVELS[words.level])]
-        sure = describer.engine.basis.calibration is not None
-        return place | _asked(describer) | {"levels": [_level(words, sure) for words in wanted]}
+        else:
+            found = describer.inventory(progress)
+        sure = engine.basis.calibration is not None
+        wanted = [_plain(one, sure) for one in found if self.level in (None, LEVELS[one.level])]
+        asked = {"asked": len(describer.words[0].phrases), "left_out": len(describer.left_out)}
+        return place | asked | {"inventory" if self._everything else "levels": wanted}
 
 
-def _asked(describer: Describer) -> dict[str, Any]:
-    return {"asked": len(describer.words[0].phrases), "left_out": len(describer.left_out)}
-
-
-def _share(softmax: float, sure: bool) -> dict[str, Any]:
-    """A share of the softmax over a vocabulary, which is a probability where that is `sure`."""
-    return {"softmax": softmax, "probability": softmax if sure else None}
-
-
-def _word(word: Word | None, sure: bool) -> dict[str, Any] | None:
-    return None if word is None else {"phrase": word.phrase, **_share(word.probability, sure)}
-
-
-def _level(words: Words, sure: bool) -> dict[str, Any]:
-    return {
-        "level": LEVELS[words.level],
-        "words": [_word(word, sure) for word in words.words],
-        "other": words.other,
-        "known": words.known,
-        "colour": _word(words.colour, sure),
-        "material": _word(words.material, sure),
-    }
-
-
-def _spot(spot: Spot, sure: bool) -> dict[str, Any]:
-    return {
-        "centre": spot.centre.tolist(),
-        "box": spot.box.tolist(),
-        "gaussians": len(spot.rows),
-        "share": spot.share,
-        "colour": _word(spot.colour, sure),
-        "material": _word(spot.material, sure),
-    }
-
-
-def _entry(entry: Entry, sure: bool) -> dict[str, Any]:
-    return {
-        "phrase": entry.phrase,
-        "also": list(entry.also),
-        "level": LEVELS[entry.level],
-        **_share(entry.probability, sure),
-        "score": entry.score,
-        "share": entry.share,
-        "spots": [_spot(spot, sure) for spot in entry.spots],
-    }
+def _plain(value: Any, sure: bool) -> Any:
+    """Words, spots and entries, ready for JSON. A share of the softmax over a vocabulary is a probability too
+    where that is `sure`."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, tuple):
+        return [_plain(item, sure) for item in value]
+    if not is_dataclass(value):
+        return value
+    made: dict[str, Any] = {}
+    for name in (field.name for field in fields(value)):
+        held = getattr(value, name)
+        if name == "level":
+            made[name] = LEVELS[held]
+        elif name == "rows":
+            made["gaussians"] = len(held)
+        elif name == "probability":
+            made |= {"softmax": held, "probability": held if sure else None}
+        else:
+            made[name] = _plain(held, sure)
+    return made
 
 
 def _looks(described: dict[str, Any]) -> str:

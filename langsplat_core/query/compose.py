@@ -32,7 +32,7 @@ from langsplat_core.query.grammar import (
     children,
     named,
     parse,
-    reading,
+    unparse,
 )
 from langsplat_core.query.surface import Surface
 from langsplat_core.scene import LEVELS, NO_THING, Camera
@@ -384,7 +384,7 @@ class ComposedResult:
     @property
     def reading(self) -> str:
         """Such as "handle  inside  red mug"."""
-        return reading(self.tree)
+        return unparse(self.tree)
 
 
 def run_phrase(

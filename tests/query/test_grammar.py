@@ -18,7 +18,7 @@ from langsplat_core.query.grammar import (
     atoms,
     named,
     parse,
-    reading,
+    unparse,
 )
 from langsplat_core.scene.language import split_phrases
 
@@ -102,10 +102,10 @@ def test_a_text_without_end_is_refused():
 
 
 def test_readings_show_the_structure():
-    assert reading(parse("red mug handle")) == "handle  inside  red mug"
-    assert reading(parse("biggest mug on the table")) == "biggest  (mug  on  table)"
-    assert reading(parse("mug nearest to the book")) == "nearest  mug  from  book"
-    assert reading(parse("mug or cup, not red cup")) == "(mug  or  cup)  without  red cup"
+    assert unparse(parse("red mug handle")) == "handle  inside  red mug"
+    assert unparse(parse("biggest mug on the table")) == "biggest  (mug  on  table)"
+    assert unparse(parse("mug nearest to the book")) == "nearest  mug  from  book"
+    assert unparse(parse("mug or cup, not red cup")) == "(mug  or  cup)  without  red cup"
 
 
 WORDS = st.sampled_from(
@@ -153,7 +153,7 @@ def test_every_text_is_read_or_refused(text):
             tree = parse(query)
         except InputError:
             continue
-        assert all(atom.text.strip() and atom.text in reading(tree) for atom in atoms(tree))
+        assert all(atom.text.strip() and atom.text in unparse(tree) for atom in atoms(tree))
 
 
 # What a phrase names by its words alone.
