@@ -203,14 +203,6 @@ def test_a_turned_box_is_found_again(sides, seed, measured):
     assert error < 0.08
 
 
-def test_axes_turn_with_the_points_and_the_sides_stay():
-    points = filled((3, 2, 1))
-    plain, rotation = oriented_box(points), turned(1)
-    box = oriented_box(points @ rotation.T + 3)
-    np.testing.assert_allclose(box.half_extents, plain.half_extents, rtol=0.05)
-    assert (np.abs(np.sum(box.axes * (rotation @ plain.axes), axis=0)) > np.cos(np.radians(8))).all()
-
-
 def test_strays_do_not_count():
     points = filled((3, 2, 1))
     before = oriented_box(points)
@@ -308,23 +300,14 @@ def test_the_hull_of_a_cloud_is_its_convex_hull_within_the_box():
 @pytest.mark.parametrize("flat", [[1, 1, 0], [1, 0, 0]], ids=["sheet", "line"])
 def test_sheets_and_lines_are_given_a_thickness(flat):
     instance, gaussians = thing(np.random.default_rng(0).uniform(size=(200, 3)) * flat)
-    mesh = hull(instance, gaussians, colours(200), "flat")
-    check_closed(mesh)
-    assert volume(mesh) > 0
+    meshes = hulls([instance, replace(instance)], gaussians, colours(200), "red mug")
+    assert [mesh.name for mesh in meshes] == ["red mug 1", "red mug 2"]
+    check_closed(meshes[0])
+    assert volume(meshes[0]) > 0
 
 
-def test_four_points_are_enough_and_all_of_them_count():
+def test_four_points_are_enough_and_one_is_not():
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
     assert volume(hull(*thing(points), colours(4), "four")) == pytest.approx(1 / 6)
-
-
-def test_a_point_has_none():
-    instance, gaussians = thing(np.ones((5, 3)))
     with pytest.raises(InputError, match="mug 1 is a single point"):
-        hulls([instance], gaussians, colours(5), "mug")
-
-
-def test_each_has_a_number():
-    instance, gaussians = thing(np.random.default_rng(0).uniform(size=(50, 3)))
-    found = hulls([instance, replace(instance)], gaussians, colours(50), "red mug")
-    assert [mesh.name for mesh in found] == ["red mug 1", "red mug 2"]
+        hull(*thing(np.ones((5, 3))), colours(5), "mug 1")

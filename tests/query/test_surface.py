@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
-from langsplat_core.arrays import Array, sigmoid, unit
+from langsplat_core.arrays import sigmoid, unit
 from langsplat_core.query.surface import (
     BORDER,
     NEIGHBOURS,
@@ -105,16 +105,6 @@ def line(count: int, gaps: tuple[int, ...] = ()) -> Gaussians:
         quats_wxyz=np.tile([1.0, 0, 0, 0], (count, 1)),
         opacity_logits=np.full(count, 3.0),
         sh=np.zeros((count, 1, 3)),
-    )
-
-
-def one_meaning(count: int, things: Array | None = None) -> LanguageField:
-    field = random_field(count, "codebook")
-    return replace(
-        field,
-        latents=np.full_like(field.latents, 3),
-        confidence=np.ones_like(field.confidence),
-        things=None if things is None else np.asarray(things, np.uint16),
     )
 
 
@@ -235,57 +225,43 @@ def test_almost_no_gaussians(kind, count):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_where_nothing_has_a_meaning_a_region_is_what_hangs_together(kind):
-    field = random_field(60, kind)
-    field = replace(field, confidence=np.zeros_like(field.confidence))
-    surface = build_surface(line(60, gaps=(25,)))
-    regions = build_regions(surface, field)
-    assert_sound(regions, surface)
-    assert [sorted(sizes) for sizes in regions.sizes] == [[25, 35]] * 3
-
-
-def test_one_meaning_is_one_region_for_every_part_of_the_surface():
+@pytest.mark.parametrize("known", [0, 1])
+def test_one_meaning_or_none_is_a_region_for_every_part_of_the_surface(kind, known):
+    field = random_field(70, kind)
+    latents = np.broadcast_to(field.latents[:1, :1], field.latents.shape).copy()
+    field = replace(field, latents=latents, confidence=np.full_like(field.confidence, known))
     surface = build_surface(line(70, gaps=(20, 61)))
-    regions = build_regions(surface, one_meaning(70))
+    regions = build_regions(surface, field)
     assert_sound(regions, surface)
     assert [sorted(sizes) for sizes in regions.sizes] == [[9, 20, 41]] * 3
 
 
-def test_two_things_that_touch_stay_apart_as_wholes_alone():
-    things = np.repeat([7, 2], 40)
-    surface = build_surface(line(80))
-    regions = build_regions(surface, one_meaning(80, things))
-    assert [len(sizes) for sizes in regions.sizes] == [1, 1, 2]
-    assert_same_partition(regions.of[2], things[surface.rows])
+HALVES, SIDES = np.repeat([0, 1], 40), np.repeat([5, 3, 6], [20, 40, 20])
 
 
-def test_a_thing_is_one_region_whatever_its_sides_mean():
-    field = one_meaning(80, np.repeat([0, 1], 40))
-    latents = field.latents.copy()
-    latents[:, :20], latents[:, 60:] = 5, 6
-    surface = build_surface(line(80))
-    regions = build_regions(surface, replace(field, latents=latents))
-    assert [len(sizes) for sizes in regions.sizes] == [3, 3, 2]
-    assert_same_partition(regions.of[2], field.things[surface.rows])
-
-
-def test_what_is_of_no_thing_goes_by_its_meaning():
-    nothing = np.full(80, NO_THING)
-    nothing[:40] = 4
-    surface = build_surface(line(80))
-    assert len(build_regions(surface, one_meaning(80, nothing)).sizes[2]) == 1
-    plain = build_regions(surface, one_meaning(80)).of
-    all_nothing = build_regions(surface, one_meaning(80, np.full(80, NO_THING))).of
-    np.testing.assert_array_equal(all_nothing, plain)
-
-
-def test_meant_and_not_meant_are_apart():
-    field = one_meaning(80)
-    field.confidence[:, 40:] = 0
-    surface = build_surface(line(80))
-    regions = build_regions(surface, field)
-    for of in regions.of:
-        assert_same_partition(of, surface.rows < 40)
+@pytest.mark.parametrize(
+    ("meaning", "known", "things", "finer", "whole"),
+    [
+        (3, 1, HALVES, 0, HALVES),  # two things that touch stay apart, as wholes alone
+        (SIDES, 1, HALVES, SIDES, HALVES),  # a thing is one region, whatever its sides mean
+        (3, 1, np.where(HALVES, NO_THING, 4), 0, 0),  # what is of no thing goes by its meaning
+        (SIDES, 1, NO_THING, SIDES, SIDES),
+        (3, HALVES, None, HALVES, HALVES),  # what means something is apart from what means nothing
+    ],
+)
+def test_borders_of_regions_on_a_line(meaning, known, things, finer, whole):
+    field, surface = random_field(80, "codebook"), build_surface(line(80))
+    latents, confidence, things = (
+        None if row is None else np.broadcast_to(row, 80) for row in (meaning, known, things)
+    )
+    field = replace(
+        field,
+        latents=np.tile(latents.astype(np.uint16)[:, None], (3, 1, 1)),
+        confidence=np.tile(confidence.astype(np.float32), (3, 1)),
+        things=None if things is None else things.astype(np.uint16),
+    )
+    for of, want in zip(build_regions(surface, field).of, (finer, finer, whole), strict=True):
+        assert_same_partition(of, np.broadcast_to(want, 80)[surface.rows])
 
 
 def test_values_without_meaning_elsewhere_harm_no_mean():
@@ -297,9 +273,6 @@ def test_values_without_meaning_elsewhere_harm_no_mean():
     values[:, ::3] = np.nan
     for means in build_regions(surface, field).means(values):
         assert means == pytest.approx(0.5)
-
-
-COUNT = 3000
 
 
 def plain_means(surface: Surface, regions: Regions, values: np.ndarray) -> list[np.ndarray]:
@@ -316,18 +289,18 @@ def plain_means(surface: Surface, regions: Regions, values: np.ndarray) -> list[
 def scattered() -> tuple[Surface, Regions]:
     """Random Gaussians, a third of them faint and some far from all others."""
     rng = np.random.default_rng(4)
-    gaussians = random_gaussians(COUNT)
-    gaussians.means[:] = rng.normal(size=(COUNT, 3))
+    gaussians = random_gaussians(3000)
+    gaussians.means[:] = rng.normal(size=(3000, 3))
     gaussians.means[:20] *= 100
-    gaussians.opacity_logits[:] = rng.choice([-4.0, 1.0], COUNT, p=[1 / 3, 2 / 3])
-    field = random_field(COUNT, "codebook")
+    gaussians.opacity_logits[:] = rng.choice([-4.0, 1.0], 3000, p=[1 / 3, 2 / 3])
+    field = random_field(3000, "codebook")
     surface = build_surface(gaussians)
     return surface, build_regions(surface, field)
 
 
 def test_means_of_regions_are_those_of_the_plain_way(scattered):
     surface, regions = scattered
-    values = np.random.default_rng(5).uniform(size=(3, COUNT)).astype(np.float32)
+    values = np.random.default_rng(5).uniform(size=(3, 3000)).astype(np.float32)
     for got, want in zip(regions.means(values), plain_means(surface, regions, values), strict=True):
         assert len(want) > 1
         np.testing.assert_allclose(got, want, rtol=1e-12)
@@ -335,19 +308,19 @@ def test_means_of_regions_are_those_of_the_plain_way(scattered):
 
 def test_what_is_spread_reaches_faint_ones_beside_a_region_and_no_others(scattered):
     surface, regions = scattered
-    others = np.random.default_rng(6).uniform(size=COUNT).astype(np.float32)
+    others = np.random.default_rng(6).uniform(size=3000).astype(np.float32)
     for level, of in enumerate(regions.of):
         values = np.arange(len(regions.sizes[level]), dtype=np.float32)
         want = np.array(
             [values[of[a]] if a >= 0 else o for a, o in zip(surface.anchors, others, strict=True)]
         )
         np.testing.assert_array_equal(regions.spread(level, values, others), want)
-    assert 0 < (surface.anchors < 0).sum() < COUNT / 3 < (regions.weights == 0).sum()
+    assert 0 < (surface.anchors < 0).sum() < 3000 / 3 < (regions.weights == 0).sum()
 
 
 def test_the_evened_map_is_the_mean_of_each_region(scattered):
     surface, regions = scattered
-    relevancy = np.random.default_rng(7).uniform(size=(3, COUNT)).astype(np.float32)
+    relevancy = np.random.default_rng(7).uniform(size=(3, 3000)).astype(np.float32)
     even = regions.even(relevancy)
     for row, of, means in zip(even, regions.of, plain_means(surface, regions, relevancy), strict=True):
         np.testing.assert_allclose(row[surface.rows], means[of], rtol=1e-6)
