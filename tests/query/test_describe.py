@@ -8,7 +8,6 @@ import pytest
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.query import describe
-from langsplat_core.query import describe as words_module
 from langsplat_core.query.describe import (
     NEAREST,
     Describer,
@@ -18,7 +17,6 @@ from langsplat_core.query.describe import (
     certain,
     completions,
     corrected,
-    field_meanings,
     hubs,
     look_at_pixel,
     meanings,
@@ -28,7 +26,6 @@ from langsplat_core.query.describe import (
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.surface import surface_areas
 from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Gaussians, LanguageField, LinearCodec, Scene
 from langsplat_core.scene.codec import CodebookCodec
 from tests.support.blob_words import NAMES, named_field, named_scene
@@ -86,33 +83,50 @@ def test_gaussians_without_a_surface_still_mean_something():
 
 
 @pytest.mark.parametrize("codebook", [True, False])
-def test_a_pixel_blends_probabilities_by_the_rows_of_w(codebook):
-    """Against float64: the reference's weights at the pixel, and every Gaussian's own words."""
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_a_pixel_is_what_the_rows_of_w_say(codebook, backend):
+    """Against float64: the reference's weights at the pixel, and every Gaussian's own words and relevancy.
+    The surface is at the median of their depths."""
     scene = named_scene(codebook)
     asked, camera = describer(scene), scene.cameras[1]
+    engine, names = asked.engine, asked.words[2]
+    results = [engine.run(word) for word in WORDS]
+    relevancy = np.stack([result.relevancy[result.level] for result in results], 1)
+    own = names.probabilities(engine.field.codec, engine.field.latents[2]).astype(np.float64)
     view = load_lifting_rasterizer("reference").view(scene.gaussians, camera)
-    for centre in [*CENTRES, (CENTRES[0] + CENTRES[1]) / 2 + (-0.15, 0, 0)]:
-        (column, row), _ = camera.project(centre[None])[0].astype(int)[0], None
+    depths = camera.project(scene.gaussians.means.astype(np.float64))[1]
+    for thing, centre in enumerate([*CENTRES, (CENTRES[0] + CENTRES[1]) / 2 + (-0.15, 0, 0)]):
+        column, row = camera.project(centre[None])[0][0].astype(int).tolist()
         image = np.zeros((camera.height, camera.width, 1))
         image[row, column] = 1
         weights = view.gather(image)[:, 0]
         if weights.sum() <= 0.3:
             continue
-        words = asked.words[2]
-        own = words.probabilities(asked.engine.field.codec, asked.engine.field.latents[2]).astype(np.float64)
+        rasterizer = load_lifting_rasterizer(backend)
+        found = look_at_pixel(rasterizer, asked, camera, (column, row), results, top=4)
+        assert asked.at_pixel(rasterizer, camera, (column, row), top=4) == found.words
         want = weights @ own / weights.sum()
-        got = asked.at_pixel(load_lifting_rasterizer("cpu"), camera, (int(column), int(row)), top=4)[2]
-        for word in got.words:
-            expected = want[words.phrases.index(word.phrase)]
-            assert word.probability == pytest.approx(expected, abs=1e-4)
+        for word in found.words[2].words:
+            assert word.probability == pytest.approx(want[names.phrases.index(word.phrase)], abs=1e-4)
+        np.testing.assert_allclose(found.relevancy, weights @ relevancy / weights.sum(), atol=2e-4)
+        back, depth = camera.project(found.position[None])
+        np.testing.assert_allclose(back[0], (column + 0.5, row + 0.5), atol=1e-6)
+        assert found.depth == pytest.approx(depth[0])
+        if thing < len(WORDS):
+            assert found.words[2].words[0].phrase == WORDS[thing]
+            assert np.linalg.norm(found.position - centre) < 0.6  # on the blob, towards the eye
+        if backend == "reference":
+            in_front = weights[depths < found.depth - 1e-9].sum()
+            there = weights[np.abs(depths - found.depth) < 1e-6].sum()
+            assert in_front < weights.sum() / 2 <= in_front + there
 
 
 def test_a_pixel_that_shows_nothing_has_no_words():
-    scene = named_scene()
-    levels = describer(scene).at_pixel(load_lifting_rasterizer("cpu"), scene.cameras[1], (0, 0))
-    assert [words.words for words in levels] == [(), (), ()]
+    scene, rasterizer = named_scene(), load_lifting_rasterizer("cpu")
     asked = describer(scene)
-    assert look_at_pixel(load_lifting_rasterizer("cpu"), asked, scene.cameras[1], (0, 0)) is None
+    levels = asked.at_pixel(rasterizer, scene.cameras[1], (0, 0))
+    assert [words.words for words in levels] == [(), (), ()]
+    assert look_at_pixel(rasterizer, asked, scene.cameras[1], (0, 0)) is None
 
 
 @pytest.mark.parametrize("codebook", [True, False])
@@ -203,13 +217,6 @@ def test_surface_of_gaussians():
     assert len(surface_areas(shape.take(np.zeros(0, int)))) == 0
 
 
-def test_meanings_of_fields_without_codewords_are_the_gaussians_own():
-    made = named_field(codebook=False)
-    held = field_meanings(made)
-    assert (held.of[0] == -1).all()
-    np.testing.assert_array_equal(held.latents[held.of[2]], made.latents[2])
-
-
 # Words of meanings, against a plain float64 reference.
 
 D, K, N, V = 24, 40, 90, 17
@@ -243,7 +250,7 @@ def plain_probabilities(made: LanguageField, vectors: Array, latents: Array, ban
         cosines = sorted((float(word @ meaning) for meaning in bank.astype(np.float64)), reverse=True)
         hub.append(np.mean(cosines[:NEAREST]))
     spreads = [np.std([float(word @ meaning) for word in every[: len(vectors)]]) for meaning in bank]
-    rows, scale = [], words_module.WORD_SCALE / np.median(spreads)
+    rows, scale = [], describe.WORD_SCALE / np.median(spreads)
     for vector in made.codec.decode(latents).astype(np.float64):
         fits = np.array([scale * (vector @ word - own / 2) for word, own in zip(every, hub, strict=True)])
         shares = np.exp(fits - fits.max())
@@ -253,7 +260,7 @@ def plain_probabilities(made: LanguageField, vectors: Array, latents: Array, ban
 
 @pytest.mark.parametrize("kind", ["codebook", "linear"])
 def test_probabilities_and_mixtures_are_those_of_the_formula(kind, monkeypatch):
-    monkeypatch.setattr(words_module, "CELLS", 7 * (V + 4))  # several blocks
+    monkeypatch.setattr(describe, "CELLS", 7 * (V + 4))  # several blocks
     made = field(kind)
     names, vectors = phrases()
     words = build_words(made, names, vectors)
@@ -390,45 +397,3 @@ def test_what_is_typed_is_completed(typed, offered):
 def test_a_correction_replaces_the_unknown_words_alone():
     assert corrected("the Red mugg", {"mugg": ("mug", "muff")}) == "the red mug"
     assert corrected("red mugg", {"mugg": ()}) is None
-
-
-# What lies under a pixel, against the whole picture of the reference rasterizer.
-
-
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
-@pytest.mark.parametrize("thing", range(3))
-def test_place_words_and_relevancy_are_those_of_the_pixel(backend, thing):
-    asked = describer(blob_scene(), WORDS)
-    engine, scene = asked.engine, asked.engine.scene
-    camera = scene.cameras[0].resized(160, 120)
-    (x, y), _ = (part[0] for part in camera.project(CENTRES[thing][None]))
-    pixel = (int(x), int(y))
-    results = [engine.run(phrase) for phrase in WORDS]
-    rasterizer = ReferenceRasterizer() if backend == "reference" else load_lifting_rasterizer("cpu")
-    found = look_at_pixel(rasterizer, asked, camera, pixel, results)
-
-    view = ReferenceRasterizer().view(scene.gaussians, camera, scene.raster_settings())
-    columns = np.stack([result.relevancy[result.level] for result in results], 1)
-    total, alpha = view.splat(columns.astype(np.float64))
-    expected = total[pixel[1], pixel[0]] / alpha[pixel[1], pixel[0]]
-    np.testing.assert_allclose(found.relevancy, expected, atol=2e-4)
-    assert int(np.argmax(found.relevancy)) == thing
-    assert found.words[2].words[0].phrase == WORDS[thing]
-    assert np.linalg.norm(found.position - CENTRES[thing]) < 0.6  # on the blob, towards the eye
-    np.testing.assert_allclose(camera.project(found.position[None])[0][0], np.add(pixel, 0.5), atol=1e-6)
-    assert found.depth == pytest.approx(camera.project(found.position[None])[1][0])
-
-
-def test_the_surface_is_at_the_median_of_the_weights():
-    scene = blob_scene()
-    camera = scene.cameras[0].resized(160, 120)
-    (x, y), _ = (part[0] for part in camera.project(CENTRES[0][None]))
-    asked = describer(scene, WORDS)
-    found = look_at_pixel(ReferenceRasterizer(), asked, camera, (int(x), int(y)))
-    view = ReferenceRasterizer().view(scene.gaussians, camera, scene.raster_settings())
-    one = np.zeros((120, 160, 1))
-    one[int(y), int(x)] = 1
-    weights = view.gather(one)[:, 0]
-    depths = camera.project(scene.gaussians.means.astype(np.float64))[1]
-    in_front = weights[depths < found.depth - 1e-9].sum()
-    assert in_front < weights.sum() / 2 <= in_front + weights[np.abs(depths - found.depth) < 1e-6].sum()
