@@ -109,8 +109,9 @@ def test_readings_show_the_structure():
 
 
 WORDS = st.sampled_from(
-    ["mug", "red", "handle", "of", "the", "and", "or", "not", "without", "but", ",", "'", "'s", "on", "in", "left",
-     "to", "biggest", "nearest", "from", "a", "orange,", "&", "on;", "mug's", "dogs'", "near", "as", "well", "top"]
+    ["mug", "red", "handle", "of", "the", "and", "or", "not", "without", "but", ",", "'", "'s", "on", "in",
+     "left", "to", "biggest", "nearest", "from", "a", "orange,", "&", "on;", "mug's", "dogs'", "near", "as",
+     "well", "top"]
 )  # fmt: skip
 
 
