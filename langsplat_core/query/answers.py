@@ -22,70 +22,68 @@ from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField, Odds
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, Scale
 
 Triple = tuple[float, float, float]  # one number a level
-CutRule = Literal["floor", "median", "range"]
-CUT_RULES: tuple[CutRule, ...] = get_args(CutRule)
-SPAN = 0.02  # the least distance between the lower end and the peak that is divided
-RANGE_SHARE = 0.7  # of the map's range: LangSplat's code maps [0, 1] to [-1, 1] and cuts at 0.4
+AnswerRule = Literal["regions", "peak"]
+Verdict = Literal["found", "weak match", "not here"]
+WEAK = 0.5  # probability from which what is not found is at least a weak match
+NEARLY = -0.5  # excess, spreads, from which it is where no probability is known
 
 
-def cut_level(rule: CutRule, values: Array, peak: float, median: float) -> float:
-    """The relevancy above which `values` belong to the answer.
+@dataclass(frozen=True, eq=False)
+class QueryResult:
+    """The answer to one phrase."""
 
-    values: the map that is cut, any shape, in [0, 1], read by "range" alone; peak: the smoothed peak of the
-    whole scene at the chosen level; median: of the scene's Gaussians at that level. Rules:
+    phrase: str
+    level: int  # index into LEVELS
+    scores: Triple  # best relevancy per level: of a region, or of a neighbourhood
+    relevancy: Array  # (3, N) float32 in [0, 1] per level and Gaussian
+    even: Array  # (N,) float32 relevancy at the level, the same all over a region
+    peak: float  # score of the chosen level
+    fits: Fits  # of the best region, or neighbourhood, of each level, see `chance.Scale.fit`
+    probability: float | None  # that the thing is there at all; None where the encoder is not calibrated
+    found: bool
+    members: Array  # (N,) bool: the Gaussians that answer, wherever they are
+    place: Array | None  # (3,) world units
+    box: Array | None  # (2, 3) corners, world units
+    excess: float | None = None  # where there is none: spreads above chance, see `chance.excess`
+    own_cut: float | None = None  # relevancy from which on everything is a member, where it was set by hand
 
-    * "floor": half way between the floor, no better than the canonical phrases, and the peak;
-    * "median": half way between the scene's median and the peak, since what is typical of the scene is not
-      what was asked for, wherever the encoder puts it;
-    * "range": at 0.7 of the map's range, as the public code of LangSplat does; it always finds something.
-    """
-    if rule == "range":
-        low, high = (float(values.min()), float(values.max())) if np.size(values) else (0.0, 1.0)
-        return low + RANGE_SHARE * (high - low)
-    low = FLOOR if rule == "floor" else median
-    return low + 0.5 * max(peak - low, SPAN)
+    @property
+    def cut(self) -> float:
+        """The least relevancy of a member, of its region where it has one; the peak where there is none."""
+        if self.own_cut is not None:
+            return self.own_cut
+        return float(self.even[self.members].min(initial=self.peak))
+
+    @property
+    def verdict(self) -> Verdict:
+        """What to say about it."""
+        if self.found:
+            return "found"
+        if self.probability is not None:
+            return "weak match" if self.probability >= WEAK else "not here"
+        near = self.excess is not None and self.excess >= NEARLY
+        return "weak match" if near and self.members.any() else "not here"
+
+    @property
+    def heat_range(self) -> tuple[float, float]:
+        """The relevancies at which a heat map of this answer is coldest and hottest."""
+        if self.own_cut is not None:
+            return min(self.own_cut, self.peak - MIN_HEAT_SPAN), self.peak
+        if self.found and self.peak < FLOOR + MIN_HEAT_SPAN:  # best on its thing, not against all phrases
+            return self.peak - MIN_HEAT_SPAN, self.peak
+        return FLOOR, max(self.peak, FLOOR + MIN_HEAT_SPAN)
+
+
+def recut(result: QueryResult, cut: float) -> QueryResult:
+    """The same answer with everything as a member whose relevancy, that of its region where it has one, is
+    at least `cut`. Place, box and verdict stay: they are of the best, wherever the answer ends."""
+    return replace(result, own_cut=cut, members=result.even >= np.float32(cut))
 
 
 def triple(values: Iterable[float]) -> Triple:
     """Three values as plain numbers."""
     subpart, part, whole = values
     return float(subpart), float(part), float(whole)
-
-
-# Where a phrase is: the strongest place among the Gaussians, and its pixel in a view.
-
-PLATEAU = 1e-3  # of relevancy: what is this close to the peak is as high
-
-
-def locate(surface: Surface, smoothed: Array, threshold: float) -> tuple[Array, Array] | tuple[None, None]:
-    """Place and box, world units, of the connected part above `threshold` that holds the peak of `smoothed`
-    (M,): (3,) around the middle of what is as high as the peak, and (2, 3) lower and upper corner between 2 %
-    and 98 % of its Gaussians. None where all is 0."""
-    if smoothed.max(initial=0) <= 0:
-        return None, None
-    peak = int(smoothed.argmax())
-    inside = smoothed > threshold
-    inside[peak] = True
-    members = surface.connected(inside, peak)
-    # All of a thing may mean the very same: then its middle is the place, not whichever comes first.
-    highest = members[smoothed[members] >= smoothed[peak] - PLATEAU]
-    centre = surface.positions[highest].mean(0)
-    middle = highest[((surface.positions[highest] - centre) ** 2).sum(1).argmin()]
-    near = surface.neighbours[middle]
-    weights = surface.weights[near] * smoothed[near]
-    position = (surface.positions[near] * weights[:, None]).sum(0) / weights.sum()
-    return position, np.quantile(surface.positions[members], [0.02, 0.98], axis=0)
-
-
-def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
-    """Peak (column, row, value) of a relevancy map (H, W) after a mean filter of `window` px (paper: 20).
-
-    The window never exceeds the picture; borders repeat the edge pixels.
-    """
-    window = max(1, min(window, *relevancy.shape))
-    smooth = uniform_filter(np.asarray(relevancy, np.float64), size=window, mode="nearest")
-    row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
-    return int(column), int(row), float(smooth[row, column])
 
 
 # What everyday phrases fit in a scene, where most of them are not: what exceeds that is found.
@@ -255,64 +253,7 @@ def _level(best: Array, named: Named) -> int:
     return int(np.flatnonzero(given == given.max())[-1])
 
 
-# From relevancies to an answer: by regions of the surface, or by the peak alone, as published.
-
-AnswerRule = Literal["regions", "peak"]
-Verdict = Literal["found", "weak match", "not here"]
-WEAK = 0.5  # probability from which what is not found is at least a weak match
-NEARLY = -0.5  # excess, spreads, from which it is where no probability is known
-
-
-@dataclass(frozen=True, eq=False)
-class QueryResult:
-    """The answer to one phrase."""
-
-    phrase: str
-    level: int  # index into LEVELS
-    scores: Triple  # best relevancy per level: of a region, or of a neighbourhood
-    relevancy: Array  # (3, N) float32 in [0, 1] per level and Gaussian
-    even: Array  # (N,) float32 relevancy at the level, the same all over a region
-    peak: float  # score of the chosen level
-    fits: Fits  # of the best region, or neighbourhood, of each level, see `chance.Scale.fit`
-    probability: float | None  # that the thing is there at all; None where the encoder is not calibrated
-    found: bool
-    members: Array  # (N,) bool: the Gaussians that answer, wherever they are
-    place: Array | None  # (3,) world units
-    box: Array | None  # (2, 3) corners, world units
-    excess: float | None = None  # where there is none: spreads above chance, see `chance.excess`
-    own_cut: float | None = None  # relevancy from which on everything is a member, where it was set by hand
-
-    @property
-    def cut(self) -> float:
-        """The least relevancy of a member, of its region where it has one; the peak where there is none."""
-        if self.own_cut is not None:
-            return self.own_cut
-        return float(self.even[self.members].min(initial=self.peak))
-
-    @property
-    def verdict(self) -> Verdict:
-        """What to say about it."""
-        if self.found:
-            return "found"
-        if self.probability is not None:
-            return "weak match" if self.probability >= WEAK else "not here"
-        near = self.excess is not None and self.excess >= NEARLY
-        return "weak match" if near and self.members.any() else "not here"
-
-    @property
-    def heat_range(self) -> tuple[float, float]:
-        """The relevancies at which a heat map of this answer is coldest and hottest."""
-        if self.own_cut is not None:
-            return min(self.own_cut, self.peak - MIN_HEAT_SPAN), self.peak
-        if self.found and self.peak < FLOOR + MIN_HEAT_SPAN:  # best on its thing, not against all phrases
-            return self.peak - MIN_HEAT_SPAN, self.peak
-        return FLOOR, max(self.peak, FLOOR + MIN_HEAT_SPAN)
-
-
-def recut(result: QueryResult, cut: float) -> QueryResult:
-    """The same answer with everything as a member whose relevancy, that of its region where it has one, is
-    at least `cut`. Place, box and verdict stay: they are of the best, wherever the answer ends."""
-    return replace(result, own_cut=cut, members=result.even >= np.float32(cut))
+# The answer by regions.
 
 
 def by_regions(
@@ -358,6 +299,39 @@ def by_regions(
     )
 
 
+def _odds(phrase: str, calibration: Calibration | None) -> Odds | None:
+    """A part asked for alone answers at the finer levels, where its fits are others than a thing's."""
+    if calibration is None:
+        return None
+    return calibration.thing if named(phrase) == "thing" else calibration.part
+
+
+# The answer as published, by the peak alone.
+
+CutRule = Literal["floor", "median", "range"]
+CUT_RULES: tuple[CutRule, ...] = get_args(CutRule)
+SPAN = 0.02  # the least distance between the lower end and the peak that is divided
+RANGE_SHARE = 0.7  # of the map's range: LangSplat's code maps [0, 1] to [-1, 1] and cuts at 0.4
+
+
+def cut_level(rule: CutRule, values: Array, peak: float, median: float) -> float:
+    """The relevancy above which `values` belong to the answer.
+
+    values: the map that is cut, any shape, in [0, 1], read by "range" alone; peak: the smoothed peak of the
+    whole scene at the chosen level; median: of the scene's Gaussians at that level. Rules:
+
+    * "floor": half way between the floor, no better than the canonical phrases, and the peak;
+    * "median": half way between the scene's median and the peak, since what is typical of the scene is not
+      what was asked for, wherever the encoder puts it;
+    * "range": at 0.7 of the map's range, as the public code of LangSplat does; it always finds something.
+    """
+    if rule == "range":
+        low, high = (float(values.min()), float(values.max())) if np.size(values) else (0.0, 1.0)
+        return low + RANGE_SHARE * (high - low)
+    low = FLOOR if rule == "floor" else median
+    return low + 0.5 * max(peak - low, SPAN)
+
+
 def by_peak(
     phrase: str, relevancy: Array, surface: Surface, scale: Scale, found: float, level: LevelChoice
 ) -> QueryResult:
@@ -384,8 +358,37 @@ def by_peak(
     )
 
 
-def _odds(phrase: str, calibration: Calibration | None) -> Odds | None:
-    """A part asked for alone answers at the finer levels, where its fits are others than a thing's."""
-    if calibration is None:
-        return None
-    return calibration.thing if named(phrase) == "thing" else calibration.part
+# Where a phrase is: the strongest place among the Gaussians, and its pixel in a view.
+
+PLATEAU = 1e-3  # of relevancy: what is this close to the peak is as high
+
+
+def locate(surface: Surface, smoothed: Array, threshold: float) -> tuple[Array, Array] | tuple[None, None]:
+    """Place and box, world units, of the connected part above `threshold` that holds the peak of `smoothed`
+    (M,): (3,) around the middle of what is as high as the peak, and (2, 3) lower and upper corner between 2 %
+    and 98 % of its Gaussians. None where all is 0."""
+    if smoothed.max(initial=0) <= 0:
+        return None, None
+    peak = int(smoothed.argmax())
+    inside = smoothed > threshold
+    inside[peak] = True
+    members = surface.connected(inside, peak)
+    # All of a thing may mean the very same: then its middle is the place, not whichever comes first.
+    highest = members[smoothed[members] >= smoothed[peak] - PLATEAU]
+    centre = surface.positions[highest].mean(0)
+    middle = highest[((surface.positions[highest] - centre) ** 2).sum(1).argmin()]
+    near = surface.neighbours[middle]
+    weights = surface.weights[near] * smoothed[near]
+    position = (surface.positions[near] * weights[:, None]).sum(0) / weights.sum()
+    return position, np.quantile(surface.positions[members], [0.02, 0.98], axis=0)
+
+
+def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
+    """Peak (column, row, value) of a relevancy map (H, W) after a mean filter of `window` px (paper: 20).
+
+    The window never exceeds the picture; borders repeat the edge pixels.
+    """
+    window = max(1, min(window, *relevancy.shape))
+    smooth = uniform_filter(np.asarray(relevancy, np.float64), size=window, mode="nearest")
+    row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
+    return int(column), int(row), float(smooth[row, column])

@@ -23,9 +23,9 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Reading, Scene
 from langsplat_core.semantics.encoder import OPEN_MODEL
-from tests.support.blob_words import NAMES, named_scene
 from tests.support.fakes import (
     CENTRES,
+    NAMES,
     PER_BLOB,
     FakeEncoder,
     axis,
@@ -34,6 +34,7 @@ from tests.support.fakes import (
     calibrated_for,
     cameras,
     language,
+    named_scene,
 )
 
 

@@ -28,8 +28,18 @@ from langsplat_core.query.surface import surface_areas
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Gaussians, LanguageField, LinearCodec, Scene
 from langsplat_core.scene.codec import CodebookCodec
-from tests.support.blob_words import NAMES, named_field, named_scene
-from tests.support.fakes import CENTRES, PER_BLOB, WORDS, FakeEncoder, axis, blob_scene, language
+from tests.support.fakes import (
+    CENTRES,
+    NAMES,
+    PER_BLOB,
+    WORDS,
+    FakeEncoder,
+    axis,
+    blob_scene,
+    language,
+    named_field,
+    named_scene,
+)
 
 
 @pytest.fixture(autouse=True)

@@ -23,8 +23,7 @@ from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import DEMO
 from langsplat_core.semantics.relevancy import FLOOR
 from langsplat_core.semantics.vocabulary import FEWEST
-from tests.support.blob_words import named_scene
-from tests.support.fakes import DIM, WORDS, FakeEncoder, axis, blob_scene
+from tests.support.fakes import DIM, WORDS, FakeEncoder, axis, blob_scene, named_scene
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_gaussians
 from tests.support.two_blobs import D, two_blob_scene
