@@ -56,7 +56,7 @@ class QueryResult:
 
     @property
     def verdict(self) -> Verdict:
-        """What to say about it."""
+        """The verdict for people."""
         if self.found:
             return "found"
         if self.probability is not None:
@@ -86,7 +86,7 @@ def triple(values: Iterable[float]) -> Triple:
     return float(subpart), float(part), float(whole)
 
 
-# What everyday phrases fit in a scene, where most of them are not: what exceeds that is found.
+# Chance: the fits of everyday phrases in a scene, most of which name nothing there. What exceeds it is found.
 #
 # Fits are those of `semantics.relevancy.Scale`. The more places a scene has, the better the best of them
 # fits a phrase by chance; so "found" is said by the best fits of everyday phrases in the scene itself.
@@ -107,7 +107,7 @@ LOW = 0.16  # quantile one standard deviation below the median; what is there li
 
 @dataclass(frozen=True)
 class Bar:
-    """What the best fit of phrases is by chance."""
+    """The best fit of phrases by chance: its median and spread."""
 
     median: float
     spread: float
@@ -185,7 +185,7 @@ def _solid(fits: Array, sizes: Array) -> Array:
     return np.where(solid[:, None], fits, -np.inf) if solid.any() else fits
 
 
-# How far an answer reaches: its level, the regions that are it, and how good the best one is.
+# Extent: the level of an answer, the regions that are it, and how good the best one is.
 #
 # Everything is judged by the fit of a region, in spreads of what phrases fit by chance (`chance`), so that
 # one rule serves all encoders. The numbers were chosen on rooms 201 to 203, with the bundled encoder and
@@ -300,7 +300,7 @@ def by_regions(
 
 
 def _odds(phrase: str, calibration: Calibration | None) -> Odds | None:
-    """A part asked for alone answers at the finer levels, where its fits are others than a thing's."""
+    """The odds for a phrase: a part asked for alone answers at the finer levels, where fits are others."""
     if calibration is None:
         return None
     return calibration.thing if named(phrase) == "thing" else calibration.part
@@ -358,7 +358,7 @@ def by_peak(
     )
 
 
-# Where a phrase is: the strongest place among the Gaussians, and its pixel in a view.
+# Places: the strongest among the Gaussians, and the pixel of the peak in a view.
 
 PLATEAU = 1e-3  # of relevancy: what is this close to the peak is as high
 
@@ -386,7 +386,7 @@ def locate(surface: Surface, smoothed: Array, threshold: float) -> tuple[Array, 
 def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
     """Peak (column, row, value) of a relevancy map (H, W) after a mean filter of `window` px (paper: 20).
 
-    The window never exceeds the picture; borders repeat the edge pixels.
+    The window never exceeds the image; borders repeat the edge pixels.
     """
     window = max(1, min(window, *relevancy.shape))
     smooth = uniform_filter(np.asarray(relevancy, np.float64), size=window, mode="nearest")

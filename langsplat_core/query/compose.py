@@ -71,7 +71,7 @@ class Body:
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Of its points."""
+        """Search tree of its points."""
         return cKDTree(self.points)
 
     @cached_property
@@ -383,7 +383,7 @@ class ComposedResult:
 
     @property
     def reading(self) -> str:
-        """Such as "handle  inside  red mug"."""
+        """The tree as text, such as "handle  inside  red mug"."""
         return unparse(self.tree)
 
 
@@ -485,7 +485,7 @@ class _Asking:
         return self.asked[key]
 
     def _thing(self, text: str, level: LevelChoice) -> QueryResult:
-        """A thing is looked for among wholes, unless it is a part, or fits none of them."""
+        """The answer to a phrase; a thing is looked for among wholes, unless it is a part, or fits none."""
         if level != "auto" or named(text) != "thing":
             return self._ask(text, level)
         whole = self._ask(text, "whole")

@@ -69,7 +69,7 @@ class WordScores:
         return found
 
     def take(self, chosen: Array) -> "WordScores":
-        """Those phrases for which `chosen` (V,) bool is True; the canonical ones stay."""
+        """The phrases for which `chosen` (V,) bool is True; the canonical ones stay."""
         rows = np.append(chosen, np.ones(len(self.vectors) - len(chosen), bool))
         phrases = tuple(phrase for phrase, kept in zip(self.phrases, chosen, strict=True) if kept)
         return replace(self, phrases=phrases, vectors=self.vectors[rows], hubs=self.hubs[rows])

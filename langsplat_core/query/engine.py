@@ -122,7 +122,7 @@ class QueryEngine:
 
     @property
     def calibration(self) -> Calibration | None:
-        """By which a probability is said; None where the encoder has none, and with other canonical phrases
+        """The calibration of probabilities; None where the encoder has none, and with other canonical phrases
         than those it was fitted with."""
         usual = self._canonical is None and self.rule == "regions"
         return self.field.reading.calibration if usual else None
@@ -265,7 +265,7 @@ class QueryEngine:
     def known_vectors(
         self, phrases: Iterable[str], progress: Progress = silent
     ) -> tuple[tuple[str, ...], Array]:
-        """Those of `phrases` whose words the encoder was taught, each once as `phrase_key` has it, and their
+        """The `phrases` whose words the encoder was taught, each once as `phrase_key` has it, and their
         (V, D) unit vectors: from the phrasebook, else encoded together. Raises EncoderError for an encoder
         that is not the scene's, or one that cannot be loaded."""
         keys = tuple(dict.fromkeys(map(phrase_key, phrases)))
@@ -279,7 +279,7 @@ class QueryEngine:
         return known, self._vectors(known)
 
     def _fresh(self, keys: Iterable[str]) -> list[str]:
-        """Those that are neither in the phrasebook nor encoded yet, each once."""
+        """The phrases that are neither in the phrasebook nor encoded yet, each once."""
         book = self.field.phrasebook
         return [key for key in dict.fromkeys(keys) if key not in book and key not in self._encoded]
 
@@ -335,7 +335,7 @@ class QueryEngine:
         progress: Progress = silent,
         vector: Array | None = None,
     ) -> QueryResult:
-        """Answer `phrase`. The level is chosen once for the scene, on raw relevancy, so that the picture
+        """Answer `phrase`. The level is chosen once for the scene, on raw relevancy, so that the image
         does not flicker between levels as the camera moves. vector: (D,) unit, the phrase's own, where it is
         at hand. Raises as `text_vector` does."""
         if vector is None:

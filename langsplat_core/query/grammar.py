@@ -31,7 +31,7 @@ class Inside:
 
 @dataclass(frozen=True)
 class Relation:
-    """Those of `what` that stand so to one of `anchor`."""
+    """The ones of `what` that stand so to one of `anchor`."""
 
     kind: Side
     what: "Tree"
@@ -54,7 +54,7 @@ class Union:
 
 @dataclass(frozen=True)
 class Without:
-    """What is `what` and not `unwanted`."""
+    """Everything that is `what` and not `unwanted`."""
 
     what: "Tree"
     unwanted: "Tree"
@@ -187,8 +187,8 @@ def is_part(word: str) -> bool:
 
 
 def named(phrase: str) -> Named:
-    """What a phrase without structure names: "red mug" a thing, "red handle" and "keyboard" a part, "mug
-    handle" a part of a thing."""
+    """Kind of what a phrase without structure names: "red mug" a thing, "red handle" and "keyboard" a part,
+    "mug handle" a part of a thing."""
     *before, last = phrase.split() or [""]
     if not is_part(last):
         return "thing"
@@ -416,6 +416,6 @@ def _thing(tokens: list[str]) -> Tree:
 
 
 def _without_articles(tokens: list[str]) -> list[str]:
-    """Without the articles at the beginning, unless there is nothing else."""
+    """The tokens without articles at the beginning, unless there is nothing else."""
     first = next((at for at, token in enumerate(tokens) if token.lower() not in ARTICLES), 0)
     return tokens[first:]

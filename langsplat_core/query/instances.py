@@ -1,4 +1,4 @@
-"""Boxes around points: along the world's axes, and along the points' own."""
+"""Instances of an answer: its Gaussians, taken apart where the surface is, with boxes, scores and hulls."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -47,7 +47,7 @@ def axis_aligned_box(points: Array) -> Array:
 
 
 def oriented_box(points: Array) -> OrientedBox:
-    """Around (M, 3) points, M >= 1, between the `INNER` quantiles along each of its axes.
+    """Box around (M, 3) points, M >= 1, between the `INNER` quantiles along each of its axes.
 
     The axes begin as the principal ones of the points that are no strays, and are then turned about one
     another to the least area of the box's faces: principal axes alone say nothing about how a square, a cube
@@ -106,8 +106,6 @@ def _right_handed(axes: Array) -> Array:
     return axes * signs
 
 
-# The instances of an answer: its Gaussians, taken apart where the surface is, with place, size and score.
-#
 # Two members belong to one instance when a walk over linked members of the surface leads from one to the
 # other. What is too faint to be on the surface belongs where the surface Gaussian nearest to it belongs.
 
@@ -232,12 +230,12 @@ class Mesh:
 
 
 def hulls(things: Sequence[Instance], gaussians: Gaussians, colours: Array, name: str) -> tuple[Mesh, ...]:
-    """One around each, named `name` and its number from 1 on. Arguments and errors as of `hull`."""
+    """One hull around each, named `name` and its number from 1 on. Arguments and errors as of `hull`."""
     return tuple(hull(thing, gaussians, colours, f"{name} {k}") for k, thing in enumerate(things, 1))
 
 
 def hull(instance: Instance, gaussians: Gaussians, colours: Array, name: str) -> Mesh:
-    """Around the instance's Gaussians that lie in its oriented box: strays would stretch it.
+    """Hull around the instance's Gaussians that lie in its oriented box: strays would stretch it.
 
     colours: (N, 3) of the scene's Gaussians, in [0, 1]; the mesh has the mean of its own. Raises InputError
     where all lie at one point.

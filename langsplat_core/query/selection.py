@@ -173,11 +173,11 @@ def in_stroke(seen: Projected, path: Array, radius: float) -> Array:
 
 
 def on_surface(seen: Projected, depths: Array, size: tuple[int, int], behind: float = BEHIND) -> Array:
-    """(N,) bool: in the picture and not hidden there: the depth of the centre is at most that of the surface
+    """(N,) bool: in the image and not hidden there: the depth of the centre is at most that of the surface
     in its pixel and `behind` of it more. Where nothing is drawn, nothing hides.
 
     depths: (H, W) camera z of the surface, world units, 0 where nothing is drawn; it may be coarser or finer
-    than the `size` (width, height) of the picture that the centres were projected into.
+    than the `size` (width, height) of the image that the centres were projected into.
     """
     check_array("depths", depths, ("H", "W"))
     height, width = depths.shape
