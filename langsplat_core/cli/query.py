@@ -16,7 +16,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.cli.checks import OutFile, OutputConsole
 from langsplat_core.config import Count, CountOrZero, LevelChoice, NotNegative, PictureConfig, Positive
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
-from langsplat_core.io import check_writable, load_scene, save_scene
+from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.io.shapes import (
     MESH_SUFFIXES,
     POINT_SUFFIXES,

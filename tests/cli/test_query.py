@@ -18,7 +18,7 @@ from langsplat_core.cli.run import main
 from langsplat_core.cli.scenes import Scale
 from langsplat_core.config import INRIA
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.io import load_scene, save_scene
+from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Reading, Scene
