@@ -7,7 +7,7 @@ region.
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -308,28 +308,7 @@ def _odds(phrase: str, calibration: Calibration | None) -> Odds | None:
 
 # The answer as published, by the peak alone.
 
-CutRule = Literal["floor", "median", "range"]
-CUT_RULES: tuple[CutRule, ...] = get_args(CutRule)
-SPAN = 0.02  # the least distance between the lower end and the peak that is divided
-RANGE_SHARE = 0.7  # of the map's range: LangSplat's code maps [0, 1] to [-1, 1] and cuts at 0.4
-
-
-def cut_level(rule: CutRule, values: Array, peak: float, median: float) -> float:
-    """The relevancy above which `values` belong to the answer.
-
-    values: the map that is cut, any shape, in [0, 1], read by "range" alone; peak: the smoothed peak of the
-    whole scene at the chosen level; median: of the scene's Gaussians at that level. Rules:
-
-    * "floor": half way between the floor, no better than the canonical phrases, and the peak;
-    * "median": half way between the scene's median and the peak, since what is typical of the scene is not
-      what was asked for, wherever the encoder puts it;
-    * "range": at 0.7 of the map's range, as the public code of LangSplat does; it always finds something.
-    """
-    if rule == "range":
-        low, high = (float(values.min()), float(values.max())) if np.size(values) else (0.0, 1.0)
-        return low + RANGE_SHARE * (high - low)
-    low = FLOOR if rule == "floor" else median
-    return low + 0.5 * max(peak - low, SPAN)
+SPAN = 0.02  # the least distance between the floor and the peak that is divided
 
 
 def by_peak(
@@ -352,7 +331,7 @@ def by_peak(
         fits=triple(scale.fit(np.array(scores))),
         probability=None,
         found=peak >= FLOOR and max(scores) >= found,
-        members=relevancy[chosen] > cut_level("floor", relevancy[chosen], peak, FLOOR),
+        members=relevancy[chosen] > FLOOR + 0.5 * max(peak - FLOOR, SPAN),
         place=place,
         box=box,
     )
