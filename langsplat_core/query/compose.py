@@ -379,7 +379,6 @@ class ComposedResult:
 
     answer: QueryResult  # in the form of a simple one
     tree: Tree
-    parts: tuple[QueryResult, ...]  # what was asked, phrase by phrase
 
     @property
     def reading(self) -> str:
@@ -416,9 +415,8 @@ def run_phrase(
             tree = Atom(tidy(text))
         else:
             answer = replace(found, phrase=tidy(text))
-            return ComposedResult(placed(engine.surface, answer), tree, tuple(asking.asked.values()))
-    answer = engine.run(tree.text, level, progress)
-    return ComposedResult(answer, tree, (answer,))
+            return ComposedResult(placed(engine.surface, answer), tree)
+    return ComposedResult(engine.run(tree.text, level, progress), tree)
 
 
 def check_phrase(
@@ -455,7 +453,7 @@ class _Asking:
     def __init__(self, engine: QueryEngine, camera: Camera | None, progress: Progress) -> None:
         self.engine, self._progress = engine, progress
         self.surface = engine.surface
-        self.asked: dict[tuple[str, LevelChoice], QueryResult] = {}
+        self._asked: dict[tuple[str, LevelChoice], QueryResult] = {}
         self._frame = upright(engine.scene.up())
         self._viewpoint = None if camera is None else viewpoint(camera, self._frame)
 
@@ -480,9 +478,9 @@ class _Asking:
 
     def _ask(self, text: str, level: LevelChoice) -> QueryResult:
         key = (phrase_key(text), level)
-        if key not in self.asked:
-            self.asked[key] = self.engine.run(text, level, self._progress)
-        return self.asked[key]
+        if key not in self._asked:
+            self._asked[key] = self.engine.run(text, level, self._progress)
+        return self._asked[key]
 
     def _thing(self, text: str, level: LevelChoice) -> QueryResult:
         """The answer to a phrase; a thing is looked for among wholes, unless it is a part, or fits none."""

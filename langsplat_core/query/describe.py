@@ -126,11 +126,8 @@ def build_words(field: LanguageField, phrases: tuple[str, ...], vectors: Array) 
 def build_attributes(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
     """Words of which a thing has one, such as colours: V phrases and their (V, D) unit vectors. Few and all
     of one kind, they are no hubs."""
-    none, scale = (
-        np.zeros(len(vectors), np.float32),
-        ATTRIBUTE_SCALE / _spread(field, vectors, meanings(field)),
-    )
-    return WordScores(phrases, vectors.astype(np.float32), none, scale)
+    scale = ATTRIBUTE_SCALE / _spread(field, vectors, meanings(field))
+    return WordScores(phrases, vectors.astype(np.float32), np.zeros(len(vectors), np.float32), scale)
 
 
 def _spread(field: LanguageField, vectors: Array, bank: Array) -> float:

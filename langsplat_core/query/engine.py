@@ -86,8 +86,8 @@ class QueryEngine:
         rule: AnswerRule = "regions",
     ) -> None:
         """load_encoder: usually `semantics.encoders.load_text_encoder`; without one only the scene's own
-        phrasebook can be asked. encoder_id: in place of the encoder that the scene names. exact: decode at
-        every Gaussian instead of looking up, 2 KB each, to measure the table by. rule: see `answers`;
+        phrasebook can be asked. encoder_id: in place of the encoder that the scene names. exact: compare
+        every latent instead of looking it up in a table, to measure the table by. rule: see `answers`;
         "regions" becomes "peak" where neither scene nor encoder has everyday phrases to compare with."""
         self.scene = scene
         self.exact = exact
@@ -157,12 +157,8 @@ class QueryEngine:
         """The scene's own everyday phrases, else the encoder's; None where the rule needs none."""
         if self._rule == "peak":
             return None
-        stored = self.field.everyday
-        if stored is None:
-            return self._encoded_everyday()
-        return _enough(stored)
-
-    def _encoded_everyday(self) -> Array | None:
+        if self.field.everyday is not None:
+            return _enough(self.field.everyday)
         try:
             encoder = self.load_encoder()
             self._check_encoder(encoder)
