@@ -287,10 +287,7 @@ def test_excess_is_counted_from_the_bars(named, level):
             bar, fit = BARS[LEVELS.index(level)], fits[LEVELS.index(level)]
             want = (fit - bar.median) / bar.spread - min(whole, finer)
         assert excess(tuple(fits), BARS, named, level) == pytest.approx(want)
-
-
-def test_a_bar_without_width_is_still_a_number():
-    assert np.isfinite(Bar(0.3, 0.0).excess(0.3, 1.0))
+    assert np.isfinite(Bar(0.3, 0.0).excess(0.3, 1.0))  # without width
 
 
 def test_the_scene_needs_everyday_phrases_else_the_peak_answers():
@@ -401,15 +398,6 @@ def test_where_everything_is_as_bad_all_of_it_answers_and_nothing_is_not_a_numbe
         assert (got.level, got.inside.all()) == (2, True)
         assert np.isfinite([*got.fits, *got.peaks]).all()
         assert (got.even == np.float32(value)).all()
-
-
-def test_a_surface_of_nothing():
-    surface = build_surface(random_gaussians(0))
-    nothing = regions_from(surface, np.zeros((3, 0), np.int32))
-    got = find_extent(np.zeros((3, 0), np.float32), nothing, SCALE, "part")
-    assert (got.level, got.peaks) == (1, (0, 0, 0))
-    assert (got.even.shape, got.inside.shape) == ((0,), (0,))
-    assert np.isfinite(got.fits).all()
 
 
 def test_the_reach_is_below_the_best_and_rises_with_it():

@@ -170,11 +170,8 @@ def test_an_outline_holds_what_a_walk_around_it_says(seen):
         ]
         assert any(wanted)
         assert in_polygon(seen, outline).tolist() == wanted
-
-
-def test_an_outline_of_less_than_three_corners_holds_nothing(seen):
-    assert not in_polygon(seen, np.zeros((0, 2))).any()
-    assert not in_polygon(seen, np.array([[0.0, 0.0], [80.0, 60.0]])).any()
+    for few in (np.zeros((0, 2)), np.array([[0.0, 0.0], [80.0, 60.0]])):
+        assert not in_polygon(seen, few).any()
 
 
 def test_a_stroke_is_as_wide_as_its_brush(seen):
