@@ -316,7 +316,7 @@ def by_peak(
 ) -> QueryResult:
     """The answer as published: the level with the highest smoothed peak, cut half way between the floor and
     that peak."""
-    smoothed = surface.smooth(relevancy)
+    smoothed = np.stack([surface.smooth(values) for values in relevancy])
     scores = triple(smoothed.max(1, initial=0))
     chosen = int(np.argmax(scores)) if level == "auto" else LEVELS.index(level)
     peak = scores[chosen]

@@ -362,7 +362,7 @@ def combine(answers: Sequence[QueryResult], how: Combination) -> QueryResult:
 def placed(surface: Surface, answer: QueryResult) -> QueryResult:
     """`answer` with the place of its strongest connected members."""
     values = np.where(answer.members, answer.relevancy[answer.level], 0).astype(np.float32)
-    smoothed = surface.smooth_at(np.arange(len(surface.rows)), values)
+    smoothed = surface.smooth(values)
     place, box = locate(surface, smoothed, HALF * float(smoothed.max(initial=0)))
     return replace(answer, place=place, box=box)
 

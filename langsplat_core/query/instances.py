@@ -167,7 +167,7 @@ def find_instances(
         return ()
     parts = surface.parts(numbers[visible])
     values = plain(relevancy)
-    scores = np.maximum.reduceat(surface.smooth_at(parts.order, values), parts.starts)
+    scores = np.maximum.reduceat(surface.smooth(values, parts.order), parts.starts)
     labels = parts.labels[numbers]  # -1: faint ones beside something else
     sizes = _extent(gaussians, every)
     extents = np.bincount(labels + 1, sizes[near], len(parts.starts) + 1)[1:]

@@ -43,23 +43,17 @@ class Surface:
     links: csr_matrix  # (M, M) who is next to whom on one surface; symmetric
     anchors: Array  # (N,) int32 number of every Gaussian, if it is too faint of the nearest; -1: none is near
 
-    def smooth(self, values: Array) -> Array:
-        """(3, N) values of all Gaussians -> (3, M) float32 opacity-weighted means over each neighbourhood.
+    def smooth(self, values: Array, numbers: Array | None = None) -> Array:
+        """(N,) float32 values of all Gaussians -> (K,) float32 opacity-weighted means over the neighbourhoods
+        of `numbers` (K,), by default of all M.
 
-        The 3D counterpart of the mean filter that the paper applies to a relevancy map before it
-        takes the peak (section 4.1, "implementation details"): one stray Gaussian decides nothing.
+        The 3D counterpart of the mean filter that the paper applies to a relevancy map before it takes the
+        peak (section 4.1, "implementation details"): one stray Gaussian decides nothing.
         """
-        count, workers = len(self.rows), shared_workers()
-        packed = np.empty((count, len(LEVELS) + 1), np.float32)
-        workers.run(_pack, count, plain(values), self.rows, self.weights, packed)
-        smoothed = np.empty((len(LEVELS), count), np.float32)
-        workers.run(_smooth, count, packed, self.neighbours, smoothed)
-        return smoothed
-
-    def smooth_at(self, numbers: Array, values: Array) -> Array:
-        """(N,) values -> (K,) float32, what `smooth` gives for one level at `numbers` (K,) alone."""
-        smoothed = np.empty(len(numbers), np.float32)
-        _smooth_at(numbers, self.neighbours, self.rows, self.weights, values, smoothed)
+        chosen = np.arange(len(self.rows)) if numbers is None else numbers
+        smoothed = np.empty(len(chosen), np.float32)
+        arguments = chosen, self.neighbours, self.rows, self.weights, plain(values), smoothed
+        shared_workers().run(_smooth, len(chosen), *arguments)
         return smoothed
 
     def parts(self, numbers: Array) -> Parts:
@@ -125,37 +119,18 @@ def _links(neighbours: Array, distances: Array, reach: Array) -> csr_matrix:
 
 
 @kernel
-def _pack(first: int, last: int, values: Array, rows: Array, weights: Array, packed: Array) -> None:
-    """Weighted values and weight side by side (M, 4): a neighbour costs one access to memory, not four."""
-    for i in range(first, last):
-        row, weight = rows[i], weights[i]
-        packed[i, 0] = weight * values[0, row]
-        packed[i, 1] = weight * values[1, row]
-        packed[i, 2] = weight * values[2, row]
-        packed[i, 3] = weight
-
-
-@kernel
-def _smooth(first: int, last: int, packed: Array, neighbours: Array, smoothed: Array) -> None:
-    """Rows [first, last) of `smoothed` (3, M) from what `_pack` made of everyone."""
-    for i in range(first, last):
-        subpart = part = whole = total = np.float32(0)
-        for k in range(neighbours.shape[1]):
-            j = neighbours[i, k]
-            subpart += packed[j, 0]
-            part += packed[j, 1]
-            whole += packed[j, 2]
-            total += packed[j, 3]
-        smoothed[0, i] = subpart / total
-        smoothed[1, i] = part / total
-        smoothed[2, i] = whole / total
-
-
-@kernel
-def _smooth_at(
-    chosen: Array, neighbours: Array, rows: Array, weights: Array, values: Array, smoothed: Array
+def _smooth(
+    first: int,
+    last: int,
+    chosen: Array,
+    neighbours: Array,
+    rows: Array,
+    weights: Array,
+    values: Array,
+    smoothed: Array,
 ) -> None:
-    for i in range(len(chosen)):
+    """Elements [first, last) of `smoothed` (K,)."""
+    for i in range(first, last):
         value = total = np.float32(0)
         for k in range(neighbours.shape[1]):
             j = neighbours[chosen[i], k]
