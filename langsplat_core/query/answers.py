@@ -16,6 +16,7 @@ from scipy.sparse import csr_matrix
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.grammar import Named, named
+from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.lookup import codewords
 from langsplat_core.query.surface import SMALLEST, Regions, Surface
 from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField, Odds
@@ -359,7 +360,7 @@ def locate(surface: Surface, smoothed: Array, threshold: float) -> tuple[Array, 
     near = surface.neighbours[middle]
     weights = surface.weights[near] * smoothed[near]
     position = (surface.positions[near] * weights[:, None]).sum(0) / weights.sum()
-    return position, np.quantile(surface.positions[members], [0.02, 0.98], axis=0)
+    return position, axis_aligned_box(surface.positions[members])
 
 
 def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:

@@ -34,6 +34,7 @@ from langsplat_core.query.grammar import (
     parse,
     unparse,
 )
+from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.surface import Surface
 from langsplat_core.scene import LEVELS, NO_THING, Camera
 from langsplat_core.scene.language import phrase_key, tidy
@@ -114,7 +115,7 @@ def viewpoint(camera: Camera, frame: Array) -> Viewpoint:
 def body(positions: Array, frame: Array) -> Body:
     """(P, 3) world points of one thing, P >= 1 -> its body in the axes of `frame`."""
     points = positions[:: max(1, -(-len(positions) // SAMPLE))] @ frame.T
-    low, high = np.quantile(points, [0.02, 0.98], axis=0)
+    low, high = axis_aligned_box(points)
     return Body(points, low, high)
 
 

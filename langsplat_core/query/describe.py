@@ -26,6 +26,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.surface import surface_areas
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import pixel_weights
@@ -438,7 +439,7 @@ class Describer:
         colour, material = self._looks(self.engine.field.latents[level, rows], weights)
         return Spot(
             centre=weights @ positions / weights.sum(),
-            box=np.quantile(positions, [0.02, 0.98], axis=0),
+            box=axis_aligned_box(positions),
             rows=rows,
             share=float(weights.sum()) / float(self.areas.sum()),
             colour=colour,
