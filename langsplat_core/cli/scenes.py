@@ -80,10 +80,7 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
         ("duplicates", f"{a.duplicates}"),
         ("bounds (1-99 %)", f"{low}  to  {high}"),
         ("opacity", ", ".join([f"{_percent(hidden)} never drawn", *below])),
-        (
-            "anisotropy",
-            f"median {median}, 99 % {most}, largest {largest}; {a.needles} > {NEEDLE:g}",
-        ),
+        ("anisotropy", f"median {median}, 99 % {most}, largest {largest}; {a.needles} > {NEEDLE:g}"),
         (
             "SH degree",
             f"{a.sh_degree}; energy by degree {' + '.join(f'{100 * e:.3g} %' for e in a.sh_energy)}",
@@ -99,10 +96,7 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
     observed = ", ".join(f"{name} {_percent(share)}" for name, share in field.observed.items())
     return [
         *lines,
-        (
-            "language field",
-            f"codec {field.codec} of {field.size}; {field.bytes / 1e6:.2f} MB in memory",
-        ),
+        ("language field", f"codec {field.codec} of {field.size}; {field.bytes / 1e6:.2f} MB in memory"),
         ("text encoder", f"{field.encoder}, {field.vector_dim} numbers"),
         ("phrasebook", f"{field.phrases} phrases"),
         ("observed", observed),

@@ -214,10 +214,7 @@ def opened_archive(path: Path, kind: str) -> Iterator[Archive]:
 
 KINDS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # always; AVIF and HEIF where Pillow has a codec
 # HEIF is named where it cannot be read, too: the message then says why such photographs are left out
-PHOTO_SUFFIXES = (
-    *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif"),
-    *(".heic", ".heif"),
-)
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif", ".heic", ".heif")
 MOST_PIXELS = 178_000_000  # of any picture: 0.7 GB once decoded. The largest cameras make 151 million
 # Declared pixels beyond these need a file of a fitting size: photographs keep 2 to 100 pixels a byte, what is
 # made to exhaust memory a million. The decoders of WebP and AVIF hold two more copies of the picture.

@@ -33,13 +33,7 @@ from langsplat_core.io.ply import read_ply
 from langsplat_core.io.ply_table import GREY, read_cloud
 from langsplat_core.io.scenes import load_gaussians
 from langsplat_core.io.spz import read_spz_scene
-from tests.support.file_samples import (
-    plain_ply,
-    random_field,
-    sog_files,
-    spz_bytes,
-    write_folder,
-)
+from tests.support.file_samples import plain_ply, random_field, sog_files, spz_bytes, write_folder
 from tests.support.scenes import random_gaussians
 
 
