@@ -7,7 +7,6 @@ smaller that stands for them; either way no (N, 512) array is made here.
 
 import re
 import struct
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.hostile import MAGIC as NPY
-from langsplat_core.io.hostile import open_for_reading, read_npy, read_npz
+from langsplat_core.io.hostile import open_for_reading, opened_archive, read_npy, read_npz
 from langsplat_core.io.langsplat_files import (
     GEOMETRY,
     autoencoder_from,
@@ -291,9 +290,9 @@ def read_part(path: Path) -> Part:
 
 def _is_npz(path: Path) -> bool:
     try:
-        with zipfile.ZipFile(path) as archive:
-            return all(name.endswith(".npy") for name in archive.namelist())
-    except (zipfile.BadZipFile, OSError, ValueError):
+        with opened_archive(path, "archive") as archive:
+            return all(name.endswith(".npy") for name in archive.names)
+    except FormatError:  # torch finds more in a damaged archive than zipfile does
         return False
 
 

@@ -17,7 +17,7 @@ from typing import IO, Any
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import FormatError, optional_imports
+from langsplat_core.errors import FormatError, optional_imports, quoted
 from langsplat_core.io.hostile import open_for_reading
 
 DEEPEST = 100  # tuples in tuples; Python's hash goes down them on the machine's stack, which ends at 100 000
@@ -142,7 +142,7 @@ def _check_pickle(stream: IO[bytes]) -> None:
             continue
         if opcode.name == "GLOBAL" and (name := str(argument).replace(" ", ".", 1)) not in _NAMED:
             raise FormatError(
-                f"needs {name[:60]!r}; only tensors, arrays and numbers are read, as all else could run code "
+                f"needs {quoted(name)}; only tensors, arrays and numbers are read, as all else could run code "
                 "of whoever made the file; save it again as plain tensors"
             )
         taken: list[int] = []
