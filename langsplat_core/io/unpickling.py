@@ -142,8 +142,8 @@ def _check_pickle(stream: IO[bytes]) -> None:
             continue
         if opcode.name == "GLOBAL" and (name := str(argument).replace(" ", ".", 1)) not in _NAMED:
             raise FormatError(
-                f"needs {quoted(name)}; only tensors, arrays and numbers are read, as all else could run code "
-                "of whoever made the file; save it again as plain tensors"
+                f"needs {quoted(name)}; only tensors, arrays and numbers are read, as all else could run "
+                "code of whoever made the file; save it again as plain tensors"
             )
         taken: list[int] = []
         if pickletools.markobject in opcode.stack_before:
