@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
 
 import tyro
 
@@ -265,20 +265,60 @@ class ClipConfig:
     device: Literal["auto", "cpu", "cuda"] = "auto"  # where it runs
 
 
-@dataclass(frozen=True)
-class CodecConfig:
-    """How a Gaussian keeps a CLIP vector: by the number of a codeword, or as latents (paper section 3.2)."""
+_KIND = tyro.conf.arg(
+    metavar="{codebook,autoencoder,linear}",
+    help="how a Gaussian keeps a CLIP vector, with settings of its own",
+)
+LatentDim = Annotated[int, Range(1, 4_096)]
 
-    kind: Literal["codebook", "autoencoder", "linear"] = "codebook"  # how vectors are kept
-    # codewords of a codebook; 0: as many as `max_relevancy_error` asks for
-    size: Annotated[int, Range(0, 65_535)] = 0
+
+@dataclass(frozen=True)
+class CodebookConfig:
+    """A Gaussian keeps the number of a codeword."""
+
+    kind: Annotated[Literal["codebook"], _KIND] = "codebook"
+    size: Annotated[int, Range(0, 65_535)] = 0  # codewords; 0: as many as `max_relevancy_error` asks for
     # mean over the scene's vectors and a few hundred phrases
     max_relevancy_error: Annotated[Share, tyro.conf.arg(aliases=["--max-relevancy-error"])] = 0.006
-    latent_dim: Annotated[int, Range(1, 4_096)] = 3  # numbers that the other kinds keep
-    steps: Count = 4_000  # of the autoencoder's training, as are the following
+    seed: Seed = 0  # of random numbers
+
+    @property
+    def seconds(self) -> float:
+        """That the fit is expected to take on two cores."""
+        return 3 + 0.02 * min(self.size or 2_500, 4_096)
+
+
+@dataclass(frozen=True)
+class AutoencoderConfig:
+    """A Gaussian keeps latents of the paper's autoencoder (section 3.2)."""
+
+    kind: Annotated[Literal["autoencoder"], _KIND] = "autoencoder"
+    latent_dim: LatentDim = 3  # numbers per Gaussian and level
+    steps: Count = 4_000  # of training
     batch: SeveralCount = 256  # vectors per step
     lr: Rate = 3e-3  # 7e-4 in the public code: with as many steps a quarter more error
     seed: Seed = 0  # of random numbers
+
+    @property
+    def seconds(self) -> float:
+        return 3 + 0.013 * self.steps
+
+
+@dataclass(frozen=True)
+class LinearConfig:
+    """A Gaussian keeps coordinates in a linear basis of the scene's vectors."""
+
+    kind: Annotated[Literal["linear"], _KIND] = "linear"
+    latent_dim: LatentDim = 3  # numbers per Gaussian and level
+    seed: Seed = 0  # of the vectors that are sampled
+    seconds: ClassVar[float] = 3.0
+
+
+# The kinds of codecs. On the command line `--codec.kind` chooses one, whose settings are then options.
+CodecConfig = tyro.conf.AvoidSubcommands[CodebookConfig | AutoencoderConfig | LinearConfig]
+CODEC_CONFIGS: Mapping[str, type[CodebookConfig | AutoencoderConfig | LinearConfig]] = MappingProxyType(
+    {settings.kind: settings for settings in (CodebookConfig, AutoencoderConfig, LinearConfig)}
+)
 
 
 @dataclass(frozen=True)
@@ -304,7 +344,7 @@ class TrainConfig:
     radiance: RadianceConfig = field(default_factory=RadianceConfig)
     masks: MaskConfig = field(default_factory=MaskConfig)
     clip: ClipConfig = field(default_factory=ClipConfig)
-    codec: CodecConfig = field(default_factory=CodecConfig)
+    codec: CodecConfig = field(default_factory=CodebookConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     phrases: tuple[str, ...] = ()  # stored encoded in the scene: they can be asked without any encoder
 
@@ -314,7 +354,7 @@ class TrainConfig:
 PAPER = TrainConfig(
     radiance=RadianceConfig(coarse_fraction=0.0),
     masks=MaskConfig(source="sam", sam="facebook/sam-vit-huge", crop_layers=1),
-    codec=CodecConfig(kind="autoencoder", steps=10_000, batch=64, lr=7e-4),
+    codec=AutoencoderConfig(steps=10_000, batch=64, lr=7e-4),
     lift=LiftConfig(mode="gradient", start="zeros-as-published"),
 )
 TrainProfile = Literal["default", "paper"]
@@ -335,7 +375,7 @@ def with_preset(config: TrainConfig, preset: TrainPreset) -> TrainConfig:
         radiance=replace(
             config.radiance, steps=steps, max_gaussians=most, sh_degree=1, opacity_decay=OPACITY_DECAY
         ),
-        codec=replace(config.codec, size=size),
+        codec=replace(config.codec, size=size) if config.codec.kind == "codebook" else config.codec,
     )
 
 

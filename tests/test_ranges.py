@@ -12,7 +12,7 @@ from langsplat_core import config
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.config import (
-    CodecConfig,
+    AutoencoderConfig,
     LiftConfig,
     RadianceConfig,
     Range,
@@ -158,7 +158,7 @@ def test_the_command_line_names_the_option_as_typed(
     "wrong",
     [
         TrainConfig(radiance=RadianceConfig(steps=0)),
-        TrainConfig(codec=CodecConfig(batch=1)),
+        TrainConfig(codec=AutoencoderConfig(batch=1)),
         TrainConfig(lift=LiftConfig(chunk=0)),
     ],
 )

@@ -4,7 +4,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from langsplat_core.config import CodecConfig, Count, CountOrZero, LiftConfig, Positive, Range, Rate, Seed
+from langsplat_core.config import (
+    CodebookConfig,
+    CodecConfig,
+    Count,
+    CountOrZero,
+    LiftConfig,
+    Positive,
+    Range,
+    Rate,
+    Seed,
+)
 from langsplat_core.query.answers import CutRule
 
 Pixels = Annotated[int, Range(1, 65_536)]
@@ -52,7 +62,7 @@ class BenchmarkConfig:
     """"demo" for the bundled one, a folder, a hub id, or clip-geometry:OWN[,ALIKE]: vectors made from truth
     with the geometry of CLIP, OWN being the cosine of a picture with its words (0.22 to 0.32)."""
     text_vectors: Path | None = None  # .npy of real text vectors for clip-geometry, names in a .txt beside it
-    codec: CodecConfig = field(default_factory=CodecConfig)
+    codec: CodecConfig = CodebookConfig()  # noqa: RUF009 (frozen)
     lift: LiftConfig = field(default_factory=LiftConfig)
     cut: CutRule | Literal["regions"] = "regions"
     """How an answer becomes a mask: whole regions, or a rule of `query.cut` for the map."""
@@ -124,7 +134,7 @@ class VerdictBenchConfig:
     """Exact outlines, the same with 15 % wrong vectors, the weight-free segmenter's."""
     encoder: str = "demo"  # as of `langsplat eval synthetic`
     text_vectors: Path | None = None  # .npy of real text vectors for clip-geometry, names in a .txt beside it
-    codec: CodecConfig = CodecConfig()  # noqa: RUF009 (frozen)
+    codec: CodecConfig = CodebookConfig()  # noqa: RUF009 (frozen)
 
 
 @dataclass(frozen=True)

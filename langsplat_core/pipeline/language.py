@@ -39,7 +39,7 @@ from langsplat_core.scene import (
     LanguageField,
     codec_from_tensors,
 )
-from langsplat_core.scene.codec import latent_dtype
+from langsplat_core.scene.codec import KINDS
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.encoder import Encoder, PhraseEncoder
 from langsplat_core.semantics.store import ImageFeatures
@@ -104,10 +104,10 @@ def language_field(
 
 
 def check_lift(config: TrainConfig) -> None:
-    """Raises InputError for a codebook whose numbers the lifting would average."""
-    if config.codec.kind == "codebook" and config.lift.mode in LATENT_LIFTS:
+    """Raises InputError for a codec of latents that cannot be averaged with a lifting that does."""
+    if config.lift.mode in LATENT_LIFTS and not KINDS[config.codec.kind].blends:
         raise InputError(
-            f"--lift.mode {config.lift.mode} averages latents, and a codebook's are numbers of codewords; "
+            f"--lift.mode {config.lift.mode}: a {config.codec.kind} has no latents that can be averaged; "
             "add --codec.kind autoencoder"
         )
 
@@ -145,8 +145,8 @@ class _Stages:
         self._made: tuple[Memberships, MaskGroups] | None = None
 
     def codec(self) -> tuple[Codec, CodecReport]:
-        """Fitted to lifted vectors and, unless it is a codebook, to the masks' own; to these alone where
-        latents are averaged themselves."""
+        """Fitted to lifted vectors and, where that helps, to the masks' own; to these alone where latents are
+        averaged themselves."""
         fitted_to = "masks" if self._lift.mode in LATENT_LIFTS else self._lift.mode
         path = self._work / f"{stage_key('codec', 2, *self._inputs, fitted_to, self._config.codec)}.npz"
         if self._lift.mode not in LATENT_LIFTS and not path.exists():
@@ -187,8 +187,7 @@ class _Stages:
             codec = fit_codec(masks, config, vocabulary, self._progress)
             return codec, codec_report(codec, masks, vocabulary)
         fitted, judged = self._lifted_samples()
-        data = fitted if config.kind == "codebook" and len(fitted) else np.concatenate([masks, fitted])
-        codec = fit_codec(data, config, vocabulary, self._progress)
+        codec = fit_codec(fitted, config, vocabulary, self._progress, further=masks)
         return codec, codec_report(codec, judged if len(judged) else masks, vocabulary)
 
     def _lifted_samples(self) -> tuple[Array, Array]:
@@ -218,7 +217,7 @@ class _Stages:
             scene = (self._rasterizer(), self._gaussians, self._views, codec)
             return lift(*scene, config=self._config.lift, progress=self._progress)
         shape = (len(LEVELS), len(self._gaussians), codec.latent_dim)
-        latents, confidence = np.zeros(shape, latent_dtype(codec)), np.zeros(shape[:2], np.float32)
+        latents, confidence = np.zeros(shape, codec.dtype), np.zeros(shape[:2], np.float32)
         for number, (first, last) in enumerate(self._memberships()[0].blocks):
             latents[:, first:last], confidence[:, first:last] = _unpack(
                 read_arrays(_numbered(folder, number))

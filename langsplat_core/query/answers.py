@@ -4,7 +4,7 @@ Absolute relevancy says little across encoders and phrases (a cosine margin of 0
 here is relative to something measured: the floor, the scene's median, or the map's own range.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -21,6 +21,7 @@ from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, 
 
 CutRule = Literal["floor", "median", "range"]
 CUT_RULES: tuple[CutRule, ...] = get_args(CutRule)
+CHUNK = 16_384  # latents compared with everyday phrases at a time
 SPAN = 0.02  # the least distance between the lower end and the peak that is divided
 RANGE_SHARE = 0.7  # of the map's range: LangSplat's code maps [0, 1] to [-1, 1] and cuts at 0.4
 
@@ -94,7 +95,6 @@ def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
 # Fits are those of `semantics.relevancy.Scale`. The more places a scene has, the better the best of them
 # fits a phrase by chance; so "found" is said by the best fits of everyday phrases in the scene itself.
 
-SAMPLED = 96  # everyday phrases that are looked up in a scene without codewords, where each costs a query
 # Spreads above the median best fit of everyday phrases from which a phrase is found, among whole things and
 # at the finer levels, by what it names: where things like it are, and elsewhere, where more is asked for. One
 # absent phrase in twenty exceeds it (rooms 201 to 203, the bundled encoder and CLIP's geometry with six sets
@@ -155,34 +155,24 @@ def excess(fits: Fits, bars: Bars, named: Named | Literal["inside"], level: Leve
     return max(bars[2].excess(fits[2], whole), bars[3].excess(max(fits[:2]), finer))
 
 
-def chance_in(
-    field: LanguageField, surface: Surface, regions: Regions, scale: Scale, lookup: Iterator[Array]
-) -> Chance:
-    """Of a scene. lookup: relevancies (3, N) of everyday phrases, which are looked at where there are no
-    codewords to compare instead."""
-    if field.codec.space == "index":
-        return _by_codewords(field, surface, regions, scale)
-    columns = [[scale.fit(means) for means in regions.means(values)] for values in lookup]
-    subpart, part, whole = (
-        _solid(np.stack(fits, 1).astype(np.float32), regions.sizes[level])
-        for level, fits in enumerate(zip(*columns, strict=True))
-    )
-    return Chance((subpart, part, whole))
-
-
-def _by_codewords(field: LanguageField, surface: Surface, regions: Regions, scale: Scale) -> Chance:
+def chance_in(field: LanguageField, surface: Surface, regions: Regions, scale: Scale) -> Chance:
+    """How well everyday phrases fit the best regions of a scene, by chance."""
     assert scale.everyday is not None
-    count = field.codec.index_size
-    vectors = field.codec.decode(np.arange(count, dtype=np.uint16)[:, None])
-    zero, rate = scale.of(vectors @ scale.texts.T)
-    relevancy = relevancy_of(vectors @ scale.everyday.T, zero[:, None], rate[:, None])
     fits = []
     for level, known in enumerate(field.known):
         has = known[surface.rows]
-        places = regions.of[level][has], field.latents[level, surface.rows[has], 0].astype(np.int64)
-        shape = (len(regions.totals[level]), count)
-        shares = csr_matrix((surface.weights[has], places), shape=shape)
-        means = (shares @ relevancy) / regions.totals[level][:, None]
+        latents, of = field.codec.unique(field.latents[level, surface.rows[has]])
+        shape = (len(regions.totals[level]), len(latents))
+        shares = csr_matrix((surface.weights[has], (regions.of[level][has], of)), shape=shape).tocsc()
+        means = np.zeros((shape[0], len(scale.everyday)))
+        for start in range(0, len(latents), CHUNK):
+            part = slice(start, start + CHUNK)
+            cosines = field.codec.cosines(latents[part], scale.texts)
+            zero, rate = scale.of(cosines)
+            means += shares[:, part] @ relevancy_of(
+                cosines[:, len(scale.canonical) :], zero[:, None], rate[:, None]
+            )
+        means /= regions.totals[level][:, None]
         fits.append(_solid(scale.fit(means).astype(np.float32), regions.sizes[level]))
     return Chance((fits[0], fits[1], fits[2]))
 

@@ -8,18 +8,16 @@ once.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.compiled import kernel, plain, shared_workers
+from langsplat_core.compiled import kernel, shared_workers
 from langsplat_core.display.displays import gated_mean
 from langsplat_core.errors import InputError
 from langsplat_core.raster.protocol import View
 from langsplat_core.scene import Codec, LanguageField
-from langsplat_core.scene.codec import meaningful
 from langsplat_core.semantics.relevancy import Scale, latent_relevancy, relevancy_of
 
 RESOLUTION = 256  # nodes per side; error against exact decoding falls with its square
@@ -68,16 +66,11 @@ class SphereTable:
             yield found
 
 
-def suits_table(codec: Codec) -> bool:
-    """Whether the codec's latents lie on a sphere."""
-    return codec.latent_dim == 3 and codec.space == "sphere"
-
-
 def build_table(codec: Codec, latents: Array, scale: Scale, resolution: int = RESOLUTION) -> SphereTable:
     """Tabulate `codec` for (M, 3) latents; those of no length have no meaning."""
-    if not suits_table(codec):
+    if not codec.spherical:
         raise ValueError(f"a sphere table needs unit latents of 3 numbers; {codec.kind} has others")
-    known = meaningful(codec, latents)
+    known = codec.known(latents)
     safe = np.where(known[:, None], latents, (0.0, 0.0, 1.0)).astype(np.float64)
     position = sphere_to_octahedral(safe) * (resolution - 1)
     cell = np.clip(np.floor(position), 0, resolution - 2).astype(np.int64)
@@ -116,13 +109,11 @@ def _interpolate(
         found[i] = low * (one - v) + high * v
 
 
-# How the relevancy of one phrase is found at every Gaussian, by what the scene's codec allows.
-#
-# A codebook gives an exact answer for a fetch; a sphere of three numbers has a table over it; what is left is
-# compared latent by latent.
+# How the relevancy of one phrase is found at every Gaussian: each distinct latent is compared, which of a
+# codebook are few; a sphere of three numbers has a table over it.
 
-TOGETHER = 16  # phrases compared with every latent at a time: 12 bytes each per Gaussian
-CHUNK = 16_384  # latents that are compared with texts, or decoded vectors held, at a time
+TOGETHER = 16  # phrases compared with every latent at a time: 4 bytes each per latent
+CHUNK = 16_384  # latents that are compared with texts at a time
 
 
 class Lookup(Protocol):
@@ -135,102 +126,44 @@ class Lookup(Protocol):
 
 def build_lookup(field: LanguageField, scale: Scale, exact: bool = False) -> Lookup:
     """The fastest lookup for `field`; with `exact` none that interpolates, to measure a table by."""
-    if field.codec.space == "index":
-        return CodeLookup(field, scale)
-    if exact:
-        return DecodedLookup(field, scale)
-    if suits_table(field.codec):
-        return build_table(field.codec, known_latents(field), scale)
+    if field.codec.spherical and not exact:
+        latents = np.where(field.known[..., None], field.latents, 0).reshape(-1, field.latents.shape[-1])
+        return build_table(field.codec, latents, scale)
     return LatentLookup(field, scale)
 
 
-def known_latents(field: LanguageField) -> Array:
-    """(3 N, d) latents, zero where a Gaussian has no meaning."""
-    latents = np.where(field.known[..., None], field.latents, 0)
-    return latents.reshape(-1, field.latents.shape[-1])
-
-
-class CodeLookup:
-    """K relevancies of codewords, and a fetch per Gaussian: exact."""
+class LatentLookup:
+    """Every distinct latent compared, and a fetch per Gaussian: exact, in bounded memory."""
 
     def __init__(self, field: LanguageField, scale: Scale) -> None:
-        count = field.codec.index_size
-        self._vectors = field.codec.decode(np.arange(count, dtype=np.uint16)[:, None])
-        self._zero, self._rate = scale.of(self._vectors @ scale.texts.T)
-        self._codes = np.where(field.known, field.latents[..., 0], count).astype(np.uint16).reshape(-1)
-
-    def relevancies(self, phrases: Array) -> Iterator[Array]:
-        """See `Lookup`."""
-        values = relevancy_of(self._vectors @ phrases.T, self._zero[:, None], self._rate[:, None])
-        for row in values.T:
-            found = np.empty(len(self._codes), np.float32)
-            shared_workers().run(_fetch, len(found), plain(np.append(row, 0)), self._codes, found)
-            yield found
-
-
-@dataclass(frozen=True, eq=False)
-class LatentLookup:
-    """Every latent compared, in bounded memory."""
-
-    field: LanguageField
-    scale: Scale
-
-    @cached_property
-    def _read(self) -> tuple[Array, Array, Array]:
-        """Rows of (3 N,) with a meaning, and the (M,) zero and rate of each."""
-        field = self.field
-        rows = np.flatnonzero(field.known)
-        latents = field.latents.reshape(-1, field.latents.shape[-1])
-        zero, rate = np.empty(len(rows), np.float32), np.empty(len(rows), np.float32)
-        for start in range(0, len(rows), CHUNK):
-            part = slice(start, start + CHUNK)
-            zero[part], rate[part] = self.scale.of(
-                field.codec.similarities(latents[rows[part]], self.scale.texts)
+        self._codec = field.codec
+        self._latents, of = field.codec.unique(field.latents.reshape(-1, field.latents.shape[-1]))
+        count = len(self._latents)
+        kind = np.uint16 if count <= np.iinfo(np.uint16).max else np.uint32
+        self._of = np.where(field.known.reshape(-1), of, count).astype(kind)
+        self._zero, self._rate = np.empty(count, np.float32), np.empty(count, np.float32)
+        for part in self._parts():
+            self._zero[part], self._rate[part] = scale.of(
+                self._codec.cosines(self._latents[part], scale.texts)
             )
-        return rows, zero, rate
 
     def relevancies(self, phrases: Array) -> Iterator[Array]:
         """See `Lookup`."""
-        field, (rows, zero, rate) = self.field, self._read
-        latents = field.latents.reshape(-1, field.latents.shape[-1])
         for first in range(0, len(phrases), TOGETHER):
             some = phrases[first : first + TOGETHER]
-            values = np.zeros((len(some), len(latents)), np.float32)
-            for start in range(0, len(rows), CHUNK):
-                part = slice(start, start + CHUNK)
-                cosines = field.codec.similarities(latents[rows[part]], some)
-                values[:, rows[part]] = relevancy_of(cosines, zero[part, None], rate[part, None]).T
-            yield from values
+            values = np.zeros((len(some), len(self._latents) + 1), np.float32)  # the last: no meaning
+            for part in self._parts():
+                cosines = self._codec.cosines(self._latents[part], some)
+                zero, rate = self._zero[part, None], self._rate[part, None]
+                values[:, :-1][:, part] = relevancy_of(cosines, zero, rate).T
+            for row in values:
+                found = np.empty(len(self._of), np.float32)
+                shared_workers().run(_fetch, len(found), row, self._of, found)
+                yield found
 
-
-@dataclass(frozen=True, eq=False)
-class DecodedLookup:
-    """Every latent decoded once, 2 KB each at D = 512."""
-
-    field: LanguageField
-    scale: Scale
-
-    @cached_property
-    def _decoded(self) -> tuple[Array, Array, Array, Array]:
-        """Rows of (3 N,) with a meaning, their (M, D) vectors, and the (M,) zero and rate of each."""
-        field = self.field
-        rows = np.flatnonzero(field.known)
-        latents = field.latents.reshape(-1, field.latents.shape[-1])
-        vectors = np.empty((len(rows), field.codec.vector_dim), np.float32)
-        zero, rate = np.empty(len(rows), np.float32), np.empty(len(rows), np.float32)
-        for start in range(0, len(rows), CHUNK):
-            part = slice(start, start + CHUNK)
-            vectors[part] = field.codec.decode(latents[rows[part]])
-            zero[part], rate[part] = self.scale.of(vectors[part] @ self.scale.texts.T)
-        return rows, vectors, zero, rate
-
-    def relevancies(self, phrases: Array) -> Iterator[Array]:
-        """See `Lookup`."""
-        rows, vectors, zero, rate = self._decoded
-        for phrase in phrases:
-            values = np.zeros(self.field.confidence.size, np.float32)
-            values[rows] = relevancy_of(vectors @ phrase, zero, rate)
-            yield values
+    def _parts(self) -> Iterator[slice]:
+        for start in range(0, len(self._latents), CHUNK):
+            yield slice(start, min(start + CHUNK, len(self._latents)))
 
 
 @kernel
@@ -260,9 +193,9 @@ def decoded_relevancy(
 
     Raises InputError for a codebook, whose numbers cannot be blended.
     """
-    if field.codec.space == "index":
+    if not field.codec.blends:
         raise InputError(
-            "the paper's order blends latents, and this scene has a codebook; train one with "
+            f"the paper's order blends latents, and this scene has a {field.codec.kind}; train one with "
             "`--codec.kind autoencoder`"
         )
     blended, alpha = view.splat(field.latents[level])

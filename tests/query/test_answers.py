@@ -8,7 +8,6 @@ import pytest
 from langsplat_core.arrays import sigmoid
 from langsplat_core.query.answers import QueryResult, by_peak, by_regions, chance_in
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.lookup import build_lookup
 from langsplat_core.query.surface import SMALLEST, Surface, build_regions, build_surface
 from langsplat_core.scene import LEVELS, Calibration, Gaussians, LanguageField, Odds, Reading, Scene
 from langsplat_core.semantics.relevancy import FLOOR, Scale
@@ -33,9 +32,7 @@ def asked(
     if rule == "peak":
         return by_peak(phrase, relevancy, surface, scale, field.reading.found, level)
     regions, calibration = build_regions(surface, field), field.reading.calibration
-    others = build_lookup(field, scale).relevancies(field.everyday[:9])
-    others = (values.reshape(relevancy.shape) for values in others)
-    bars = chance_in(field, surface, regions, scale, others).bars()
+    bars = chance_in(field, surface, regions, replace(scale, everyday=field.everyday[:9])).bars()
     return by_regions(phrase, relevancy, surface, regions, scale, bars, calibration, level)
 
 

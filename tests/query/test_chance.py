@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.query import answers as chance_module
-from langsplat_core.query.answers import FOUND, Bar, Chance, chance_in, excess
+from langsplat_core.query.answers import FOUND, Bar, Chance, excess
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.surface import SMALLEST
 from langsplat_core.scene import LEVELS, Reading, Scene
@@ -14,6 +14,7 @@ from tests.support.fakes import FakeEncoder, blob_scene, language
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_gaussians
 
+TOLERANCE = {"codebook": 1e-4, "linear": 1e-4, "autoencoder": 5e-3}  # of the table that finds relevancies
 BARS = (Bar(0.0, 1.0), Bar(0.5, 1.0), Bar(-1.0, 2.0), Bar(0.6, 0.5))
 
 
@@ -21,30 +22,21 @@ def engine_of(kind: str) -> QueryEngine:
     return QueryEngine(Scene(random_gaussians(400), random_field(400, kind)))
 
 
-def test_by_codewords_is_as_by_looking_up(monkeypatch):
-    monkeypatch.setattr(chance_module, "SAMPLED", 60)
-    engine = engine_of("codebook")
-    field, everyday = engine.field, engine.field.everyday
+@pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
+def test_fits_by_chance_are_those_of_looking_everyday_phrases_up(kind, monkeypatch):
+    monkeypatch.setattr(chance_module, "CHUNK", 7)  # several
+    engine = engine_of(kind)
+    everyday = engine.field.everyday
     fits = engine.chance.fits
     for number, vector in enumerate(everyday):
         means = engine.regions.means(engine.relevancy(vector))
         for level in range(len(LEVELS)):
             solid = engine.regions.sizes[level] >= SMALLEST
             want = engine.scale.fit(means[level])
-            np.testing.assert_allclose(fits[level][solid, number], want[solid], atol=1e-4)
+            np.testing.assert_allclose(
+                fits[level][solid, number], want[solid], atol=5e-3 if kind == "autoencoder" else 1e-4
+            )
             assert np.isneginf(fits[level][~solid, number]).all() or not solid.any()
-    scene = (field, engine.surface, engine.regions, engine.scale)
-    assert chance_in(*scene, iter(())).bars() == engine.chance.bars()
-
-
-@pytest.mark.parametrize("kind", ["autoencoder", "linear"])
-def test_without_codewords_everyday_phrases_are_looked_up(kind):
-    engine = engine_of(kind)
-    bars = engine.chance.bars()
-    assert all(np.isfinite([bar.median, bar.spread]).all() and bar.spread > 0 for bar in bars)
-    best = [engine.run("x", level, vector=engine.field.everyday[7]).fits for level in LEVELS]
-    column = [fits[:, 7].max() for fits in engine.chance.fits]  # all 60 phrases are looked at
-    np.testing.assert_allclose(best[0], column, atol=1e-4)
 
 
 def test_bars_are_quantiles_of_the_best_and_those_of_some_regions_are_lower():

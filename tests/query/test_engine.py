@@ -14,7 +14,6 @@ from langsplat_core.query.lookup import (
     octahedral_to_sphere,
     sphere_to_octahedral,
     splatted_relevancy,
-    suits_table,
 )
 from langsplat_core.query.surface import build_surface
 from langsplat_core.raster.reference import ReferenceRasterizer
@@ -109,7 +108,7 @@ def test_a_table_needs_a_sphere():
     canonical = unit(rng.normal(size=(4, D))).astype(np.float32)
     flat = LinearCodec(np.eye(D, dtype=np.float32)[:3])  # 3 numbers, but of any length
     for codec in (random_codec(rng, d=4), flat):
-        assert not suits_table(codec)
+        assert not codec.spherical
         with pytest.raises(ValueError, match="sphere"):
             build_table(codec, np.ones((2, codec.latent_dim), np.float32), canonical)
 

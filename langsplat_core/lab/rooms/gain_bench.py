@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from langsplat_core.config import CodecConfig
+from langsplat_core.config import CodebookConfig
 from langsplat_core.errors import InputError
 from langsplat_core.lab.config import BenchmarkConfig, GainBenchConfig, MaskOrigin
 from langsplat_core.lab.rooms.gains import GAINS, Material
@@ -87,7 +87,7 @@ def _material(room: Room, variant: Variant) -> Material:
 def _field(lifted: Lifted, encoder: Encoder, vocabulary: Vocabulary, size: int) -> LanguageField:
     seen = lifted.vectors[lifted.confidence > 0]
     sample = seen[np.random.default_rng(0).permutation(len(seen))[:SAMPLE]]
-    codec = fit_codebook(sample, CodecConfig(size=size), vocabulary)
+    codec = fit_codebook(sample, CodebookConfig(size=size), vocabulary)
     levels, count, dim = lifted.vectors.shape
     codes = codec.encode(lifted.vectors.reshape(-1, dim)).reshape(levels, count, 1)
     canonical = encoder.encode_texts(list(CANONICAL_PHRASES))

@@ -3,7 +3,14 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from langsplat_core.config import CodecConfig, LevelChoice, LiftConfig
+from langsplat_core.config import (
+    AutoencoderConfig,
+    CodebookConfig,
+    CodecConfig,
+    LevelChoice,
+    LiftConfig,
+    LinearConfig,
+)
 from langsplat_core.lab.config import BenchmarkConfig, LiftBenchConfig, MaskOrigin
 
 
@@ -14,20 +21,20 @@ class Variant:
     name: str
     masks: MaskOrigin
     vectors: Literal["image", "text"] = "image"  # text: of every region's true words
-    codec: CodecConfig = CodecConfig()  # noqa: RUF009 (frozen)
+    codec: CodecConfig = CodebookConfig()  # noqa: RUF009 (frozen)
     lift: LiftConfig = LiftConfig()  # noqa: RUF009
     query: Literal["blend answers", "paper"] = "blend answers"  # paper: blend latents, then decode
     level: LevelChoice = "auto"  # that is asked
 
 
-def autoencoder(d: int = 3, steps: int = CodecConfig.steps) -> CodecConfig:
+def autoencoder(d: int = 3, steps: int = AutoencoderConfig.steps) -> AutoencoderConfig:
     """The paper's codec."""
-    return CodecConfig(kind="autoencoder", latent_dim=d, steps=steps)
+    return AutoencoderConfig(latent_dim=d, steps=steps)
 
 
 def ceiling(dim: int) -> CodecConfig:
     """A codec that loses nothing: all `dim` numbers."""
-    return CodecConfig(kind="linear", latent_dim=dim)
+    return LinearConfig(latent_dim=dim)
 
 
 def variants(config: BenchmarkConfig, dim: int) -> list[Variant]:
@@ -37,7 +44,7 @@ def variants(config: BenchmarkConfig, dim: int) -> list[Variant]:
     if not config.budget:
         return [method, replace(method, name="no codec", codec=ceiling(dim))][: 1 + config.ceiling]
     perfect = [replace(method, name="perfect masks", masks="truth")] if config.masks != "truth" else []
-    decoded = replace(method, name="autoencoder, d = 3", codec=autoencoder(steps=config.codec.steps))
+    decoded = replace(method, name="autoencoder, d = 3", codec=autoencoder())
     return [
         method,
         *perfect,
@@ -65,11 +72,11 @@ def liftings(config: LiftBenchConfig, masks: MaskOrigin, dim: int) -> list[Varia
         for d in config.dims
     ]
     made += [
-        replace(method, name=f"median, linear r = {rank}", codec=CodecConfig(kind="linear", latent_dim=rank))
+        replace(method, name=f"median, linear r = {rank}", codec=LinearConfig(latent_dim=rank))
         for rank in config.ranks
     ]
     made += [
-        replace(method, name=f"median, codebook K = {size}", codec=CodecConfig(size=size))
+        replace(method, name=f"median, codebook K = {size}", codec=CodebookConfig(size=size))
         for size in config.sizes
     ]
     chosen = replace(method, name="median, codebook by error budget")

@@ -18,7 +18,7 @@ from typing import overload
 import numpy as np
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.config import CodecConfig, TrainConfig
+from langsplat_core.config import CodebookConfig, TrainConfig
 from langsplat_core.errors import InputError
 from langsplat_core.lab.speed.cases import random_scene
 from langsplat_core.lab.speed.resident import peak_memory
@@ -133,7 +133,7 @@ class RandomEncoder:
 
 
 def _measure(count: int, views: int, picture: tuple[int, int]) -> LiftCost:
-    config = TrainConfig(codec=CodecConfig(size=1_024))
+    config = TrainConfig(codec=CodebookConfig(size=1_024))
     gaussians = random_scene(count)
     with tempfile.TemporaryDirectory(prefix="langsplat_lift_") as folder:
         start = time.perf_counter()

@@ -10,7 +10,7 @@ from PIL import Image
 
 from langsplat_core.cli.evaluate import EvalSynthetic
 from langsplat_core.cli.run import main
-from langsplat_core.config import CodecConfig, DatasetConfig
+from langsplat_core.config import CodebookConfig, DatasetConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io import save_scene
@@ -45,7 +45,7 @@ TINY = BenchmarkConfig(
     steps=60,
     max_gaussians=3_000,
     budget=True,
-    codec=CodecConfig(steps=60),
+    codec=CodebookConfig(),
 )
 
 
