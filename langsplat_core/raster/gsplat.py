@@ -108,6 +108,7 @@ def draw(
         sh_degree=sh_degree,
         packed=False,
         rasterize_mode="antialiased" if settings.antialiased else "classic",
+        camera_model="ortho" if camera.orthographic else "pinhole",
     )
     means_px = extra["means2d"]
     if means_px.requires_grad:

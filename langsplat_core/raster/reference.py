@@ -61,7 +61,8 @@ def colours(sh: Array, means: Array, camera_position: Array) -> Array:
 #
 # Image formation, from top to bottom (constants in `config.RasterSettings`):
 #
-# 1. Camera space: p = R x + t; Gaussians with p.z <= near or p.z > far are not drawn. 2. Footprint: the
+# 1. Camera space: p = R x + t; Gaussians with p.z <= near or p.z > far are not drawn. 2. Footprint (of an
+# orthographic camera, whose map is linear, J is diag(fx, fy) without a third column): the
 # perspective map is linearised at p, with p.x/p.z and p.y/p.z clamped to 1.3 times the half field of view
 # on each side of the principal point. With A = J R rotation diag(scales) (2x3) the 2D covariance is A A^T +
 # 0.3 I, positive definite by construction. 3. alpha(u) = min(0.99, opacity * exp(-1/2 (u-m)^T cov^-1
@@ -100,11 +101,13 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INR
     top, bottom = camera.cy / camera.fy + margin_y, (camera.height - camera.cy) / camera.fy + margin_y
     tx = np.clip(x / z, -left, right) * z
     ty = np.clip(y / z, -top, bottom) * z
-    zero = np.zeros_like(z)
+    zero, over, bent = np.zeros_like(z), z, 1.0
+    if camera.orthographic:
+        over, bent = np.ones_like(z), 0.0
     jacobian = np.stack(
         [
-            np.stack([camera.fx / z, zero, -camera.fx * tx / z**2], -1),
-            np.stack([zero, camera.fy / z, -camera.fy * ty / z**2], -1),
+            np.stack([camera.fx / over, zero, -bent * camera.fx * tx / z**2], -1),
+            np.stack([zero, camera.fy / over, -bent * camera.fy * ty / z**2], -1),
         ],
         -2,
     )
@@ -126,7 +129,7 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INR
     opacities = np.where(drawn & (opacities >= settings.alpha_min), opacities, 0)
     reach = np.sqrt(2 * np.log(np.maximum(opacities / settings.alpha_min, 1)))  # in standard deviations
     return Footprints(
-        means_px=np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1),
+        means_px=np.stack([camera.fx * x / over + camera.cx, camera.fy * y / over + camera.cy], -1),
         depths=z,
         conics=np.stack([yy / det, -xy / det, xx / det], -1),
         extents_px=np.stack([reach * np.sqrt(xx), reach * np.sqrt(yy)], -1),

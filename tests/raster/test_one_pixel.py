@@ -7,7 +7,7 @@ from langsplat_core.config import INRIA
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.raster.render import pixel_weights
 from langsplat_core.scene import Gaussians, look_at
-from tests.support.scenes import random_gaussians
+from tests.support.scenes import random_gaussians, without_perspective
 
 SIZE = (64, 48)
 PIXELS = [(0, 0), (63, 47), (32, 24), (20, 40), (50, 5)]
@@ -17,11 +17,13 @@ def view_from(distance: float):
     return look_at(np.array([0.2, -0.3, -distance]), np.zeros(3), np.array([0.0, -1, 0]), SIZE)
 
 
+@pytest.mark.parametrize("orthographic", [False, True])
 @pytest.mark.parametrize("distance", [3.0, 0.8])  # outside, and amid them: some behind, some at the edge
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_the_row_of_w(backend, distance):
+def test_the_row_of_w(backend, distance, orthographic):
     gaussians = random_gaussians(400, 3, scale_range=(0.005, 0.5))
     camera, rasterizer = view_from(distance), load_lifting_rasterizer(backend)
+    camera = without_perspective(camera) if orthographic else camera
     truth = load_lifting_rasterizer("reference").view(gaussians, camera)
     for column, row in PIXELS:
         image = np.zeros((SIZE[1], SIZE[0], 1))

@@ -15,17 +15,18 @@ from hypothesis import strategies as st
 from langsplat_core.config import GSPLAT, INRIA, RasterSettings
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Camera, Gaussians
 from tests.support.backends import Backend
 from tests.support.close import assert_adjoint
-from tests.support.scenes import random_camera, random_gaussians, random_values
+from tests.support.scenes import random_camera, random_gaussians, random_values, without_perspective
 
 Case = tuple[Gaussians, Camera, RasterSettings]
 
 
 @st.composite
 def cases(draw: st.DrawFn) -> Case:
-    """1 to 30 Gaussians, sizes 1e-6 to 10 world units, opacities from 0 to 1, any camera."""
+    """1 to 30 Gaussians, sizes 1e-6 to 10 world units, opacities from 0 to 1, any camera of both kinds."""
     count, seed = draw(st.integers(1, 30)), draw(st.integers(0, 2**31))
     rng = np.random.default_rng(seed)
     base = random_gaussians(count, seed)
@@ -41,6 +42,8 @@ def cases(draw: st.DrawFn) -> Case:
     )
     width, height = draw(st.integers(1, 36)), draw(st.integers(1, 36))
     camera = random_camera(seed, width, height, distance=draw(st.floats(0.05, 6)))
+    if draw(st.booleans()):
+        camera = without_perspective(camera, draw(st.floats(0.05, 6)))
     profile = draw(st.sampled_from([INRIA, GSPLAT]))
     return gaussians, camera, replace(profile, antialiased=draw(st.booleans()))
 
@@ -146,3 +149,17 @@ def test_gradients_are_finite(slow: bool) -> None:
             assert not gradient[undrawn].any(), name
 
     over_random_cases(law, slow)
+
+
+def test_without_perspective_a_step_along_the_view_changes_nothing(backend: Backend) -> None:
+    """Colours that depend on the view too; a step moves no Gaussian behind the camera."""
+    gaussians, camera = random_gaussians(60, 3, sh_degree=3), without_perspective(random_camera(5, 41, 30))
+    step = np.eye(4)
+    step[2, 3] = 4.0  # a power of two: depths keep their last digit
+    moved = replace(camera, world_to_camera=step @ camera.world_to_camera)
+    images = []
+    for at in (camera, moved):
+        drawn = splat_colours(backend.raster.view(gaussians, at), gaussians, at)
+        images.append(np.concatenate([drawn.colours, drawn.alpha[..., None]], -1))
+    assert images[0].std() > 0.1
+    np.testing.assert_allclose(images[1], images[0], atol=max(backend.tolerance, 1e-6))

@@ -275,6 +275,8 @@ def _point_gradient(point: cp.Point, camera: cp.KernelCamera, du: float, dv: flo
 
     A clamped coordinate is a constant multiple of z in the Jacobian, so it gets no gradient there.
     """
+    if camera.orthographic:
+        return du * camera.fx, dv * camera.fy, 0.0
     x, y, z = point
     r = camera.rotation
     j00 = db[0, 0] * r[0, 0] + db[0, 1] * r[0, 1] + db[0, 2] * r[0, 2]

@@ -75,6 +75,7 @@ class KernelCamera(NamedTuple):
     dilation: float
     alpha_min: float
     antialiased: bool
+    orthographic: bool
 
 
 def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
@@ -99,6 +100,7 @@ def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
         dilation=float(settings.dilation),
         alpha_min=float(settings.alpha_min),
         antialiased=bool(settings.antialiased),
+        orthographic=camera.orthographic,
     )
 
 
@@ -116,6 +118,8 @@ def camera_point(mean: Array, camera: KernelCamera) -> Point:
 @helper
 def _jacobian(x: float, y: float, z: float, camera: KernelCamera) -> tuple[float, float, float, float]:
     """Non-zero entries (0,0), (0,2), (1,1), (1,2) of d(pixel)/d(camera point), taken at the clamped point."""
+    if camera.orthographic:
+        return camera.fx, 0.0, camera.fy, 0.0
     tx = min(max(x / z, -camera.left), camera.right)
     ty = min(max(y / z, -camera.top), camera.bottom)
     return camera.fx / z, -camera.fx * tx / z, camera.fy / z, -camera.fy * ty / z
@@ -224,7 +228,8 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Footpr
             if opacity < camera.alpha_min:
                 continue
         reach = np.sqrt(2 * np.log(max(opacity / camera.alpha_min, 1.0)))
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        over = 1.0 if camera.orthographic else z
+        u, v = camera.fx * x / over + camera.cx, camera.fy * y / over + camera.cy
         wide, high = reach * np.sqrt(xx), reach * np.sqrt(yy)
         right, bottom = camera.width - 0.5, camera.height - 0.5  # the last pixel's centre
         if u + wide < 0.5 or u - wide > right or v + high < 0.5 or v - high > bottom:

@@ -174,6 +174,7 @@ class GlRasterizer:
                 "world_to_camera": camera.rotation.T.astype("f4").tobytes(),  # GLSL is column-major
                 "camera_high": tuple(high),
                 "camera_low": tuple(camera.position - high),
+                "orthographic": camera.orthographic,
                 "focal": (camera.fx, camera.fy),
                 "principal": (camera.cx, camera.cy),
                 "tangents": (

@@ -13,7 +13,7 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Gaussians
 from tests.support import torch_reference
 from tests.support.close import BAND, assert_gradient
-from tests.support.scenes import random_camera, random_gaussians, random_values
+from tests.support.scenes import random_camera, random_gaussians, random_values, without_perspective
 
 PARAMETERS = ("means", "log_scales", "quats_wxyz", "opacity_logits")
 
@@ -61,12 +61,23 @@ def test_autograd(seed):
     assert (got.opacity_logits != 0).sum() > 15
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_autograd_itself_against_differences(antialiased):
+def test_autograd_without_perspective(antialiased):
+    """A Gaussian's depth changes nothing but the order; beside the picture no Jacobian is clamped."""
+    gaussians, camera = random_gaussians(50, 3, radius=2.0), random_camera(3, 40, 27, distance=1.5)
+    camera = without_perspective(camera, 1.5)
+    got = compare_with_autograd(gaussians, camera, replace(INRIA, antialiased=antialiased))
+    np.testing.assert_allclose(got.means @ camera.rotation[2], 0, atol=1e-5 * np.abs(got.means).max())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("orthographic", [False, True])
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_autograd_itself_against_differences(antialiased, orthographic):
     """The twin's gradients by torch's own check in float64; cut-offs are moved to where nothing is left."""
     settings = replace(INRIA, alpha_min=1e-12, transmittance_min=1e-14, antialiased=antialiased)
     gaussians, camera = random_gaussians(4, 10), random_camera(10, 6, 5)
+    camera = without_perspective(camera) if orthographic else camera
     gaussians = replace(gaussians, opacity_logits=logit(np.linspace(0.2, 0.8, 4)))
     leaves = torch_reference.parameters(gaussians)
     values = torch.tensor(random_values(4, 2), dtype=torch.float64, requires_grad=True)
@@ -78,11 +89,13 @@ def test_autograd_itself_against_differences(antialiased):
     assert torch.autograd.gradcheck(drawn, (*leaves.values(), values), eps=1e-6, atol=1e-7, rtol=1e-5)
 
 
+@pytest.mark.parametrize("orthographic", [False, True])
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_the_twin_draws_what_the_reference_draws(antialiased):
+def test_the_twin_draws_what_the_reference_draws(antialiased, orthographic):
     """So that its gradients are those of the image formation that is documented."""
     settings = replace(INRIA, antialiased=antialiased)
     gaussians, camera, x = random_gaussians(40, 11), random_camera(11, 40, 27), random_values(40, 3)
+    camera = without_perspective(camera) if orthographic else camera
     want, want_alpha = ReferenceRasterizer().view(gaussians, camera, settings).splat(x)
     image, alpha, _ = torch_reference.render(
         torch_reference.parameters(gaussians), torch.tensor(x, dtype=torch.float64), camera, settings
