@@ -188,7 +188,7 @@ def test_the_rule_itself_can_fail():
 
 def test_opening_a_scene_imports_nothing_heavy():
     code = (
-        "import sys, langsplat_core, langsplat_core.io, langsplat_core.scene,"
+        "import sys, langsplat_core, langsplat_core.io.scenes, langsplat_core.scene,"
         " langsplat_core.query.engine,"
         " langsplat_core.display.displays, langsplat_core.raster;"
         f"print([m for m in {HEAVY!r} if m in sys.modules])"

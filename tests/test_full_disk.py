@@ -13,10 +13,12 @@ import pytest
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
 from langsplat_core.evaluation.report import write_json
-from langsplat_core.io import save_scene, write_cameras, write_ply
+from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.langsplat_files import write_autoencoder, write_checkpoint, write_features
 from langsplat_core.io.language import write_language
+from langsplat_core.io.ply import write_ply
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.io.shapes import write_points
 from langsplat_core.lab.encoder.crops import CropSet
 from langsplat_core.lab.rooms.report import save_json as save_rooms

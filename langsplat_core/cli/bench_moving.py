@@ -8,7 +8,7 @@ import tyro
 
 from langsplat_core.cli.bench_files import save_figures
 from langsplat_core.cli.checks import OutFolder
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.lab.config import MovingBenchConfig
 from langsplat_core.progress import TerminalProgress
 

@@ -9,7 +9,7 @@ import tyro
 from langsplat_core.cli.bench_files import save_figures
 from langsplat_core.cli.checks import OutFolder
 from langsplat_core.errors import InputError
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.lab.config import QueryBenchConfig
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import no_field

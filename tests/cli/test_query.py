@@ -14,7 +14,7 @@ from langsplat_core.cli import query
 from langsplat_core.cli.query import QueryScene
 from langsplat_core.config import INRIA
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
-from langsplat_core.io import load_scene, save_scene
+from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.lab.rooms.scoring import ask, evaluate
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer

@@ -13,7 +13,7 @@ from PIL import Image
 
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import Command, main
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_viewer.__main__ import parse as parse_viewer
 from tests.support.file_samples import compressed_ply
 from tests.support.scenes import random_gaussians

@@ -13,7 +13,7 @@ import pytest
 
 from langsplat_core.config import PictureConfig
 from langsplat_core.evaluation.scoring import intersection_over_union, majority
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.lab.demo import SEED, SIZE, VIEWS
 from langsplat_core.lab.world.appearance.render import Renderer
 from langsplat_core.lab.world.photographs import LIGHT, orbit_cameras, photographed_room, truth_ids

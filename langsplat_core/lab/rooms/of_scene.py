@@ -5,7 +5,7 @@ from pathlib import Path
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.lab.rooms.scoring import Reading, ask, evaluate, found_rate
 from langsplat_core.lab.rooms.truth import read_truth
 from langsplat_core.lab.world.objects.catalogue import EVERYTHING

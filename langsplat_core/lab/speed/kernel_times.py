@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.lab.config import KernelStepsConfig
 from langsplat_core.lab.speed.cases import default_camera, random_scene
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer

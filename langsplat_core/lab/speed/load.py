@@ -20,8 +20,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
-from langsplat_core.io import read_ply
-from langsplat_core.io.ply import BASE_COLOUR, NORMAL, POSITION, ROTATION, SCALE
+from langsplat_core.io.ply import BASE_COLOUR, NORMAL, POSITION, ROTATION, SCALE, read_ply
 from langsplat_core.lab.speed.resident import peak_memory
 from langsplat_core.progress import Progress, silent
 

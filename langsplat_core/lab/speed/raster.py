@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from langsplat_core.errors import BackendError
-from langsplat_core.io import load_scene
 from langsplat_core.io.files import atomic_path
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.lab.config import RasterBenchConfig
 from langsplat_core.lab.speed import report as tables
 from langsplat_core.lab.speed.cases import Case, default_camera, random_scene, sweep

@@ -13,7 +13,7 @@ from langsplat_core.cli.run import main
 from langsplat_core.config import CodebookConfig, DatasetConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.lab.config import BenchmarkConfig, GainBenchConfig, LiftBenchConfig, PaperBenchConfig
 from langsplat_core.lab.demo import SEED
 from langsplat_core.lab.rooms import patches, tiles

@@ -6,7 +6,7 @@ import pytest
 
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.lab.speed.endurance import PARTS, parts
 from langsplat_core.lab.speed.resident import peak_memory, resident_memory, restart_peak
 from tests.support.fakes import blob_scene

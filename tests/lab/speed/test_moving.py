@@ -8,7 +8,7 @@ import pytest
 
 from langsplat_core.cli.bench_moving import BenchMoving
 from langsplat_core.errors import InputError
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.lab.config import MovingBenchConfig
 from langsplat_core.lab.speed.moving import WAYS, measure_moving
 

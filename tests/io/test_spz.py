@@ -9,11 +9,12 @@ import zstandard
 
 from langsplat_core.arrays import rotation_matrices, sigmoid
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.io import read_splat, read_spz_scene, write_spz
+from langsplat_core.io.splat import read_splat
+from langsplat_core.io.spz import read_spz_scene, write_spz
 from langsplat_core.raster.reference import colours
 from langsplat_core.scene import Gaussians
+from tests.support.file_samples import spz_bytes
 from tests.support.scenes import covariances, random_gaussians
-from tests.support.splat_samples import spz_bytes
 
 # Half a step of each code, and the error of a rotation matrix. From version 3 on: half a step of 9 bits over
 # [0, 0.71] is 7e-4 a component, amplified up to 5 times in the matrix, whose entries are twice products of

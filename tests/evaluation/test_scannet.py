@@ -19,7 +19,7 @@ from langsplat_core.evaluation.scannet import (
     save_point_json,
     scene_classes,
 )
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
 from tests.support.fakes import CENTRES, axis, blobs, language

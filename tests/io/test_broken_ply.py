@@ -1,16 +1,18 @@
-"""PLY files that are cut, or whose headers lie: one FormatError of one line, memory bounded by the file."""
+"""One broken rule of the PLY at a time, and the message of each."""
 
 import os
 import tracemalloc
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pytest
 
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.io import ply, read_ply, read_ply_scene, write_ply
+from langsplat_core.io import ply
+from langsplat_core.io.ply import read_ply, read_ply_scene, write_ply
 from langsplat_core.scene import Gaussians, Scene
 from tests.support.file_samples import (
     ascii_ply,
@@ -21,8 +23,155 @@ from tests.support.file_samples import (
     ply_bytes,
     vertex_table,
 )
-from tests.support.ply_lies import lie
 from tests.support.scenes import random_gaussians
+
+
+@pytest.fixture
+def put(tmp_path):
+    def write(content: bytes):
+        path = tmp_path / "scene.ply"
+        path.write_bytes(content)
+        return path
+
+    return write
+
+
+HEADER = ["format binary_little_endian 1.0", "element vertex 2"]
+FLOATS = [f"property float {name}" for name in inria_names(0)]
+BODY = bytes(2 * 4 * len(FLOATS))
+
+
+def replaced(lines: list[str], old: str, *new: str) -> list[str]:
+    assert old in lines
+    return [out for line in lines for out in (new if line == old else (line,))]
+
+
+BROKEN = {
+    "no property": (
+        ply_bytes(HEADER + replaced(FLOATS, "property float opacity"), BODY),
+        r"property 'opacity' is missing",
+    ),
+    "a missing rotation": (
+        ply_bytes(HEADER + replaced(FLOATS, "property float rot_3"), BODY),
+        r"property 'rot_3' is missing",
+    ),
+    "wrong number of coefficients": (
+        ply_bytes([*HEADER, *FLOATS, *(f"property float f_rest_{i}" for i in range(44))], BODY * 9),
+        r"44 properties f_rest_\*; expected 0, 9, 24 or 45 \(SH degree 0-3\)",
+    ),
+    "a gap among the coefficients": (
+        ply_bytes([*HEADER, *FLOATS, *(f"property float f_rest_{i}" for i in range(1, 10))], BODY * 9),
+        r"'f_rest_0' is missing among 9",
+    ),
+    "a list for a number": (
+        ply_bytes(
+            HEADER + replaced(FLOATS, "property float opacity", "property list uchar float opacity"), BODY
+        ),
+        r"'opacity' of vertex is a list",
+    ),
+    "truncated body": (
+        ply_bytes(HEADER + FLOATS, BODY[:-1]),
+        rf"truncated: 2 rows of element vertex need at least {len(BODY)} bytes, the file has {len(BODY) - 1}",
+    ),
+    "10^12 vertices": (
+        ply_bytes(replaced(HEADER, HEADER[1], f"element vertex {10**12}") + FLOATS, BODY),
+        r"truncated: 1000000000000 rows",
+    ),
+    "10^12 vertices in ascii": (
+        ply_bytes(["format ascii 1.0", f"element vertex {10**12}", *FLOATS], b"0 " * 99),
+        r"truncated: 1000000000000 rows",
+    ),
+    "a million faces in front": (
+        ply_bytes([HEADER[0], "element face 1000000", "property list uchar int i", HEADER[1], *FLOATS], BODY),
+        r"truncated: 1000000 rows of element face",
+    ),
+    "faces that eat the vertices": (
+        ply_bytes(
+            [HEADER[0], "element face 1", "property list uint int i", HEADER[1], *FLOATS], b"\xff" * 4 + BODY
+        ),
+        r"truncated",
+    ),
+    "a negative list length": (
+        ply_bytes(
+            [HEADER[0], "element face 1", "property list char int i", HEADER[1], *FLOATS], b"\xff" + BODY
+        ),
+        r"negative list length",
+    ),
+    "a negative count": (
+        ply_bytes(replaced(HEADER, HEADER[1], "element vertex -2") + FLOATS, BODY),
+        r"count '-2'; expected a whole number",
+    ),
+    "a count of a million digits": (
+        ply_bytes(replaced(HEADER, HEADER[1], "element vertex " + "9" * 50_000) + FLOATS, BODY),
+        r"expected a whole number",
+    ),
+    "no end of the header": (
+        b"ply\n" + b"comment x\n" * 10_000,
+        r"truncated: no 'end_header' line in the first 65536 bytes",
+    ),
+    "header without a format": (ply_bytes([HEADER[1], *FLOATS], BODY), r"no 'format' line"),
+    "an unknown format": (
+        ply_bytes(["format binary_pdp 1.0", *HEADER[1:], *FLOATS], BODY),
+        r"not understood",
+    ),
+    "an unknown type": (
+        ply_bytes(HEADER + replaced(FLOATS, "property float x", "property quad x"), BODY),
+        r"'property quad x' is not a valid property",
+    ),
+    "a property before any element": (ply_bytes([HEADER[0], *FLOATS], b""), r"not understood"),
+    "a property twice": (ply_bytes([*HEADER, *FLOATS, FLOATS[0]], BODY * 2), r"'x' is declared twice"),
+    "an element twice": (
+        ply_bytes([*HEADER, *FLOATS, HEADER[1]], BODY),
+        r"element 'vertex' is declared twice",
+    ),
+    "not a PLY": (b"solid cube\n" * 20, r"is not a PLY file"),
+    "an empty file": (b"", r"is not a PLY file"),
+    "no vertices": (ply_bytes([HEADER[0], "element face 0"], b""), r"no element 'vertex'"),
+    "a mesh": (
+        ply_bytes([*HEADER, *(f"property float {n}" for n in ("x", "y", "z", "red"))], BODY),
+        r"a mesh or point cloud, not a 3D Gaussian scene",
+    ),
+    "words in ascii": (
+        ply_bytes(["format ascii 1.0", "element vertex 1", *FLOATS], b"one " * len(FLOATS) + b"\n"),
+        r"unreadable row",
+    ),
+    "too few rows in ascii": (
+        ply_bytes(["format ascii 1.0", "element vertex 2", *FLOATS], b"0.000000 " * len(FLOATS) + b"\n"),
+        r"truncated: element vertex has 1 rows, the header says 2",
+    ),
+    "no row in ascii": (
+        ply_bytes(["format ascii 1.0", "element vertex 1", *FLOATS], b"\n" * 99),
+        r"truncated: element vertex has 0 rows",
+    ),
+    "too many values in ascii": (
+        ply_bytes(["format ascii 1.0", "element vertex 1", *FLOATS], b"0 " * (len(FLOATS) + 1) + b"\n"),
+        rf"{len(FLOATS) + 1} values in a row of vertex; expected {len(FLOATS)}",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_every_broken_rule_has_its_message(put, case):
+    content, message = BROKEN[case]
+    with pytest.raises(FormatError, match=message) as caught:
+        read_ply(put(content))
+    assert str(caught.value).startswith(str(put(content)))
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < len(str(put(content))) + 200  # whatever a library adds
+
+
+def test_paths_that_cannot_be_read(tmp_path):
+    with pytest.raises(InputError, match=r"nowhere\.ply: no such file"):
+        read_ply(tmp_path / "nowhere.ply")
+    with pytest.raises(InputError, match="is a folder"):
+        read_ply(tmp_path)
+    with pytest.raises(InputError, match="cannot be opened"):
+        read_ply("nul\0.ply")
+    with pytest.raises(InputError, match="not an ordinary file"):
+        read_ply("/dev/null")
+
+
+# PLY files that are cut, or whose headers lie: one FormatError of one line, memory bounded by the file.
 
 FIELDS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh")
 
@@ -219,7 +368,7 @@ def fuzz(reader: Reader, kind: str, rounds: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     sample = KINDS[kind](random_gaussians(20, sh_degree=1))
     for count in range(rounds):
-        scene = reader(lie(sample, rng))
+        scene = reader(malformed(sample, rng))
         if scene is not None and count % 5 == 0:
             assert_survives_writing(scene, reader.path.with_name("b.ply"))
     assert rounds / 10 < reader.refused < rounds  # the lies do matter, and some are harmless
@@ -246,3 +395,96 @@ def test_the_samples_are_good(reader):
             np.testing.assert_array_equal(got.gaussians.sh, g.sh)
     assert list(reader(many_types(g)).extras) == ["segment", "id"]
     assert read_ply(reader.path).sh_degree == 1
+
+
+# Headers of PLY files that lie: lines removed, doubled, swapped, or saying something else.
+
+T = TypeVar("T")
+
+TYPES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double", "int8", "float64")
+INSERTS = [
+    b"element face 3",
+    b"element face 0",
+    b"element a 999999999999",
+    b"element vertex 3",
+    b"property list uchar int v",
+    b"property list char int v",
+    b"property list uint double w",
+    b"property list float int v",
+    b"property double q",
+    b"property uchar q",
+    b"property float x",
+    b"property float f_rest_0",
+    b"property float f_rest_45",
+    b"property float packed_color",
+    b"property char \xff\xfe",
+    b"comment SplatRenderMode: mip",
+    b"obj_info \x00",
+    b"format ascii 1.0",
+    b"format binary_big_endian 1.0",
+    b"end_header",
+    b"ply",
+    b"",
+    b"\x00",
+    b"property",
+    b"element",
+]
+COUNTS = [0, 1, 2, 19, 21, 255, 256, 257, 2**31, 2**32, 2**63, 2**64, 10**12, -1]
+NAMES = [*inria_names(1), "chunk", "sh", "vertex", "min_x", "packed_position", "f_rest_9", "f_rest_-1", "ä"]
+
+
+def malformed(content: bytes, rng: np.random.Generator) -> bytes:
+    """One to three changes to lines of the header, then perhaps a mutation to the body."""
+    header, _, body = content.partition(b"end_header\n")
+    lines = header.splitlines()
+    for _ in range(int(rng.integers(1, 4))):
+        change_a_line(lines, rng)
+    newline = b"\r\n" if rng.random() < 0.1 else b"\n"
+    return newline.join([*lines, b"end_header"]) + newline + mutated(body, rng)
+
+
+def change_a_line(lines: list[bytes], rng: np.random.Generator) -> None:
+    """Remove, double, swap or add a line, or change what one says; in place."""
+    place, other = (int(i) for i in rng.integers(1, len(lines), size=2))
+    match int(rng.integers(0, 8)):
+        case 0 if len(lines) > 3:
+            del lines[place]
+        case 1:
+            lines.insert(other, lines[place])
+        case 2:
+            lines[place], lines[other] = lines[other], lines[place]
+        case 3:
+            lines.insert(place, _pick(INSERTS, rng))
+        case 4:
+            words = lines[place].split(b" ")
+            words[min(1, len(words) - 1)] = _pick(TYPES, rng).encode()
+            lines[place] = b" ".join(words)
+        case 5:
+            lines[place] = b" ".join([*lines[place].split(b" ")[:-1], _pick(NAMES, rng).encode()])
+        case 6:
+            elements = [i for i, line in enumerate(lines) if line.startswith(b"element ")]
+            if elements:
+                at = _pick(elements, rng)
+                lines[at] = b" ".join([*lines[at].split(b" ")[:-1], str(_pick(COUNTS, rng)).encode()])
+        case _:
+            kinds = [b"ascii", b"binary_little_endian", b"binary_big_endian"]
+            lines[1] = b"format " + _pick(kinds, rng)
+
+
+def mutated(body: bytes, rng: np.random.Generator) -> bytes:
+    """Half of the time as it is; else cut, longer, with bytes in between, or several times over."""
+    match int(rng.integers(0, 8)):
+        case 0:
+            return body[: int(rng.integers(0, len(body) + 1))]
+        case 1:
+            return body + rng.bytes(int(rng.integers(1, 400)))
+        case 2:
+            place = int(rng.integers(0, len(body)))
+            return body[:place] + rng.bytes(int(rng.integers(1, 40))) + body[place:]
+        case 3:
+            return body * int(rng.integers(2, 5))
+    return body
+
+
+def _pick(choices: Sequence[T], rng: np.random.Generator) -> T:
+    return choices[int(rng.integers(len(choices)))]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.io import read_features, write_features
+from langsplat_core.io.langsplat_files import read_features, write_features
 
 rng = np.random.default_rng(0)
 VECTORS = rng.normal(size=(9, 512)).astype(np.float32)

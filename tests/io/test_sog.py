@@ -8,7 +8,8 @@ from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import rotation_matrices, sigmoid
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.io import load_scene, read_sog
+from langsplat_core.io.scenes import load_scene
+from langsplat_core.io.sog import read_sog
 from tests.support.file_samples import SHARED_DATA, sog_files, write_folder, zipped
 from tests.support.scenes import random_gaussians
 

@@ -13,42 +13,39 @@ from langsplat_core.arrays import unit
 from langsplat_core.datasets.capture import Capture, read_photo
 from langsplat_core.datasets.colmap import load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
-from langsplat_core.io import (
-    load_scene,
-    read_cameras,
-    read_language,
-    write_cameras,
-    write_language,
-)
+from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.hostile import picture_size
+from langsplat_core.io.language import read_language, write_language
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import silent
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from tests.support.file_samples import (
     ascii_ply,
     compressed_ply,
+    ksplat_bytes,
     plain_ply,
     random_field,
     sog_files,
+    splat_bytes,
+    spz_bytes,
     zipped,
 )
-from tests.support.mutants import Wound, mutant
+from tests.support.mutation import Mutation, in_gzip, in_png, in_zip, mutant
 from tests.support.scenes import random_camera, random_gaussians
 from tests.support.small_datasets import write_colmap, write_nerfstudio
-from tests.support.splat_samples import ksplat_bytes, splat_bytes, spz_bytes
-from tests.support.wrapped_mutants import in_gzip, in_png, in_zip
 
 SCENE = random_gaussians(20, sh_degree=1)
 PLAIN = random_gaussians(300, seed=1)
 
 
 @dataclass(frozen=True)
-class MutantKind:
+class FileKind:
     """One format."""
 
     file: str  # where the mutants are written, below the folder of the test
     samples: Callable[[Path], list[bytes]]  # also writes what has to lie beside them into the folder
     read: Callable[[Path], float]  # the share of sound content
-    damage: Wound = mutant
+    damage: Mutation = mutant
 
 
 def scene_share(path: Path) -> float:
@@ -172,7 +169,7 @@ def _usable(capture: Capture) -> float:
     return 1.0
 
 
-def colmap(part: str) -> MutantKind:
+def colmap(part: str) -> FileKind:
     """`part`: cameras.bin, for one."""
 
     def samples(folder: Path) -> list[bytes]:
@@ -181,7 +178,7 @@ def colmap(part: str) -> MutantKind:
     def read(path: Path) -> float:
         return _usable(load_colmap(path.parent.parent.parent, path.parent, 64, silent))
 
-    return MutantKind(f"sparse/0/{part}", samples, read)
+    return FileKind(f"sparse/0/{part}", samples, read)
 
 
 def pictures(kind: str) -> Callable[[Path], list[bytes]]:
@@ -233,12 +230,12 @@ def photograph(path: Path) -> float:
     return 1.0
 
 
-def _photographs(kind: str, damage: Wound = mutant) -> MutantKind:
-    return MutantKind("a.png", pictures(kind), photograph, damage)  # the name's ending plays no part
+def _photographs(kind: str, damage: Mutation = mutant) -> FileKind:
+    return FileKind("a.png", pictures(kind), photograph, damage)  # the name's ending plays no part
 
 
-def _scenes(file: str, *samples: bytes, damage: Wound = mutant) -> MutantKind:
-    return MutantKind(file, lambda _: [*samples], scene_share, damage)
+def _scenes(file: str, *samples: bytes, damage: Mutation = mutant) -> FileKind:
+    return FileKind(file, lambda _: [*samples], scene_share, damage)
 
 
 KINDS = {
@@ -253,18 +250,18 @@ KINDS = {
     ".ksplat": _scenes(
         "a.ksplat", *(ksplat_bytes([SCENE, PLAIN][: 1 + level % 2], level) for level in range(3))
     ),
-    "sidecar": MutantKind(
+    "sidecar": FileKind(
         "a.langsplat.safetensors", sidecars, _whole(lambda path: read_language(path, SCENE.means))
     ),
-    "cameras.json": MutantKind("a.cameras.json", camera_files, camera_list),
-    "transforms.json": MutantKind("transforms.json", transforms, beside_transforms),
-    "point-cloud PLY": MutantKind("cloud.ply", cloud_folder, beside_transforms),
+    "cameras.json": FileKind("a.cameras.json", camera_files, camera_list),
+    "transforms.json": FileKind("transforms.json", transforms, beside_transforms),
+    "point-cloud PLY": FileKind("cloud.ply", cloud_folder, beside_transforms),
     **{
         f"COLMAP {part}.{form}": colmap(f"{part}.{form}")
         for form in ("bin", "txt")
         for part in ("cameras", "images", "points3D")
     },
-    ".features.npz": MutantKind("a.features.npz", feature_files, stored_features, in_zip),
+    ".features.npz": FileKind("a.features.npz", feature_files, stored_features, in_zip),
     "PNG": _photographs("PNG", in_png),
     **{kind: _photographs(kind) for kind in ("JPEG", "WEBP", "TIFF", "BMP", "AVIF")},
 }

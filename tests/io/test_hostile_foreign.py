@@ -13,7 +13,7 @@ import torch
 
 from langsplat_core.io.unpickling import load_torch, plain_array
 from tests.support.foreign_files import geometry, training_state
-from tests.support.mutants import mutant
+from tests.support.mutation import mutant
 from tests.support.scenes import random_gaussians
 from tests.support.warm_children import Ended, convert_each
 

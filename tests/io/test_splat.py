@@ -7,11 +7,10 @@ import pytest
 
 from langsplat_core.arrays import rotation_matrices, sigmoid
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.io import read_ksplat, read_splat, write_splat
+from langsplat_core.io.splat import read_ksplat, read_splat, write_splat
 from langsplat_core.scene import Gaussians
-from tests.support.file_samples import C0
+from tests.support.file_samples import C0, ksplat_bytes, splat_bytes
 from tests.support.scenes import covariances, random_gaussians
-from tests.support.splat_samples import ksplat_bytes, splat_bytes
 
 
 @pytest.fixture
