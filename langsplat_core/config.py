@@ -328,7 +328,6 @@ class LiftConfig:
     # median, mean: of the CLIP vectors of the masks a Gaussian belongs to, then encoded;
     # one-pass: the paper's latents, averaged as W^T H / W^T 1; gradient: trained by Adam, as in the paper
     mode: Literal["median", "mean", "one-pass", "gradient"] = "median"
-    chunk: Count = 32  # mask channels per gather pass, where a backend cannot lift label maps at once
     backend: Literal["auto", "cpu", "cuda"] = "auto"  # what lifts
     steps: Count = 30_000  # of mode gradient, as are the following
     lr: Rate = 2.5e-3  # learning rate

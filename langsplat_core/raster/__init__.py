@@ -7,21 +7,12 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
 from langsplat_core.errors import BackendError, InputError, optional_imports
-from langsplat_core.raster.protocol import (
-    FreezableView,
-    LiftingRasterizer,
-    LiftingView,
-    MedianDepth,
-    Rasterizer,
-    View,
-)
+from langsplat_core.raster.protocol import LiftingRasterizer, LiftingView, Rasterizer, View
 
 __all__ = [
     "BACKENDS",
-    "FreezableView",
     "LiftingRasterizer",
     "LiftingView",
-    "MedianDepth",
     "Rasterizer",
     "View",
     "load_lifting_rasterizer",

@@ -7,7 +7,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array, rotation_matrices, sigmoid, unit
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster.protocol import farthest
+from langsplat_core.raster.protocol import LiftingView, farthest, tangent_limits
 from langsplat_core.scene import Camera, Gaussians
 
 C0 = 0.28209479177387814  # 1 / (2 sqrt(pi))
@@ -95,10 +95,7 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INR
 
     # Clamp where the Jacobian is taken, not where the mean goes (EWA splatting's linearisation
     # explodes far outside the field of view).
-    margin_x = (settings.fov_clamp - 1) * 0.5 * camera.width / camera.fx
-    margin_y = (settings.fov_clamp - 1) * 0.5 * camera.height / camera.fy
-    left, right = camera.cx / camera.fx + margin_x, (camera.width - camera.cx) / camera.fx + margin_x
-    top, bottom = camera.cy / camera.fy + margin_y, (camera.height - camera.cy) / camera.fy + margin_y
+    left, top, right, bottom = tangent_limits(camera, settings)
     tx = np.clip(x / z, -left, right) * z
     ty = np.clip(y / z, -top, bottom) * z
     zero, over, bent = np.zeros_like(z), z, 1.0
@@ -163,7 +160,7 @@ def rim(f: Footprints, settings: RasterSettings, relative: float) -> Array:
     return f.extents_px * np.sqrt(1 + 2.1 * relative / squared)[:, None] + 1e-3
 
 
-class ReferenceView:
+class ReferenceView(LiftingView):
     """Blending weights of one view, recomputed Gaussian by Gaussian in every call."""
 
     def __init__(
@@ -250,17 +247,13 @@ class ReferenceView:
             values[step.index] = np.tensordot(step.weights, image[step.window], 2)
         return values
 
-    def contributions(self) -> Array:
-        """See `LiftingView.contributions`; float64."""
-        return self.gather(np.ones((self.camera.height, self.camera.width, 1)))[:, 0]
-
     def depth(self) -> Array:
         """See `View.depth`; float64."""
         total, alpha = self.splat(self.footprints.depths[:, None])
         return np.where(alpha > 0, total[..., 0] / np.where(alpha > 0, alpha, 1), 0)
 
     def median_depth(self) -> Array:
-        """See `MedianDepth.median_depth`; float64."""
+        """See `View.median_depth`; float64."""
         median = np.zeros((self.camera.height, self.camera.width))
         for step in self.steps():
             passed = (step.weights > 0) & (step.after <= 0.5)

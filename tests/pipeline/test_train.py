@@ -156,7 +156,7 @@ def test_a_setting_repeats_only_what_depends_on_it(room, tmp_path):
     train_scene(room, out, replace(tiny_settings(room), codec=CodebookConfig(size=9)))
     added = {Path(name).name.partition("-")[0] for name in set(kept_results(work)) - set(before)}
     assert added == {"codec", "latents"}
-    other_machine = replace(tiny_settings(room), lift=LiftConfig(backend="cpu", chunk=7))
+    other_machine = replace(tiny_settings(room), lift=LiftConfig(backend="cpu"))
     train_scene(room, out, other_machine)
     assert len(kept_results(work)) == len(before) + 2  # who computes, and in which batches, changes nothing
 

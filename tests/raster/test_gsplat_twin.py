@@ -16,7 +16,7 @@ from langsplat_core.errors import BackendError
 from langsplat_core.raster import gsplat, load_lifting_rasterizer, load_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera
-from langsplat_core.training.language.mask_weights import find_memberships
+from langsplat_core.training.language.mask_weights import find_mask_weights
 from langsplat_core.training.radiance.differentiable import CpuRenderer, CudaRenderer, DifferentiableRenderer
 from langsplat_core.training.radiance.state import PARAMETERS, start
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
@@ -64,7 +64,7 @@ def test_masks_lift_as_on_the_cpu() -> None:
     gaussians, views = random_gaussians(25, 3), make_views()
     settings = gsplat.drawn_settings(INRIA)
     found = [
-        find_memberships(load_lifting_rasterizer(name), gaussians, views, 3, settings)
+        find_mask_weights(load_lifting_rasterizer(name), gaussians, views, settings)
         for name in ("cpu", "cuda")
     ]
     for cpu, cuda in zip(found[0].pairs, found[1].pairs, strict=True):

@@ -14,7 +14,6 @@ from langsplat_core.config import INRIA, Display, PictureConfig, RasterSettings
 from langsplat_core.display.displays import DISPLAYS, MAX_QUERIES, Channels, Extra, HeatRanges
 from langsplat_core.query.answers import QueryResult, Verdict
 from langsplat_core.raster import Rasterizer, View
-from langsplat_core.raster.protocol import MedianDepth
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians, Scene
 from langsplat_core.semantics.relevancy import FLOOR
@@ -344,15 +343,6 @@ def camera_depths(gaussians: Gaussians, camera: Camera) -> Array:
         return np.nan_to_num(depths.astype(np.float32))[:, None]
 
 
-def surface_depths(view: View, count: int) -> Array:
-    """(H, W) depth of the surface as a view of `count` Gaussians has it: the median where the rasterizer
-    knows it, else the mean; world units, 0 where less than half of the light is stopped."""
-    if isinstance(view, MedianDepth):
-        return view.median_depth()
-    _, alpha = view.splat(np.empty((count, 0), np.float32))
-    return np.where(alpha >= 0.5, view.depth(), 0)
-
-
 class ArrayChannels:
     """Channels by a rasterizer that returns arrays; the projection is kept while the camera rests."""
 
@@ -397,5 +387,5 @@ class ArrayChannels:
         the scene is transparent there), world units, 0 where there is nothing, and alpha."""
         view = self.views.of(sight)
         _, alpha = view.splat(np.empty((len(sight.scene.gaussians), 0), np.float32))
-        median = view.median_depth()[row, column] if isinstance(view, MedianDepth) else 0
+        median = view.median_depth()[row, column]
         return float(median or view.depth()[row, column]), float(alpha[row, column])

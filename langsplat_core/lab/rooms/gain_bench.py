@@ -23,7 +23,7 @@ from langsplat_core.semantics.encoder import Encoder
 from langsplat_core.semantics.encoders import load_encoder
 from langsplat_core.training.language.codec_fit import Vocabulary, everyday_vocabulary, fit_codebook
 from langsplat_core.training.language.lift import Lifted
-from langsplat_core.training.language.mask_weights import find_memberships
+from langsplat_core.training.language.mask_weights import find_mask_weights
 
 SAMPLE = 36_000  # lifted vectors that a codebook is fitted to
 
@@ -80,7 +80,7 @@ def measure_gains(
 
 def _material(room: Room, variant: Variant) -> Material:
     views = room.views(variant)
-    members = find_memberships(load_lifting_rasterizer(), room.gaussians, views, progress=room.progress)
+    members = find_mask_weights(load_lifting_rasterizer(), room.gaussians, views, progress=room.progress)
     return Material(room.gaussians, members, tuple(features.vectors for _, features in views))
 
 

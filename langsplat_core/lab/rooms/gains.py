@@ -15,7 +15,7 @@ from langsplat_core.scene import LEVELS, Gaussians
 from langsplat_core.training.language.lift import Lifted, lift_block
 from langsplat_core.training.language.mask_weights import (
     MaskGroups,
-    Memberships,
+    MaskWeights,
     group_masks,
     masks_of_things,
 )
@@ -30,7 +30,7 @@ class Material:
     """What vectors are lifted from."""
 
     gaussians: Gaussians
-    members: Memberships
+    members: MaskWeights
     vectors: tuple[Array, ...]  # of each view, (M, D) float32 unit vectors of its masks
 
     def lifted(self) -> Lifted:
@@ -65,13 +65,13 @@ def visibility_gate(material: Material) -> Lifted:
     per_view = _weights_per_view(material.members)
     seen = per_view >= GATE * per_view.max(0)
     pairs = [pairs[seen[v][pairs["row"]]] for v, pairs in enumerate(material.members.pairs)]
-    return replace(material, members=Memberships(pairs, material.members.count)).lifted()
+    return replace(material, members=MaskWeights(pairs, material.members.count)).lifted()
 
 
 def root_weights(material: Material) -> Lifted:
     """Masks count by the square root of their pixels: near views outvote far ones less."""
     pairs = [_reweighted(pairs, np.sqrt(pairs["weight"])) for pairs in material.members.pairs]
-    return replace(material, members=Memberships(pairs, material.members.count)).lifted()
+    return replace(material, members=MaskWeights(pairs, material.members.count)).lifted()
 
 
 def gate_faint(material: Material) -> Lifted:
@@ -93,7 +93,7 @@ def outlier_views(material: Material) -> Lifted:
     for view, cosine in pairs:
         row, level = view["row"], view["level"]
         kept.append(view[cosine >= mean[level, row] + OUTLIER * spread[level, row]])
-    return replace(material, members=Memberships(kept, material.members.count)).lifted()
+    return replace(material, members=MaskWeights(kept, material.members.count)).lifted()
 
 
 def merged_masks(material: Material) -> Lifted:
@@ -121,7 +121,7 @@ GAINS: Mapping[str, Callable[[Material], Lifted]] = MappingProxyType(
 )
 
 
-def same_things(members: Memberships, counts: Sequence[int]) -> Array:
+def same_things(members: MaskWeights, counts: Sequence[int]) -> Array:
     """(M,) number of the thing that each mask of all views shows, at every level."""
     labels = np.arange(sum(counts))
     for level in range(len(LEVELS)):
@@ -130,7 +130,7 @@ def same_things(members: Memberships, counts: Sequence[int]) -> Array:
     return np.unique(labels, return_inverse=True)[1]
 
 
-def _weights_per_view(members: Memberships) -> Array:
+def _weights_per_view(members: MaskWeights) -> Array:
     """(V, N) float32 weight of every Gaussian in the masks of each view, all levels together."""
     return np.stack([
         np.bincount(pairs["row"], pairs["weight"], members.count).astype(np.float32)

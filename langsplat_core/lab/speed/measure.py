@@ -22,7 +22,7 @@ from langsplat_core.lab.speed.cases import Case, default_camera, random_scene
 from langsplat_core.lab.speed.resident import peak_memory, restart_peak
 from langsplat_core.lab.speed.torch_baseline import TorchRasterizer
 from langsplat_core.lab.speed.truth import Error, Truth
-from langsplat_core.raster.protocol import FreezableView, LabelView, Rasterizer
+from langsplat_core.raster.protocol import LiftingView, Rasterizer
 from langsplat_core.scene import Camera
 
 GRIDS = ((16, 12), (8, 6), (4, 3))  # cells of subparts, parts and wholes: 252 labels in all
@@ -144,9 +144,9 @@ def operations(backend: Rasterizer, case: Case, channels: int, truth: Truth | No
             None if truth is None else lambda: _gradient_error(view, case, values, truth.masked(image), truth)
         )
         yield Operation("backward", lambda: view.backward(values, image), wrong)
-    if isinstance(view, LabelView):
+    if type(view).gather_labels is not LiftingView.gather_labels:
         yield _labels(view, case.camera, truth)
-    if isinstance(view, FreezableView):
+    if type(view).frozen is not LiftingView.frozen:
         yield Operation("freeze", view.frozen)
         yield from _linear(view.frozen(), values, image, truth, "frozen ")
 
@@ -167,7 +167,7 @@ def _linear(view: Any, values: Array, image: Array, truth: Truth | None, prefix:
         )
 
 
-def _labels(view: LabelView, camera: Camera, truth: Truth | None) -> Operation:
+def _labels(view: LiftingView, camera: Camera, truth: Truth | None) -> Operation:
     """Label maps of three levels (`GRIDS`), as many regions as a segmenter finds."""
     maps, count = label_maps(camera)
 

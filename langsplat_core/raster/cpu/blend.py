@@ -1,6 +1,6 @@
 """Blending on the CPU: ``W x``, ``W^T y`` and the depth of half transmittance, tile by tile (see `walk`)."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -27,6 +27,7 @@ from langsplat_core.raster.cpu.tiles import (
     walk,
     write_tile,
 )
+from langsplat_core.raster.protocol import LiftingView
 from langsplat_core.scene import Camera
 
 
@@ -378,7 +379,7 @@ def _as_matrix(merged: Merged, count: int) -> sparse.csr_matrix:
 _CHANNELS_AT_ONCE = 32  # a tile's state stays in the first level cache
 
 
-class TileOperator(ABC):
+class TileOperator(LiftingView):
     """The linear operator W of a view: M drawn of `count` Gaussians, in depth order, with their tiles."""
 
     def __init__(self, camera: Camera, count: int, order: Array, tiles: Tiles, workers: Workers) -> None:
@@ -386,14 +387,6 @@ class TileOperator(ABC):
         self.order = order  # (M,) int32
         self.tiles, self.workers = tiles, workers
         self.dropped = 0
-
-    @abstractmethod
-    def depth(self) -> Array:
-        """See `View.depth`; float32."""
-
-    @abstractmethod
-    def median_depth(self) -> Array:
-        """See `MedianDepth.median_depth`; float32."""
 
     @abstractmethod
     def _splat_part(self, values: Array, image: Array, alpha: Array) -> None:
@@ -430,10 +423,6 @@ class TileOperator(ABC):
             self.workers.run(sum_partials, len(self.order), self.tiles, self.order, partial, out)
             values[:, start : start + _CHANNELS_AT_ONCE] = out
         return values
-
-    def contributions(self) -> Array:
-        """See `LiftingView.contributions`; float32."""
-        return self.gather(np.ones((self.camera.height, self.camera.width, 1), np.float32))[:, 0]
 
 
 def in_fours(values: Array) -> Array:

@@ -190,7 +190,7 @@ class FrozenView(TileOperator):
         return self._view.depth()
 
     def median_depth(self) -> Array:
-        """See `MedianDepth.median_depth`; float32."""
+        """See `View.median_depth`; float32."""
         return self._view.median_depth()
 
     def _splat_part(self, values: Array, image: Array, alpha: Array) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.compiled import helper, kernel, plain, shared_workers
 from langsplat_core.config import RasterSettings
-from langsplat_core.raster.protocol import farthest
+from langsplat_core.raster.protocol import farthest, tangent_limits
 from langsplat_core.raster.reference import C0, C1, C2, C3
 from langsplat_core.scene import Camera
 from langsplat_core.scene.gaussians import LARGEST_COEFFICIENT
@@ -79,9 +79,7 @@ class KernelCamera(NamedTuple):
 
 
 def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
-    """The clamp is 1.3 times the half field of view beyond the image's borders; see `reference.project`."""
-    margin_x = (settings.fov_clamp - 1) * 0.5 * camera.width / camera.fx
-    margin_y = (settings.fov_clamp - 1) * 0.5 * camera.height / camera.fy
+    left, top, right, bottom = tangent_limits(camera, settings)
     return KernelCamera(
         rotation=np.ascontiguousarray(camera.rotation),
         translation=np.ascontiguousarray(camera.world_to_camera[:3, 3]),
@@ -91,10 +89,10 @@ def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
         cy=float(camera.cy),
         width=float(camera.width),
         height=float(camera.height),
-        left=camera.cx / camera.fx + margin_x,
-        right=(camera.width - camera.cx) / camera.fx + margin_x,
-        top=camera.cy / camera.fy + margin_y,
-        bottom=(camera.height - camera.cy) / camera.fy + margin_y,
+        left=float(left),
+        right=float(right),
+        top=float(top),
+        bottom=float(bottom),
         near=float(settings.near),
         far=float(farthest(settings)),
         dilation=float(settings.dilation),

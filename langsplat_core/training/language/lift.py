@@ -16,10 +16,10 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.compiled import helper, kernel, plain, shared_workers
 from langsplat_core.config import INRIA, LiftConfig, RasterSettings, check_settings
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster.protocol import FreezableView, LiftingRasterizer, LiftingView
+from langsplat_core.raster.protocol import LiftingRasterizer, LiftingView
 from langsplat_core.scene import LEVELS, Camera, Codec, Gaussians
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.mask_weights import MaskGroups, Memberships
+from langsplat_core.training.language.mask_weights import MaskGroups, MaskWeights
 
 MEDIAN_STEPS = 8
 FAINT = 2e-3  # share of a Gaussian's weight below which a mask has no say in its median
@@ -33,22 +33,22 @@ class Lifted:
     confidence: Array  # (3, n) float32 total blending weight, in pixels
 
 
-def lift_block(memberships: Memberships, groups: MaskGroups, number: int, robust: bool) -> Lifted:
+def lift_block(mask_weights: MaskWeights, groups: MaskGroups, number: int, robust: bool) -> Lifted:
     """Of the Gaussians of one block. `robust` takes the geometric median, else the mean."""
-    return lift_weights(memberships.block(number, groups), groups.vectors, robust)
+    return lift_weights(mask_weights.block(number, groups), groups.vectors, robust)
 
 
 def lift_sample(
-    memberships: Memberships, groups: MaskGroups, rows: Array, robust: bool, progress: Progress = silent
+    mask_weights: MaskWeights, groups: MaskGroups, rows: Array, robust: bool, progress: Progress = silent
 ) -> Lifted:
     """Of the Gaussians at `rows`, in rising order."""
     parts = []
-    for number, (first, last) in enumerate(memberships.blocks):
+    for number, (first, last) in enumerate(mask_weights.blocks):
         inside = rows[(rows >= first) & (rows < last)] - first
         if len(inside):
-            weights = memberships.block(number, groups)[inside]
+            weights = mask_weights.block(number, groups)[inside]
             parts.append(lift_weights(weights, groups.vectors, robust))
-        progress("averaging the masks of a sample", last / memberships.count)
+        progress("averaging the masks of a sample", last / mask_weights.count)
     if not parts:
         nothing = np.zeros((len(LEVELS), 0, groups.vectors.shape[1]), np.float32)
         return Lifted(nothing, np.zeros((len(LEVELS), 0), np.float32))
@@ -345,9 +345,8 @@ class _Weights:
         if index in self._kept:
             return self._kept[index]
         view = self._rasterizer.view(self._gaussians, self._cameras[index], self._settings)
-        if not isinstance(view, FreezableView) or self._bytes > KEPT_BYTES:
-            return view
-        frozen = view.frozen()
-        self._bytes += frozen.nbytes
-        self._kept[index] = frozen
+        frozen = view.frozen() if self._bytes <= KEPT_BYTES else view
+        if frozen is not view:
+            self._bytes += frozen.nbytes
+            self._kept[index] = frozen
         return frozen

@@ -1,4 +1,4 @@
-"""Memberships of masks, W^T onehot(mask), through gsplat's gradients and through the CPU's walk."""
+"""MaskWeights of masks, W^T onehot(mask), through gsplat's gradients and through the CPU's walk."""
 
 import time
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ from gpu_sections import Plan, need_cuda, table
 from gpu_sections.pictures import bundled_scene, masked_views
 from langsplat_core.config import INRIA
 from langsplat_core.raster import gsplat, load_lifting_rasterizer
-from langsplat_core.training.language.mask_weights import find_memberships
+from langsplat_core.training.language.mask_weights import find_mask_weights
 
 
 def measure(plan: Plan) -> Iterator[str]:
@@ -22,9 +22,9 @@ def measure(plan: Plan) -> Iterator[str]:
     found, rows = {}, []
     for name in ("cpu", "cuda"):
         rasterizer = load_lifting_rasterizer(name)
-        find_memberships(rasterizer, scene.gaussians, views[:1])
+        find_mask_weights(rasterizer, scene.gaussians, views[:1])
         start = time.perf_counter()
-        members = find_memberships(rasterizer, scene.gaussians, views, settings=gsplat.drawn_settings(INRIA))
+        members = find_mask_weights(rasterizer, scene.gaussians, views, settings=gsplat.drawn_settings(INRIA))
         rows.append((name, time.perf_counter() - start, sum(len(pairs) for pairs in members.pairs)))
         found[name] = members.pairs
     yield table(("backend", "seconds", "pairs of Gaussian and mask"), rows)

@@ -8,7 +8,7 @@ from langsplat_core.lab.rooms.gains import GAINS, Material, same_things
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import LEVELS, look_at
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.mask_weights import PAIR, Memberships, find_memberships
+from langsplat_core.training.language.mask_weights import PAIR, MaskWeights, find_mask_weights
 from tests.support.fakes import PER_BLOB, blobs
 
 D = 16
@@ -34,7 +34,7 @@ def material() -> Material:
         if index == WRONG[0]:
             vectors[WRONG[1]] = meanings[0]
         views.append((camera, ImageFeatures(labels, vectors)))
-    members = find_memberships(ReferenceRasterizer(), gaussians, views)
+    members = find_mask_weights(ReferenceRasterizer(), gaussians, views)
     return Material(gaussians, members, tuple(features.vectors for _, features in views))
 
 
@@ -67,7 +67,7 @@ def test_a_gaussian_that_paints_nothing_gets_no_meaning(material):
     pairs = [view[view["row"] != 5] for view in material.members.pairs]
     stray = np.array([(5, 0, 1, 0.2)], PAIR)
     pairs[0] = np.sort(np.concatenate([pairs[0], stray]), order="row")
-    members = Memberships(pairs, material.members.count)
+    members = MaskWeights(pairs, material.members.count)
     lifted = GAINS["Gaussians that paint < 1 px in every view have no meaning"](
         Material(material.gaussians, members, material.vectors)
     )

@@ -1,4 +1,4 @@
-"""Lifting label maps in one walk is ``W^T onehot(labels)``, and says so wherever labels lie."""
+"""Lifting label maps is ``W^T onehot(labels)``, and says so wherever labels lie."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from scipy import sparse
 
 from langsplat_core.arrays import Array
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.raster.protocol import LabelView
+from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Gaussians
 from tests.support.scenes import random_camera, random_gaussians
@@ -25,13 +25,16 @@ def dense(gaussians: Gaussians, camera: object, maps: Array, count: int) -> Arra
     return ReferenceRasterizer().view(gaussians, camera).gather(onehot(maps, count))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("rasterizer", [CPU, ReferenceRasterizer()], ids=["in one walk", "label by label"])
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("count", [1, 5, 90])
-def test_weights_are_those_of_the_reference(size: tuple[int, int], count: int) -> None:
+def test_weights_are_those_of_the_reference(
+    size: tuple[int, int], count: int, rasterizer: LiftingRasterizer
+) -> None:
     gaussians, camera = random_gaussians(60, 3), random_camera(1, *size)
     rng = np.random.default_rng(count)
     maps = rng.integers(-1, count, (3, size[1], size[0])).astype(np.int32)
-    got = CPU.view(gaussians, camera).gather_labels(maps, count)
+    got = rasterizer.view(gaussians, camera).gather_labels(maps, count)
     want = dense(gaussians, camera, maps, count)
     assert got.shape == want.shape
     assert got.has_sorted_indices
@@ -85,13 +88,9 @@ def test_results_do_not_depend_on_threads():
 def test_labels_out_of_range_are_refused(label: int) -> None:
     maps = np.zeros((1, 45, 70), np.int32)
     maps[0, 3, 3] = label
-    with pytest.raises(ValueError, match="expected -1 to 2"):
-        CPU.view(random_gaussians(3), random_camera()).gather_labels(maps, 3)
-    with pytest.raises(ValueError, match="maps: expected shape"):
-        CPU.view(random_gaussians(3), random_camera()).gather_labels(maps[:, :5], 3)
-
-
-def test_the_protocol_tells_who_can():
-    gaussians, camera = random_gaussians(3), random_camera()
-    assert isinstance(CPU.view(gaussians, camera), LabelView)
-    assert not isinstance(ReferenceRasterizer().view(gaussians, camera), LabelView)
+    for rasterizer in (CPU, ReferenceRasterizer()):
+        view = rasterizer.view(random_gaussians(3), random_camera())
+        with pytest.raises(ValueError, match="expected -1 to 2"):
+            view.gather_labels(maps, 3)
+        with pytest.raises(ValueError, match="maps: expected shape"):
+            view.gather_labels(maps[:, :5], 3)

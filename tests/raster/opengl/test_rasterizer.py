@@ -12,7 +12,6 @@ from langsplat_core.config import GSPLAT, INRIA, RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.raster.opengl.scene_textures import create_egl_context, front_to_back
-from langsplat_core.raster.protocol import MedianDepth
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians
 from tests.support.gl_context import gl_state
@@ -181,8 +180,10 @@ def test_median_depth_of_one_pixel(gl, raster):
         assert covered == pytest.approx(alpha[row, column], abs=1e-5)
 
 
-def test_a_blender_promises_no_median_image(gl, raster):
-    assert not isinstance(raster.view(random_gaussians(3), random_camera()), MedianDepth)
+def test_in_place_of_a_median_image_stands_the_mean_where_half_is_stopped(gl, raster):
+    view = raster.view(random_gaussians(60), random_camera())
+    _, alpha = view.splat(random_values(60, 1))
+    np.testing.assert_array_equal(view.median_depth(), np.where(alpha >= 0.5, view.depth(), 0))
 
 
 def test_an_image_beyond_the_driver_is_refused(gl, raster):

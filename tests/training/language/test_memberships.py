@@ -1,4 +1,4 @@
-"""Memberships against dense weights, block by block, and groups of masks."""
+"""MaskWeights against dense weights, block by block, and groups of masks."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language import mask_weights as module
-from langsplat_core.training.language.mask_weights import PAIR, find_memberships, group_masks, view_pairs
+from langsplat_core.training.language.mask_weights import PAIR, find_mask_weights, group_masks, view_pairs
 from tests.support.lifting import D, dense_weights, make_views
 from tests.support.scenes import random_camera, random_gaussians
 
@@ -25,8 +25,8 @@ def ungrouped(views):
 @pytest.mark.parametrize(("backend", "chunk"), [("reference", 3), ("reference", 32), ("cpu", 32)])
 def test_membership_is_the_weight_inside_the_mask(gaussians, backend, chunk):
     views = make_views()
-    members = find_memberships(load_lifting_rasterizer(backend), gaussians, views, chunk)
-    got = members.block(0, ungrouped(views)).toarray()
+    mask_weights = find_mask_weights(load_lifting_rasterizer(backend), gaussians, views, chunk)
+    got = mask_weights.block(0, ungrouped(views)).toarray()
     assert got.shape == (25, 3 * 21)
     for index, (camera, features) in enumerate(views):
         weights = dense_weights(gaussians, camera)
@@ -42,11 +42,11 @@ def test_membership_is_the_weight_inside_the_mask(gaussians, backend, chunk):
 
 def test_blocks_are_the_rows_of_the_whole(gaussians, monkeypatch):
     views = make_views()
-    members = find_memberships(ReferenceRasterizer(), gaussians, views)
+    mask_weights = find_mask_weights(ReferenceRasterizer(), gaussians, views)
     groups = ungrouped(views)
-    whole = members.block(0, groups).toarray()
+    whole = mask_weights.block(0, groups).toarray()
     monkeypatch.setattr(module, "BLOCK", 7)
-    again = find_memberships(ReferenceRasterizer(), gaussians, views)
+    again = find_mask_weights(ReferenceRasterizer(), gaussians, views)
     assert again.blocks == [(0, 7), (7, 14), (14, 21), (21, 25)]
     parts = [again.block(number, groups).toarray() for number in range(4)]
     np.testing.assert_array_equal(np.concatenate(parts), whole)
@@ -54,14 +54,14 @@ def test_blocks_are_the_rows_of_the_whole(gaussians, monkeypatch):
 
 def test_masks_of_one_group_are_one_column(gaussians):
     views = make_views()
-    members = find_memberships(ReferenceRasterizer(), gaussians, views)
+    mask_weights = find_mask_weights(ReferenceRasterizer(), gaussians, views)
     groups = group_masks([features.vectors for _, features in views], groups=4)
     assert groups.vectors.shape == (4, D)
-    apart = members.block(0, ungrouped(views)).toarray().reshape(25, 3, 21)
+    apart = mask_weights.block(0, ungrouped(views)).toarray().reshape(25, 3, 21)
     together = np.zeros((25, 3, 4))
     for column, group in enumerate(np.concatenate(groups.of_mask)):
         together[:, :, group] += apart[:, :, column]
-    np.testing.assert_allclose(members.block(0, groups).toarray(), together.reshape(25, 12), rtol=1e-5)
+    np.testing.assert_allclose(mask_weights.block(0, groups).toarray(), together.reshape(25, 12), rtol=1e-5)
 
 
 def test_groups_hold_what_says_the_same():

@@ -12,7 +12,7 @@ from langsplat_core.training.language import mask_weights as module
 from langsplat_core.training.language.mask_weights import (
     PAIR,
     SAME,
-    Memberships,
+    MaskWeights,
     find_things,
     masks_of_things,
 )
@@ -42,7 +42,7 @@ def counts_of(views: Sequence[Array]) -> list[int]:
 
 
 def found(views: Sequence[Array], count: int) -> Array:
-    return find_things(Memberships(list(views), count), counts_of(views))
+    return find_things(MaskWeights(list(views), count), counts_of(views))
 
 
 def random_views(seed: int, count: int = 240, views: int = 8) -> list[Array]:
@@ -98,7 +98,7 @@ def plain_masks_of_things(views: Sequence[Array], level: int) -> list[int]:
 @pytest.mark.parametrize("seed", range(4))
 def test_masks_go_together_by_the_plain_rule(seed, level):
     views = random_views(seed)
-    got = masks_of_things(Memberships(views, 240), counts_of(views), level)
+    got = masks_of_things(MaskWeights(views, 240), counts_of(views), level)
     want = np.array(plain_masks_of_things(views, level))
     assert ((got == -1) == (want == -1)).all()
     pairs = len({*zip(got.tolist(), want.tolist(), strict=True)})
@@ -172,16 +172,16 @@ def test_a_mask_over_two_things_merges_neither():
 def test_masks_of_other_levels_show_no_thing():
     rows = np.arange(20)
     views = [joined(view(np.where(rows < 10, 0, UNSEEN)), view(np.full(20, 1), level=1))] * 2
-    assert masks_of_things(Memberships(views, 20), [2, 2], WHOLE).tolist() == [0, -1, 0, -1]
-    assert masks_of_things(Memberships(views, 20), [2, 2], 1).tolist() == [-1, 0, -1, 0]
-    assert masks_of_things(Memberships(views, 20), [2, 2], 0).tolist() == [-1] * 4
+    assert masks_of_things(MaskWeights(views, 20), [2, 2], WHOLE).tolist() == [0, -1, 0, -1]
+    assert masks_of_things(MaskWeights(views, 20), [2, 2], 1).tolist() == [-1, 0, -1, 0]
+    assert masks_of_things(MaskWeights(views, 20), [2, 2], 0).tolist() == [-1] * 4
     assert found(views, 20).tolist() == [0] * 10 + [NO_THING] * 10
 
 
 def test_a_gaussian_that_two_masks_share_evenly_is_claimed_by_neither():
     even = joined(view([0, 0, 0]), view([1, UNSEEN, UNSEEN]))
     assert plain_masks_of_things([even], WHOLE) == [0, -1]
-    assert masks_of_things(Memberships([even], 3), [2], WHOLE).tolist() == [0, -1]
+    assert masks_of_things(MaskWeights([even], 3), [2], WHOLE).tolist() == [0, -1]
     assert found([even], 3).tolist() == [0, 0, 0]
 
 
@@ -217,5 +217,5 @@ def test_views_without_masks():
     assert found([empty, full, empty, full, empty], 12).tolist() == [0] * 12
     for views in ([empty], [empty, empty]):
         assert found(views, 5).tolist() == [NO_THING] * 5
-    assert find_things(Memberships([empty], 5), [3]).tolist() == [NO_THING] * 5  # masks that hide behind
+    assert find_things(MaskWeights([empty], 5), [3]).tolist() == [NO_THING] * 5  # masks that hide behind
     assert found([empty], 0).shape == (0,)
