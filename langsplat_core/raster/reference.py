@@ -167,7 +167,7 @@ class ReferenceView(LiftingView):
         self, footprints: Footprints, camera: Camera, settings: RasterSettings, dropped: int
     ) -> None:
         self.camera, self.settings, self.footprints = camera, settings, footprints
-        self.dropped = dropped
+        self.count, self.dropped = len(footprints.depths), dropped
         self.order = np.argsort(footprints.depths, kind="stable")
         self.windows = self._windows()
 
