@@ -21,11 +21,11 @@ from tests.support.backends import Backend
 from tests.support.close import assert_adjoint
 from tests.support.scenes import random_camera, random_gaussians, random_values, without_perspective
 
-Case = tuple[Gaussians, Camera, RasterSettings]
+Drawn = tuple[Gaussians, Camera, RasterSettings]
 
 
 @st.composite
-def cases(draw: st.DrawFn) -> Case:
+def cases(draw: st.DrawFn) -> Drawn:
     """1 to 30 Gaussians, sizes 1e-6 to 10 world units, opacities from 0 to 1, any camera of both kinds."""
     count, seed = draw(st.integers(1, 30)), draw(st.integers(0, 2**31))
     rng = np.random.default_rng(seed)
@@ -48,7 +48,7 @@ def cases(draw: st.DrawFn) -> Case:
     return gaussians, camera, replace(profile, antialiased=draw(st.booleans()))
 
 
-def over_random_cases(law: Callable[[Case], None], slow: bool, largest: int = 1000) -> None:
+def over_random_cases(law: Callable[[Drawn], None], slow: bool, largest: int = 1000) -> None:
     """Run `law` on as many cases as the tier has."""
     examples = settings(
         max_examples=largest if slow else 25, derandomize=True, suppress_health_check=list(HealthCheck)
@@ -61,7 +61,7 @@ def slow(request: pytest.FixtureRequest) -> bool:
     return bool(request.config.getoption("--slow"))
 
 
-def view_of(backend: Backend, case: Case) -> Any:
+def view_of(backend: Backend, case: Drawn) -> Any:
     return backend.raster.view(*case)
 
 
@@ -69,7 +69,7 @@ def view_of(backend: Backend, case: Case) -> Any:
 def test_finite_and_between_0_and_1(backend: Backend, slow: bool) -> None:
     """Values in [0, 1] give an image in [0, alpha], and the weights of a pixel add up to alpha."""
 
-    def law(case: Case) -> None:
+    def law(case: Drawn) -> None:
         n, view = len(case[0]), view_of(backend, case)
         image, alpha = view.splat(np.column_stack([random_values(n, 2), np.ones(n, np.float32)]))
         assert np.isfinite(image).all()
@@ -87,7 +87,7 @@ def test_linear(backend: Backend, slow: bool) -> None:
     """W (2 x - 3 y) = 2 W x - 3 W y."""
     atol = {"reference": 1e-12, "opengl-half": 2.5e-2}.get(backend.name, 1e-5)
 
-    def law(case: Case) -> None:
+    def law(case: Drawn) -> None:
         n, view = len(case[0]), view_of(backend, case)
         x, y = (random_values(n, 2, seed).astype(np.float64) for seed in (1, 2))
         mixed = view.splat(2 * x - 3 * y)[0]
@@ -101,7 +101,7 @@ def test_adjoint(backend: Backend, slow: bool) -> None:
     if backend.name.startswith("opengl"):
         pytest.skip("it has no adjoint")
 
-    def law(case: Case) -> None:
+    def law(case: Drawn) -> None:
         view, camera = view_of(backend, case), case[1]
         x = random_values(len(case[0]), 3)
         y = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
@@ -114,7 +114,7 @@ def test_equal_to_the_reference(fast_backend: Backend, slow: bool) -> None:
     """Away from cut-offs, within the backend's promise."""
     flipped = pixels = 0
 
-    def law(case: Case) -> None:
+    def law(case: Drawn) -> None:
         nonlocal flipped, pixels
         gaussians, camera, raster_settings = case
         if not fast_backend.promises(gaussians, raster_settings):
@@ -137,7 +137,7 @@ def test_equal_to_the_reference(fast_backend: Backend, slow: bool) -> None:
 def test_gradients_are_finite(slow: bool) -> None:
     """Of the CPU backend; those that are not drawn have none."""
 
-    def law(case: Case) -> None:
+    def law(case: Drawn) -> None:
         gaussians, camera, raster_settings = case
         view = CpuRasterizer().view(gaussians, camera, raster_settings)
         rng = np.random.default_rng(1)
