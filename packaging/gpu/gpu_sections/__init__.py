@@ -56,7 +56,7 @@ TINY = Plan(
     crops=1,
     batches=1,
     million=500,
-    tests=("tests/raster/test_one_pixel.py", "-k", "reference"),
+    tests=("tests/raster/test_render.py", "-k", "reference"),
 )
 PLANS = {"full": FULL, "tiny": TINY}
 
