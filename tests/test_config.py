@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 import pytest
 
-from langsplat_core import config
+from langsplat_core import bench, config
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.config import (
@@ -26,7 +26,8 @@ from langsplat_core.pipeline.train import train_scene
 
 CONFIGS = {
     name: value
-    for name, value in vars(config).items()
+    for module in (config, bench)
+    for name, value in vars(module).items()
     if dataclasses.is_dataclass(value) and isinstance(value, type) and value not in (Range, Setting)
 }
 SETTINGS = [

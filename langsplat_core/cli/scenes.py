@@ -30,7 +30,7 @@ from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import load_text_encoder
 
-OPTIONAL = ("torch", "transformers", "pycolmap", "open3d", "matplotlib", "gsplat")
+OPTIONAL = ("torch", "transformers", "pycolmap", "matplotlib", "gsplat")
 LIBRARIES = {
     "EGL": "libegl1",
     "GL": "libgl1",

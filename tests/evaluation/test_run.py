@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from langsplat_core.cli import evaluate_labels
+from langsplat_core.cli import evaluate
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
@@ -366,7 +366,7 @@ def test_bad_arguments_are_one_line(data, monkeypatch, capsys, words, message):
 def test_scenes_are_trained_and_stand_beside_what_was_published(tmp_path, capsys, monkeypatch):
     """In LERF-OVS's layout; one scene cannot be trained, which is said after the table of the other."""
     monkeypatch.setattr(
-        evaluate_labels, "with_preset", lambda config, _: replace(tiny_settings(room), masks=config.masks)
+        evaluate, "with_preset", lambda config, _: replace(tiny_settings(room), masks=config.masks)
     )
     room = tiny_room(tmp_path / "data" / "ramen")
     box = rectangle(0, 0, 63, 47)

@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from langsplat_core.arrays import logit, psnr, rotation_matrices, sigmoid
-from langsplat_core.lab.speed.queries import repeated
+from langsplat_core.bench.query import repeated
 from langsplat_core.progress import Cancelled
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import NO_THING, Calibration, Gaussians, Odds, Reading, Scene
