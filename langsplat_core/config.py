@@ -22,7 +22,7 @@ from langsplat_core.errors import InputError
 
 @dataclass(frozen=True)
 class Range:
-    """Where a number must lie; both ends count, but for `low` where `above` says so. Always finite."""
+    """Range of a number; both ends count, but for `low` where `above` says so. Always finite."""
 
     low: float
     high: float
@@ -30,7 +30,7 @@ class Range:
     some: bool = False  # of a field with several numbers: there must be at least one
 
     def holds(self, value: float) -> bool:
-        """Whether `value` lies in the range; NaN lies in none."""
+        """True where `value` lies in the range; NaN lies in none."""
         return (self.low < value if self.above else self.low <= value) and value <= self.high
 
     def __str__(self) -> str:
@@ -60,7 +60,7 @@ def check_settings(settings: object, option: str = "--") -> None:
 
 
 def numeric_settings(settings: object, option: str = "--") -> Iterator[Setting]:
-    """All fields of a dataclass that hold numbers, and those of dataclasses in it, in their order."""
+    """Fields of a dataclass that hold numbers, and those of dataclasses in it, in their order."""
     for name, value, hint in named_values(settings, option):
         kinds = set(_kinds(hint))
         if kinds & {int, float}:
@@ -81,7 +81,7 @@ def named_values(settings: object, option: str = "--") -> Iterator[tuple[str, An
 
 
 def annotations(hint: Any) -> Iterator[Any]:
-    """What `Annotated` says beside the type, also inside of unions, tuples and further `Annotated`."""
+    """Parts of `Annotated` beside the type, also inside of unions, tuples and further `Annotated`."""
     if get_origin(hint) is Annotated:
         yield from hint.__metadata__
     if get_origin(hint) is not typing.Literal:
@@ -103,12 +103,12 @@ def _kinds(hint: Any) -> Iterator[type]:
 
 
 def _is_flat(hint: Any) -> bool:
-    """Whether a dataclass's fields are options without its own name: ``tyro.conf.arg(name="")``."""
+    """True where a dataclass's fields are options without its own name: ``tyro.conf.arg(name="")``."""
     return any(getattr(part, "name", None) == "" for part in annotations(hint))
 
 
 def _problem(setting: Setting) -> str | None:
-    """What is wrong with a setting's value; None where nothing is."""
+    """Fault of a setting's value; None where there is none."""
     bound, numbers = setting.range, list(_flat(setting.value))
     if bound is None:
         return None
@@ -236,7 +236,7 @@ class RadianceConfig:
 
 @dataclass(frozen=True)
 class MaskConfig:
-    """Where masks come from and which are kept (paper section 3.1 and the method's public code)."""
+    """Source of masks, and which are kept (paper section 3.1 and the method's public code)."""
 
     source: Literal["auto", "sam", "graph"] = "auto"  # auto: sam when `sam` names weights, else graph
     # hub id, folder or file of SAM, SAM 2 or SAM-HQ weights, e.g. facebook/sam-vit-huge

@@ -75,7 +75,7 @@ def load_lifting_rasterizer(backend: str = "auto") -> LiftingRasterizer:
 
 
 def _cuda_may_work() -> bool:
-    """Whether it is worth importing gsplat, which takes seconds: it is there, and so is a CUDA device."""
+    """True where gsplat, which takes seconds to import, and a CUDA device are there."""
     if find_spec("gsplat") is None or find_spec("torch") is None:
         return False
     from torch import cuda

@@ -46,12 +46,12 @@ class Drawn:
 
 
 def has_device() -> bool:
-    """Whether torch finds the device that gsplat draws on."""
+    """True where torch finds the device that gsplat draws on."""
     return torch.cuda.is_available()
 
 
 def drawn_settings(settings: RasterSettings) -> RasterSettings:
-    """What the installed gsplat draws with where `settings` are asked for: its cap of alpha is its own."""
+    """Settings that the installed gsplat draws with in place of `settings`: its cap of alpha is its own."""
     release = tuple(int(part) for part in version("gsplat").split(".")[:2])
     return replace(settings, alpha_max=0.999 if release < (1, 6) else 0.99)
 

@@ -138,7 +138,7 @@ def check_picture(camera: Camera) -> None:
 
 @cache
 def memory_bytes() -> float:
-    """What a process here may use at most: the machine's memory, or its container's share; infinite where the
+    """Most that a process here may use: the machine's memory, or its container's share; infinite where the
     system does not say."""
     found = [float("inf")]
     if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):

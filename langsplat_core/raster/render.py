@@ -86,7 +86,7 @@ def _in_camera(gaussians: Gaussians, camera: Camera) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """What one camera sees of a scene; every channel is premultiplied by alpha, without background."""
+    """A scene as one camera sees it; every channel is premultiplied by alpha, without background."""
 
     colours: Array  # (H, W, 3) display colours >= 0, not clamped above
     alpha: Array  # (H, W) in [0, 1]

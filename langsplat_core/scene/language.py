@@ -1,5 +1,4 @@
-"""How phrases are written: the one place that says which marks of a text count, where one phrase ends and the
-next begins, and when two of them are the same.
+"""Phrases as they are written, calibration of an encoder, and the language field of a scene.
 
 Quotes and punctuation around words are marks of writing and no part of a phrase: an encoder that met them
 would answer another question, and the demo encoder's tokenizer would end the phrase there.
@@ -32,7 +31,7 @@ def tidy(text: str) -> str:
 
 
 def phrase_key(text: str) -> str:
-    """What a phrase is looked up and encoded by: its words, in lower case as CLIP's tokenizers have them."""
+    """Key by which a phrase is looked up and encoded: its words, in lower case as of CLIP's tokenizers."""
     return " ".join(token for token in tokens(text) if token != ",").lower()
 
 

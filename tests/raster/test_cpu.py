@@ -3,8 +3,7 @@
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields, replace
-from importlib.util import find_spec
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from scipy import sparse
 
 from langsplat_core.arrays import Array, logit
 from langsplat_core.config import GSPLAT, INRIA
-from langsplat_core.errors import BackendError, InputError
+from langsplat_core.errors import InputError
 from langsplat_core.raster import BACKENDS, load_rasterizer, reference
 from langsplat_core.raster.cpu.projection import colours, colours_backward
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
@@ -23,7 +22,6 @@ from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Gaussians
 from tests.support import torch_reference
 from tests.support.close import BAND, assert_adjoint, assert_close_off_cuts, assert_gradient
-from tests.support.golden import load_golden
 from tests.support.scenes import random_camera, random_gaussians, random_values, without_perspective
 
 CPU, REFERENCE = CpuRasterizer(), ReferenceRasterizer()
@@ -51,31 +49,12 @@ def assert_same_picture(gaussians, camera, settings=INRIA, channels=3, atol=2e-5
     return image
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_random_scenes(seed):
-    image = assert_same_picture(random_gaussians(150, seed), random_camera(seed))
-    assert image.max() > 0.1
-
-
-@pytest.mark.parametrize("distance", [0.6, 1.0])
-def test_inside_the_scene(distance):
-    """Gaussians behind, beside and around the camera: near plane and clamped Jacobians."""
-    assert_same_picture(random_gaussians(150, 8), random_camera(8, distance=distance))
-    assert_same_picture(random_gaussians(150, 8), random_camera(8, distance=distance), GSPLAT)
-
-
 @pytest.mark.parametrize("channels", [1, 2, 5, 32, 40])
-def test_any_number_of_channels(channels):
-    assert_same_picture(random_gaussians(60, 11), random_camera(11), channels=channels)
-
-
-def test_contributions_are_the_summed_weights():
-    gaussians, camera = random_gaussians(200, 17), random_camera(17)
-    view, truth = CPU.view(gaussians, camera), REFERENCE.view(gaussians, camera)
-    want = truth.gather(np.ones((camera.height, camera.width, 1)))[:, 0]
-    np.testing.assert_array_equal(truth.contributions(), want)
-    np.testing.assert_allclose(view.contributions(), want, atol=1e-3)  # a flipped pixel weighs up to 1/255
-    assert abs(view.contributions().sum() - view.splat(np.zeros((200, 0)))[1].sum()) < 1e-2
+@pytest.mark.parametrize("distance", [0.6, 3.0])  # 0.6: in the scene, Gaussians behind, beside and around
+@pytest.mark.parametrize("settings", [INRIA, GSPLAT])
+def test_pictures_are_the_references(channels, distance, settings):
+    gaussians, camera = random_gaussians(150, 8 + channels), random_camera(8, distance=distance)
+    assert assert_same_picture(gaussians, camera, settings, channels).max() > 0.1
 
 
 @pytest.mark.parametrize("channels", [1, 3, 12, 40])
@@ -173,16 +152,6 @@ def test_depth_order_is_a_stable_sort():
         assert np.array_equal(depth_order(status, depths.view(np.uint64)), want)
 
 
-@pytest.mark.parametrize("case", ["tiny_case", "basic_case"])
-def test_golden_images_of_gsplat(real_data, case):
-    gaussians, camera, want = load_golden(real_data / "golden" / f"{case}.safetensors")
-    image, alpha = CPU.view(gaussians, camera, GSPLAT).splat(
-        colours(gaussians.sh, gaussians.means, camera.position)
-    )
-    got = np.concatenate([image, alpha[..., None]], -1)
-    np.testing.assert_allclose(got, want, atol=1e-5, rtol=0.01)
-
-
 @pytest.mark.parametrize("degree", range(4))
 def test_colours_and_their_gradient(degree):
     gaussians, eye = random_gaussians(200, 22, degree), np.array([0.3, -2.0, 0.5])
@@ -231,12 +200,6 @@ def test_backends_are_loaded_by_name_and_lazily():
         "print([m for m in ('numba', 'torch', 'moderngl') if m in sys.modules])"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
-
-
-@pytest.mark.skipif(find_spec("gsplat") is not None, reason="gsplat is installed")
-def test_a_missing_backend_says_what_to_try():
-    with pytest.raises(BackendError, match=r"^rasterizer 'cuda' cannot load \(.*\); try --backend cpu$"):
-        load_rasterizer("cuda")
 
 
 def test_no_channels_still_have_an_alpha():
@@ -460,46 +423,3 @@ def test_autograd_of_opaque_needles_and_discs():
 @pytest.mark.parametrize("channels", [1, 5])
 def test_autograd_with_other_channels(channels):
     compare_with_autograd(random_gaussians(30, 6), random_camera(6, 33, 20), channels=channels)
-
-
-def test_differences_of_the_reference():
-    """Directional derivatives of the reference itself; its cut-offs are moved to where nothing is left."""
-    settings = replace(INRIA, alpha_min=1e-10, transmittance_min=1e-12)
-    gaussians, camera = random_gaussians(12, 7), random_camera(7, 24, 18)
-    gaussians = replace(gaussians, opacity_logits=logit(np.linspace(0.1, 0.9, 12)))  # none at the cap
-    x = random_values(12, 2)
-    target = np.random.default_rng(0).normal(size=(18, 24, 2))
-
-    def loss(changed: Gaussians) -> float:
-        return float((ReferenceRasterizer().view(changed, camera, settings).splat(x)[0] * target).sum())
-
-    gradients = CpuRasterizer().view(gaussians, camera, settings).backward(x, target)
-    rng = np.random.default_rng(8)
-    for name in PARAMETERS:
-        value = getattr(gaussians, name)
-        direction = rng.normal(size=value.shape) * 2e-3
-        ahead, back = (replace(gaussians, **{name: value + sign * direction}) for sign in (1, -1))
-        step = getattr(ahead, name).astype(np.float64) - getattr(back, name)  # as float32 rounds it
-        want = loss(ahead) - loss(back)
-        # The third derivative times 2e-3 squared is left over.
-        assert np.vdot(getattr(gradients, name), step) == pytest.approx(want, rel=2e-3, abs=1e-5), name
-
-
-def test_a_descent_step_lowers_the_loss():
-    gaussians, camera = random_gaussians(60, 9), random_camera(9, 40, 30)
-    x = random_values(60, 3)
-    target = np.full((30, 40, 3), 0.5, np.float32)
-    before = after = 0.0
-    for _ in range(20):
-        view = CpuRasterizer().view(gaussians, camera)
-        error = view.splat(x)[0] - target
-        after = float((error**2).mean())
-        before = before or after
-        by = view.backward(x, 2 * error / error.size)
-        moved = [
-            getattr(gaussians, f.name) - 3.0 * getattr(by, f.name)
-            for f in fields(gaussians)
-            if f.name in PARAMETERS
-        ]
-        gaussians = Gaussians(*moved, gaussians.sh)
-    assert after < 0.9 * before

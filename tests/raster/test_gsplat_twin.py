@@ -135,11 +135,3 @@ def test_a_kernel_that_fails_is_one_line(monkeypatch: pytest.MonkeyPatch) -> Non
     with pytest.raises(BackendError, match=r"Error building extension 'gsplat_cuda'\); install") as caught:
         gsplat.require_device()
     assert "\n" not in str(caught.value)
-
-
-def test_no_kernel_takes_what_the_real_ones_refuse() -> None:
-    with pytest.raises(RuntimeError, match="contiguous: False"):
-        twin.intersect_offset(torch.zeros(4, 2, dtype=torch.int64)[:, 0], 1, 1, 1)
-    kept = gsplat.DeviceGaussians(*(torch.ones(1, n).double() for n in (3, 3, 4)), torch.ones(1).double())
-    with pytest.raises(RuntimeError, match=r"torch\.float64"):
-        gsplat.draw(kept, torch.ones(1, 1), random_camera(0, 16, 16), INRIA)

@@ -166,6 +166,7 @@ def test_the_order_is_kept_while_the_camera_stands(gl, both):
     view.splat(random_values(50, 1))
     assert rasterizer.view(gaussians, camera.resized(20, 20)).order is view.order
     assert rasterizer.view(gaussians, random_camera(3)).order is not view.order
+    assert rasterizer.view(gaussians, camera, GSPLAT).order is not view.order
 
 
 def test_a_driver_that_sorts_wrongly_is_not_used(gl, monkeypatch):
@@ -358,15 +359,6 @@ def test_views_drawn_in_turn_do_not_disturb_each_other(gl, raster):
             values = random_values(len(gaussians), 3)
             want, _ = ReferenceRasterizer().view(gaussians, cam).splat(values)
             np.testing.assert_allclose(view.splat(values)[0], want, atol=1 / 255)
-
-
-def test_the_order_is_kept_while_the_camera_stands_test_rasterizer(gl, raster):
-    gaussians, camera = random_gaussians(50), random_camera()
-    view = raster.view(gaussians, camera)
-    view.splat(random_values(50, 1))
-    assert raster.view(gaussians, camera.resized(20, 20)).order is view.order
-    assert raster.view(gaussians, random_camera(3)).order is not view.order
-    assert raster.view(gaussians, camera, GSPLAT).order is not view.order
 
 
 def test_median_depth_of_one_pixel(gl, raster):

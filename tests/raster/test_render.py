@@ -16,7 +16,7 @@ from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer, protocol, reference
 from langsplat_core.raster import render as front_door
 from langsplat_core.raster.render import pixel_weights, splat_colours
-from langsplat_core.scene import Gaussians, look_at
+from langsplat_core.scene import look_at
 from tests.support.scenes import random_camera, random_gaussians, random_values, without_perspective
 
 G, CAMERA = random_gaussians(80, 4, sh_degree=2), random_camera(2)
@@ -124,11 +124,7 @@ def test_the_row_of_w(backend, distance, orthographic):
 
 def test_few_are_projected_and_invalid_ones_are_not():
     gaussians = random_gaussians(2000, 4, scale_range=(0.005, 0.02))
-    means = gaussians.means.copy()
-    means[5] = np.nan
-    broken = Gaussians(
-        means, gaussians.log_scales, gaussians.quats_wxyz, gaussians.opacity_logits, gaussians.sh
-    )
+    broken = replace(gaussians, means=np.where(np.arange(2000)[:, None] == 5, np.nan, gaussians.means))
     seen = []
 
     class Recorder:

@@ -1,4 +1,4 @@
-"""A scene far from the origin still has a camera that frames it."""
+"""Scenes: framing, merged Gaussians, phrases, calibration."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from langsplat_core.arrays import logit, psnr, rotation_matrices, sigmoid
+from langsplat_core.arrays import logit, psnr, sigmoid
 from langsplat_core.bench.query import repeated
 from langsplat_core.progress import Cancelled
 from langsplat_core.raster.reference import ReferenceRasterizer
@@ -15,7 +15,7 @@ from langsplat_core.scene import NO_THING, Calibration, Gaussians, Odds, Reading
 from langsplat_core.scene.gaussians import GROUP, merged
 from langsplat_core.scene.language import phrase_key, split_phrases, tidy, tokens
 from tests.support.file_samples import random_field
-from tests.support.scenes import random_camera, random_gaussians
+from tests.support.scenes import covariances, random_camera, random_gaussians
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e4, 1e15, 3e38])
@@ -29,11 +29,6 @@ def test_a_camera_frames_any_scene(offset: float) -> None:
 
 
 # Fewer Gaussians that look much the same.
-
-
-def covariances(gaussians: Gaussians) -> np.ndarray:
-    axes = rotation_matrices(gaussians.quats_wxyz.astype(float)) * np.exp(gaussians.log_scales)[:, None, :]
-    return axes @ axes.swapaxes(1, 2)
 
 
 def test_copies_become_one():

@@ -129,14 +129,9 @@ def draws_something(seen: Seen) -> None:
 
 # The table of what is hard for a rasterizer: every row says what must happen, and checks it.
 #
-# `test_rasterizers.py` runs each row on every backend that loads and asserts, beside the row's own check,
+# `test_laws.py` runs each row on every backend that loads and asserts, beside the row's own check,
 # that nothing is NaN, that rows were dropped and counted as said, that the picture is the reference's, and
 # that adjoint and gradients are finite and zero for dropped rows.
-#
-# Hard cases elsewhere: scene files (zero-filled rows, headers, truncation) in `test_hostile_files.py`;
-# datasets (missing photographs, one photograph) in `test_hostile_datasets.py`; zero latents, the decode of
-# nothing, and segment ids beyond the table in `tests/core/test_codec.py`, `test_query.py` and
-# `test_langsplat_features.py`.
 
 ROW = 5  # the row that is made hard where only one is
 _SLOTS = {

@@ -176,7 +176,7 @@ def backward(
 
 
 class ParameterGradients(NamedTuple):
-    """What `to_parameters` fills in, float32; rows that are not drawn are left alone."""
+    """Result of `to_parameters`, float32; rows that are not drawn are left alone."""
 
     means: Array  # (N, 3)
     log_scales: Array  # (N, 3)

@@ -47,8 +47,8 @@ class Rows(NamedTuple):
     sh_bits: Array  # (N, 3 K) uint32: the SH coefficients' bits, only to see whether they are usable
 
 
-class Footprints(NamedTuple):
-    """What `project` fills in."""
+class Projected(NamedTuple):
+    """Result of `project`."""
 
     geometry: Array  # (N, 8) float64, columns MEAN_X to HALF_HEIGHT; only where DRAWN
     depths: Array  # (N,) float64 camera z; only where DRAWN
@@ -56,7 +56,7 @@ class Footprints(NamedTuple):
 
 
 class KernelCamera(NamedTuple):
-    """What the kernels need to know of a camera and the settings."""
+    """Camera and settings as the kernels take them."""
 
     rotation: Array  # (3, 3) world to camera
     translation: Array  # (3,)
@@ -204,7 +204,7 @@ def _is_valid(rows: Rows, i: int) -> bool:
 
 
 @kernel
-def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Footprints) -> None:
+def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projected) -> None:
     """Fill `out` for rows [first, last).
 
     A Gaussian whose alpha = alpha_min contour meets no pixel centre is UNDRAWN.

@@ -51,7 +51,7 @@ class CpuView(TileOperator):
             plain(gaussians.opacity_logits),
             plain(gaussians.sh).reshape(n, gaussians.sh.shape[1] * 3).view(np.uint32),
         )
-        found = projection.Footprints(np.empty((n, projection.COLUMNS)), np.empty(n), np.empty(n, np.uint8))
+        found = projection.Projected(np.empty((n, projection.COLUMNS)), np.empty(n), np.empty(n, np.uint8))
         with lap("projection"):
             workers.run(projection.project, n, self._rows, self._kernel_camera, found)
         with lap("sort"):

@@ -1,4 +1,4 @@
-"""What a codec costs in the only currency that counts: the relevancy of phrases."""
+"""Fitting codecs to the CLIP vectors of one scene, and what they cost: errors of the relevancy of phrases."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -42,14 +42,6 @@ class Vocabulary:
         return relevancy_of(vectors @ self.phrases.T, zero[:, None], rate[:, None])
 
 
-@dataclass(frozen=True)
-class RelevancyError:
-    """Absolute differences to the relevancy of the unquantised vectors, over vectors and phrases."""
-
-    mean: float
-    p99: float
-
-
 def everyday_vocabulary(encoder: Encoder | PhraseEncoder, phrases: tuple[str, ...] = ()) -> Vocabulary:
     """`phrases` and everyday ones, as `encoder` writes them."""
     texts = list(dict.fromkeys([*phrases, *everyday_phrases(encoder.unknown_words)]))
@@ -58,33 +50,33 @@ def everyday_vocabulary(encoder: Encoder | PhraseEncoder, phrases: tuple[str, ..
     return Vocabulary(encoder.encode_texts(texts) if texts else canonical, scale)
 
 
-def relevancy_error(made: Array, vectors: Array, vocabulary: Vocabulary) -> RelevancyError:
-    """Of (M, D) `made` in place of (M, D) `vectors`, both float32 unit vectors; 0 where M = 0."""
+def relevancy_error(made: Array, vectors: Array, vocabulary: Vocabulary) -> tuple[float, float]:
+    """Mean and 99 % quantile of the change of relevancy, over vectors and phrases, with (M, D) `made` in
+    place of (M, D) `vectors`, both float32 unit vectors; 0 where M = 0."""
     differences = [
         np.abs(vocabulary.relevancy(made[i : i + CHUNK]) - vocabulary.relevancy(vectors[i : i + CHUNK]))
         for i in range(0, len(vectors), CHUNK)
     ]
     if not differences:
-        return RelevancyError(0.0, 0.0)
+        return 0.0, 0.0
     errors = np.concatenate([part.astype(np.float32).ravel() for part in differences])
-    return RelevancyError(float(errors.mean(dtype=np.float64)), float(np.quantile(errors, 0.99)))
+    return float(errors.mean(dtype=np.float64)), float(np.quantile(errors, 0.99))
 
 
 @dataclass(frozen=True)
 class CodecReport:
-    """What a codec loses of vectors that it was not fitted to."""
+    """Losses of a codec on vectors that it was not fitted to."""
 
     cosine: float  # mean, of a vector with what the codec makes of it
-    error_mean: float  # of relevancy, see `RelevancyError`
+    error_mean: float  # of relevancy, see `relevancy_error`
     error_p99: float
 
 
 def codec_report(codec: Codec, vectors: Array, vocabulary: Vocabulary) -> CodecReport:
-    """Of (M, D) float32 unit vectors."""
+    """Report on (M, D) float32 unit vectors."""
     made = codec.decode(codec.encode(vectors))
-    error = relevancy_error(made, vectors, vocabulary)
     cosine = float((made * vectors).sum(1).mean()) if len(vectors) else 1.0
-    return CodecReport(cosine, error.mean, error.p99)
+    return CodecReport(cosine, *relevancy_error(made, vectors, vocabulary))
 
 
 # The paper's codec: an autoencoder of one scene's CLIP vectors.
@@ -241,30 +233,28 @@ def _smallest(
     while True:
         codewords = grow(size, smaller)
         error = codebook_error(codewords, judged, vocabulary)
-        if error.mean <= budget or size == most or len(codewords) < size:
+        if error <= budget or size == most or len(codewords) < size:
             break
         smaller, size = codewords, min(2 * size, most)
-    if error.mean > budget and size == most:
-        log.warning(
-            "codebook: %d codewords still have a mean relevancy error of %.4f", len(codewords), error.mean
-        )
-    if smaller is None or error.mean > budget:
+    if error > budget and size == most:
+        log.warning("codebook: %d codewords still have a mean relevancy error of %.4f", len(codewords), error)
+    if smaller is None or error > budget:
         return codewords
     low, high = len(smaller), len(codewords)
     for _ in range(REFINEMENTS):
         middle = round((low * high) ** 0.5)
         tried = grow(middle, smaller)
-        if codebook_error(tried, judged, vocabulary).mean <= budget:
+        if codebook_error(tried, judged, vocabulary) <= budget:
             codewords, high = tried, middle
         else:
             smaller, low = tried, middle
     return codewords
 
 
-def codebook_error(codewords: Array, vectors: Array, vocabulary: Vocabulary) -> RelevancyError:
-    """Of every vector's nearest codeword in its place."""
+def codebook_error(codewords: Array, vectors: Array, vocabulary: Vocabulary) -> float:
+    """Mean error of relevancy with every vector's nearest codeword in its place."""
     nearest, _ = nearest_centres(vectors, codewords)
-    return relevancy_error(codewords[nearest], vectors, vocabulary)
+    return relevancy_error(codewords[nearest], vectors, vocabulary)[0]
 
 
 def codeword_colours(codewords: Array, usage: Array, seed: int = 0) -> Array:

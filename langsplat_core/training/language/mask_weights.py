@@ -1,4 +1,4 @@
-"""Spherical k-means: few unit vectors that many lie close to (Dhillon and Modha 2001)."""
+"""Mask weights, how much of every mask each Gaussian paints; groups of masks; and 3D instances from them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +14,8 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import LEVELS, NO_THING, Camera, Gaussians
 from langsplat_core.semantics.store import ImageFeatures
+
+# Spherical k-means: few unit vectors that many lie close to (Dhillon and Modha 2001).
 
 CHUNK = 8_192  # vectors compared with all centres at a time
 HELPING = 8  # one in so many centres is added, or given up, at a time
@@ -154,7 +156,7 @@ def _per_view(groups: Array, counts: list[int]) -> tuple[Array, ...]:
     return tuple(np.split(groups.astype(np.int32), np.cumsum(counts)[:-1]))
 
 
-# MaskWeights: how much of every mask in every photograph each Gaussian paints, ``W^T onehot(mask)``.
+# Mask weights: how much of every mask in every photograph each Gaussian paints, ``W^T onehot(mask)``.
 #
 # Targets are constant on masks, so this sparse matrix carries vectors of any length from photographs onto
 # Gaussians. It is kept view by view, as pairs sorted by Gaussian, in memory or in files, and read block by
@@ -179,7 +181,7 @@ class MaskWeights:
 
     @cached_property
     def _edges(self) -> list[Array]:
-        """Of each view, where each block begins in its pairs, and where the last ends."""
+        """Places in each view's pairs at which blocks begin, and the last one ends."""
         firsts = np.arange(0, self.count + BLOCK, BLOCK)
         return [np.searchsorted(view["row"], firsts) for view in self.pairs]
 
@@ -206,7 +208,7 @@ def find_mask_weights(
     settings: RasterSettings = INRIA,
     progress: Progress = silent,
 ) -> MaskWeights:
-    """Of all views, in memory."""
+    """Mask weights of all views, in memory."""
     pairs = []
     for camera, features in views:
         pairs.append(view_pairs(rasterizer, gaussians, camera, features, settings))

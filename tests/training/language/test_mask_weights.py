@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.raster import load_lifting_rasterizer
+from langsplat_core.raster import load_lifting_rasterizer, protocol
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import LEVELS, NO_THING
 from langsplat_core.semantics.store import ImageFeatures
@@ -35,10 +35,11 @@ def ungrouped(views):
     return group_masks([features.vectors for _, features in views], groups=10_000)
 
 
-@pytest.mark.parametrize(("backend", "chunk"), [("reference", 3), ("reference", 32), ("cpu", 32)])
-def test_membership_is_the_weight_inside_the_mask(gaussians, backend, chunk):
+@pytest.mark.parametrize(("backend", "together"), [("reference", 3), ("reference", 32), ("cpu", 32)])
+def test_a_mask_weight_is_the_weight_inside_the_mask(gaussians, backend, together, monkeypatch):
+    monkeypatch.setattr(protocol, "LABELS_AT_ONCE", together)
     views = make_views()
-    mask_weights = find_mask_weights(load_lifting_rasterizer(backend), gaussians, views, chunk)
+    mask_weights = find_mask_weights(load_lifting_rasterizer(backend), gaussians, views)
     got = mask_weights.block(0, ungrouped(views)).toarray()
     assert got.shape == (25, 3 * 21)
     for index, (camera, features) in enumerate(views):
