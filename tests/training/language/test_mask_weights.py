@@ -217,53 +217,58 @@ def test_a_gaussian_belongs_to_the_thing_that_it_paints_most(seed):
     np.testing.assert_array_equal(found(views, 240), things)
 
 
-def test_masks_seen_in_several_views_are_one_thing_numbered_from_the_largest():
-    truth = np.repeat([0, 1, 2], [10, 30, 20])
-    views = [view(np.array(order)[truth]) for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0])]
-    things = found(views, 60)
+ROWS = np.arange(40)
+TRUTH = np.repeat([0, 1, 2], [10, 30, 20])
+APART = [view(np.where(ROWS < 20, 0, UNSEEN)), view(np.where(ROWS >= 20, 0, UNSEEN))]
+HALVES = ROWS // 20
+CASES = {
+    "masks seen in several views are one thing, numbered from the largest": (
+        [view(np.array(order)[TRUTH]) for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0])],
+        np.array([2, 0, 1])[TRUTH],
+    ),
+    "views that never meet say nothing about each other": (APART, HALVES),
+    "a view of both joins them": (
+        [*APART, view(np.where((ROWS >= 10) & (ROWS < 30), 0, UNSEEN))], np.zeros(40)
+    ),
+    "half a thing in the corner of an image is that thing": (
+        [view(np.zeros(40, int)), view(np.where(ROWS < 6, 0, UNSEEN))], np.zeros(40)
+    ),
+    **{
+        f"touching masks do not merge where one spills over by {spilled}": (
+            [view(HALVES), view(HALVES), view((20 + spilled <= ROWS).astype(int))], HALVES
+        )
+        for spilled in (2, 5)
+    },
+    "a mask over two things merges neither": (
+        [view(HALVES), view(1 - HALVES), view(np.zeros(40, int))], HALVES
+    ),
+    "no masks": ([np.zeros(0, PAIR)] * 2, np.full(5, NO_THING)),
+    "views without masks": (
+        [np.zeros(0, PAIR), view(np.zeros(12, int)), np.zeros(0, PAIR), view(np.zeros(12, int))], np.zeros(12)
+    ),
+    "no Gaussians": ([np.zeros(0, PAIR)], np.zeros(0)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_things_of_a_case(name):
+    """Things of one size may be numbered either way."""
+    views, want = CASES[name]
+    things = found(views, len(want))
     assert things.dtype == np.uint16
-    assert things.tolist() == np.array([2, 0, 1])[truth].tolist()
-
-
-def test_views_that_never_meet_say_nothing_about_each_other():
-    rows = np.arange(40)
-    apart = [view(np.where(rows < 20, 0, UNSEEN)), view(np.where(rows >= 20, 0, UNSEEN))]
-    assert found(apart, 40).tolist() == [0] * 20 + [1] * 20
-    between = view(np.where((rows >= 10) & (rows < 30), 0, UNSEEN))
-    assert found([*apart, between], 40).tolist() == [0] * 40  # a view of both joins them
-
-
-def test_half_a_thing_in_the_corner_of_a_picture_is_that_thing():
-    """What the other view does not see counts on neither side."""
-    rows = np.arange(40)
-    cropped = view(np.where(rows < 6, 0, UNSEEN))
-    assert found([view(np.zeros(40, int)), cropped], 40).tolist() == [0] * 40
-
-
-@pytest.mark.parametrize("spilled", [2, 5])
-def test_touching_masks_do_not_merge_where_one_spills_over(spilled):
-    rows = np.arange(40)
-    exact, wide = view(rows // 20), view((rows >= 20 + spilled).astype(int))
-    things = found([exact, exact.copy(), wide], 40)
-    assert len(np.unique(things)) == 2
-    np.testing.assert_array_equal(things == things[0], rows < 20)
-
-
-def test_a_mask_over_two_things_merges_neither():
-    rows = np.arange(40)
-    both = view(np.zeros(40, int))
-    things = found([view(rows // 20), view(1 - rows // 20), both], 40)
-    np.testing.assert_array_equal(things == things[0], rows < 20)
-    assert NO_THING not in things
+    if "two things" in name or "touching" in name or "never meet" in name:
+        things = (things != things[:1]).astype(int)
+    np.testing.assert_array_equal(things, want)
 
 
 def test_masks_of_other_levels_show_no_thing():
     rows = np.arange(20)
     views = [joined(view(np.where(rows < 10, 0, UNSEEN)), view(np.full(20, 1), level=1))] * 2
-    assert masks_of_things(MaskWeights(views, 20), [2, 2], WHOLE).tolist() == [0, -1, 0, -1]
-    assert masks_of_things(MaskWeights(views, 20), [2, 2], 1).tolist() == [-1, 0, -1, 0]
-    assert masks_of_things(MaskWeights(views, 20), [2, 2], 0).tolist() == [-1] * 4
+    for level, want in ((WHOLE, [0, -1, 0, -1]), (1, [-1, 0, -1, 0]), (0, [-1] * 4)):
+        assert masks_of_things(MaskWeights(views, 20), [2, 2], level).tolist() == want
     assert found(views, 20).tolist() == [0] * 10 + [NO_THING] * 10
+    hidden = find_things(MaskWeights([np.zeros(0, PAIR)], 5), [3])  # masks behind everything
+    assert hidden.tolist() == [NO_THING] * 5
 
 
 def test_a_gaussian_that_two_masks_share_evenly_is_claimed_by_neither():
@@ -297,13 +302,3 @@ def test_blocks_change_nothing(monkeypatch):
     whole = found(views, 240)
     monkeypatch.setattr(blocks, "BLOCK", 37)
     np.testing.assert_array_equal(found(views, 240), whole)
-
-
-def test_views_without_masks():
-    empty = np.zeros(0, PAIR)
-    full = view(np.zeros(12, int))
-    assert found([empty, full, empty, full, empty], 12).tolist() == [0] * 12
-    for views in ([empty], [empty, empty]):
-        assert found(views, 5).tolist() == [NO_THING] * 5
-    assert find_things(MaskWeights([empty], 5), [3]).tolist() == [NO_THING] * 5  # masks that hide behind
-    assert found([empty], 0).shape == (0,)
