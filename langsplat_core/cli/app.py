@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields, make_dataclass
+from dataclasses import make_dataclass
 from difflib import get_close_matches
 from importlib import import_module
 from itertools import takewhile
@@ -11,8 +11,7 @@ from typing import Annotated, Any, Union
 
 import tyro
 
-from langsplat_core.cli.run import Command, codec_settings, main, parsed
-from langsplat_core.config import CodecConfig
+from langsplat_core.cli.run import Command, main, parsed, with_codec
 from langsplat_core.errors import InputError
 
 FLAGS = ("-q", "--quiet", "-v", "--verbose")  # may precede a command
@@ -82,16 +81,6 @@ def load_command(where: str) -> type[Command]:
     module, _, name = where.partition(".")
     found: type[Command] = getattr(import_module(f"langsplat_core.cli.{module}"), name)
     return found
-
-
-def with_codec(command: type[Command], args: Sequence[str]) -> type[Command]:
-    """`command` with the settings of the codec that `args` choose, where it has any."""
-    default: Any = next((entry.default for entry in fields(command) if entry.name == "codec"), None)  # type: ignore[arg-type]
-    if default is None:
-        return command
-    chosen = ("codec", CodecConfig, codec_settings(args, default))
-    names = {"__doc__": command.__doc__}
-    return make_dataclass(command.__name__, [chosen], bases=(command,), frozen=True, namespace=names)
 
 
 def _subcommand(name: str, command: type[Command]) -> Any:

@@ -16,7 +16,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, make_dataclass
+from dataclasses import MISSING, dataclass, fields, make_dataclass
 from itertools import dropwhile, pairwise, takewhile
 from types import FrameType
 from typing import Annotated, Any, Protocol
@@ -93,6 +93,17 @@ def codec_settings(args: Sequence[str], default: CodecConfig) -> CodecConfig:
     if kind not in CODEC_CONFIGS:
         raise InputError(f"--codec.kind {kind}: choose one of {', '.join(CODEC_CONFIGS)}")
     return default if kind == default.kind else CODEC_CONFIGS[kind]()
+
+
+def with_codec(command: type[Command], args: Sequence[str]) -> type[Command]:
+    """`command` with the settings of the codec that `args` choose, where it has a field `codec`."""
+    entry: Any = next((entry for entry in fields(command) if entry.name == "codec"), None)  # type: ignore[arg-type]
+    if entry is None:
+        return command
+    default = entry.default_factory() if entry.default is MISSING else entry.default
+    chosen = ("codec", CodecConfig, codec_settings(args, default))
+    names = {"__doc__": command.__doc__}
+    return make_dataclass(command.__name__, [chosen], bases=(command,), frozen=True, namespace=names)
 
 
 def one_line(box: str) -> str:
