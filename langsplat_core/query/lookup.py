@@ -1,9 +1,9 @@
-"""A phrase as a small table: relevancy over the sphere of latents.
+"""Relevancy of phrases at every Gaussian, by what the scene's codec allows, and at every pixel.
 
-With d = 3 and unit latents, the relevancy of one phrase is a function on the sphere. The decoder is run
-once per scene at the nodes of an octahedral grid that its latents lie between; after that a phrase costs one
-matrix-vector product, and every Gaussian looks its value up by bilinear interpolation at a place computed
-once.
+Each distinct latent is compared, exactly; those of a codebook are few, and every Gaussian costs a fetch. Of
+unit latents of three numbers, the relevancy of a phrase is a function on the sphere: the decoder is run once
+per scene at the nodes of an octahedral grid that its latents lie between; after that a phrase costs one
+matrix-vector product, and every Gaussian a bilinear interpolation at a place computed once.
 """
 
 from collections.abc import Iterator
@@ -21,97 +21,6 @@ from langsplat_core.scene import Codec, LanguageField
 from langsplat_core.semantics.relevancy import Scale, latent_relevancy, relevancy_of
 
 RESOLUTION = 256  # nodes per side; error against exact decoding falls with its square
-
-
-def octahedral_to_sphere(uv: Array) -> Array:
-    """(..., 2) in [0, 1]^2 -> (..., 3) unit vectors; the square's border is the lower hemisphere's pole."""
-    xy = 2 * np.asarray(uv, np.float64) - 1
-    z = 1 - np.abs(xy).sum(-1)
-    folded = (1 - np.abs(xy[..., ::-1])) * np.where(xy >= 0, 1, -1)
-    xy = np.where((z < 0)[..., None], folded, xy)
-    vectors = np.concatenate([xy, z[..., None]], -1)
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-
-
-def sphere_to_octahedral(vectors: Array) -> Array:
-    """(..., 3) non-zero vectors -> (..., 2) in [0, 1]^2; inverse of `octahedral_to_sphere`."""
-    scaled = vectors / np.abs(vectors).sum(-1, keepdims=True)
-    xy, z = scaled[..., :2], scaled[..., 2]
-    folded = (1 - np.abs(xy[..., ::-1])) * np.where(xy >= 0, 1, -1)
-    return (np.where((z < 0)[..., None], folded, xy) + 1) / 2
-
-
-@dataclass(frozen=True, eq=False)
-class SphereTable:
-    """Decoded vectors at the U nodes of R x R that are needed, and where M latents lie between them."""
-
-    used: Array  # (U,) int64 index of each node in the grid, row-major
-    vectors: Array  # (U, D) float32 decoded unit vectors
-    zero: Array  # (U,) cosine of relevancy 0.5, see `chance.Scale`
-    rate: Array  # (U,)
-    corner: Array  # (M,) int32 index of the lower left node; -1 for a latent without meaning
-    fraction: Array  # (M, 2) float32 position inside the cell, in [0, 1]
-    resolution: int
-
-    def relevancies(self, phrases: Array) -> Iterator[Array]:
-        """(Q, D) unit phrase vectors -> of each in turn (M,) float32 relevancy; 0 where the latent has no
-        meaning."""
-        values = relevancy_of(self.vectors @ phrases.T, self.zero[:, None], self.rate[:, None])
-        nodes = np.zeros(self.resolution**2, np.float32)
-        for row in values.T:
-            nodes[self.used] = row
-            found = np.empty(len(self.corner), np.float32)
-            arguments = nodes, self.corner, self.fraction, self.resolution, found
-            shared_workers().run(_interpolate, len(found), *arguments)
-            yield found
-
-
-def build_table(codec: Codec, latents: Array, scale: Scale, resolution: int = RESOLUTION) -> SphereTable:
-    """Tabulate `codec` for (M, 3) latents; those of no length have no meaning."""
-    if not codec.spherical:
-        raise ValueError(f"a sphere table needs unit latents of 3 numbers; {codec.kind} has others")
-    known = codec.known(latents)
-    safe = np.where(known[:, None], latents, (0.0, 0.0, 1.0)).astype(np.float64)
-    position = sphere_to_octahedral(safe) * (resolution - 1)
-    cell = np.clip(np.floor(position), 0, resolution - 2).astype(np.int64)
-    corner = cell[:, 1] * resolution + cell[:, 0]  # row-major: first coordinate fastest
-    needed = np.zeros(resolution**2, bool)
-    for step in (0, 1, resolution, resolution + 1):
-        needed[corner[known] + step] = True
-    used = np.flatnonzero(needed)
-    grid = np.stack([used % resolution, used // resolution], 1) / (resolution - 1)
-    vectors = codec.decode(octahedral_to_sphere(grid).astype(np.float32))
-    zero, rate = scale.of(vectors @ scale.texts.T)
-    return SphereTable(
-        used=used,
-        vectors=vectors,
-        zero=zero,
-        rate=rate,
-        corner=np.where(known, corner, -1).astype(np.int32),
-        fraction=(position - cell).astype(np.float32),
-        resolution=resolution,
-    )
-
-
-@kernel
-def _interpolate(
-    first: int, last: int, nodes: Array, corner: Array, fraction: Array, resolution: int, found: Array
-) -> None:
-    """Rows [first, last) of `found` (M,), bilinear."""
-    one = np.float32(1)
-    for i in range(first, last):
-        node, u, v = corner[i], fraction[i, 0], fraction[i, 1]
-        if node < 0:
-            found[i] = 0
-            continue
-        low = nodes[node] * (one - u) + nodes[node + 1] * u
-        high = nodes[node + resolution] * (one - u) + nodes[node + resolution + 1] * u
-        found[i] = low * (one - v) + high * v
-
-
-# How the relevancy of one phrase is found at every Gaussian: each distinct latent is compared, which of a
-# codebook are few; a sphere of three numbers has a table over it.
-
 TOGETHER = 16  # phrases compared with every latent at a time: 4 bytes each per latent
 CHUNK = 16_384  # latents that are compared with texts at a time
 
@@ -127,9 +36,82 @@ class Lookup(Protocol):
 def build_lookup(field: LanguageField, scale: Scale, exact: bool = False) -> Lookup:
     """The fastest lookup for `field`; with `exact` none that interpolates, to measure a table by."""
     if field.codec.spherical and not exact:
-        latents = np.where(field.known[..., None], field.latents, 0).reshape(-1, field.latents.shape[-1])
-        return build_table(field.codec, latents, scale)
+        latents = np.where(field.known[..., None], field.latents, 0)
+        return build_table(field.codec, latents.reshape(-1, 3), scale)
     return LatentLookup(field, scale)
+
+
+class Vectors:
+    """K unit vectors of meanings, with the zero and rate of relevancy at each."""
+
+    def __init__(self, vectors: Array, scale: Scale) -> None:
+        self.vectors = vectors  # (K, D) float32
+        self._zero, self._rate = scale.of(vectors @ scale.texts.T)
+
+    def relevancies(self, phrases: Array) -> Array:
+        """(Q, D) unit phrase vectors -> (K, Q) in (0, 1)."""
+        return relevancy_of(self.vectors @ phrases.T, self._zero[:, None], self._rate[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class SphereTable:
+    """Decoded vectors at the U nodes of R x R that are needed, and where M latents lie between them."""
+
+    used: Array  # (U,) int64 index of each node in the grid, row-major
+    nodes: Vectors  # of what they decode to
+    corner: Array  # (M,) int32 index of the lower left node; -1 for a latent without meaning
+    fraction: Array  # (M, 2) float32 position inside the cell, in [0, 1]
+    resolution: int
+
+    def relevancies(self, phrases: Array) -> Iterator[Array]:
+        """See `Lookup`."""
+        grid = np.zeros(self.resolution**2, np.float32)
+        for row in self.nodes.relevancies(phrases).T:
+            grid[self.used] = row
+            found = np.empty(len(self.corner), np.float32)
+            arguments = grid, self.corner, self.fraction, self.resolution, found
+            shared_workers().run(_interpolate, len(found), *arguments)
+            yield found
+
+
+def build_table(codec: Codec, latents: Array, scale: Scale, resolution: int = RESOLUTION) -> SphereTable:
+    """Tabulate a `codec` of unit latents for (M, 3) latents; those of no length have no meaning."""
+    known = codec.known(latents)
+    safe = np.where(known[:, None], latents, (0.0, 0.0, 1.0)).astype(np.float64)
+    position = sphere_to_octahedral(safe) * (resolution - 1)
+    cell = np.clip(np.floor(position), 0, resolution - 2).astype(np.int64)
+    corner = cell[:, 1] * resolution + cell[:, 0]  # row-major: first coordinate fastest
+    needed = np.zeros(resolution**2, bool)
+    for step in (0, 1, resolution, resolution + 1):
+        needed[corner[known] + step] = True
+    used = np.flatnonzero(needed)
+    grid = np.stack([used % resolution, used // resolution], 1) / (resolution - 1)
+    return SphereTable(
+        used=used,
+        nodes=Vectors(codec.decode(octahedral_to_sphere(grid).astype(np.float32)), scale),
+        corner=np.where(known, corner, -1).astype(np.int32),
+        fraction=(position - cell).astype(np.float32),
+        resolution=resolution,
+    )
+
+
+def octahedral_to_sphere(uv: Array) -> Array:
+    """(..., 2) in [0, 1]^2 -> (..., 3) unit vectors; the square's border is the lower hemisphere's pole."""
+    xy = 2 * np.asarray(uv, np.float64) - 1
+    z = 1 - np.abs(xy).sum(-1)
+    vectors = np.concatenate([_folded(xy, z), z[..., None]], -1)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def sphere_to_octahedral(vectors: Array) -> Array:
+    """(..., 3) non-zero vectors -> (..., 2) in [0, 1]^2; inverse of `octahedral_to_sphere`."""
+    scaled = vectors / np.abs(vectors).sum(-1, keepdims=True)
+    return (_folded(scaled[..., :2], scaled[..., 2]) + 1) / 2
+
+
+def _folded(xy: Array, z: Array) -> Array:
+    """The square's corners turned out where z < 0, or back in."""
+    return np.where((z < 0)[..., None], (1 - np.abs(xy[..., ::-1])) * np.where(xy >= 0, 1, -1), xy)
 
 
 class LatentLookup:
@@ -143,9 +125,8 @@ class LatentLookup:
         self._of = np.where(field.known.reshape(-1), of, count).astype(kind)
         self._zero, self._rate = np.empty(count, np.float32), np.empty(count, np.float32)
         for part in self._parts():
-            self._zero[part], self._rate[part] = scale.of(
-                self._codec.cosines(self._latents[part], scale.texts)
-            )
+            cosines = self._codec.cosines(self._latents[part], scale.texts)
+            self._zero[part], self._rate[part] = scale.of(cosines)
 
     def relevancies(self, phrases: Array) -> Iterator[Array]:
         """See `Lookup`."""
@@ -173,11 +154,25 @@ def _fetch(first: int, last: int, values: Array, codes: Array, found: Array) -> 
         found[i] = values[codes[i]]
 
 
-# Relevancy of pixels, in both orders.
-#
-# `decode-first` (ours): relevancy is looked up per Gaussian and splatted, one linear channel per phrase.
-# `paper` (LangSplat section 3.4): latents are splatted, every pixel's blend is decoded, then compared.
-# Both are gated by alpha, because an uncovered pixel's zero latent decodes to a confident something.
+@kernel
+def _interpolate(
+    first: int, last: int, nodes: Array, corner: Array, fraction: Array, resolution: int, found: Array
+) -> None:
+    """Rows [first, last) of `found` (M,), bilinear."""
+    one = np.float32(1)
+    for i in range(first, last):
+        node, u, v = corner[i], fraction[i, 0], fraction[i, 1]
+        if node < 0:
+            found[i] = 0
+            continue
+        low = nodes[node] * (one - u) + nodes[node + 1] * u
+        high = nodes[node + resolution] * (one - u) + nodes[node + resolution + 1] * u
+        found[i] = low * (one - v) + high * v
+
+
+# Relevancy of pixels: per Gaussian and splatted, one linear channel per phrase (ours); or of latents that are
+# splatted and decoded (the paper's order, section 3.4). Both are gated by alpha, because an uncovered pixel's
+# zero latent decodes to a confident something.
 
 
 def splatted_relevancy(view: View, relevancy: Array, alpha_gate: float) -> Array:
