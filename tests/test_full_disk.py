@@ -92,7 +92,9 @@ WRITERS: dict[str, Write] = {
     "their checkpoint": lambda folder: write_checkpoint(
         folder / "c.pth", GAUSSIANS, np.ones((40, 3), np.float32)
     ),
-    "their autoencoder": lambda folder: write_autoencoder(folder / "a.pth", random_codec("autoencoder")),  # type: ignore[arg-type]
+    "their autoencoder": lambda folder: write_autoencoder(
+        folder / "a.pth", *random_codec("autoencoder").networks
+    ),  # type: ignore[misc]
     "their features": lambda folder: write_features(
         folder, "a", np.ones((2, 64), np.float32), np.zeros((4, 8, 8), np.int32)
     ),

@@ -17,7 +17,7 @@ from rich.text import Text
 
 from langsplat_core import __version__
 from langsplat_core.cli.checks import OutFile, OutputConsole
-from langsplat_core.config import CodecConfig, CompactConfig, Positive, Range
+from langsplat_core.config import CodebookConfig, CodecConfig, CompactConfig, Positive, Range
 from langsplat_core.errors import EXTRAS, BackendError, InputError, LangSplatError, remedy
 from langsplat_core.io.files import check_output_folder
 from langsplat_core.io.language import rematch_language
@@ -191,7 +191,7 @@ class Convert:
     """Levels of the checkpoints with features, in their order, where files and folders do not tell."""
     phrases: tuple[str, ...] = ()
     """Stored encoded in a scene made of checkpoints: they can be asked without any encoder."""
-    codec: CodecConfig = field(default_factory=CodecConfig)
+    codec: CodecConfig = CodebookConfig()  # noqa: RUF009  (frozen)
     """How the Gaussians of checkpoints with whole vectors keep them."""
 
     @property

@@ -24,6 +24,7 @@ from langsplat_core.io.hostile import read_npy, write_npy
 from langsplat_core.io.ply import REST_COUNTS
 from langsplat_core.io.unpickling import plain_array
 from langsplat_core.scene import AutoencoderCodec, Gaussians
+from langsplat_core.scene.codec import Layers
 
 MAP_COUNT = 4
 NO_MASK = -1
@@ -131,11 +132,11 @@ def _folded(layers: list[Layer]) -> tuple[tuple[Array, Array], ...]:
     return tuple((weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in folded)
 
 
-def autoencoder_weights(codec: AutoencoderCodec) -> dict[str, Array]:
+def autoencoder_weights(encoder: Layers, decoder: Layers) -> dict[str, Array]:
     """The dictionary of a codec; its batch normalisations change nothing, because theirs are folded in."""
     named: dict[str, Array] = {}
-    last = len(codec.encoder) - 1
-    for number, (weight, bias) in enumerate(codec.encoder):
+    last = len(encoder) - 1
+    for number, (weight, bias) in enumerate(encoder):
         named |= {f"encoder.{3 * number}.weight": weight, f"encoder.{3 * number}.bias": bias}
         if number < last:
             ones, zeros = np.ones(len(bias), np.float32), np.zeros(len(bias), np.float32)
@@ -145,7 +146,7 @@ def autoencoder_weights(codec: AutoencoderCodec) -> dict[str, Array]:
                 "num_batches_tracked": np.array(0, np.int64),
             }
             named |= {f"encoder.{3 * number + 1}.{name}": array for name, array in neutral.items()}
-    for number, (weight, bias) in enumerate(codec.decoder):
+    for number, (weight, bias) in enumerate(decoder):
         named |= {f"decoder.{2 * number}.weight": weight, f"decoder.{2 * number}.bias": bias}
     return named
 
@@ -240,9 +241,9 @@ def write_checkpoint(path: Path, gaussians: Gaussians, features: Array) -> None:
     _save((elements, ITERATION), path)
 
 
-def write_autoencoder(path: Path, codec: AutoencoderCodec) -> None:
+def write_autoencoder(path: Path, encoder: Layers, decoder: Layers) -> None:
     """`best_ckpt.pth` of a codec, atomically."""
-    _save({name: _tensor(array) for name, array in autoencoder_weights(codec).items()}, path)
+    _save({name: _tensor(array) for name, array in autoencoder_weights(encoder, decoder).items()}, path)
 
 
 def _tensor(array: Array) -> Any:

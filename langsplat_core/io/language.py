@@ -68,7 +68,6 @@ from langsplat_core.scene import (
     Reading,
     codec_from_tensors,
 )
-from langsplat_core.scene.codec import KINDS
 
 FORMAT, VERSION = "langsplat", "2"
 CODEC = "codec."
@@ -134,18 +133,18 @@ def _check_metadata(metadata: dict[str, str], path: Path) -> None:
 
 
 def _assemble(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> Stored:
-    kind = KINDS.get(metadata["codec"])
-    latents_name = "codes" if kind is not None and kind.space == "index" else "latents"
     places = ("means",) if metadata["version"] == "1" else ("positions", "corners")
-    for name in (latents_name, "confidence", "canonical", *places):
+    for name in ("confidence", "canonical", *places):
         if name not in tensors:
             raise FormatError(f"{path}: tensor {name!r} is missing")
     for name, tensor in tensors.items():
         if name != "means" and not np.isfinite(tensor).all():
             raise FormatError(f"{path}: tensor {quoted(name)} holds numbers that are not finite")
     try:
-        field = _field(tensors, metadata, latents_name, path)
+        field = _field(tensors, metadata, path)
         means, precision = _means(tensors, len(field))
+    except KeyError as missing:
+        raise FormatError(f"{path}: tensor {missing} is missing") from None
     except (ValueError, TypeError, IndexError) as error:
         raise FormatError(f"{path}: {error}") from None
     if (metadata["d"], metadata["gaussians"]) != (str(field.codec.latent_dim), str(len(field))):
@@ -155,15 +154,9 @@ def _assemble(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -
     return Stored(field, means, precision, metadata["means_blake2b"])
 
 
-def _field(
-    tensors: dict[str, Array], metadata: dict[str, str], latents_name: str, path: Path
-) -> LanguageField:
+def _field(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> LanguageField:
     weights = {name.removeprefix(CODEC): t for name, t in tensors.items() if name.startswith(CODEC)}
     codec = codec_from_tensors(metadata["codec"], weights)
-    latents = tensors[latents_name]
-    if latents_name == "codes":
-        check_array("codes", latents, (len(LEVELS), "N"))
-        latents = latents[..., None]
     phrases = _phrases(metadata, path)
     vectors = tensors.get("phrasebook", np.zeros((0, codec.vector_dim), np.float32))
     check_array("phrasebook", vectors, (len(phrases), codec.vector_dim))
@@ -173,7 +166,7 @@ def _field(
         calibration = _calibration(metadata, path)
         reading = Reading(float(metadata["temperature"]), float(metadata["found"]), calibration)
     return LanguageField(
-        latents,
+        codec.from_file(tensors),
         tensors["confidence"],
         codec,
         tensors["canonical"],
@@ -248,19 +241,16 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
     """Write `field` for the Gaussians at `means` (N, 3), atomically."""
     check_array("means", means, (len(field), 3), dtype=np.float32)
     positions, corners = pack_positions(means)
-    indexed = field.codec.space == "index"
     floats = {
         "confidence": field.confidence,
         "canonical": field.canonical,
-        **({} if indexed else {"latents": field.latents}),
+        **field.codec.to_file(field.latents),
         **({} if field.everyday is None else {"everyday": field.everyday}),
         **({"phrasebook": np.stack(list(field.phrasebook.values()))} if field.phrasebook else {}),
         **{CODEC + name: tensor for name, tensor in field.codec.tensors().items()},
     }
     tensors = {name: _narrow(tensor) for name, tensor in floats.items()}
     tensors |= {"positions": positions, "corners": corners}
-    if indexed:
-        tensors["codes"] = field.latents[..., 0]
     if field.things is not None:
         tensors["things"] = field.things
     metadata = {
@@ -284,6 +274,9 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
 
 
 def _narrow(tensor: Array) -> Array:
+    """Floats as float16 where that loses nothing."""
+    if tensor.dtype != np.float32:
+        return tensor
     with np.errstate(over="ignore"):
         half = tensor.astype(np.float16)
     return half if np.array_equal(half.astype(np.float32), tensor) else tensor

@@ -150,7 +150,7 @@ def _language(field: LanguageField) -> LanguageSummary:
     }
     return LanguageSummary(
         codec=field.codec.kind,
-        size=field.codec.index_size or field.codec.latent_dim,
+        size=field.codec.size,
         encoder=field.encoder_id,
         vector_dim=field.codec.vector_dim,
         phrases=len(field.phrasebook),

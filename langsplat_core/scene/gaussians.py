@@ -74,7 +74,7 @@ class Gaussians:
         return counts
 
     def _requirements(self) -> tuple[tuple[str, Any], ...]:
-        """What a row must fulfil to be drawn: name of the fault, (N,) True where there is none."""
+        """Requirements of a row that is drawn: name of the fault, (N,) True where there is none."""
         with np.errstate(over="ignore", invalid="ignore"):
             length_squared = (self.quats_wxyz.astype(np.float64) ** 2).sum(1)
             sound_colour = (np.abs(self.sh) <= LARGEST_COEFFICIENT).all((1, 2))
@@ -117,7 +117,7 @@ class Merged:
 
 
 class _Part(NamedTuple):
-    """What becomes of some groups."""
+    """Merged Gaussians of some groups."""
 
     gaussians: Gaussians
     sources: Array  # (m, GROUP) rows of the original; only the first counts where its weight is 1

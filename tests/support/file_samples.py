@@ -272,8 +272,8 @@ def random_field(
 ) -> LanguageField:
     rng = np.random.default_rng(seed)
     codec = random_codec(kind, seed=seed)
-    if codec.index_size:
-        latents = rng.integers(codec.index_size, size=(3, n, 1)).astype(np.uint16)
+    if not codec.blends:
+        latents = rng.integers(codec.size, size=(3, n, 1)).astype(np.uint16)
     else:
         latents = unit(rng.normal(size=(3, n, codec.latent_dim))).astype(np.float32)
     latents[:, ::7] = 0  # never observed

@@ -14,11 +14,9 @@ from langsplat_core.config import INRIA, Display, PictureConfig, RasterSettings
 from langsplat_core.display.displays import DISPLAYS, MAX_QUERIES, Channels, Extra, HeatRanges
 from langsplat_core.query.answers import QueryResult, Verdict
 from langsplat_core.raster import Rasterizer, View
-from langsplat_core.raster.protocol import MedianDepth
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians, Scene
 from langsplat_core.semantics.relevancy import FLOOR
-from langsplat_viewer.camera.controls import eye_depth
 
 SplitMode = Literal["off", "wipe", "levels"]
 AT_RANGE = (0.02, 0.98)  # of the area's width, where the line can be: it stays within reach
@@ -81,10 +79,6 @@ class Clip:
     near: float = 0.0
     far: float = math.inf
 
-    def beyond(self, plane: float) -> "Clip":
-        """The same in depths of a camera before which the eye's plane lies `plane` away."""
-        return Clip(self.near + plane, self.far + plane)
-
     def keeps(self, depths: Array) -> Array:
         """(N,) bool, of (N,) camera z."""
         kept: Array = (depths > self.near) & (depths <= self.far)
@@ -118,7 +112,9 @@ _SAMPLE = 20_000  # Gaussians looked at; quantiles need no more
 def near_plane(gaussians: Gaussians, camera: Camera, most: float = INRIA.near) -> float:
     """Where the near plane lies for looking, world units: a share of the depth of what is nearest in the
     picture, so that one can go as near to a thing as it is small; at most `most`, the constant of training,
-    so that the view of a photograph is the one that was trained."""
+    so that the view of a photograph is the one that was trained. Without perspective, that of the eye."""
+    if camera.orthographic:
+        return 0.0
     rows = slice(None, None, max(len(gaussians) // _SAMPLE, 1))
     means = gaussians.means[rows].astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -144,11 +140,9 @@ def drawn_scene(scene: Scene, splats: Splats) -> Scene:
 
 
 def looking_settings(scene: Scene, camera: Camera, clip: Clip = UNCLIPPED) -> RasterSettings:
-    """The scene's own image formation, with the near plane of `near_plane`, and what `clip` cuts away;
-    without what lies behind the eye of a parallel projection."""
+    """The scene's own image formation, with the near plane of `near_plane`, and what `clip` cuts away."""
     settings = scene.raster_settings()
     near = near_plane(scene.gaussians, camera, settings.near)
-    clip = clip.beyond(eye_depth(camera))
     return replace(settings, near=max(near, clip.near), far=None if math.isinf(clip.far) else clip.far)
 
 
@@ -172,7 +166,7 @@ def why_nothing(gaussians: Gaussians, camera: Camera) -> str:
     if reason:
         return reason
     _, depths = camera.project(gaussians.means[gaussians.valid()].astype(np.float64))
-    if (depths <= eye_depth(camera)).all():
+    if (depths <= 0).all():
         return "the whole scene lies behind the camera"
     if (depths <= near_plane(gaussians, camera)).all():
         return "the whole scene lies nearer than the camera can see"
@@ -198,8 +192,8 @@ class Sight:
         return hash((id(self.scene), self._place()))
 
     def _place(self) -> tuple[object, ...]:
-        plane = eye_depth(self.camera)
-        return self.clip, plane, self.camera.intrinsics, self.camera.world_to_camera.tobytes()
+        camera = self.camera
+        return self.clip, camera.orthographic, camera.intrinsics, camera.world_to_camera.tobytes()
 
     def settings(self) -> RasterSettings:
         """The image formation for it."""
@@ -335,7 +329,7 @@ def depth_range(gaussians: Gaussians, camera: Camera, clip: Clip = UNCLIPPED) ->
     with np.errstate(invalid="ignore", over="ignore"):
         pixels, depths = camera.project(means)
         inside = (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1) & (depths > 0)
-        inside &= clip.beyond(eye_depth(camera)).keeps(depths)
+        inside &= clip.keeps(depths)
     if not inside.any():
         return 0.0, 1.0
     near, far = np.quantile(depths[inside], [0.02, 0.98])
@@ -347,15 +341,6 @@ def camera_depths(gaussians: Gaussians, camera: Camera) -> Array:
     with np.errstate(invalid="ignore", over="ignore"):
         depths = gaussians.means.astype(np.float64) @ camera.rotation[2] + camera.world_to_camera[2, 3]
         return np.nan_to_num(depths.astype(np.float32))[:, None]
-
-
-def surface_depths(view: View, count: int) -> Array:
-    """(H, W) depth of the surface as a view of `count` Gaussians has it: the median where the rasterizer
-    knows it, else the mean; world units, 0 where less than half of the light is stopped."""
-    if isinstance(view, MedianDepth):
-        return view.median_depth()
-    _, alpha = view.splat(np.empty((count, 0), np.float32))
-    return np.where(alpha >= 0.5, view.depth(), 0)
 
 
 class ArrayChannels:
@@ -402,5 +387,5 @@ class ArrayChannels:
         the scene is transparent there), world units, 0 where there is nothing, and alpha."""
         view = self.views.of(sight)
         _, alpha = view.splat(np.empty((len(sight.scene.gaussians), 0), np.float32))
-        median = view.median_depth()[row, column] if isinstance(view, MedianDepth) else 0
+        median = view.median_depth()[row, column]
         return float(median or view.depth()[row, column]), float(alpha[row, column])

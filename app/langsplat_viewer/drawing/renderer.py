@@ -21,7 +21,6 @@ from langsplat_viewer.drawing.channels import (
     LastView,
     Layers,
     Sight,
-    surface_depths,
 )
 
 Textures = tuple[moderngl.Texture, ...]  # colours with alpha, then one for each channel that was wanted
@@ -98,7 +97,7 @@ class GlSource:
         return self._view(sight).depth_at(column, row)
 
     def depth_map(self, sight: Sight) -> Array:
-        return surface_depths(self._view(sight), len(sight.scene.gaussians))
+        return self._view(sight).median_depth()
 
     def forget(self) -> None:
         self._keep([])
@@ -173,7 +172,7 @@ class ArraySource:
         return self._channels.depth_at(sight, column, row)
 
     def depth_map(self, sight: Sight) -> Array:
-        return surface_depths(self._channels.views.of(sight), len(sight.scene.gaussians))
+        return self._channels.views.of(sight).median_depth()
 
     def forget(self) -> None:
         self._channels.views.forget()

@@ -282,7 +282,7 @@ def turn(prepared: Prepared, request: FilmRequest) -> Motion:
         if box is None:
             box = np.stack([place, place + 0.1 * extent.radius])
         nearer = min(holding_distance(view, box), float(np.linalg.norm(place - view.eye)))
-        view = focus(view, place, None if view.back else nearer)  # the scale of a parallel one was chosen
+        view = focus(view, place, None if view.orthographic else nearer)  # whose scale was chosen
     assert request.turntable is not None
     return turntable(view, request.turntable)
 

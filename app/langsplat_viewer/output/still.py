@@ -194,9 +194,8 @@ def still_camera(scene: Scene, choice: str, size: tuple[int, int] | None) -> Cam
 
 
 def without_perspective(scene: Scene, camera: Camera, span: float) -> Camera:
-    """From the same eye in parallel projection, `span` world units across the picture's shorter side."""
-    extent = extent_of(scene)
-    return spanning(from_camera(camera, extent), span, extent).camera(camera.width, camera.height)
+    """An orthographic camera at the same eye, `span` world units across the picture's shorter side."""
+    return spanning(from_camera(camera, extent_of(scene)), span).camera(camera.width, camera.height)
 
 
 def describe(result: QueryResult) -> str:

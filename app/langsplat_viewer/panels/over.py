@@ -62,7 +62,7 @@ def draw(viewer: Viewer, area: Area) -> None:
 def _projection(viewer: Viewer, area: Area) -> None:
     """That there is no perspective, and how much the picture shows."""
     view, scene = viewer.state.view, viewer.state.scene
-    if view is None or scene is None or not view.back:
+    if view is None or scene is None or not view.orthographic:
         return
     line = imgui.get_text_line_height()
     lines_below = 2 if "grid" in viewer.state.preferences.overlays else 1
@@ -84,8 +84,7 @@ def clicked(area: Area) -> bool:
 def _least_depth(viewer: Viewer) -> float:
     """Camera z from which on lines are drawn: a little before the eye."""
     assert viewer.state.extent is not None
-    assert viewer.state.view is not None
-    return viewer.state.view.back + overlays.LEAST_DEPTH * viewer.state.extent.radius
+    return overlays.LEAST_DEPTH * viewer.state.extent.radius
 
 
 def _lines(area: Area, segments: Array, colour: tuple[float, float, float, float], thick: float) -> None:

@@ -44,4 +44,4 @@ def figures(hover: Hover) -> list[str]:
         f"{phrase}: {value:.2f}" for phrase, value in zip(hover.phrases, hover.found.relevancy, strict=True)
     ]
     x, y, z = hover.found.position
-    return [*lines, f"at {x:.2f}  {y:.2f}  {z:.2f}, {hover.found.depth - hover.view.back:.2f} away"]
+    return [*lines, f"at {x:.2f}  {y:.2f}  {z:.2f}, {hover.found.depth:.2f} away"]
