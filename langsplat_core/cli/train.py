@@ -24,7 +24,7 @@ from langsplat_core.config import (
     with_preset,
 )
 from langsplat_core.errors import InputError
-from langsplat_core.progress import LineProgress, TerminalProgress, silent
+from langsplat_core.progress import LineProgress, Progress, TerminalProgress, silent
 
 log = logging.getLogger("langsplat")
 
@@ -73,7 +73,7 @@ class Train:
                 self.out,
                 self.config,
                 self.work,
-                Forecast(stages, progress),
+                Progress(Forecast(stages, progress).show),
                 crew=crew,
                 gaussians_from=self.gaussians,
             )

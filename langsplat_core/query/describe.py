@@ -258,13 +258,13 @@ def take_inventory(
     for level in reversed(range(len(LEVELS))):
         claims = list(_claims(field, held, words[level], level, areas))
         for done, claim in enumerate(claims):
-            progress(f"checking words: {LEVELS[level]}", done / len(claims))
+            progress("checking words", done / len(claims), LEVELS[level])
             if named.isdisjoint(claim.phrases):
                 entry = _verified(engine, words[level], attributes, areas, claim)
                 if entry is not None:
                     entries.append(entry)
                     named.update(claim.phrases)
-        progress(f"checking words: {LEVELS[level]}", 1.0)
+        progress("checking words", 1.0, LEVELS[level])
     return entries
 
 

@@ -430,7 +430,7 @@ class SamMasks:
         crops = crop_boxes(image.shape[:2], self._config.crop_layers)
         levels: list[list[Proposal]] = [[] for _ in range(LEVELS)]
         for index, crop in enumerate(crops):
-            part = _part(progress, index, len(crops))
+            part = progress.part(index, len(crops))
             try:
                 found = self._in_crop(image, crop, part, self._half)
             except OverflowError:
@@ -555,8 +555,3 @@ def grid_points(per_side: int, size: tuple[int, int]) -> Array:
     centres = (np.arange(per_side) + 0.5) / per_side
     x, y = np.meshgrid(centres * size[1], centres * size[0])
     return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
-
-
-def _part(progress: Progress, index: int, count: int) -> Progress:
-    """Reports the work on one crop of `count` as a part of the whole."""
-    return lambda label, fraction: progress(label, (index + fraction) / count)

@@ -225,6 +225,9 @@ class StoredFeatures(Sequence[ImageFeatures]):
         return self._store.load(self._names[index])
 
 
+MASKS_STAGE = "masks and vectors"
+
+
 def describe_capture(
     images: Sequence[Array],
     names: Sequence[str],
@@ -239,7 +242,6 @@ def describe_capture(
     `progress` interrupts the work. Each photograph's regions are encoded by themselves: its file does not
     depend on which others were made beside it.
     """
-    label = f"masks ({mask_source.name}) and vectors"
     made_by = fingerprint(encoder)
 
     def keep(finish: Callable[[], LevelMasks], image: Array, name: str, key: str) -> None:
@@ -249,8 +251,8 @@ def describe_capture(
     with ThreadPoolExecutor(1) as worker:  # filters, crops and files of one while masks of the next are found
         before: Future[None] | None = None
         for index, (image, name) in enumerate(zip(images, names, strict=True)):
-            part = _part(progress, f"{label}: {name}", index, len(images))
-            part("", 0.0)
+            part = progress.part(index, len(images), MASKS_STAGE, name)
+            part(MASKS_STAGE, 0.0)
             key = feature_key(image, mask_source, made_by)
             if not store.has(name, key):
                 finish = _begin(mask_source, image, part)
@@ -259,7 +261,7 @@ def describe_capture(
                 before = worker.submit(keep, finish, image, name, key)
         if before is not None:
             before.result()
-    progress(label, 1.0)
+    progress(MASKS_STAGE, 1.0)
     return StoredFeatures(store, names)
 
 
@@ -268,8 +270,3 @@ def _begin(source: MaskSource, image: Array, progress: Progress) -> Callable[[],
         return source.begin(image, progress)
     found = source(image, progress)
     return lambda: found
-
-
-def _part(progress: Progress, label: str, index: int, count: int) -> Progress:
-    """Reports the work on item `index` of `count`, as a part of the whole and under one label."""
-    return lambda _, fraction: progress(label, (index + fraction) / count)

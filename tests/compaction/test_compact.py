@@ -26,7 +26,7 @@ from langsplat_core.config import CompactConfig
 from langsplat_core.datasets import Capture
 from langsplat_core.errors import InputError
 from langsplat_core.io import load_scene, save_scene
-from langsplat_core.progress import silent
+from langsplat_core.progress import Progress, Report, silent
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Scene, look_at
@@ -221,12 +221,12 @@ def test_interruption_leaves_the_old_file(source, tmp_path, monkeypatch):
     compact_scene(source, out, CONFIG)
     old = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
 
-    def interrupted(label: str, fraction: float) -> None:
-        if label.startswith("finding"):
+    def interrupted(at: Report) -> None:
+        if at.stage.startswith("finding"):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        compact_scene(source, out, replace(CONFIG, max_psnr_loss=1.0), progress=interrupted)
+        compact_scene(source, out, replace(CONFIG, max_psnr_loss=1.0), progress=Progress(interrupted))
     monkeypatch.setattr(compact, "psnr_losses", lambda *_: np.array([0.0, 9.0]))  # a loss nobody foresaw
     with pytest.raises(InputError):
         compact_scene(source, out, CONFIG)

@@ -15,7 +15,7 @@ from PIL import Image
 from langsplat_core.config import TrainConfig
 from langsplat_core.io import save_scene
 from langsplat_core.pipeline.train import train_scene
-from langsplat_core.progress import Cancelled
+from langsplat_core.progress import Cancelled, Progress, Report
 from tests.support.another_user import bound_by_permissions
 from tests.support.fakes import blob_scene
 from tests.support.tiny_room import tiny_room, tiny_settings
@@ -44,12 +44,12 @@ def scene_in(folder: Path) -> dict[str, bytes]:
 def interrupted(room: Path, folder: Path, config: TrainConfig) -> None:
     """A training that ends when most of its steps are done, with a checkpoint."""
 
-    def stop(label: str, fraction: float) -> None:
-        if label.startswith("Training") and fraction > 0.7:
+    def stop(at: Report) -> None:
+        if at.stage == "training Gaussians" and at.fraction > 0.7:
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        train_scene(room, folder / "scene.ply", config, progress=stop)
+        train_scene(room, folder / "scene.ply", config, progress=Progress(stop))
     assert list((folder / "scene.work").glob("*.checkpoint.safetensors"))
 
 
@@ -87,11 +87,11 @@ def test_everything_moved_after_an_interruption(room: Path, whole: dict[str, byt
     there = tmp_path / "there"
     reported: list[float] = []
 
-    def watch(label: str, fraction: float) -> None:
-        if label.startswith("Training"):
-            reported.append(fraction)
+    def watch(at: Report) -> None:
+        if at.stage == "training Gaussians":
+            reported.append(at.fraction)
 
-    train_scene(there / "data", there / "scene.ply", tiny_settings(room), progress=watch)
+    train_scene(there / "data", there / "scene.ply", tiny_settings(room), progress=Progress(watch))
     assert min(reported) > 0.5  # it went on from the checkpoint
     assert scene_in(there) == whole
 

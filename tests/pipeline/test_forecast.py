@@ -7,20 +7,19 @@ import pytest
 
 from langsplat_core.config import PAPER, MaskConfig, TrainConfig, with_preset
 from langsplat_core.pipeline.forecast import (
-    ALL,
     Forecast,
     Stage,
     count_photographs,
     forecast_in_words,
-    in_words,
     plan,
 )
+from langsplat_core.progress import ALL_STAGES, Progress, Report, duration
 
 STAGES = (
-    Stage("photographs", ("reading", "finding"), 10.0),
-    Stage("masks and vectors", ("masks (",), 20.0),
-    Stage("Gaussians", ("Training Gaussians",), 60.0),
-    Stage("language field", ("",), 10.0),
+    Stage("photographs", ("reading photographs", "finding features"), 10.0),
+    Stage("masks and vectors", ("masks and vectors",), 20.0),
+    Stage("Gaussians", ("training Gaussians",), 60.0),
+    Stage("language field", (), 10.0),
 )
 
 
@@ -28,61 +27,59 @@ class Run:
     """A forecast that is told things at times."""
 
     def __init__(self, stages: tuple[Stage, ...] = STAGES) -> None:
-        self.now, self.said = 0.0, []
-        self.forecast = Forecast(stages, self.hear, self.clock)
-
-    def hear(self, label: str, fraction: float) -> None:
-        self.said.append((label, fraction))
+        self.now, self.said = 0.0, list[Report]()
+        forecast = Forecast(stages, Progress(self.said.append), self.clock)
+        self.progress = Progress(forecast.show)
 
     def clock(self) -> float:
         return self.now
 
-    def at(self, now: float, label: str, fraction: float) -> tuple[str, float]:
+    def at(self, now: float, stage: str, fraction: float) -> tuple[float, float]:
+        """Seconds left and the fraction of the whole after a report at a time."""
         self.now = now
-        self.forecast(label, fraction)
-        return self.said[-1]
+        self.progress(stage, fraction)
+        report = self.said[-1]
+        assert report.stage == ALL_STAGES
+        return report.metrics["seconds_left"], report.fraction
 
 
 def test_a_run_as_fast_as_expected():
     run = Run()
-    assert run.at(0, "reading photographs", 0.0) == (f"{ALL}: about 2 min left", 0.0)
+    assert run.at(0, "reading photographs", 0.0) == (120, 0.0)
     assert run.at(5, "finding features", 0.5)[1] == pytest.approx(0.05)
-    assert run.at(10, "masks (graph) and vectors", 0.0)[1] == pytest.approx(0.1)
-    assert run.at(30, "Training Gaussians: 5 Gaussians", 0.0)[1] == pytest.approx(0.3)
-    label, done = run.at(60, "Training Gaussians: 9 Gaussians", 0.5)
-    assert (label, done) == (f"{ALL}: about 40 s left", pytest.approx(0.6))
-    assert run.at(90, "codebook: 16 codewords", 0.1)[1] == pytest.approx(0.9)
-    assert run.at(100, "finding things", 1.0) == (f"{ALL}: about 10 s left", 1.0)
+    assert run.at(10, "masks and vectors", 0.0)[1] == pytest.approx(0.1)
+    assert run.at(30, "training Gaussians", 0.0)[1] == pytest.approx(0.3)
+    left, done = run.at(60, "training Gaussians", 0.5)
+    assert (left, done) == (40, pytest.approx(0.6))
+    assert run.at(90, "codebook", 0.1)[1] == pytest.approx(0.9)
+    assert run.at(100, "finding things", 1.0) == (10, 1.0)
 
 
 def test_what_was_slower_makes_the_rest_slower():
     run = Run()
     run.at(0, "reading photographs", 0.0)
-    run.at(20, "masks (graph) and vectors", 0.0)
-    assert run.at(60, "Training Gaussians", 0.0)[0] == f"{ALL}: about 2 min left"  # 70 s, twice
+    run.at(20, "masks and vectors", 0.0)
+    assert run.at(60, "training Gaussians", 0.0)[0] == 120  # 70 s, twice
 
 
 def test_what_was_kept_from_before_takes_nothing_and_breaks_nothing():
     run = Run()
-    assert run.at(0, "Training Gaussians", 0.5)[1] >= 0
+    assert run.at(0, "training Gaussians", 0.5)[1] >= 0
     assert run.at(0.001, "finding things", 0.5)[1] <= 1
-    fractions = [fraction for label, fraction in run.said if label.startswith(ALL)]
-    assert all(0 <= fraction <= 1 for fraction in fractions)
+    assert all(0 <= report.fraction <= 1 for report in run.said)
 
 
 def test_stages_never_go_back():
     run = Run()
-    run.at(0, "masks (graph) and vectors", 0.5)
-    before = len(run.said)
-    run.at(1, "reading photographs", 1.0)
-    assert run.said[before:][0] == ("reading photographs", 1.0)
-    assert run.said[-1][1] < 0.5  # still among the masks
+    run.at(0, "masks and vectors", 0.5)
+    run.progress("reading photographs", 1.0)
+    assert run.said[-1] == Report("reading photographs", 1.0)  # nothing new of the whole
 
 
 def test_everything_that_is_reported_is_passed_on():
     run = Run()
-    run.at(0, "reading photographs", 0.25)
-    assert run.said[0] == ("reading photographs", 0.25)
+    run.progress("reading photographs", 0.25, "a.jpg", loss=0.5)
+    assert run.said[0] == Report("reading photographs", 0.25, "a.jpg", {"loss": 0.5})
 
 
 def test_costs_grow_with_what_is_asked_for():
@@ -125,7 +122,7 @@ def test_masks_cost_what_points_crops_and_weights_do(tmp_path: Path):
 
 
 def test_words():
-    assert [in_words(seconds) for seconds in (0, 44, 89, 100, 3000, 9000)] == [
+    assert [duration(seconds) for seconds in (0, 44, 89, 100, 3000, 9000)] == [
         "10 s",
         "40 s",
         "90 s",

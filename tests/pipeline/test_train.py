@@ -26,7 +26,7 @@ from langsplat_core.io.ply import write_metres
 from langsplat_core.pipeline import language, train
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import train_scene
-from langsplat_core.progress import Cancelled, LineProgress, Progress
+from langsplat_core.progress import Cancelled, LineProgress, Progress, Report
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics import store
 from langsplat_core.semantics.masks import LevelMasks
@@ -202,16 +202,16 @@ def test_other_liftings(room, tmp_path, mode):
 
 
 @pytest.mark.parametrize(
-    "stage", ["reading", "Training", "masks", "lifting", "codebook", "averaging", "finding"]
+    "stage", ["reading", "training", "masks", "lifting", "codebook", "averaging", "finding"]
 )
 def test_an_interrupted_run_leaves_no_scene_and_resumes(room, tmp_path, stage):
-    def stop(label: str, fraction: float) -> None:
-        if label.startswith(stage):
+    def stop(at: Report) -> None:
+        if at.stage.startswith(stage):
             raise Cancelled
 
     out = tmp_path / "scene.ply"
     with pytest.raises(Cancelled):
-        train_scene(room, out, tiny_settings(room), progress=stop)
+        train_scene(room, out, tiny_settings(room), progress=Progress(stop))
     assert not list(tmp_path.glob("*.ply"))
     assert not list(tmp_path.glob("*.safetensors"))
     train_scene(room, out, tiny_settings(room))
@@ -246,11 +246,11 @@ def test_without_any_mask_no_gaussians_are_trained(room, tmp_path):
             room,
             out,
             tiny_settings(room),
-            progress=lambda label, _: said.append(label),
+            progress=Progress(lambda at: said.append(at.stage)),
             masks_of=lambda _: Blind(),
         )
-    assert any("blind" in label for label in said)
-    assert not any("Training" in label for label in said)
+    assert "masks and vectors" in said
+    assert "training Gaussians" not in said
     assert not list(tmp_path.glob("**/*.ply"))
     train_scene(room, out, tiny_settings(room))  # in the same work folder, as the message advises
     assert load_scene(out).language is not None
@@ -378,7 +378,18 @@ def test_presets_are_defaults_that_options_override():
 
 def test_progress_as_lines_for_other_programs(capsys):
     with LineProgress() as progress:
-        for label, fraction in (("a\n", 0.25), ("a\n", 0.2501), ("b", 7.0)):
-            progress(label, fraction)
-    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
-    assert lines == [{"label": "a\n", "fraction": 0.25}, {"label": "b", "fraction": 1.0}]
+        progress("a\n", 0.25, "one", loss=0.25)
+        progress("a\n", 0.2501, "one", loss=0.250001)
+        progress("b", 7.0)
+    reports = [Report.from_json(line) for line in capsys.readouterr().err.splitlines()]
+    assert reports == [Report("a\n", 0.25, "one", {"loss": 0.25}), Report("b", 1.0)]
+    assert reports[0].text == "a\n: one, loss 0.2500"
+    for line in (
+        "plain words",
+        '{"stage": 3}',
+        '"text"',
+        "[1]",
+        '{"stage": "a", "fraction": 0, "metrics": 1}',
+    ):
+        with pytest.raises(ValueError):
+            Report.from_json(line)

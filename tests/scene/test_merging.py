@@ -7,7 +7,7 @@ import pytest
 
 from langsplat_core.arrays import logit, psnr, rotation_matrices, sigmoid
 from langsplat_core.lab.speed.queries import repeated
-from langsplat_core.progress import Cancelled
+from langsplat_core.progress import Cancelled, Progress, Report
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_core.scene.gaussians import GROUP, merged
@@ -127,8 +127,8 @@ def test_extremes_stay_drawable():
 
 
 def test_it_stops_when_told_to(dense):
-    def stop(label: str, fraction: float) -> None:
+    def stop(at: Report) -> None:
         raise Cancelled
 
     with pytest.raises(Cancelled):
-        merged(dense, stop)
+        merged(dense, Progress(stop))

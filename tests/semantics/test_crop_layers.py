@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from langsplat_core.config import MaskConfig
-from langsplat_core.progress import silent
+from langsplat_core.progress import Progress, silent
 from langsplat_core.semantics.sam import SamMasks, crop_boxes, cut_by_crop
 
 pytestmark = pytest.mark.long  # torch alone takes seconds to load
@@ -87,6 +87,6 @@ def test_crops_find_small_things_and_win_where_both_see_a_thing_whole() -> None:
 def test_progress_runs_once_through_all_crops() -> None:
     seen: list[float] = []
     config = MaskConfig(points_per_side=4, points_per_batch=8, crop_layers=1)
-    SamMasks(Blind(), config)(np.zeros((40, 40, 3), np.uint8), lambda _, part: seen.append(part))
+    SamMasks(Blind(), config)(np.zeros((40, 40, 3), np.uint8), Progress(lambda at: seen.append(at.fraction)))
     assert seen == sorted(seen)
     assert (seen[0], seen[-1], len(seen)) == (0.0, 1.0, 5 * 2 + 1)

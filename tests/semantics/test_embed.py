@@ -10,7 +10,7 @@ import pytest
 
 from langsplat_core.arrays import unit
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.progress import Cancelled, Progress, silent
+from langsplat_core.progress import Cancelled, Progress, Report, silent
 from langsplat_core.semantics.masks import LevelMasks
 from langsplat_core.semantics.store import (
     FeatureStore,
@@ -205,16 +205,18 @@ def test_an_interrupted_run_continues_where_it_stopped(tmp_path: Path) -> None:
     names = ["a", "b", "c", "d"]
     source, encoder, store = Halves(), ColourEncoder(), FeatureStore(tmp_path)
 
-    def stop_at_c(label: str, fraction: float) -> None:
-        if label.endswith("c") and fraction > 0.5:  # while its masks are being found
+    def stop_at_c(at: Report) -> None:
+        if at.note == "c" and at.fraction > 0.5:  # while its masks are being found
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        describe_capture(images, names, source, encoder, store, stop_at_c)
+        describe_capture(images, names, source, encoder, store, Progress(stop_at_c))
     assert [store.has(name) for name in names] == [True, True, False, False]
     assert len(list(tmp_path.iterdir())) == 2  # and nothing half written
     seen: list[float] = []
-    found = describe_capture(images, names, source, encoder, store, lambda _, fraction: seen.append(fraction))
+    found = describe_capture(
+        images, names, source, encoder, store, Progress(lambda at: seen.append(at.fraction))
+    )
     assert source.calls == 3 + 2
     assert encoder.calls == 4
     assert seen == sorted(seen)

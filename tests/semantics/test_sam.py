@@ -15,7 +15,7 @@ from transformers import Sam2Model, SamHQModel, SamModel
 
 from langsplat_core.config import MaskConfig
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.progress import silent
+from langsplat_core.progress import Progress, silent
 from langsplat_core.semantics import sam
 from langsplat_core.semantics.sam import (
     Look,
@@ -295,7 +295,7 @@ def test_thin_pictures_work(config: MaskConfig, shape: tuple[int, int]) -> None:
 
 def test_progress_rises_to_one_and_may_interrupt(config: MaskConfig) -> None:
     seen: list[float] = []
-    load_sam(config, "cpu")(photograph(), lambda _, fraction: seen.append(fraction))
+    load_sam(config, "cpu")(photograph(), Progress(lambda at: seen.append(at.fraction)))
     assert seen == sorted(seen)
     assert (seen[0], seen[-1]) == (0.0, 1.0)
     assert len(seen) == 5  # 25 points in batches of 7, and the end

@@ -1,6 +1,5 @@
 """Trainings that are killed, and how far they were."""
 
-import json
 import random
 import signal
 import subprocess
@@ -9,6 +8,8 @@ import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
+
+from langsplat_core.progress import ALL_STAGES, Report
 
 START = "starting"  # before the first report
 SCENE = ("scene.ply", "scene.langsplat.safetensors", "scene.cameras.json")
@@ -70,14 +71,12 @@ def train(data: Path, encoder: Path, folder: Path, kill: Moment | None = None) -
 
 
 def _report(line: str) -> tuple[str, float] | None:
-    """Stage and fraction of a line of progress; None for other lines and for what is said of the whole."""
+    """Stage and fraction of a line of progress; None for other lines and for the progress of the whole."""
     try:
-        report = json.loads(line)
-        label = str(report["label"])
+        report = Report.from_json(line)
     except ValueError:
         return None
-    known = not label.startswith("all stages")
-    return (label.partition(":")[0].partition(" (")[0], float(report["fraction"])) if known else None
+    return None if report.stage == ALL_STAGES else (report.stage, report.fraction)
 
 
 def moments(whole: Ended, seed: int) -> list[Moment]:

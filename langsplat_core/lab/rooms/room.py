@@ -295,7 +295,7 @@ class Room:
 
 def labelled(progress: Progress, prefix: str) -> Progress:
     """Reports under labels that begin with `prefix`."""
-    return lambda label, fraction: progress(prefix + label, fraction)
+    return Progress(lambda at: progress.show(replace(at, stage=prefix + at.stage)))
 
 
 def median_seconds(work: Callable[[], object]) -> float:

@@ -235,7 +235,7 @@ def lift_by_gradient(
         loss, by_y = loss_and_gradient(weights.of(index), targets[index], blended(adam.x, published))
         adam.update(by_features(adam.x, by_y) if published else by_y, config.lr)
         if adam.steps % 20 == 0 or adam.steps == config.steps:
-            progress(f"training language features: loss {loss:.4f}", adam.steps / config.steps)
+            progress("training language features", adam.steps / config.steps, loss=loss)
     latents = unit(adam.x)
     return np.where(confidence[..., None] > 0, latents, 0).astype(np.float32), confidence
 

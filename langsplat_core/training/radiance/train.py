@@ -135,7 +135,7 @@ def schedule_for(config: RadianceConfig, extent: float) -> Schedule:
 # pruning and opacity resets follow the `Schedule`. On the CPU a run is deterministic given its seed and
 # resumes from a checkpoint exactly where it stopped.
 
-LOSSES_SAID = 200  # how often in a run its loss is said
+LOSSES_SAID = 200  # mean losses reported in a run
 COARSE_MIN_SIDE = 64  # px: smaller pictures are never halved
 SMALLEST_EXTENT = 0.05  # of the distance to the scene: one camera, or cameras in one place, have no extent
 
@@ -194,18 +194,18 @@ class _Run:
 
 
 class _Losses:
-    """The loss as it is said: its mean over a share of the steps, since every photograph has another."""
+    """The mean loss over a share of the steps, since every photograph has another."""
 
     def __init__(self, steps: int) -> None:
         self._steps = steps
-        self._latest: list[float] = []  # since it was said last
-        self.said = ""
+        self._latest: list[float] = []  # of the share under way
+        self.mean: float | None = None
 
     def add(self, step: int, loss: float) -> None:
-        """That of one step, counted from 1."""
+        """Add the loss of one step, counted from 1."""
         self._latest.append(loss)
         if step * LOSSES_SAID // self._steps > (step - 1) * LOSSES_SAID // self._steps:
-            self.said = f", loss {np.mean(self._latest):.4f}"
+            self.mean = float(np.mean(self._latest))
             self._latest = []
 
 
@@ -248,8 +248,9 @@ def train_radiance(
             while state.step < config.steps:
                 loss = _step(run, state)
                 losses.add(state.step, loss)
+                metrics = {} if losses.mean is None else {"loss": losses.mean}
                 progress(
-                    f"Training Gaussians: {len(state)} Gaussians{losses.said}", state.step / config.steps
+                    "training Gaussians", state.step / config.steps, f"{len(state)} Gaussians", **metrics
                 )
                 if on_step:
                     on_step(state, loss)

@@ -16,7 +16,7 @@ from langsplat_core.lab.encoder.report import report
 from langsplat_core.lab.encoder.train import CANONICAL_COSINE, loss_of, train_demo_encoder
 from langsplat_core.lab.world.appearance.colours import COLOURS
 from langsplat_core.lab.world.captions import Label
-from langsplat_core.progress import Cancelled, silent
+from langsplat_core.progress import Cancelled, Progress, silent
 from langsplat_core.scene import CANONICAL_PHRASES
 from langsplat_core.semantics.encoders import load_encoder, model_path
 
@@ -175,7 +175,7 @@ def test_training_in_miniature(monkeypatch, tmp_path):
     with pytest.raises(Cancelled):
         train_demo_encoder(tmp_path, config, interrupt)
     seen = []
-    train_demo_encoder(tmp_path, config, lambda label, fraction: seen.append(fraction))
+    train_demo_encoder(tmp_path, config, Progress(lambda at: seen.append(at.fraction)))
     assert seen == [0.75, 1.0]  # went on at step 3 of 4
     encoder = load_encoder(str(tmp_path), "cpu")
     assert (encoder.dim, encoder.image_size) == (512, 64)

@@ -15,7 +15,7 @@ from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.config import INRIA, RadianceConfig, RasterSettings
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError, InputError
-from langsplat_core.progress import Cancelled
+from langsplat_core.progress import Cancelled, Progress, Report
 from langsplat_core.raster.reference import C0, ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians, look_at
 from langsplat_core.training.radiance.differentiable import CpuRenderer, renderer_for
@@ -153,19 +153,19 @@ def test_training_learns_the_scene() -> None:
 @pytest.mark.long
 def test_the_loss_is_said_as_the_mean_since_it_was_said_last(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("langsplat_core.training.radiance.train.LOSSES_SAID", 3)
-    labels: list[str] = []
+    reports: list[Report] = []
     losses: list[float] = []
     train_radiance(
         capture(),
         replace(SHORT, steps=6, reference_steps=6),
         [0, 1],
-        progress=lambda label, fraction: labels.append(label),
+        progress=Progress(reports.append),
         on_step=lambda state, loss: losses.append(loss),
     )
-    first, *said = (label.partition(", loss ")[2] for label in labels)
+    first, *said = (report.metrics for report in reports)
     means = np.reshape(losses, (3, 2)).mean(1)
-    assert first == ""
-    assert [float(text) for text in said] == pytest.approx(means[[0, 0, 1, 1, 2]], abs=6e-5)  # four decimals
+    assert not first
+    assert [metrics["loss"] for metrics in said] == pytest.approx(means[[0, 0, 1, 1, 2]])
 
 
 @pytest.mark.long
@@ -173,12 +173,12 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     straight_path, path = tmp_path / "straight.safetensors", tmp_path / "resumed.safetensors"
     straight = train_radiance(capture(), SHORT, [0, 1, 2], straight_path)
 
-    def stop_at_20(label: str, fraction: float) -> None:
-        if fraction >= 0.5:
+    def stop_at_20(at: Report) -> None:
+        if at.fraction >= 0.5:
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        train_radiance(capture(), SHORT, [0, 1, 2], path, stop_at_20)
+        train_radiance(capture(), SHORT, [0, 1, 2], path, Progress(stop_at_20))
     steps: list[int] = []
     resumed = train_radiance(
         capture(), SHORT, [0, 1, 2], path, on_step=lambda state, loss: steps.append(state.step)
