@@ -21,7 +21,7 @@ SURE = 0.05  # share of a stage from which its own speed is trusted
 GPU = 1 / 30  # of the seconds of two CPU cores; not measured
 POINT = 0.17  # seconds of a point that a segmenter is asked at
 REGIONS = 300  # of an ordinary photograph
-# Millions of weights by what a hub id contains, the first that fits; TIPS sees five times as many patches.
+# Millions of weights by what a hub id contains, the first that fits.
 MILLIONS = {
     "vit-huge": 641,
     "vit-large": 312,
@@ -34,7 +34,6 @@ MILLIONS = {
     "vit-l": 428,
     "so400m": 878,
     "large": 400,
-    "tips": 590,
 }
 USUAL = 150  # millions of weights of any other: CLIP's of ViT-B
 Given = Literal["nothing", "cameras", "points"]  # what photographs come with: cameras, or cameras and points

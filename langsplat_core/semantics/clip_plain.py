@@ -19,7 +19,6 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.semantics.encoder import Logits
 from langsplat_core.semantics.tokens import FILE, check_whole
 from langsplat_core.semantics.weights import CONFIG, SAFE, Weights
 
@@ -90,16 +89,13 @@ class PlainClipText:
     def __init__(self, id: str, config: TextConfig, tensors: Tensors, tokenizer: "PairTokenizer") -> None:
         self.id = id
         self.temperature = TEMPERATURE
-        self.logits: Logits | None = None
         self._config, self._tensors, self._tokenizer = config, tensors, tokenizer
 
     @property
     def dim(self) -> int:
-        """See `TextTower`."""
         return self._config.projection_dim
 
     def encode(self, texts: list[str]) -> Array:
-        """See `TextTower`."""
         begin, end = self._tokenizer.begin, self._tokenizer.end
         rows = [[begin, *self._tokenizer.encode(text), end] for text in texts]
         for text, row in zip(texts, rows, strict=True):

@@ -1,6 +1,6 @@
-"""What every image-text encoder does alike: checks of phrases and pictures, batches, unit vectors.
+"""Image-text encoders as callers see them: checks of phrases and pictures, batches, unit vectors.
 
-A family of models brings two towers, each a few lines (`families/`); everything a caller sees is here.
+A family of models (`encoders`) brings two towers, each a few lines.
 """
 
 import json
@@ -26,26 +26,12 @@ EXAMPLES = 12  # known words to name where a phrase has an unknown one
 SUGGESTIONS = 2  # known words offered for an unknown one
 TEXT_BATCH = 64  # phrases per forward pass
 Triple = tuple[float, float, float]
-SHARE_OF_SCALE = 0.1  # of a model's logit scale: the temperature of relevancy, see `Logits.temperature`
-
-
-@dataclass(frozen=True)
-class Logits:
-    """How a model was trained to turn a cosine into a logit: scale * cosine + bias."""
-
-    scale: float
-    bias: float = 0.0  # of no effect on relevancy, which is made of differences of cosines
-
-    @property
-    def temperature(self) -> float:
-        """What a difference of cosines is multiplied by before the sigmoid of relevancy.
-
-        LERF and LangSplat take 10 for CLIP, whose training caps the scale at 100: a tenth. The scale says
-        how far apart a model's training pushed the cosines of right and wrong pairs (the larger it is, the
-        smaller the gaps that it had to make), so a tenth of it gives the margins of two families like
-        relevancies. It is a rule of proportion, not a calibration: verdicts need thresholds of their own.
-        """
-        return SHARE_OF_SCALE * self.scale
+# Share of a model's logit scale that is the temperature of relevancy, the factor of a difference of cosines
+# before the sigmoid. LERF and LangSplat take 10 for CLIP, whose training caps the scale at 100: a tenth. The
+# larger the scale, the smaller the gaps between cosines of right and wrong pairs that training had to make, so
+# a tenth of it gives the margins of two families like relevancies. It is a rule of proportion, not a
+# calibration: verdicts need thresholds of their own.
+SHARE_OF_SCALE = 0.1
 
 
 class TextTower(Protocol):
@@ -57,11 +43,7 @@ class TextTower(Protocol):
 
     @property
     def temperature(self) -> float:
-        """Of relevancy, see `Logits.temperature`."""
-
-    @property
-    def logits(self) -> Logits | None:
-        """As the weights state it; None where a family does not need it."""
+        """Temperature of relevancy, see `SHARE_OF_SCALE`."""
 
     def encode(self, texts: list[str]) -> Array:
         """(B, D) float32 vectors, of any length, of B > 0 phrases. Raises InputError and EncoderError as
@@ -96,10 +78,10 @@ class PhraseEncoder:
     """The text half of a model, in float32; it satisfies `query.engine.TextEncoder`."""
 
     def __init__(self, weights: Weights, tower: TextTower) -> None:
-        self.id = weights.id
+        self.id = weights.id  # hub id or folder as it was asked for; "demo" for the bundled encoder
         self._tower = tower
         self._words = _vocabulary(weights.folder)
-        self._reading = _reading(weights, self._tower.temperature)
+        self.reading = _reading(weights, tower.temperature)  # how its cosines are read, as a scene stores it
 
     @property
     def dim(self) -> int:
@@ -108,18 +90,8 @@ class PhraseEncoder:
 
     @property
     def temperature(self) -> float:
-        """With which a margin of cosines, phrase minus nearest canonical phrase, becomes relevancy."""
+        """Factor with which a margin of cosines, phrase minus nearest canonical phrase, becomes relevancy."""
         return self._tower.temperature
-
-    @property
-    def reading(self) -> Reading:
-        """How its cosines are read, as a scene made with it stores it."""
-        return self._reading
-
-    @property
-    def logits(self) -> Logits | None:
-        """Learned scale and bias of the model's own logits, where its family states them."""
-        return self._tower.logits
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
         """Words of `text` that the encoder was never taught; empty when it was taught open vocabulary."""
@@ -171,56 +143,17 @@ class PhraseEncoder:
         return " ".join(self._taught(word) or "" for word in WORD.findall(text.lower()))
 
 
-class Encoder:
-    """Both halves of a model; it satisfies `embed.ImageEncoder` too."""
+class Encoder(PhraseEncoder):
+    """Both halves of a model; it satisfies `store.ImageEncoder` too."""
 
-    def __init__(self, text: PhraseEncoder, pictures: PictureTower, device: str, batch: int) -> None:
-        self._text = text
-        self._pictures = pictures
-        self._device = device
-        self._batch = batch
-
-    @property
-    def id(self) -> str:
-        """Hub id or folder as it was asked for; "demo" for the bundled encoder."""
-        return self._text.id
-
-    @property
-    def dim(self) -> int:
-        """Length D of the vectors."""
-        return self._text.dim
-
-    @property
-    def temperature(self) -> float:
-        """As `PhraseEncoder.temperature`."""
-        return self._text.temperature
-
-    @property
-    def reading(self) -> Reading:
-        """As `PhraseEncoder.reading`."""
-        return self._text.reading
-
-    @property
-    def logits(self) -> Logits | None:
-        """As `PhraseEncoder.logits`."""
-        return self._text.logits
+    def __init__(self, weights: Weights, text: TextTower, pictures: PictureTower, batch: int) -> None:
+        super().__init__(weights, text)
+        self._pictures, self._device, self._batch = pictures, weights.device, batch
 
     @property
     def image_size(self) -> int:
         """Side of the pictures it takes, px."""
         return self._pictures.image_size
-
-    def unknown_words(self, text: str) -> tuple[str, ...]:
-        """As `PhraseEncoder.unknown_words`."""
-        return self._text.unknown_words(text)
-
-    def near_words(self, word: str) -> tuple[str, ...]:
-        """As `PhraseEncoder.near_words`."""
-        return self._text.near_words(word)
-
-    def encode_texts(self, texts: Sequence[str]) -> Array:
-        """As `PhraseEncoder.encode_texts`."""
-        return self._text.encode_texts(texts)
 
     def encode_images(self, crops: Array | Sequence[Array]) -> Array:
         """(M, D) float32 unit vectors of M pictures (image_size, image_size, 3) uint8, display values."""

@@ -1,4 +1,4 @@
-"""What segmenters of the SAM family do alike: a picture is seen once and then asked about points."""
+"""Masks by models of the SAM family: a picture is seen once, asked about a grid of points, and filtered."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -115,7 +115,7 @@ def upscale(logits: Any, side: int, size: tuple[int, int] | None, shape: tuple[i
     return interpolate(square, shape, mode="bilinear", align_corners=False)[:, 0]
 
 
-# Segment Anything (Kirillov et al. 2023), and SAM-HQ (Ke et al. 2023), which refines its masks.
+# Segment Anything (Kirillov et al. 2023).
 
 EPSILON = 1e-5  # of the norms between attentions in segment_anything, PyTorch's; transformers has 1e-6 there
 
@@ -128,46 +128,18 @@ class Sam:
     def __init__(self, weights: Weights) -> None:
         from transformers import SamConfig, SamModel
 
-        self._model = _load(SamModel, SamConfig, weights, self.name)
+        settings = load_config(SamConfig, weights, self.name)
+        settings.mask_decoder_config.layer_norm_eps = EPSILON
+        self._model: Any = load_model(SamModel, weights, settings)
 
     def look(self, image: Array) -> Look:
-        """See `Segmenter`."""
-        pixels, side, size = _seen(self._model, image)
-        seen = {"image_embeddings": self._model.get_image_embeddings(pixels)}
+        import torch
+
+        side = int(self._model.config.vision_config.image_size)
+        pixels, size = padded(image, side)
+        given = torch.from_numpy(pixels).to(self._model.device)
+        seen = {"image_embeddings": self._model.get_image_embeddings(given)}
         return Look(self._model, seen, side, size, image.shape[:2], ordered=True)
-
-
-class SamHq:
-    """A `Segmenter`. transformers gives its masks by falling score, so their size must tell the level; and
-    one refinement is added to all three, which brings them closer together than SAM's are."""
-
-    name = "SAM-HQ"
-
-    def __init__(self, weights: Weights) -> None:
-        from transformers import SamHQConfig, SamHQModel
-
-        self._model = _load(SamHQModel, SamHQConfig, weights, self.name)
-
-    def look(self, image: Array) -> Look:
-        """See `Segmenter`."""
-        pixels, side, size = _seen(self._model, image)
-        embedding, inner = self._model.get_image_embeddings(pixels)
-        seen = {"image_embeddings": embedding, "intermediate_embeddings": inner}
-        return Look(self._model, seen, side, size, image.shape[:2], ordered=False)
-
-
-def _load(kind: Any, config: Any, weights: Weights, name: str) -> Any:
-    settings = load_config(config, weights, name)
-    settings.mask_decoder_config.layer_norm_eps = EPSILON
-    return load_model(kind, weights, settings)
-
-
-def _seen(model: Any, image: Array) -> tuple[Any, int, tuple[int, int]]:
-    import torch
-
-    side = int(model.config.vision_config.image_size)
-    pixels, size = padded(image, side)
-    return torch.from_numpy(pixels).to(model.device), side, size
 
 
 # SAM 2 and 2.1 (Ravi et al. 2024) on single pictures, by the image half of their video model.
@@ -185,7 +157,6 @@ class Sam2:
         self._model: Any = load_model(Sam2Model, weights, load_config(Sam2Config, weights, self.name))
 
     def look(self, image: Array) -> Look:
-        """See `Segmenter`."""
         import torch
 
         side = int(self._model.config.prompt_encoder_config.image_size)
@@ -197,7 +168,7 @@ class Sam2:
 # Segmenters by hub id, folder or file: a new family is one file and one row here.
 
 FAMILIES: Mapping[str, Callable[[Weights], Segmenter]] = MappingProxyType(  # by `model_type` of config.json
-    {"sam": Sam, "sam2": Sam2, "sam2_video": Sam2, "sam_hq": SamHq}
+    {"sam": Sam, "sam2": Sam2, "sam2_video": Sam2}
 )
 
 
@@ -412,7 +383,6 @@ class SamMasks:
 
     @property
     def name(self) -> str:
-        """See `MaskSource`."""
         return f"{self._segmenter.name} {self._config.sam}"
 
     @property

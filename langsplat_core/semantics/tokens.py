@@ -25,40 +25,32 @@ class Tokens:
     tokenizer: Any  # tokenizers.Tokenizer
     length: int  # tokens per phrase
     pad: int
-    end: int | None  # put behind every phrase; None: nothing
+    end: int  # put behind every phrase
 
     @property
     def is_unigram(self) -> bool:
         """Whether it is of SentencePiece's unigram kind, as SigLIP's is and SigLIP 2's is not."""
         return type(self.tokenizer.model).__name__ == "Unigram"
 
-    def rows(self, texts: list[str]) -> tuple[Any, Any]:
-        """(B, length) int64 tensor of token numbers, and one of 1 where a token is no padding. Raises as
-        `check_whole`."""
+    def rows(self, texts: list[str]) -> Any:
+        """Return the (B, length) int64 tensor of token numbers. Raises as `check_whole`."""
         import torch
 
         ids = torch.full((len(texts), self.length), self.pad)
-        used = torch.zeros_like(ids)
-        tail = [] if self.end is None else [self.end]
         for row, found in enumerate(self.tokenizer.encode_batch(texts, add_special_tokens=False)):
-            check_whole(texts[row], found.ids, self.length - len(tail), set(tail))
-            tokens = found.ids + tail
-            ids[row, : len(tokens)] = torch.tensor(tokens)
-            used[row, : len(tokens)] = 1
-        return ids, used
+            check_whole(texts[row], found.ids, self.length - 1, {self.end})
+            ids[row, : len(found.ids) + 1] = torch.tensor([*found.ids, self.end])
+        return ids
 
 
-def load_tokens(weights: Weights, length: int, ends: bool) -> Tokens:
-    """Read the folder's tokenizer; `ends`: whether phrases get an end token.
-
-    Raises EncoderError where there is none, or it lacks the tokens that pad and end.
-    """
+def load_tokens(weights: Weights, length: int) -> Tokens:
+    """Read the folder's tokenizer. Raises EncoderError where it is absent, or lacks tokens that pad and end."""
     path = weights.folder / FILE
     if not path.is_file():
         raise EncoderError(f"{weights.id}: no {FILE} in this folder, which its phrases are read with")
     tokenizer = read_tokenizer(weights)
     pad = _number(weights, tokenizer, "pad_token")
-    return Tokens(tokenizer, length, pad, _number(weights, tokenizer, "eos_token") if ends else None)
+    return Tokens(tokenizer, length, pad, _number(weights, tokenizer, "eos_token"))
 
 
 def text_cleaner() -> Callable[[str], str]:

@@ -12,7 +12,7 @@ from transformers import PreTrainedTokenizerFast, Siglip2Tokenizer, SiglipModel
 
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
-from tests.support.tiny_siglip import BIAS, LENGTH, SCALE, SIDE, tiny_naflex, tiny_siglip
+from tests.support.tiny_siglip import LENGTH, SCALE, SIDE, tiny_siglip
 
 pytestmark = pytest.mark.long  # transformers alone takes seconds to load
 
@@ -20,7 +20,6 @@ Maker = Callable[[Path], Any]
 MAKERS: dict[str, Maker] = {
     "siglip": tiny_siglip,
     "siglip2": lambda folder: tiny_siglip(folder, second=True),
-    "naflex": tiny_naflex,
 }
 
 
@@ -63,9 +62,8 @@ def test_texts_agree_with_the_whole_model(tmp_path: Path) -> None:
     np.testing.assert_allclose(got, one_by_one, atol=2e-6)  # a phrase does not depend on its neighbours
 
 
-@pytest.mark.parametrize("name", ["siglip2", "naflex"])
-def test_texts_of_the_second_generation_agree_with_transformers(tmp_path: Path, name: str) -> None:
-    model = MAKERS[name](tmp_path)
+def test_texts_of_the_second_generation_agree_with_transformers(tmp_path: Path) -> None:
+    model = MAKERS["siglip2"](tmp_path)
     phrases = ["Red mug", "red", "a red mug, with a very long handle"]
     ids = padded_ids(Siglip2Tokenizer.from_pretrained(tmp_path), phrases)
     assert ids[1].tolist()[1:] == [1] + [0] * (LENGTH - 2)  # an end, then padding to the right
@@ -90,28 +88,9 @@ def test_images_agree_with_the_whole_model(tmp_path: Path) -> None:
     np.testing.assert_allclose(encoder.encode_images(pictures), want, atol=2e-6)
 
 
-def test_naflex_cuts_patches_as_transformers_does(tmp_path: Path) -> None:
-    from transformers.models.siglip2.image_processing_pil_siglip2 import convert_image_to_patches
-
-    model, pictures = tiny_naflex(tmp_path), crops(3)
-    encoder = load_encoder(str(tmp_path), "cpu")
-    assert encoder.image_size == SIDE  # 4 x 4 patches of 8 px
-    channels_first = (pictures / 127.5 - 1).transpose(0, 3, 1, 2).astype(np.float32)
-    patches = torch.from_numpy(np.stack([convert_image_to_patches(one, 8) for one in channels_first]))
-    want = model.get_image_features(
-        pixel_values=patches,
-        pixel_attention_mask=torch.ones(3, 16, dtype=torch.long),
-        spatial_shapes=torch.full((3, 2), 4),
-    ).pooler_output
-    np.testing.assert_allclose(encoder.encode_images(pictures), unit_rows(want), atol=2e-6)
-
-
-def test_scale_and_bias_are_stated(made: tuple[Path, Any]) -> None:
-    encoder = load_encoder(str(made[0]), "cpu")
-    assert encoder.logits is not None
-    assert encoder.logits.scale == pytest.approx(SCALE, rel=1e-5)
-    assert encoder.logits.bias == BIAS
-    assert encoder.temperature == load_text_encoder(str(made[0])).temperature == pytest.approx(SCALE / 10)
+def test_the_temperature_is_a_tenth_of_the_learned_scale(made: tuple[Path, Any]) -> None:
+    for load in (load_encoder, load_text_encoder):
+        assert load(str(made[0]), "cpu").temperature == pytest.approx(SCALE / 10)
 
 
 def test_pickled_weights_give_the_same_vectors(tmp_path: Path) -> None:
@@ -120,7 +99,7 @@ def test_pickled_weights_give_the_same_vectors(tmp_path: Path) -> None:
     (tmp_path / "model.safetensors").unlink()
     torch.save(model.state_dict(), tmp_path / "pytorch_model.bin")
     after = load_encoder(str(tmp_path), "cpu")
-    assert after.logits == before.logits
+    assert after.temperature == before.temperature
     np.testing.assert_array_equal(after.encode_texts(["red"]), before.encode_texts(["red"]))
     np.testing.assert_array_equal(after.encode_images(crops(1)), before.encode_images(crops(1)))
 
@@ -180,7 +159,7 @@ def change_config(folder: Path, change: Callable[[dict[str, Any]], None]) -> Non
         (remove_tokenizer, r"no tokenizer\.json in this folder"),
         (damage_tokenizer, r"tokenizer\.json is no tokenizer"),
         (remove_special_tokens, "no eos_token"),
-        (remove_logit_scale, "logit_scale and logit_bias are not in them"),
+        (remove_logit_scale, "logit_scale is not in them"),
         (truncate_weights, r"not \w+ weights"),
         (more_layers, "16 do not fit, such as"),
         (another_model, "'bert' model is no image-text encoder known here; known are clip, siglip"),

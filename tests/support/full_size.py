@@ -109,15 +109,6 @@ def _make_siglip(folder: Path, words: int) -> None:
     model.save_pretrained(folder)
 
 
-def make_tips(folder: Path) -> None:
-    """google/tipsv2-b14."""
-    from transformers import Tipsv2Config, Tipsv2Model, Tipsv2Tokenizer
-
-    pieces = ["<pad>", "<unk>", "▁", *"abcdefghijklmnopqrstuvwxyz", *(f"word{i}" for i in range(31_971))]
-    Tipsv2Tokenizer(vocab={piece: i for i, piece in enumerate(pieces)}).save_pretrained(folder)
-    _save(Tipsv2Model, Tipsv2Config(), folder)
-
-
 def _save(kind: Any, config: Any, folder: Path) -> None:
     import torch
 
@@ -132,7 +123,6 @@ MODELS = {
     "clip": Model("laion/CLIP-ViT-B-16-laion2B-s34B-b88K", 149.6, make_clip, False),
     "siglip": Model("google/siglip-base-patch16-224", 203.2, make_siglip, False),
     "siglip2": Model("google/siglip2-base-patch16-224", 375.2, make_siglip2, False),
-    "tips": Model("google/tipsv2-b14", 195.9, make_tips, False),
 }
 
 

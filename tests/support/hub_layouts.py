@@ -117,20 +117,6 @@ linear vision_model.head.mlp.fc2 768 3072
 tensor logit_scale 1
 tensor logit_bias 1
 """
-TIPS = """
-tensor vision_encoder.cls_token 1 1 768
-linear vision_encoder.patch_embed.proj 768 3 14 14
-linear vision_encoder.blocks.[12].attn.qkv 2304 768
-linear vision_encoder.blocks.[12].attn.proj 768 768
-norm vision_encoder.blocks.[12].norm1 768
-norm vision_encoder.blocks.[12].norm2 768
-tensor vision_encoder.blocks.[12].ls1.gamma 768
-tensor vision_encoder.blocks.[12].ls2.gamma 768
-norm text_encoder.transformer.resblocks.[12].ln_1 768
-norm text_encoder.transformer.resblocks.[12].ln_2 768
-linear text_encoder.transformer.resblocks.[12].mlp.c_fc 3072 768
-linear text_encoder.transformer.resblocks.[12].mlp.c_proj 768 3072
-"""
 
 
 def _transformer(prefix: str, width: int) -> str:
@@ -175,12 +161,10 @@ LAYOUTS = {
     "clip": CLIP + _transformer("text_model", 512) + "\n" + _transformer("vision_model", 768),
     "siglip": _siglip(32_000),
     "siglip2": _siglip(256_000),
-    "tips": TIPS,
 }
-# What a checkpoint holds besides: the video model's memory; of TIPS not every name is written down here.
+# What a checkpoint holds besides: the video model's memory.
 BESIDES = {
     "sam2.1-hiera-tiny": "memory_|mask_downsample|object_pointer|temporal_|no_memory_pos|no_object|occlusion",
-    "tips": "vision_encoder|text_encoder|temperature",
 }
 BESIDES["sam2.1-hiera-large"] = BESIDES["sam2.1-hiera-tiny"]
 
