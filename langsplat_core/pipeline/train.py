@@ -1,4 +1,8 @@
-"""Views with masks that are read when they are needed: hundreds of label maps are more than memory wants."""
+"""From photographs to a searchable scene: the whole method, one line a stage.
+
+Every stage keeps its result in the work folder under a key of its settings, so that an interrupted run
+continues where it stopped and a changed setting recomputes only what depends on it.
+"""
 
 import logging
 import time
@@ -6,7 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import overload
+from typing import Any
 
 import numpy as np
 
@@ -23,39 +27,9 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, load_encoder
 from langsplat_core.semantics.masks import MaskSource
-from langsplat_core.semantics.sources import load_mask_source
+from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures, describe_capture
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
-
-
-class StoredViews(Sequence[tuple[Camera, ImageFeatures]]):
-    """Cameras, and the features of what each saw."""
-
-    def __init__(self, cameras: Sequence[Camera], features: Sequence[ImageFeatures]) -> None:
-        """`features`: such as `StoredFeatures`; one per camera."""
-        if len(cameras) != len(features):
-            raise ValueError(f"{len(cameras)} cameras, {len(features)} features")
-        self._cameras, self._features = cameras, features
-
-    def __len__(self) -> int:
-        return len(self._cameras)
-
-    @overload
-    def __getitem__(self, index: int) -> tuple[Camera, ImageFeatures]: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> "StoredViews": ...
-
-    def __getitem__(self, index: int | slice) -> "tuple[Camera, ImageFeatures] | StoredViews":
-        if isinstance(index, slice):
-            return StoredViews(self._cameras[index], self._features[index])
-        return self._cameras[index], self._features[index]
-
-
-# From photographs to a searchable scene: the whole method, one line a stage.
-#
-# Every stage keeps its result in the work folder under a key of its settings, so that an interrupted run
-# continues where it stopped and a changed setting recomputes only what depends on it.
 
 FEWEST_VIEWS = 3
 
@@ -188,6 +162,21 @@ def trained_gaussians(
     write_ply(done, gaussians)
     done.with_suffix(".checkpoint.safetensors").unlink(missing_ok=True)
     return gaussians
+
+
+class StoredViews(Sequence[tuple[Camera, ImageFeatures]]):
+    """Cameras with the features of what each saw, read when a view is looked at: hundreds of label maps are
+    more than memory holds."""
+
+    def __init__(self, cameras: Sequence[Camera], features: Sequence[ImageFeatures]) -> None:
+        self._cameras, self._features = cameras, features
+
+    def __len__(self) -> int:
+        return len(self._cameras)
+
+    def __getitem__(self, index: Any) -> Any:
+        """Return view `index`, a number; slices are not supported."""
+        return self._cameras[index], self._features[index]
 
 
 class _Clock:

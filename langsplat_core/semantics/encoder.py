@@ -28,8 +28,8 @@ TEXT_BATCH = 64  # phrases per forward pass
 Triple = tuple[float, float, float]
 # Share of a model's logit scale that is the temperature of relevancy, the factor of a difference of cosines
 # before the sigmoid. LERF and LangSplat take 10 for CLIP, whose training caps the scale at 100: a tenth. The
-# larger the scale, the smaller the gaps between cosines of right and wrong pairs that training had to make, so
-# a tenth of it gives the margins of two families like relevancies. It is a rule of proportion, not a
+# larger the scale, the smaller the gaps between cosines of right and wrong pairs that training had to make,
+# so a tenth of it gives the margins of two families like relevancies. It is a rule of proportion, not a
 # calibration: verdicts need thresholds of their own.
 SHARE_OF_SCALE = 0.1
 

@@ -14,10 +14,10 @@ from scipy import ndimage
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import MaskConfig
-from langsplat_core.errors import EncoderError
+from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress
 from langsplat_core.semantics.layouts import open_weights
-from langsplat_core.semantics.masks import LevelMasks
+from langsplat_core.semantics.masks import GraphMasks, LevelMasks, MaskSource
 from langsplat_core.semantics.weights import (
     Weights,
     load_config,
@@ -343,6 +343,20 @@ VERSION = 2
 # system gives and takes back large memory page by page.
 MASKS_AT_ONCE = 4
 HALF_ON = "cuda"  # where products are float16's: bfloat16's error is seven times as large (docs/encoders.md)
+
+
+def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:
+    """The source that `config` asks for; "auto" is SAM where `config.sam` names weights, else the graph.
+
+    Raises EncoderError where SAM's weights are absent, InputError where they are not named at all.
+    """
+    if config.source == "graph" or (config.source == "auto" and not config.sam):
+        return GraphMasks()
+    if not config.sam:
+        raise InputError(
+            "masks.source sam: name the weights too, such as `--masks.sam facebook/sam-vit-huge`"
+        )
+    return load_sam(config, device)
 
 
 def load_sam(config: MaskConfig, device: str = "auto") -> "SamMasks":

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, overload
+from typing import Any, Protocol
 from urllib.parse import quote, unquote
 
 import numpy as np
@@ -213,15 +213,8 @@ class StoredFeatures(Sequence[ImageFeatures]):
     def __len__(self) -> int:
         return len(self._names)
 
-    @overload
-    def __getitem__(self, index: int) -> ImageFeatures: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> "StoredFeatures": ...
-
-    def __getitem__(self, index: int | slice) -> "ImageFeatures | StoredFeatures":
-        if isinstance(index, slice):
-            return StoredFeatures(self._store, self._names[index])
+    def __getitem__(self, index: Any) -> Any:
+        """Return the features of photograph `index`, a number; slices are not supported."""
         return self._store.load(self._names[index])
 
 

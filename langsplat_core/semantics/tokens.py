@@ -44,7 +44,7 @@ class Tokens:
 
 
 def load_tokens(weights: Weights, length: int) -> Tokens:
-    """Read the folder's tokenizer. Raises EncoderError where it is absent, or lacks tokens that pad and end."""
+    """Read the folder's tokenizer; EncoderError where it is absent or lacks tokens that pad and end."""
     path = weights.folder / FILE
     if not path.is_file():
         raise EncoderError(f"{weights.id}: no {FILE} in this folder, which its phrases are read with")

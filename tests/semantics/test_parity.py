@@ -18,8 +18,7 @@ from langsplat_core.config import MaskConfig
 from langsplat_core.progress import silent
 from langsplat_core.semantics.encoders import load_encoder
 from langsplat_core.semantics.masks import label_maps
-from langsplat_core.semantics.sam import LEVELS, Look, SamMasks, load_sam, load_segmenter
-from langsplat_core.semantics.sources import load_mask_source
+from langsplat_core.semantics.sam import LEVELS, Look, SamMasks, load_mask_source, load_sam, load_segmenter
 from langsplat_core.semantics.store import masked_crop
 from tests.support.measured import Measure
 from tests.support.upstream import save_clip, scrambled, siglip_tensors, upstream

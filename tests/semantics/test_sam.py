@@ -23,6 +23,7 @@ from langsplat_core.semantics.sam import (
     by_area,
     clean_regions,
     grid_points,
+    load_mask_source,
     load_sam,
     load_segmenter,
     mask_boxes,
@@ -30,7 +31,6 @@ from langsplat_core.semantics.sam import (
     squashed,
     upscale,
 )
-from langsplat_core.semantics.sources import load_mask_source
 from tests.support.plain_filters import plain_box_nms, plain_mask_nms
 from tests.support.tiny_sam import SIDE, tiny_sam, tiny_sam2, tiny_sam2_video
 

@@ -62,7 +62,7 @@ from langsplat_core.scene import LEVELS, Camera, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.encoder import Encoder
 from langsplat_core.semantics.encoders import load_encoder, model_path
 from langsplat_core.semantics.masks import MaskSource
-from langsplat_core.semantics.sources import load_mask_source
+from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture
 from langsplat_core.training.language.codec_fit import CodecReport
 from langsplat_core.training.radiance.train import evaluate_views

@@ -181,28 +181,6 @@ PUBLISHED_EPSILON = 1e-9  # in x / (|x| + 1e-9)
 KEPT_BYTES = 4e9  # weights of views that are kept; further views are projected again at every step
 
 
-@dataclass
-class AdamState:
-    """Adam (Kingma and Ba 2015) on one array."""
-
-    x: Array  # float32
-    first: Array
-    second: Array
-    steps: int = 0
-
-    @staticmethod
-    def begin(x: Array) -> "AdamState":
-        """Before the first step."""
-        return AdamState(x.astype(np.float32), np.zeros_like(x, np.float32), np.zeros_like(x, np.float32))
-
-    def update(self, gradient: Array, lr: float) -> None:
-        """One step, in place."""
-        self.steps += 1
-        corrected = (lr / (1 - BETAS[0] ** self.steps), 1 / (1 - BETAS[1] ** self.steps))
-        flat = (array.reshape(-1) for array in (self.x, self.first, self.second, plain(gradient)))
-        shared_workers().run(_adam, self.x.size, *flat, *(np.float32(factor) for factor in corrected))
-
-
 @dataclass(frozen=True, eq=False)
 class _Target:
     """One photograph: its camera, and what each pixel ought to show at every level."""
@@ -226,17 +204,23 @@ def lift_by_gradient(
     `config` says for how many steps, how fast, from where. Deterministic for a given seed on the CPU.
     """
     start, confidence = lift_latents(rasterizer, gaussians, views, codec, settings, progress)
+    import torch  # seconds that other modes need not pay
+
     check_settings(config, "--lift.")
     published = config.start == "zeros-as-published"
-    adam = AdamState.begin(np.zeros_like(start) if published else start)
+    x = np.zeros_like(start) if published else start.copy()
+    features = torch.from_numpy(x)  # the same memory
+    adam = torch.optim.Adam([features], config.lr, BETAS, EPSILON, fused=True)
     targets = [_target(camera, features, codec) for camera, features in views]
     weights = _Weights(rasterizer, gaussians, [camera for camera, _ in views], settings)
-    for index in _shuffled(len(views), config.steps, config.seed):
-        loss, by_y = loss_and_gradient(weights.of(index), targets[index], blended(adam.x, published))
-        adam.update(by_features(adam.x, by_y) if published else by_y, config.lr)
-        if adam.steps % 20 == 0 or adam.steps == config.steps:
-            progress("training language features", adam.steps / config.steps, loss=loss)
-    latents = unit(adam.x)
+    for step, index in enumerate(_shuffled(len(views), config.steps, config.seed), 1):
+        loss, by_y = loss_and_gradient(weights.of(index), targets[index], blended(x, published))
+        gradient = by_features(x, by_y) if published else by_y
+        features.grad = torch.from_numpy(plain(gradient))
+        adam.step()
+        if step % 20 == 0 or step == config.steps:
+            progress("training language features", step / config.steps, loss=loss)
+    latents = unit(x)
     return np.where(confidence[..., None] > 0, latents, 0).astype(np.float32), confidence
 
 
@@ -290,26 +274,6 @@ def _compare(
                 total += abs(difference)
                 signs[row, column, channel] = share * np.sign(difference)
         losses[row] = total
-
-
-@kernel
-def _adam(
-    first: int,
-    last: int,
-    x: Array,
-    mean: Array,
-    square: Array,
-    gradient: Array,
-    rate: float,
-    correction: float,
-) -> None:
-    """Numbers [first, last). rate: lr / (1 - beta1^t); correction: 1 / (1 - beta2^t)."""
-    old, older = np.float32(BETAS[0]), np.float32(BETAS[1])
-    for i in range(first, last):
-        g = gradient[i]
-        mean[i] = old * mean[i] + (np.float32(1) - old) * g
-        square[i] = older * square[i] + (np.float32(1) - older) * g * g
-        x[i] -= rate * mean[i] / (np.sqrt(square[i] * correction) + np.float32(EPSILON))
 
 
 def _target(camera: Camera, features: ImageFeatures, codec: Codec) -> _Target:

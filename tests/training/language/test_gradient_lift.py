@@ -14,7 +14,6 @@ from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera, LinearCodec
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.lift import (
-    AdamState,
     blended,
     by_features,
     lift_by_gradient,
@@ -94,19 +93,6 @@ def test_the_gradient_through_the_published_normalisation():
     np.testing.assert_allclose(blended(x, True), y.detach().numpy(), atol=1e-12)
     (want,) = torch.autograd.grad(y, leaf, torch.tensor(by_y))
     np.testing.assert_allclose(by_features(x, by_y), want.numpy(), rtol=1e-9, atol=1e-9)
-
-
-def test_adam_is_torchs():
-    rng = np.random.default_rng(1)
-    x = rng.normal(size=(3, 6, 2)).astype(np.float32)
-    mine, leaf = AdamState.begin(x), torch.tensor(x, requires_grad=True)
-    theirs = torch.optim.Adam([leaf], lr=0.03, eps=1e-15)
-    for _ in range(40):
-        gradient = (rng.normal(size=x.shape) * 10.0 ** rng.integers(-8, 3, x.shape)).astype(np.float32)
-        mine.update(gradient, 0.03)
-        leaf.grad = torch.tensor(gradient)
-        theirs.step()
-    np.testing.assert_allclose(mine.x, leaf.detach().numpy(), atol=2e-5)
 
 
 def test_it_is_deterministic_and_can_be_interrupted():
