@@ -116,11 +116,6 @@ def test_a_broken_line_of_a_text_model_is_refused(tmp_path: Path, name: str, tex
     assert len(message) < 400
 
 
-def test_text_that_is_not_text(tmp_path: Path) -> None:
-    (write_colmap(tmp_path, "txt") / "cameras.txt").write_bytes(b"\xff\xfe\x80")
-    assert "cameras.txt" in refuse(tmp_path, tmp_path / "work")
-
-
 def test_names_that_no_file_system_holds_count_as_missing(tmp_path: Path) -> None:
     text = (write_colmap(tmp_path, "txt") / "images.txt").read_text()
     (tmp_path / "sparse/0/images.txt").write_text(text.replace("a.png", "a" * 5000 + ".png"))

@@ -32,11 +32,6 @@ def test_every_kind_of_picture_becomes_rgb(tmp_path: Path) -> None:
         assert np.abs(got.astype(int) - grey[..., None]).max() <= 1, name
 
 
-def test_a_black_and_white_bitmap(tmp_path: Path) -> None:
-    Image.new("1", (4, 4), 1).save(tmp_path / "bits.png")
-    assert (np.asarray(read_photo(tmp_path / "bits.png", upright=False)) == 255).all()
-
-
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_every_exif_orientation(tmp_path: Path, orientation: int) -> None:
     picture = Image.fromarray(np.random.default_rng(0).integers(0, 256, (6, 9, 3), dtype=np.uint8))

@@ -115,14 +115,6 @@ def test_missing_photographs_are_reported_once(tmp_path: Path, caplog: pytest.Lo
     assert "view_1.png" in record.getMessage()
 
 
-def test_no_photograph_at_all_is_an_error(tmp_path: Path) -> None:
-    write_dataset(tmp_path, GLOBAL)
-    for photo in (tmp_path / "images").iterdir():
-        photo.unlink()
-    with pytest.raises(InputError, match="none of the 3 photographs"):
-        load(tmp_path)
-
-
 def write_ply(path: Path, columns: dict[str, Array]) -> None:
     rows = np.zeros(len(columns["x"]), [(name, column.dtype) for name, column in columns.items()])
     for name, column in columns.items():

@@ -12,6 +12,8 @@ from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.sfm import optics
 from langsplat_core.progress import Cancelled
 
+pytestmark = pytest.mark.long
+
 FOCAL, ON_FILM, PLANE_X, PLANE_UNIT, WIDTH = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002
 
 

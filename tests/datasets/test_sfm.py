@@ -2,13 +2,8 @@
 
 import logging
 import os
-import random
 import shutil
-import signal
 import sqlite3
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -50,18 +45,6 @@ STAGES = [
     "reading photographs",
 ]
 TABLES = ("keypoints", "descriptors", "matches", "two_view_geometries")
-RUNS = 20  # that are killed, beside BUSY processes that never rest
-BUSY = 4
-KILLED = """
-import os, signal, sys, threading
-from pathlib import Path
-from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets import load_capture
-timer = threading.Timer(float(sys.argv[3]), os.kill, (os.getpid(), signal.SIGKILL))
-timer.daemon = True
-timer.start()
-load_capture(Path(sys.argv[1]), DatasetConfig(max_side=400), Path(sys.argv[2]))
-"""
 
 
 @contextmanager
@@ -222,40 +205,6 @@ def test_cameras_are_the_same_byte_for_byte(
     assert_same(located[1], tmp_path / "work")
     (ours,), (theirs,) = located[1].glob("sfm-*"), (tmp_path / "work").glob("sfm-*")
     assert ours.name == theirs.name
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(os.name == "nt", reason="no signal 9")
-def test_killed_anywhere_beside_load_it_ends_the_same(photos: Path, tmp_path: Path) -> None:
-    """Every run is killed at a random moment of a fixed seed, and then goes on to its end."""
-    rest = "import time\nwhile time.monotonic() < float('{}'): pass"
-    busy = [
-        subprocess.Popen([sys.executable, "-c", rest.format(time.monotonic() + 3600)]) for _ in range(BUSY)
-    ]
-    generator, kills = random.Random(0), 0
-    try:
-        start = time.monotonic()
-        solve(photos, tmp_path / "whole")
-        seconds = time.monotonic() - start
-        for number in range(RUNS):
-            work = tmp_path / str(number)
-            words = [str(photos), str(work), str(generator.uniform(0, seconds))]
-            code = subprocess.run([sys.executable, "-c", KILLED, *words], check=False).returncode
-            assert code in (0, -signal.SIGKILL)
-            left = sorted(path.name for path in work.glob("sfm-*/*"))
-            if "sparse" in left:  # it was faster than the whole one
-                for path in (tmp_path / "whole" / "record" / "sparse").iterdir():
-                    assert next(work.glob(f"sfm-*/sparse/{path.name}")).read_bytes() == path.read_bytes()
-                continue
-            kills += 1
-            solve(photos, work)
-            assert_same(tmp_path / "whole", work)
-            print(f"| {number} | killed after {float(words[2]):.1f} s | left {left} | same |", flush=True)
-        assert kills > RUNS / 2
-    finally:
-        for process in busy:
-            process.kill()
-            process.wait()
 
 
 def test_changed_photographs_are_computed_again(

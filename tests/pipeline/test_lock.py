@@ -10,6 +10,8 @@ import pytest
 from langsplat_core.errors import InputError
 from langsplat_core.pipeline.stages import LOCK, sole_use
 
+pytestmark = pytest.mark.long
+
 HOLD = (
     "import sys, time\nfrom pathlib import Path\nfrom langsplat_core.pipeline.stages import sole_use\n"
     "with sole_use(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)\n"

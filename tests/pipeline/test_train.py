@@ -280,27 +280,6 @@ def run(*args: object) -> int:
     return main("langsplat", lambda: parse(words))
 
 
-@pytest.mark.parametrize(
-    ("args", "says"),
-    [
-        (["train", "photos"], "--out"),
-        (["train", "photos", "--out", "s.ply", "--radiance.steps", "many"], "radiance.steps"),
-        (["query", "missing.ply", "cup"], "missing.ply"),
-        (["inspect", "."], "folder"),
-        (["convert", "missing.ply", "out.ply"], "missing.ply"),
-        (["convert", "missing.ply", "out.obj"], ".ply, .spz, .splat"),
-        (["nonsense"], "nonsense"),
-    ],
-)
-def test_commands_end_with_one_line_and_code_2(args, says, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert run(*args) == 2
-    printed = capsys.readouterr().err.strip()
-    assert says in printed
-    assert "\n" not in printed
-    assert not list(tmp_path.iterdir())
-
-
 def test_query_inspect_and_convert_commands(room, tmp_path, capsys):
     out = tmp_path / "scene.ply"
     train_scene(room, out, tiny_settings(room))

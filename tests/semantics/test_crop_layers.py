@@ -8,7 +8,7 @@ from langsplat_core.config import MaskConfig
 from langsplat_core.progress import Progress, silent
 from langsplat_core.semantics.sam import SamMasks, crop_boxes, cut_by_crop
 
-pytestmark = pytest.mark.long  # torch alone takes seconds to load
+pytestmark = pytest.mark.long
 
 
 def test_crops_are_those_of_the_public_code() -> None:

@@ -69,11 +69,6 @@ def test_each_row_describes_its_own_region() -> None:
     np.testing.assert_allclose(vectors, [[0, 0, 1], [1, 0, 0], [1, 0, 0]], atol=1e-4)
 
 
-def test_no_region_gives_no_row() -> None:
-    labels = np.full((3, 10, 20), -1, np.int32)
-    assert embed_regions(red_and_blue(), labels, ColourEncoder()).shape == (0, 3)
-
-
 def random_features(seed: int = 0, count: int = 7) -> ImageFeatures:
     rng = np.random.default_rng(seed)
     vectors = unit(rng.normal(size=(count, 512)).astype(np.float32))
@@ -169,11 +164,6 @@ def test_a_damaged_header_counts_as_absent_and_is_told_of_once(
         store.load("a")
     store.save("a", random_features(), "k")
     assert store.has("a", "k")
-
-
-def test_an_absent_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"a\.features\.npz"):
-        FeatureStore(tmp_path).load("a")
 
 
 def test_the_key_follows_all_that_matters() -> None:

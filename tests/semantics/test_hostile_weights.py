@@ -14,7 +14,7 @@ from langsplat_core.semantics.sam import load_segmenter
 from tests.support.tiny_clip import tiny_clip
 from tests.support.tiny_sam import tiny_sam
 
-pytestmark = pytest.mark.long  # transformers alone takes seconds to load
+pytestmark = pytest.mark.long
 PLAIN, WEIGHTS = "pytorch_model.bin", "model.safetensors"
 
 

@@ -34,7 +34,7 @@ from tests.support.tiny_clip import tiny_clip
 from tests.support.tiny_sam import SIDE as SAM_SIDE
 from tests.support.tiny_sam import tiny_sam, tiny_sam2
 
-pytestmark = pytest.mark.long  # transformers alone takes seconds to load
+pytestmark = pytest.mark.long
 PHRASES = ["red mug", "a", "handle"]
 CONFIG = "open_clip_config.json"
 Case = tuple[Path, int, int, bool, Any]  # what to load, heads of pictures and of text, quick GELU, config

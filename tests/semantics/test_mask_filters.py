@@ -8,6 +8,8 @@ from langsplat_core.config import MaskConfig
 from langsplat_core.semantics.sam import box_nms, clean_regions, common_pixels, mask_boxes, mask_nms
 from tests.support.plain_filters import plain_box_nms, plain_mask_nms
 
+pytestmark = pytest.mark.long
+
 
 def blobs(count: int, seed: int) -> np.ndarray:
     """Masks of many sizes, many of them nested, doubled or nearly so."""

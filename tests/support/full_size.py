@@ -29,7 +29,6 @@ class Model:
     """A checkpoint of the hub."""
 
     id: str
-    million: float  # parameters, as published or counted
     make: Callable[[Path], None]
     segments: bool  # else it encodes
 
@@ -117,12 +116,12 @@ def _save(kind: Any, config: Any, folder: Path) -> None:
 
 
 MODELS = {
-    "sam-vit-huge": Model("facebook/sam-vit-huge", 641.1, make_sam, True),
-    "sam2.1-hiera-large": Model("facebook/sam2.1-hiera-large", 224.4, make_sam2_large, True),
-    "sam2.1-hiera-tiny": Model("facebook/sam2.1-hiera-tiny", 38.9, make_sam2_tiny, True),
-    "clip": Model("laion/CLIP-ViT-B-16-laion2B-s34B-b88K", 149.6, make_clip, False),
-    "siglip": Model("google/siglip-base-patch16-224", 203.2, make_siglip, False),
-    "siglip2": Model("google/siglip2-base-patch16-224", 375.2, make_siglip2, False),
+    "sam-vit-huge": Model("facebook/sam-vit-huge", make_sam, True),
+    "sam2.1-hiera-large": Model("facebook/sam2.1-hiera-large", make_sam2_large, True),
+    "sam2.1-hiera-tiny": Model("facebook/sam2.1-hiera-tiny", make_sam2_tiny, True),
+    "clip": Model("laion/CLIP-ViT-B-16-laion2B-s34B-b88K", make_clip, False),
+    "siglip": Model("google/siglip-base-patch16-224", make_siglip, False),
+    "siglip2": Model("google/siglip2-base-patch16-224", make_siglip2, False),
 }
 
 
