@@ -27,7 +27,7 @@ pytestmark = pytest.mark.long
 BANANA = Path(__file__).parents[3] / "shared" / "data" / "banana" / "colmap_640"
 PARAMS = [190.0, 188.0, 103.0, 74.0, -0.1, 0.02, 0.001, -0.001]
 LENS = PhotoIntrinsics(200, 150, *PARAMS[:4], BrownDistortion(*PARAMS[4:]))
-CONFIG = DatasetConfig(max_side=200)
+WHOLE = DatasetConfig(max_side=200)
 
 
 def write_dataset(folder: Path, form: str = "bin", subfolder: str = "sparse/0", views: int = 3) -> None:
@@ -79,7 +79,7 @@ def test_a_real_model_reads_as_pycolmap_reads_it(folder: str) -> None:
 def test_a_capture_shows_what_its_cameras_see(tmp_path: Path, form: str, subfolder: str) -> None:
     write_dataset(tmp_path, form, subfolder)
     labels: list[str] = []
-    capture = load_capture(tmp_path, CONFIG, tmp_path / "work", lambda label, _: labels.append(label))
+    capture = load_capture(tmp_path, WHOLE, tmp_path / "work", lambda label, _: labels.append(label))
     assert [camera.name for camera in capture.cameras] == ["view_0", "view_1", "view_2"]
     for camera, image, matrix in zip(capture.cameras, capture.images, poses(3), strict=True):
         np.testing.assert_allclose(camera.world_to_camera, matrix, atol=1e-12)
@@ -96,7 +96,7 @@ def test_of_several_models_the_one_with_most_photographs_is_taken(
         write_dataset(tmp_path, subfolder=f"sparse/{name}", views=views)
     (tmp_path / "sparse/other").mkdir()
     with caplog.at_level(logging.WARNING, "langsplat"):
-        assert len(load_capture(tmp_path, CONFIG, tmp_path / "work")) == 4
+        assert len(load_capture(tmp_path, WHOLE, tmp_path / "work")) == 4
     (said,) = [record.getMessage() for record in caplog.records if "models" in record.getMessage()]
     assert "4 models; 1 is taken, which has most photographs (0: 2, 1: 4, 2: 4, 10: 3)" in said
 
@@ -106,7 +106,7 @@ def test_of_several_models_the_one_with_most_photographs_is_taken(
     for path in tmp_path.glob("sparse/*/images.bin"):
         path.write_bytes(b"\xff" * 20)
     with pytest.raises(InputError, match=r"sparse/0/images\.bin is no readable COLMAP file"):
-        load_capture(tmp_path, CONFIG, tmp_path / "work")
+        load_capture(tmp_path, WHOLE, tmp_path / "work")
 
 
 def test_photographs_in_subfolders_keep_apart(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_photographs_in_subfolders_keep_apart(tmp_path: Path) -> None:
     model.add_point3D(np.zeros(3), pycolmap.Track(), np.zeros(3, np.uint8))
     (tmp_path / "sparse").mkdir()
     model.write_text(tmp_path / "sparse")
-    capture = load_capture(tmp_path, CONFIG, tmp_path / "work")
+    capture = load_capture(tmp_path, WHOLE, tmp_path / "work")
     assert [camera.name for camera in capture.cameras] == ["left_0001", "right_0001"]
 
 
@@ -127,7 +127,7 @@ def test_missing_photographs_are_reported_once(tmp_path: Path, caplog: pytest.Lo
     write_dataset(tmp_path)
     (tmp_path / "images/view_1.png").unlink()
     with caplog.at_level(logging.WARNING, "langsplat"):
-        capture = load_capture(tmp_path, CONFIG, tmp_path / "work")
+        capture = load_capture(tmp_path, WHOLE, tmp_path / "work")
     assert [camera.name for camera in capture.cameras] == ["view_0", "view_2"]
     assert [r.getMessage() for r in caplog.records] == [
         "1 of 3 photographs of the model do not exist and are left out: view_1.png"
@@ -139,7 +139,7 @@ def test_a_model_of_few_of_the_photographs_says_so(tmp_path: Path, caplog: pytes
     for index in range(4):
         Image.new("RGB", (8, 8)).save(tmp_path / "images" / f"other_{index}.png")
     with caplog.at_level(logging.WARNING, "langsplat"):
-        assert len(load_capture(tmp_path, CONFIG, tmp_path / "work")) == 3
+        assert len(load_capture(tmp_path, WHOLE, tmp_path / "work")) == 3
     (message,) = [record.getMessage() for record in caplog.records]
     assert "cameras for only 3 of the 7 photographs" in message
 
@@ -149,14 +149,14 @@ def test_no_photograph_at_all_is_an_error(tmp_path: Path) -> None:
     for photo in (tmp_path / "images").iterdir():
         photo.unlink()
     with pytest.raises(InputError, match=r"none of its 3 photographs .*view_.*png"):
-        load_capture(tmp_path, CONFIG, tmp_path / "work")
+        load_capture(tmp_path, WHOLE, tmp_path / "work")
 
 
 def test_photographs_shrunk_by_the_user_still_fit(tmp_path: Path) -> None:
     write_dataset(tmp_path)
     for photo in (tmp_path / "images").iterdir():
         Image.open(photo).reduce(2).save(photo)
-    capture = load_capture(tmp_path, CONFIG, tmp_path / "work")
+    capture = load_capture(tmp_path, WHOLE, tmp_path / "work")
     assert capture.cameras[0].width <= 110
     assert psnr(capture.images[0], pinhole_picture(capture.cameras[0], 4)) > 30
 
@@ -166,7 +166,7 @@ def test_photographs_of_another_shape_are_refused(tmp_path: Path) -> None:
     photo = tmp_path / "images/view_1.png"
     Image.open(photo).crop((0, 0, 150, 150)).save(photo)
     with pytest.raises(InputError, match=r"view_1\.png is 150x150 pixels but its camera is 200x150"):
-        load_capture(tmp_path, CONFIG, tmp_path / "work")
+        load_capture(tmp_path, WHOLE, tmp_path / "work")
 
 
 @pytest.mark.parametrize(("tag", "turn"), [(6, Image.Transpose.ROTATE_90), (8, Image.Transpose.ROTATE_270)])
@@ -174,12 +174,12 @@ def test_a_turned_photograph_is_turned_back_when_its_camera_is_upright(
     tmp_path: Path, tag: int, turn: Image.Transpose
 ) -> None:
     write_dataset(tmp_path)
-    want = load_capture(tmp_path, CONFIG, tmp_path / "work")
+    want = load_capture(tmp_path, WHOLE, tmp_path / "work")
     exif = Image.Exif()
     exif[0x0112] = tag
     photo = tmp_path / "images/view_1.png"
     Image.open(photo).transpose(turn).save(photo, exif=exif)
-    got = load_capture(tmp_path, CONFIG, tmp_path / "work")
+    got = load_capture(tmp_path, WHOLE, tmp_path / "work")
     np.testing.assert_array_equal(got.images[1], want.images[1])
 
 

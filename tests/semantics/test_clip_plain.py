@@ -25,6 +25,7 @@ from langsplat_core.semantics.clip_plain import (
 )
 from langsplat_core.semantics.encoders import ClipText, clip_text, load_text_encoder
 from langsplat_core.semantics.weights import Weights
+from tests.semantics.test_siglip import change_config
 from tests.support.tiny_clip import tiny_clip
 
 pytestmark = pytest.mark.long
@@ -46,13 +47,6 @@ def by_transformers(folder: Path, phrases: list[str]) -> np.ndarray:
         ids = [torch.tensor([tokenizer(phrase).input_ids]) for phrase in phrases]
         rows = [model.text_projection(model.text_model(input_ids=row).pooler_output)[0] for row in ids]
     return unit_rows(torch.stack(rows).numpy())
-
-
-def change_config(folder: Path, change: Callable[[dict], None]) -> None:
-    path = folder / "config.json"
-    config = json.loads(path.read_text(encoding="utf-8"))
-    change(config)
-    path.write_text(json.dumps(config), encoding="utf-8")
 
 
 def taught(folder: Path) -> list[str]:

@@ -12,7 +12,9 @@ from transformers import PreTrainedTokenizerFast, Siglip2Tokenizer, SiglipModel
 
 from langsplat_core.errors import EncoderError
 from langsplat_core.semantics.encoders import load_encoder, load_text_encoder
-from tests.support.tiny_siglip import LENGTH, SCALE, SIDE, tiny_siglip
+from tests.semantics.test_clip import crops
+from tests.support.tiny_clip import SIDE
+from tests.support.tiny_siglip import LENGTH, SCALE, tiny_siglip
 
 pytestmark = pytest.mark.long
 
@@ -30,13 +32,9 @@ def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     return folder, MAKERS[request.param](folder)
 
 
-def unit_rows(tensor: torch.Tensor) -> np.ndarray:
+def unit_tensor(tensor: torch.Tensor) -> np.ndarray:
     rows = tensor.detach().numpy()
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
-
-
-def crops(count: int, side: int = SIDE) -> np.ndarray:
-    return np.random.default_rng(1).integers(0, 256, (count, side, side, 3), dtype=np.uint8)
 
 
 def padded_ids(tokenizer: Any, phrases: list[str]) -> torch.Tensor:
@@ -54,7 +52,7 @@ def test_texts_agree_with_the_whole_model(tmp_path: Path) -> None:
     ids = padded_ids(tokenizer, phrases)
     assert ids.shape == (3, LENGTH)
     assert ids[0].tolist() == [4, 5] + [1] * (LENGTH - 2)  # end and padding are one token
-    want = unit_rows(model.get_text_features(input_ids=ids).pooler_output)
+    want = unit_tensor(model.get_text_features(input_ids=ids).pooler_output)
     got = load_text_encoder(str(tmp_path)).encode_texts(phrases)
     assert got.dtype == np.float32
     np.testing.assert_allclose(got, want, atol=2e-6)
@@ -67,7 +65,7 @@ def test_texts_of_the_second_generation_agree_with_transformers(tmp_path: Path) 
     phrases = ["Red mug", "red", "a red mug, with a very long handle"]
     ids = padded_ids(Siglip2Tokenizer.from_pretrained(tmp_path), phrases)
     assert ids[1].tolist()[1:] == [1] + [0] * (LENGTH - 2)  # an end, then padding to the right
-    want = unit_rows(model.get_text_features(input_ids=ids).pooler_output)
+    want = unit_tensor(model.get_text_features(input_ids=ids).pooler_output)
     got = load_text_encoder(str(tmp_path)).encode_texts(phrases)
     np.testing.assert_allclose(got, want, atol=2e-6)
 
@@ -84,7 +82,7 @@ def test_images_agree_with_the_whole_model(tmp_path: Path) -> None:
     encoder = load_encoder(str(tmp_path), "cpu", batch=2)
     assert (encoder.dim, encoder.image_size, encoder.id) == (32, SIDE, str(tmp_path))
     pixels = torch.from_numpy((pictures / 127.5 - 1).transpose(0, 3, 1, 2).astype(np.float32))
-    want = unit_rows(model.get_image_features(pixel_values=pixels).pooler_output)
+    want = unit_tensor(model.get_image_features(pixel_values=pixels).pooler_output)
     np.testing.assert_allclose(encoder.encode_images(pictures), want, atol=2e-6)
 
 
