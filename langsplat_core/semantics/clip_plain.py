@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.semantics.tokens import FILE, check_whole
+from langsplat_core.semantics.encoder import FILE, check_whole
 from langsplat_core.semantics.weights import CONFIG, SAFE, Weights
 
 # Of the text half. NumPy was the quicker one at 63 million too (docs/encoders.md); but checkpoints that large

@@ -19,11 +19,13 @@ from langsplat_core.semantics.encoder import (
     Family,
     PhraseEncoder,
     TextTower,
+    check_whole,
     inferred,
+    load_tokens,
     pixel_statistics,
+    text_cleaner,
 )
 from langsplat_core.semantics.layouts import open_weights
-from langsplat_core.semantics.tokens import check_whole, load_tokens, text_cleaner
 from langsplat_core.semantics.weights import (
     Weights,
     load_config,

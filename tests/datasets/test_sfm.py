@@ -1,13 +1,14 @@
 """Structure from motion and triangulation, on a small textured room whose shape is known."""
 
+import json
 import logging
 import os
 import shutil
-import sqlite3
-from collections.abc import Callable, Collection, Iterator
-from contextlib import closing, contextmanager
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -17,13 +18,14 @@ from PIL import Image
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture, sfm
-from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.capture import Capture, find_photos
 from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
 from langsplat_core.datasets.known_poses import add_points, neighbouring_views
-from langsplat_core.datasets.sfm import pairs_by_name
+from langsplat_core.datasets.sfm import optics, pairs_by_name
 from langsplat_core.errors import InputError
-from langsplat_core.progress import Cancelled, Progress, silent
+from langsplat_core.progress import Cancelled, silent
 from langsplat_core.scene import Camera, look_at
+from tests.support.full_disk import files_of_at_most
 from tests.support.photographed import (
     colmap_reconstruction,
     distance_to_room,
@@ -31,6 +33,7 @@ from tests.support.photographed import (
     poses,
     write_photos,
 )
+from tests.support.street import walk
 
 pytestmark = pytest.mark.long
 
@@ -44,63 +47,6 @@ STAGES = [
     "locating cameras",
     "reading photographs",
 ]
-TABLES = ("keypoints", "descriptors", "matches", "two_view_geometries")
-
-
-@contextmanager
-def recorded(folder: Path) -> Iterator[None]:
-    """Keeps in `folder` what every way of the mapper is given and gives: ``0.db``, ``0-0/cameras.bin`` ..."""
-    folder.mkdir(parents=True)
-
-    def watched(number: int, way: Callable[..., Collection[sfm.Model]]) -> Callable[..., object]:
-        def run(workspace: Path, attempts: Path, advance: Callable[[], None]) -> Collection[sfm.Model]:
-            models = list(way(workspace, attempts, advance))
-            with closing(sqlite3.connect(workspace / "database.db")) as database:
-                database.execute("VACUUM INTO ?", (str(folder / f"{number}.db"),))
-            for index, model in enumerate(models):
-                (folder / f"{number}-{index}").mkdir()
-                model.write_binary(folder / f"{number}-{index}")
-            return models
-
-        return run
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sfm, "WAYS", tuple(watched(*each) for each in enumerate(sfm.WAYS)))
-        yield
-
-
-def contents(record: Path) -> dict[str, bytes]:
-    """Tables of the databases, and files of the models, in what was `recorded`."""
-    found = {str(path.relative_to(record)): path.read_bytes() for path in record.rglob("*.bin")}
-    for path in record.glob("*.db"):
-        with closing(sqlite3.connect(path)) as database:
-            for table in TABLES:
-                rows = database.execute(f"SELECT * FROM {table} ORDER BY 1").fetchall()
-                found[f"{path.name} {table}"] = repr(rows).encode()
-    return found
-
-
-def assert_same(ours: Path, theirs: Path) -> None:
-    """Two work folders: what differs is printed, of both, each table and each way's model by itself."""
-    a, b = contents(ours / "record"), contents(theirs / "record")
-    assert {f"{way}.db {table}" for way in range(3) for table in TABLES} < a.keys()
-    lines = []
-    for name in sorted(a.keys() | b.keys()):
-        mine, other = a.get(name, b""), b.get(name, b"")
-        if mine != other:
-            pairs = enumerate(zip(mine, other, strict=False))
-            at = next((place for place, (x, y) in pairs if x != y), min(len(mine), len(other)))
-            lines.append(f"{name} from byte {at}: {mine[at : at + 32]!r} and {other[at : at + 32]!r}")
-    assert not lines, "\n".join([*lines, f"kept: {ours}", f"and {theirs}"])
-
-
-def solve(photos: Path, work: Path, progress: Progress = silent) -> Capture:
-    """Goes on from what is in `work`; what the mapper was given and gave, and the model, is in ``record``."""
-    with recorded(work / "record"):
-        capture = load_capture(photos, CONFIG, work, progress)
-    (stage,) = work.glob("sfm-*")
-    shutil.copytree(stage / "sparse", work / "record" / "sparse")
-    return capture
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +83,7 @@ def located(
     logging.getLogger("langsplat").addHandler(handler)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pycolmap, "extract_features", _never)
-        capture = solve(photos, work, lambda label, _: labels.append(label))
+        capture = load_capture(photos, CONFIG, work, lambda label, _: labels.append(label))
     logging.getLogger("langsplat").removeHandler(handler)
     return capture, work, labels, messages
 
@@ -201,10 +147,11 @@ def test_cameras_are_the_same_byte_for_byte(
     shutil.copytree(photos, tmp_path / "moved")
     for photo in (tmp_path / "moved" / "images").iterdir():
         os.utime(photo, (0, 0))
-    solve(tmp_path / "moved", tmp_path / "work")
-    assert_same(located[1], tmp_path / "work")
+    load_capture(tmp_path / "moved", CONFIG, tmp_path / "work")
     (ours,), (theirs,) = located[1].glob("sfm-*"), (tmp_path / "work").glob("sfm-*")
     assert ours.name == theirs.name
+    for path in (ours / "sparse").iterdir():
+        assert (theirs / "sparse" / path.name).read_bytes() == path.read_bytes()
 
 
 def test_changed_photographs_are_computed_again(
@@ -369,3 +316,252 @@ def test_each_photograph_that_has_no_camera_is_told_why(tmp_path: Path) -> None:
     assert "from one and the same place, or without enough overlap: a.png" in message
     assert "the same picture as a.png: b.png, c.png" in message
     assert "no features (nothing but plain areas, or blurred): black.png, tiny.png" in message
+
+
+# Structure from motion that has to try several ways, and what is done where it finds too little.
+
+STEPS = 8
+SMALL = DatasetConfig(max_side=64)
+PINHOLE_LENS = PhotoIntrinsics(400, 300, 380.0, 380.0, 200.0, 150.0)
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("street")
+    walk(folder, STEPS)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def matched(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The street's workspace before it is mapped."""
+    work = tmp_path_factory.mktemp("matched")
+
+    def cancel(label: str, _: float) -> None:
+        if label == "locating cameras":
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        load_capture(street, SMALL, work, cancel)
+    (workspace,) = work.glob("sfm-*")
+    return workspace
+
+
+def advance() -> None:
+    pass
+
+
+def test_a_walk_straight_ahead_is_located(street: Path, tmp_path: Path) -> None:
+    capture = load_capture(street, SMALL, tmp_path / "work")
+    assert len(capture) == STEPS
+    along = np.array([camera.position for camera in capture.cameras])
+    steps = np.linalg.norm(np.diff(along, axis=0), axis=1)
+    assert steps.max() < 1.1 * steps.min()  # one step after the other, and all as long
+    axis = (along[-1] - along[0]) / np.linalg.norm(along[-1] - along[0])
+    assert np.abs(np.diff(along, axis=0) @ axis - steps).max() < 0.01 * steps.mean()
+
+
+@pytest.mark.parametrize(("way", "found"), [(0, 0), (1, STEPS), (2, STEPS)])
+def test_every_way_gives_the_same_bytes_again(way: int, found: int, matched: Path, tmp_path: Path) -> None:
+    """And the usual way is what does not find this street."""
+    written = []
+    for name in ("first", "second"):
+        folder = tmp_path / name
+        folder.mkdir()
+        models = sfm.WAYS[way](matched, folder, advance)
+        assert max((len(sfm.located_names(model)) for model in models), default=0) == found
+        for model in models:
+            model.write_binary(folder)
+        written.append({path.name: path.read_bytes() for path in sorted(folder.glob("*.bin"))})
+        if not found:
+            return
+    assert written[0] == written[1]
+    assert "images.bin" in written[0]
+
+
+def synthetic(images: int, points: int) -> "pycolmap.Reconstruction":
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig = 1, 1
+    options.num_frames_per_rig, options.num_points3D = images, points
+    return pycolmap.synthesize_dataset(options)
+
+
+def test_the_model_with_most_well_held_photographs_is_kept() -> None:
+    small, large = synthetic(4, 100), synthetic(6, 100)
+    assert sfm.best_model(None, [small, large]) is large
+    again = pycolmap.Reconstruction(large)
+    assert sfm.best_model(large, [small, again]) is large  # equal: the earlier way
+    wobbly = synthetic(7, sfm.FEWEST_POINTS - 1)  # all of its cameras are guesses
+    assert sfm.best_model(large, [wobbly]) is large
+    assert sfm.best_model(None, [wobbly]) is None
+
+
+def test_of_models_about_as_good_the_first_is_kept() -> None:
+    def erring(images: int, error: float) -> "pycolmap.Reconstruction":
+        model = synthetic(images, 100)
+        for point in model.points3D.values():
+            point.error = error
+        return model
+
+    first, better, more = erring(6, 1.0), erring(6, 0.94), erring(7, 2.0)
+    assert sfm.best_model(first, [erring(6, 0.96)]) is first
+    assert sfm.best_model(None, [first, erring(6, 0.96), better]) is better
+    assert sfm.best_model(None, [better, more, first]) is more
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_libraries_inside_of_pycolmap_keep_to_one_thread_and_others_do_not() -> None:
+    code = """
+import ctypes, os
+from langsplat_core.datasets.intrinsics import pycolmap
+libraries = {line.split()[-1] for line in open("/proc/self/maps") if "pycolmap.libs/libgomp" in line}
+print([ctypes.CDLL(path).omp_get_max_threads() for path in libraries], os.environ["OMP_NUM_THREADS"])
+"""
+    environment = os.environ | {"OMP_NUM_THREADS": "3"}
+    told = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert told.stdout.split() == ["[1]", "3"]
+
+
+@pytest.fixture(scope="module")
+def mostly_noise(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four photographs of a room and five of nothing."""
+    folder = tmp_path_factory.mktemp("noise")
+    write_photos(folder, PINHOLE_LENS, poses(4))
+    for index in range(5):
+        noise = np.random.default_rng(index).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(folder / f"noise_{index}.png")
+    return folder
+
+
+def test_below_half_is_refused_each_time_unless_told_otherwise(mostly_noise: Path, tmp_path: Path) -> None:
+    for _ in range(2):  # the second time from what the first one kept
+        with pytest.raises(InputError, match="only 4 of 9 photographs could be located") as caught:
+            load_capture(mostly_noise, SMALL, tmp_path)
+        said = str(caught.value)
+        assert ", ".join(f"noise_{index}.png" for index in range(5)) in said
+        assert "--dataset.allow-few-cameras" in said
+    told = DatasetConfig(max_side=64, allow_few_cameras=True)
+    assert len(load_capture(mostly_noise, told, tmp_path)) == 4
+    (stage,) = tmp_path.glob("sfm-*")
+    assert len(json.loads((stage / sfm.LEFT_OUT).read_text())) == 5
+
+
+def test_two_views_are_refused_although_they_are_half(
+    mostly_noise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """COLMAP may end with a first pair that nothing else was added to."""
+    for path in find_photos(mostly_noise)[-4:]:  # the room's
+        (tmp_path / path.name).symlink_to(path)
+
+    def gives_up(folder: Path, count: int, progress: object) -> None:
+        model = synthetic(2, 100)
+        for number, image in sorted(model.images.items()):
+            image.name = f"{number - 1:05d}.jpg"
+        sfm.write_left_out(folder, sfm.located_names(model))
+        sfm.store_model(model, folder)
+
+    monkeypatch.setattr(sfm, "map_cameras", gives_up)
+    for _ in range(2):
+        with pytest.raises(InputError, match="only 2 of 4 photographs"):
+            load_capture(tmp_path, SMALL, tmp_path / "work")
+
+
+@pytest.mark.parametrize("label", ["finding features", "matching photographs", "locating cameras"])
+def test_a_full_disk_is_said_before_pycolmap_ends_the_process(
+    label: str, mostly_noise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill(reported: str, fraction: float) -> None:
+        if reported == label:
+            monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
+
+    told = DatasetConfig(max_side=64, allow_few_cameras=True)
+    with pytest.raises(OSError, match="No space left") as caught:
+        load_capture(mostly_noise, told, tmp_path, fill)
+    assert Path(caught.value.filename).parent == tmp_path
+    monkeypatch.undo()
+    assert len(load_capture(mostly_noise, told, tmp_path)) == 4
+
+
+def test_a_model_that_was_cut_off_is_not_kept(tmp_path: Path) -> None:
+    """pycolmap writes what fits and says nothing."""
+    model = synthetic(4, 100)
+    (tmp_path / "whole").mkdir()
+    model.write_binary(tmp_path / "whole")
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        with (
+            files_of_at_most((tmp_path / "whole" / name).stat().st_size - 1),
+            pytest.raises(OSError, match="No space"),
+        ):
+            sfm.store_model(model, tmp_path)
+        assert not (tmp_path / "sparse").exists()
+    sfm.store_model(model, tmp_path)
+    assert (tmp_path / "sparse").is_dir()
+
+
+# The lens of a photograph, as COLMAP learns of it from our smaller copy.
+
+FOCAL, ON_FILM, PLANE_X, PLANE_UNIT, WIDTH = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002
+
+
+def photo(path: Path, tags: dict[int, float], size: tuple[int, int] = (2000, 1500)) -> Path:
+    exif = Image.Exif()
+    exif[0x010F] = "Maker"
+    exif.get_ifd(0x8769).update(tags)
+    exif.get_ifd(0x8825).update({1: "N", 2: (47.0, 22.0, 0.0), 3: "E", 4: (8.0, 32.0, 0.0)})  # a place
+    Image.linear_gradient("L").resize(size).convert("RGB").save(path, exif=exif)
+    return path
+
+
+def on_film(path: Path) -> float | None:
+    return optics(path).get_ifd(0x8769).get(ON_FILM)
+
+
+@pytest.mark.parametrize(("unit", "millimetres"), [(2, 25.4), (3, 10.0), (4, 1.0), (None, 25.4)])
+def test_a_sensor_counted_by_the_inch(unit: int | None, millimetres: float, tmp_path: Path) -> None:
+    """A sensor 22.3 mm wide, of 4 to 3, 4000 pixels; the file was made smaller since."""
+    tags: dict[int, float] = {FOCAL: 18.0, PLANE_X: 4000 / 22.3 * millimetres, WIDTH: 4000}
+    if unit is not None:
+        tags[PLANE_UNIT] = unit
+    expected = 18 / (22.3 * 1.25) * np.hypot(36, 24)
+    assert on_film(photo(tmp_path / "a.jpg", tags)) == round(expected)
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {},
+        {FOCAL: 18.0},
+        {FOCAL: 18.0, PLANE_X: 0.0},
+        {FOCAL: 0.0, PLANE_X: 4500.0},
+        {FOCAL: 18.0, PLANE_X: 4500.0, PLANE_UNIT: 77},
+        {FOCAL: 1e6, PLANE_X: 1e9},
+    ],
+)
+def test_what_is_no_lens_is_left_out(tags: dict[int, float], tmp_path: Path) -> None:
+    assert on_film(photo(tmp_path / "a.jpg", tags)) is None
+
+
+def test_what_the_camera_says_itself_counts(tmp_path: Path) -> None:
+    assert on_film(photo(tmp_path / "a.jpg", {ON_FILM: 31, FOCAL: 18.0, PLANE_X: 4500.0})) == 31
+
+
+def test_colmap_begins_with_it(tmp_path: Path) -> None:
+    """The database's camera, of photographs that were shrunk; where they were taken is not passed on."""
+    for index in range(3):
+        photo(tmp_path / f"{index}.jpg", {FOCAL: 18.0, PLANE_X: 4000 / 22.3 * 25.4, WIDTH: 4000})
+
+    def cancel(label: str, _: float) -> None:
+        if label == "matching photographs":
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        load_capture(tmp_path, DatasetConfig(), tmp_path / "work", cancel)
+    (stage,) = (tmp_path / "work").glob("sfm-*")
+    with pycolmap.Database.open(stage / "database.db") as database:
+        (camera,) = database.read_all_cameras()
+        assert database.num_pose_priors() == 0
+    assert (camera.width, camera.height) == (1600, 1200)
+    assert camera.has_prior_focal_length
+    assert camera.focal_length == pytest.approx(18 / 22.3 * 1600, rel=0.02)  # whole millimetres

@@ -1,7 +1,8 @@
-"""Several processes that share one training: the same scene as from one."""
+"""A work folder belongs to one training at a time, and to none once that has ended, however it ended."""
 
 import multiprocessing
 import os
+import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -12,7 +13,7 @@ import torch.distributed
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
-from langsplat_core.pipeline.stages import Crew, join_crew
+from langsplat_core.pipeline.stages import LOCK, Crew, join_crew, sole_use
 from langsplat_core.pipeline.train import StoredViews
 from langsplat_core.training.language import codec_fit
 from tests.support.lifting import make_views
@@ -20,6 +21,40 @@ from tests.support.tiny_room import tiny_room
 from tests.support.tiny_sam import tiny_sam
 
 pytestmark = pytest.mark.long
+
+HOLD = (
+    "import sys, time\nfrom pathlib import Path\nfrom langsplat_core.pipeline.stages import sole_use\n"
+    "with sole_use(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)\n"
+)
+
+
+def test_a_second_one_is_told_who_is_there_and_a_dead_one_holds_nothing(tmp_path: Path) -> None:
+    work = tmp_path / "scene.work"
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(work)], stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(InputError, match=f"process {other.pid} on .*--work"), sole_use(work):
+            pass
+        other.kill()  # -9: it can tidy nothing up
+        other.wait()
+        assert (work / LOCK).exists()
+        with sole_use(work):
+            assert (work / LOCK).read_text().startswith(f"process {os.getpid()} ")
+
+
+def test_one_after_the_other_and_never_two_in_one_process(tmp_path: Path) -> None:
+    work = tmp_path / "c"
+    for _ in range(2):
+        with sole_use(work), pytest.raises(InputError, match="--work"), sole_use(work):
+            pass
+    with sole_use(tmp_path / "a"), sole_use(tmp_path / "b"):
+        (tmp_path / "a" / "result").touch()
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a", LOCK, "result"]  # b held nothing
+
+
+# Several processes that share one training: the same scene as from one.
 
 OPTIONS = (
     *("--dataset.max-side", "64", "--dataset.test-every", "4", "--radiance.steps", "20"),
@@ -75,7 +110,7 @@ def train_by_two(room: Path, out: Path, *more: str) -> tuple[list[int | None], l
     there = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(store.port), "WORLD_SIZE": "2"}
     there["TORCHELASTIC_USE_AGENT_STORE"] = "True"
     processes = multiprocessing.get_context("forkserver")
-    processes.set_forkserver_preload(["tests.pipeline.test_crew"])
+    processes.set_forkserver_preload(["tests.pipeline.test_stages"])
     two, said = [], [out.with_name("0.txt"), out.with_name("1.txt")]
     for rank, text in enumerate(said):
         surroundings = there | {"RANK": str(rank), "LOCAL_RANK": str(rank)}
