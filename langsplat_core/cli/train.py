@@ -144,7 +144,7 @@ def _words(table: Mapping[str, Any], before: str = "") -> Iterator[str]:
 
 
 def _named(args: Sequence[str], option: str) -> str:
-    """What `args` give for an option, the last time they do; "" where they do not."""
+    """Value that `args` give for an option, the last time they do; "" where they do not."""
     values = [
         after if word == option else word.partition("=")[2]
         for word, after in pairwise([*args, ""])

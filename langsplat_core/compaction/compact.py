@@ -1,4 +1,4 @@
-"""Which Gaussians stay: those that contribute most, and as few as the error budget allows."""
+"""Compact scenes: as few Gaussians as an error budget allows, those that contribute most."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -43,7 +43,7 @@ RESOLUTION = 256  # the number of Gaussians is found to this fraction of the who
 
 @dataclass(frozen=True)
 class Choice:
-    """How many of the ranked Gaussians stay, and with which SH degree."""
+    """Number of the ranked Gaussians that stay, and their SH degree."""
 
     count: int
     sh_degree: int
@@ -51,7 +51,7 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What stays of a scene of N Gaussians."""
+    """Part of a scene of N Gaussians that stays."""
 
     keep: Array  # (N,) bool
     sh_degree: int
@@ -67,8 +67,8 @@ def select(
     config: CompactConfig,
     progress: Progress = silent,
 ) -> Selection:
-    """What of `scene` to keep; `measured` are those of ``views.measuring``. Raises InputError where nothing
-    is visible, nothing fits the budget or nothing can be dropped."""
+    """Select what of `scene` to keep; `measured` are those of ``views.measuring``. Raises InputError where
+    nothing is visible, nothing fits the budget or nothing can be dropped."""
     score = contributions(rasterizer, scene, views.ranking, progress)
     if not score.any():
         raise InputError(f"no Gaussian of the scene is visible from {views.origin}")

@@ -1,4 +1,4 @@
-"""Where a scene is looked at when it is made compact: views that rank its Gaussians, views that measure."""
+"""Views that rank a scene's Gaussians and views that measure, and what is measured in them."""
 
 import logging
 import tempfile
@@ -267,7 +267,7 @@ UNLIKE = 10.0  # dB: a scene that is this far from the photographs does not show
 
 @dataclass(frozen=True)
 class Weight:
-    """What a scene costs, and what it is worth."""
+    """Costs and worth of a scene."""
 
     gaussians: int
     sh_degree: int

@@ -91,7 +91,7 @@ class ModelImage:
 
 @dataclass(frozen=True, eq=False)
 class SparseModel:
-    """What a COLMAP model says."""
+    """Content of a COLMAP model."""
 
     cameras: dict[int, ModelCamera]
     images: list[ModelImage]
@@ -102,7 +102,7 @@ class SparseModel:
 
 
 def has_model(folder: Path) -> bool:
-    """Whether cameras and images lie in `folder`, both binary or both text."""
+    """Return True where cameras and images lie in `folder`, both binary or both text."""
     return _suffix(folder) is not None
 
 
@@ -122,7 +122,7 @@ def _suffix(folder: Path) -> str | None:
 
 
 def read_images(folder: Path) -> list[ModelImage]:
-    """Those of the model in `folder`, alone. FormatError where they are damaged."""
+    """Read the images of the model in `folder` alone. FormatError where they are damaged."""
     suffix = _suffix_of(folder)
     return _guarded((_BINARY if suffix == ".bin" else _TEXT)[1], folder / f"images{suffix}")
 
@@ -311,7 +311,7 @@ def find_model(folder: Path) -> Path | None:
 
 
 def _photographs_of(model_folder: Path) -> int:
-    """How many a model has cameras for; none if it is damaged."""
+    """Count the photographs that a model has cameras for; 0 if it is damaged."""
     try:
         return len({image.name for image in read_images(model_folder)})
     except FormatError:

@@ -1,4 +1,4 @@
-"""How long a training will take: said beforehand from measured costs, then from how fast this run is.
+"""Forecast of a training's duration: from measured costs beforehand, then from how fast this run is.
 
 The costs are seconds of two CPU cores, measured on photographs and rooms (docs/photographs.md,
 docs/encoders.md); what a GPU makes of them is a guess. They are rough; what a run has behind it corrects them
@@ -104,7 +104,7 @@ def _millions(model: str) -> float:
 
 
 def count_photographs(dataset: Path) -> tuple[int, Given]:
-    """How many photographs lie in a dataset, and what comes with them. Does not raise."""
+    """Count the photographs in a dataset, and name what comes with them. Does not raise."""
     try:
         folder = dataset if dataset.is_dir() else dataset.parent
         images = folder / "images" if (folder / "images").is_dir() else folder
@@ -122,7 +122,7 @@ def _given(folder: Path) -> Given:
 
 
 def forecast_in_words(stages: Sequence[Stage], on_gpu: bool = False) -> str:
-    """What a plan costs: "about 6 min on two CPU cores (photographs 80 s, ...)"."""
+    """Return the cost of a plan: "about 6 min on two CPU cores (photographs 80 s, ...)"."""
     where = "two CPU cores and a GPU" if on_gpu else "two CPU cores"
     parts = ", ".join(f"{stage.name} {duration(stage.seconds)}" for stage in stages if stage.seconds > 1)
     return f"about {duration(sum(stage.seconds for stage in stages))} on {where} ({parts})"
@@ -167,7 +167,7 @@ class Forecast:
         return (before / (before + left) if before + left > 0 else 1.0), left
 
     def _pace(self) -> float:
-        """How many times longer than expected the stages behind took."""
+        """Ratio of the time that the stages behind took to the time expected."""
         expected = sum(stage.seconds for stage in self.stages[: self._current])
         if expected <= 0:
             return 1.0

@@ -121,7 +121,7 @@ def check_masks(features: Iterable[ImageFeatures]) -> None:
 
 
 class _Stages:
-    """What is made on the way, each at most once, and not at all where it is kept."""
+    """Results on the way to a field, each made at most once, or read where it was kept."""
 
     def __init__(
         self,
@@ -154,7 +154,7 @@ class _Stages:
         return self._crew.once(lambda: kept(path, self._fit, _pack_codec, _unpack_codec))
 
     def latents(self, codec: Codec) -> Latents:
-        """Of every Gaussian at every level, and the confidence in them."""
+        """Return the latents of every Gaussian at every level, and the confidence in them."""
         blocks = self._work / stage_key("latents", 2, *self._inputs, self._lift, self._config.codec)
         done = blocks.with_name(f"{blocks.name}.npz")
         if self._lift.mode not in LATENT_LIFTS and not done.exists():
@@ -166,7 +166,7 @@ class _Stages:
         return made
 
     def things(self) -> Array | None:
-        """Which thing each Gaussian belongs to; None where latents are averaged themselves, which needs no
+        """Return the instance of each Gaussian; None where latents are averaged themselves, which needs no
         memberships."""
         if self._lift.mode in LATENT_LIFTS:
             return None

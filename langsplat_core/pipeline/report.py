@@ -1,4 +1,4 @@
-"""What a training did, as `report.json` of its work folder says; read without torch."""
+"""Report of a training, `report.json` in its work folder; read without torch."""
 
 import json
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ MOST_DOUBTS = 5  # that are taken from a file
 
 @dataclass(frozen=True)
 class TrainReport:
-    """What a run did."""
+    """Figures of a training."""
 
     views: int
     held_out: int
@@ -44,24 +44,24 @@ class TrainReport:
 
 
 def work_folder(out: Path) -> Path:
-    """Where the training of a scene keeps its stages, if no other folder was named."""
+    """Default folder in which the training of a scene keeps its stages."""
     return out.with_name(f"{out.stem}.work")
 
 
 def write_report(work: Path, report: TrainReport) -> None:
-    """Into the work folder, whole or not at all."""
+    """Write the report into the work folder, whole or not at all."""
     with atomic_path(work / REPORT) as temporary:
         temporary.write_text(json.dumps(asdict(report), indent=1))
 
 
 def read_report(work: Path) -> TrainReport:
-    """That of the run which has just ended, in this process or another."""
+    """Read the report of the run which has just ended, in this process or another."""
     stated = json.loads((work / REPORT).read_text())
     return TrainReport(**stated | {"doubts": tuple(stated["doubts"])})
 
 
 def stated_doubts(scene: Path, gaussians: int) -> tuple[str, ...]:
-    """What the report beside a scene says against it. Nothing where there is no report, where it cannot be
+    """Quality warnings of the report beside a scene. None where there is no report, where it cannot be
     read, or where it is of a scene with another number of Gaussians than this file has."""
     try:
         stated = read_json_file(work_folder(scene) / REPORT, LIMIT)

@@ -42,8 +42,8 @@ def stage_key(name: str, version: int, *inputs: Any) -> str:
 
 
 def kept(path: Path, make: Callable[[], T], pack: Callable[[T], Arrays], unpack: Callable[[Arrays], T]) -> T:
-    """What a stage makes: taken from `path` (*.npz) where it was made before, else made and stored there,
-    whole or not at all. `pack` and `unpack` turn it into named arrays and back."""
+    """Return the result of a stage: read from `path` (*.npz) where it was made before, else made and stored
+    there, whole or not at all. `pack` and `unpack` turn it into named arrays and back."""
     if path.exists():
         log.debug("%s: kept from an earlier run", path.name)
         return unpack(read_arrays(path))
@@ -54,7 +54,7 @@ def kept(path: Path, make: Callable[[], T], pack: Callable[[T], Arrays], unpack:
 
 
 def kept_array(path: Path, make: Callable[[], Array]) -> None:
-    """See to it that `path` (*.npy) holds what `make` gives, which is not called where the file is there."""
+    """Store what `make` gives in `path` (*.npy), unless the file is there."""
     if not path.exists():
         write_npy(path, make())
 
@@ -80,12 +80,12 @@ def read_arrays(path: Path) -> dict[str, Array]:
 
 
 def gaussians_digest(gaussians: Gaussians) -> str:
-    """Of every number of the Gaussians."""
+    """Digest of every number of the Gaussians."""
     return _digest(*(getattr(gaussians, field.name) for field in fields(gaussians)))
 
 
 def features_digest(features: list[ImageFeatures]) -> str:
-    """Of the masks and vectors of photographs, in their order."""
+    """Digest of the masks and vectors of photographs, in their order."""
     return _digest(*(array for item in features for array in (item.labels, item.vectors)))
 
 
@@ -172,7 +172,7 @@ class Crew:
 
     @property
     def leads(self) -> bool:
-        """Whether this is the process that does what cannot be shared, and that speaks."""
+        """True for the process that does what cannot be shared, and that speaks."""
         return self.rank == 0
 
     def share(self, items: Sequence[T]) -> list[T]:

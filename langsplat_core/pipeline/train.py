@@ -180,7 +180,7 @@ class StoredViews(Sequence[tuple[Camera, ImageFeatures]]):
 
 
 class _Clock:
-    """Seconds per stage."""
+    """Clock of the seconds that each stage takes."""
 
     def __init__(self) -> None:
         self.laps: dict[str, float] = {}

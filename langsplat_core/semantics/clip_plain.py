@@ -51,7 +51,7 @@ PIECES = re.compile(
 
 @dataclass(frozen=True)
 class TextConfig:
-    """What the weights alone do not say; defaults as of `transformers.CLIPTextConfig`."""
+    """Settings that the weights alone do not say; defaults as of `transformers.CLIPTextConfig`."""
 
     vocab_size: int = 49_408
     hidden_size: int = 512
@@ -84,7 +84,7 @@ class TextConfig:
 
 
 class PlainClipText:
-    """A `TextTower`."""
+    """A `TextTower` in NumPy."""
 
     def __init__(self, id: str, config: TextConfig, tensors: Tensors, tokenizer: "PairTokenizer") -> None:
         self.id = id
@@ -200,7 +200,7 @@ _ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {"quick_gelu": _quick_gel
 
 
 def _text_config(weights: Weights) -> TextConfig | None:
-    """What config.json says of the text half; None where it says what cannot be understood."""
+    """Settings of the text half in config.json; None where they cannot be understood."""
     try:
         whole = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8"))
         stated = {**(whole.get("text_config") or {}), **(whole.get("text_config_dict") or {})}
@@ -216,7 +216,7 @@ def _text_config(weights: Weights) -> TextConfig | None:
 
 @dataclass(frozen=True)
 class PairTokenizer:
-    """CLIP's byte-pair encoding."""
+    """Tokenizer of CLIP's byte-pair encoding."""
 
     numbers: Mapping[str, int]  # token -> its number
     ranks: Mapping[tuple[str, str], int]  # pair of tokens that are merged -> its place, the lowest first
@@ -245,7 +245,7 @@ class PairTokenizer:
 
 
 def _pieces(text: str) -> Iterator[str]:
-    """What `SPLIT` finds in `text` behind the normalizers: words, single numbers, runs of marks."""
+    """Pieces that `SPLIT` finds in `text` behind the normalizers: words, single numbers, runs of marks."""
     plain = "".join(letter.lower() for letter in unicodedata.normalize("NFC", text))
     for found in PIECES.findall(plain):
         for is_word, letters in groupby(found, str.isalpha) if found[0].isalnum() else [(True, found)]:

@@ -39,7 +39,7 @@ class Tokens:
 
     @property
     def is_unigram(self) -> bool:
-        """Whether it is of SentencePiece's unigram kind, as SigLIP's is and SigLIP 2's is not."""
+        """True for SentencePiece's unigram kind, as SigLIP's is and SigLIP 2's is not."""
         return type(self.tokenizer.model).__name__ == "Unigram"
 
     def rows(self, texts: list[str]) -> Any:
@@ -64,8 +64,8 @@ def load_tokens(weights: Weights, length: int) -> Tokens:
 
 
 def text_cleaner() -> Callable[[str], str]:
-    """What open_clip does to a text before its tokenizer reads it: broken Unicode is mended, curly quotes and
-    ligatures are made plain, names of HTML replaced, spaces made single.
+    """Return the cleaning that open_clip does before its tokenizer reads a text: broken Unicode is mended,
+    curly quotes and ligatures are made plain, names of HTML replaced, spaces made single.
 
     The function raises InputError where no letter and no digit is left.
     """

@@ -69,7 +69,7 @@ class ClipText:
 
 
 class ClipPictures:
-    """A `PictureTower`."""
+    """A `PictureTower` by torch."""
 
     def __init__(self, weights: Weights) -> None:
         from transformers import CLIPVisionModelWithProjection
@@ -86,7 +86,7 @@ class ClipPictures:
 
 
 def clip_text(weights: Weights) -> TextTower:
-    """In NumPy where the model is small, else by torch."""
+    """The text tower in NumPy where the model is small, else by torch."""
     return plain_text_tower(weights) or ClipText(weights)
 
 
@@ -135,7 +135,7 @@ NO_PUNCTUATION = str.maketrans("", "", string.punctuation)
 
 
 class SiglipText:
-    """A `TextTower`."""
+    """A `TextTower` by torch."""
 
     def __init__(self, weights: Weights) -> None:
         from transformers import SiglipTextModel
@@ -159,13 +159,14 @@ class SiglipText:
         return inferred(lambda: self._model(input_ids=ids.to(self._device)).pooler_output)
 
     def canonical(self, text: str) -> str:
-        """As the captions of its training: clean, in lower case; SigLIP 1 had no punctuation either."""
+        """Return `text` like the captions of its training: clean, in lower case; SigLIP 1 had no punctuation
+        either."""
         lower = self._clean(text).lower()
         return " ".join(lower.translate(NO_PUNCTUATION).split()) if self._tokens.is_unigram else lower
 
 
 class SiglipPictures:
-    """A `PictureTower`."""
+    """A `PictureTower` by torch."""
 
     def __init__(self, weights: Weights) -> None:
         from transformers import SiglipVisionModel
@@ -228,7 +229,7 @@ def load_encoder(model: str, device: str = "auto", batch: int = 32) -> Encoder:
 
 
 def model_path(model: str, option: str) -> Path:
-    """Where the files of `model` lie; `option` is what messages name, see `weights.weights_path`."""
+    """Folder or file of `model`; `option` is what messages name, see `weights.weights_path`."""
     if model != DEMO:
         return weights_path(model, option)
     folder = Path(str(files("langsplat_assets") / "demo_encoder"))

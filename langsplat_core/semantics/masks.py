@@ -33,7 +33,7 @@ class MaskSource(Protocol):
 
     @property
     def name(self) -> str:
-        """What the user is told, such as "graph (no weights)"."""
+        """Name for messages, such as "graph (no weights)"."""
 
     @property
     def key(self) -> str:
@@ -208,7 +208,6 @@ class GraphMasks:
 
     @property
     def key(self) -> str:
-        """See `MaskSource`."""
         return json.dumps(["graph", VERSION, WORK_SIDE, MERGE_COSTS, MIN_FRACTIONS])
 
     def __call__(self, image: Array, progress: Progress) -> LevelMasks:

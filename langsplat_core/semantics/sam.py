@@ -65,10 +65,10 @@ class Segmenter(Protocol):
 
     @property
     def name(self) -> str:
-        """What the user is told, such as "SAM 2"."""
+        """Name for messages, such as "SAM 2"."""
 
     def look(self, image: Array) -> Look:
-        """See (H, W, 3) uint8 once."""
+        """Show the model a picture (H, W, 3) uint8 once."""
 
 
 def by_area(ious: Any, logits: Any) -> tuple[Any, Any]:
@@ -401,7 +401,7 @@ class SamMasks:
 
     @property
     def key(self) -> str:
-        """See `MaskSource`. The size of batches changes no result."""
+        """Settings that change the masks; the size of batches does not."""
         settings = asdict(self._config) | {"source": "sam", "points_per_batch": 0}
         return json.dumps(["sam", VERSION, settings, *["float16"] * self._half], sort_keys=True)
 
@@ -410,7 +410,7 @@ class SamMasks:
         return self.begin(image, progress)()
 
     def begin(self, image: Array, progress: Progress) -> Callable[[], LevelMasks]:
-        """See `SplitMaskSource`: the model is asked here, pixels are compared there."""
+        """Ask the model; what is returned compares pixels."""
         crops = crop_boxes(image.shape[:2], self._config.crop_layers)
         levels: list[list[Proposal]] = [[] for _ in range(LEVELS)]
         for index, crop in enumerate(crops):
@@ -459,7 +459,7 @@ class SamMasks:
     def _passing(
         self, look: Look, answer: tuple[Any, Any], crop: Array, shape: tuple[int, int]
     ) -> tuple[Array, Any]:
-        """Of the masks that pass the tests for themselves: (M, 7) level, predicted IoU, stability and box in
+        """Masks that pass the tests for themselves: (M, 7) level, predicted IoU, stability and box in
         the picture, and (M, h, w) logits, low resolution, still on the device."""
         import torch
 
@@ -476,7 +476,8 @@ class SamMasks:
         return figures[good], logits[rows[torch.from_numpy(good).to(rows.device)]]
 
     def _best(self, look: Look, figures: Array, logits: Any, level: int, crop: Array) -> list[Proposal]:
-        """Those of a level whose box no better one resembles: only they are enlarged and leave the device."""
+        """Proposals of a level whose box no better one resembles: only they are enlarged and leave the
+        device."""
         rows = np.flatnonzero(figures[:, 0] == level)
         rows = rows[box_nms(figures[rows, 3:], figures[rows, 1], self._config.box_nms)]
         area = int((crop[2] - crop[0]) * (crop[3] - crop[1]))
@@ -512,7 +513,7 @@ def measure(logits: Any, offset: float) -> Any:
 def filter_level(
     proposals: list[Proposal], shape: tuple[int, int], config: MaskConfig
 ) -> tuple[Array, Array]:
-    """What remains of one level: (M, H, W) bool masks and (M,) float32 scores, stability times IoU.
+    """Filter one level: (M, H, W) bool masks and (M,) float32 scores, stability times IoU.
 
     proposals: of each crop those that no better one resembled. Order of the steps as in SAM's mask generator
     with LangSplat's mask suppression behind it: boxes of different crops, where the smaller crop shows more

@@ -1,4 +1,4 @@
-"""The picture that CLIP is shown of one mask."""
+"""Regions of photographs: what CLIP is shown of each, its vectors, and their store on disk."""
 
 import hashlib
 import json
@@ -114,7 +114,7 @@ class FeatureStore:
         self._reported: set[str] = set()  # names whose damaged files were told of
 
     def path(self, name: str) -> Path:
-        """Where the photograph called `name` is kept: by its name, percent-encoded, or, where that is longer
+        """File of the photograph called `name`: by its name, percent-encoded, or, where that is longer
         than files' names may be, by the beginning of it and a digest. The file itself holds the whole."""
         quoted = quote(name, safe=" ", errors="surrogateescape")
         if len(quoted) > LONGEST_NAME:
@@ -136,7 +136,7 @@ class FeatureStore:
         return os.fsdecode(stored.tobytes())
 
     def has(self, name: str, key: str | None = None) -> bool:
-        """Whether a whole file for `name` exists; with `key`, only if it was saved with that key.
+        """Return True where a whole file for `name` exists; with `key`, only if it was saved with that key.
 
         A damaged one counts as absent, and is told of once: what it held is then made again.
         """

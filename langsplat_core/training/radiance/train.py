@@ -1,9 +1,9 @@
-"""When what happens during radiance training, and how fast parameters learn, for any number of steps.
+"""Radiance training: Gaussians fitted to photographs as in 3D Gaussian Splatting (Kerbl et al. 2023).
 
-At the reference budget this is exactly the INRIA schedule (Kerbl et al. 2023, arguments/__init__.py and
-train.py of the public code). A smaller budget shortens every interval in proportion, but not below what
-it needs to make sense: a gradient mean wants some views, a reset opacity wants time to
-recover. Steps count from 1.
+The schedule says when what happens and how fast parameters learn, for any number of steps. At the reference
+budget this is exactly the INRIA schedule (Kerbl et al. 2023, arguments/__init__.py and train.py of the public
+code). A smaller budget shortens every interval in proportion, but not below what it needs to make sense: a
+gradient mean wants some views, a reset opacity wants time to recover. Steps count from 1.
 
 Positions, scales and rotations then learn faster, by the square root of the missing factor: Adam moves a
 parameter by about its rate per step, and 600 steps at rates meant for 30 000 leave Gaussians where they
@@ -144,7 +144,7 @@ OnStep = Callable[[TrainingState, float], None]  # (state after the step, its lo
 
 @dataclass(frozen=True)
 class ViewScore:
-    """How well one photograph is reproduced."""
+    """Scores of one photograph's reproduction."""
 
     name: str
     psnr: float  # dB
@@ -184,7 +184,7 @@ def _halved(camera: Camera, image: Array) -> tuple[Camera, Array]:
 
 @dataclass(frozen=True)
 class _Run:
-    """What stays the same from step to step."""
+    """Constants of a run."""
 
     config: RadianceConfig
     schedule: Schedule
