@@ -6,11 +6,10 @@ memory depends on a block of Gaussians and not on all of them times all photogra
 """
 
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
@@ -209,19 +208,20 @@ class _Stages:
             return _encoded(codec, lift_block(memberships, groups, number, self._robust))
 
         for number in self._crew.share(range(len(memberships.blocks))):
-            kept(_numbered(folder, number), partial(lift, number), _pack, _unpack)
+            kept(folder / f"{number:05d}.npz", partial(lift, number), _pack, _unpack)
             self._progress("averaging mask vectors", (number + 1) / len(memberships.blocks))
 
     def _all_latents(self, codec: Codec, folder: Path) -> Latents:
         if self._lift.mode in LATENT_LIFTS:
-            lift = LATENT_LIFTS[self._lift.mode]
             scene = (self._rasterizer(), self._gaussians, self._views, codec)
-            return lift(*scene, config=self._config.lift, progress=self._progress)
+            if self._lift.mode == "one-pass":
+                return lift_latents(*scene, progress=self._progress)
+            return lift_by_gradient(*scene, config=self._config.lift, progress=self._progress)
         shape = (len(LEVELS), len(self._gaussians), codec.latent_dim)
         latents, confidence = np.zeros(shape, latent_dtype(codec)), np.zeros(shape[:2], np.float32)
         for number, (first, last) in enumerate(self._memberships()[0].blocks):
             latents[:, first:last], confidence[:, first:last] = _unpack(
-                read_arrays(_numbered(folder, number))
+                read_arrays(folder / f"{number:05d}.npz")
             )
         return latents, confidence
 
@@ -262,21 +262,8 @@ def _what_matters(config: LiftConfig) -> LiftConfig:
     return replace(config, backend="auto", chunk=LiftConfig.chunk)
 
 
-def _one_pass(
-    rasterizer: LiftingRasterizer,
-    gaussians: Gaussians,
-    views: Views,
-    codec: Codec,
-    config: LiftConfig,
-    progress: Progress,
-) -> Latents:
-    return lift_latents(rasterizer, gaussians, views, codec, progress=progress)
-
-
 # Modes that lift latents of a codec that is fitted to the masks' vectors alone.
-LATENT_LIFTS: Mapping[str, Callable[..., Latents]] = MappingProxyType(
-    {"one-pass": _one_pass, "gradient": lift_by_gradient}
-)
+LATENT_LIFTS = frozenset({"one-pass", "gradient"})
 
 
 def _encoded(codec: Codec, lifted: Lifted) -> Latents:
@@ -284,10 +271,6 @@ def _encoded(codec: Codec, lifted: Lifted) -> Latents:
     levels, count, dim = lifted.vectors.shape
     latents = codec.encode(lifted.vectors.reshape(-1, dim)).reshape(levels, count, -1)
     return np.where(lifted.confidence[..., None] > 0, latents, 0).astype(latents.dtype), lifted.confidence
-
-
-def _numbered(folder: Path, number: int) -> Path:
-    return folder / f"{number:05d}.npz"
 
 
 def _pack(latents: Latents) -> Arrays:

@@ -139,8 +139,6 @@ LOSSES_SAID = 200  # mean losses reported in a run
 COARSE_MIN_SIDE = 64  # px: smaller pictures are never halved
 SMALLEST_EXTENT = 0.05  # of the distance to the scene: one camera, or cameras in one place, have no extent
 
-OnStep = Callable[[TrainingState, float], None]  # (state after the step, its loss)
-
 
 @dataclass(frozen=True)
 class ViewScore:
@@ -215,13 +213,12 @@ def train_radiance(
     train_indices: Sequence[int],
     checkpoint: Path | None = None,
     progress: Progress = silent,
-    on_step: OnStep | None = None,
 ) -> Gaussians:
     """Fit Gaussians to the photographs at `train_indices`; returns those that can be seen.
 
     With a `checkpoint` path the run continues from that file if it exists, and writes it every
     `config.checkpoint_every` steps, at the end, and when it is interrupted (Ctrl-C, or `Cancelled` from
-    `progress` or `on_step`). Raises InputError when a setting is out of its range, there is nothing to train
+    `progress`). Raises InputError when a setting is out of its range, there is nothing to train
     on or the checkpoint belongs to another run, BackendError when the chosen backend does not work.
     """
     check_settings(config, "--radiance.")
@@ -252,8 +249,6 @@ def train_radiance(
                 progress(
                     "training Gaussians", state.step / config.steps, f"{len(state)} Gaussians", **metrics
                 )
-                if on_step:
-                    on_step(state, loss)
                 raise_if_interrupted()
                 if state.step % config.checkpoint_every == 0 or state.step == config.steps:
                     save()

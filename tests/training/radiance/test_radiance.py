@@ -3,6 +3,7 @@
 import math
 import os
 import signal
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -450,6 +451,11 @@ def capture() -> Capture:
     return Capture(tuple(cameras), tuple(images), points, np.full(points.shape, 128, np.uint8))
 
 
+def steps_into(steps: list[int]) -> Progress:
+    """Progress of `SHORT` that notes the number of every step."""
+    return Progress(lambda at: steps.append(round(at.fraction * SHORT.steps)))
+
+
 def as_arrays(gaussians: Gaussians) -> list[Array]:
     return [getattr(gaussians, name) for name in gaussians.__dataclass_fields__]
 
@@ -522,22 +528,22 @@ def test_training_learns_the_scene() -> None:
     assert trained.opacity_logits.min() > -5.6  # none below alpha 1/255
 
 
-@pytest.mark.long
-def test_the_loss_is_said_as_the_mean_since_it_was_said_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("langsplat_core.training.radiance.train.LOSSES_SAID", 3)
+def reported(times: int, monkeypatch: pytest.MonkeyPatch) -> list[Mapping[str, float]]:
+    """The metrics of six steps whose mean loss is reported so many times."""
+    monkeypatch.setattr("langsplat_core.training.radiance.train.LOSSES_SAID", times)
     reports: list[Report] = []
-    losses: list[float] = []
-    train_radiance(
-        capture(),
-        replace(SHORT, steps=6, reference_steps=6),
-        [0, 1],
-        progress=Progress(reports.append),
-        on_step=lambda state, loss: losses.append(loss),
-    )
-    first, *said = (report.metrics for report in reports)
+    config = replace(SHORT, steps=6, reference_steps=6)
+    train_radiance(capture(), config, [0, 1], progress=Progress(reports.append))
+    return [report.metrics for report in reports]
+
+
+@pytest.mark.long
+def test_the_mean_loss_since_the_last_one_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    losses = [metrics["loss"] for metrics in reported(6, monkeypatch)]
+    first, *others = reported(3, monkeypatch)
     means = np.reshape(losses, (3, 2)).mean(1)
     assert not first
-    assert [metrics["loss"] for metrics in said] == pytest.approx(means[[0, 0, 1, 1, 2]])
+    assert [metrics["loss"] for metrics in others] == pytest.approx(means[[0, 0, 1, 1, 2]])
 
 
 @pytest.mark.long
@@ -552,9 +558,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     with pytest.raises(Cancelled):
         train_radiance(capture(), SHORT, [0, 1, 2], path, Progress(stop_at_20))
     steps: list[int] = []
-    resumed = train_radiance(
-        capture(), SHORT, [0, 1, 2], path, on_step=lambda state, loss: steps.append(state.step)
-    )
+    resumed = train_radiance(capture(), SHORT, [0, 1, 2], path, steps_into(steps))
     assert steps == list(range(21, 41))
     for a, b in zip(as_arrays(straight), as_arrays(resumed), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -571,16 +575,16 @@ def test_ctrl_c_ends_between_two_steps_with_a_checkpoint(tmp_path: Path) -> None
     path = tmp_path / "run.safetensors"
     seen: list[int] = []
 
-    def interrupt(state: TrainingState, loss: float) -> None:
-        seen.append(state.step)
-        if state.step == 7:
+    def interrupt(at: Report) -> None:
+        steps_into(seen).show(at)
+        if seen[-1] == 7:
             os.kill(os.getpid(), signal.SIGINT)
 
     handler = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
-        train_radiance(capture(), SHORT, [0, 1, 2], path, on_step=interrupt)
+        train_radiance(capture(), SHORT, [0, 1, 2], path, Progress(interrupt))
     assert signal.getsignal(signal.SIGINT) is handler
-    train_radiance(capture(), SHORT, [0, 1, 2], path, on_step=lambda state, loss: seen.append(state.step))
+    train_radiance(capture(), SHORT, [0, 1, 2], path, steps_into(seen))
     assert seen == list(range(1, 41))
 
 
