@@ -1,4 +1,4 @@
-"""Structure from motion and triangulation, on a small textured room whose shape is known."""
+"""A walk straight ahead between two walls: what structure from motion finds hardest to begin with."""
 
 import json
 import logging
@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,6 +15,7 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
@@ -33,7 +35,49 @@ from tests.support.photographed import (
     poses,
     write_photos,
 )
-from tests.support.street import walk
+
+LENGTH, HALF_WIDTH, HEIGHT = 40.0, 3.0, 4.0  # world units; one walks along y at x = 0 and looks along it
+TEXELS = 24  # per unit
+SIZE, FOCAL = (480, 320), 420.0
+EYE = 1.6  # above the ground
+
+
+@cache
+def _texture(seed: int, across: float) -> Array:
+    """(texels along, texels across) in [0, 255], of the length of the street; nothing repeats."""
+    noise = np.random.default_rng(seed).normal(size=(int(LENGTH * TEXELS) + 2, int(across * TEXELS) + 2))
+    layers = [gaussian_filter(noise, sigma) for sigma in (1.5, 4, 12)]
+    return np.clip(128 + sum(40 * layer / layer.std() for layer in layers), 0, 255)
+
+
+def walk(folder: Path, count: int, step: float = 0.8) -> list[str]:
+    """PNG files in `folder`, taken every `step` units; returns their names."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names = [f"step_{index:02d}.png" for index in range(count)]
+    for index, name in enumerate(names):
+        Image.fromarray(_seen_from(3 + step * index)).reduce(2).save(folder / name)
+    return names
+
+
+def _seen_from(y: float) -> Array:
+    """(2 H, 2 W) uint8."""
+    width, height, focal = 2 * SIZE[0], 2 * SIZE[1], 2 * FOCAL
+    v, u = np.mgrid[:height, :width] + 0.5
+    right, up = (u - width / 2) / focal, (height / 2 - v) / focal - 0.03  # a little downward
+    picture = np.full((height, width), 200.0)
+    with np.errstate(divide="ignore"):
+        depths = np.stack([-EYE / up, -HALF_WIDTH / right, HALF_WIDTH / right])
+    depths[~(depths > 0)] = np.inf
+    nearest, depth = depths.argmin(0), depths.min(0)
+    across = [right * depth + HALF_WIDTH, EYE + up * depth, EYE + up * depth]
+    for number, extent in enumerate((2 * HALF_WIDTH, HEIGHT, HEIGHT)):
+        seen = (nearest == number) & (depth + y < LENGTH) & (across[number] < extent)
+        place = TEXELS * np.stack([depth[seen] + y, across[number][seen]])
+        picture[seen] = map_coordinates(_texture(number, extent), place, order=1, mode="nearest")
+    return picture.astype(np.uint8)
+
+
+# Structure from motion and triangulation, on a small textured room whose shape is known.
 
 pytestmark = pytest.mark.long
 
@@ -502,7 +546,7 @@ def test_a_model_that_was_cut_off_is_not_kept(tmp_path: Path) -> None:
 
 # The lens of a photograph, as COLMAP learns of it from our smaller copy.
 
-FOCAL, ON_FILM, PLANE_X, PLANE_UNIT, WIDTH = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002
+FOCAL_TAG, ON_FILM, PLANE_X, PLANE_UNIT, WIDTH = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002
 
 
 def photo(path: Path, tags: dict[int, float], size: tuple[int, int] = (2000, 1500)) -> Path:
@@ -521,7 +565,7 @@ def on_film(path: Path) -> float | None:
 @pytest.mark.parametrize(("unit", "millimetres"), [(2, 25.4), (3, 10.0), (4, 1.0), (None, 25.4)])
 def test_a_sensor_counted_by_the_inch(unit: int | None, millimetres: float, tmp_path: Path) -> None:
     """A sensor 22.3 mm wide, of 4 to 3, 4000 pixels; the file was made smaller since."""
-    tags: dict[int, float] = {FOCAL: 18.0, PLANE_X: 4000 / 22.3 * millimetres, WIDTH: 4000}
+    tags: dict[int, float] = {FOCAL_TAG: 18.0, PLANE_X: 4000 / 22.3 * millimetres, WIDTH: 4000}
     if unit is not None:
         tags[PLANE_UNIT] = unit
     expected = 18 / (22.3 * 1.25) * np.hypot(36, 24)
@@ -532,11 +576,11 @@ def test_a_sensor_counted_by_the_inch(unit: int | None, millimetres: float, tmp_
     "tags",
     [
         {},
-        {FOCAL: 18.0},
-        {FOCAL: 18.0, PLANE_X: 0.0},
-        {FOCAL: 0.0, PLANE_X: 4500.0},
-        {FOCAL: 18.0, PLANE_X: 4500.0, PLANE_UNIT: 77},
-        {FOCAL: 1e6, PLANE_X: 1e9},
+        {FOCAL_TAG: 18.0},
+        {FOCAL_TAG: 18.0, PLANE_X: 0.0},
+        {FOCAL_TAG: 0.0, PLANE_X: 4500.0},
+        {FOCAL_TAG: 18.0, PLANE_X: 4500.0, PLANE_UNIT: 77},
+        {FOCAL_TAG: 1e6, PLANE_X: 1e9},
     ],
 )
 def test_what_is_no_lens_is_left_out(tags: dict[int, float], tmp_path: Path) -> None:
@@ -544,13 +588,13 @@ def test_what_is_no_lens_is_left_out(tags: dict[int, float], tmp_path: Path) -> 
 
 
 def test_what_the_camera_says_itself_counts(tmp_path: Path) -> None:
-    assert on_film(photo(tmp_path / "a.jpg", {ON_FILM: 31, FOCAL: 18.0, PLANE_X: 4500.0})) == 31
+    assert on_film(photo(tmp_path / "a.jpg", {ON_FILM: 31, FOCAL_TAG: 18.0, PLANE_X: 4500.0})) == 31
 
 
 def test_colmap_begins_with_it(tmp_path: Path) -> None:
     """The database's camera, of photographs that were shrunk; where they were taken is not passed on."""
     for index in range(3):
-        photo(tmp_path / f"{index}.jpg", {FOCAL: 18.0, PLANE_X: 4000 / 22.3 * 25.4, WIDTH: 4000})
+        photo(tmp_path / f"{index}.jpg", {FOCAL_TAG: 18.0, PLANE_X: 4000 / 22.3 * 25.4, WIDTH: 4000})
 
     def cancel(label: str, _: float) -> None:
         if label == "matching photographs":

@@ -16,7 +16,7 @@ from langsplat_core.pipeline.forecast import (
     plan,
 )
 from langsplat_core.pipeline.report import APART, REPORT, camera_groups, doubts, stated_doubts, work_folder
-from langsplat_core.progress import ALL_STAGES, Progress, Report, duration
+from langsplat_core.progress import ALL_STAGES, Progress, Report
 from langsplat_core.scene import Camera, look_at
 from langsplat_core.training.radiance.train import ViewScore
 
@@ -193,18 +193,6 @@ def test_masks_cost_what_points_crops_and_weights_do(tmp_path: Path):
         weights.truncate(4 * 94_000_000)  # a hole: no byte is written
     assert cost(str(file), points_per_side=8) == pytest.approx(few)
     assert forecast_in_words(STAGES, on_gpu=True).startswith("about 2 min on two CPU cores and a GPU (")
-
-
-def test_words():
-    assert [duration(seconds) for seconds in (0, 44, 89, 100, 3000, 9000)] == [
-        "10 s",
-        "40 s",
-        "90 s",
-        "2 min",
-        "50 min",
-        "2 h",
-    ]
-    assert forecast_in_words(STAGES).startswith("about 2 min on two CPU cores (photographs 10 s, masks")
 
 
 def test_photographs_are_counted_where_they_lie(tmp_path: Path):

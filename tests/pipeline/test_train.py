@@ -30,7 +30,7 @@ from langsplat_core.io.ply import write_metres
 from langsplat_core.pipeline import language, train
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import train_scene
-from langsplat_core.progress import Cancelled, LineProgress, Progress, Report
+from langsplat_core.progress import Cancelled, Progress, Report
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics import store
 from langsplat_core.semantics.masks import LevelMasks
@@ -359,25 +359,6 @@ def test_presets_are_defaults_that_options_override():
     assert quick == replace(expected, radiance=replace(expected.radiance, steps=7))
     both = parse([*words, "--profile", "paper", "--preset", "good"]).config
     assert both == with_preset(PAPER, "good")
-
-
-def test_progress_as_lines_for_other_programs(capsys):
-    with LineProgress() as progress:
-        progress("a\n", 0.25, "one", loss=0.25)
-        progress("a\n", 0.2501, "one", loss=0.250001)
-        progress("b", 7.0)
-    reports = [Report.from_json(line) for line in capsys.readouterr().err.splitlines()]
-    assert reports == [Report("a\n", 0.25, "one", {"loss": 0.25}), Report("b", 1.0)]
-    assert reports[0].text == "a\n: one, loss 0.2500"
-    for line in (
-        "plain words",
-        '{"stage": 3}',
-        '"text"',
-        "[1]",
-        '{"stage": "a", "fraction": 0, "metrics": 1}',
-    ):
-        with pytest.raises(ValueError):
-            Report.from_json(line)
 
 
 # What changes around a training between its interruption and its end, and around a program that reads.
