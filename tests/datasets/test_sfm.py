@@ -330,12 +330,6 @@ def test_copies_are_upright_and_keep_the_focal_length(tmp_path: Path) -> None:
         assert copy.getexif().get(0x0112, 1) == 1
 
 
-def test_too_few_photographs_say_so(tmp_path: Path) -> None:
-    write_photos(tmp_path / "two", LENS.regridded(64, 48), poses(2))
-    with pytest.raises(InputError, match="has 2 photographs; at least 3"):
-        load_capture(tmp_path / "two", CONFIG, tmp_path / "work")
-
-
 def test_photographs_that_do_not_overlap_say_so(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for index in range(3):
@@ -585,10 +579,6 @@ def test_a_sensor_counted_by_the_inch(unit: int | None, millimetres: float, tmp_
 )
 def test_what_is_no_lens_is_left_out(tags: dict[int, float], tmp_path: Path) -> None:
     assert on_film(photo(tmp_path / "a.jpg", tags)) is None
-
-
-def test_what_the_camera_says_itself_counts(tmp_path: Path) -> None:
-    assert on_film(photo(tmp_path / "a.jpg", {ON_FILM: 31, FOCAL_TAG: 18.0, PLANE_X: 4500.0})) == 31
 
 
 def test_colmap_begins_with_it(tmp_path: Path) -> None:

@@ -55,10 +55,6 @@ def test_two_groups_of_cameras():
     assert "2 groups far apart (9 and 6 photographs)" in doubt
 
 
-def test_a_single_stray_camera_is_no_group():
-    assert camera_groups(np.array([c.position for c in [*ring(9), *ring(1, (500.0, 0, 0))]])) == (9,)
-
-
 @pytest.mark.parametrize("factor", [0.5, 0.9])
 def test_a_wide_step_is_not_yet_a_gap(factor):
     line = np.zeros((20, 3))
@@ -148,12 +144,6 @@ def test_stages_never_go_back():
     run.at(0, "masks and vectors", 0.5)
     run.progress("reading photographs", 1.0)
     assert run.said[-1] == Report("reading photographs", 1.0)  # nothing new of the whole
-
-
-def test_everything_that_is_reported_is_passed_on():
-    run = Run()
-    run.progress("reading photographs", 0.25, "a.jpg", loss=0.5)
-    assert run.said[0] == Report("reading photographs", 0.25, "a.jpg", {"loss": 0.5})
 
 
 def test_costs_grow_with_what_is_asked_for():

@@ -139,11 +139,6 @@ def test_more_regions_than_half_integers_hold(tmp_path: Path) -> None:
     np.testing.assert_array_equal(FeatureStore(tmp_path).load("many").labels, labels)
 
 
-def test_rows_beyond_the_vectors_are_refused() -> None:
-    with pytest.raises(ValueError, match="labels: rows"):
-        ImageFeatures(np.full((3, 2, 2), 1, np.int32), np.zeros((1, 4), np.float32))
-
-
 def test_another_key_is_not_what_is_wanted(tmp_path: Path) -> None:
     store = FeatureStore(tmp_path)
     assert not store.has("a")
@@ -306,14 +301,6 @@ def test_what_fails_behind_the_model_is_raised(fails: int, tmp_path: Path) -> No
     with pytest.raises(InputError, match="no room"):
         describe_capture(images, names, InTwoParts(fails), ColourEncoder(), store)
     assert [store.has(name) for name in names] == [n < fails for n in range(4)]
-
-
-def test_changed_settings_redo_what_is_stored(tmp_path: Path) -> None:
-    store, encoder = FeatureStore(tmp_path), ColourEncoder()
-    describe_capture([red_and_blue()], ["a"], Halves(), encoder, store)
-    changed = Halves("other thresholds")
-    describe_capture([red_and_blue()], ["a"], changed, encoder, store)
-    assert changed.calls == 1
 
 
 def test_a_photograph_one_pixel_wide(tmp_path: Path) -> None:
