@@ -17,7 +17,7 @@ from imgui_bundle import immapp
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui
 
 import glfw  # isort: skip
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_viewer.drawing.frame import FrameRenderer
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest, open_window

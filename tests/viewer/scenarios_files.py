@@ -10,9 +10,10 @@ import numpy as np
 from PIL import Image
 
 from imgui_bundle import imgui  # isort: skip
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.pipeline.report import REPORT
 from langsplat_viewer import actions
+from langsplat_viewer import viewer as training
 from langsplat_viewer.panels.area import scene_area
 from tests.support.fakes import CENTRES, blob_scene
 
@@ -182,7 +183,7 @@ def watch_a_training(s: Any) -> None:
     photographs.mkdir()
     for number in range(3):
         (photographs / f"{number}.jpg").write_bytes(b"")
-    viewer.command = lambda request: [sys.executable, "-c", TRAINS]
+    training.command = lambda request: [sys.executable, "-c", TRAINS]
     actions.choose_photographs(viewer, photographs)
     actions.open_panel(viewer, "Train")
     s.ctx.yield_(3)
@@ -217,7 +218,7 @@ def read_what_speaks_against(s: Any) -> None:
     report = s.folder / "photos.work" / REPORT
     report.parent.mkdir()
     report.write_text(json.dumps({"gaussians": len(s.state.scene.gaussians), "doubts": DOUBTS}))
-    viewer.command = lambda request: [sys.executable, "-c", "print('photos.ply: 360 Gaussians')"]
+    training.command = lambda request: [sys.executable, "-c", "print('photos.ply: 360 Gaussians')"]
     actions.choose_photographs(viewer, photographs)
     actions.open_panel(viewer, "Train")
     s.ctx.yield_(3)

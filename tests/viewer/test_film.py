@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from langsplat_core.errors import InputError
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.progress import Cancelled, Progress, Report
 from langsplat_viewer import __main__ as program
 from langsplat_viewer import options

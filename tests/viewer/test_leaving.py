@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_viewer import actions
 from langsplat_viewer.actions.selecting import take
 from tests.support.fakes import COLOURS

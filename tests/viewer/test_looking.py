@@ -9,7 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from langsplat_core.config import INRIA, PictureConfig
-from langsplat_core.io import save_scene, write_cameras
+from langsplat_core.io.cameras import write_cameras
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_viewer import __main__ as program
 from langsplat_viewer.camera.controls import default_view, extent_of

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from langsplat_core.io import load_scene, save_scene
+from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer import actions
 from langsplat_viewer.options import say_compiling

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from PIL import Image
 
 from langsplat_core.config import PictureConfig
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_viewer import __main__ as program
 from langsplat_viewer import actions, options
 from langsplat_viewer.actions.filming import subject_of

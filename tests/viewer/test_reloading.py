@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_core.io import load_scene, save_scene
+from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_viewer import actions
 from langsplat_viewer.files.watching import Watch, stamps
 from tests.support.fakes import blob_scene

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from tests.support.fakes import blob_scene
 from tests.support.on_display import play
 

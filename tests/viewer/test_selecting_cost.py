@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.query.selection import in_polygon, in_rectangle, in_stroke, on_surface, project
 from langsplat_viewer.marks import unmarked
 from langsplat_viewer.staging import marked_scene

@@ -11,7 +11,7 @@ import moderngl
 import numpy as np
 import pytest
 
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
 from langsplat_viewer.canvas import NOTHING_LEFT, REST_SECONDS, Canvas

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from langsplat_core.io import cameras, language
-from langsplat_core.io.sog import META_NAME
+from langsplat_core.io.scenes import format_of
 from langsplat_core.pipeline.forecast import count_photographs
 from langsplat_core.pipeline.report import work_folder
 from langsplat_viewer.actions.filming import load_path
@@ -15,7 +15,7 @@ from langsplat_viewer.actions.queries import load_queries
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.files import watching
 from langsplat_viewer.files.browsing import SUFFIX as QUERIES
-from langsplat_viewer.files.browsing import Entry, is_scene, list_folder
+from langsplat_viewer.files.browsing import Entry, list_folder
 from langsplat_viewer.files.flight_files import SUFFIX as PATHS
 from langsplat_viewer.files.watching import Stamps
 from langsplat_viewer.jobs import one_line
@@ -185,7 +185,7 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
     if not scenes:
         _ask_sets(viewer, sets)
         return
-    known = [path for path in scenes if is_scene(path)] or scenes[:1]
+    known = [path for path in scenes if format_of(path)] or scenes[:1]
     others = [path.name for path in scenes if path not in known]
     if others:
         more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
@@ -203,7 +203,7 @@ def open_all(viewer: Viewer) -> None:
     listing = viewer.state.browser
     if listing is not None:
         open_scenes(
-            viewer, [entry.path for entry in listing.entries if entry.is_file and is_scene(entry.path)]
+            viewer, [entry.path for entry in listing.entries if entry.is_file and format_of(entry.path)]
         )
         open_panel(viewer, "Scene")
 
@@ -235,6 +235,6 @@ def open_typed(viewer: Viewer) -> None:
 
 def _is_plain_folder(path: Path) -> bool:
     try:
-        return path.is_dir() and not (path / META_NAME).is_file()
+        return path.is_dir() and format_of(path) is None
     except OSError:  # a name that no file system takes: opening it says so
         return False

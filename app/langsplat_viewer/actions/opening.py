@@ -10,7 +10,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.compiled import is_compiled
 from langsplat_core.display.displays import DISPLAYS, latent_colours
 from langsplat_core.errors import InputError
-from langsplat_core.io import scene_files
+from langsplat_core.io.scenes import scene_files
 from langsplat_core.pipeline.report import stated_doubts
 from langsplat_core.progress import Progress
 from langsplat_core.query import surface

@@ -4,8 +4,9 @@ from pathlib import Path
 
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
+from langsplat_core.io.scenes import format_of
 from langsplat_viewer import actions
-from langsplat_viewer.files.browsing import Entry, Listing, is_scene
+from langsplat_viewer.files.browsing import Entry, Listing
 from langsplat_viewer.panels.style import bad, muted, small_wrapped
 from langsplat_viewer.viewer import Viewer
 
@@ -49,7 +50,7 @@ def _foot(viewer: Viewer, listing: Listing) -> None:
 
 def has_several(listing: Listing) -> bool:
     """Whether there is more than one scene to open."""
-    return sum(entry.is_file and is_scene(entry.path) for entry in listing.entries) > 1
+    return sum(entry.is_file and format_of(entry.path) is not None for entry in listing.entries) > 1
 
 
 def _box(viewer: Viewer) -> None:

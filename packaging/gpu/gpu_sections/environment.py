@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 
 from gpu_sections import Plan, need_cuda
+from langsplat_core.bench.raster import describe_machine
 from langsplat_core.errors import BackendError
-from langsplat_core.lab.speed.raster import describe_machine
 from langsplat_core.raster.gsplat import require_device
 
 LIBRARIES = ("torch", "gsplat", "transformers", "numpy", "numba", "moderngl")

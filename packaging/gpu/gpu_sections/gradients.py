@@ -8,9 +8,9 @@ import torch
 from gpu_sections import Plan, need_cuda, table
 from gpu_sections.raster import device_gaussians
 from langsplat_core.arrays import Array
+from langsplat_core.bench.measure import Case, default_camera, random_scene
+from langsplat_core.bench.torch_rasterizer import TorchRasterizer
 from langsplat_core.config import INRIA
-from langsplat_core.lab.speed.cases import Case, default_camera, random_scene
-from langsplat_core.lab.speed.torch_baseline import TorchRasterizer
 from langsplat_core.raster import gsplat, load_lifting_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 

@@ -7,13 +7,18 @@ import moderngl
 
 from gpu_sections import Missing, Plan
 from gpu_sections.pictures import bundled_scene
+from langsplat_core.bench.measure import (
+    Case,
+    Foresight,
+    default_camera,
+    random_scene,
+    reference_windows,
+    warm_up,
+)
+from langsplat_core.bench.measure import measure as measure_backend
+from langsplat_core.bench.raster import table as speed_table
 from langsplat_core.config import INRIA
 from langsplat_core.errors import BackendError
-from langsplat_core.lab.speed.cases import Case, default_camera, random_scene
-from langsplat_core.lab.speed.measure import Foresight, warm_up
-from langsplat_core.lab.speed.measure import measure as measure_backend
-from langsplat_core.lab.speed.report import table as speed_table
-from langsplat_core.lab.speed.truth import make_truth
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.opengl.scene_textures import create_egl_context
 from langsplat_viewer.drawing.frame import is_software
@@ -46,8 +51,8 @@ def tables(plan: Plan, context: moderngl.Context) -> Iterator[str]:
     backends = [load_rasterizer("opengl", ctx=context, precision=p) for p in ("single", "half")]
     warm_up(backends, (3,))
     for case in cases:
-        truth = make_truth(case.gaussians, case.camera, ENDLESS)
+        exact = reference_windows(case.gaussians, case.camera, ENDLESS)
         rows = []
         for backend in backends:
-            rows += measure_backend(backend, case, 3, truth, Foresight(30.0))
+            rows += measure_backend(backend, case, 3, exact, Foresight(30.0))
         yield speed_table(rows)

@@ -9,8 +9,8 @@ import numpy as np
 from gpu_sections import Plan
 from langsplat_core import load_scene, render
 from langsplat_core.arrays import unit
+from langsplat_core.bench.measure import label_maps
 from langsplat_core.datasets.capture import Capture
-from langsplat_core.lab.speed.measure import label_maps
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.store import ImageFeatures
 

@@ -5,12 +5,17 @@ from collections.abc import Iterator
 import torch
 
 from gpu_sections import Plan, forget_peak, milliseconds, need_cuda, peak_mib, table
+from langsplat_core.bench.measure import (
+    Case,
+    Foresight,
+    default_camera,
+    random_scene,
+    reference_windows,
+    warm_up,
+)
+from langsplat_core.bench.measure import measure as measure_backend
+from langsplat_core.bench.raster import table as speed_table
 from langsplat_core.config import INRIA
-from langsplat_core.lab.speed.cases import Case, default_camera, random_scene
-from langsplat_core.lab.speed.measure import Foresight, warm_up
-from langsplat_core.lab.speed.measure import measure as measure_backend
-from langsplat_core.lab.speed.report import table as speed_table
-from langsplat_core.lab.speed.truth import make_truth
 from langsplat_core.raster import gsplat, load_rasterizer
 
 LONGEST_S = 10.0  # what is likely to take the CPU longer is not begun
@@ -34,9 +39,9 @@ def measure(plan: Plan) -> Iterator[str]:
         case = Case("random", random_scene(count), default_camera(*size))
         rows = []
         for backend in backends:
-            truth = make_truth(case.gaussians, case.camera, settings[backend.name])
+            exact = reference_windows(case.gaussians, case.camera, settings[backend.name])
             for channels in plan.channels:
-                rows += measure_backend(backend, case, channels, truth, foresight)
+                rows += measure_backend(backend, case, channels, exact, foresight)
         yield speed_table(rows)
         yield "On the device alone, scene and picture staying there:\n"
         yield _on_device(case, plan.channels)
