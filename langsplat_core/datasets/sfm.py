@@ -418,13 +418,13 @@ def write_left_out(folder: Path, located: Collection[str]) -> None:
         names = {image.image_id: image.name for image in database.read_all_images()}
         features = {number: database.num_keypoints_for_image(number) for number in names}
         pairs, inliers = database.read_two_view_geometry_num_inliers()
-    friends: dict[int, int] = dict.fromkeys(names, 0)
+    matched: dict[int, int] = dict.fromkeys(names, 0)
     for pair, count in zip(pairs, inliers, strict=True):
         if count >= FEWEST_MATCHES:
             for number in pycolmap.pair_id_to_image_pair(pair):
-                friends[number] += 1
+                matched[number] += 1
     why = {
-        name: _reason(features[number], friends[number])
+        name: _reason(features[number], matched[number])
         for number, name in names.items()
         if name not in located
     }
@@ -432,13 +432,13 @@ def write_left_out(folder: Path, located: Collection[str]) -> None:
         temporary.write_text(json.dumps(why, sort_keys=True))
 
 
-def _reason(features: int, friends: int) -> str:
+def _reason(features: int, matched: int) -> str:
     """Reason in words, from the number of features and of photographs that share enough of them."""
     if features == 0:
         return "no features (nothing but plain areas, or blurred)"
     if features < FEWEST_FEATURES:
         return "too few features (plain, dark, blurred or tiny)"
-    if friends == 0:
+    if matched == 0:
         return "no matches with any other"
     return "matched, but from one and the same place, or without enough overlap"
 

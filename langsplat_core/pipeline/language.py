@@ -18,7 +18,7 @@ from langsplat_core.config import LiftConfig, TrainConfig
 from langsplat_core.errors import InputError
 from langsplat_core.pipeline.stages import (
     Arrays,
-    Crew,
+    ProcessGroup,
     features_digest,
     gaussians_digest,
     kept,
@@ -77,7 +77,7 @@ def language_field(
     config: TrainConfig,
     work: Path,
     progress: Progress,
-    crew: Crew | None = None,
+    processes: ProcessGroup | None = None,
 ) -> tuple[LanguageField, CodecReport]:
     """The language field of the views' mask vectors, and what its codec loses.
 
@@ -85,7 +85,7 @@ def language_field(
     """
     check_lift(config)
     check_masks(features for _, features in views)
-    stages = _Stages(gaussians, views, encoder, config, work, crew or Crew(), progress)
+    stages = _Stages(gaussians, views, encoder, config, work, processes or ProcessGroup(), progress)
     codec, report = stages.codec()
     latents, confidence = stages.latents(codec)
     field = LanguageField(
@@ -129,11 +129,11 @@ class _Stages:
         encoder: Encoder,
         config: TrainConfig,
         work: Path,
-        crew: Crew,
+        processes: ProcessGroup,
         progress: Progress,
     ) -> None:
         self._gaussians, self._views, self._encoder = gaussians, views, encoder
-        self._config, self._work, self._crew, self._progress = config, work, crew, progress
+        self._config, self._work, self._processes, self._progress = config, work, processes, progress
         self._lift = _what_matters(config.lift)
         self._robust = self._lift.mode == "median"
         self._vectors, digests = [], []
@@ -150,7 +150,7 @@ class _Stages:
         path = self._work / f"{stage_key('codec', 2, *self._inputs, fitted_to, self._config.codec)}.npz"
         if self._lift.mode not in LATENT_LIFTS and not path.exists():
             self._memberships()  # everyone's work, unlike the fit
-        return self._crew.once(lambda: kept(path, self._fit, _pack_codec, _unpack_codec))
+        return self._processes.once(lambda: kept(path, self._fit, _pack_codec, _unpack_codec))
 
     def latents(self, codec: Codec) -> Latents:
         """Return the latents of every Gaussian at every level, and the confidence in them."""
@@ -158,9 +158,11 @@ class _Stages:
         done = blocks.with_name(f"{blocks.name}.npz")
         if self._lift.mode not in LATENT_LIFTS and not done.exists():
             self._lift_blocks(codec, blocks)
-            self._crew.meet()
-        made = self._crew.once(lambda: kept(done, lambda: self._all_latents(codec, blocks), _pack, _unpack))
-        if self._crew.leads:
+            self._processes.barrier()
+        made = self._processes.once(
+            lambda: kept(done, lambda: self._all_latents(codec, blocks), _pack, _unpack)
+        )
+        if self._processes.is_main:
             shutil.rmtree(blocks, ignore_errors=True)
         return made
 
@@ -172,7 +174,7 @@ class _Stages:
         path = self._work / f"{stage_key('things', 1, *self._inputs)}.npy"
         if not path.exists():
             self._memberships()  # everyone's work
-        self._crew.once(lambda: kept_array(path, self._find_things))
+        self._processes.once(lambda: kept_array(path, self._find_things))
         return np.array(open_array(path))
 
     def _find_things(self) -> Array:
@@ -207,7 +209,7 @@ class _Stages:
         def lift(number: int) -> Latents:
             return _encoded(codec, lift_block(memberships, groups, number, self._robust))
 
-        for number in self._crew.share(range(len(memberships.blocks))):
+        for number in self._processes.share(range(len(memberships.blocks))):
             kept(folder / f"{number:05d}.npz", partial(lift, number), _pack, _unpack)
             self._progress("averaging mask vectors", (number + 1) / len(memberships.blocks))
 
@@ -231,12 +233,12 @@ class _Stages:
             folder = self._work / stage_key("memberships", 2, *self._inputs)
             files = [folder / f"{index:05d}.npy" for index in range(len(self._views))]
             rasterizer = self._rasterizer()
-            for index in self._crew.share(range(len(self._views))):
+            for index in self._processes.share(range(len(self._views))):
                 kept_array(files[index], partial(self._pairs, rasterizer, index))
                 self._progress("lifting masks onto the Gaussians", (index + 1) / len(self._views))
-            self._crew.meet()
+            self._processes.barrier()
             pairs = [open_array(path) for path in files]
-            groups = self._crew.once(lambda: self._groups(folder / "groups.npz"))
+            groups = self._processes.once(lambda: self._groups(folder / "groups.npz"))
             self._made = Memberships(pairs, len(self._gaussians)), groups
         return self._made
 

@@ -164,14 +164,14 @@ PATIENCE = timedelta(days=7)  # radiance training is one process's work, and the
 
 
 @dataclass(frozen=True)
-class Crew:
+class ProcessGroup:
     """This process among all of them; alone by default."""
 
     rank: int = 0
     size: int = 1
 
     @property
-    def leads(self) -> bool:
+    def is_main(self) -> bool:
         """True for the process that does what cannot be shared, and that speaks."""
         return self.rank == 0
 
@@ -179,7 +179,7 @@ class Crew:
         """The items that are this process's."""
         return list(items[self.rank :: self.size])
 
-    def meet(self) -> None:
+    def barrier(self) -> None:
         """Wait for all. Raises InputError where one of them is no more."""
         if self.size < 2:
             return
@@ -196,23 +196,23 @@ class Crew:
 
     def once(self, make: Callable[[], T]) -> T:
         """The result of `make`, which keeps it in a file: made by one process and read by the others."""
-        if self.leads:
+        if self.is_main:
             result = make()
-            self.meet()
+            self.barrier()
             return result
-        self.meet()
+        self.barrier()
         return make()
 
 
-def join_crew() -> Crew:
-    """The crew that torchrun started this process in; a crew of one without it."""
+def join_processes() -> ProcessGroup:
+    """Join the processes that torchrun started; a group of one without it."""
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size < 2:
-        return Crew()
+        return ProcessGroup()
     import torch.distributed
 
     if not torch.distributed.is_initialized():
         torch.distributed.init_process_group("gloo", timeout=PATIENCE)
     if torch.cuda.is_available():
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
-    return Crew(torch.distributed.get_rank(), torch.distributed.get_world_size())
+    return ProcessGroup(torch.distributed.get_rank(), torch.distributed.get_world_size())

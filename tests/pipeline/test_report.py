@@ -15,7 +15,14 @@ from langsplat_core.pipeline.forecast import (
     forecast_in_words,
     plan,
 )
-from langsplat_core.pipeline.report import APART, REPORT, camera_groups, doubts, stated_doubts, work_folder
+from langsplat_core.pipeline.report import (
+    APART,
+    REPORT,
+    camera_groups,
+    quality_warnings,
+    stated_warnings,
+    work_folder,
+)
 from langsplat_core.progress import ALL_STAGES, Progress, Report
 from langsplat_core.scene import Camera, look_at
 from langsplat_core.training.radiance.train import ViewScore
@@ -35,24 +42,24 @@ def score(psnr: float, covered: float = 0.9) -> ViewScore:
 
 
 def test_nothing_is_said_of_a_good_scene():
-    assert doubts([score(27.0), score(14.0)], ring(20)) == ()
-    assert doubts([], ring(20)) == ()
-    assert doubts([], []) == ()
+    assert quality_warnings([score(27.0), score(14.0)], ring(20)) == ()
+    assert quality_warnings([], ring(20)) == ()
+    assert quality_warnings([], []) == ()
 
 
 @pytest.mark.parametrize(
     ("scores", "says"), [([score(12.5), score(14.5)], "at 13.5 dB"), ([score(20, 0.3)], "only 30 %")]
 )
 def test_what_speaks_against_it_is_one_sentence_with_a_remedy(scores, says):
-    (doubt,) = doubts(scores, ring(12))
-    assert says in doubt
-    assert "\n" not in doubt
-    assert "photograph" in doubt.partition(":")[2]
+    (warning,) = quality_warnings(scores, ring(12))
+    assert says in warning
+    assert "\n" not in warning
+    assert "photograph" in warning.partition(":")[2]
 
 
 def test_two_groups_of_cameras():
-    (doubt,) = doubts([], [*ring(9), *ring(6, (500.0, 0, 0))])
-    assert "2 groups far apart (9 and 6 photographs)" in doubt
+    (warning,) = quality_warnings([], [*ring(9), *ring(6, (500.0, 0, 0))])
+    assert "2 groups far apart (9 and 6 photographs)" in warning
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.9])
@@ -72,15 +79,24 @@ def test_positions_that_say_nothing(positions):
 
 def test_a_report_beside_a_scene_says_its_doubts_and_a_strange_one_nothing(tmp_path: Path) -> None:
     scene = tmp_path / "s.ply"
-    assert stated_doubts(scene, 3) == ()
+    assert stated_warnings(scene, 3) == ()
     report = work_folder(scene) / REPORT
     report.parent.mkdir()
-    report.write_text(json.dumps({"gaussians": 3, "doubts": ["dim: look\nagain", 4]}))
-    assert stated_doubts(scene, 3) == ("dim: look again",)
-    assert stated_doubts(scene, 4) == ()  # of another scene, or of an earlier state of it
-    for text in ("[]", "{", '{"gaussians": 3}', '{"gaussians": 3, "doubts": "all"}', "\udcff", "[" * 10_000):
+    report.write_text(json.dumps({"gaussians": 3, "warnings": ["dim: look\nagain", 4]}))
+    assert stated_warnings(scene, 3) == ("dim: look again",)
+    report.write_text(json.dumps({"gaussians": 3, "doubts": ["of an earlier version"]}))
+    assert stated_warnings(scene, 3) == ("of an earlier version",)
+    assert stated_warnings(scene, 4) == ()  # of another scene
+    for text in (
+        "[]",
+        "{",
+        '{"gaussians": 3}',
+        '{"gaussians": 3, "warnings": "all"}',
+        "\udcff",
+        "[" * 10_000,
+    ):
         report.write_bytes(text.encode("utf-8", "surrogateescape"))
-        assert stated_doubts(scene, 3) == ()
+        assert stated_warnings(scene, 3) == ()
 
 
 # What a training is said to cost, and how much is said to be left, on a clock of the test's own.

@@ -13,7 +13,7 @@ import torch.distributed
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
-from langsplat_core.pipeline.stages import LOCK, Crew, join_crew, sole_use
+from langsplat_core.pipeline.stages import LOCK, ProcessGroup, join_processes, sole_use
 from langsplat_core.pipeline.train import StoredViews
 from langsplat_core.training.language import codec_fit
 from tests.support.lifting import make_views
@@ -64,16 +64,16 @@ OPTIONS = (
 
 def test_every_item_is_shared_once():
     items = list(range(11))
-    shares = [Crew(rank, 3).share(items) for rank in range(3)]
+    shares = [ProcessGroup(rank, 3).share(items) for rank in range(3)]
     assert sorted(item for share in shares for item in share) == items
     assert max(map(len, shares)) - min(map(len, shares)) <= 1
-    assert [Crew(rank, 3).leads for rank in range(3)] == [True, False, False]
+    assert [ProcessGroup(rank, 3).is_main for rank in range(3)] == [True, False, False]
 
 
 def test_alone_without_a_launcher(monkeypatch):
     monkeypatch.delenv("WORLD_SIZE", raising=False)
-    assert join_crew() == Crew(0, 1)
-    assert Crew().once(lambda: 7) == 7
+    assert join_processes() == ProcessGroup(0, 1)
+    assert ProcessGroup().once(lambda: 7) == 7
 
 
 def test_a_lost_process_is_said_in_one_line(monkeypatch):
@@ -82,7 +82,7 @@ def test_a_lost_process_is_said_in_one_line(monkeypatch):
 
     monkeypatch.setattr("torch.distributed.barrier", lost)
     with pytest.raises(InputError, match=r"ended \(Connection closed by peer .*what is finished is kept"):
-        Crew(1, 2).meet()
+        ProcessGroup(1, 2).barrier()
 
 
 def test_views_are_read_when_they_are_looked_at():

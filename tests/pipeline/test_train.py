@@ -76,7 +76,7 @@ def test_photographs_become_a_searchable_scene(room, tmp_path):
     assert report.held_out == 2
     assert report.gaussians == len(scene.gaussians) > 0
     assert report.psnr is not None
-    assert any("reproduced" in doubt for doubt in report.doubts) == (report.psnr < 16)
+    assert any("reproduced" in warning for warning in report.warnings) == (report.psnr < 16)
     assert report.observed > 0.5
     assert report.masks == "graph (no weights)"
     np.testing.assert_allclose(np.linalg.norm(scene.language.canonical, axis=1), 1, atol=1e-5)
@@ -85,7 +85,7 @@ def test_photographs_become_a_searchable_scene(room, tmp_path):
     assert 0 < result.peak < 1
     assert json.loads((tmp_path / "scene.work" / "report.json").read_text())["views"] == 3
     again = train_scene(room, out, tiny_settings(room))
-    assert again.doubts == report.doubts  # as they were read from the file
+    assert again.warnings == report.warnings  # as they were read from the file
 
 
 STAGES = (
