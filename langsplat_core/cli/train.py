@@ -46,7 +46,8 @@ class Train:
     """How much is spent: quick takes minutes on a CPU, good perhaps half an hour, full is as published and
     for a GPU; options beside it still count."""
     progress: Literal["bars", "lines"] = "bars"
-    """How progress is shown: as bars, or for other programs as lines of JSON, both on standard error."""
+    """How progress is shown: as bars, or for other programs as lines of JSON (stage, fraction, note,
+    metrics), both on standard error."""
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml")] = None
     """A file of options, `preset = "good"` or `radiance.steps = 7000`; options beside it count more."""
     gaussians: Path | None = None
