@@ -386,8 +386,8 @@ class Proposal:
         return mask
 
 
-class SamMasks:
-    """A `MaskSource` that asks a segmenter."""
+class SamMasks(MaskSource):
+    """Masks of a segmenter's answers to a grid of points."""
 
     def __init__(self, segmenter: Segmenter, config: MaskConfig, half: bool = False) -> None:
         """half: whether the model multiplies in float16, see `HALF_ON`."""

@@ -20,7 +20,7 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import exists, read_npz
 from langsplat_core.progress import Progress, silent
-from langsplat_core.semantics.masks import LevelMasks, MaskSource, SplitMaskSource, label_maps
+from langsplat_core.semantics.masks import LevelMasks, MaskSource, label_maps
 
 
 def masked_crop(image: Array, mask: Array, size: int) -> Array:
@@ -248,7 +248,7 @@ def describe_capture(
             part(MASKS_STAGE, 0.0)
             key = feature_key(image, mask_source, made_by)
             if not store.has(name, key):
-                finish = _begin(mask_source, image, part)
+                finish = mask_source.begin(image, part)
                 if before is not None:  # one photograph's full-size masks at a time
                     before.result()
                 before = worker.submit(keep, finish, image, name, key)
@@ -256,10 +256,3 @@ def describe_capture(
             before.result()
     progress(MASKS_STAGE, 1.0)
     return StoredFeatures(store, names)
-
-
-def _begin(source: MaskSource, image: Array, progress: Progress) -> Callable[[], LevelMasks]:
-    if isinstance(source, SplitMaskSource):
-        return source.begin(image, progress)
-    found = source(image, progress)
-    return lambda: found

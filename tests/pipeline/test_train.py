@@ -33,7 +33,7 @@ from langsplat_core.pipeline.train import train_scene
 from langsplat_core.progress import Cancelled, Progress, Report
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics import store
-from langsplat_core.semantics.masks import LevelMasks
+from langsplat_core.semantics.masks import LevelMasks, MaskSource
 from tests.support.another_user import bound_by_permissions
 from tests.support.fakes import blob_scene
 from tests.support.tiny_room import tiny_room, tiny_settings
@@ -235,7 +235,7 @@ def test_what_cannot_be_used_is_said_before_anything_is_made(room, tmp_path):
     assert not list(tmp_path.glob("**/*.ply"))
 
 
-class Blind:
+class Blind(MaskSource):
     """A mask source that finds nothing."""
 
     name = key = "blind"

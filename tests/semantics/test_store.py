@@ -11,7 +11,7 @@ import pytest
 from langsplat_core.arrays import unit
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.progress import Cancelled, Progress, Report, silent
-from langsplat_core.semantics.masks import LevelMasks
+from langsplat_core.semantics.masks import LevelMasks, MaskSource
 from langsplat_core.semantics.store import (
     FeatureStore,
     ImageFeatures,
@@ -80,13 +80,12 @@ class ColourEncoder:
         return unit(seen.max(axis=1) + 1e-3).astype(np.float32).reshape(len(crops), 3)
 
 
-class Halves:
+class Halves(MaskSource):
     """A mask source: left and right at subpart level, everything at whole level, no parts."""
 
-    name = "halves"
+    name = key = "halves"
 
-    def __init__(self, key: str = "1") -> None:
-        self.key = key
+    def __init__(self) -> None:
         self.calls = 0
 
     def __call__(self, image: np.ndarray, progress: Progress) -> LevelMasks:
@@ -210,7 +209,7 @@ def test_the_key_follows_all_that_matters() -> None:
     encoder, image = ColourEncoder(), red_and_blue()
     keys = {
         feature_key(image, Halves(), fingerprint(encoder)),
-        feature_key(image, Halves("2"), fingerprint(encoder)),
+        feature_key(image, OtherHalves(), fingerprint(encoder)),
     }
     keys.add(feature_key(image[::-1], Halves(), fingerprint(encoder)))
     keys.add(feature_key(red_and_blue(20, 10), Halves(), fingerprint(encoder)))
@@ -258,6 +257,12 @@ def test_an_interrupted_run_continues_where_it_stopped(tmp_path: Path) -> None:
         np.testing.assert_array_equal(one.vectors, other.vectors)
     assert np.unique(found[0].labels).tolist() == [-1, 0, 1, 2]
     np.testing.assert_allclose(found[0].vectors[:2], [[1, 0, 0], [0, 0, 1]], atol=1e-4)
+
+
+class OtherHalves(Halves):
+    """Halves by other settings."""
+
+    key = "other thresholds"
 
 
 class InTwoParts(Halves):
