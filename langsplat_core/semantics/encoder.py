@@ -1,4 +1,4 @@
-"""Image-text encoders as callers see them: checks of phrases and pictures, batches, unit vectors.
+"""Image-text encoders as callers see them: checks of phrases and images, batches, unit vectors.
 
 A family of models (`encoders`) brings two towers, each a few lines.
 """
@@ -129,10 +129,6 @@ def _stated(weights: Weights, name: str, role: str) -> str | None:
     return content if isinstance(content, str) else None
 
 
-# Image-text encoders as callers see them: checks of phrases and pictures, batches, unit vectors.
-#
-# A family of models (`encoders`) brings two towers, each a few lines.
-
 OPEN_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 VOCABULARY = "vocabulary.txt"  # beside the weights: the only words the encoder was taught, one per line
 READING = "reading.json"  # beside the weights, optional: fields of `scene.Reading`, but for the temperature
@@ -165,12 +161,12 @@ class TextTower(Protocol):
         `tokens.check_whole`: no part of a phrase is left out in silence."""
 
 
-class PictureTower(Protocol):
-    """The half of a model that sees pictures."""
+class ImageTower(Protocol):
+    """The half of a model that sees images."""
 
     @property
     def image_size(self) -> int:
-        """Side of the pictures it takes, px."""
+        """Side of the images it takes, px."""
 
     @property
     def statistics(self) -> tuple[Array, Array]:
@@ -186,7 +182,7 @@ class Family:
 
     name: str  # in messages
     text: Callable[[Weights], TextTower]
-    pictures: Callable[[Weights], PictureTower]
+    images: Callable[[Weights], ImageTower]
 
 
 class PhraseEncoder:
@@ -261,21 +257,21 @@ class PhraseEncoder:
 class Encoder(PhraseEncoder):
     """Both halves of a model; it satisfies `store.ImageEncoder` too."""
 
-    def __init__(self, weights: Weights, text: TextTower, pictures: PictureTower, batch: int) -> None:
+    def __init__(self, weights: Weights, text: TextTower, images: ImageTower, batch: int) -> None:
         super().__init__(weights, text)
-        self._pictures, self._device, self._batch = pictures, weights.device, batch
+        self._images, self._device, self._batch = images, weights.device, batch
 
     @property
     def image_size(self) -> int:
-        """Side of the pictures it takes, px."""
-        return self._pictures.image_size
+        """Side of the images it takes, px."""
+        return self._images.image_size
 
     def encode_images(self, crops: Array | Sequence[Array]) -> Array:
-        """(M, D) float32 unit vectors of M pictures (image_size, image_size, 3) uint8, display values."""
+        """(M, D) float32 unit vectors of M images (image_size, image_size, 3) uint8, display values."""
         size = self.image_size
         for crop in crops:
             if crop.shape != (size, size, 3):
-                raise ValueError(f"crops: expected {size} x {size} x 3 pictures, got shape {crop.shape}")
+                raise ValueError(f"crops: expected {size} x {size} x 3 images, got shape {crop.shape}")
         starts = range(0, len(crops), self._batch)
         parts = [self._encode(np.stack(list(crops[i : i + self._batch]))) for i in starts]
         return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
@@ -283,10 +279,10 @@ class Encoder(PhraseEncoder):
     def _encode(self, crops: Array) -> Array:
         import torch
 
-        mean, std = self._pictures.statistics
+        mean, std = self._images.statistics
         pixels = (crops.astype(np.float32) / 255 - mean) / std
         inputs = torch.from_numpy(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))).to(self._device)
-        return unit(inferred(lambda: self._pictures.encode(inputs)))
+        return unit(inferred(lambda: self._images.encode(inputs)))
 
 
 def inferred(forward: Callable[[], Any]) -> Array:

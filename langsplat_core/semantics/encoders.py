@@ -68,8 +68,8 @@ class ClipText:
         return inferred(lambda: self._model(input_ids=tokens).text_embeds)
 
 
-class ClipPictures:
-    """A `PictureTower` by torch."""
+class ClipImages:
+    """A `ImageTower` by torch."""
 
     def __init__(self, weights: Weights) -> None:
         from transformers import CLIPVisionModelWithProjection
@@ -90,7 +90,7 @@ def clip_text(weights: Weights) -> TextTower:
     return plain_text_tower(weights) or ClipText(weights)
 
 
-CLIP = Family("CLIP", clip_text, ClipPictures)
+CLIP = Family("CLIP", clip_text, ClipImages)
 
 
 def _load(kind: Any, tower: str, weights: Weights) -> Any:
@@ -165,8 +165,8 @@ class SiglipText:
         return " ".join(lower.translate(NO_PUNCTUATION).split()) if self._tokens.is_unigram else lower
 
 
-class SiglipPictures:
-    """A `PictureTower` by torch."""
+class SiglipImages:
+    """A `ImageTower` by torch."""
 
     def __init__(self, weights: Weights) -> None:
         from transformers import SiglipVisionModel
@@ -189,7 +189,7 @@ def _siglip_config(weights: Weights) -> Any:
     return load_config(SiglipConfig, weights, "SigLIP")
 
 
-SIGLIP = Family("SigLIP", SiglipText, SiglipPictures)
+SIGLIP = Family("SigLIP", SiglipText, SiglipImages)
 
 
 # Image-text encoders by hub id, folder or file: a new family is two towers above and one row here.
@@ -220,12 +220,12 @@ def load_text_encoder(model: str, device: str = "cpu") -> PhraseEncoder:
 def load_encoder(model: str, device: str = "auto", batch: int = 32) -> Encoder:
     """Load both halves of `model`: a folder, a file, a hub id, or "demo" for the bundled encoder.
 
-    batch: pictures per forward pass.
+    batch: images per forward pass.
     Raises EncoderError where the weights are absent or are those of no family here.
     """
     weights = open_weights(model, model_path(model, "--clip.model"), torch_device(device))
     family = _family(weights)
-    return Encoder(weights, family.text(weights), family.pictures(weights), batch)
+    return Encoder(weights, family.text(weights), family.images(weights), batch)
 
 
 def model_path(model: str, option: str) -> Path:

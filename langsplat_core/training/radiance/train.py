@@ -129,8 +129,6 @@ def schedule_for(config: RadianceConfig, extent: float) -> Schedule:
     )
 
 
-# Radiance training: Gaussians fitted to photographs as in 3D Gaussian Splatting (Kerbl et al. 2023).
-#
 # One step draws one photograph's view, compares, and moves every parameter by Adam; densification,
 # pruning and opacity resets follow the `Schedule`. On the CPU a run is deterministic given its seed and
 # resumes from a checkpoint exactly where it stopped.
