@@ -165,7 +165,7 @@ class Sam2:
         return Look(self._model, seen, side, None, image.shape[:2], ordered=False)
 
 
-# Segmenters by hub id, folder or file: a new family is one file and one row here.
+# Segmenters by hub id, folder or file: a new family is a class above and one row here.
 
 FAMILIES: Mapping[str, Callable[[Weights], Segmenter]] = MappingProxyType(  # by `model_type` of config.json
     {"sam": Sam, "sam2": Sam2, "sam2_video": Sam2}
