@@ -19,7 +19,7 @@ from langsplat_core.datasets.colmap import find_model, good_points, read_model
 from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, PhotoIntrinsics
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.progress import silent
+from langsplat_core.progress import Progress, silent
 from tests.support.photographed import (
     colmap_reconstruction,
     photograph,
@@ -93,7 +93,7 @@ def test_a_real_model_reads_as_pycolmap_reads_it(folder: str) -> None:
 def test_a_capture_shows_what_its_cameras_see(tmp_path: Path, form: str, subfolder: str) -> None:
     write_dataset(tmp_path, form, subfolder)
     labels: list[str] = []
-    capture = load_capture(tmp_path, WHOLE, tmp_path / "work", lambda label, _: labels.append(label))
+    capture = load_capture(tmp_path, WHOLE, tmp_path / "work", Progress(lambda at: labels.append(at.stage)))
     assert [camera.name for camera in capture.cameras] == ["view_0", "view_1", "view_2"]
     for camera, image, matrix in zip(capture.cameras, capture.images, poses(3), strict=True):
         np.testing.assert_allclose(camera.world_to_camera, matrix, atol=1e-12)

@@ -25,7 +25,7 @@ from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
 from langsplat_core.datasets.known_poses import add_points, neighbouring_views
 from langsplat_core.datasets.sfm import optics, pairs_by_name
 from langsplat_core.errors import InputError
-from langsplat_core.progress import Cancelled, silent
+from langsplat_core.progress import Cancelled, Progress, Report, silent
 from langsplat_core.scene import Camera, look_at
 from tests.support.full_disk import files_of_at_most
 from tests.support.photographed import (
@@ -35,6 +35,7 @@ from tests.support.photographed import (
     poses,
     write_photos,
 )
+from tests.support.stops import stop_at
 
 LENGTH, HALF_WIDTH, HEIGHT = 40.0, 3.0, 4.0  # world units; one walks along y at x = 0 and looks along it
 TEXELS = 24  # per unit
@@ -113,12 +114,8 @@ def located(
     features were found, and then repeated."""
     work = tmp_path_factory.mktemp("work")
 
-    def cancel(label: str, _: float) -> None:
-        if label == "matching photographs":
-            raise Cancelled
-
     with pytest.raises(Cancelled):
-        load_capture(photos, CONFIG, work, cancel)
+        load_capture(photos, CONFIG, work, stop_at("matching photographs"))
 
     labels: list[str] = []
     messages: list[str] = []
@@ -127,7 +124,7 @@ def located(
     logging.getLogger("langsplat").addHandler(handler)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pycolmap, "extract_features", _never)
-        capture = load_capture(photos, CONFIG, work, lambda label, _: labels.append(label))
+        capture = load_capture(photos, CONFIG, work, Progress(lambda at: labels.append(at.stage)))
     logging.getLogger("langsplat").removeHandler(handler)
     return capture, work, labels, messages
 
@@ -227,7 +224,7 @@ def known(count: int = VIEWS, size: tuple[int, int] = (320, 240)) -> Capture:
 def test_known_poses_give_points_in_their_own_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = known(4)
     labels: list[str] = []
-    found = add_points(capture, range(4), tmp_path, lambda label, _: labels.append(label))
+    found = add_points(capture, range(4), tmp_path, Progress(lambda at: labels.append(at.stage)))
     assert list(dict.fromkeys(labels)) == [STAGES[0], *STAGES[1:3], "triangulating points"]
     assert found.cameras is capture.cameras
     assert len(found.points) > 200
@@ -315,12 +312,8 @@ def test_copies_are_upright_and_keep_the_focal_length(tmp_path: Path) -> None:
     for index in range(3):
         Image.linear_gradient("L").resize((90, 60)).convert("RGB").save(tmp_path / f"{index}.jpg", exif=exif)
 
-    def cancel(label: str, _: float) -> None:
-        if label == "finding features":
-            raise Cancelled
-
     with pytest.raises(Cancelled):
-        load_capture(tmp_path, CONFIG, tmp_path / "work", cancel)
+        load_capture(tmp_path, CONFIG, tmp_path / "work", stop_at("finding features"))
     (stage,) = (tmp_path / "work").glob("sfm-*")
     camera = pycolmap.infer_camera_from_image(stage / "images/00000.jpg")
     assert (camera.width, camera.height) == (60, 90)
@@ -375,12 +368,8 @@ def matched(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The street's workspace before it is mapped."""
     work = tmp_path_factory.mktemp("matched")
 
-    def cancel(label: str, _: float) -> None:
-        if label == "locating cameras":
-            raise Cancelled
-
     with pytest.raises(Cancelled):
-        load_capture(street, SMALL, work, cancel)
+        load_capture(street, SMALL, work, stop_at("locating cameras"))
     (workspace,) = work.glob("sfm-*")
     return workspace
 
@@ -510,13 +499,13 @@ def test_two_views_are_refused_although_they_are_half(
 def test_a_full_disk_is_said_before_pycolmap_ends_the_process(
     label: str, mostly_noise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fill(reported: str, fraction: float) -> None:
-        if reported == label:
+    def fill(at: Report) -> None:
+        if at.stage == label:
             monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
 
     told = DatasetConfig(max_side=64, allow_few_cameras=True)
     with pytest.raises(OSError, match="No space left") as caught:
-        load_capture(mostly_noise, told, tmp_path, fill)
+        load_capture(mostly_noise, told, tmp_path, Progress(fill))
     assert Path(caught.value.filename).parent == tmp_path
     monkeypatch.undo()
     assert len(load_capture(mostly_noise, told, tmp_path)) == 4
@@ -586,12 +575,8 @@ def test_colmap_begins_with_it(tmp_path: Path) -> None:
     for index in range(3):
         photo(tmp_path / f"{index}.jpg", {FOCAL_TAG: 18.0, PLANE_X: 4000 / 22.3 * 25.4, WIDTH: 4000})
 
-    def cancel(label: str, _: float) -> None:
-        if label == "matching photographs":
-            raise Cancelled
-
     with pytest.raises(Cancelled):
-        load_capture(tmp_path, DatasetConfig(), tmp_path / "work", cancel)
+        load_capture(tmp_path, DatasetConfig(), tmp_path / "work", stop_at("matching photographs"))
     (stage,) = (tmp_path / "work").glob("sfm-*")
     with pycolmap.Database.open(stage / "database.db") as database:
         (camera,) = database.read_all_cameras()

@@ -36,6 +36,7 @@ from langsplat_core.semantics import store
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
 from tests.support.another_user import bound_by_permissions
 from tests.support.fakes import blob_scene
+from tests.support.stops import stop_at
 from tests.support.tiny_room import tiny_room, tiny_settings
 
 pytestmark = pytest.mark.long
@@ -211,13 +212,9 @@ def test_other_liftings(room, tmp_path, mode):
     "stage", ["reading", "training", "masks", "lifting", "codebook", "averaging", "finding"]
 )
 def test_an_interrupted_run_leaves_no_scene_and_resumes(room, tmp_path, stage):
-    def stop(at: Report) -> None:
-        if at.stage.startswith(stage):
-            raise Cancelled
-
     out = tmp_path / "scene.ply"
     with pytest.raises(Cancelled):
-        train_scene(room, out, tiny_settings(room), progress=Progress(stop))
+        train_scene(room, out, tiny_settings(room), progress=stop_at(stage))
     assert not list(tmp_path.glob("*.ply"))
     assert not list(tmp_path.glob("*.safetensors"))
     train_scene(room, out, tiny_settings(room))
@@ -380,13 +377,8 @@ def scene_in(folder: Path) -> dict[str, bytes]:
 
 def interrupted(room: Path, folder: Path, config: TrainConfig) -> None:
     """A training that ends when most of its steps are done, with a checkpoint."""
-
-    def stop(at: Report) -> None:
-        if at.stage == "training Gaussians" and at.fraction > 0.7:
-            raise Cancelled
-
     with pytest.raises(Cancelled):
-        train_scene(room, folder / "scene.ply", config, progress=Progress(stop))
+        train_scene(room, folder / "scene.ply", config, progress=stop_at("training Gaussians", 0.75))
     assert list((folder / "scene.work").glob("*.checkpoint.safetensors"))
 
 

@@ -9,7 +9,7 @@ import torch
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import LiftConfig
-from langsplat_core.progress import Cancelled, Progress, Report
+from langsplat_core.progress import Cancelled
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera, LinearCodec
 from langsplat_core.semantics.store import ImageFeatures
@@ -20,6 +20,7 @@ from langsplat_core.training.language.lift import (
     lift_latents,
 )
 from tests.support.scenes import random_camera, random_gaussians
+from tests.support.stops import stop_at
 
 pytestmark = pytest.mark.long
 
@@ -102,12 +103,8 @@ def test_it_is_deterministic_and_can_be_interrupted():
     other = lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, replace(SHORT, seed=1))[0]
     assert not np.array_equal(one, other)
 
-    def stop(at: Report) -> None:
-        if at.stage == "training language features":
-            raise Cancelled
-
     with pytest.raises(Cancelled):
-        lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, SHORT, progress=Progress(stop))
+        lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, SHORT, progress=stop_at("training language features"))
 
 
 @pytest.mark.slow

@@ -39,6 +39,7 @@ from langsplat_core.training.radiance.state import (
     start,
 )
 from langsplat_core.training.radiance.train import evaluate_views, schedule_for, train_radiance
+from tests.support.stops import stop_at
 
 
 def pictures(seed: int, shape: tuple[int, int, int] = (31, 40, 3)) -> tuple[torch.Tensor, torch.Tensor]:
@@ -535,12 +536,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     straight_path, path = tmp_path / "straight.safetensors", tmp_path / "resumed.safetensors"
     straight = train_radiance(capture(), SHORT, [0, 1, 2], straight_path)
 
-    def stop_at_20(at: Report) -> None:
-        if at.fraction >= 0.5:
-            raise Cancelled
-
     with pytest.raises(Cancelled):
-        train_radiance(capture(), SHORT, [0, 1, 2], path, Progress(stop_at_20))
+        train_radiance(capture(), SHORT, [0, 1, 2], path, stop_at("training", 0.5))
     steps: list[int] = []
     resumed = train_radiance(capture(), SHORT, [0, 1, 2], path, steps_into(steps))
     assert steps == list(range(21, 41))
