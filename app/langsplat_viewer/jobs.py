@@ -13,7 +13,7 @@ from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from langsplat_core.errors import LangSplatError
-from langsplat_core.progress import Cancelled, Progress
+from langsplat_core.progress import Cancelled, Progress, Report
 
 _ARENA_MAX = -8  # M_ARENA_MAX of malloc.h
 _PAGE_OUT = 21  # MADV_PAGEOUT of asm-generic/mman-common.h; Linux before 5.4 refuses it
@@ -72,15 +72,15 @@ class Job:
     work: Callable[[Progress], Any]
     wake: Callable[[], None]
     future: Future[Any] = field(default_factory=Future)
-    step: tuple[str, float] = ("", 0.0)  # what it last reported, fraction in [0, 1]
+    reached: Report = field(default=Report("", 0.0))
     stopped: threading.Event = field(default_factory=threading.Event)
     reported: float = 0.0  # when, seconds
 
-    def report(self, label: str, fraction: float) -> None:
-        """The `Progress` given to the work; raises Cancelled once the job is cancelled."""
+    def report(self, report: Report) -> None:
+        """Take a report of the work; raises Cancelled once the job is cancelled."""
         if self.stopped.is_set():
             raise Cancelled
-        self.step = (label, fraction)
+        self.reached = report
         now = time.monotonic()
         if now - self.reported >= REPORT_EVERY:
             self.reported = now
@@ -91,7 +91,7 @@ class Job:
         if not self.future.set_running_or_notify_cancel():
             return
         try:
-            self.future.set_result(self.work(self.report))
+            self.future.set_result(self.work(Progress(self.report)))
         except BaseException as error:  # noqa: BLE001  whatever it is, the window's thread says it
             self.future.set_exception(error)
         self.wake()
@@ -149,8 +149,7 @@ class Worker:
         """What is being done and how far it is, for the status line; None when idle or only winding up."""
         for job in self._jobs:
             if not job.stopped.is_set():
-                label, fraction = job.step
-                return label or job.label, fraction
+                return job.reached.text or job.label, job.reached.fraction
         return None
 
     @property

@@ -7,9 +7,7 @@ file holds OpenAI's `input_resolution` too or has "quickgelu" or "openai" in its
 Of SAM 2, whose windows and heads no shape tells, the published sizes are known.
 """
 
-import io
 import json
-import pickletools
 import re
 import zipfile
 from collections.abc import Mapping
@@ -22,7 +20,6 @@ from langsplat_core.errors import EncoderError
 from langsplat_core.semantics.weights import (
     OPEN_CLIP,
     OPEN_CLIP_CONFIG,
-    UNREADABLE,
     Converted,
     Weights,
     is_hugging_face,
@@ -120,7 +117,7 @@ SAM2_SIDE = 1024  # px, of the square that SAM 2 sees, which no shape tells
 
 @dataclass(frozen=True)
 class Hiera:
-    """What the shapes of a SAM 2 do not tell of its encoder."""
+    """Settings of a SAM 2's encoder that shapes do not tell."""
 
     heads: int  # of the first stage; they double with the width
     windows: tuple[int, int, int, int]  # side by stage, in positions of its grid
@@ -169,15 +166,11 @@ def _read(id: str, file: Path) -> Tensors:
         return load_file(file)
     zipped = zipfile.is_zipfile(file)  # files of PyTorch before 1.6 are none, and cannot be mapped
     if zipped and any(name.endswith("/constants.pkl") for name in zipfile.ZipFile(file).namelist()):
-        try:
-            found: Any = _script_tensors(file)
-        except UNREADABLE as error:
-            raise EncoderError(
-                f"{id}: a TorchScript archive that is damaged or whose code would have to be run; pass the "
-                "same weights in another layout, such as the hub id openai/clip-vit-base-patch16"
-            ) from error
-    else:
-        found = torch.load(file, map_location="cpu", weights_only=True, mmap=zipped)
+        raise EncoderError(
+            f"{id}: a TorchScript archive, whose code would have to be run; pass the same weights in another "
+            "layout, such as the hub id openai/clip-vit-base-patch16"
+        )
+    found = torch.load(file, map_location="cpu", weights_only=True, mmap=zipped)
     found = found.get("state_dict", found.get("model", found)) if isinstance(found, dict) else {}
     if not isinstance(found, dict):
         raise ValueError("it holds no named tensors")
@@ -189,48 +182,6 @@ def _read(id: str, file: Path) -> Tensors:
         name: name.removeprefix("module.").removeprefix("text.") for name in found if isinstance(name, str)
     }
     return {names[name]: found[name] for name in names if isinstance(found[name], torch.Tensor)}
-
-
-class _Module:
-    """Stands for every class of a TorchScript archive: its attributes, and none of its code."""
-
-    parts: Mapping[Any, Any] = MappingProxyType({})
-
-    def __setstate__(self, state: Any) -> None:
-        self.parts = state if isinstance(state, dict) else {}
-
-
-def _script_tensors(file: Path) -> dict[str, Any]:
-    """The tensors of a TorchScript archive, as OpenAI publishes CLIP, by their modules' names.
-
-    torch reads such an archive only by running it, so what holds the tensors is put into one of its own.
-    """
-    import torch
-
-    copy = io.BytesIO()
-    with zipfile.ZipFile(file) as archive, zipfile.ZipFile(copy, "w") as plain:
-        for entry in archive.infolist():
-            _, _, name = entry.filename.partition("/")
-            if name in ("data.pkl", "version", "byteorder") or name.startswith("data/"):
-                if entry.compress_type != zipfile.ZIP_STORED:
-                    raise ValueError("torch compresses nothing")
-                plain.writestr(f"archive/{name}", archive.read(entry))
-        pickled = plain.read("archive/data.pkl")
-    named = (str(argument) for code, argument, _ in pickletools.genops(pickled) if code.name == "GLOBAL")
-    classes = {name.replace(" ", ".", 1) for name in named if name.startswith("__torch__.")}
-    copy.seek(0)
-    with torch.serialization.safe_globals([(_Module, name) for name in sorted(classes)]):
-        waiting = [("", torch.load(copy, map_location="cpu", weights_only=True))]
-    found: dict[str, Any] = {}
-    seen: set[int] = set()  # a part may hold itself
-    while waiting:
-        prefix, module = waiting.pop()
-        if isinstance(module, _Module) and id(module) not in seen:
-            seen.add(id(module))
-            waiting += [(f"{prefix}{name}.", part) for name, part in module.parts.items()]
-        elif isinstance(module, torch.Tensor):
-            found[prefix[:-1]] = module
-    return found
 
 
 def _clip(file: Path, tensors: Tensors) -> Converted:
@@ -255,7 +206,7 @@ def _clip(file: Path, tensors: Tensors) -> Converted:
 
 
 def _stated(path: Path) -> Settings:
-    """What open_clip_config.json says; nothing where there is none."""
+    """Content of open_clip_config.json; empty where there is none."""
     if not path.is_file():
         return {}
     try:
@@ -269,7 +220,7 @@ def _stated(path: Path) -> Settings:
 
 
 def _clip_config(tensors: Tensors) -> Settings:
-    """What the shapes tell, as a config.json of transformers would."""
+    """Settings by the shapes, as in a config.json of transformers."""
     words, wide = _shape(tensors, "token_embedding.weight", 2)
     channels, _, patch, _ = _shape(tensors, "visual.conv1.weight", 4)
     positions, _ = _shape(tensors, "visual.positional_embedding", 2)
@@ -365,7 +316,7 @@ def _sam_tensors(tensors: Tensors, names: Names) -> dict[str, Any]:
 
 
 def _sam_config(tensors: Tensors) -> Settings:
-    """What the shapes tell, as a config.json of transformers would."""
+    """Settings by the shapes, as in a config.json of transformers."""
     _, grid, _, wide = _shape(tensors, "image_encoder.pos_embed", 4)
     patch = _shape(tensors, "image_encoder.patch_embed.proj.weight", 4)[2]
     layers = _count(tensors, r"image_encoder\.blocks\.(\d+)\.")
@@ -394,7 +345,7 @@ def _sam_config(tensors: Tensors) -> Settings:
 
 
 def _decoder_config(tensors: Tensors, first: str) -> Settings:
-    """What the shapes tell of the halves for prompts and masks; `first`: of the two layers of an "mlp"."""
+    """Settings of the halves for prompts and masks, by the shapes; `first`: of the two layers of an "mlp"."""
     tokens, size = _shape(tensors, "mask_decoder.mask_tokens.weight", 2)
     decoder = "mask_decoder.transformer.layers.0."
     narrow = _shape(tensors, f"{decoder}cross_attn_token_to_image.q_proj.weight", 2)[0]
@@ -426,7 +377,7 @@ def _sam2(tensors: dict[str, Any]) -> Converted:
 
 
 def _sam2_config(tensors: Tensors) -> Settings:
-    """What shapes and the published sizes tell, as a config.json of transformers would."""
+    """Settings by shapes and published sizes, as in a config.json of transformers."""
     _, wide, *background = _shape(tensors, "image_encoder.trunk.pos_embed", 4)
     blocks = _count(tensors, r"image_encoder\.trunk\.blocks\.(\d+)\.")
     if (wide, blocks) not in SAM2_SIZES:
@@ -467,5 +418,5 @@ def _shape(tensors: Tensors, name: str, axes: int) -> tuple[int, ...]:
 
 
 def _count(tensors: Tensors, pattern: str) -> int:
-    """How many numbers the names have that begin with `pattern`."""
+    """Count the numbers in names that begin with `pattern`."""
     return len({found[1] for found in map(re.compile(pattern).match, tensors) if found})

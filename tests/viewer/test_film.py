@@ -14,7 +14,7 @@ from PIL import Image
 
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import save_scene
-from langsplat_core.progress import Cancelled
+from langsplat_core.progress import Cancelled, Progress, Report
 from langsplat_viewer import __main__ as program
 from langsplat_viewer import options
 from langsplat_viewer.camera.controls import extent_of
@@ -116,12 +116,12 @@ def test_every_picture_is_the_one_that_a_still_would_be(folder):
 
 
 def test_a_folder_is_filled_where_it_was_left(folder):
-    def stop(label: str, fraction: float) -> None:
-        if fraction > 0.5:
+    def stop(at: Report) -> None:
+        if at.fraction > 0.5:
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        make_film(shot(), folder / "film", stop)
+        make_film(shot(), folder / "film", Progress(stop))
     assert sorted(path.name for path in (folder / "film").iterdir()) == ["film.json", *FRAMES[:3]]
     before = (folder / "film" / FRAMES[1]).stat().st_mtime_ns
     assert "3 of them kept" in make_film(shot(), folder / "film")[0]
@@ -208,12 +208,12 @@ def test_what_ffmpeg_complains_of_is_one_line_and_the_old_film_stays(ffmpeg, vie
 def test_a_stopped_video_leaves_nothing(ffmpeg, folder):
     ffmpeg(FAKE_FFMPEG)
 
-    def stop(label: str, fraction: float) -> None:
-        if fraction > 0.5:
+    def stop(at: Report) -> None:
+        if at.fraction > 0.5:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        make_film(shot(), folder / "a.mp4", stop)
+        make_film(shot(), folder / "a.mp4", Progress(stop))
     assert not [path for path in folder.iterdir() if path.suffix == ".mp4"]
 
 

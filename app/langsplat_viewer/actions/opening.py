@@ -11,7 +11,7 @@ from langsplat_core.compiled import is_compiled
 from langsplat_core.display.displays import DISPLAYS, latent_colours
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import scene_files
-from langsplat_core.pipeline.report import stated_doubts
+from langsplat_core.pipeline.report import stated_warnings
 from langsplat_core.progress import Progress
 from langsplat_core.query import surface
 from langsplat_core.query.engine import no_field
@@ -73,7 +73,7 @@ def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Cal
         progress(f"preparing {path.name}", 0.9)
         latent = None if scene.language is None else latent_colours(scene.language)
         unusable = scene.gaussians.invalid_rows()
-        doubts = stated_doubts(path, len(scene.gaussians))
+        doubts = stated_warnings(path, len(scene.gaussians))
         return _Opened(scene, unusable, extent_of(scene), latent, read, doubts)
 
     def done(opened: _Opened) -> None:

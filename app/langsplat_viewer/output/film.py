@@ -320,7 +320,7 @@ class _Roll:
     def draw(self, number: int) -> Array:
         """(H, W, 3) uint8. InputError at the last picture where none showed anything."""
         cameras = self._shot.cameras
-        self._progress(f"drawing: {number + 1} of {len(cameras)} pictures", number / len(cameras))
+        self._progress("drawing", number / len(cameras), f"{number + 1} of {len(cameras)} pictures")
         drawn = self._paint(cameras[number])
         self._drawn += 1
         self.empty += drawn.nothing
