@@ -377,7 +377,25 @@ def openai_state(folder: Path, tensors: Tensors) -> Case:
     return folder / "ViT.bin", 2, 2, True, None
 
 
+def openai_script(folder: Path, tensors: Tensors) -> Case:
+    """As OpenAI publishes them: a TorchScript archive of modules with parameters and three numbers."""
+    root = torch.nn.Module()
+    for name, tensor in tensors.items():
+        *path, leaf = name.split(".")
+        module = root
+        for part in path:
+            if not hasattr(module, part):
+                module.add_module(part, torch.nn.Module())
+            module = getattr(module, part)
+        module.register_parameter(leaf, torch.nn.Parameter(tensor, requires_grad=False))
+    for number in ("input_resolution", "context_length", "vocab_size"):
+        root.register_buffer(number, torch.tensor(3))
+    torch.jit.script(root).save(folder / "ViT-B-16.pt")
+    return folder / "ViT-B-16.pt", 2, 2, True, None
+
+
 LAYOUTS = [
+    pytest.param(openai_script, marks=pytest.mark.filterwarnings("ignore::DeprecationWarning")),
     *(hub_folder, hub_folder_of_safetensors, text_apart),
     *(training_checkpoint, quick_by_name, openai_state),
 ]
@@ -573,10 +591,12 @@ def test_damaged_files_are_one_line_and_run_nothing(load: Callable[[str], object
     assert "a pickle that holds more than tensors" in refusal(load, whole)
     assert not (tmp_path / "ran").exists()
     script = tmp_path / "ViT-B-16.pt"
-    with zipfile.ZipFile(script, "w") as archive:
-        for part in ("data.pkl", "version", "constants.pkl", "code/__torch__.py"):
-            archive.writestr(f"ViT-B-16/{part}", pickle.dumps({"visual": Runs(tmp_path / "ran")}, 2))
-    assert "openai/clip-vit-base-patch16" in refusal(load, script)
+    for content in (b"", pickle.dumps({"visual": Runs(tmp_path / "ran")}, 2)):
+        for packed in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            with zipfile.ZipFile(script, "w", packed) as archive:
+                for part in ("data.pkl", "version", "constants.pkl", "code/__torch__.py"):
+                    archive.writestr(f"ViT-B-16/{part}", content if part == "data.pkl" else b"3")
+            assert "openai/clip-vit-base-patch16" in refusal(load, script)
     assert not (tmp_path / "ran").exists()
 
 
