@@ -18,14 +18,13 @@ from langsplat_core.errors import BackendError, InputError, LangSplatError
 from langsplat_viewer import actions, fonts
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.display_probe import probe_gl
-from langsplat_viewer.drawing.frame import Backend, FrameRenderer
-from langsplat_viewer.drawing.renderer import Renderer
 from langsplat_viewer.files.flight_files import Shelf
 from langsplat_viewer.jobs import give_memory_back, one_line, share_one_heap
 from langsplat_viewer.options import chosen_camera, latent_level
 from langsplat_viewer.panels import keyboard, layout, menu, navigation, over, photograph, pictures
 from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.remembered import Remembered
+from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.viewer import Services, Viewer
 
 TITLE = "LangSplat viewer"
@@ -50,7 +49,7 @@ DRAW_ERRORS = (
 
 RECORDER_PATIENCE = 5.0  # seconds for a film that is being drawn to leave nothing half written
 
-MakeRenderer = Callable[[moderngl.Context], Renderer]
+MakeRenderer = Callable[[moderngl.Context], GlRenderer]
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ class WindowRequest:
 def open_window(request: WindowRequest, services: Services) -> None:
     """Run until the window is closed. Raises BackendError where there is no display or no OpenGL."""
     share_one_heap()
-    window = Window(request, services, lambda ctx: FrameRenderer(ctx, request.backend))
+    window = Window(request, services, lambda ctx: GlRenderer(ctx, request.backend))
     immapp.run(window.params())
     if window.failure is not None:
         raise window.failure

@@ -32,7 +32,7 @@ class Preferences:
     recent: tuple[str, ...] = ()  # scenes that were opened, the latest first
     panels: tuple[str, ...] | None = None  # titles of those that are open; None: those that are at first
     colour_map: ColourMap = "turbo"  # of relevancy and depth
-    overlays: tuple[str, ...] = ()  # of `seeing.OVERLAYS`, those that lie over the scene
+    overlays: tuple[str, ...] = ()  # of `state.OVERLAYS`, those that lie over the scene
     keys: dict[str, tuple[str, ...]] = field(default_factory=dict)  # other than in the table of commands
     photographs: dict[str, str] = field(default_factory=dict)  # scene -> folder; the latest chosen last
 

@@ -7,10 +7,8 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import ColourMap
-from langsplat_core.display.displays import QUERY_COLOURS, mapped
+from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, mapped, painted
 from langsplat_core.query.answers import QueryResult
-from langsplat_viewer import staging
-from langsplat_viewer.drawing import channels
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.panels.style import elided, width_of
 from langsplat_viewer.viewer import Viewer
@@ -31,9 +29,8 @@ def draw(viewer: Viewer, area: Area) -> None:
     """A colour bar with numbers for every query that is painted."""
     state = viewer.state
     shown = state.shown_results()
-    slots = channels.painted(shown)
-    heats = any(one.picture.display == "relevancy" for one in staging.shown_pictures(state))
-    if state.scene is None or not heats or not slots:
+    slots = painted(shown)
+    if state.scene is None or not slots or not any(pane.row.legend for pane in state.panes()):
         return
     corner = ImVec2(
         area.left + area.width - hello_imgui.em_size(0.7), area.top + area.height - hello_imgui.em_size(0.7)
@@ -44,7 +41,7 @@ def draw(viewer: Viewer, area: Area) -> None:
     for slot in slots:
         result = shown[slot]
         if result is not None:
-            strength = channels.STRENGTH[result.verdict]
+            strength = STRENGTH[result.verdict]
             _bar(result, bar_colours(slot, strength, len(slots) == 1, state.picture.colour_map))
     imgui.end()
 

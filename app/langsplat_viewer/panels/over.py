@@ -8,7 +8,7 @@ from imgui_bundle import ImVec2, imgui
 from langsplat_core.arrays import Array
 from langsplat_core.display.displays import QUERY_COLOURS
 from langsplat_core.scene import Camera
-from langsplat_viewer import actions, staging
+from langsplat_viewer import actions
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.overlays import Label, placed
 from langsplat_viewer.panels.area import Area
@@ -35,7 +35,7 @@ def draw(viewer: Viewer, area: Area) -> None:
     state = viewer.state
     if state.scene is None or state.view is None or state.extent is None:
         return
-    count = staging.columns(state.seeing.split)
+    count = state.settings.split.columns
     width = area.width / count
     paint = imgui.get_background_draw_list()
     for column in range(count):
@@ -52,7 +52,7 @@ def draw(viewer: Viewer, area: Area) -> None:
         _ruler(viewer, part, camera)
         paint.pop_clip_rect()
     _projection(viewer, area)
-    if state.seeing.ruler.measures and not imgui.get_io().want_capture_mouse:
+    if state.ruler.measures and not imgui.get_io().want_capture_mouse:
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_all)
         if clicked(area):
             mouse = imgui.get_io().mouse_pos
@@ -107,7 +107,7 @@ def _cameras(viewer: Viewer, area: Area, camera: Camera) -> None:
     owners = rows // edges.shape[1]
     segments, owners = segments[away[owners]], owners[away[owners]]
     under = -1
-    if not (imgui.get_io().want_capture_mouse or state.seeing.ruler.measures):
+    if not (imgui.get_io().want_capture_mouse or state.ruler.measures):
         mouse = imgui.get_io().mouse_pos
         row, distance = overlays.nearest_segment(segments, (mouse.x - area.left, mouse.y - area.top))
         under = int(owners[row]) if distance < REACH else -1
@@ -183,7 +183,7 @@ def _grid(viewer: Viewer, area: Area, camera: Camera, is_named: bool) -> None:
 
 def _ruler(viewer: Viewer, area: Area, camera: Camera) -> None:
     """The points that were clicked, and what lies between them."""
-    ruler, scene = viewer.state.seeing.ruler, viewer.state.scene
+    ruler, scene = viewer.state.ruler, viewer.state.scene
     assert scene is not None
     paint, least = imgui.get_background_draw_list(), _least_depth(viewer)
     for point in ruler.points:

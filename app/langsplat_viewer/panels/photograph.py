@@ -4,7 +4,7 @@ import moderngl
 from imgui_bundle import ImVec2, imgui
 
 from langsplat_core.arrays import Array
-from langsplat_viewer import actions, staging
+from langsplat_viewer import actions
 from langsplat_viewer.files.photographs import corners
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.panels.style import leave_room, muted, small_wrapped, tip
@@ -16,11 +16,11 @@ def draw_slider(viewer: Viewer) -> None:
     state = viewer.state
     leave_room("Photograph", 11)
     flags = imgui.SliderFlags_.always_clamp
-    changed, fade = imgui.slider_float("Photograph", state.seeing.fade, 0.0, 1.0, "%.2f", flags)
+    changed, fade = imgui.slider_float("Photograph", state.settings.fade, 0.0, 1.0, "%.2f", flags)
     if changed:
         actions.fade_photograph(viewer, fade)
     tip("Lay the photograph of the training camera over the picture")
-    if state.seeing.fade == 0:
+    if state.settings.fade == 0:
         return
     photograph = actions.photograph_here(state)
     if photograph is None:
@@ -43,14 +43,14 @@ class Overlay:
         """Over every picture in the area, where one stands at its camera."""
         state = viewer.state
         photograph = actions.photograph_here(state)
-        if state.seeing.fade == 0 or photograph is None or photograph.image is None or state.view is None:
+        if state.settings.fade == 0 or photograph is None or photograph.image is None or state.view is None:
             return
         texture = self._upload(photograph.image)
-        count = staging.columns(state.seeing.split)
+        count = state.settings.split.columns
         width, paint = area.width / count, imgui.get_background_draw_list()
         shown = state.view.camera(max(round(width), 1), max(round(area.height), 1))
         left, top, right, bottom = corners(photograph.camera, shown)
-        tint = imgui.get_color_u32((1.0, 1.0, 1.0, state.seeing.fade))
+        tint = imgui.get_color_u32((1.0, 1.0, 1.0, state.settings.fade))
         for column in range(count):
             x = area.left + column * width
             end = ImVec2(x + width, area.top + area.height)

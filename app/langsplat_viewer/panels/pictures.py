@@ -5,7 +5,7 @@ from typing import Any
 import moderngl
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_viewer import actions, staging
+from langsplat_viewer import actions
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.viewer import Viewer
 
@@ -25,7 +25,7 @@ UNMOVED = (
 
 def draw(viewer: Viewer, area: Area, textures: tuple[moderngl.Texture, ...]) -> None:
     """The textures of `Canvas.textures` where they belong, each with its name if there are several."""
-    split = viewer.state.seeing.split
+    split = viewer.state.settings.split
     if split.mode == "wipe" and len(textures) > 1:
         _image(area, textures[0], 0.0, split.at)
         _image(area, textures[1], split.at, 1.0)
@@ -61,7 +61,7 @@ def _line(area: Area, at: float) -> None:
 
 def _name(viewer: Viewer, area: Area) -> None:
     """What each picture shows, at its upper edge: left and right of the line of a wipe."""
-    split, names = viewer.state.seeing.split, staging.labels(viewer.state)
+    split, names = viewer.state.settings.split, tuple(pane.label for pane in viewer.state.panes())
     gap, top = hello_imgui.em_size(0.6), area.top + hello_imgui.em_size(0.5)
     if split.mode == "wipe":
         x = area.left + split.at * area.width
@@ -90,7 +90,7 @@ def text_on_shade(text: str, x: float, y: float, area: Area) -> None:
 
 def draw_grip(viewer: Viewer, area: Area) -> None:
     """What the line of a wipe is dragged by; a double click puts it into the middle."""
-    split = viewer.state.seeing.split
+    split = viewer.state.settings.split
     if split.mode != "wipe" or viewer.state.scene is None:
         return
     x = area.left + split.at * area.width

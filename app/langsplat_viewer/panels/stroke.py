@@ -9,7 +9,7 @@ from langsplat_viewer import actions, marks
 from langsplat_viewer.marks import Mode, Tool
 from langsplat_viewer.panels.area import Area
 from langsplat_viewer.panels.legend import QUIET
-from langsplat_viewer.staging import TINT
+from langsplat_viewer.rendering.request import TINT
 from langsplat_viewer.viewer import Viewer
 
 HINTS: dict[Tool, str] = {

@@ -8,13 +8,14 @@ from imgui_bundle import imgui
 
 from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
-from langsplat_viewer import actions, staging
+from langsplat_viewer import actions
 from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, adopt_up, level, with_fov
 from langsplat_viewer.camera.overlays import length_text
 from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of, with_key
-from langsplat_viewer.drawing.channels import MOST_DEGREE, SIZE_RANGE, Clip, Splats
 from langsplat_viewer.panels import photograph
 from langsplat_viewer.panels.style import beside, beside_boxed, leave_room, muted, small_wrapped, tip
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.request import MOST_DEGREE, SIZE_RANGE, Splats
 from langsplat_viewer.viewer import Viewer
 
 CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut can be chosen
@@ -39,7 +40,7 @@ def draw_display(viewer: Viewer) -> None:
     picture = replace(picture, colour_map=viewer.state.picture.colour_map)
     actions.set_picture(viewer, replace(picture, background=_backdrop(picture.background)))
     tip("What shows where the scene is not")
-    transparent = viewer.state.seeing.transparent
+    transparent = viewer.state.settings.transparent
     changed, transparent = imgui.checkbox("Save without backdrop", transparent)
     if changed:
         actions.save_transparent(viewer, transparent)
@@ -49,7 +50,7 @@ def draw_display(viewer: Viewer) -> None:
 
 def _splats(viewer: Viewer) -> None:
     """How the Gaussians are drawn."""
-    scene, splats = viewer.state.scene, viewer.state.seeing.splats
+    scene, splats = viewer.state.scene, viewer.state.settings.splats
     size = _slider("Splat size", splats.size, *SIZE_RANGE)
     tip("Smaller, every Gaussian can be seen; answers and files do not change")
     degree, most = splats.sh_degree, MOST_DEGREE if scene is None else scene.gaussians.sh_degree
@@ -78,8 +79,7 @@ def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, flo
 
 def _colour_map(viewer: Viewer) -> None:
     """Where something is shown by it."""
-    shown = {DISPLAYS[one.picture.display].name for one in staging.shown_pictures(viewer.state)}
-    if not shown & {"relevancy", "depth"}:
+    if not any(pane.row.uses_map for pane in viewer.state.panes()):
         return
     names = list(COLOUR_MAPS)
     leave_room("Colour map", WIDTH_EM)
@@ -113,8 +113,8 @@ def _display_button(viewer: Viewer, button: Button) -> None:
 
 def _compared(viewer: Viewer) -> None:
     """What is shown beside it."""
-    state, split = viewer.state, viewer.state.seeing.split
-    second = Button("", split.second, split.second_level if split.second == "latent" else None)
+    state, split = viewer.state, viewer.state.settings.split
+    second = Button("", split.second, split.second_level if DISPLAYS[split.second].by_level else None)
     shown = {"off": "nothing", "levels": "three levels", "wipe": compared_name(second)}[split.mode]
     leave_room("Beside it", WIDTH_EM)
     if not imgui.begin_combo("Beside it", shown):
@@ -147,7 +147,7 @@ def draw_overlays(viewer: Viewer) -> None:
         changed, shown = imgui.checkbox(title.capitalize(), name in state.preferences.overlays)
         if changed:
             actions.show_overlay(viewer, name, shown)
-    ruler, scene = state.seeing.ruler, state.scene
+    ruler, scene = state.ruler, state.scene
     measure = with_key("Measure", actions.toggle_measuring, state.preferences.keys)
     imgui.begin_disabled(scene is None)
     changed, measures = imgui.checkbox(f"{measure}###measure", ruler.measures)
@@ -222,7 +222,7 @@ def _projection(viewer: Viewer, view: OrbitCamera) -> None:
 
 def _cuts(viewer: Viewer) -> None:
     """Near and far cut; at the ends of their sliders there is none."""
-    extent, clip = viewer.state.extent, viewer.state.seeing.clip
+    extent, clip = viewer.state.extent, viewer.state.settings.clip
     if extent is None:
         return
     low, high = (share * extent.radius for share in CUT_RANGE)
