@@ -373,7 +373,7 @@ NUMBERS: Mapping[Display, int] = MappingProxyType({name: number for number, name
 
 
 def shader_defines() -> dict[str, int | float | str]:
-    """Constants that the shader shares with this module, and the drawings of all displays as one expression."""
+    """Constants that the shader shares with this module, and all displays' drawings as one expression."""
     shown = "".join(f"display == {number} ? ({row.glsl}) : " for number, row in enumerate(_ROWS))
     return {
         "HEAT_FADE": HEAT_FADE,

@@ -26,7 +26,7 @@ from langsplat_core.lab.speed.queries import repeated
 from langsplat_core.scene import Scene
 from langsplat_viewer import actions
 from langsplat_viewer.camera.controls import orbit
-from langsplat_viewer.drawing.frame import FrameRenderer
+from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest
 from tests.support.fakes import FakeEncoder
@@ -53,7 +53,7 @@ class Orbiting:
     cpu_to_sharp: list[float] = field(default_factory=list)
 
 
-class AtOnce(FrameRenderer):
+class AtOnce(GlRenderer):
     """Leaves nothing to other threads."""
 
     def ahead(self, *_: object) -> None:
@@ -133,7 +133,7 @@ def ride(
     count: int,
     seconds: float,
     size: tuple[int, int],
-    renderer: type[FrameRenderer] = FrameRenderer,
+    renderer: type[GlRenderer] = GlRenderer,
 ) -> Orbiting:
     def load(path: Path) -> Scene:
         found = load_scene(path)
@@ -172,5 +172,5 @@ if __name__ == "__main__":
     parser.add_argument("--size", type=int, nargs=2, default=(1280, 800))
     parser.add_argument("--at-once", action="store_true", help="full pictures in the window's thread")
     asked = parser.parse_args()
-    renderer = AtOnce if asked.at_once else FrameRenderer
+    renderer = AtOnce if asked.at_once else GlRenderer
     print(json.dumps(asdict(ride(asked.scene, asked.count, asked.seconds, tuple(asked.size), renderer))))

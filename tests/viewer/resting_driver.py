@@ -18,7 +18,7 @@ from imgui_bundle.glfw_utils import glfw_window_hello_imgui
 
 import glfw  # isort: skip
 from langsplat_core.io import load_scene
-from langsplat_viewer.drawing.frame import FrameRenderer
+from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest, open_window
 from tests.support.fakes import FakeEncoder
@@ -51,7 +51,7 @@ def close_after(seconds: float, ready: Callable[[], bool]) -> None:
 
 def rest(path: Path) -> None:
     services = Services(load_scene, lambda encoder_id: FakeEncoder())
-    window = Window(WindowRequest(path, size=(860, 620)), services, lambda ctx: FrameRenderer(ctx, "opengl"))
+    window = Window(WindowRequest(path, size=(860, 620)), services, lambda ctx: GlRenderer(ctx, "opengl"))
     params = window.params()
     frames, gui = [], params.callbacks.show_gui
 

@@ -11,7 +11,7 @@ from tests.support.on_display import play
 @pytest.mark.long
 def test_pictures_are_coarse_while_moving_and_sharp_afterwards(display: str, tmp_path: Path):
     script = (
-        "import sys, langsplat_viewer.drawing.renderer as pacing\n"
+        "import sys, langsplat_viewer.canvas as pacing\n"
         "pacing.MOVING_BUDGET = 0.0\n"  # however fast the machine is
         "from pathlib import Path\n"
         "from dataclasses import asdict\n"

@@ -124,7 +124,7 @@ def test_it_is_read_once_it_is_wanted_and_only_at_its_camera(placed):
     stand(placed, 1)
     assert placed.state.photograph is None
     actions.fade_photograph(placed, 3.0)
-    assert placed.state.seeing.fade == 1
+    assert placed.state.settings.fade == 1
     stand(placed, 1)
     found = actions.photograph_here(placed.state)
     assert found.image.shape == (120, 160, 3)

@@ -84,7 +84,7 @@ def test_reload_keeps_camera_queries_and_settings(shown):
     actions.go_to_camera(shown, 1)
     actions.tick(shown, shown.clock + 10)
     actions.add_keyframe(shown)
-    actions.set_splats(shown, replace(shown.state.seeing.splats, size=0.5))
+    actions.set_splats(shown, replace(shown.state.settings.splats, size=0.5))
     actions.set_picture(shown, replace(shown.state.picture, dim=0.1))
     view, before = shown.state.view, shown.state.scene
     save_scene(shown.state.path, dyed())
@@ -98,7 +98,7 @@ def test_reload_keeps_camera_queries_and_settings(shown):
     assert [(q.phrase, q.slot, q.cut) for q in state.queries] == [("mug", 0, 0.6), ("book", None, None)]
     assert state.queries[0].result.own_cut == 0.6
     assert state.selected is state.queries[0]
-    assert (state.picture.display, state.picture.dim, state.seeing.splats.size) == ("relevancy", 0.1, 0.5)
+    assert (state.picture.display, state.picture.dim, state.settings.splats.size) == ("relevancy", 0.1, 0.5)
     assert len(state.record.keyframes) == 1
     assert state.camera_index == 1
     assert not look(shown)

@@ -7,9 +7,9 @@ import pytest
 
 from langsplat_viewer import actions
 from langsplat_viewer.actions.opening import MOST
-from langsplat_viewer.drawing.channels import UNCLIPPED, Clip
 from langsplat_viewer.files.browsing import list_folder
 from langsplat_viewer.panels.browser import has_several
+from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
 from tests.support.windowless import SCENES, arrive, errors, settle
 
 BLOBS, PLAIN, BARE = (Path(f"{name}.ply").absolute() for name in ("blobs", "plain", "bare"))
@@ -53,7 +53,7 @@ def test_camera_and_queries_of_each_are_found_again(three):
     assert three.state.scene is SCENES["bare.ply"]
     assert three.state.queries == []
     assert three.state.canonical == ()
-    assert three.state.seeing.clip == UNCLIPPED
+    assert three.state.settings.clip == UNCLIPPED
     actions.ask(three, "plant")
     settle(three)
     actions.zoom_by(three, 2.0)
@@ -66,7 +66,7 @@ def test_camera_and_queries_of_each_are_found_again(three):
     assert state.queries[1].result.own_cut == 0.7
     assert state.canonical == three.engine.canonical_phrases == ("plant",)
     assert (state.camera_index, len(state.record.keyframes)) == (2, 1)
-    assert state.seeing.clip == Clip(1.0, 9.0)
+    assert state.settings.clip == Clip(1.0, 9.0)
     switch(three, BARE)
     assert three.state.view is bare
     assert [query.phrase for query in three.state.queries] == ["plant"]

@@ -11,7 +11,7 @@ import pytest
 from langsplat_core.io import load_scene
 from langsplat_core.query.selection import in_polygon, in_rectangle, in_stroke, on_surface, project
 from langsplat_viewer.marks import unmarked
-from langsplat_viewer.staging import marked_scene
+from langsplat_viewer.rendering.request import edited_scene
 from tests.support.measured import Measure
 
 DEMO = Path(__file__).parents[2] / "assets" / "demo" / "scene.ply"
@@ -35,13 +35,13 @@ def test_selecting_in_the_demo_scene_takes_milliseconds(measured: Measure):
     count, means = len(scene.gaussians), scene.gaussians.means
     tenth = np.random.default_rng(0).uniform(size=count) < 0.1
     marks = unmarked(count)
-    first = marked_scene(scene, marks)
+    first = edited_scene(scene, marks)
     seen = project(means, scene.cameras[0].resized(*SIZE))
     turns = np.linspace(0, 2 * np.pi, 200)
     path = np.stack([640 + 300 * np.cos(turns), 360 + 250 * np.sin(turns)], 1)
     work: dict[str, Callable[[], object]] = {
-        "another selection": lambda: marked_scene(scene, replace(marks, selected=tenth), first),
-        "hiding": lambda: marked_scene(scene, replace(marks, hidden=tenth)),
+        "another selection": lambda: edited_scene(scene, replace(marks, selected=tenth), first),
+        "hiding": lambda: edited_scene(scene, replace(marks, hidden=tenth)),
         "projection": lambda: project(means, scene.cameras[0].resized(*SIZE)),
         "rectangle": lambda: in_rectangle(seen, path.min(0), path.max(0)),
         "lasso": lambda: in_polygon(seen, path),

@@ -2,26 +2,11 @@
 
 import threading
 
-from numpy.testing import assert_allclose
-
 from langsplat_core.errors import InputError
 from langsplat_viewer import actions
 from langsplat_viewer.panels.style import elided
 from langsplat_viewer.state import MAX_MESSAGES
 from tests.support.windowless import settle
-
-
-def test_layers_change_only_when_the_picture_needs_others(opened):
-    state = opened.state
-    key = state.layers_key()
-    actions.set_display(opened, "depth")
-    assert state.layers_key() == key
-    assert state.latent_rgb() is None
-    actions.set_display(opened, "latent", 2)
-    assert state.layers_key() != key
-    assert_allclose(state.latent_rgb(), state.latent[2])
-    actions.set_display(opened, "latent", 1)
-    assert_allclose(state.latent_rgb(), state.latent[1])
 
 
 def test_parts_of_the_window_come_and_go(viewer):

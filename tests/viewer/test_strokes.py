@@ -6,8 +6,8 @@ import pytest
 from langsplat_core.scene import look_at
 from langsplat_viewer import actions, marks
 from langsplat_viewer.camera.controls import from_camera
-from langsplat_viewer.drawing.channels import Clip
 from langsplat_viewer.marks import Drawn, Stroke, caught, outlines
+from langsplat_viewer.rendering.depth import Clip
 from tests.support.fakes import CENTRES, PER_BLOB
 from tests.support.selected import marked, marks_of
 from tests.support.windowless import FakeSurface, errors, settle

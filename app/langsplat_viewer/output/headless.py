@@ -47,6 +47,15 @@ DEFAULT_SIZE = (1280, 720)
 log = logging.getLogger("langsplat")
 
 
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """All that is done once, however many images are drawn."""
+
+    request: RenderRequest
+    results: tuple[QueryResult, ...]
+    lines: tuple[str, ...]  # one for each query, and what all stand on, for people and scripts
+
+
 def check_options(options: ViewerOptions) -> Path:
     """Where the image or film goes. InputError where that cannot work, before anything slow is done."""
     if options.path is not None and options.turntable is not None:
@@ -162,15 +171,6 @@ def describe(result: QueryResult) -> str:
         verdict += f" ({100 * result.probability:.0f} %)"
     level = LEVELS[result.level]
     return f"'{result.phrase}': {verdict}, score {result.peak:.3f}, level {level}, place {place}"
-
-
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """All that is done once, however many images are drawn."""
-
-    request: RenderRequest
-    results: tuple[QueryResult, ...]
-    lines: tuple[str, ...]  # one for each query, and what all stand on, for people and scripts
 
 
 def prepare(options: ViewerOptions, path: Path, services: Services, progress: Progress = silent) -> Prepared:
