@@ -315,12 +315,13 @@ class RenderKey:
 
 
 class Inputs:
-    """Scenes and channels of requests as a rasterizer takes them; what the last request had is kept, as the
-    same objects."""
+    """Scenes and channels of requests as a rasterizer takes them; those of the last scene, edits and answers
+    are kept, as the same objects."""
 
     def __init__(self) -> None:
         self._scene: tuple[tuple[object, ...], Scene] | None = None
-        self._channels: list[tuple[tuple[object, ...], Channel]] = []
+        self._of: tuple[object, ...] = ()  # whose channels are kept
+        self._channels: dict[tuple[object, int | None], Channel] = {}
 
     def key(self, request: RenderRequest) -> RenderKey:
         """The projection that the request needs."""
@@ -334,17 +335,18 @@ class Inputs:
 
     def channels(self, request: RenderRequest) -> list[Channel]:
         """The further channel of each pane."""
-        known, self._channels = self._channels, []
-        for pane in request.panes:
-            answers = pane.answers if pane.row.needs_query else None
-            of = (request.scene, request.detail.merged, pane.row.channel, pane.level, answers)
-            kept = [channel for other, channel in (*known, *self._channels) if other == of]
-            self._channels.append((of, kept[0] if kept else _channel(request, pane)))
-        return [channel for _, channel in self._channels]
+        of = (request.scene, request.answers, request.detail.merged)
+        if self._of != of:
+            self._of, self._channels = of, {}
+        wanted = [(pane.row.channel, pane.level) for pane in request.panes]
+        for of_pane, pane in zip(wanted, request.panes, strict=True):
+            if of_pane not in self._channels:
+                self._channels[of_pane] = _channel(request, pane)
+        return [self._channels[of_pane] for of_pane in wanted]
 
     def forget(self) -> None:
         """Hold nothing of the last request."""
-        self._scene, self._channels = None, []
+        self._scene, self._of, self._channels = None, (), {}
 
 
 def _channel(request: RenderRequest, pane: Pane) -> Channel:
