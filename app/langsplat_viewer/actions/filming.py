@@ -212,7 +212,7 @@ def save_film(viewer: Viewer, folder: Path) -> None:
     request = state.request(record.size)
     try:
         out = check_film(_film_out(viewer, folder), record.size)
-        cameras = cameras_of(motion, state.extent, record.fps, request.split.pane_size(record.size))
+        cameras = cameras_of(motion, state.extent, record.fps, record.size)
     except (InputError, OSError) as error:
         state.say(f"no film: {error}", is_error=True)
         return

@@ -209,7 +209,7 @@ class Shot:
     """A request seen by a camera that moves."""
 
     request: RenderRequest
-    cameras: tuple[Camera, ...]  # one for each image, all of the size of the request's panes
+    cameras: tuple[Camera, ...]  # one for each image, of its size
     fps: float
     backend: Backend = "auto"
 

@@ -234,7 +234,10 @@ class RenderRequest:
         return self.camera.resized(width, height)
 
     def seen_by(self, camera: Camera) -> "RenderRequest":
-        """The same by another camera of the same size."""
+        """The same by another camera, which has the size of the image and is fitted into each pane."""
+        pane = self.split.pane_size(self.size)
+        if pane != (camera.width, camera.height):
+            camera = camera.with_intrinsics(camera.intrinsics.fitted(*pane))
         return replace(self, camera=camera)
 
     def without_line(self) -> "RenderRequest":
