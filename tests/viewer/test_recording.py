@@ -1,7 +1,6 @@
-"""The panel "Record" without its window: keyframes, playing, undo, files, films, commands."""
+"""Camera paths, films, saved images and commands, as actions of the window."""
 
 import shlex
-import sys
 import time
 from pathlib import Path
 
@@ -12,17 +11,16 @@ from PIL import Image
 
 from langsplat_core.config import PictureConfig
 from langsplat_core.io import save_scene
-from langsplat_viewer import __main__ as program
-from langsplat_viewer import actions, options
-from langsplat_viewer.actions.filming import subject_of
+from langsplat_core.io.cameras import read_cameras
+from langsplat_viewer import actions
 from langsplat_viewer.camera.controls import orbit, zoom
 from langsplat_viewer.files.flight_files import read_flight
-from langsplat_viewer.output import film
-from langsplat_viewer.output.still import Subject, draw_something, painter
+from langsplat_viewer.output import film, saving
 from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.renderer import render_image
 from langsplat_viewer.rendering.request import Splats
 from langsplat_viewer.viewer import Viewer
-from tests.support.fakes import FakeEncoder, blob_scene
+from tests.support.fakes import blob_scene
 from tests.support.windowless import arrive, errors, settle
 
 
@@ -201,8 +199,8 @@ def test_a_film_is_made_beside_the_window(opened, folder):
     seen = sorted((folder / "blobs-film-001").glob("*.png"))
     assert len(seen) == 5
     camera = opened.state.record.keyframes[1].pose.camera(32, 24)
-    with painter(Subject(opened.state.scene), "cpu") as paint:
-        np.testing.assert_array_equal(np.asarray(Image.open(seen[2])), paint(camera).image)
+    expected = render_image(opened.state.request((32, 24)).seen_by(camera), "cpu")
+    np.testing.assert_array_equal(np.asarray(Image.open(seen[2])), expected)
 
 
 def test_a_film_can_be_stopped(opened, folder):
@@ -221,22 +219,6 @@ def test_a_picture_of_any_size(opened, folder):
     actions.save_sized_picture(opened, folder)
     drawn(opened)
     assert Image.open(folder / "blobs-97x41-001.png").size == (97, 41)
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    """Runs a command as a shell would."""
-    monkeypatch.setattr(options, "load_text_encoder", lambda encoder_id: FakeEncoder())
-
-    def go(command: str) -> np.ndarray:
-        words = shlex.split(command)
-        monkeypatch.setattr(sys, "argv", [*words, "--backend", "cpu"])
-        with pytest.raises(SystemExit) as stop:
-            program.entry()
-        assert not stop.value.code, capsys.readouterr().err
-        return np.asarray(Image.open(words[words.index("--out") + 1])).astype(int)
-
-    return go
 
 
 def see_depth(viewer) -> None:
@@ -276,7 +258,7 @@ LOOKS = {
 @pytest.mark.parametrize(
     "case", ["training camera", "elsewhere", *QUERIES, "latent", "depth", "clip", "orthographic"]
 )
-def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run, case):
+def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run_viewer, case):
     where = folder / "with a space"
     where.mkdir()
     save_scene(where / "blobs.ply", blob_scene(phrasebook=True))
@@ -297,11 +279,12 @@ def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run
     assert [path.suffix for path in folder.iterdir() if path.is_file()] == (
         [] if case == "training camera" else [".json"]
     )
-    with painter(subject_of(opened.state), "cpu") as paint:
-        expected = draw_something(
-            subject_of(opened.state), opened.state.view.camera(*opened.state.size), paint
-        )
-    assert_allclose(run(command), expected.astype(int), atol=2)
+    expected = render_image(opened.state.request(), "cpu")
+    words = shlex.split(command)
+    code, _, problems = run_viewer(*words[1:], "--backend", "cpu")
+    assert (code, problems) == (0, [])
+    image = np.asarray(Image.open(words[words.index("--out") + 1]))
+    assert_allclose(image.astype(int), expected.astype(int), atol=2)
     assert expected.std() > 5
     assert errors(opened) == []
 
@@ -314,3 +297,37 @@ def test_what_the_command_cannot_say_is_said(opened, folder):
     assert "the size of splats" in said
     assert "the picture beside it" in said
     assert "backdrop" not in said
+
+
+# Images and views to files.
+
+
+def test_pictures_are_saved_under_new_names(opened, tmp_path):
+    first, second = saving.save_picture(opened, tmp_path), saving.save_picture(opened, tmp_path)
+    assert [first.name, second.name] == ["blobs-001.png", "blobs-002.png"]
+    assert np.asarray(Image.open(second)).tolist() == np.full((6, 8, 3), 77).tolist()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["blobs-001.png", "blobs-002.png"]
+
+
+def test_a_saved_view_can_be_read_again(opened, tmp_path):
+    opened.state.size = (321, 123)
+    camera = read_cameras(saving.save_view(opened, tmp_path))[0]
+    expected = opened.state.view.camera(321, 123)
+    assert (camera.width, camera.height) == (321, 123)
+    assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-9)
+    assert camera.fx == pytest.approx(expected.fx)
+
+
+def test_an_unwritable_folder_is_one_line(opened, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    assert saving.save_picture(opened, blocked) is None
+    assert saving.save_view(opened, blocked) is None
+    assert len(errors(opened)) == 2
+    assert all("not saved" in text for text in errors(opened))
+
+
+def test_nothing_to_save_before_a_scene_is_open(viewer, tmp_path):
+    assert saving.save_picture(viewer, tmp_path) is None
+    assert saving.save_view(viewer, tmp_path) is None
+    assert len(errors(viewer)) == 2

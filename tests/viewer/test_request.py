@@ -1,4 +1,4 @@
-"""Render requests: what they depend on, their panes, the edited scene, and that every image is one of them."""
+"""Render requests: what they depend on, their panes, the edited scene; and that every image is one."""
 
 import time
 from dataclasses import MISSING, fields, replace
