@@ -325,16 +325,11 @@ def test_latents_are_those_of_the_level_asked_for():
     assert [latent_level(level) for level in ("subpart", "part", "whole", "auto")] == [0, 1, 2, 2]
 
 
+BLOBS = blob_scene().gaussians
 NOTHING = {
-    "empty": (blob_scene().gaussians.take(np.zeros(360, bool)), "the scene holds no Gaussians"),
-    "nan": (
-        replace(blob_scene().gaussians, means=np.full((360, 3), np.nan)),
-        "none of the 360 Gaussians can be drawn",
-    ),
-    "clear": (
-        replace(blob_scene().gaussians, opacity_logits=np.full(360, -20.0)),
-        "all 360 Gaussians are transparent",
-    ),
+    "empty": (BLOBS.take(np.zeros(360, bool)), "the scene holds no Gaussians"),
+    "nan": (replace(BLOBS, means=np.full((360, 3), np.nan)), "none of the 360 Gaussians can be drawn"),
+    "clear": (replace(BLOBS, opacity_logits=np.full(360, -20.0)), "all 360 Gaussians are transparent"),
 }
 
 
