@@ -7,28 +7,7 @@ from langsplat_core.arrays import Array
 from langsplat_viewer import actions, staging
 from langsplat_viewer.files.photographs import corners
 from langsplat_viewer.panels.area import Area
-from langsplat_viewer.panels.style import leave_room, muted, small_wrapped, tip
 from langsplat_viewer.viewer import Viewer
-
-
-def draw_slider(viewer: Viewer) -> None:
-    """How much of it is seen, and why it is not."""
-    state = viewer.state
-    leave_room("Photograph", 11)
-    flags = imgui.SliderFlags_.always_clamp
-    changed, fade = imgui.slider_float("Photograph", state.seeing.fade, 0.0, 1.0, "%.2f", flags)
-    if changed:
-        actions.fade_photograph(viewer, fade)
-    tip("Lay the photograph of the training camera over the picture")
-    if state.seeing.fade == 0:
-        return
-    photograph = actions.photograph_here(state)
-    if photograph is None:
-        small_wrapped("stand at a training camera to see its photograph", muted())
-    elif photograph.reason:
-        small_wrapped(photograph.reason, muted())
-        if imgui.button("Folder of photographs ..."):
-            actions.ask_for_photographs(viewer)
 
 
 class Overlay:

@@ -13,7 +13,6 @@ from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, adopt_up, l
 from langsplat_viewer.camera.overlays import length_text
 from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of, with_key
 from langsplat_viewer.drawing.channels import MOST_DEGREE, SIZE_RANGE, Clip, Splats
-from langsplat_viewer.panels import photograph
 from langsplat_viewer.panels.style import beside, beside_boxed, leave_room, muted, small_wrapped, tip
 from langsplat_viewer.viewer import Viewer
 
@@ -257,7 +256,27 @@ def _training_cameras(viewer: Viewer) -> None:
     tip("Training cameras: stand where a photograph was taken")
     if changed and index != state.camera_index:
         actions.go_to_camera(viewer, index)
-    photograph.draw_slider(viewer)
+    _photograph(viewer)
+
+
+def _photograph(viewer: Viewer) -> None:
+    """How much of it is seen, and why it is not."""
+    state = viewer.state
+    leave_room("Photograph", WIDTH_EM)
+    flags = imgui.SliderFlags_.always_clamp
+    changed, fade = imgui.slider_float("Photograph", state.seeing.fade, 0.0, 1.0, "%.2f", flags)
+    if changed:
+        actions.fade_photograph(viewer, fade)
+    tip("Lay the photograph of the training camera over the picture")
+    if state.seeing.fade == 0:
+        return
+    photograph = actions.photograph_here(state)
+    if photograph is None:
+        small_wrapped("stand at a training camera to see its photograph", muted())
+    elif photograph.reason:
+        small_wrapped(photograph.reason, muted())
+        if imgui.button("Folder of photographs ..."):
+            actions.ask_for_photographs(viewer)
 
 
 def _slider(
