@@ -22,7 +22,6 @@ from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.drawing.channels import UNCLIPPED, Layers, why_nothing, why_undrawable
 from langsplat_viewer.drawing.renderer import FINE, Level, Pace, Rasterized, Renderer
-from langsplat_viewer.keys import Changed
 from langsplat_viewer.staging import (
     Background,
     Depiction,
@@ -110,7 +109,7 @@ class Canvas:
         if self._unsure and not moving and not self.waits and self._camera is not None:
             self._unsure = False  # asked at rest only: it reads the picture back
             if self._renderer.shows_nothing():
-                state.nothing = self._why_nothing(wanted, self._camera, state.preferences.keys)
+                state.nothing = self._why_nothing(wanted, self._camera)
         return moving or self.waits
 
     @property
@@ -156,17 +155,17 @@ class Canvas:
         before, self._timed = self._timed, state.timing.wanted
         return self._timed and not before
 
-    def _why_nothing(self, wanted: Depiction, camera: Camera, keys: Changed) -> str:
+    def _why_nothing(self, wanted: Depiction, camera: Camera) -> str:
         source = wanted.model.scene
         gaussians = source.gaussians if self._marked is None else self._marked.scene.gaussians
         if len(source.gaussians) and not len(gaussians):
-            shown = with_key("show what is hidden", actions.show_hidden, keys)
-            return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', actions.undo, keys)}"
+            shown = with_key("show what is hidden", actions.show_hidden)
+            return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', actions.undo)}"
         if wanted.clip != UNCLIPPED and gaussians.valid().any():
             return NOTHING_BETWEEN
         reason = why_nothing(gaussians, camera)
         elsewhere = not why_undrawable(gaussians)  # another view would show something
-        back = with_key("return to the opening view", actions.reset_view, keys)
+        back = with_key("return to the opening view", actions.reset_view)
         return f"{reason}: {back}" if elsewhere else reason
 
     def _merged(self) -> Merged | None:

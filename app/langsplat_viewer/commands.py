@@ -12,7 +12,6 @@ from langsplat_viewer import actions
 from langsplat_viewer.actions.selecting import Part
 from langsplat_viewer.camera.controls import Side, adopt_up, level
 from langsplat_viewer.drawing.channels import Overlay
-from langsplat_viewer.keys import Changed
 from langsplat_viewer.marks import TOOLS, Tool
 from langsplat_viewer.output import saving
 from langsplat_viewer.viewer import Viewer
@@ -39,7 +38,7 @@ BUTTONS = tuple(button for row in DISPLAYS.values() for button in buttons_of(row
 
 @dataclass(frozen=True)
 class Command:
-    """One row: what it does, in words, and the keys for it, which a user may change (`keys_of`).
+    """One row: what it does, in words, and the keys for it.
 
     Keys are written as people read them: "Ctrl+Shift+P", "F1", "R", or a typed character such as "?",
     wherever that is on the keyboard. Those with Ctrl, and F1, also work while something is typed;
@@ -187,7 +186,6 @@ COMMANDS: tuple[Command, ...] = (
     *(_panel(title) for title in PANEL_TITLES),
     Command("find a command", lambda viewer: actions.show_palette(viewer, True), ("Ctrl+Shift+P",), "Help"),
     Command("list of keys", actions.toggle_help, ("F1", "?"), "Help"),
-    Command("change the keys", lambda viewer: actions.edit_keys(viewer, True), menu="Help"),
     Command("close what lies over the scene", actions.escape, ("Esc",)),
 )
 
@@ -205,17 +203,9 @@ HELD: tuple[tuple[str, str], ...] = (
 )
 
 
-def keys_of(command: Command, changed: Changed) -> tuple[str, ...]:
-    """The keys of a command: those that it was given, else those of the table that no other was given."""
-    if command.does in changed:
-        return changed[command.does]
-    given = {key for keys in changed.values() for key in keys}
-    return tuple(key for key in command.keys if key not in given)
-
-
-def with_key(text: str, act: Callable[[Viewer], object], changed: Changed) -> str:
+def with_key(text: str, act: Callable[[Viewer], object]) -> str:
     """`text`, and in brackets the key of the command that does it."""
-    keys = next((keys_of(command, changed) for command in COMMANDS if command.act is act), ())
+    keys = next((command.keys for command in COMMANDS if command.act is act), ())
     return f"{text} ({keys[0]})" if keys else text
 
 

@@ -24,7 +24,6 @@ from langsplat_viewer.files.browsing import Listing
 from langsplat_viewer.files.flight_files import Bookmark
 from langsplat_viewer.files.photographs import Photograph
 from langsplat_viewer.files.preferences import Preferences
-from langsplat_viewer.keys import Keying
 from langsplat_viewer.marks import Selection
 
 KEPT = 31  # measurements of which the median is told
@@ -246,7 +245,6 @@ class ViewerState:
     wanted_panel: str = ""  # the title of one that is opened and brought to the front at the next frame
     show_panel: bool = True  # the panels, as many as are open
     show_help: bool = False
-    keying: Keying = field(default_factory=Keying)
     show_palette: bool = False
     palette_typed: str = ""
     browser: Listing | None = None  # the folder that the file browser shows, while it is open

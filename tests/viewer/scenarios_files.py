@@ -42,57 +42,6 @@ def reload_what_changed(s: Any) -> None:
     assert hot[0] > hot[2] + 60
 
 
-def change_a_key(s: Any) -> None:
-    """The key that is pressed is the command's from then on, and does nothing else while it is waited for."""
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
-    key, ctrl = imgui.Key, imgui.Key.mod_ctrl
-    s.menu("Help", "Change the keys")
-    s.ctx.yield_(3)
-    s.ctx.item_click("//Keys/##words")
-    s.ctx.key_chars("show")
-    s.ctx.yield_(3)
-    s.shot("some keys")
-    s.ctx.item_click("//**/show depth/2 ##key")
-    s.ctx.yield_(2)
-    assert s.state.keying.waiting == "show depth"
-    s.shot("waiting")
-    s.ctx.key_press(ctrl | key.z)  # of "undo"
-    s.ctx.yield_(3)
-    assert s.state.keying.conflict.owner == "undo"
-    s.shot("conflict")
-    s.ctx.item_click("//Keys/Leave it")
-    s.ctx.item_click("//**/show depth/2 ##key")
-    s.ctx.yield_(2)
-    s.ctx.key_press(key.space)
-    s.ctx.yield_(3)
-    assert s.state.preferences.keys == {"show depth": ("Space",)}
-    s.ctx.item_click("//**/show alpha/3 ##key")
-    s.ctx.yield_(2)
-    s.ctx.key_press(key.escape)
-    s.ctx.yield_(3)
-    assert s.state.show_help
-    assert s.state.keying.waiting == ""
-    s.ctx.item_click("//**/show alpha/3 ##key")
-    s.ctx.yield_(2)
-    s.ctx.key_chars("%")
-    s.ctx.yield_(3)
-    assert s.state.preferences.keys["show alpha"] == ("%",)
-    s.shot("changed keys")
-    s.ctx.key_press(key.escape)
-    s.ctx.yield_(3)
-    assert not s.state.show_help
-    s.ctx.key_press(digit_key(2))
-    s.ctx.yield_(3)
-    assert s.state.picture.display == "rgb"
-    s.ctx.key_press(key.space)
-    s.ctx.yield_(3)
-    assert s.state.picture.display == "depth"
-    s.ctx.key_chars("%")
-    s.ctx.yield_(3)
-    assert s.state.picture.display == "alpha"
-
-
 def fade_in_a_photograph(s: Any) -> None:
     """The slider lays it over the picture where the camera saw it; elsewhere there is none."""
     s.wait(lambda: s.state.scene is not None)

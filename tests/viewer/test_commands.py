@@ -71,7 +71,7 @@ def test_every_panel_can_be_opened_by_a_command(viewer):
 
 
 def test_help_lists_every_key():
-    listed = " ".join(keys for keys, _ in rows({}))
+    listed = " ".join(keys for keys, _ in rows())
     assert all(key in listed for key in KEYS)
 
 

@@ -165,7 +165,6 @@ from langsplat_viewer.actions.settings import (
     toggle_wipe,
     turn_to_face,
 )
-from langsplat_viewer.actions.settings import edit_keys as edit_keys
 from langsplat_viewer.actions.settings import escape as escape
 from langsplat_viewer.actions.settings import mute_letters as mute_letters
 from langsplat_viewer.actions.settings import note_panels as note_panels
@@ -183,6 +182,5 @@ from langsplat_viewer.actions.settings import take_wanted_panel as take_wanted_p
 from langsplat_viewer.actions.settings import toggle_help as toggle_help
 from langsplat_viewer.actions.settings import toggle_panel as toggle_panel
 from langsplat_viewer.actions.settings import type_command as type_command
-from langsplat_viewer.actions.settings import type_keys as type_keys
 from langsplat_viewer.actions.undoing import redo as redo
 from langsplat_viewer.actions.undoing import undo as undo

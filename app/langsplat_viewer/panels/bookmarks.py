@@ -24,7 +24,7 @@ def draw(viewer: Viewer) -> None:
     if imgui.begin_child("bookmarks"):
         if not state.bookmarks:
             words = "views that you keep are listed here"
-            small_wrapped(with_key(words, actions.add_bookmark, state.preferences.keys), muted())
+            small_wrapped(with_key(words, actions.add_bookmark), muted())
         for number, bookmark in enumerate(state.bookmarks):
             imgui.push_id(number)
             side, right = imgui.get_frame_height(), imgui.get_content_region_avail().x

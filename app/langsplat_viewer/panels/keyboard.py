@@ -5,8 +5,8 @@ from functools import cache
 
 from imgui_bundle import imgui
 
-from langsplat_viewer import actions, keying, keys
-from langsplat_viewer.commands import COMMANDS, Command, keys_of
+from langsplat_viewer import actions
+from langsplat_viewer.commands import COMMANDS, Command
 from langsplat_viewer.viewer import Viewer
 
 NAMED = {  # keys whose name in imgui is another
@@ -48,35 +48,10 @@ def _key(name: str) -> imgui.Key:
 def handle(viewer: Viewer) -> None:
     """Run the commands whose keys were pressed in this frame."""
     state, typing = viewer.state, imgui.get_io().want_text_input
-    if state.keying.waiting:
-        _take(viewer)
-        return
     for command in COMMANDS:
-        texts = keys_of(command, state.preferences.keys)
-        if any(_pressed(chord(text), command, typing, state.letters_muted) for text in texts):
+        if any(_pressed(chord(text), command, typing, state.letters_muted) for text in command.keys):
             command.act(viewer)
             return
-
-
-def _take(viewer: Viewer) -> None:
-    """Give the key that was pressed to the command that waits for one; Esc ends that."""
-    if imgui.is_key_pressed(imgui.Key.escape, False):
-        keying.wait_for_key(viewer, None)
-        return
-    key = pressed_key()
-    if key:
-        keying.press(viewer, key)
-
-
-def pressed_key() -> str:
-    """The key that was pressed in this frame, as `commands` writes keys; "" for none."""
-    io = imgui.get_io()
-    symbols = [symbol for symbol in map(chr, io.input_queue_characters) if keys.is_symbol(symbol)]
-    if symbols and not io.key_ctrl:
-        return symbols[0]
-    name = next((name for name in keys.NAMED if imgui.is_key_pressed(_key(name), False)), "")
-    down = zip(keys.HELD_WITH, (io.key_ctrl, io.key_shift, io.key_alt), strict=True)
-    return "+".join([*(key for key, is_down in down if is_down), name]) if name else ""
 
 
 def _pressed(wanted: Chord, command: Command, typing: bool, muted: bool) -> bool:

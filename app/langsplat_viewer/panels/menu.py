@@ -5,7 +5,7 @@ from pathlib import Path
 from imgui_bundle import hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.commands import MENUS, in_menu, keys_of
+from langsplat_viewer.commands import MENUS, in_menu
 from langsplat_viewer.files.preferences import SCALES, THEMES
 from langsplat_viewer.viewer import Viewer
 
@@ -14,12 +14,11 @@ UI_SCALES = (0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
 
 def draw(viewer: Viewer) -> None:
     """Inside the menu bar."""
-    changed = viewer.state.preferences.keys
     for menu in MENUS:
         if imgui.begin_menu(menu):
             for command in in_menu(menu):
                 title = command.does[0].upper() + command.does[1:]
-                if imgui.menu_item(title, ", ".join(keys_of(command, changed)[:1]), False)[0]:
+                if imgui.menu_item(title, ", ".join(command.keys[:1]), False)[0]:
                     command.act(viewer)
             if menu == "File":
                 _recent(viewer)

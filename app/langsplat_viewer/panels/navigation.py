@@ -24,7 +24,6 @@ def handle(viewer: Viewer, area: Area) -> None:
     actions.hover(viewer, _pixel(area))
     keyboard.handle(viewer)
     letters = not (io.want_text_input or io.key_ctrl or viewer.state.letters_muted)
-    letters = letters and not viewer.state.keying.waiting
     if viewer.state.view is not None and letters:
         _fly(viewer)
 

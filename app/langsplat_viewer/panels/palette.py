@@ -3,8 +3,7 @@
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_viewer import actions
-from langsplat_viewer.commands import Command, keys_of, matching
-from langsplat_viewer.keys import Changed
+from langsplat_viewer.commands import Command, matching
 from langsplat_viewer.panels.style import muted
 from langsplat_viewer.viewer import Viewer
 
@@ -30,7 +29,7 @@ def draw(viewer: Viewer) -> None:
     )
     actions.type_command(viewer, typed)
     found = matching(typed)
-    chosen = found[0] if entered and found else _clicked(found, viewer.state.preferences.keys)
+    chosen = found[0] if entered and found else _clicked(found)
     left = not imgui.is_window_focused(imgui.FocusedFlags_.root_and_child_windows)
     escaped = imgui.is_key_pressed(imgui.Key.escape)
     imgui.end()
@@ -40,7 +39,7 @@ def draw(viewer: Viewer) -> None:
         chosen.act(viewer)
 
 
-def _clicked(found: list[Command], changed: Changed) -> Command | None:
+def _clicked(found: list[Command]) -> Command | None:
     """The list; the command that was clicked."""
     chosen = None
     if imgui.begin_child("found"):
@@ -48,7 +47,7 @@ def _clicked(found: list[Command], changed: Changed) -> Command | None:
         for command in found:
             if imgui.selectable(command.does, False)[0]:
                 chosen = command
-            keys = ", ".join(keys_of(command, changed))
+            keys = ", ".join(command.keys)
             imgui.same_line(right - imgui.calc_text_size(keys).x)
             imgui.text_colored(muted(), keys)
     imgui.end_child()

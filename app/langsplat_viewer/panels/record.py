@@ -47,7 +47,7 @@ def _play(viewer: Viewer) -> None:
     imgui.begin_disabled(seconds <= 0)
     if imgui.button("Stop##path" if record.began is not None else "Play##path"):
         actions.toggle_playing(viewer)
-    tip(with_key("Play", actions.toggle_playing, viewer.state.preferences.keys))
+    tip(with_key("Play", actions.toggle_playing))
     imgui.same_line()
     loop = imgui.calc_text_size("Loop").x + imgui.get_frame_height() + 2 * imgui.get_style().item_spacing.x
     imgui.set_next_item_width(-loop)
@@ -82,7 +82,7 @@ def _keyframes(viewer: Viewer) -> None:
     record = viewer.state.record
     if imgui.button("Add keyframe"):
         actions.add_keyframe(viewer)
-    tip(with_key("The current view", actions.add_keyframe, viewer.state.preferences.keys))
+    tip(with_key("The current view", actions.add_keyframe))
     beside("Clear")
     imgui.begin_disabled(not record.keyframes)
     if imgui.button("Clear"):

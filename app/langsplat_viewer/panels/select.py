@@ -136,7 +136,7 @@ def _buttons(viewer: Viewer, verbs: Sequence[Verb]) -> None:
             beside(name)
         if imgui.button(f"{name}##verb"):
             act(viewer)
-        tip(with_key(what, act, viewer.state.preferences.keys))
+        tip(with_key(what, act))
 
 
 def _slider(label: str, value: float, limits: tuple[float, float], text: str) -> float:

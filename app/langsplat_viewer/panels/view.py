@@ -147,7 +147,7 @@ def draw_overlays(viewer: Viewer) -> None:
         if changed:
             actions.show_overlay(viewer, name, shown)
     ruler, scene = state.seeing.ruler, state.scene
-    measure = with_key("Measure", actions.toggle_measuring, state.preferences.keys)
+    measure = with_key("Measure", actions.toggle_measuring)
     imgui.begin_disabled(scene is None)
     changed, measures = imgui.checkbox(f"{measure}###measure", ruler.measures)
     if changed:
@@ -171,18 +171,17 @@ def draw_camera(viewer: Viewer) -> None:
     imgui.begin_disabled(state.view is None)
     if state.scene is not None and state.scene.cameras:
         _training_cameras(viewer)
-    keys = state.preferences.keys
-    if imgui.button(with_key("Reset", actions.reset_view, keys)):
+    if imgui.button(with_key("Reset", actions.reset_view)):
         actions.reset_view(viewer)
     tip("Return to the opening view")
-    focus = with_key("Focus", actions.focus_result, keys)
+    focus = with_key("Focus", actions.focus_result)
     beside(focus)
     if imgui.button(focus):
         actions.focus_result(viewer)
     beside("Frame all")
     if imgui.button("Frame all"):
         actions.frame_scene(viewer)
-    tip(with_key("Show the whole scene from this side", actions.frame_scene, keys))
+    tip(with_key("Show the whole scene from this side", actions.frame_scene))
     if imgui.button("Horizon"):
         actions.move(viewer, level)
     tip("Turn the picture until the horizon is level")
@@ -207,7 +206,7 @@ def draw_camera(viewer: Viewer) -> None:
 
 def _projection(viewer: Viewer, view: OrbitCamera) -> None:
     """With perspective or without; the field of view is one of perspective."""
-    text = with_key("Orthographic", actions.toggle_orthographic, viewer.state.preferences.keys)
+    text = with_key("Orthographic", actions.toggle_orthographic)
     _, orthographic = imgui.checkbox(f"{text}###orthographic", bool(view.back))
     actions.set_orthographic(viewer, orthographic)
     tip("No perspective: what is parallel looks parallel; the wheel changes the scale")
