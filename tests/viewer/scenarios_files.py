@@ -201,5 +201,4 @@ SCENARIOS: dict[str, Scenario] = {
     "switch_between_scenes": (switch_between_scenes, "blobs.ply", {}),
     "watch_a_training": (watch_a_training, "blobs.ply", {}),
     "read_what_speaks_against": (read_what_speaks_against, "blobs.ply", {}),
-    "change_a_key": (change_a_key, "blobs.ply", {}),
 }

@@ -8,14 +8,6 @@ something a user did: the reason appears in the messages area.
 from langsplat_viewer.actions.browsing import ask_for_file as ask_for_file
 from langsplat_viewer.actions.browsing import browse as browse
 from langsplat_viewer.actions.browsing import choose as choose
-from langsplat_viewer.actions.browsing import (
-    choose_photographs,
-    fill_in,
-    look_at_training,
-    start_training,
-    stop_training,
-    watch_training,
-)
 from langsplat_viewer.actions.browsing import close_browser as close_browser
 from langsplat_viewer.actions.browsing import open_all as open_all
 from langsplat_viewer.actions.browsing import open_dropped as open_dropped
@@ -184,3 +176,4 @@ from langsplat_viewer.actions.settings import toggle_panel as toggle_panel
 from langsplat_viewer.actions.settings import type_command as type_command
 from langsplat_viewer.actions.undoing import redo as redo
 from langsplat_viewer.actions.undoing import undo as undo
+from langsplat_viewer.actions.training import choose_photographs, fill_in, look_at_training, start_training, stop_training, watch_training

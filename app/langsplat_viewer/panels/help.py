@@ -7,7 +7,7 @@ from langsplat_viewer.commands import COMMANDS, HELD
 from langsplat_viewer.viewer import Viewer
 
 KEYS_EM, DOES_EM = 14.0, 20.0  # widths of the columns
-MOST_SHARE = 0.94  # of the window's height
+HELP_SHARE = 0.94  # of the window's height
 
 
 def rows() -> tuple[tuple[str, str], ...]:
@@ -23,7 +23,7 @@ def draw(viewer: Viewer) -> None:
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_collapse
     centre = imgui.get_main_viewport().get_center()
     room = imgui.get_main_viewport().work_size
-    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, MOST_SHARE * room.y))
+    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, HELP_SHARE * room.y))
     imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
     imgui.set_next_window_bg_alpha(1.0)
     _, still_open = imgui.begin("Keys", True, flags)
