@@ -14,7 +14,6 @@ ROOT = Path(__file__).parent.parent
 LAYERS = [
     ["langsplat_viewer.__main__"],
     ["langsplat_viewer.window"],
-    ["langsplat_viewer.display_probe", "langsplat_viewer.remembered"],
     ["langsplat_viewer.panels"],
     ["langsplat_viewer.canvas"],
     ["langsplat_viewer.commands"],

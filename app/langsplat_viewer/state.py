@@ -21,7 +21,7 @@ from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.drawing import channels
 from langsplat_viewer.drawing.channels import Seeing
 from langsplat_viewer.files.browsing import Listing
-from langsplat_viewer.files.flight_files import Bookmark
+from langsplat_viewer.files.flights import Bookmark
 from langsplat_viewer.files.photographs import Photograph
 from langsplat_viewer.files.preferences import Preferences
 from langsplat_viewer.marks import Selection

@@ -22,7 +22,7 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.drawing.channels import Clip, Ruler
-from langsplat_viewer.files.flight_files import Shelf
+from langsplat_viewer.files.flights import Shelf
 from langsplat_viewer.files.watching import Stamps, Watch
 from langsplat_viewer.jobs import Worker
 from langsplat_viewer.marks import Pair

@@ -14,7 +14,7 @@ from langsplat_core.io import save_scene
 from langsplat_core.pipeline.report import REPORT
 from langsplat_viewer import actions
 from langsplat_viewer import viewer as training
-from langsplat_viewer.panels.area import scene_area
+from langsplat_viewer.panels.style import scene_area
 from tests.support.fakes import CENTRES, blob_scene
 
 

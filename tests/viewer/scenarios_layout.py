@@ -5,8 +5,8 @@ from typing import Any
 
 from imgui_bundle import imgui  # isort: skip
 from langsplat_viewer import actions
-from langsplat_viewer.panels.area import scene_area
 from langsplat_viewer.panels.layout import PANELS
+from langsplat_viewer.panels.style import scene_area
 
 LONG = "mugg or boook or plent or mugg or boook or plent or mugg or boook or plent or mugg"
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from imgui_bundle import imgui  # isort: skip
 from langsplat_viewer import actions
-from langsplat_viewer.files.flight_files import read_flight
+from langsplat_viewer.files.flights import read_flight
 
 
 def record_and_play(s) -> None:

@@ -13,9 +13,9 @@ from langsplat_viewer import actions
 from langsplat_viewer.camera.overlays import Label, visible_faces
 from langsplat_viewer.drawing import renderer
 from langsplat_viewer.drawing.channels import ArrayChannels
-from langsplat_viewer.panels import over
-from langsplat_viewer.panels.area import Area, scene_area
-from langsplat_viewer.panels.cube import EDGE
+from langsplat_viewer.panels import overlays
+from langsplat_viewer.panels.overlays import EDGE
+from langsplat_viewer.panels.style import Area, scene_area
 from tests.support.fakes import CENTRES
 
 MUG, BOOK, PLANT = CENTRES
@@ -311,16 +311,16 @@ def name_what_is_close(s: Any) -> None:
         s.search(word)
     actions.look_from(s.window.viewer, "left")
     s.settle()
-    written, write = [], over.text_on_shade
+    written, write = [], overlays.text_on_shade
 
     def remembered(text: str, x: float, y: float, area: Area) -> None:
         size = imgui.calc_text_size(text)
         written.append((text, Label(x, y, size.x, size.y)))
         write(text, x, y, area)
 
-    over.text_on_shade = remembered
+    overlays.text_on_shade = remembered
     s.ctx.yield_(2)
-    over.text_on_shade = write
+    overlays.text_on_shade = write
     frame = dict(written)
     assert set(frame) == {"mug", "book", "plant"}
     assert not any(a.covers(b) for a, b in combinations(frame.values(), 2))

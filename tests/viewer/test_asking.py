@@ -10,7 +10,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.scene import CANONICAL_PHRASES
 from langsplat_viewer import actions
 from langsplat_viewer.files.browsing import QuerySet, SavedQuery, read_queries, write_queries
-from langsplat_viewer.panels.cut import BINS, histogram
+from langsplat_viewer.panels.search import BINS, histogram
 from tests.support.windowless import errors, settle
 
 

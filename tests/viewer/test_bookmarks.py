@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from langsplat_viewer import actions
 from langsplat_viewer.camera.controls import OrbitCamera, from_side, look, orbit, symmetric_intrinsics, walk
-from langsplat_viewer.files.flight_files import FILE_NAME, MOST_SCENES, MOST_VIEWS, Shelf
+from langsplat_viewer.files.flights import FILE_NAME, MOST_SCENES, MOST_VIEWS, Shelf
 from tests.support.windowless import arrive, errors, settle
 
 

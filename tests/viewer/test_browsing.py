@@ -6,7 +6,7 @@ import pytest
 
 from langsplat_viewer import actions
 from langsplat_viewer.files.browsing import MOST_LISTED, Entry, list_folder
-from langsplat_viewer.panels.browser import in_words
+from langsplat_viewer.panels.scene import in_words
 from tests.support.windowless import SCENES, errors, settle
 
 

@@ -6,9 +6,8 @@ import pytest
 
 from langsplat_viewer import actions
 from langsplat_viewer.commands import BUTTONS, COMMANDS, MENUS, PANEL_TITLES, in_menu, matching
-from langsplat_viewer.panels.help import rows
-from langsplat_viewer.panels.keyboard import chord
-from langsplat_viewer.panels.layout import PANELS
+from langsplat_viewer.panels.layout import PANELS, key_rows
+from langsplat_viewer.panels.navigation import chord
 
 KEYS = {key: command for command in COMMANDS for key in command.keys}
 
@@ -71,7 +70,7 @@ def test_every_panel_can_be_opened_by_a_command(viewer):
 
 
 def test_help_lists_every_key():
-    listed = " ".join(keys for keys, _ in rows())
+    listed = " ".join(keys for keys, _ in key_rows())
     assert all(key in listed for key in KEYS)
 
 

@@ -19,7 +19,7 @@ from langsplat_viewer import __main__ as program
 from langsplat_viewer import options
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.camera.flight import Flight, Keyframe
-from langsplat_viewer.files.flight_files import write_flight
+from langsplat_viewer.files.flights import write_flight
 from langsplat_viewer.output import film
 from langsplat_viewer.output.film import Shot, cameras_of, find_ffmpeg, fingerprint, make_film
 from langsplat_viewer.output.still import Subject, render_picture

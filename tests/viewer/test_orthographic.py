@@ -11,8 +11,8 @@ from langsplat_viewer import actions
 from langsplat_viewer.actions.opening import standing_at
 from langsplat_viewer.camera.controls import from_side, zoom
 from langsplat_viewer.commands import COMMANDS
-from langsplat_viewer.files.flight_files import Shelf
-from langsplat_viewer.panels.pointing import figures
+from langsplat_viewer.files.flights import Shelf
+from langsplat_viewer.panels.overlays import pointed_figures
 from langsplat_viewer.state import GLIDE_SECONDS
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import CENTRES
@@ -157,7 +157,7 @@ def test_what_is_under_the_cursor_is_said_to_be_as_far_as_from_the_eye(flat):
     settle(flat)  # the first time kernels are compiled
     found = flat.state.hover.found
     assert len(found.words) == len(LEVELS)
-    away = float(figures(flat.state.hover)[-1].split(", ")[1].removesuffix(" away"))
+    away = float(pointed_figures(flat.state.hover)[-1].split(", ")[1].removesuffix(" away"))
     eye = flat.state.view.eye
     assert away == pytest.approx(float((found.position - eye) @ flat.state.view.rotation[2]), abs=0.006)
     assert np.linalg.norm(found.position - CENTRES[1]) < 0.6

@@ -12,7 +12,7 @@ from langsplat_core.query.answers import QueryResult
 from langsplat_viewer import actions
 from langsplat_viewer.drawing import channels
 from langsplat_viewer.output.still import describe
-from langsplat_viewer.panels.legend import STEPS, bar_colours
+from langsplat_viewer.panels.overlays import STEPS, bar_colours
 from tests.support.windowless import settle
 
 

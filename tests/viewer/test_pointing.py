@@ -8,7 +8,7 @@ from langsplat_core.query.describe import Describer, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_viewer import actions
-from langsplat_viewer.panels.pointing import figures, said
+from langsplat_viewer.panels.overlays import pointed_figures, said
 from tests.support.fakes import CENTRES, FakeEncoder, blob_scene
 from tests.support.windowless import errors, settle
 
@@ -55,8 +55,8 @@ def test_it_is_said_once_the_mouse_rests(pointing):
     assert "mug" in said(found.found.words[2], sure=False)
     assert "%" not in said(found.found.words[2], sure=False)
     assert "mug 100 %" in said(found.found.words[2], sure=True)
-    assert "away" in figures(found)[-1]
-    assert figures(found)[0].startswith("mug: ")
+    assert "away" in pointed_figures(found)[-1]
+    assert pointed_figures(found)[0].startswith("mug: ")
 
 
 def test_it_is_forgotten_when_the_mouse_or_the_camera_moves(pointing):

@@ -9,7 +9,7 @@ import pytest
 
 from langsplat_core.scene import Calibration, Reading
 from langsplat_viewer import actions
-from langsplat_viewer.panels import answers, query_box, style
+from langsplat_viewer.panels import search, style
 from langsplat_viewer.panels import search as panel
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene, calibrated_for, language
@@ -64,12 +64,12 @@ class Paper:
 @pytest.fixture
 def paper(monkeypatch) -> Iterator[Paper]:
     made = Paper()
-    for module in (panel, answers, query_box):
+    for module in (panel, search, search):
         monkeypatch.setattr(module, "imgui", made)
-    for module in (panel, answers):
+    for module in (panel, search):
         monkeypatch.setattr(module, "small_wrapped", lambda text, colour: made.said.append(text))
     monkeypatch.setattr(style, "imgui", made)
-    monkeypatch.setattr(answers.cut, "draw", lambda viewer, query, result: None)
+    monkeypatch.setattr(search.cut, "draw", lambda viewer, query, result: None)
     return made
 
 
@@ -111,8 +111,8 @@ def test_structure_is_said_as_it_was_read(viewer, paper):
 
 
 def test_the_list_takes_the_room_that_the_details_leave_it():
-    assert answers.rows_shown(0, 40.0) == 1  # a line says what will be there
-    assert answers.rows_shown(3, 12.0) == 3
-    assert answers.rows_shown(9, 12.0) == 3.5  # as much as a low window has
-    assert answers.rows_shown(9, 17.3) == 7.5
-    assert answers.rows_shown(9, 40.0) == 9
+    assert search.rows_shown(0, 40.0) == 1  # a line says what will be there
+    assert search.rows_shown(3, 12.0) == 3
+    assert search.rows_shown(9, 12.0) == 3.5  # as much as a low window has
+    assert search.rows_shown(9, 17.3) == 7.5
+    assert search.rows_shown(9, 40.0) == 9

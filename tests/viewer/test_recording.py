@@ -17,7 +17,7 @@ from langsplat_viewer import actions, options
 from langsplat_viewer.actions.filming import subject_of
 from langsplat_viewer.camera.controls import orbit, zoom
 from langsplat_viewer.drawing.channels import Clip, Splats
-from langsplat_viewer.files.flight_files import read_flight
+from langsplat_viewer.files.flights import read_flight
 from langsplat_viewer.output import film
 from langsplat_viewer.output.still import Subject, draw_something, painter
 from langsplat_viewer.viewer import Viewer

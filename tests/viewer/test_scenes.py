@@ -9,7 +9,7 @@ from langsplat_viewer import actions
 from langsplat_viewer.actions.opening import MOST
 from langsplat_viewer.drawing.channels import UNCLIPPED, Clip
 from langsplat_viewer.files.browsing import list_folder
-from langsplat_viewer.panels.browser import has_several
+from langsplat_viewer.panels.scene import has_several
 from tests.support.windowless import SCENES, arrive, errors, settle
 
 BLOBS, PLAIN, BARE = (Path(f"{name}.ply").absolute() for name in ("blobs", "plain", "bare"))

@@ -11,7 +11,7 @@ from langsplat_core.scene import Reading
 from langsplat_viewer import actions
 from langsplat_viewer.drawing.channels import NO_HEAT
 from langsplat_viewer.output.still import describe
-from langsplat_viewer.panels.query_box import hint
+from langsplat_viewer.panels.search import hint
 from tests.support.fakes import CENTRES, blob_scene, calibrated_for, language
 from tests.support.windowless import SCENES, errors, settle
 

@@ -9,7 +9,7 @@ from langsplat_viewer import actions
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.drawing.channels import Clip, Splats
 from langsplat_viewer.drawing.frame import FrameRenderer
-from langsplat_viewer.panels.timing import in_numbers
+from langsplat_viewer.panels.layout import in_numbers
 from langsplat_viewer.staging import LONGEST_SIDE, reference_of, small
 from langsplat_viewer.state import KEPT, Timing, compared, memory_bytes
 from tests.support.windowless import errors, rest, settle

@@ -19,7 +19,7 @@ from langsplat_core.io import load_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer import actions
 from langsplat_viewer.drawing.frame import Backend, FrameRenderer
-from langsplat_viewer.panels.area import scene_area
+from langsplat_viewer.panels.style import scene_area
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest
 from tests.support.fakes import CENTRES, FakeEncoder

@@ -5,47 +5,6 @@ Each takes the `Viewer` and changes its state; long work goes to the worker. Non
 something a user did: the reason appears in the messages area.
 """
 
-from langsplat_viewer.actions.browsing import ask_for_file as ask_for_file
-from langsplat_viewer.actions.browsing import browse as browse
-from langsplat_viewer.actions.browsing import choose as choose
-from langsplat_viewer.actions.browsing import close_browser as close_browser
-from langsplat_viewer.actions.browsing import open_all as open_all
-from langsplat_viewer.actions.browsing import open_dropped as open_dropped
-from langsplat_viewer.actions.browsing import open_recent as open_recent
-from langsplat_viewer.actions.browsing import open_typed as open_typed
-from langsplat_viewer.actions.browsing import type_path as type_path
-from langsplat_viewer.actions.camera import (
-    add_bookmark,
-    compare_with_reference,
-    delete_bookmark,
-    go_to_bookmark,
-    hover,
-    measure_frame,
-    path_seconds,
-    scrub,
-    stop_comparing,
-    toggle_playing,
-    toggle_pointing,
-    type_bookmark,
-)
-from langsplat_viewer.actions.camera import focus_pixel as focus_pixel
-from langsplat_viewer.actions.camera import focus_result as focus_result
-from langsplat_viewer.actions.camera import frame_scene as frame_scene
-from langsplat_viewer.actions.camera import glide_to as glide_to
-from langsplat_viewer.actions.camera import go_to_camera as go_to_camera
-from langsplat_viewer.actions.camera import look_from as look_from
-from langsplat_viewer.actions.camera import move as move
-from langsplat_viewer.actions.camera import open_at as open_at
-from langsplat_viewer.actions.camera import open_orthographic as open_orthographic
-from langsplat_viewer.actions.camera import reset_view as reset_view
-from langsplat_viewer.actions.camera import set_fly_speed as set_fly_speed
-from langsplat_viewer.actions.camera import set_orthographic as set_orthographic
-from langsplat_viewer.actions.camera import set_walking as set_walking
-from langsplat_viewer.actions.camera import step_camera as step_camera
-from langsplat_viewer.actions.camera import tick as tick
-from langsplat_viewer.actions.camera import toggle_orthographic as toggle_orthographic
-from langsplat_viewer.actions.camera import toggle_walking as toggle_walking
-from langsplat_viewer.actions.camera import zoom_by as zoom_by
 from langsplat_viewer.actions.filming import (
     add_keyframe,
     choose_keyframe,
@@ -71,19 +30,29 @@ from langsplat_viewer.actions.filming import take_clipboard as take_clipboard
 from langsplat_viewer.actions.filming import type_film as type_film
 from langsplat_viewer.actions.opening import (
     add_scenes,
+    ask_for_file,
     ask_for_photographs,
+    browse,
+    choose,
     choose_photograph_folder,
+    close_browser,
     fade_photograph,
     fetch_photograph,
     keep_old,
+    open_all,
+    open_dropped,
+    open_recent,
     open_scenes,
+    open_typed,
     photograph_here,
     reload,
     step_scene,
     switch_scene,
+    type_path,
     unlist_scene,
 )
 from langsplat_viewer.actions.opening import cancel as cancel
+from langsplat_viewer.actions.opening import choose_photographs as choose_photographs
 from langsplat_viewer.actions.opening import open_scene as open_scene
 from langsplat_viewer.actions.queries import ask as ask
 from langsplat_viewer.actions.queries import (
@@ -174,6 +143,44 @@ from langsplat_viewer.actions.settings import take_wanted_panel as take_wanted_p
 from langsplat_viewer.actions.settings import toggle_help as toggle_help
 from langsplat_viewer.actions.settings import toggle_panel as toggle_panel
 from langsplat_viewer.actions.settings import type_command as type_command
+from langsplat_viewer.actions.training import (
+    fill_in,
+    look_at_training,
+    start_training,
+    stop_training,
+    watch_training,
+)
 from langsplat_viewer.actions.undoing import redo as redo
 from langsplat_viewer.actions.undoing import undo as undo
-from langsplat_viewer.actions.training import choose_photographs, fill_in, look_at_training, start_training, stop_training, watch_training
+from langsplat_viewer.actions.viewpoint import (
+    add_bookmark,
+    compare_with_reference,
+    delete_bookmark,
+    focus_pixel,
+    focus_result,
+    frame_scene,
+    glide_to,
+    go_to_bookmark,
+    go_to_camera,
+    hover,
+    look_from,
+    measure_frame,
+    move,
+    open_at,
+    open_orthographic,
+    path_seconds,
+    reset_view,
+    scrub,
+    set_fly_speed,
+    set_orthographic,
+    set_walking,
+    step_camera,
+    stop_comparing,
+    tick,
+    toggle_orthographic,
+    toggle_playing,
+    toggle_pointing,
+    toggle_walking,
+    type_bookmark,
+    zoom_by,
+)

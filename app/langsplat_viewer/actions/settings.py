@@ -5,9 +5,9 @@ from dataclasses import fields, replace
 from langsplat_core.config import ColourMap, Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
-from langsplat_viewer.actions.camera import glide_to
 from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.selecting import leave_tool, stay
+from langsplat_viewer.actions.viewpoint import glide_to
 from langsplat_viewer.camera.overlays import facing
 from langsplat_viewer.drawing.channels import (
     AT_RANGE,

@@ -1,6 +1,5 @@
 """Training a scene from photographs, in a process of its own."""
 
-from dataclasses import replace
 from pathlib import Path
 
 from langsplat_core.pipeline.forecast import count_photographs
@@ -18,13 +17,6 @@ WARNING = "warning: "  # before each doubt that `langsplat train` ends with
 def fill_in(viewer: Viewer, form: TrainingForm) -> None:
     """What stands in the boxes."""
     viewer.state.training_form = form
-
-
-def choose_photographs(viewer: Viewer, folder: Path) -> None:
-    """Take a folder of photographs, and a name beside it for the scene."""
-    form = viewer.state.training_form
-    out = form.out or str(folder.with_name(f"{folder.name or 'scene'}.ply"))
-    fill_in(viewer, replace(form, dataset=str(folder), out=out))
 
 
 def start_training(viewer: Viewer) -> None:
@@ -117,5 +109,3 @@ def watch_training(viewer: Viewer) -> None:
         state.say("training stopped; Train goes on where it was")
     else:
         state.say(last, is_error=True)
-
-

@@ -10,7 +10,7 @@ from langsplat_core.config import LevelChoice
 from langsplat_core.errors import InputError, printable_line
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.sog import META_NAME
-from langsplat_viewer.files.flight_files import SUFFIX as PATHS
+from langsplat_viewer.files.flights import SUFFIX as PATHS
 
 SUFFIX = ".queries.json"
 FORMAT = "langsplat-queries"

@@ -28,7 +28,7 @@ from langsplat_viewer.camera.controls import Extent, extent_of, focus, from_came
 from langsplat_viewer.camera.flight import Motion, camera_of, frame_times, turntable
 from langsplat_viewer.drawing.channels import why_nothing
 from langsplat_viewer.drawing.frame import Backend
-from langsplat_viewer.files.flight_files import read_flight
+from langsplat_viewer.files.flights import read_flight
 from langsplat_viewer.output.saving import save_png
 from langsplat_viewer.output.still import (
     Drawn,

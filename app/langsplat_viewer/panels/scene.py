@@ -1,13 +1,28 @@
 """The file: what is open, opening another, saving pictures."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
-from imgui_bundle import ImVec2, imgui
+import numpy as np
+from imgui_bundle import ImVec2, hello_imgui, imgui
 
+from langsplat_core.config import TrainPreset
 from langsplat_viewer import actions
+from langsplat_viewer.files.browsing import Entry, Listing, is_scene
 from langsplat_viewer.output import saving
-from langsplat_viewer.panels.style import bad, beside, elided, muted, small_wrapped, tip, width_of
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.panels.style import (
+    Area,
+    bad,
+    beside,
+    beside_boxed,
+    elided,
+    muted,
+    small_wrapped,
+    tip,
+    width_of,
+)
+from langsplat_viewer.viewer import Training, Viewer
 
 DIALOG_PROGRAMS = ("zenity", "kdialog", "matedialog", "qarma")  # one of them draws the dialog on Linux
 
@@ -71,3 +86,266 @@ def _figures(viewer: Viewer) -> str:
         parts.append(f"{len(scene.cameras)} cameras")
     parts.append("no language field" if scene.language is None else "searchable")
     return ", ".join(parts)
+
+
+# The file browser, over everything else.
+
+OPEN, PICK = "Open a scene", "Folder of the photographs"
+WIDTH_EM, HEIGHT_EM = 40.0, 30.0
+UNITS = ("bytes", "kB", "MB", "GB", "TB")
+
+
+def draw_browser(viewer: Viewer) -> None:
+    """A box for a path, the folders above, what is in this one, and what was open before."""
+    listing = viewer.state.browser
+    title = PICK if viewer.state.picks_folder else OPEN
+    if listing is not None and not imgui.is_popup_open(title):
+        imgui.open_popup(title)
+    centre = imgui.get_main_viewport().get_center()
+    imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
+    imgui.set_next_window_size(hello_imgui.em_to_vec2(WIDTH_EM, HEIGHT_EM), imgui.Cond_.appearing)
+    shown, stays = imgui.begin_popup_modal(title, True, imgui.WindowFlags_.no_saved_settings)
+    if not shown:
+        return
+    if listing is not None:
+        _path_box(viewer)
+        _above(viewer, listing.folder)
+        _entries(viewer, listing)
+        _foot(viewer, listing)
+    if not stays or imgui.is_key_pressed(imgui.Key.escape):
+        actions.close_browser(viewer)
+    if viewer.state.browser is None:
+        imgui.close_current_popup()
+    imgui.end_popup()
+
+
+def _foot(viewer: Viewer, listing: Listing) -> None:
+    """What can be done with the whole folder."""
+    if viewer.state.picks_folder:
+        if imgui.button("Take this folder"):
+            actions.choose_photograph_folder(viewer, listing.folder)
+    elif has_several(listing) and imgui.button("Open all scenes here"):
+        actions.open_all(viewer)
+
+
+def has_several(listing: Listing) -> bool:
+    """Whether there is more than one scene to open."""
+    return sum(entry.is_file and is_scene(entry.path) for entry in listing.entries) > 1
+
+
+def _path_box(viewer: Viewer) -> None:
+    button = imgui.calc_text_size("Open").x + 2 * imgui.get_style().frame_padding.x
+    imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
+    if imgui.is_window_appearing():
+        imgui.set_keyboard_focus_here()
+    flags = imgui.InputTextFlags_.enter_returns_true
+    picks = viewer.state.picks_folder
+    hint = "path of a folder" if picks else "path of a scene or folder, or drop files onto the window"
+    entered, typed = imgui.input_text_with_hint("##path", hint, viewer.state.path_typed, flags)
+    actions.type_path(viewer, typed)
+    imgui.same_line()
+    if imgui.button("Open") or entered:
+        actions.open_typed(viewer)
+
+
+def _above(viewer: Viewer, folder: Path) -> None:
+    """The folders above, each to be gone to."""
+    for number, parent in enumerate((*reversed(folder.parents), folder)):
+        if number:
+            imgui.same_line(0, 2)
+            name = parent.name or str(parent)
+            width = imgui.calc_text_size(name).x + 2 * imgui.get_style().frame_padding.x
+            if imgui.get_content_region_avail().x < width:
+                imgui.new_line()
+        if imgui.small_button(f"{parent.name or parent}##above {number}"):
+            actions.browse(viewer, parent)
+
+
+def _entries(viewer: Viewer, listing: Listing) -> None:
+    picks = viewer.state.picks_folder
+    recent = () if picks else viewer.state.preferences.recent
+    lines = min(len(recent), 4) + 1 if recent else 0
+    below = lines * imgui.get_text_line_height_with_spacing() + 8 * bool(recent)
+    below += imgui.get_frame_height_with_spacing() * (picks or has_several(listing))
+    if imgui.begin_child("entries", ImVec2(0, -below), imgui.ChildFlags_.borders):
+        if listing.problem:
+            small_wrapped(listing.problem, bad())
+        elif not listing.entries:
+            small_wrapped("no folders here" if picks else "no scenes and no folders here", muted())
+        for entry in (entry for entry in listing.entries if not (picks and entry.is_file)):
+            _entry(viewer, entry)
+        if listing.left_out:
+            small_wrapped(f"{listing.left_out:,} more: type a path", muted())
+    imgui.end_child()
+    if recent:
+        imgui.text_colored(muted(), "Recent")
+        foot = imgui.get_frame_height_with_spacing() * has_several(listing)
+        if imgui.begin_child("recent", ImVec2(0, -foot)):
+            for path in recent:
+                if imgui.selectable(f"{path}##recent", False)[0]:
+                    actions.open_recent(viewer, path)
+        imgui.end_child()
+
+
+def _entry(viewer: Viewer, entry: Entry) -> None:
+    right = imgui.get_content_region_avail().x
+    name = entry.path.name if entry.is_file else f"{entry.path.name}/"
+    if imgui.selectable(name, False)[0]:
+        actions.choose(viewer, entry)
+    if entry.size:
+        text = in_words(entry.size)
+        imgui.same_line(right - imgui.calc_text_size(text).x)
+        imgui.text_colored(muted(), text)
+
+
+def in_words(size: float) -> str:
+    """Bytes as people read them: "1.4 MB"."""
+    unit = 0
+    while size >= 1000 and unit + 1 < len(UNITS):
+        size, unit = size / 1000, unit + 1
+    return f"{size:.0f} {UNITS[unit]}" if unit == 0 or size >= 100 else f"{size:.1f} {UNITS[unit]}"
+
+
+# A bar over the scene, while its file is another than the one that is shown.
+
+BAR = (
+    imgui.WindowFlags_.no_decoration
+    | imgui.WindowFlags_.no_move
+    | imgui.WindowFlags_.no_docking
+    | imgui.WindowFlags_.always_auto_resize
+    | imgui.WindowFlags_.no_saved_settings
+    | imgui.WindowFlags_.no_focus_on_appearing
+    | imgui.WindowFlags_.no_nav
+)
+
+
+def draw_changed(viewer: Viewer, area: Area) -> None:
+    """What has changed, and what can be done about it."""
+    state = viewer.state
+    if not viewer.watch.changed or state.path is None or state.opening is not None:
+        return
+    top = ImVec2(area.left + area.width / 2, area.top + hello_imgui.em_size(3))  # below what a tool says
+    imgui.set_next_window_pos(top, imgui.Cond_.always, ImVec2(0.5, 0))
+    imgui.begin("changed", None, BAR)
+    imgui.align_text_to_frame_padding()
+    imgui.text_unformatted(f"{state.path.name} has changed on disk")
+    imgui.same_line()
+    if imgui.button("Reload"):
+        actions.reload(viewer)
+    tip("Read it again; camera, queries and view settings stay")
+    imgui.same_line()
+    if imgui.button("Not now"):
+        actions.keep_old(viewer)
+    imgui.end()
+
+
+# The question before deletions are lost.
+
+UNSAVED = "Not saved"
+
+
+def draw_unsaved(viewer: Viewer) -> None:
+    """Save, discard, cancel; over everything else, while something waits for the answer."""
+    leaving = viewer.state.selection.leaving
+    if leaving is not None and not imgui.is_popup_open(UNSAVED):
+        imgui.open_popup(UNSAVED)
+    centre = imgui.get_main_viewport().get_center()
+    imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
+    flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_saved_settings
+    if not imgui.begin_popup_modal(UNSAVED, None, flags)[0]:
+        return
+    if leaving is not None:
+        count = int(viewer.state.selection.marks.deleted.sum())
+        imgui.text_unformatted(f"{count:,} Gaussians were deleted, and the scene is not saved without them.")
+        imgui.text_unformatted(f"Save it as a new file before {leaving.to}?")
+        if imgui.button("Save"):
+            actions.save_and_leave(viewer, Path.cwd())
+        imgui.same_line()
+        if imgui.button("Discard"):
+            actions.discard_and_leave(viewer)
+        imgui.same_line()
+        if imgui.button("Cancel"):
+            actions.stay(viewer)
+    if viewer.state.selection.leaving is None:
+        imgui.close_current_popup()
+    imgui.end_popup()
+
+
+# From photographs to a scene, without leaving the window.
+
+PRESETS: tuple[TrainPreset, ...] = get_args(TrainPreset)
+LOSS_EM = 5.0  # height of its plot
+MEANS = {
+    "quick": "minutes on a CPU",
+    "good": "a quarter of an hour and more on a CPU",
+    "full": "as published: for a GPU",
+}
+
+
+def draw_training(viewer: Viewer) -> None:
+    """The form, or what a running training says."""
+    training = viewer.training
+    if training is None:
+        _form(viewer)
+    else:
+        _running(viewer, training)
+
+
+def _form(viewer: Viewer) -> None:
+    form = viewer.state.training_form
+    form = replace(
+        form, dataset=_text_box("Photographs", "a folder, a COLMAP project, transforms.json", form.dataset)
+    )
+    form = replace(form, out=_text_box("Scene", "scene.ply", form.out))
+    form = replace(form, encoder=_text_box("Encoder", '"demo", or a folder or hub id of CLIP', form.encoder))
+    for number, preset in enumerate(PRESETS):
+        if number:
+            beside_boxed(preset)
+        if imgui.radio_button(preset, form.preset == preset):
+            form = replace(form, preset=preset)
+        if imgui.is_item_hovered():
+            imgui.set_tooltip(MEANS[preset])
+    actions.fill_in(viewer, form)
+    if imgui.button("Train"):
+        actions.start_training(viewer)
+    small_wrapped("An interrupted training continues where it stopped.", muted())
+    _doubts(viewer)
+
+
+def _doubts(viewer: Viewer) -> None:
+    """What speaks against the scene that is shown, as its training found."""
+    state = viewer.state
+    if state.doubts and state.path is not None:
+        imgui.separator_text(f"What speaks against {state.path.name}")
+        for doubt in state.doubts:
+            small_wrapped(doubt, bad())
+
+
+def _text_box(label: str, hint: str, text: str) -> str:
+    imgui.text(label)
+    imgui.set_next_item_width(-1)
+    return str(imgui.input_text_with_hint(f"##{label} to train", hint, text)[1])
+
+
+def _running(viewer: Viewer, training: Training) -> None:
+    progress = training.progress
+    imgui.text_unformatted(training.request.out.name)
+    for label, fraction in list(progress.stages.items()):
+        small_wrapped(f"{label}: done" if fraction >= 1 else label, muted())
+        if fraction < 1:
+            imgui.progress_bar(fraction, ImVec2(-1, 0))
+    if len(progress.losses) > 1:
+        values = np.array(progress.losses, np.float32)
+        size = ImVec2(-1, hello_imgui.em_size(LOSS_EM))
+        imgui.plot_lines("##loss", values, scale_min=0.0, graph_size=size)
+        tip("How far the pictures are from the photographs, on average: lower is better")
+        imgui.text_colored(muted(), f"loss {values[-1]:.4f}, at first {values[0]:.4f}")
+    imgui.separator()
+    imgui.progress_bar(progress.overall, ImVec2(-1, 0), progress.left or "starting")
+    if imgui.button("Stop"):
+        actions.stop_training(viewer)
+    beside("Look at it so far")
+    if imgui.button("Look at it so far"):
+        actions.look_at_training(viewer)
+    for line in progress.said[-3:]:
+        small_wrapped(line, muted())

@@ -31,7 +31,7 @@ from langsplat_viewer.camera.controls import (
 )
 from langsplat_viewer.camera.flight import pose_at, pose_of, view_of
 from langsplat_viewer.drawing.channels import looking_settings
-from langsplat_viewer.files.flight_files import MOST_VIEWS, Bookmark, named
+from langsplat_viewer.files.flights import MOST_VIEWS, Bookmark, named
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.staging import reference_of, small
 from langsplat_viewer.state import GLIDE_SECONDS, Glide, Hover, Query, compared, flight_of
