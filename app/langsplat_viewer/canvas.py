@@ -17,7 +17,8 @@ from langsplat_core.errors import BackendError
 from langsplat_core.progress import watched
 from langsplat_core.scene import Camera
 from langsplat_core.scene.gaussians import Merged
-from langsplat_viewer import actions, staging
+from langsplat_viewer import staging
+from langsplat_viewer.actions import selecting, undoing, viewpoint
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.drawing.channels import UNCLIPPED, Layers, why_nothing, why_undrawable
@@ -159,13 +160,13 @@ class Canvas:
         source = wanted.model.scene
         gaussians = source.gaussians if self._marked is None else self._marked.scene.gaussians
         if len(source.gaussians) and not len(gaussians):
-            shown = with_key("show what is hidden", actions.show_hidden)
-            return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', actions.undo)}"
+            shown = with_key("show what is hidden", selecting.show_hidden)
+            return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', undoing.undo)}"
         if wanted.clip != UNCLIPPED and gaussians.valid().any():
             return NOTHING_BETWEEN
         reason = why_nothing(gaussians, camera)
         elsewhere = not why_undrawable(gaussians)  # another view would show something
-        back = with_key("return to the opening view", actions.reset_view)
+        back = with_key("return to the opening view", viewpoint.reset_view)
         return f"{reason}: {back}" if elsewhere else reason
 
     def _merged(self) -> Merged | None:

@@ -25,7 +25,8 @@ import moderngl
 
 from langsplat_core.config import Display, LevelChoice, PictureConfig
 from langsplat_core.errors import LangSplatError
-from langsplat_viewer import actions, fonts
+from langsplat_viewer import fonts
+from langsplat_viewer.actions import filming, opening, queries, selecting, settings, training, viewpoint
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.drawing.frame import Backend, FrameRenderer
 from langsplat_viewer.drawing.renderer import Renderer
@@ -256,7 +257,7 @@ class Window:
         self.viewer.watch.start()
         imgui.get_io().config_input_text_cursor_blink = False  # a blinking cursor would be drawn for ever
         glfw.set_drop_callback(glfw_window_hello_imgui(), self._dropped)  # type: ignore[arg-type]
-        actions.open_scene(self.viewer, self._request.path, self._first_view)
+        opening.open_scene(self.viewer, self._request.path, self._first_view)
 
     def _first_view(self, viewer: Viewer) -> None:
         """The scene of the command line is open: do what else the command line asks for."""
@@ -265,23 +266,23 @@ class Window:
         try:
             camera = chosen_camera(state.scene, request.camera)
             if camera is not None:
-                actions.open_at(viewer, camera)
+                viewpoint.open_at(viewer, camera)
         except InputError as error:
             state.say(str(error), is_error=True)
         if request.orthographic is not None:
-            actions.open_orthographic(viewer, request.orthographic)
+            viewpoint.open_orthographic(viewer, request.orthographic)
         looks = replace(state.picture, heat_opacity=request.heat_opacity, dim=request.dim)
-        actions.set_picture(viewer, looks)
+        settings.set_picture(viewer, looks)
         if request.path_file is not None:
-            actions.load_path(viewer, request.path_file)
-        actions.set_level(viewer, request.level)
+            filming.load_path(viewer, request.path_file)
+        queries.set_level(viewer, request.level)
         for phrase in request.queries:
-            actions.ask(viewer, phrase)
-        actions.set_display(viewer, request.display, latent_level(request.level))
+            queries.ask(viewer, phrase)
+        settings.set_display(viewer, request.display, latent_level(request.level))
 
     def drop(self, paths: list[str]) -> None:
         """Files were dropped onto the window."""
-        actions.open_dropped(self.viewer, [Path(path) for path in paths])
+        opening.open_dropped(self.viewer, [Path(path) for path in paths])
 
     def _dropped(self, window: object, paths: list[str]) -> None:
         self.drop(paths)
@@ -294,9 +295,9 @@ class Window:
         if viewer.state.selection.may_close:
             hello_imgui.get_runner_params().app_shall_exit = True
         self._began = time.perf_counter()
-        actions.tick(viewer, imgui.get_time())
-        actions.watch_training(viewer)
-        actions.fetch_photograph(viewer)
+        viewpoint.tick(viewer, imgui.get_time())
+        training.watch_training(viewer)
+        opening.fetch_photograph(viewer)
         navigation.muted_until_clicked(viewer)  # hello_imgui draws the panels after this
         self._hiding.apply(viewer)
         self._column.apply(viewer)
@@ -356,7 +357,7 @@ class Window:
         layout.draw_over(viewer)
         navigation.handle(viewer, area)
         scale = imgui.get_io().display_framebuffer_scale
-        actions.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))
+        settings.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))
         canvas, state = self._canvas, viewer.state
         if state.timing.wanted:
             state.timing.add("panels", 1e3 * (time.perf_counter() - self._began))
@@ -380,10 +381,10 @@ class Window:
     def _may_close(self) -> bool:
         """The window is asked to close."""
         glfw.post_empty_event()  # where there is a question, it is drawn now
-        return actions.may_close(self.viewer)
+        return selecting.may_close(self.viewer)
 
     def _stop(self) -> None:
-        actions.finish_writing(self.viewer)
+        selecting.finish_writing(self.viewer)
         self._remembered.update()
         self.viewer.watch.close()
         if self._canvas is not None:

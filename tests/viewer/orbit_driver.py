@@ -24,7 +24,7 @@ import glfw  # isort: skip
 from langsplat_core.io import load_scene
 from langsplat_core.lab.speed.queries import repeated
 from langsplat_core.scene import Scene
-from langsplat_viewer import actions
+from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.drawing.frame import FrameRenderer
 from langsplat_viewer.viewer import Services
@@ -102,7 +102,7 @@ class Rider:
         self._longest = max(self._longest, time.monotonic() - self._framed)
 
     def _turn(self) -> None:
-        actions.move(self.window.viewer, lambda view: orbit(view, STEP, 0.0))
+        viewpoint.move(self.window.viewer, lambda view: orbit(view, STEP, 0.0))
 
     def _stop(self, now: float) -> None:
         stats, count = self.window.viewer.state.stats, len(self._pictures)

@@ -12,8 +12,8 @@ from PIL import Image
 from imgui_bundle import imgui  # isort: skip
 from langsplat_core.io import save_scene
 from langsplat_core.pipeline.report import REPORT
-from langsplat_viewer import actions
 from langsplat_viewer import viewer as training
+from langsplat_viewer.actions import opening, settings, viewpoint
 from langsplat_viewer.panels.style import scene_area
 from tests.support.fakes import CENTRES, blob_scene
 
@@ -51,11 +51,11 @@ def fade_in_a_photograph(s: Any) -> None:
     colours = np.full((240, 320, 3), (250, 120, 10), np.uint8)
     colours[:, 160:] = (20, 60, 240)
     Image.fromarray(colours).save(folder / "photo_1.png")
-    actions.open_panel(viewer, "Camera")
-    actions.go_to_camera(viewer, 1)
+    settings.open_panel(viewer, "Camera")
+    viewpoint.go_to_camera(viewer, 1)
     s.settle()
     plain = s.shot("plain")
-    actions.fade_photograph(viewer, 1.0)
+    opening.fade_photograph(viewer, 1.0)
     s.settle()
     s.ctx.yield_(3)
     assert "no photograph 'photo_1'" in s.state.photograph.reason
@@ -75,14 +75,14 @@ def fade_in_a_photograph(s: Any) -> None:
     np.testing.assert_allclose(shot[middle, left + quarter], (250, 120, 10), atol=3)
     np.testing.assert_allclose(shot[middle, left + 3 * quarter], (20, 60, 240), atol=3)
     assert (shot[int(area.top) + 30, left + quarter] == plain[int(area.top) + 30, left + quarter]).all()
-    actions.fade_photograph(viewer, 0.5)
+    opening.fade_photograph(viewer, 0.5)
     s.ctx.yield_(3)
     half = s.shot("half")
     place = middle, left + quarter
     np.testing.assert_allclose(half[place], (shot[place] + plain[place]) / 2, atol=4)
     s.drag((600, 300), (656, 279))
     s.settle()
-    assert actions.photograph_here(s.state) is None
+    assert opening.photograph_here(s.state) is None
 
 
 def switch_between_scenes(s: Any) -> None:
@@ -132,8 +132,8 @@ def watch_a_training(s: Any) -> None:
     for number in range(3):
         (photographs / f"{number}.jpg").write_bytes(b"")
     training.command = lambda request: [sys.executable, "-c", TRAINS]
-    actions.choose_photographs(viewer, photographs)
-    actions.open_panel(viewer, "Train")
+    opening.choose_photographs(viewer, photographs)
+    settings.open_panel(viewer, "Train")
     s.ctx.yield_(3)
     s.ctx.item_click("//Train/Train")
     s.wait(lambda: viewer.training is not None and len(viewer.training.progress.losses) > 50)
@@ -167,8 +167,8 @@ def read_what_speaks_against(s: Any) -> None:
     report.parent.mkdir()
     report.write_text(json.dumps({"gaussians": len(s.state.scene.gaussians), "doubts": DOUBTS}))
     training.command = lambda request: [sys.executable, "-c", "print('photos.ply: 360 Gaussians')"]
-    actions.choose_photographs(viewer, photographs)
-    actions.open_panel(viewer, "Train")
+    opening.choose_photographs(viewer, photographs)
+    settings.open_panel(viewer, "Train")
     s.ctx.yield_(3)
     before = s.shot("before")
     s.ctx.item_click("//Train/Train")
@@ -184,7 +184,7 @@ def read_what_speaks_against(s: Any) -> None:
     )
     reddish = (after[here].astype(int)[..., 0] - after[here][..., 2] > 40).sum()
     assert reddish > 200 > (before[here].astype(int)[..., 0] - before[here][..., 2] > 40).sum()
-    actions.switch_scene(viewer, s.folder / "blobs.ply")
+    opening.switch_scene(viewer, s.folder / "blobs.ply")
     s.wait(lambda: s.state.path.name == "blobs.ply")
     s.settle()
     assert s.state.doubts == ()

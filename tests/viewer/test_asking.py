@@ -8,7 +8,7 @@ import pytest
 
 from langsplat_core.errors import InputError
 from langsplat_core.scene import CANONICAL_PHRASES
-from langsplat_viewer import actions
+from langsplat_viewer.actions import opening, queries, undoing
 from langsplat_viewer.files.browsing import QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.panels.search import BINS, histogram
 from tests.support.windowless import errors, settle
@@ -17,7 +17,7 @@ from tests.support.windowless import errors, settle
 @pytest.fixture
 def asked(opened):
     """Three blobs, and "mug" asked."""
-    actions.ask(opened, "mug")
+    queries.ask(opened, "mug")
     settle(opened)
     return opened
 
@@ -29,32 +29,32 @@ def test_an_answer_ends_where_one_says_and_can_end_by_itself_again(asked):
     assert 0 < automatic.members.sum() < 360
     key = asked.state.layers_key()
     for cut in (0.0, float(np.median(automatic.even)), 1.1):
-        actions.set_cut(asked, query, cut)
+        queries.set_cut(asked, query, cut)
         assert query.result.cut == cut
         np.testing.assert_array_equal(query.result.members, automatic.even >= np.float32(cut))
         assert query.result.heat_range[0] <= min(cut, automatic.peak)
     assert asked.state.layers_key() != key
-    actions.set_cut(asked, query, None)
+    queries.set_cut(asked, query, None)
     assert query.result is automatic
 
 
 def test_a_cut_is_undone_in_one_step_and_outlives_another_level(asked):
     (query,) = asked.state.queries
     automatic = query.result
-    actions.set_cut(asked, query, 0.6)
+    queries.set_cut(asked, query, 0.6)
     for value in (0.61, 0.62):  # the slider moves on
-        actions.set_cut(asked, query, value, is_new=False)
-    actions.set_level(asked, "part")
+        queries.set_cut(asked, query, value, is_new=False)
+    queries.set_level(asked, "part")
     settle(asked)
     assert (query.result.level, query.result.own_cut) == (1, 0.62)
-    actions.undo(asked)
+    undoing.undo(asked)
     settle(asked)
     assert query.result.own_cut == 0.62
-    actions.undo(asked)
+    undoing.undo(asked)
     settle(asked)
     assert query.result.own_cut is None
     np.testing.assert_array_equal(query.result.members, automatic.members)
-    actions.redo(asked)
+    undoing.redo(asked)
     assert query.result.own_cut == 0.62
 
 
@@ -66,17 +66,17 @@ def test_the_cut_of_an_answer_is_the_least_relevancy_in_it(asked):
 def test_everything_can_be_compared_with_other_phrases(asked):
     (query,) = asked.state.queries
     before = query.result
-    actions.set_canonical(asked, "book, plant")
+    queries.set_canonical(asked, "book, plant")
     settle(asked)
     assert asked.state.canonical == ("book", "plant")
     assert asked.engine.canonical_phrases == ("book", "plant")
     assert np.abs(query.result.relevancy - before.relevancy).max() > 0.01
     assert query.result.probability is None
-    actions.set_canonical(asked, "sofa")  # never taught: all stays as it was
+    queries.set_canonical(asked, "sofa")  # never taught: all stays as it was
     settle(asked)
     assert "sofa" in errors(asked)[-1]
     assert asked.state.canonical == ("book", "plant")
-    actions.set_canonical(asked, "")
+    queries.set_canonical(asked, "")
     settle(asked)
     assert asked.state.canonical == ()
     assert asked.engine.canonical_phrases == CANONICAL_PHRASES
@@ -84,19 +84,19 @@ def test_everything_can_be_compared_with_other_phrases(asked):
 
 
 def test_a_set_of_queries_is_asked_again(asked, tmp_path):
-    actions.set_cut(asked, asked.state.queries[0], 0.7)
-    actions.ask(asked, "plant")
+    queries.set_cut(asked, asked.state.queries[0], 0.7)
+    queries.ask(asked, "plant")
     settle(asked)
-    actions.hide(asked, asked.state.queries[1])
-    actions.set_level(asked, "whole")
-    actions.set_canonical(asked, "book")
+    queries.hide(asked, asked.state.queries[1])
+    queries.set_level(asked, "whole")
+    queries.set_canonical(asked, "book")
     settle(asked)
-    path = actions.save_queries(asked, tmp_path)
+    path = queries.save_queries(asked, tmp_path)
     assert path.name == "blobs-001.queries.json"
-    actions.open_scene(asked, Path("blobs.ply"))
+    opening.open_scene(asked, Path("blobs.ply"))
     settle(asked)
     assert (asked.state.queries, asked.state.canonical) == ([], ())
-    actions.open_dropped(asked, [path])
+    opening.open_dropped(asked, [path])
     settle(asked)
     found = [(query.phrase, query.cut, query.slot is None) for query in asked.state.queries]
     assert found == [("mug", 0.7, False), ("plant", None, True)]
@@ -108,21 +108,21 @@ def test_a_set_of_queries_is_asked_again(asked, tmp_path):
 def test_queries_dropped_with_a_scene_are_asked_of_it(viewer, tmp_path):
     path = tmp_path / "a.queries.json"
     write_queries(path, QuerySet((SavedQuery("mug"),)))
-    actions.open_dropped(viewer, [path, Path("blobs.ply")])
+    opening.open_dropped(viewer, [path, Path("blobs.ply")])
     settle(viewer)
     assert [query.phrase for query in viewer.state.queries] == ["mug"]
 
 
 def test_nothing_to_save_and_nothing_to_ask_of(viewer, opened, tmp_path):
-    assert actions.save_queries(opened, tmp_path) is None
-    actions.load_queries(opened, tmp_path / "gone.queries.json")
+    assert queries.save_queries(opened, tmp_path) is None
+    queries.load_queries(opened, tmp_path / "gone.queries.json")
     assert "gone.queries.json" in errors(opened)[-1]
-    actions.open_scene(opened, Path("plain.ply"))
+    opening.open_scene(opened, Path("plain.ply"))
     settle(opened)
     write_queries(tmp_path / "a.queries.json", QuerySet((SavedQuery("mug"),)))
-    actions.load_queries(opened, tmp_path / "a.queries.json")
+    queries.load_queries(opened, tmp_path / "a.queries.json")
     assert "searched" in errors(opened)[-1]
-    actions.set_canonical(opened, "book")
+    queries.set_canonical(opened, "book")
     assert "language field" in errors(opened)[-1]
     assert opened.state.queries == []
 

@@ -15,7 +15,7 @@ import pytest
 
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
-from langsplat_viewer import actions
+from langsplat_viewer.actions import queries, selecting, settings, undoing, viewpoint
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.drawing import frame, renderer
 from langsplat_viewer.drawing.channels import Clip, Splats
@@ -57,9 +57,9 @@ def gated(monkeypatch: pytest.MonkeyPatch) -> Gated:
 
 @pytest.fixture
 def asked(opened: Viewer) -> Viewer:
-    actions.ask(opened, "mug")
+    queries.ask(opened, "mug")
     settle(opened)
-    actions.resize(opened, *SIZE)
+    settings.resize(opened, *SIZE)
     return opened
 
 
@@ -118,16 +118,16 @@ def test_the_window_s_thread_projects_no_fine_picture(gl, asked, canvas, gated):
 
 
 CHANGES = {
-    "camera": lambda v: actions.look_from(v, "left"),
-    "undone camera": lambda v: (actions.look_from(v, "left"), actions.reset_view(v)),
-    "marks": actions.select_all,
-    "deleted": lambda v: (actions.select_all(v), actions.delete_selected(v)),
-    "undone": lambda v: (actions.select_all(v), actions.delete_selected(v), actions.undo(v)),
-    "splats": lambda v: actions.set_splats(v, Splats(0.5)),
-    "cut": lambda v: actions.set_clip(v, Clip(1.0)),
-    "display": lambda v: actions.set_display(v, "depth"),
-    "query": lambda v: actions.hide(v, v.state.queries[0]),
-    "size": lambda v: actions.resize(v, 100, 80),
+    "camera": lambda v: viewpoint.look_from(v, "left"),
+    "undone camera": lambda v: (viewpoint.look_from(v, "left"), viewpoint.reset_view(v)),
+    "marks": selecting.select_all,
+    "deleted": lambda v: (selecting.select_all(v), selecting.delete_selected(v)),
+    "undone": lambda v: (selecting.select_all(v), selecting.delete_selected(v), undoing.undo(v)),
+    "splats": lambda v: settings.set_splats(v, Splats(0.5)),
+    "cut": lambda v: settings.set_clip(v, Clip(1.0)),
+    "display": lambda v: settings.set_display(v, "depth"),
+    "query": lambda v: queries.hide(v, v.state.queries[0]),
+    "size": lambda v: settings.resize(v, 100, 80),
     "scene": lambda v: setattr(v.state, "scene", replace(v.state.scene)),
 }
 
@@ -140,8 +140,8 @@ def test_what_became_stale_is_dropped(gl, asked, canvas, gated, monkeypatch, nam
     canvas.update(asked.state, 0.0)
     until(lambda: len(gated.threads) == 1)  # it is under way
     CHANGES[name](asked)
-    actions.tick(asked, 10.0)
-    actions.tick(asked, 20.0)
+    viewpoint.tick(asked, 10.0)
+    viewpoint.tick(asked, 20.0)
     canvas.update(asked.state, 20.0)
     canvas.update(asked.state, 21.0)
     gated.gate.set()
@@ -154,7 +154,7 @@ def test_what_became_stale_is_dropped(gl, asked, canvas, gated, monkeypatch, nam
 def test_what_changes_no_projection_does_not_begin_anew(gl, asked, canvas, gated):
     canvas.update(asked.state, 0.0)
     until(lambda: len(gated.threads) == 1)
-    actions.set_picture(asked, replace(asked.state.picture, dim=0.1))
+    settings.set_picture(asked, replace(asked.state.picture, dim=0.1))
     canvas.update(asked.state, 1.0)
     gated.gate.set()
     rest(canvas, asked.state, 2.0)
@@ -165,8 +165,8 @@ def test_what_changes_no_projection_does_not_begin_anew(gl, asked, canvas, gated
 def test_a_camera_that_moves_on_is_followed_coarsely(asked, canvas, gated):
     canvas.update(asked.state, 0.0)
     until(lambda: len(gated.threads) == 1)
-    actions.look_from(asked, "left")
-    actions.tick(asked, 10.0)
+    viewpoint.look_from(asked, "left")
+    viewpoint.tick(asked, 10.0)
     canvas.update(asked.state, 10.0)
     assert gated.threads[1:] == [main_thread()]
     assert not canvas.waits
@@ -181,8 +181,8 @@ def test_told_to_stay_fine_it_draws_while_the_camera_moves(asked, canvas, gated)
     asked.state.coarse_while_moving = False
     gated.gate.set()
     rest(canvas, asked.state, 0.0)
-    actions.look_from(asked, "left")
-    actions.tick(asked, 10.0)
+    viewpoint.look_from(asked, "left")
+    viewpoint.tick(asked, 10.0)
     canvas.update(asked.state, 10.0)
     assert gated.threads[1:] == [main_thread()]
     assert asked.state.stats.scale == 1
@@ -198,7 +198,7 @@ def test_an_error_is_said_once_and_another_picture_is_tried(gl, asked, canvas, g
     assert not canvas.update(asked.state, 2.0)
     assert len(gated.threads) == 1
     gated.error = None
-    actions.set_clip(asked, Clip(1.0))
+    settings.set_clip(asked, Clip(1.0))
     rest(canvas, asked.state, 3.0)
     np.testing.assert_array_equal(on_screen(canvas), expected(gl, asked))
 
@@ -211,7 +211,7 @@ def test_until_it_is_there_merged_gaussians_show_what_was_changed(gl, asked, gat
     until(lambda: not canvas.is_running)
     gated.gate.clear()
     monkeypatch.setattr("langsplat_viewer.drawing.renderer.MERGED_SHARE", 1e-3)
-    actions.set_splats(asked, Splats(0.5))
+    settings.set_splats(asked, Splats(0.5))
     for now in (1.0, 2.0, 3.0):
         assert canvas.update(asked.state, now)
     assert [what for kind, what in quick.calls if kind == "draw"] == [(60, 45)]

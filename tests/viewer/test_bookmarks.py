@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from langsplat_viewer import actions
+from langsplat_viewer.actions import opening, viewpoint
 from langsplat_viewer.camera.controls import OrbitCamera, from_side, look, orbit, symmetric_intrinsics, walk
 from langsplat_viewer.files.flights import FILE_NAME, MOST_SCENES, MOST_VIEWS, Shelf
 from tests.support.windowless import arrive, errors, settle
 
 
 def reopen(viewer, name: str = "blobs.ply") -> None:
-    actions.open_scene(viewer, Path(name))
+    opening.open_scene(viewer, Path(name))
     settle(viewer)
 
 
@@ -24,20 +24,20 @@ def names(viewer) -> list[str]:
 
 def test_a_bookmark_leads_back_and_is_there_the_next_time(opened, tmp_path):
     opened.shelf = Shelf(tmp_path / "settings")
-    actions.move(opened, lambda view: orbit(view, 0.4, 0.1))
+    viewpoint.move(opened, lambda view: orbit(view, 0.4, 0.1))
     marked = opened.state.view
-    actions.add_bookmark(opened, "  the  mug ")
+    viewpoint.add_bookmark(opened, "  the  mug ")
     reopen(opened, "plain.ply")
     assert names(opened) == []
-    actions.add_bookmark(opened)
+    viewpoint.add_bookmark(opened)
     reopen(opened)
     assert names(opened) == ["the mug"]
-    actions.go_to_bookmark(opened, opened.state.bookmarks[0])
+    viewpoint.go_to_bookmark(opened, opened.state.bookmarks[0])
     arrive(opened)
     assert_allclose(opened.state.view.eye, marked.eye, atol=1e-9)
     assert_allclose(opened.state.view.rotation, marked.rotation, atol=1e-9)
     assert_allclose(opened.state.view.target, marked.target, atol=1e-9)
-    actions.delete_bookmark(opened, opened.state.bookmarks[0])
+    viewpoint.delete_bookmark(opened, opened.state.bookmarks[0])
     reopen(opened)
     assert names(opened) == []
     reopen(opened, "plain.ply")
@@ -45,20 +45,20 @@ def test_a_bookmark_leads_back_and_is_there_the_next_time(opened, tmp_path):
 
 
 def test_names_are_numbers_or_replaced_and_end_somewhere(opened):
-    actions.add_bookmark(opened)
-    actions.add_bookmark(opened, "view 2")
-    actions.add_bookmark(opened)
-    actions.add_bookmark(opened, "view 2")
+    viewpoint.add_bookmark(opened)
+    viewpoint.add_bookmark(opened, "view 2")
+    viewpoint.add_bookmark(opened)
+    viewpoint.add_bookmark(opened, "view 2")
     assert names(opened) == ["view 1", "view 3", "view 2"]
     for _ in range(MOST_VIEWS):
-        actions.add_bookmark(opened)
+        viewpoint.add_bookmark(opened)
     assert len(names(opened)) == MOST_VIEWS
     assert "at most" in errors(opened)[-1]
 
 
 def test_without_a_folder_nothing_is_written(opened, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    actions.add_bookmark(opened, "here")
+    viewpoint.add_bookmark(opened, "here")
     assert names(opened) == ["here"]
     assert list(tmp_path.iterdir()) == []
 
@@ -84,14 +84,14 @@ def test_a_file_that_makes_no_sense_is_said_and_kept(opened, tmp_path, text):
     assert names(opened) == []
     assert FILE_NAME in errors(opened)[0]
     if '"scenes": {"' not in text:
-        actions.add_bookmark(opened, "here")
+        viewpoint.add_bookmark(opened, "here")
         assert "not kept" in errors(opened)[-1]
         assert (tmp_path / FILE_NAME).read_text() == text
 
 
 def test_scenes_that_were_marked_long_ago_are_forgotten(opened, tmp_path):
     shelf = Shelf(tmp_path)
-    actions.add_bookmark(opened, "here")
+    viewpoint.add_bookmark(opened, "here")
     scenes = {f"/old/{number}.ply": [] for number in range(MOST_SCENES)}
     (tmp_path / FILE_NAME).write_text(json.dumps({"version": 1, "scenes": scenes}))
     shelf.write(Path("/new.ply"), opened.state.bookmarks)
@@ -138,7 +138,7 @@ def test_in_a_scene_of_opencv_the_front_is_the_camera_at_rest():
 
 def test_commands_look_from_the_sides(opened):
     target = opened.state.view.target
-    actions.look_from(opened, "top")
+    viewpoint.look_from(opened, "top")
     arrive(opened)
     assert_allclose(opened.state.view.rotation[2], -opened.state.view.up, atol=1e-9)
     assert_allclose(opened.state.view.target, target)
@@ -164,7 +164,7 @@ def test_walking_while_looking_down_goes_where_the_pictures_top_points(side):
 
 
 def test_walking_is_chosen(opened):
-    actions.toggle_walking(opened)
+    viewpoint.toggle_walking(opened)
     assert opened.state.walks
-    actions.set_walking(opened, False)
+    viewpoint.set_walking(opened, False)
     assert not opened.state.walks

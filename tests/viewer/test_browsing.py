@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from langsplat_viewer import actions
+from langsplat_viewer.actions import opening, settings
 from langsplat_viewer.files.browsing import MOST_LISTED, Entry, list_folder
 from langsplat_viewer.panels.scene import in_words
 from tests.support.windowless import SCENES, errors, settle
@@ -55,36 +55,36 @@ def test_a_crowded_folder_is_cut(tmp_path, monkeypatch):
 
 def test_one_goes_into_folders_and_opens_scenes(viewer, folder, monkeypatch):
     monkeypatch.chdir(folder)
-    actions.ask_for_file(viewer)
+    opening.ask_for_file(viewer)
     assert viewer.state.browser.folder == folder
-    actions.choose(viewer, Entry(folder / "B folder", is_file=False))
+    opening.choose(viewer, Entry(folder / "B folder", is_file=False))
     assert viewer.state.browser.folder == folder / "B folder"
-    actions.browse(viewer, folder)
-    actions.choose(viewer, Entry(folder / "blobs.ply", is_file=True))
+    opening.browse(viewer, folder)
+    opening.choose(viewer, Entry(folder / "blobs.ply", is_file=True))
     assert viewer.state.browser is None
     settle(viewer)
     assert viewer.state.scene is SCENES["blobs.ply"]
-    actions.ask_for_file(viewer)
+    opening.ask_for_file(viewer)
     assert viewer.state.browser.folder == folder  # that of the scene
-    actions.escape(viewer)
+    settings.escape(viewer)
     assert viewer.state.browser is None
 
 
 @pytest.mark.parametrize("typed", [" blobs.ply ", "B folder/../blobs.ply"])
 def test_a_path_can_be_typed(viewer, folder, monkeypatch, typed):
     monkeypatch.chdir(folder)
-    actions.ask_for_file(viewer)
+    opening.ask_for_file(viewer)
     for nothing in ("", "  "):
-        actions.type_path(viewer, nothing)
-        actions.open_typed(viewer)
+        opening.type_path(viewer, nothing)
+        opening.open_typed(viewer)
         assert viewer.state.browser is not None
-    actions.type_path(viewer, "B folder")
-    actions.open_typed(viewer)
+    opening.type_path(viewer, "B folder")
+    opening.open_typed(viewer)
     assert viewer.state.browser.folder == folder / "B folder"
     assert viewer.state.path_typed == ""
-    actions.browse(viewer, folder)
-    actions.type_path(viewer, typed)
-    actions.open_typed(viewer)
+    opening.browse(viewer, folder)
+    opening.type_path(viewer, typed)
+    opening.open_typed(viewer)
     settle(viewer)
     assert viewer.state.scene is SCENES["blobs.ply"]
 
@@ -92,21 +92,21 @@ def test_a_path_can_be_typed(viewer, folder, monkeypatch, typed):
 @pytest.mark.parametrize("typed", ["gone.ply", "x" * 5000, "~nobody-of-this-name/a.ply"])
 def test_a_path_that_leads_nowhere_is_an_error_line(viewer, folder, monkeypatch, typed):
     monkeypatch.chdir(folder)
-    actions.ask_for_file(viewer)
-    actions.type_path(viewer, typed)
-    actions.open_typed(viewer)
+    opening.ask_for_file(viewer)
+    opening.type_path(viewer, typed)
+    opening.open_typed(viewer)
     settle(viewer)
     assert len(errors(viewer)) == 1
 
 
 def test_scenes_that_were_open_are_remembered_the_latest_first(viewer):
     for name in ("blobs.ply", "plain.ply", "blobs.ply"):
-        actions.open_scene(viewer, Path(name))
+        opening.open_scene(viewer, Path(name))
         settle(viewer)
     recent = viewer.state.preferences.recent
     assert [Path(path).name for path in recent] == ["blobs.ply", "plain.ply"]
     assert all(Path(path).is_absolute() for path in recent)
-    actions.open_recent(viewer, recent[1])
+    opening.open_recent(viewer, recent[1])
     settle(viewer)
     assert viewer.state.scene is SCENES["plain.ply"]
 

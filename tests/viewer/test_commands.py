@@ -4,7 +4,7 @@ from collections import Counter
 
 import pytest
 
-from langsplat_viewer import actions
+from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.commands import BUTTONS, COMMANDS, MENUS, PANEL_TITLES, in_menu, matching
 from langsplat_viewer.panels.layout import PANELS, key_rows
 from langsplat_viewer.panels.navigation import chord
@@ -65,8 +65,8 @@ def test_every_panel_can_be_opened_by_a_command(viewer):
     for title in PANEL_TITLES:
         (command,) = matching(f"panel: {title}")
         command.act(viewer)
-        assert actions.take_wanted_panel(viewer) == title
-    assert actions.take_wanted_panel(viewer) == ""
+        assert settings.take_wanted_panel(viewer) == title
+    assert settings.take_wanted_panel(viewer) == ""
 
 
 def test_help_lists_every_key():
@@ -81,7 +81,7 @@ def test_every_display_has_its_digit():
 def test_commands_are_found_by_their_words(opened):
     assert matching("") == list(COMMANDS)
     (found,) = matching("OPENING view")
-    assert found.act is actions.reset_view
+    assert found.act is viewpoint.reset_view
     assert matching("make coffee") == []
 
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from langsplat_viewer import actions, staging
+from langsplat_viewer import staging
+from langsplat_viewer.actions import queries, selecting, settings, viewpoint
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.drawing.channels import Clip, LastView, Sight, Splats
 from langsplat_viewer.drawing.frame import FrameRenderer
@@ -20,31 +21,31 @@ def depicted(viewer: Viewer) -> Depiction:
 
 
 CHANGES = {
-    "display": lambda v: actions.set_display(v, "depth"),
-    "slider": lambda v: actions.set_picture(v, replace(v.state.picture, dim=0.1)),
-    "hidden query": lambda v: actions.hide(v, v.state.queries[0]),
-    "cut": lambda v: actions.set_cut(v, v.state.queries[0], 0.7),
-    "split": actions.toggle_wipe,
-    "splats": lambda v: actions.set_splats(v, Splats(0.5)),
-    "near cut": lambda v: actions.set_clip(v, Clip(1.0)),
-    "marks": actions.select_all,
-    "size": lambda v: actions.resize(v, 300, 200),
-    "view": lambda v: actions.look_from(v, "left"),
+    "display": lambda v: settings.set_display(v, "depth"),
+    "slider": lambda v: settings.set_picture(v, replace(v.state.picture, dim=0.1)),
+    "hidden query": lambda v: queries.hide(v, v.state.queries[0]),
+    "cut": lambda v: queries.set_cut(v, v.state.queries[0], 0.7),
+    "split": settings.toggle_wipe,
+    "splats": lambda v: settings.set_splats(v, Splats(0.5)),
+    "near cut": lambda v: settings.set_clip(v, Clip(1.0)),
+    "marks": selecting.select_all,
+    "size": lambda v: settings.resize(v, 300, 200),
+    "view": lambda v: viewpoint.look_from(v, "left"),
 }
 UNSEEN = {
-    "line": lambda v: actions.move_line(v, 0.3),
-    "ruler": actions.toggle_measuring,
-    "tool": lambda v: actions.use_tool(v, "brush"),
-    "word": lambda v: actions.type_phrase(v, "plant"),
-    "chosen query": lambda v: actions.select(v, None),
+    "line": lambda v: settings.move_line(v, 0.3),
+    "ruler": settings.toggle_measuring,
+    "tool": lambda v: selecting.use_tool(v, "brush"),
+    "word": lambda v: queries.type_phrase(v, "plant"),
+    "chosen query": lambda v: queries.select(v, None),
 }
 
 
 @pytest.fixture
 def asked(opened: Viewer) -> Viewer:
-    actions.ask(opened, "mug")
+    queries.ask(opened, "mug")
     settle(opened)
-    actions.resize(opened, 240, 180)
+    settings.resize(opened, 240, 180)
     return opened
 
 
@@ -53,8 +54,8 @@ def test_what_is_seen_is_in_it(asked, name):
     before = depicted(asked)
     assert depicted(asked) == before
     CHANGES[name](asked)
-    actions.tick(asked, asked.clock + 10)
-    actions.tick(asked, asked.clock + 10)
+    viewpoint.tick(asked, asked.clock + 10)
+    viewpoint.tick(asked, asked.clock + 10)
     assert depicted(asked) != before
 
 
@@ -107,8 +108,8 @@ def test_what_is_kept_gives_the_picture_that_a_new_renderer_gives(gl, asked, nam
     canvas = Canvas(gl, kept)
     canvas.update(asked.state, 0.0)
     CHANGES[name](asked)
-    actions.tick(asked, asked.clock + 10)
-    actions.tick(asked, asked.clock + 10)
+    viewpoint.tick(asked, asked.clock + 10)
+    viewpoint.tick(asked, asked.clock + 10)
     canvas.update(asked.state, 20.0)
     canvas.update(asked.state, 30.0)
     expected = Canvas(gl, fresh).capture(asked.state)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from langsplat_core.errors import EncoderError
-from langsplat_viewer import actions
+from langsplat_viewer.actions import opening, queries, settings
 from langsplat_viewer.viewer import Services
 from tests.support.fakes import FakeEncoder
 from tests.support.windowless import load, settle
@@ -17,12 +17,12 @@ def test_an_unexpected_error_of_the_encoder_is_one_line_too(viewer):
         raise ZeroDivisionError("deep\ninside")
 
     viewer.services = replace(viewer.services, load_encoder=broken)
-    actions.open_scene(viewer, Path("blobs.ply"))
+    opening.open_scene(viewer, Path("blobs.ply"))
     settle(viewer)
-    actions.ask(viewer, "mug")
+    queries.ask(viewer, "mug")
     settle(viewer)
     assert viewer.state.queries[0].problem == "internal error: ZeroDivisionError: deep inside"
-    actions.set_display(viewer, "depth")  # and life goes on
+    settings.set_display(viewer, "depth")  # and life goes on
     assert viewer.state.picture.display == "depth"
 
 
@@ -31,10 +31,10 @@ def test_a_local_encoder_is_loaded_while_the_user_looks_round(viewer, encoder_id
     """A hub id may mean a download: it waits for a phrase."""
     asked = []
     viewer.services = Services(load, lambda name: asked.append(name) or FakeEncoder(), encoder_id)
-    actions.open_scene(viewer, Path("blobs.ply"))
+    opening.open_scene(viewer, Path("blobs.ply"))
     settle(viewer)
     assert asked == ([] if "/" in encoder_id else [encoder_id])
-    actions.ask(viewer, "mug")
+    queries.ask(viewer, "mug")
     assert viewer.worker.current == ("searching 'mug'", 0.0) or asked
     settle(viewer)
     assert asked == [encoder_id]
@@ -46,10 +46,10 @@ def test_phrasebook_needs_no_encoder(viewer):
         raise EncoderError("no weights; download them")
 
     viewer.services = replace(viewer.services, load_encoder=absent)
-    actions.open_scene(viewer, Path("book.ply"))
+    opening.open_scene(viewer, Path("book.ply"))
     settle(viewer)
-    actions.ask(viewer, "Book")
-    actions.ask(viewer, "mug")
+    queries.ask(viewer, "Book")
+    queries.ask(viewer, "mug")
     settle(viewer)
     book, mug = viewer.state.queries
     assert book.result.found
@@ -64,9 +64,9 @@ def test_the_encoder_of_the_command_line_comes_before_the_scenes(viewer):
         return FakeEncoder()
 
     viewer.services = Services(load, load_encoder, "mine")
-    actions.open_scene(viewer, Path("blobs.ply"))
+    opening.open_scene(viewer, Path("blobs.ply"))
     settle(viewer)
-    actions.ask(viewer, "mug")
-    actions.ask(viewer, "book")
+    queries.ask(viewer, "mug")
+    queries.ask(viewer, "book")
     settle(viewer)
     assert asked == ["mine"]  # once for both

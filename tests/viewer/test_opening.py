@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from langsplat_core.io import load_scene, save_scene
 from langsplat_core.scene import Scene
-from langsplat_viewer import actions
+from langsplat_viewer.actions import opening, queries, settings, viewpoint
 from langsplat_viewer.options import say_compiling
 from tests.support.fakes import blob_scene
 from tests.support.windowless import SCENES, errors, settle
@@ -31,7 +31,7 @@ def test_unusable_gaussians_are_counted(viewer):
     scene = blob_scene(field=False)
     scene.gaussians.means[[3, 7]] = np.nan
     viewer.services = replace(viewer.services, load_scene=lambda path: scene)
-    actions.open_scene(viewer, Path("holes.ply"))
+    opening.open_scene(viewer, Path("holes.ply"))
     settle(viewer)
     assert viewer.state.messages[0].text == "holes.ply: 360 Gaussians; not drawn: 2 with position not finite"
     assert np.isfinite(viewer.state.view.camera(160, 120).world_to_camera).all()
@@ -39,7 +39,7 @@ def test_unusable_gaussians_are_counted(viewer):
 
 def test_a_broken_file_leaves_the_open_scene_alone(opened):
     before = opened.state.view
-    actions.open_scene(opened, Path("broken.ply"))
+    opening.open_scene(opened, Path("broken.ply"))
     settle(opened)
     assert opened.state.scene is SCENES["blobs.ply"]
     assert opened.state.view is before
@@ -48,22 +48,22 @@ def test_a_broken_file_leaves_the_open_scene_alone(opened):
 
 
 def test_opening_another_scene_forgets_the_queries(opened):
-    actions.ask(opened, "mug")
+    queries.ask(opened, "mug")
     settle(opened)
-    actions.open_scene(opened, Path("bare.ply"))
+    opening.open_scene(opened, Path("bare.ply"))
     settle(opened)
     assert opened.state.queries == []
     assert opened.state.camera_index is None
 
 
 def test_a_scene_without_language_field_says_what_makes_one(viewer):
-    actions.set_display(viewer, "relevancy")
-    actions.open_scene(viewer, Path("plain.ply"))
+    settings.set_display(viewer, "relevancy")
+    opening.open_scene(viewer, Path("plain.ply"))
     settle(viewer)
     assert viewer.state.picture.display == "rgb"
     assert "langsplat train" in viewer.state.messages[-1].text
-    actions.ask(viewer, "mug")
-    actions.set_display(viewer, "latent")
+    queries.ask(viewer, "mug")
+    settings.set_display(viewer, "latent")
     assert viewer.state.queries == []
     assert viewer.state.picture.display == "rgb"
     assert "langsplat train" in errors(viewer)[-1]
@@ -77,8 +77,8 @@ def test_the_window_stays_responsive_while_a_scene_is_read(viewer):
         return SCENES["blobs.ply"]
 
     viewer.services = replace(viewer.services, load_scene=slow)
-    actions.open_scene(viewer, Path("blobs.ply"))
-    actions.tick(viewer, 0.0)  # returns although the file is still being read
+    opening.open_scene(viewer, Path("blobs.ply"))
+    viewpoint.tick(viewer, 0.0)  # returns although the file is still being read
     assert viewer.state.scene is None
     assert viewer.worker.current[0] == "opening blobs.ply"
     release.set()
@@ -94,8 +94,8 @@ def test_cancelled_opening_shows_nothing(viewer):
         return SCENES["blobs.ply"]
 
     viewer.services = replace(viewer.services, load_scene=slow)
-    actions.open_scene(viewer, Path("blobs.ply"))
-    actions.cancel(viewer)
+    opening.open_scene(viewer, Path("blobs.ply"))
+    opening.cancel(viewer)
     assert viewer.worker.current is None
     assert viewer.state.opening is None
     release.set()
@@ -111,7 +111,7 @@ def test_a_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
     for name in names:
         (tmp_path / name).write_bytes(b"{")
     viewer.services = replace(viewer.services, load_scene=load_scene)
-    actions.open_scene(viewer, path)
+    opening.open_scene(viewer, path)
     settle(viewer)
     assert viewer.state.scene.language is None
     said = errors(viewer)
@@ -128,7 +128,7 @@ def test_a_scene_with_broken_companions_opens_and_says_why(tmp_path, viewer):
     ],
 )
 def test_of_dropped_files_the_scene_is_opened_and_what_is_none_is_said(viewer, names, opened_name, said):
-    actions.open_dropped(viewer, [Path(name) for name in names])
+    opening.open_dropped(viewer, [Path(name) for name in names])
     settle(viewer)
     assert viewer.state.path.name == opened_name
     assert [path.name for path in viewer.state.scenes] == [opened_name]
@@ -149,7 +149,7 @@ def test_the_first_run_says_that_it_compiles(viewer, monkeypatch):
     monkeypatch.setattr(
         viewer.worker, "submit", lambda label, *rest: labels.append(label) or submit(label, *rest)
     )
-    actions.open_scene(viewer, Path("blobs.ply"))
+    opening.open_scene(viewer, Path("blobs.ply"))
     settle(viewer)
     assert seen == [("compiling the drawing kernels, once per installation (half a minute)", 0.7)]
     assert "compiling the search kernels, once per installation (half a minute)" in labels

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.displays import QUERY_COLOURS, SEGMENT_OPACITY, Channels, compose
 from langsplat_core.query.answers import QueryResult
-from langsplat_viewer import actions
+from langsplat_viewer.actions import queries
 from langsplat_viewer.drawing import channels
 from langsplat_viewer.output.still import describe
 from langsplat_viewer.panels.overlays import STEPS, bar_colours
@@ -19,7 +19,7 @@ from tests.support.windowless import settle
 @pytest.fixture
 def answers(opened) -> dict[str, QueryResult]:
     """The same answer with each verdict."""
-    actions.ask(opened, "mug")
+    queries.ask(opened, "mug")
     settle(opened)
     found = opened.state.queries[0].result
     weak = replace(found, found=False, probability=0.7)

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from langsplat_core.errors import InputError
-from langsplat_viewer import actions
+from langsplat_viewer.actions import opening, viewpoint
 from langsplat_viewer.files.photographs import LONGEST_SIDE, corners, find, read
 from langsplat_viewer.files.preferences import (
     MOST_FOLDERS,
@@ -92,7 +92,7 @@ def test_one_of_another_shape_is_refused(tmp_path):
 
 
 def test_it_lies_where_its_camera_saw_it(opened):
-    actions.go_to_camera(opened, 1)
+    viewpoint.go_to_camera(opened, 1)
     arrive(opened)
     camera = opened.state.scene.cameras[1]
     shown = opened.state.view.camera(500, 300)
@@ -114,45 +114,45 @@ def placed(opened, tmp_path):
 
 
 def stand(viewer, index: int) -> None:
-    actions.go_to_camera(viewer, index)
+    viewpoint.go_to_camera(viewer, index)
     arrive(viewer)
-    actions.fetch_photograph(viewer)
+    opening.fetch_photograph(viewer)
     settle(viewer)
 
 
 def test_it_is_read_once_it_is_wanted_and_only_at_its_camera(placed):
     stand(placed, 1)
     assert placed.state.photograph is None
-    actions.fade_photograph(placed, 3.0)
+    opening.fade_photograph(placed, 3.0)
     assert placed.state.seeing.fade == 1
     stand(placed, 1)
-    found = actions.photograph_here(placed.state)
+    found = opening.photograph_here(placed.state)
     assert found.image.shape == (120, 160, 3)
     stand(placed, 1)
-    assert actions.photograph_here(placed.state) is found  # not read again
-    actions.zoom_by(placed, 1.1)
-    assert actions.photograph_here(placed.state) is None
+    assert opening.photograph_here(placed.state) is found  # not read again
+    viewpoint.zoom_by(placed, 1.1)
+    assert opening.photograph_here(placed.state) is None
     stand(placed, 2)
-    here = actions.photograph_here(placed.state)
+    here = opening.photograph_here(placed.state)
     assert here.image is None
     assert "no photograph 'photo_2'" in here.reason
 
 
 def test_a_chosen_folder_is_looked_into_and_remembered(placed, tmp_path):
     photograph(tmp_path / "away" / "deep" / "photo_2.jpg")
-    actions.fade_photograph(placed, 1.0)
+    opening.fade_photograph(placed, 1.0)
     stand(placed, 2)
-    actions.ask_for_photographs(placed)
+    opening.ask_for_photographs(placed)
     assert placed.state.picks_folder
-    actions.choose_photograph_folder(placed, tmp_path / "away")
+    opening.choose_photograph_folder(placed, tmp_path / "away")
     assert placed.state.browser is None
     stand(placed, 2)
-    assert actions.photograph_here(placed.state).image.shape == (120, 160, 3)
+    assert opening.photograph_here(placed.state).image.shape == (120, 160, 3)
     save_preferences(tmp_path / "settings", placed.state.preferences)
     assert load_preferences(tmp_path / "settings").photographs == {
         str(tmp_path / "blobs.ply"): str(tmp_path / "away")
     }
-    actions.ask_for_file(placed)
+    opening.ask_for_file(placed)
     assert not placed.state.picks_folder
 
 
@@ -165,9 +165,9 @@ def test_folders_are_not_remembered_without_end():
 
 
 def test_without_cameras_there_is_no_photograph(viewer):
-    actions.open_scene(viewer, Path("bare.ply"))
+    opening.open_scene(viewer, Path("bare.ply"))
     settle(viewer)
-    actions.fade_photograph(viewer, 1.0)
-    actions.fetch_photograph(viewer)
+    opening.fade_photograph(viewer, 1.0)
+    opening.fetch_photograph(viewer)
     assert viewer.state.photograph is None
     assert viewer.state.scene is SCENES["bare.ply"]

@@ -7,7 +7,7 @@ import pytest
 from langsplat_core.query.describe import Describer, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_viewer import actions
+from langsplat_viewer.actions import opening, queries, settings, viewpoint
 from langsplat_viewer.panels.overlays import pointed_figures, said
 from tests.support.fakes import CENTRES, FakeEncoder, blob_scene
 from tests.support.windowless import errors, settle
@@ -24,10 +24,10 @@ def compiled() -> None:
 @pytest.fixture
 def pointing(compiled, opened):
     """The mug asked for, and the mouse asked about."""
-    actions.resize(opened, 160, 120)
-    actions.ask(opened, "mug")
+    settings.resize(opened, 160, 120)
+    queries.ask(opened, "mug")
     settle(opened)
-    actions.toggle_pointing(opened)
+    viewpoint.toggle_pointing(opened)
     return opened
 
 
@@ -40,8 +40,8 @@ def rest(viewer, pixel, seconds: float = 0.5) -> None:
     """The mouse lies still there."""
     began = viewer.clock
     for now in (began, began + seconds):
-        actions.tick(viewer, now)
-        actions.hover(viewer, pixel)
+        viewpoint.tick(viewer, now)
+        viewpoint.hover(viewer, pixel)
     settle(viewer)
 
 
@@ -61,17 +61,17 @@ def test_it_is_said_once_the_mouse_rests(pointing):
 
 def test_it_is_forgotten_when_the_mouse_or_the_camera_moves(pointing):
     rest(pointing, at(pointing, 0))
-    actions.hover(pointing, (3, 4))
+    viewpoint.hover(pointing, (3, 4))
     assert pointing.state.hover.found is None
     rest(pointing, at(pointing, 1))
     assert pointing.state.hover.found is not None
-    actions.step_camera(pointing, 1)
+    viewpoint.step_camera(pointing, 1)
     for now in (10.0, 11.0):
-        actions.tick(pointing, now)
-    actions.hover(pointing, at(pointing, 1))
+        viewpoint.tick(pointing, now)
+    viewpoint.hover(pointing, at(pointing, 1))
     assert pointing.state.hover.found is None
     for elsewhere in (None, (-1, 5), (160, 5), (5, 120)):
-        actions.hover(pointing, elsewhere)
+        viewpoint.hover(pointing, elsewhere)
         assert pointing.state.hover is None
 
 
@@ -80,15 +80,15 @@ def test_the_words_are_read_once_for_a_scene(pointing):
     describer = pointing.describer
     rest(pointing, at(pointing, 1))
     assert pointing.describer is describer
-    actions.open_scene(pointing, Path("book.ply"))
+    opening.open_scene(pointing, Path("book.ply"))
     settle(pointing)
     assert (pointing.describer, pointing.state.hover, pointing.state.pointing) == (None, None, True)
 
 
 def test_a_scene_that_means_nothing_says_so(pointing):
-    actions.open_scene(pointing, Path("plain.ply"))
+    opening.open_scene(pointing, Path("plain.ply"))
     settle(pointing)
     assert not pointing.state.pointing
-    actions.toggle_pointing(pointing)
+    viewpoint.toggle_pointing(pointing)
     assert not pointing.state.pointing
     assert "langsplat train" in errors(pointing)[-1]

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from langsplat_core.errors import InputError
-from langsplat_viewer import actions
+from langsplat_viewer.actions import settings
 from langsplat_viewer.files.preferences import (
     FILE_NAME,
     MOST_RECENT,
@@ -73,6 +73,6 @@ def test_they_lie_in_the_platforms_folder(monkeypatch, tmp_path):
 
 
 def test_looks_are_chosen_within_limits(viewer):
-    actions.set_theme(viewer, "light")
-    actions.set_ui_scale(viewer, 99.0)
+    settings.set_theme(viewer, "light")
+    settings.set_ui_scale(viewer, 99.0)
     assert viewer.state.preferences == replace(Preferences(), theme="light", ui_scale=SCALES[1])

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from langsplat_core.scene import Calibration, Reading
-from langsplat_viewer import actions
+from langsplat_viewer.actions import opening, queries
 from langsplat_viewer.panels import search, style
 from langsplat_viewer.panels import search as panel
 from langsplat_viewer.viewer import Viewer
@@ -77,11 +77,11 @@ def searched(viewer: Viewer, phrase: str, calibration: Calibration | None = None
     field = replace(language(), reading=Reading(calibration=calibration))
     SCENES["asked.ply"] = replace(blob_scene(), language=field)
     try:
-        actions.open_scene(viewer, Path("asked.ply"))
+        opening.open_scene(viewer, Path("asked.ply"))
         settle(viewer)
     finally:
         del SCENES["asked.ply"]
-    actions.ask(viewer, phrase)
+    queries.ask(viewer, phrase)
     settle(viewer)
     return viewer
 

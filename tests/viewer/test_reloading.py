@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.io import load_scene, save_scene
-from langsplat_viewer import actions
+from langsplat_viewer.actions import filming, opening, queries, settings, viewpoint
 from langsplat_viewer.files.watching import Watch, stamps
 from tests.support.fakes import blob_scene
 from tests.support.windowless import errors, settle
@@ -22,7 +22,7 @@ def shown(viewer, tmp_path):
     path = tmp_path / "blobs.ply"
     save_scene(path, replace(blob_scene(), path=None))
     viewer.services = replace(viewer.services, load_scene=load_scene)
-    actions.open_scene(viewer, path)
+    opening.open_scene(viewer, path)
     settle(viewer)
     return viewer
 
@@ -75,21 +75,21 @@ def test_a_scene_whose_file_is_gone_is_not_offered(shown):
 
 def test_reload_keeps_camera_queries_and_settings(shown):
     for word in ("mug", "book"):
-        actions.ask(shown, word)
+        queries.ask(shown, word)
     settle(shown)
     mug, book = shown.state.queries
-    actions.set_cut(shown, mug, 0.6)
-    actions.hide(shown, book)
-    actions.select(shown, mug)
-    actions.go_to_camera(shown, 1)
-    actions.tick(shown, shown.clock + 10)
-    actions.add_keyframe(shown)
-    actions.set_splats(shown, replace(shown.state.seeing.splats, size=0.5))
-    actions.set_picture(shown, replace(shown.state.picture, dim=0.1))
+    queries.set_cut(shown, mug, 0.6)
+    queries.hide(shown, book)
+    queries.select(shown, mug)
+    viewpoint.go_to_camera(shown, 1)
+    viewpoint.tick(shown, shown.clock + 10)
+    filming.add_keyframe(shown)
+    settings.set_splats(shown, replace(shown.state.seeing.splats, size=0.5))
+    settings.set_picture(shown, replace(shown.state.picture, dim=0.1))
     view, before = shown.state.view, shown.state.scene
     save_scene(shown.state.path, dyed())
     assert look(shown)
-    actions.reload(shown)
+    opening.reload(shown)
     settle(shown)
     state = shown.state
     assert state.scene is not before
@@ -106,11 +106,11 @@ def test_reload_keeps_camera_queries_and_settings(shown):
 
 
 def test_a_reload_with_other_gaussians_asks_anew(shown):
-    actions.ask(shown, "plant")
+    queries.ask(shown, "plant")
     settle(shown)
     half = np.arange(0, 360, 2)
     save_scene(shown.state.path, replace(blob_scene().take(half), path=None))
-    actions.reload(shown)
+    opening.reload(shown)
     settle(shown)
     (query,) = shown.state.queries
     assert query.result.members.shape == (180,)
@@ -119,11 +119,11 @@ def test_a_reload_with_other_gaussians_asks_anew(shown):
 
 
 def test_canonical_phrases_outlive_a_reload(shown):
-    actions.set_canonical(shown, "book, plant")
-    actions.ask(shown, "mug")
+    queries.set_canonical(shown, "book, plant")
+    queries.ask(shown, "mug")
     settle(shown)
     before = shown.state.queries[0].result.relevancy.copy()
-    actions.reload(shown)
+    opening.reload(shown)
     settle(shown)
     assert shown.state.canonical == ("book", "plant")
     assert shown.engine.canonical_phrases == ("book", "plant")
@@ -132,7 +132,7 @@ def test_canonical_phrases_outlive_a_reload(shown):
 
 @pytest.mark.parametrize("name", ["blobs.ply", "blobs.langsplat.safetensors", "blobs.cameras.json"])
 def test_a_half_written_file_leaves_the_scene_as_it_was(shown, name):
-    actions.ask(shown, "mug")
+    queries.ask(shown, "mug")
     settle(shown)
     query, before, view = shown.state.queries[0], shown.state.scene, shown.state.view
     answer = query.result
@@ -140,14 +140,14 @@ def test_a_half_written_file_leaves_the_scene_as_it_was(shown, name):
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) // 2])
     assert look(shown)
-    actions.reload(shown)
+    opening.reload(shown)
     settle(shown)
     assert shown.state.scene is before
     assert (shown.state.view, shown.state.queries, query.result) == (view, [query], answer)
     assert name in errors(shown)[-1]
     assert shown.watch.changed  # to be tried again
     file.write_bytes(whole)
-    actions.reload(shown)
+    opening.reload(shown)
     settle(shown)
     assert shown.state.scene is not before
     assert not look(shown)
@@ -156,24 +156,24 @@ def test_a_half_written_file_leaves_the_scene_as_it_was(shown, name):
 def test_what_is_not_wanted_is_not_offered_again_until_it_changes_again(shown):
     os.utime(shown.state.path, ns=(1, 1))
     assert look(shown)
-    actions.keep_old(shown)
+    opening.keep_old(shown)
     assert not look(shown)
     os.utime(shown.state.path, ns=(2, 2))
     assert look(shown)
 
 
 def test_a_field_that_went_away_takes_its_display_along(shown):
-    actions.ask(shown, "mug")
+    queries.ask(shown, "mug")
     settle(shown)
     save_scene(shown.state.path, replace(blob_scene(field=False), path=None))
-    actions.reload(shown)
+    opening.reload(shown)
     settle(shown)
     assert shown.state.picture.display == "rgb"
     assert shown.state.queries == []
 
 
 def test_there_is_nothing_to_reload_before_a_scene_is_open(viewer):
-    actions.reload(viewer)
+    opening.reload(viewer)
     assert "open a scene first" in errors(viewer)[-1]
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_viewer import actions
+from langsplat_viewer.actions import filming, opening, queries, settings, viewpoint
 from langsplat_viewer.actions.opening import MOST
 from langsplat_viewer.drawing.channels import UNCLIPPED, Clip
 from langsplat_viewer.files.browsing import list_folder
@@ -18,13 +18,13 @@ BLOBS, PLAIN, BARE = (Path(f"{name}.ply").absolute() for name in ("blobs", "plai
 @pytest.fixture
 def three(viewer):
     """Three scenes were dropped; the first is shown."""
-    actions.open_dropped(viewer, [Path("blobs.ply"), Path("plain.ply"), Path("bare.ply")])
+    opening.open_dropped(viewer, [Path("blobs.ply"), Path("plain.ply"), Path("bare.ply")])
     settle(viewer)
     return viewer
 
 
 def switch(viewer, path: Path) -> None:
-    actions.switch_scene(viewer, path)
+    opening.switch_scene(viewer, path)
     settle(viewer)
 
 
@@ -32,31 +32,31 @@ def test_of_several_the_first_is_opened_and_all_are_listed(three):
     assert three.state.scene is SCENES["blobs.ply"]
     assert three.state.scenes == (BLOBS, PLAIN, BARE)
     assert errors(three) == []
-    assert actions.take_wanted_panel(three) == "Scene"
+    assert settings.take_wanted_panel(three) == "Scene"
 
 
 def test_camera_and_queries_of_each_are_found_again(three):
     for word in ("mug", "book"):
-        actions.ask(three, word)
+        queries.ask(three, word)
     settle(three)
-    actions.set_canonical(three, "plant")
+    queries.set_canonical(three, "plant")
     settle(three)
     mug, book = three.state.queries
-    actions.hide(three, mug)
-    actions.set_cut(three, book, 0.7)
-    actions.go_to_camera(three, 2)
+    queries.hide(three, mug)
+    queries.set_cut(three, book, 0.7)
+    viewpoint.go_to_camera(three, 2)
     arrive(three)
-    actions.set_clip(three, Clip(1.0, 9.0))
-    actions.add_keyframe(three)
+    settings.set_clip(three, Clip(1.0, 9.0))
+    filming.add_keyframe(three)
     view = three.state.view
     switch(three, BARE)
     assert three.state.scene is SCENES["bare.ply"]
     assert three.state.queries == []
     assert three.state.canonical == ()
     assert three.state.seeing.clip == UNCLIPPED
-    actions.ask(three, "plant")
+    queries.ask(three, "plant")
     settle(three)
-    actions.zoom_by(three, 2.0)
+    viewpoint.zoom_by(three, 2.0)
     bare = three.state.view
 
     switch(three, BLOBS)
@@ -75,7 +75,7 @@ def test_camera_and_queries_of_each_are_found_again(three):
 
 
 def test_a_display_of_answers_comes_back_after_a_scene_without(three):
-    actions.ask(three, "mug")
+    queries.ask(three, "mug")
     settle(three)
     switch(three, PLAIN)
     assert three.state.picture.display == "rgb"
@@ -84,7 +84,7 @@ def test_a_display_of_answers_comes_back_after_a_scene_without(three):
 
 
 def test_nothing_of_a_scene_that_was_left_is_kept_in_memory(three):
-    actions.ask(three, "mug")
+    queries.ask(three, "mug")
     settle(three)
     switch(three, BARE)
     (visit,) = three.visits.values()
@@ -95,7 +95,7 @@ def test_nothing_of_a_scene_that_was_left_is_kept_in_memory(three):
 def test_steps_go_round(three):
     seen = []
     for by in (1, 1, 1, -1):
-        actions.step_scene(three, by)
+        opening.step_scene(three, by)
         settle(three)
         seen.append(three.state.path.absolute())
     assert seen == [PLAIN, BARE, BLOBS, BARE]
@@ -103,37 +103,37 @@ def test_steps_go_round(three):
 
 def test_one_scene_has_no_next(opened):
     assert opened.state.scenes == (BLOBS,)
-    actions.step_scene(opened, 1)
+    opening.step_scene(opened, 1)
     assert "no other scene" in errors(opened)[-1]
 
 
 def test_a_scene_that_is_opened_joins_the_list_once(three):
-    actions.open_scene(three, Path("book.ply"))
+    opening.open_scene(three, Path("book.ply"))
     settle(three)
     assert three.state.scenes[-1].name == "book.ply"
-    actions.add_scenes(three, [Path("book.ply"), PLAIN])
+    opening.add_scenes(three, [Path("book.ply"), PLAIN])
     assert len(three.state.scenes) == 4
 
 
 def test_a_scene_is_taken_off_the_list(three):
     switch(three, PLAIN)
-    actions.unlist_scene(three, BLOBS)
+    opening.unlist_scene(three, BLOBS)
     assert three.state.scenes == (PLAIN, BARE)
     assert three.visits == {}
-    actions.step_scene(three, 1)
+    opening.step_scene(three, 1)
     settle(three)
     assert three.state.path == BARE
 
 
 def test_a_broken_scene_leaves_the_shown_one(three):
-    actions.add_scenes(three, [Path("broken.ply")])
+    opening.add_scenes(three, [Path("broken.ply")])
     switch(three, Path("broken.ply").absolute())
     assert three.state.scene is SCENES["blobs.ply"]
     assert "broken" in errors(three)[-1]
 
 
 def test_the_list_ends(viewer):
-    actions.add_scenes(viewer, [Path(f"{number}.ply") for number in range(MOST + 5)])
+    opening.add_scenes(viewer, [Path(f"{number}.ply") for number in range(MOST + 5)])
     assert len(viewer.state.scenes) == MOST
 
 
@@ -143,7 +143,7 @@ def test_all_scenes_of_a_folder_are_opened_together(viewer, tmp_path):
     (tmp_path / "folder").mkdir()
     viewer.state.browser = list_folder(tmp_path)
     assert has_several(viewer.state.browser)
-    actions.open_all(viewer)
+    opening.open_all(viewer)
     settle(viewer)
     assert viewer.state.browser is None
     assert viewer.state.scenes == (tmp_path / "blobs.ply", tmp_path / "plain.ply")

@@ -5,7 +5,7 @@ import pytest
 
 from langsplat_core.errors import InputError
 from langsplat_core.scene import Scene
-from langsplat_viewer import actions
+from langsplat_viewer.actions import opening, settings
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import OVERLAY_TITLES, matching
 from langsplat_viewer.drawing.channels import OVERLAYS, Ruler, Splats, drawn_scene
@@ -18,12 +18,12 @@ from tests.support.windowless import rest, settle
 
 def test_overlays_are_shown_and_remembered(opened, tmp_path):
     for name in reversed(OVERLAYS):
-        actions.toggle_overlay(opened, name)
+        settings.toggle_overlay(opened, name)
     assert opened.state.preferences.overlays == OVERLAYS
     save_preferences(tmp_path, opened.state.preferences)
     assert load_preferences(tmp_path).overlays == OVERLAYS
-    actions.show_overlay(opened, "cube", False)
-    actions.show_overlay(opened, "cube", False)
+    settings.show_overlay(opened, "cube", False)
+    settings.show_overlay(opened, "cube", False)
     assert opened.state.preferences.overlays == tuple(name for name in OVERLAYS if name != "cube")
 
 
@@ -35,7 +35,7 @@ def test_every_overlay_has_a_command(opened):
 
 
 def test_the_colour_map_is_remembered(opened, tmp_path):
-    actions.set_colour_map(opened, "cividis")
+    settings.set_colour_map(opened, "cividis")
     assert opened.state.shown_picture().colour_map == "cividis"
     save_preferences(tmp_path, opened.state.preferences)
     assert load_preferences(tmp_path).colour_map == "cividis"
@@ -49,7 +49,7 @@ def test_pictures_are_saved_without_background_if_so_chosen(opened, tmp_path):
     capture = opened.surface.capture
     opened.surface.capture = lambda state: asked.append(state.picture.transparent) or capture(state)
     saving.save_picture(opened, tmp_path)
-    actions.save_transparent(opened, True)
+    settings.save_transparent(opened, True)
     saving.save_picture(opened, tmp_path)
     assert asked == [False, True]
     assert not opened.state.picture.transparent  # on screen there is a background
@@ -65,9 +65,9 @@ def test_splats_are_drawn_smaller_and_of_one_colour():
 
 
 def test_splats_stay_within_their_range(opened):
-    actions.set_splats(opened, Splats(7.0, 9))
+    settings.set_splats(opened, Splats(7.0, 9))
     assert opened.state.seeing.splats == Splats()
-    actions.set_splats(opened, Splats(0.0, -1))
+    settings.set_splats(opened, Splats(0.0, -1))
     assert opened.state.seeing.splats == Splats(0.1, 0)
 
 
@@ -80,31 +80,31 @@ def test_the_canvas_takes_other_splats_once(gl, opened):
     state.size = (240, 180)
     rest(canvas, state, 1.0)
     whole = canvas.capture(state)
-    actions.set_splats(opened, Splats(0.1))
+    settings.set_splats(opened, Splats(0.1))
     for now in (2.0, 3.0, 4.0):
         rest(canvas, state, now)
     assert len(given) == 2
     assert 0 < (canvas.capture(state) > 20).sum() < 0.7 * (whole > 20).sum()
-    actions.set_splats(opened, Splats())
+    settings.set_splats(opened, Splats())
     np.testing.assert_array_equal(canvas.capture(state), whole)
     assert given[-1] is state.scene
     renderer.release()
 
 
 def test_two_clicks_measure_and_a_third_begins_anew(opened):
-    actions.toggle_measuring(opened)
+    settings.toggle_measuring(opened)
     assert opened.state.seeing.ruler.length is None
-    actions.measure_at(opened, 0.5, 0.5)
-    actions.measure_at(opened, 0.8, 0.1)  # the fake surface: (u - 0.5, v - 0.5, 0)
+    settings.measure_at(opened, 0.5, 0.5)
+    settings.measure_at(opened, 0.8, 0.1)  # the fake surface: (u - 0.5, v - 0.5, 0)
     assert opened.state.seeing.ruler.length == pytest.approx(0.5)
-    actions.measure_at(opened, 0.6, 0.6)
+    settings.measure_at(opened, 0.6, 0.6)
     assert opened.state.seeing.ruler.length is None
     assert len(opened.state.seeing.ruler.points) == 1
 
 
 def test_a_click_beside_everything_is_said(opened):
-    actions.measure(opened, True)
-    actions.measure_at(opened, 0.95, 0.5)
+    settings.measure(opened, True)
+    settings.measure_at(opened, 0.95, 0.5)
     assert opened.state.seeing.ruler.points == ()
     assert "nothing under the cursor" in opened.state.messages[-1].text
 
@@ -112,9 +112,9 @@ def test_a_click_beside_everything_is_said(opened):
 def test_measuring_ends_with_esc_and_with_another_scene(opened):
     from pathlib import Path
 
-    for end in (actions.escape, lambda viewer: actions.open_scene(viewer, Path("plain.ply"))):
-        actions.measure(opened, True)
-        actions.measure_at(opened, 0.5, 0.5)
+    for end in (settings.escape, lambda viewer: opening.open_scene(viewer, Path("plain.ply"))):
+        settings.measure(opened, True)
+        settings.measure_at(opened, 0.5, 0.5)
         end(opened)
         settle(opened)
         assert opened.state.seeing.ruler == Ruler()

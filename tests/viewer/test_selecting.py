@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_viewer import actions, marks
+from langsplat_viewer import marks
+from langsplat_viewer.actions import opening, queries, selecting, undoing
 from langsplat_viewer.actions.selecting import NOTHING, take
 from langsplat_viewer.panels.select import counts
 from tests.support.selected import blob, marked, marks_of, names
@@ -16,18 +17,18 @@ from tests.support.windowless import errors, settle
 @pytest.fixture
 def searched(opened):
     """One answer: the book."""
-    actions.ask(opened, "book")
+    queries.ask(opened, "book")
     settle(opened)
     return opened
 
 
 def test_everything_nothing_and_the_rest(opened):
-    actions.select_all(opened)
+    selecting.select_all(opened)
     assert marked(opened) == ("mug book plant", "", "")
-    actions.select_none(opened)
+    selecting.select_none(opened)
     assert marked(opened) == ("", "", "")
     take(opened, blob("book"))
-    actions.invert_selection(opened)
+    selecting.invert_selection(opened)
     assert marked(opened) == ("mug plant", "", "")
 
 
@@ -37,46 +38,46 @@ def test_everything_nothing_and_the_rest(opened):
 )
 def test_what_is_found_is_combined_by_the_mode(opened, mode, selected):
     take(opened, blob("mug") | blob("book"))
-    actions.set_mode(opened, mode)
+    selecting.set_mode(opened, mode)
     take(opened, blob("book") | blob("plant"))
     assert marked(opened)[0] == selected
 
 
 def test_a_mode_that_is_held_goes_before_the_one_that_is_set(opened):
-    actions.set_mode(opened, "remove")
+    selecting.set_mode(opened, "remove")
     take(opened, blob("mug"), "add")
     assert marked(opened)[0] == "mug"
 
 
 def test_hidden_and_deleted_ones_are_never_selected(opened):
     take(opened, blob("mug"))
-    actions.hide_selected(opened)
+    selecting.hide_selected(opened)
     take(opened, blob("plant"))
-    actions.delete_selected(opened)
+    selecting.delete_selected(opened)
     assert marked(opened) == ("", "mug", "plant")
-    actions.select_all(opened)
+    selecting.select_all(opened)
     assert marked(opened) == ("book", "mug", "plant")
-    actions.invert_selection(opened)
+    selecting.invert_selection(opened)
     assert marked(opened) == ("", "mug", "plant")
-    actions.show_hidden(opened)
-    actions.select_all(opened)
+    selecting.show_hidden(opened)
+    selecting.select_all(opened)
     assert marked(opened) == ("mug book", "", "plant")
 
 
 def test_isolating_hides_all_else_but_what_is_gone(opened):
     take(opened, blob("plant"))
-    actions.delete_selected(opened)
+    selecting.delete_selected(opened)
     take(opened, blob("mug"))
-    actions.isolate_selected(opened)
+    selecting.isolate_selected(opened)
     assert marked(opened) == ("mug", "book", "plant")
 
 
 def test_every_change_is_one_step_back_and_forth(opened):
     take(opened, blob("mug"))
-    actions.hide_selected(opened)
+    selecting.hide_selected(opened)
     take(opened, blob("book"))
-    actions.delete_selected(opened)
-    actions.show_hidden(opened)
+    selecting.delete_selected(opened)
+    selecting.show_hidden(opened)
     states = [
         ("", "", "book"),
         ("", "mug", "book"),
@@ -87,64 +88,64 @@ def test_every_change_is_one_step_back_and_forth(opened):
     ]
     assert marked(opened) == states[0]
     for state in states[1:]:
-        actions.undo(opened)
+        undoing.undo(opened)
         assert marked(opened) == state
     for state in states[-2::-1]:
-        actions.redo(opened)
+        undoing.redo(opened)
         assert marked(opened) == state
 
 
 def test_what_changes_nothing_is_no_step(opened):
-    actions.select_none(opened)
-    actions.show_hidden(opened)
+    selecting.select_none(opened)
+    selecting.show_hidden(opened)
     take(opened, blob("mug"))
     take(opened, blob("mug"))
     assert len(opened.history.past) == 1
-    actions.use_tool(opened, "brush")
-    actions.set_brush(opened, 0.1)
+    selecting.use_tool(opened, "brush")
+    selecting.set_brush(opened, 0.1)
     assert len(opened.history.past) == 1
 
 
 def test_undo_of_a_query_keeps_the_selection_of_then(searched):
     take(searched, blob("mug"))
-    actions.ask(searched, "plant")
+    queries.ask(searched, "plant")
     settle(searched)
-    actions.undo(searched)
+    undoing.undo(searched)
     assert marked(searched)[0] == "mug"
     assert [query.phrase for query in searched.state.queries] == ["book"]
 
 
 def test_what_the_search_found(searched):
-    actions.select_query(searched)
+    selecting.select_query(searched)
     assert marked(searched)[0] == "book"
-    actions.ask(searched, "mug")
+    queries.ask(searched, "mug")
     settle(searched)
-    actions.select_query(searched, mode="add")
+    selecting.select_query(searched, mode="add")
     assert marked(searched)[0] == "mug book"
 
 
 def test_nothing_was_searched_or_found(searched):
     query = searched.state.queries[0]
     query.result = replace(query.result, found=False, probability=None, excess=None)
-    actions.select_query(searched)
+    selecting.select_query(searched)
     assert "'book' is not here" in searched.state.messages[-1].text
-    actions.find_things(searched)
+    selecting.find_things(searched)
     assert searched.worker.current is None
-    actions.remove(searched, query)
-    actions.select_query(searched)
+    queries.remove(searched, query)
+    selecting.select_query(searched)
     assert "search for something first" in searched.state.messages[-1].text
     assert marked(searched) == ("", "", "")
 
 
 def test_things_of_an_answer_one_by_one(searched):
-    actions.find_things(searched)
+    selecting.find_things(searched)
     settle(searched)
     things = searched.state.selection.things
     assert things.phrase == "book"
     assert len(things.found) == 1
-    actions.select_thing(searched, 0)
+    selecting.select_thing(searched, 0)
     np.testing.assert_array_equal(np.flatnonzero(marks_of(searched).selected), things.found[0].members)
-    actions.select_thing(searched, 1)  # there is none
+    selecting.select_thing(searched, 1)  # there is none
     assert marks_of(searched).selected.sum() == things.found[0].count
 
 
@@ -152,66 +153,71 @@ def test_growing_and_shrinking_follow_the_surface(opened):
     means = opened.state.scene.gaussians.means
     core = np.linalg.norm(means, axis=1) < 0.15
     take(opened, core)
-    actions.set_reach(opened, 0.15)
-    actions.grow_selection(opened)
+    selecting.set_reach(opened, 0.15)
+    selecting.grow_selection(opened)
     settle(opened)
     grown = marks_of(opened).selected.copy()
     assert core.sum() < grown.sum()
     assert (grown >= core).all()
     assert not (grown & ~blob("book")).any()  # the others are not on its surface
-    actions.shrink_selection(opened)
+    selecting.shrink_selection(opened)
     settle(opened)
     assert marks_of(opened).selected.sum() < grown.sum()
-    actions.undo(opened)
+    undoing.undo(opened)
     assert (marks_of(opened).selected == grown).all()
 
 
 def test_what_is_found_too_late_is_not_taken(opened):
     take(opened, blob("mug"))
-    actions.grow_selection(opened)
+    selecting.grow_selection(opened)
     opened.state.scene = None  # another one is being shown
     settle(opened)
     assert marked(opened)[0] == "mug"
 
 
 def test_nothing_selected_is_said(opened):
-    for act in (actions.hide_selected, actions.isolate_selected, actions.delete_selected):
+    for act in (selecting.hide_selected, selecting.isolate_selected, selecting.delete_selected):
         act(opened)
         assert opened.state.messages[-1].text == NOTHING
-    actions.grow_selection(opened)
-    actions.shrink_selection(opened)
+    selecting.grow_selection(opened)
+    selecting.shrink_selection(opened)
     assert opened.worker.current is None
     assert opened.history.past == []
 
 
 def test_without_a_scene_it_is_said(viewer):
-    for act in (actions.select_all, actions.invert_selection, actions.show_hidden, actions.delete_selected):
+    for act in (
+        selecting.select_all,
+        selecting.invert_selection,
+        selecting.show_hidden,
+        selecting.delete_selected,
+    ):
         act(viewer)
     assert set(errors(viewer)) == {"open a scene first, then select in it"}
 
 
 def test_another_scene_has_no_marks_but_the_tool_stays(opened):
     take(opened, blob("mug"))
-    actions.hide_selected(opened)
-    actions.use_tool(opened, "lasso")
-    actions.set_mode(opened, "add")
-    actions.open_scene(opened, Path("plain.ply"))
+    selecting.hide_selected(opened)
+    selecting.use_tool(opened, "lasso")
+    selecting.set_mode(opened, "add")
+    opening.open_scene(opened, Path("plain.ply"))
     settle(opened)
     assert marked(opened) == ("", "", "")
     assert (opened.state.selection.tool, opened.state.selection.mode) == ("lasso", "add")
 
 
 def test_settings_keep_their_limits(opened):
-    actions.set_brush(opened, 9.0)
-    actions.set_reach(opened, 0.0)
+    selecting.set_brush(opened, 9.0)
+    selecting.set_reach(opened, 0.0)
     assert opened.state.selection.brush == marks.BRUSHES[1]
     assert opened.state.selection.reach == marks.REACHES[0]
-    assert actions.reach(opened) == pytest.approx(marks.REACHES[0] * opened.state.extent.radius)
+    assert selecting.reach(opened) == pytest.approx(marks.REACHES[0] * opened.state.extent.radius)
 
 
 def test_counts_are_said(opened):
     take(opened, blob("mug"))
-    actions.delete_selected(opened)
+    selecting.delete_selected(opened)
     take(opened, blob("book"))
     assert counts(marks_of(opened)) == "120 of 360 selected, 0 hidden, 120 deleted"
     assert counts(marks.unmarked(0)) == "0 of 0 selected, 0 hidden, 0 deleted"

@@ -5,7 +5,7 @@ import threading
 from numpy.testing import assert_allclose
 
 from langsplat_core.errors import InputError
-from langsplat_viewer import actions
+from langsplat_viewer.actions import queries, settings
 from langsplat_viewer.panels.style import elided
 from langsplat_viewer.state import MAX_MESSAGES
 from tests.support.windowless import settle
@@ -14,25 +14,25 @@ from tests.support.windowless import settle
 def test_layers_change_only_when_the_picture_needs_others(opened):
     state = opened.state
     key = state.layers_key()
-    actions.set_display(opened, "depth")
+    settings.set_display(opened, "depth")
     assert state.layers_key() == key
     assert state.latent_rgb() is None
-    actions.set_display(opened, "latent", 2)
+    settings.set_display(opened, "latent", 2)
     assert state.layers_key() != key
     assert_allclose(state.latent_rgb(), state.latent[2])
-    actions.set_display(opened, "latent", 1)
+    settings.set_display(opened, "latent", 1)
     assert_allclose(state.latent_rgb(), state.latent[1])
 
 
 def test_parts_of_the_window_come_and_go(viewer):
     state = viewer.state
-    actions.toggle_panel(viewer)
-    actions.toggle_help(viewer)
+    settings.toggle_panel(viewer)
+    settings.toggle_help(viewer)
     assert (state.show_panel, state.show_help) == (False, True)
-    actions.toggle_panel(viewer)
-    actions.toggle_help(viewer)
+    settings.toggle_panel(viewer)
+    settings.toggle_help(viewer)
     assert (state.show_panel, state.show_help) == (True, False)
-    actions.resize(viewer, 0, 300)
+    settings.resize(viewer, 0, 300)
     assert state.size == (1, 300)
 
 
@@ -84,10 +84,10 @@ def test_a_job_that_hangs_does_not_keep_the_process(viewer):
 
 
 def test_letters_meant_for_a_box_that_is_not_there_are_no_keys(viewer):
-    actions.focus_search(viewer)
+    queries.focus_search(viewer)
     assert viewer.state.letters_muted
     assert "open a scene" in viewer.state.messages[-1].text
-    actions.escape(viewer)
+    settings.escape(viewer)
     assert not viewer.state.letters_muted
 
 

@@ -8,7 +8,8 @@ import pytest
 from langsplat_core.config import PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.scene import Scene
-from langsplat_viewer import actions, staging
+from langsplat_viewer import staging
+from langsplat_viewer.actions import queries, settings
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import COMMANDS
 from langsplat_viewer.drawing.channels import AT_RANGE, Layers, Split
@@ -31,7 +32,7 @@ LOOKS = ("latent", "latent", "relevancy", "depth")
 
 
 def ask(viewer, phrase: str) -> None:
-    actions.ask(viewer, phrase)
+    queries.ask(viewer, phrase)
     settle(viewer)
 
 
@@ -42,34 +43,34 @@ def test_one_picture_is_the_state_itself(opened):
 
 def test_the_second_picture_is_what_the_state_would_show(opened):
     ask(opened, "plant")
-    actions.set_display(opened, "rgb")
-    actions.compare_with(opened, "relevancy")
+    settings.set_display(opened, "rgb")
+    settings.compare_with(opened, "relevancy")
     first, second = staging.shown_pictures(opened.state)
     assert first is opened.state
     assert (opened.state.picture.display, second.picture.display) == ("rgb", "relevancy")
-    actions.show_one(opened)
-    actions.set_display(opened, "relevancy")
+    settings.show_one(opened)
+    settings.set_display(opened, "relevancy")
     assert second.layers_key() == opened.state.layers_key()
     np.testing.assert_array_equal(second.relevancies(), opened.state.relevancies())
     assert second.shown_picture() == opened.state.shown_picture()
 
 
 def test_three_levels_of_latents(opened):
-    actions.toggle_levels(opened)
+    settings.toggle_levels(opened)
     shown = staging.shown_pictures(opened.state)
     for level, one in enumerate(shown):
         np.testing.assert_array_equal(one.latent_rgb(), opened.state.latent[level])
     assert staging.labels(opened.state) == ("Latent, subpart", "Latent, part", "Latent, whole")
     opened.state.size = (200, 90)
     assert staging.picture_size(opened.state) == (66, 90)
-    actions.toggle_levels(opened)
+    settings.toggle_levels(opened)
     assert staging.labels(opened.state) == ("Colours",)
 
 
 def test_three_levels_of_an_answer_share_one_scale(opened):
     ask(opened, "plant")
-    actions.set_display(opened, "segmentation")
-    actions.toggle_levels(opened)
+    settings.set_display(opened, "segmentation")
+    settings.toggle_levels(opened)
     shown = staging.shown_pictures(opened.state)
     result = opened.state.queries[0].result
     for level, one in enumerate(shown):
@@ -82,17 +83,17 @@ def test_three_levels_of_an_answer_share_one_scale(opened):
 
 def test_the_line_stays_within_reach(opened):
     for at, kept in ((-3.0, AT_RANGE[0]), (0.3, 0.3), (2.0, AT_RANGE[1])):
-        actions.move_line(opened, at)
+        settings.move_line(opened, at)
         assert opened.state.seeing.split.at == kept
 
 
 def test_without_a_field_levels_and_latents_are_refused(viewer):
     viewer.state.scene = Scene(random_gaussians(5))
-    actions.toggle_levels(viewer)
-    actions.compare_with(viewer, "latent", 1)
+    settings.toggle_levels(viewer)
+    settings.compare_with(viewer, "latent", 1)
     assert viewer.state.seeing.split.mode == "off"
     assert len(errors(viewer)) == 1  # the same line is not said twice
-    actions.toggle_wipe(viewer)
+    settings.toggle_wipe(viewer)
     assert viewer.state.seeing.split.mode == "wipe"
 
 
@@ -158,18 +159,18 @@ def test_the_canvas_draws_both_and_then_rests(gl, opened):
     original = renderer.draw
     renderer.draw = lambda *args, **kwargs: (drawn.append(args[2].display), original(*args, **kwargs))
     for display in DISPLAYS:
-        actions.compare_with(opened, display)
+        settings.compare_with(opened, display)
         rest(canvas, state, 1.0)
         assert len(canvas.textures) == 2
         assert canvas.textures[0].size == (60, 40)
     drawn.clear()
-    actions.move_line(opened, 0.2)  # only the window is drawn anew
+    settings.move_line(opened, 0.2)  # only the window is drawn anew
     rest(canvas, state, 2.0)
     assert drawn == []
     both = canvas.capture(state)
-    actions.show_one(opened)
+    settings.show_one(opened)
     np.testing.assert_array_equal(canvas.capture(state)[:, :12], both[:, :12])
-    actions.toggle_levels(opened)
+    settings.toggle_levels(opened)
     rest(canvas, state, 3.0)
     assert [texture.size for texture in canvas.textures] == [(20, 40)] * 3
     assert canvas.capture(state).shape == (40, 60, 3)
@@ -179,13 +180,13 @@ def test_the_canvas_draws_both_and_then_rests(gl, opened):
 def test_the_surface_is_found_in_every_column(gl, opened):
     canvas, state = Canvas(gl, FrameRenderer(gl, "cpu")), opened.state
     state.size = (240, 120)
-    actions.toggle_levels(opened)
+    settings.toggle_levels(opened)
     rest(canvas, state, 1.0)
     places = [canvas.point_at((column + 0.5) / 3, 0.5) for column in range(3)]
     assert all(place is not None for place in places)
     np.testing.assert_allclose(places[0], places[1])
     np.testing.assert_allclose(places[0], places[2])
-    actions.show_one(opened)
+    settings.show_one(opened)
     state.picture = replace(state.picture, display="rgb")
     rest(canvas, state, 2.0)
     np.testing.assert_allclose(canvas.point_at(0.5, 0.5), places[0], atol=0.1)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from langsplat_core.scene import look_at
-from langsplat_viewer import actions, marks
+from langsplat_viewer import marks
+from langsplat_viewer.actions import selecting, settings, undoing, viewpoint
 from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.drawing.channels import Clip
 from langsplat_viewer.marks import Drawn, Stroke, caught, outlines
@@ -19,8 +20,8 @@ SIZE = (400, 300)
 def front(opened):
     """From straight ahead, so that the blobs lie in a row: mug, book, plant from left to right."""
     camera = look_at(np.array([0, 0, -5.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
-    actions.resize(opened, *SIZE)
-    actions.move(opened, lambda view: from_camera(camera, opened.state.extent))
+    settings.resize(opened, *SIZE)
+    viewpoint.move(opened, lambda view: from_camera(camera, opened.state.extent))
     return opened
 
 
@@ -37,10 +38,10 @@ def around(viewer, centre, radius: float = 0.58) -> list[tuple[float, float]]:
 
 
 def draw(viewer, places, mode=None) -> None:
-    actions.begin_stroke(viewer, *places[0])
+    selecting.begin_stroke(viewer, *places[0])
     for u, v in places[1:]:
-        actions.extend_stroke(viewer, u, v)
-    actions.end_stroke(viewer, mode)
+        selecting.extend_stroke(viewer, u, v)
+    selecting.end_stroke(viewer, mode)
 
 
 def corners(viewer, centre, half: float = 0.58) -> list[tuple[float, float]]:
@@ -48,34 +49,34 @@ def corners(viewer, centre, half: float = 0.58) -> list[tuple[float, float]]:
 
 
 def test_a_rectangle_selects_the_blob_inside_it_and_is_undone(front):
-    actions.use_tool(front, "rectangle")
+    selecting.use_tool(front, "rectangle")
     draw(front, corners(front, CENTRES[0]))
     assert marked(front)[0] == "mug"
     draw(front, corners(front, CENTRES[2])[::-1], "add")
     assert marked(front)[0] == "mug plant"
-    actions.undo(front)
+    undoing.undo(front)
     assert marked(front)[0] == "mug"
 
 
 def test_a_rectangle_of_one_click_selects_nothing(front):
-    actions.use_tool(front, "rectangle")
+    selecting.use_tool(front, "rectangle")
     draw(front, corners(front, CENTRES[0]))
     draw(front, [(0.01, 0.01)])
     assert marked(front)[0] == ""
 
 
 def test_a_lasso_selects_what_it_goes_around(front):
-    actions.use_tool(front, "lasso")
+    selecting.use_tool(front, "lasso")
     draw(front, around(front, CENTRES[1]))
     assert marked(front)[0] == "book"
 
 
 def test_a_brush_selects_what_it_sweeps_over(front):
-    actions.use_tool(front, "brush")
-    actions.set_brush(front, 0.12)
+    selecting.use_tool(front, "brush")
+    selecting.set_brush(front, 0.12)
     draw(front, [place(front, CENTRES[0]), place(front, CENTRES[1])])
     assert marked(front)[0] == "mug book"
-    actions.set_brush(front, 0.01)
+    selecting.set_brush(front, 0.01)
     draw(front, [place(front, CENTRES[2])])
     assert 0 < marks_of(front).selected.sum() < PER_BLOB
 
@@ -83,23 +84,23 @@ def test_a_brush_selects_what_it_sweeps_over(front):
 @pytest.mark.parametrize("tool", ["sphere", "box"])
 def test_a_body_is_as_large_as_the_drag_or_the_reach(front, tool, monkeypatch):
     monkeypatch.setattr(FakeSurface, "point_at", lambda self, u, v: CENTRES[2])
-    actions.use_tool(front, tool)
+    selecting.use_tool(front, tool)
     draw(front, [place(front, CENTRES[2]), place(front, CENTRES[2] + [0.7, 0, 0])])
     assert marked(front)[0] == "plant"
     draw(front, [place(front, CENTRES[2])])  # a click
     offsets = np.abs(front.state.scene.gaussians.means - CENTRES[2])
     far = np.linalg.norm(offsets, axis=1) if tool == "sphere" else offsets.max(1)
-    np.testing.assert_array_equal(marks_of(front).selected, far <= actions.reach(front))
+    np.testing.assert_array_equal(marks_of(front).selected, far <= selecting.reach(front))
     assert marks_of(front).selected.any()
 
 
 def test_what_lies_behind_something_is_left_out_unless_all_is_wanted(front, monkeypatch):
     monkeypatch.setattr(FakeSurface, "depths", lambda self: np.full((30, 40), 4.95))
-    actions.use_tool(front, "rectangle")
+    selecting.use_tool(front, "rectangle")
     draw(front, corners(front, CENTRES[1]))
     z = front.state.scene.gaussians.means[:, 2]
     in_front = marks_of(front).selected
-    actions.set_only_visible(front, False)
+    selecting.set_only_visible(front, False)
     draw(front, corners(front, CENTRES[1]))
     assert marked(front)[0] == "book"
     np.testing.assert_array_equal(in_front, marks_of(front).selected & (z + 5 <= 4.95 * 1.03))
@@ -108,19 +109,19 @@ def test_what_lies_behind_something_is_left_out_unless_all_is_wanted(front, monk
 
 def test_in_parallel_projection_strokes_meet_the_same(front, monkeypatch):
     """Depths count from the eye: what hides, and what is cut away."""
-    actions.toggle_orthographic(front)
+    viewpoint.toggle_orthographic(front)
     back = front.state.view.back
     monkeypatch.setattr(FakeSurface, "depths", lambda self: np.full((30, 40), back + 4.95))
     z = front.state.scene.gaussians.means[:, 2]
-    actions.use_tool(front, "lasso")
+    selecting.use_tool(front, "lasso")
     draw(front, around(front, CENTRES[0], 0.7))
     in_front = marks_of(front).selected
-    actions.set_only_visible(front, False)
+    selecting.set_only_visible(front, False)
     draw(front, around(front, CENTRES[0], 0.7))
     assert marked(front)[0] == "mug"
     np.testing.assert_array_equal(in_front, marks_of(front).selected & (z + 5 <= 4.95 * 1.03))
     assert 20 < in_front.sum() < 100
-    actions.set_clip(front, Clip(5.0))
+    settings.set_clip(front, Clip(5.0))
     draw(front, around(front, CENTRES[0], 0.7))
     assert 20 < marks_of(front).selected.sum() < 100
     assert (z[marks_of(front).selected] > 0).all()
@@ -128,46 +129,46 @@ def test_in_parallel_projection_strokes_meet_the_same(front, monkeypatch):
 
 def test_a_click_selects_the_thing_at_the_level_of_the_queries(front, monkeypatch):
     monkeypatch.setattr(FakeSurface, "point_at", lambda self, u, v: CENTRES[1])
-    actions.use_tool(front, "thing")
+    selecting.use_tool(front, "thing")
     draw(front, [(0.5, 0.5)])
     settle(front)
     assert marked(front)[0] == "book"
-    actions.undo(front)
+    undoing.undo(front)
     assert marked(front)[0] == ""
 
 
 def test_a_click_on_nothing_and_without_a_field(front, monkeypatch):
-    actions.use_tool(front, "sphere")
+    selecting.use_tool(front, "sphere")
     draw(front, [(0.95, 0.5)])  # where the picture is empty
     assert "nothing under the cursor" in front.state.messages[-1].text
     front.state.scene = type(front.state.scene)(front.state.scene.gaussians)
-    actions.use_tool(front, "thing")
+    selecting.use_tool(front, "thing")
     draw(front, [(0.5, 0.5)])
     assert "without a language field" in errors(front)[-1]
     assert marked(front) == ("", "", "")
 
 
 def test_escape_gives_up_the_stroke_then_the_tool_and_help_before_both(front):
-    actions.use_tool(front, "lasso")
-    actions.begin_stroke(front, 0.1, 0.1)
-    actions.show_help(front, True)
-    actions.escape(front)
+    selecting.use_tool(front, "lasso")
+    selecting.begin_stroke(front, 0.1, 0.1)
+    settings.show_help(front, True)
+    settings.escape(front)
     assert front.state.selection.stroke is not None
-    actions.escape(front)
+    settings.escape(front)
     assert (front.state.selection.stroke, front.state.selection.tool) == (None, "lasso")
-    actions.end_stroke(front)  # of nothing
-    actions.escape(front)
+    selecting.end_stroke(front)  # of nothing
+    settings.escape(front)
     assert front.state.selection.tool is None
     assert marked(front) == ("", "", "")
 
 
 def test_a_stroke_keeps_only_places_that_differ(front):
-    actions.begin_stroke(front, 0.1, 0.1)
+    selecting.begin_stroke(front, 0.1, 0.1)
     assert front.state.selection.stroke is None  # no tool
-    actions.use_tool(front, "brush")
-    actions.begin_stroke(front, 0.1, 0.1)
+    selecting.use_tool(front, "brush")
+    selecting.begin_stroke(front, 0.1, 0.1)
     for u in (0.1, 0.1 + 1e-5, 0.2, 0.2):
-        actions.extend_stroke(front, u, 0.1)
+        selecting.extend_stroke(front, u, 0.1)
     assert front.state.selection.stroke.path == ((0.1, 0.1), (0.2, 0.1))
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from langsplat_viewer import actions
+from langsplat_viewer.actions import queries, selecting, settings, viewpoint
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.drawing.channels import Clip, Splats
 from langsplat_viewer.drawing.frame import FrameRenderer
@@ -48,7 +48,7 @@ def drawn(gl, opened, request):
     renderer = FrameRenderer(gl, request.param, "single")
     opened.surface = canvas = Canvas(gl, renderer)
     opened.state.backend = renderer.backend
-    actions.resize(opened, 400, 300)
+    settings.resize(opened, 400, 300)
     rest(canvas, opened.state, 0.0)
     yield opened
     renderer.release()
@@ -56,10 +56,10 @@ def drawn(gl, opened, request):
 
 def test_the_steps_of_a_picture_are_measured_while_the_panel_is_seen(drawn):
     assert drawn.state.timing.medians() == []
-    actions.measure_frame(drawn)
+    viewpoint.measure_frame(drawn)
     drawn.state.coarse_while_moving = False
-    actions.look_from(drawn, "left")
-    actions.tick(drawn, 10.0)
+    viewpoint.look_from(drawn, "left")
+    viewpoint.tick(drawn, 10.0)
     rest(drawn.surface, drawn.state, 10.0)
     laps, steps = drawn.state.timing.laps, {"projection", "sort", "blend", "compose"}
     if drawn.state.backend == "cpu":
@@ -71,20 +71,20 @@ def test_the_steps_of_a_picture_are_measured_while_the_panel_is_seen(drawn):
 def test_the_panel_has_a_picture_measured_when_it_opens(drawn):
     """All of its steps, though nothing has changed; once."""
     for now in (10.0, 11.0):
-        actions.measure_frame(drawn)
+        viewpoint.measure_frame(drawn)
         rest(drawn.surface, drawn.state, now)
         counts = {name: len(measured) for name, measured in drawn.state.timing.laps.items()}
         assert counts.keys() >= {"projection", "sort", "blend", "compose", "picture"}
         assert set(counts.values()) == {1}
     drawn.state.timing.wanted = False  # closed, and opened again
     rest(drawn.surface, drawn.state, 12.0)
-    actions.measure_frame(drawn)
+    viewpoint.measure_frame(drawn)
     rest(drawn.surface, drawn.state, 13.0)
     assert {len(measured) for measured in drawn.state.timing.laps.values()} == {2}
 
 
 def test_a_search_is_measured(opened):
-    actions.ask(opened, "mug")
+    queries.ask(opened, "mug")
     settle(opened)
     assert [title for title, _ in opened.state.timing.medians()] == ["Search"]
 
@@ -99,18 +99,18 @@ def wait(viewer) -> None:
 def test_what_is_shown_is_that_of_the_reference(drawn, look):
     """Whatever is chosen in the window: queries, split, marks, cuts, splats."""
     if look != "plain":
-        actions.ask(drawn, "mug")
+        queries.ask(drawn, "mug")
         settle(drawn)
     if look == "wipe":
-        actions.toggle_wipe(drawn)
+        settings.toggle_wipe(drawn)
     if look == "levels":
-        actions.toggle_levels(drawn)
+        settings.toggle_levels(drawn)
     if look == "changed":
-        actions.select_all(drawn)
-        actions.set_splats(drawn, Splats(0.5, 0))
-        actions.set_clip(drawn, Clip(1.0, 5.2))
-        actions.set_colour_map(drawn, "viridis")
-    actions.compare_with_reference(drawn)
+        selecting.select_all(drawn)
+        settings.set_splats(drawn, Splats(0.5, 0))
+        settings.set_clip(drawn, Clip(1.0, 5.2))
+        settings.set_colour_map(drawn, "viridis")
+    viewpoint.compare_with_reference(drawn)
     wait(drawn)
     found = drawn.state.timing.comparison
     assert errors(drawn) == []
@@ -124,7 +124,7 @@ def test_what_is_wrong_is_told(drawn, monkeypatch):
     right = reference_of(small(drawn.state))().astype(int)
     capture = drawn.surface.capture
     monkeypatch.setattr(drawn.surface, "capture", lambda state: 255 - capture(state))
-    actions.compare_with_reference(drawn)
+    viewpoint.compare_with_reference(drawn)
     wait(drawn)
     found = drawn.state.timing.comparison
     assert found.largest == 255
@@ -132,7 +132,7 @@ def test_what_is_wrong_is_told(drawn, monkeypatch):
 
 
 def test_the_picture_on_screen_is_drawn_again_after_it(drawn):
-    actions.compare_with_reference(drawn)
+    viewpoint.compare_with_reference(drawn)
     wait(drawn)
     rest(drawn.surface, drawn.state, 2.0)
     assert drawn.surface.textures[0].size == (400, 300)
@@ -141,14 +141,14 @@ def test_the_picture_on_screen_is_drawn_again_after_it(drawn):
 
 
 def test_there_is_nothing_to_compare_without_a_scene(viewer):
-    actions.compare_with_reference(viewer)
+    viewpoint.compare_with_reference(viewer)
     assert "open a scene first" in errors(viewer)[-1]
 
 
 def test_a_comparison_is_one_at_a_time_and_can_be_left(drawn):
-    actions.compare_with_reference(drawn)
-    actions.compare_with_reference(drawn)
+    viewpoint.compare_with_reference(drawn)
+    viewpoint.compare_with_reference(drawn)
     assert "wait for it or cancel it" in errors(drawn)[-1]
-    actions.stop_comparing(drawn)
+    viewpoint.stop_comparing(drawn)
     wait(drawn)
     assert drawn.state.timing.comparison is None

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from langsplat_viewer import actions
+from langsplat_viewer.actions import settings
 from langsplat_viewer.camera.controls import default_view, extent_of, from_side, orbit
 from langsplat_viewer.camera.overlays import FACES, face_at, facing, visible_faces, world_axes
 from tests.support.fakes import blob_scene
@@ -55,7 +55,7 @@ def test_the_worlds_axes_on_screen():
 
 
 def test_a_click_glides_there(opened):
-    actions.turn_to_face(opened, "top")
+    settings.turn_to_face(opened, "top")
     assert opened.state.glide is not None
     arrive(opened)
     assert visible_faces(opened.state.view)[0].name == "top"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_viewer import actions
+from langsplat_viewer.actions import filming, opening, selecting, settings, viewpoint
 from langsplat_viewer.commands import COMMANDS, HELD, MENUS, Command, in_menu, matching
 from langsplat_viewer.files.preferences import SCALES, THEMES
 from langsplat_viewer.panels import (
@@ -47,13 +47,13 @@ def _recent(viewer: Viewer) -> None:
         for number, path in enumerate(recent):
             name = Path(path)
             if imgui.menu_item(f"{name.parent.name}/{name.name}##{number}", "", False)[0]:
-                actions.open_recent(viewer, path)
+                opening.open_recent(viewer, path)
             if imgui.is_item_hovered():
                 imgui.set_tooltip(path)
         imgui.end_menu()
     imgui.separator()
     if imgui.menu_item("Quit", "", False)[0]:
-        actions.quit_viewer(viewer)
+        selecting.quit_viewer(viewer)
 
 
 def _panels() -> None:
@@ -70,13 +70,13 @@ def _looks(viewer: Viewer) -> None:
     preferences = viewer.state.preferences
     for theme in THEMES:
         if imgui.menu_item(f"{theme.capitalize()} theme", "", preferences.theme == theme)[0]:
-            actions.set_theme(viewer, theme)
+            settings.set_theme(viewer, theme)
     if imgui.begin_menu("Size of letters"):
         for scale in UI_SCALES:
             if SCALES[0] <= scale <= SCALES[1]:
                 chosen = abs(preferences.ui_scale - scale) < 1e-6
                 if imgui.menu_item(f"{100 * scale:.0f} %", "", chosen)[0]:
-                    actions.set_ui_scale(viewer, scale)
+                    settings.set_ui_scale(viewer, scale)
         imgui.end_menu()
 
 
@@ -102,14 +102,14 @@ def draw_palette(viewer: Viewer) -> None:
     entered, typed = imgui.input_text_with_hint(
         "##command", "what to do", viewer.state.palette_typed, imgui.InputTextFlags_.enter_returns_true
     )
-    actions.type_command(viewer, typed)
+    settings.type_command(viewer, typed)
     found = matching(typed)
     chosen = found[0] if entered and found else _clicked(found)
     left = not imgui.is_window_focused(imgui.FocusedFlags_.root_and_child_windows)
     escaped = imgui.is_key_pressed(imgui.Key.escape)
     imgui.end()
     if chosen is not None or escaped or (left and not imgui.is_window_appearing()):
-        actions.show_palette(viewer, False)
+        settings.show_palette(viewer, False)
     if chosen is not None:
         chosen.act(viewer)
 
@@ -152,7 +152,7 @@ def draw_help(viewer: Viewer) -> None:
     imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
     imgui.set_next_window_bg_alpha(1.0)
     _, still_open = imgui.begin("Keys", True, flags)
-    actions.show_help(viewer, bool(still_open))
+    settings.show_help(viewer, bool(still_open))
     _table()
     imgui.end()
 
@@ -178,7 +178,7 @@ LEAST_LINES = 2  # of messages, however low the panel is
 def draw_messages(viewer: Viewer) -> None:
     """What is being done, what was said (the latest first), and how fast pictures are made."""
     if viewer.worker.current is not None and stoppable(*viewer.worker.current):
-        actions.cancel(viewer)
+        opening.cancel(viewer)
     line = imgui.get_text_line_height_with_spacing()
     height = max(imgui.get_content_region_avail().y - line, LEAST_LINES * line)
     if imgui.begin_child("messages", ImVec2(0, height)):
@@ -205,7 +205,7 @@ def figures(viewer: Viewer, frames_per_second: float | None) -> str:
 
 def draw_timing(viewer: Viewer) -> None:
     """Medians of the last pictures, memory, and a comparison."""
-    actions.measure_frame(viewer)
+    viewpoint.measure_frame(viewer)
     rows = [(title, f"{milliseconds:.1f} ms") for title, milliseconds in viewer.state.timing.medians()]
     memory = memory_bytes()
     if memory is not None:
@@ -223,11 +223,11 @@ def draw_timing(viewer: Viewer) -> None:
     work = viewer.recorder.current
     if work is not None:
         if stoppable(*work, tag="comparison"):
-            actions.stop_comparing(viewer)
+            viewpoint.stop_comparing(viewer)
     else:
         imgui.begin_disabled(viewer.state.scene is None)
         if imgui.button("Compare with the reference"):
-            actions.compare_with_reference(viewer)
+            viewpoint.compare_with_reference(viewer)
         imgui.end_disabled()
         tip("Draws this view small in float64, in the background: about 15 s for 100,000 Gaussians")
     if viewer.state.timing.comparison is not None:
@@ -304,7 +304,7 @@ def _window(viewer: Viewer, panel: Panel) -> hello_imgui.DockableWindow:
 
 def show_wanted(viewer: Viewer) -> None:
     """Open the panel that an action wants seen, in front of those it shares its place with."""
-    title = actions.take_wanted_panel(viewer)
+    title = settings.take_wanted_panel(viewer)
     if title:
         docking = hello_imgui.get_runner_params().docking_params
         docking.dockable_window_of_name(title).is_visible = True
@@ -361,7 +361,7 @@ class Hiding:
             self._hidden = []
         if shown:
             visible = (window.label for window in docking.dockable_windows if window.is_visible)
-            actions.note_panels(viewer, tuple(visible))
+            settings.note_panels(viewer, tuple(visible))
 
 
 def draw_over(viewer: Viewer) -> None:
@@ -378,7 +378,7 @@ def draw_over(viewer: Viewer) -> None:
     overlays.draw_cube(viewer, area)
     scene.draw_changed(viewer, area)
     scene.draw_unsaved(viewer)
-    copied = actions.take_clipboard(viewer)
+    copied = filming.take_clipboard(viewer)
     if copied:
         imgui.set_clipboard_text(copied)
     scene.draw_browser(viewer)

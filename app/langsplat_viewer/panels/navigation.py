@@ -6,7 +6,7 @@ from functools import cache
 
 from imgui_bundle import imgui
 
-from langsplat_viewer import actions
+from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera import controls
 from langsplat_viewer.commands import COMMANDS, Command
 from langsplat_viewer.panels import select
@@ -73,7 +73,7 @@ def _pressed(wanted: Chord, command: Command, typing: bool, muted: bool) -> bool
 def muted_until_clicked(viewer: Viewer) -> None:
     """Letters are keys again once something is clicked; to be called before the panels are drawn."""
     if imgui.is_mouse_clicked(imgui.MouseButton_.left):
-        actions.mute_letters(viewer, False)
+        settings.mute_letters(viewer, False)
 
 
 # Mouse and held keys over the scene -> camera moves; pressed keys -> commands.
@@ -89,7 +89,7 @@ def handle(viewer: Viewer, area: Area) -> None:
     select.handle_stroke(viewer, area)
     if viewer.state.view is not None and not io.want_capture_mouse:
         _mouse(viewer, area)
-    actions.hover(viewer, _pixel(area))
+    viewpoint.hover(viewer, _pixel(area))
     handle_keys(viewer)
     letters = not (io.want_text_input or io.key_ctrl or viewer.state.letters_muted)
     if viewer.state.view is not None and letters:
@@ -112,20 +112,20 @@ def _mouse(viewer: Viewer, area: Area) -> None:
     free = viewer.state.selection.tool is None
     turns = 0 if free else 2
     if free and imgui.is_mouse_double_clicked(0):
-        actions.focus_pixel(viewer, *area.fraction(io.mouse_pos.x, io.mouse_pos.y))
+        viewpoint.focus_pixel(viewer, *area.fraction(io.mouse_pos.x, io.mouse_pos.y))
         return
     dx, dy = io.mouse_delta.x, io.mouse_delta.y
     if dx or dy:
         turn = math.pi / area.height  # a drag over the whole height is half a turn
         if _held(1) or (free and (_held(2) or (_held(0) and io.key_shift))):
             size = (max(round(area.width), 1), max(round(area.height), 1))
-            actions.move(viewer, lambda view: controls.pan(view, dx, dy, size))
+            viewpoint.move(viewer, lambda view: controls.pan(view, dx, dy, size))
         elif _held(turns) and io.key_ctrl:
-            actions.move(viewer, lambda view: controls.look(view, dx * turn, dy * turn))
+            viewpoint.move(viewer, lambda view: controls.look(view, dx * turn, dy * turn))
         elif _held(turns):
-            actions.move(viewer, lambda view: controls.orbit(view, dx * turn, dy * turn))
+            viewpoint.move(viewer, lambda view: controls.orbit(view, dx * turn, dy * turn))
     if io.mouse_wheel:
-        actions.zoom_by(viewer, WHEEL_STEP**io.mouse_wheel)
+        viewpoint.zoom_by(viewer, WHEEL_STEP**io.mouse_wheel)
 
 
 def _held(button: int) -> bool:
@@ -148,7 +148,7 @@ def _fly(viewer: Viewer) -> None:
         pace = 4.0 if io.key_shift else 0.25 if io.key_alt else 1.0
         step = pace * viewer.state.fly_speed * extent.radius * seconds
         go = controls.walk if viewer.state.walks else controls.fly
-        actions.move(viewer, lambda view: go(view, right * step, up * step, ahead * step))
+        viewpoint.move(viewer, lambda view: go(view, right * step, up * step, ahead * step))
     turn = held(key.right_bracket, key.left_bracket)
     if turn:
-        actions.move(viewer, lambda view: controls.roll(view, turn * ROLL_SPEED * seconds))
+        viewpoint.move(viewer, lambda view: controls.roll(view, turn * ROLL_SPEED * seconds))

@@ -13,7 +13,8 @@ from langsplat_core.display.displays import QUERY_COLOURS, mapped
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.describe import Words
 from langsplat_core.scene import LEVELS, Camera
-from langsplat_viewer import actions, staging
+from langsplat_viewer import staging
+from langsplat_viewer.actions import opening, settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.overlays import Face, Label, face_at, placed, visible_faces, world_axes
@@ -118,9 +119,9 @@ def draw_grip(viewer: Viewer, area: Area) -> None:
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew)
         _knob(x, area)
     if imgui.is_item_hovered() and imgui.is_mouse_double_clicked(0):
-        actions.move_line(viewer, 0.5)
+        settings.move_line(viewer, 0.5)
     elif imgui.is_item_active() and imgui.get_io().mouse_delta.x:
-        actions.move_line(viewer, area.fraction(imgui.get_io().mouse_pos.x, 0)[0])
+        settings.move_line(viewer, area.fraction(imgui.get_io().mouse_pos.x, 0)[0])
     imgui.end()
     imgui.pop_style_var(2)
 
@@ -149,7 +150,7 @@ class PhotographOverlay:
     def draw(self, viewer: Viewer, area: Area) -> None:
         """Over every picture in the area, where one stands at its camera."""
         state = viewer.state
-        photograph = actions.photograph_here(state)
+        photograph = opening.photograph_here(state)
         if state.seeing.fade == 0 or photograph is None or photograph.image is None or state.view is None:
             return
         texture = self._upload(photograph.image)
@@ -223,7 +224,7 @@ def draw_lines(viewer: Viewer, area: Area) -> None:
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_all)
         if clicked(area):
             mouse = imgui.get_io().mouse_pos
-            actions.measure_at(viewer, *area.fraction(mouse.x, mouse.y))
+            settings.measure_at(viewer, *area.fraction(mouse.x, mouse.y))
 
 
 def _orthographic(viewer: Viewer, area: Area) -> None:
@@ -286,7 +287,7 @@ def _cameras(viewer: Viewer, area: Area, camera: Camera) -> None:
         name = state.scene.cameras[under].name
         text_on_shade(f"camera {under}  {name}", mouse.x + 14, mouse.y + 10, area)
         if clicked(area):
-            actions.go_to_camera(viewer, under)
+            viewpoint.go_to_camera(viewer, under)
 
 
 def _things(viewer: Viewer, area: Area, camera: Camera) -> None:
@@ -532,7 +533,7 @@ def draw_cube(viewer: Viewer, area: Area) -> None:
     imgui.end()
     imgui.pop_style_var()
     if pressed and under:
-        actions.turn_to_face(viewer, under)
+        settings.turn_to_face(viewer, under)
 
 
 def _face(face: Face, middle: tuple[float, float], scale: float, hovered: bool) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.config import TrainPreset
-from langsplat_viewer import actions
+from langsplat_viewer.actions import opening, selecting, settings, training
 from langsplat_viewer.files.browsing import Entry, Listing, is_scene
 from langsplat_viewer.output import saving
 from langsplat_viewer.panels.style import (
@@ -39,7 +39,7 @@ def draw(viewer: Viewer) -> None:
             small_wrapped(doubt.partition(":")[0], bad())
             tip(doubt)
     if imgui.button("Open ..."):
-        actions.ask_for_file(viewer)
+        opening.ask_for_file(viewer)
     beside("Save picture")
     if imgui.button("Save picture"):
         saving.save_picture(viewer, Path.cwd())
@@ -48,7 +48,7 @@ def draw(viewer: Viewer) -> None:
         saving.save_view(viewer, Path.cwd())
     beside("Keys")
     if imgui.button("Keys"):
-        actions.toggle_help(viewer)
+        settings.toggle_help(viewer)
     if len(state.scenes) > 1:
         _list(viewer)
 
@@ -67,12 +67,12 @@ def _list(viewer: Viewer) -> None:
             name = elided(name, room, width_of)
             imgui.align_text_to_frame_padding()
             if imgui.selectable(f"{name}##scene", path == shown, size=ImVec2(room, 0))[0]:
-                actions.switch_scene(viewer, path)
+                opening.switch_scene(viewer, path)
             tip(str(path))
             imgui.same_line(room + imgui.get_style().item_spacing.x)
             imgui.begin_disabled(path == shown)
             if imgui.button("x", ImVec2(side, 0)):
-                actions.unlist_scene(viewer, path)
+                opening.unlist_scene(viewer, path)
             imgui.end_disabled()
             imgui.pop_id()
     imgui.end_child()
@@ -113,7 +113,7 @@ def draw_browser(viewer: Viewer) -> None:
         _entries(viewer, listing)
         _foot(viewer, listing)
     if not stays or imgui.is_key_pressed(imgui.Key.escape):
-        actions.close_browser(viewer)
+        opening.close_browser(viewer)
     if viewer.state.browser is None:
         imgui.close_current_popup()
     imgui.end_popup()
@@ -123,9 +123,9 @@ def _foot(viewer: Viewer, listing: Listing) -> None:
     """What can be done with the whole folder."""
     if viewer.state.picks_folder:
         if imgui.button("Take this folder"):
-            actions.choose_photograph_folder(viewer, listing.folder)
+            opening.choose_photograph_folder(viewer, listing.folder)
     elif has_several(listing) and imgui.button("Open all scenes here"):
-        actions.open_all(viewer)
+        opening.open_all(viewer)
 
 
 def has_several(listing: Listing) -> bool:
@@ -142,10 +142,10 @@ def _path_box(viewer: Viewer) -> None:
     picks = viewer.state.picks_folder
     hint = "path of a folder" if picks else "path of a scene or folder, or drop files onto the window"
     entered, typed = imgui.input_text_with_hint("##path", hint, viewer.state.path_typed, flags)
-    actions.type_path(viewer, typed)
+    opening.type_path(viewer, typed)
     imgui.same_line()
     if imgui.button("Open") or entered:
-        actions.open_typed(viewer)
+        opening.open_typed(viewer)
 
 
 def _above(viewer: Viewer, folder: Path) -> None:
@@ -158,7 +158,7 @@ def _above(viewer: Viewer, folder: Path) -> None:
             if imgui.get_content_region_avail().x < width:
                 imgui.new_line()
         if imgui.small_button(f"{parent.name or parent}##above {number}"):
-            actions.browse(viewer, parent)
+            opening.browse(viewer, parent)
 
 
 def _entries(viewer: Viewer, listing: Listing) -> None:
@@ -183,7 +183,7 @@ def _entries(viewer: Viewer, listing: Listing) -> None:
         if imgui.begin_child("recent", ImVec2(0, -foot)):
             for path in recent:
                 if imgui.selectable(f"{path}##recent", False)[0]:
-                    actions.open_recent(viewer, path)
+                    opening.open_recent(viewer, path)
         imgui.end_child()
 
 
@@ -191,7 +191,7 @@ def _entry(viewer: Viewer, entry: Entry) -> None:
     right = imgui.get_content_region_avail().x
     name = entry.path.name if entry.is_file else f"{entry.path.name}/"
     if imgui.selectable(name, False)[0]:
-        actions.choose(viewer, entry)
+        opening.choose(viewer, entry)
     if entry.size:
         text = in_words(entry.size)
         imgui.same_line(right - imgui.calc_text_size(text).x)
@@ -231,11 +231,11 @@ def draw_changed(viewer: Viewer, area: Area) -> None:
     imgui.text_unformatted(f"{state.path.name} has changed on disk")
     imgui.same_line()
     if imgui.button("Reload"):
-        actions.reload(viewer)
+        opening.reload(viewer)
     tip("Read it again; camera, queries and view settings stay")
     imgui.same_line()
     if imgui.button("Not now"):
-        actions.keep_old(viewer)
+        opening.keep_old(viewer)
     imgui.end()
 
 
@@ -259,13 +259,13 @@ def draw_unsaved(viewer: Viewer) -> None:
         imgui.text_unformatted(f"{count:,} Gaussians were deleted, and the scene is not saved without them.")
         imgui.text_unformatted(f"Save it as a new file before {leaving.to}?")
         if imgui.button("Save"):
-            actions.save_and_leave(viewer, Path.cwd())
+            selecting.save_and_leave(viewer, Path.cwd())
         imgui.same_line()
         if imgui.button("Discard"):
-            actions.discard_and_leave(viewer)
+            selecting.discard_and_leave(viewer)
         imgui.same_line()
         if imgui.button("Cancel"):
-            actions.stay(viewer)
+            selecting.stay(viewer)
     if viewer.state.selection.leaving is None:
         imgui.close_current_popup()
     imgui.end_popup()
@@ -284,11 +284,11 @@ MEANS = {
 
 def draw_training(viewer: Viewer) -> None:
     """The form, or what a running training says."""
-    training = viewer.training
-    if training is None:
+    process = viewer.training
+    if process is None:
         _form(viewer)
     else:
-        _running(viewer, training)
+        _running(viewer, process)
 
 
 def _form(viewer: Viewer) -> None:
@@ -305,9 +305,9 @@ def _form(viewer: Viewer) -> None:
             form = replace(form, preset=preset)
         if imgui.is_item_hovered():
             imgui.set_tooltip(MEANS[preset])
-    actions.fill_in(viewer, form)
+    training.fill_in(viewer, form)
     if imgui.button("Train"):
-        actions.start_training(viewer)
+        training.start_training(viewer)
     small_wrapped("An interrupted training continues where it stopped.", muted())
     _doubts(viewer)
 
@@ -327,9 +327,9 @@ def _text_box(label: str, hint: str, text: str) -> str:
     return str(imgui.input_text_with_hint(f"##{label} to train", hint, text)[1])
 
 
-def _running(viewer: Viewer, training: Training) -> None:
-    progress = training.progress
-    imgui.text_unformatted(training.request.out.name)
+def _running(viewer: Viewer, process: Training) -> None:
+    progress = process.progress
+    imgui.text_unformatted(process.request.out.name)
     for label, fraction in list(progress.stages.items()):
         small_wrapped(f"{label}: done" if fraction >= 1 else label, muted())
         if fraction < 1:
@@ -343,9 +343,9 @@ def _running(viewer: Viewer, training: Training) -> None:
     imgui.separator()
     imgui.progress_bar(progress.overall, ImVec2(-1, 0), progress.left or "starting")
     if imgui.button("Stop"):
-        actions.stop_training(viewer)
+        training.stop_training(viewer)
     beside("Look at it so far")
     if imgui.button("Look at it so far"):
-        actions.look_at_training(viewer)
+        training.look_at_training(viewer)
     for line in progress.said[-3:]:
         small_wrapped(line, muted())

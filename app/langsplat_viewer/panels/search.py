@@ -13,7 +13,7 @@ from langsplat_core.display.displays import QUERY_COLOURS
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS
-from langsplat_viewer import actions
+from langsplat_viewer.actions import queries, settings, viewpoint
 from langsplat_viewer.panels.style import bad, beside_boxed, elided, good, muted, small_wrapped, tip, width_of
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
@@ -25,26 +25,26 @@ OFFER_LINES = 2  # more are scrolled to
 
 def _box(viewer: Viewer) -> None:
     """Box, button, offers."""
-    actions.prepare_suggestions(viewer)
+    queries.prepare_suggestions(viewer)
     button = imgui.calc_text_size("Search").x + 2 * imgui.get_style().frame_padding.x
     imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
-    if actions.take_search_focus(viewer):
+    if queries.take_search_focus(viewer):
         imgui.set_keyboard_focus_here()
     flags = imgui.InputTextFlags_.enter_returns_true | imgui.InputTextFlags_.callback_history
 
     def recalled(data: imgui.InputTextCallbackData) -> int:
-        text = actions.recall(viewer, -1 if data.event_key == imgui.Key.up_arrow else 1)
+        text = queries.recall(viewer, -1 if data.event_key == imgui.Key.up_arrow else 1)
         data.delete_chars(0, data.buf_text_len)
         data.insert_chars(0, text)
         return 0
 
     typed = viewer.state.typed
     entered, typed = imgui.input_text_with_hint("##phrase", hint(viewer), typed, flags, recalled)
-    actions.type_phrase(viewer, typed)
+    queries.type_phrase(viewer, typed)
     imgui.same_line()
     clicked = imgui.button("Search")
     if entered or clicked:
-        actions.ask_typed(viewer)
+        queries.ask_typed(viewer)
     _offers(viewer)
 
 
@@ -56,7 +56,7 @@ def hint(viewer: Viewer) -> str:
 
 def _offers(viewer: Viewer) -> None:
     """Small buttons, as many in a row as fit, where there is anything to offer."""
-    title, phrases = actions.offers(viewer)
+    title, phrases = queries.offers(viewer)
     if not phrases:
         return
     height = OFFER_LINES * imgui.get_text_line_height_with_spacing()
@@ -74,7 +74,7 @@ def _offer_buttons(viewer: Viewer, title: str, phrases: tuple[str, ...]) -> None
             imgui.new_line()
         shown = elided(phrase, imgui.get_content_region_avail().x - margins, width_of)
         if imgui.small_button(f"{shown}###offer {number}"):
-            actions.ask_offered(viewer, phrase)
+            queries.ask_offered(viewer, phrase)
         if shown != phrase:
             tip(phrase)
 
@@ -101,11 +101,11 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
     imgui.set_next_item_width(-(button + imgui.get_style().item_spacing.x) if own else -1)
     changed, value = imgui.slider_float("##cut", result.cut, low, high, "ends at %.3f")
     if changed:
-        actions.set_cut(viewer, query, value, is_new=not own)
+        queries.set_cut(viewer, query, value, is_new=not own)
     if own:
         imgui.same_line()
         if imgui.button("Auto"):
-            actions.set_cut(viewer, query, None)
+            queries.set_cut(viewer, query, None)
     imgui.text_colored(muted(), f"{int(result.members.sum()):,} Gaussians")
 
 
@@ -161,7 +161,7 @@ def _line(viewer: Viewer, query: Query) -> None:
     chosen = viewer.state.selected is query
     name = elided(query.phrase, room, width_of)
     if imgui.selectable(f"{name}##phrase of list", chosen, size=ImVec2(room, 0))[0]:
-        actions.select(viewer, query)
+        queries.select(viewer, query)
     if name != query.phrase and imgui.is_item_hovered():
         imgui.set_tooltip(query.phrase)
     imgui.same_line(left + right - side - spacing - verdict_width)
@@ -169,7 +169,7 @@ def _line(viewer: Viewer, query: Query) -> None:
     _verdict(query)
     imgui.same_line(left + right - side)
     if imgui.button("x", ImVec2(side, 0)):
-        actions.remove(viewer, query)
+        queries.remove(viewer, query)
     if imgui.is_item_hovered():
         imgui.set_tooltip("Take it off the list")
 
@@ -180,9 +180,9 @@ def _swatch(viewer: Viewer, query: Query, side: float) -> None:
     flags = imgui.ColorEditFlags_.no_tooltip
     if imgui.color_button("##shown", ImVec4(red, green, blue, 1.0), flags, ImVec2(side, side)):
         if shown:
-            actions.hide(viewer, query)
+            queries.hide(viewer, query)
         else:
-            actions.show(viewer, query)
+            queries.show(viewer, query)
     if imgui.is_item_hovered():
         imgui.set_tooltip("Click to hide" if shown else "Click to show")
 
@@ -205,7 +205,7 @@ def _details(viewer: Viewer, query: Query) -> None:
     place = None if result is None or result.verdict == "not here" else result.place
     imgui.begin_disabled(place is None)
     if imgui.button("Focus"):
-        actions.focus_result(viewer, query)
+        viewpoint.focus_result(viewer, query)
     imgui.end_disabled()
     if place is not None:
         imgui.same_line()
@@ -244,7 +244,7 @@ def draw(viewer: Viewer) -> None:
     imgui.end_group()
     hovered = imgui.is_item_hovered(imgui.HoveredFlags_.allow_when_disabled)
     if scene is None and hovered and imgui.is_mouse_clicked(imgui.MouseButton_.left):
-        actions.mute_letters(viewer, True)  # what is typed now was meant for the box
+        settings.mute_letters(viewer, True)  # what is typed now was meant for the box
     _level(viewer)
     imgui.end_disabled()
     if viewer.engine is not None:
@@ -265,11 +265,11 @@ def _canonical(viewer: Viewer) -> None:
     hint = ", ".join(state.canonical or CANONICAL_PHRASES)
     flags = imgui.InputTextFlags_.enter_returns_true
     entered, typed = imgui.input_text_with_hint("##canonical", hint, state.canonical_typed, flags)
-    actions.type_canonical(viewer, typed)
+    queries.type_canonical(viewer, typed)
     if entered:
-        actions.set_canonical(viewer, typed)
+        queries.set_canonical(viewer, typed)
     if state.canonical and imgui.button("The scene's own"):
-        actions.set_canonical(viewer, "")
+        queries.set_canonical(viewer, "")
 
 
 def _level(viewer: Viewer) -> None:
@@ -278,6 +278,6 @@ def _level(viewer: Viewer) -> None:
     for choice in CHOICES:
         beside_boxed(choice)
         if imgui.radio_button(choice, viewer.state.level == choice):
-            actions.set_level(viewer, choice)
+            queries.set_level(viewer, choice)
     if imgui.is_item_hovered():
         imgui.set_tooltip("auto: the level that answers best")

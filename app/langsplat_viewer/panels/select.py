@@ -7,7 +7,8 @@ from typing import Any
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
-from langsplat_viewer import actions, marks
+from langsplat_viewer import marks
+from langsplat_viewer.actions import selecting
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks, Mode, Tool
 from langsplat_viewer.panels.overlays import QUIET
@@ -28,33 +29,33 @@ from langsplat_viewer.viewer import Viewer
 MOST_THINGS = 24  # of an answer that have a button
 Verb = tuple[str, Callable[[Viewer], object], str]  # button, action, tip
 CHANGES: tuple[Verb, ...] = (
-    ("All", actions.select_all, "Everything that is shown"),
-    ("None", actions.select_none, "Nothing"),
-    ("Invert", actions.invert_selection, "What was not selected"),
-    ("Grow", actions.grow_selection, "And what is within reach along the surface"),
-    ("Shrink", actions.shrink_selection, "Without what is within reach of the rest"),
+    ("All", selecting.select_all, "Everything that is shown"),
+    ("None", selecting.select_none, "Nothing"),
+    ("Invert", selecting.invert_selection, "What was not selected"),
+    ("Grow", selecting.grow_selection, "And what is within reach along the surface"),
+    ("Shrink", selecting.shrink_selection, "Without what is within reach of the rest"),
 )
 FATES: tuple[Verb, ...] = (
-    ("Hide", actions.hide_selected, "Out of the picture"),
-    ("Isolate", actions.isolate_selected, "Everything else out of the picture"),
-    ("Show all", actions.show_hidden, "Everything that was hidden"),
+    ("Hide", selecting.hide_selected, "Out of the picture"),
+    ("Isolate", selecting.isolate_selected, "Everything else out of the picture"),
+    ("Show all", selecting.show_hidden, "Everything that was hidden"),
     (
         "Delete",
-        actions.delete_selected,
+        selecting.delete_selected,
         "Out of the scene; its file stays as it is",
     ),
 )
 FILES: tuple[Verb, ...] = (
-    ("Selection", lambda viewer: actions.export(viewer, Path.cwd(), "selection"), "A PLY with its field"),
-    ("Rest", lambda viewer: actions.export(viewer, Path.cwd(), "rest"), "Everything else as a PLY"),
+    ("Selection", lambda viewer: selecting.export(viewer, Path.cwd(), "selection"), "A PLY with its field"),
+    ("Rest", lambda viewer: selecting.export(viewer, Path.cwd(), "rest"), "Everything else as a PLY"),
     (
         "Points",
-        lambda viewer: actions.export(viewer, Path.cwd(), "selection", as_points=True),
+        lambda viewer: selecting.export(viewer, Path.cwd(), "selection", as_points=True),
         "The selection as a point cloud",
     ),
     (
         "Scene",
-        lambda viewer: actions.export(viewer, Path.cwd(), "edited"),
+        lambda viewer: selecting.export(viewer, Path.cwd(), "edited"),
         "The scene without what was deleted, as a new PLY",
     ),
 )
@@ -68,7 +69,7 @@ def draw(viewer: Viewer) -> None:
     _found(viewer)
     imgui.separator()
     _buttons(viewer, CHANGES)
-    actions.set_reach(viewer, _slider("Reach", viewer.state.selection.reach, REACHES, "%.3f of the scene"))
+    selecting.set_reach(viewer, _slider("Reach", viewer.state.selection.reach, REACHES, "%.3f of the scene"))
     imgui.separator()
     _buttons(viewer, FATES)
     imgui.separator()
@@ -94,34 +95,34 @@ def _tools(viewer: Viewer) -> None:
         colour = imgui.Col_.button_active if active else imgui.Col_.button
         imgui.push_style_color(imgui.Col_.button, imgui.get_style_color_vec4(colour))
         if imgui.button(f"{tool.capitalize()}##tool"):
-            actions.use_tool(viewer, None if active else tool)
+            selecting.use_tool(viewer, None if active else tool)
         imgui.pop_style_color()
     for place, mode in enumerate(MODES):
         if place:
             beside_boxed(mode)
         if imgui.radio_button(mode.capitalize(), selection.mode == mode):
-            actions.set_mode(viewer, mode)
+            selecting.set_mode(viewer, mode)
     _, only = imgui.checkbox("Only what is visible", selection.only_visible)
-    actions.set_only_visible(viewer, only)
+    selecting.set_only_visible(viewer, only)
     tip("Rectangle, lasso and brush leave out what lies behind something")
     if selection.tool == "brush":
-        actions.set_brush(viewer, _slider("Brush", selection.brush, BRUSHES, "%.3f of the height"))
+        selecting.set_brush(viewer, _slider("Brush", selection.brush, BRUSHES, "%.3f of the height"))
 
 
 def _found(viewer: Viewer) -> None:
     """What the search found, whole or thing by thing."""
-    query = actions.chosen_query(viewer)
+    query = selecting.chosen_query(viewer)
     if query is None or query.result is None:
         return
     button = imgui.calc_text_size("Things").x + 2 * imgui.get_style().frame_padding.x
     room = imgui.get_content_region_avail().x - button - imgui.get_style().item_spacing.x
     name = elided(query.phrase, room - hello_imgui.em_size(4), width_of)
     if imgui.button(f"Found: {name}##found"):
-        actions.select_query(viewer, query)
+        selecting.select_query(viewer, query)
     tip("Select what the search has found")
     imgui.same_line()
     if imgui.button("Things"):
-        actions.find_things(viewer, query)
+        selecting.find_things(viewer, query)
     tip("Take it apart, to select one thing at a time")
     things = viewer.state.selection.things
     if things is None or things.result is not query.result:
@@ -130,7 +131,7 @@ def _found(viewer: Viewer) -> None:
         if number:
             beside(str(number + 1))
         if imgui.button(f"{number + 1}##thing"):
-            actions.select_thing(viewer, number)
+            selecting.select_thing(viewer, number)
         tip(f"{thing.count:,} Gaussians, {100 * thing.share:.0f} % of the answer, score {thing.score:.2f}")
 
 
@@ -174,12 +175,12 @@ def handle_stroke(viewer: Viewer, area: Area) -> None:
     place = area.fraction(io.mouse_pos.x, io.mouse_pos.y)
     if selection.stroke is None:
         if imgui.is_mouse_clicked(imgui.MouseButton_.left) and not io.want_capture_mouse:
-            actions.begin_stroke(viewer, *place)
+            selecting.begin_stroke(viewer, *place)
     elif imgui.is_mouse_down(imgui.MouseButton_.left):
-        actions.extend_stroke(viewer, *place)
+        selecting.extend_stroke(viewer, *place)
     else:
-        actions.extend_stroke(viewer, *place)
-        actions.end_stroke(viewer, held_mode())
+        selecting.extend_stroke(viewer, *place)
+        selecting.end_stroke(viewer, held_mode())
 
 
 def held_mode() -> Mode | None:
@@ -197,7 +198,7 @@ def draw_stroke(viewer: Viewer, area: Area) -> None:
         return
     paint = imgui.get_foreground_draw_list()
     paint.push_clip_rect(ImVec2(area.left, area.top), ImVec2(area.left + area.width, area.top + area.height))
-    drawn, radius = actions.drawn_stroke(viewer), selection.brush * area.height
+    drawn, radius = selecting.drawn_stroke(viewer), selection.brush * area.height
     for line in marks.outlines(drawn) if drawn is not None else []:
         points = _on_screen(line, area)
         if selection.tool == "brush":

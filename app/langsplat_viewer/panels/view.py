@@ -8,7 +8,8 @@ from imgui_bundle import imgui
 
 from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
-from langsplat_viewer import actions, staging
+from langsplat_viewer import staging
+from langsplat_viewer.actions import opening, settings, viewpoint
 from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, adopt_up, level, with_fov
 from langsplat_viewer.camera.overlays import length_text
 from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of, with_key
@@ -36,12 +37,12 @@ def draw_display(viewer: Viewer) -> None:
         picture = replace(picture, dim=_slider("Rest dimmed to", picture.dim, 0.0, 1.0))
     _colour_map(viewer)
     picture = replace(picture, colour_map=viewer.state.picture.colour_map)
-    actions.set_picture(viewer, replace(picture, background=_backdrop(picture.background)))
+    settings.set_picture(viewer, replace(picture, background=_backdrop(picture.background)))
     tip("What shows where the scene is not")
     transparent = viewer.state.seeing.transparent
     changed, transparent = imgui.checkbox("Save without backdrop", transparent)
     if changed:
-        actions.save_transparent(viewer, transparent)
+        settings.save_transparent(viewer, transparent)
     tip("Pictures are saved transparent where the scene is not")
     _splats(viewer)
 
@@ -58,7 +59,7 @@ def _splats(viewer: Viewer) -> None:
         changed, chosen = imgui.slider_int("SH degree", min(degree, most), 0, most, "%d", flags)
         degree = (MOST_DEGREE if chosen == most else chosen) if changed else degree
         tip("Up to which degree colours change with the direction that they are seen from")
-    actions.set_splats(viewer, Splats(size, degree))
+    settings.set_splats(viewer, Splats(size, degree))
 
 
 def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -84,7 +85,7 @@ def _colour_map(viewer: Viewer) -> None:
     leave_room("Colour map", WIDTH_EM)
     changed, chosen = imgui.combo("Colour map", names.index(viewer.state.picture.colour_map), list(names))
     if changed:
-        actions.set_colour_map(viewer, names[chosen])
+        settings.set_colour_map(viewer, names[chosen])
 
 
 def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
@@ -106,7 +107,7 @@ def _display_button(viewer: Viewer, button: Button) -> None:
     chosen = state.picture.display == button.display and button.latent_level in (None, state.latent_level)
     imgui.begin_disabled(without_field and DISPLAYS[button.display].needs_field)
     if imgui.radio_button(button.label, chosen):
-        actions.set_display(viewer, button.display, button.latent_level)
+        settings.set_display(viewer, button.display, button.latent_level)
     imgui.end_disabled()
 
 
@@ -119,16 +120,16 @@ def _compared(viewer: Viewer) -> None:
     if not imgui.begin_combo("Beside it", shown):
         return
     if imgui.selectable("nothing", split.mode == "off")[0]:
-        actions.show_one(viewer)
+        settings.show_one(viewer)
     without_field = state.scene is not None and state.scene.language is None
     for button in BUTTONS:
         imgui.begin_disabled(without_field and DISPLAYS[button.display].needs_field)
         if imgui.selectable(compared_name(button), shown == compared_name(button))[0]:
-            actions.compare_with(viewer, button.display, button.latent_level)
+            settings.compare_with(viewer, button.display, button.latent_level)
         imgui.end_disabled()
     imgui.begin_disabled(without_field)
     if imgui.selectable("three levels", split.mode == "levels")[0] and split.mode != "levels":
-        actions.toggle_levels(viewer)
+        settings.toggle_levels(viewer)
     imgui.end_disabled()
     imgui.end_combo()
 
@@ -145,13 +146,13 @@ def draw_overlays(viewer: Viewer) -> None:
     for name, title in OVERLAY_TITLES.items():
         changed, shown = imgui.checkbox(title.capitalize(), name in state.preferences.overlays)
         if changed:
-            actions.show_overlay(viewer, name, shown)
+            settings.show_overlay(viewer, name, shown)
     ruler, scene = state.seeing.ruler, state.scene
-    measure = with_key("Measure", actions.toggle_measuring)
+    measure = with_key("Measure", settings.toggle_measuring)
     imgui.begin_disabled(scene is None)
     changed, measures = imgui.checkbox(f"{measure}###measure", ruler.measures)
     if changed:
-        actions.measure(viewer, measures)
+        settings.measure(viewer, measures)
     tip("Click two points on the surface; Esc ends it")
     imgui.end_disabled()
     if ruler.measures:
@@ -171,51 +172,51 @@ def draw_camera(viewer: Viewer) -> None:
     imgui.begin_disabled(state.view is None)
     if state.scene is not None and state.scene.cameras:
         _training_cameras(viewer)
-    if imgui.button(with_key("Reset", actions.reset_view)):
-        actions.reset_view(viewer)
+    if imgui.button(with_key("Reset", viewpoint.reset_view)):
+        viewpoint.reset_view(viewer)
     tip("Return to the opening view")
-    focus = with_key("Focus", actions.focus_result)
+    focus = with_key("Focus", viewpoint.focus_result)
     beside(focus)
     if imgui.button(focus):
-        actions.focus_result(viewer)
+        viewpoint.focus_result(viewer)
     beside("Frame all")
     if imgui.button("Frame all"):
-        actions.frame_scene(viewer)
-    tip(with_key("Show the whole scene from this side", actions.frame_scene))
+        viewpoint.frame_scene(viewer)
+    tip(with_key("Show the whole scene from this side", viewpoint.frame_scene))
     if imgui.button("Horizon"):
-        actions.move(viewer, level)
+        viewpoint.move(viewer, level)
     tip("Turn the picture until the horizon is level")
     beside("Up is up")
     if imgui.button("Up is up"):
-        actions.move(viewer, adopt_up)
+        viewpoint.move(viewer, adopt_up)
     tip("Take what is up in the picture as the world's up")
     if state.view is not None:
         _projection(viewer, state.view)
     _cuts(viewer)
     speed = _slider("Fly speed", state.fly_speed, 0.05, 4.0, "%.2f", logarithmic=True)
-    actions.set_fly_speed(viewer, speed)
+    viewpoint.set_fly_speed(viewer, speed)
     _, walks = imgui.checkbox("Walk", state.walks)
-    actions.set_walking(viewer, walks)
+    viewpoint.set_walking(viewer, walks)
     tip("W A S D keep the height of the eye")
     beside_boxed("Coarse while moving")
     _, coarse = imgui.checkbox("Coarse while moving", state.coarse_while_moving)
-    actions.set_coarse_while_moving(viewer, coarse)
+    settings.set_coarse_while_moving(viewer, coarse)
     tip("Draw fewer pixels and merged Gaussians while the camera moves, where drawing is slow")
     imgui.end_disabled()
 
 
 def _projection(viewer: Viewer, view: OrbitCamera) -> None:
     """With perspective or without; the field of view is one of perspective."""
-    text = with_key("Orthographic", actions.toggle_orthographic)
+    text = with_key("Orthographic", viewpoint.toggle_orthographic)
     _, orthographic = imgui.checkbox(f"{text}###orthographic", bool(view.back))
-    actions.set_orthographic(viewer, orthographic)
+    viewpoint.set_orthographic(viewer, orthographic)
     tip("No perspective: what is parallel looks parallel; the wheel changes the scale")
     before = view.intrinsics.fov_degrees
     imgui.begin_disabled(orthographic)
     fov = _slider("Field of view", before, *FOV_RANGE, "%.0f deg")
     imgui.end_disabled()
     if abs(fov - before) > 1e-3:
-        actions.move(viewer, lambda view: with_fov(view, fov))
+        viewpoint.move(viewer, lambda view: with_fov(view, fov))
 
 
 def _cuts(viewer: Viewer) -> None:
@@ -232,7 +233,7 @@ def _cuts(viewer: Viewer) -> None:
         "Far cut", min(clip.far, high), low, high, "%.3g" if clip.far < high else "off", logarithmic=True
     )
     tip("Farther than this nothing is drawn; world units")
-    actions.set_clip(
+    settings.set_clip(
         viewer, Clip(0.0 if near < 1.001 * low else near, math.inf if far > 0.999 * high else far)
     )
 
@@ -241,10 +242,10 @@ def _training_cameras(viewer: Viewer) -> None:
     state = viewer.state
     assert state.scene is not None
     if imgui.arrow_button("##previous", imgui.Dir.left):
-        actions.step_camera(viewer, -1)
+        viewpoint.step_camera(viewer, -1)
     imgui.same_line()
     if imgui.arrow_button("##next", imgui.Dir.right):
-        actions.step_camera(viewer, 1)
+        viewpoint.step_camera(viewer, 1)
     imgui.same_line()
     index = state.camera_index or 0
     imgui.set_next_item_width(-1)
@@ -254,7 +255,7 @@ def _training_cameras(viewer: Viewer) -> None:
     )
     tip("Training cameras: stand where a photograph was taken")
     if changed and index != state.camera_index:
-        actions.go_to_camera(viewer, index)
+        viewpoint.go_to_camera(viewer, index)
     _photograph(viewer)
 
 
@@ -265,17 +266,17 @@ def _photograph(viewer: Viewer) -> None:
     flags = imgui.SliderFlags_.always_clamp
     changed, fade = imgui.slider_float("Photograph", state.seeing.fade, 0.0, 1.0, "%.2f", flags)
     if changed:
-        actions.fade_photograph(viewer, fade)
+        opening.fade_photograph(viewer, fade)
     tip("Lay the photograph of the training camera over the picture")
     if state.seeing.fade == 0:
         return
-    photograph = actions.photograph_here(state)
+    photograph = opening.photograph_here(state)
     if photograph is None:
         small_wrapped("stand at a training camera to see its photograph", muted())
     elif photograph.reason:
         small_wrapped(photograph.reason, muted())
         if imgui.button("Folder of photographs ..."):
-            actions.ask_for_photographs(viewer)
+            opening.ask_for_photographs(viewer)
 
 
 def _slider(
