@@ -106,7 +106,7 @@ def test_it_lies_where_its_camera_saw_it(opened):
 
 
 @pytest.fixture
-def placed(opened, tmp_path):
+def beside_photograph(opened, tmp_path):
     """A scene that lies beside the photograph of its second camera."""
     opened.state.path = tmp_path / "blobs.ply"
     photograph(tmp_path / "images" / "photo_1.png")
@@ -120,40 +120,40 @@ def stand(viewer, index: int) -> None:
     settle(viewer)
 
 
-def test_it_is_read_once_it_is_wanted_and_only_at_its_camera(placed):
-    stand(placed, 1)
-    assert placed.state.photograph is None
-    opening.fade_photograph(placed, 3.0)
-    assert placed.state.seeing.fade == 1
-    stand(placed, 1)
-    found = opening.photograph_here(placed.state)
+def test_it_is_read_once_it_is_wanted_and_only_at_its_camera(beside_photograph):
+    stand(beside_photograph, 1)
+    assert beside_photograph.state.photograph is None
+    opening.fade_photograph(beside_photograph, 3.0)
+    assert beside_photograph.state.seeing.fade == 1
+    stand(beside_photograph, 1)
+    found = opening.photograph_here(beside_photograph.state)
     assert found.image.shape == (120, 160, 3)
-    stand(placed, 1)
-    assert opening.photograph_here(placed.state) is found  # not read again
-    viewpoint.zoom_by(placed, 1.1)
-    assert opening.photograph_here(placed.state) is None
-    stand(placed, 2)
-    here = opening.photograph_here(placed.state)
+    stand(beside_photograph, 1)
+    assert opening.photograph_here(beside_photograph.state) is found  # not read again
+    viewpoint.zoom_by(beside_photograph, 1.1)
+    assert opening.photograph_here(beside_photograph.state) is None
+    stand(beside_photograph, 2)
+    here = opening.photograph_here(beside_photograph.state)
     assert here.image is None
     assert "no photograph 'photo_2'" in here.reason
 
 
-def test_a_chosen_folder_is_looked_into_and_remembered(placed, tmp_path):
+def test_a_chosen_folder_is_looked_into_and_remembered(beside_photograph, tmp_path):
     photograph(tmp_path / "away" / "deep" / "photo_2.jpg")
-    opening.fade_photograph(placed, 1.0)
-    stand(placed, 2)
-    opening.ask_for_photographs(placed)
-    assert placed.state.picks_folder
-    opening.choose_photograph_folder(placed, tmp_path / "away")
-    assert placed.state.browser is None
-    stand(placed, 2)
-    assert opening.photograph_here(placed.state).image.shape == (120, 160, 3)
-    save_preferences(tmp_path / "settings", placed.state.preferences)
+    opening.fade_photograph(beside_photograph, 1.0)
+    stand(beside_photograph, 2)
+    opening.ask_for_photographs(beside_photograph)
+    assert beside_photograph.state.picks_folder
+    opening.choose_photograph_folder(beside_photograph, tmp_path / "away")
+    assert beside_photograph.state.browser is None
+    stand(beside_photograph, 2)
+    assert opening.photograph_here(beside_photograph.state).image.shape == (120, 160, 3)
+    save_preferences(tmp_path / "settings", beside_photograph.state.preferences)
     assert load_preferences(tmp_path / "settings").photographs == {
         str(tmp_path / "blobs.ply"): str(tmp_path / "away")
     }
-    opening.ask_for_file(placed)
-    assert not placed.state.picks_folder
+    opening.ask_for_file(beside_photograph)
+    assert not beside_photograph.state.picks_folder
 
 
 def test_folders_are_not_remembered_without_end():
