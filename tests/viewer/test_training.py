@@ -251,13 +251,6 @@ def test_a_checkpoint_of_training_itself_is_read(tmp_path):
         np.testing.assert_array_equal(getattr(seen, field.name), getattr(gaussians, field.name))
 
 
-def test_another_scene_is_left_alone_while_a_training_goes_on(training_now, folder):
-    viewer = training_now
-    checkpoint(folder.parent, blob_scene())
-    training.watch_training(viewer)
-    assert viewer.worker.current is None
-
-
 def test_a_damaged_checkpoint_is_one_line(training_now, folder):
     path = checkpoint(folder.parent, blob_scene())
     path.write_bytes(path.read_bytes()[:100])

@@ -115,14 +115,6 @@ def test_colour_level_and_display_are_undone(opened):
     assert query.slot == 0
 
 
-def test_a_change_after_an_undo_ends_what_could_be_redone(opened):
-    queries.ask(opened, "mug")
-    undoing.undo(opened)
-    queries.ask(opened, "book")
-    undoing.redo(opened)
-    assert phrases(opened) == ["book"]
-
-
 def test_another_scene_and_a_long_day(opened):
     for _ in range(LONGEST):
         settings.set_display(opened, "depth")
@@ -202,13 +194,6 @@ def test_a_slider_that_is_moved_is_one_step_and_another_time_another(opened):
     assert opened.state.picture.dim == 0.45
 
 
-def test_two_sliders_are_two_steps(opened):
-    slide(opened, 1.0, 0.2)
-    settings.set_picture(opened, replace(opened.state.picture, heat_opacity=0.3))
-    slide(opened, 1.0, 0.1)
-    assert len(opened.history.past) == 3
-
-
 def test_the_ruler_is_not_undone(opened):
     settings.toggle_wipe(opened)
     settings.measure(opened, True)
@@ -230,19 +215,6 @@ def test_an_undone_setting_leaves_the_marks_the_same_objects(opened):
     mark(opened, replace(opened.state.selection.marks, selected=~hidden | True))
     undoing.undo(opened)
     assert opened.state.selection.marks.hidden is hidden
-
-
-def test_marks_come_back_bit_for_bit(opened):
-    rng, seen = np.random.default_rng(0), []
-    for _ in range(12):
-        seen.append(opened.state.selection.marks)
-        mark(opened, Marks(*(rng.uniform(size=360) < 0.4 for _ in range(3))))
-    for marks in reversed(seen):
-        undoing.undo(opened)
-        assert opened.state.selection.marks.same(marks)
-    for marks in seen[1:]:
-        undoing.redo(opened)
-        assert opened.state.selection.marks.same(marks)
 
 
 def changed(marks: Marks, rng: np.random.Generator, step: int) -> Marks:
