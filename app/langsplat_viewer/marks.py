@@ -10,7 +10,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.query.instances import Instance
 from langsplat_core.query.selection import (
     in_box,
     in_polygon,
@@ -115,15 +114,6 @@ class Stroke:
 
 
 @dataclass(frozen=True, eq=False)
-class Things:
-    """The instances of an answer, to be selected one by one."""
-
-    phrase: str
-    result: Any  # the `QueryResult` whose they are
-    found: tuple[Instance, ...]  # best first
-
-
-@dataclass(frozen=True, eq=False)
 class Leaving:
     """What waits for an answer to whether deletions are to be saved."""
 
@@ -143,7 +133,6 @@ class Selection:
     reach: float = 0.05  # how far growing goes, and how large a sphere of one click is; of the scene's radius
     only_visible: bool = True  # rectangle, lasso and brush leave out what lies behind something
     stroke: Stroke | None = None
-    things: Things | None = None
     leaving: Leaving | None = None
     writing: Future[Any] | None = None  # what was last written, or is being written
     may_close: bool = False  # the window closes at the next frame
@@ -157,7 +146,7 @@ class Selection:
 
 def of_scene(selection: Selection, count: int) -> Selection:
     """For another scene, of `count` Gaussians: the tool and its settings stay."""
-    return replace(selection, marks=unmarked(count), saved=None, stroke=None, things=None, leaving=None)
+    return replace(selection, marks=unmarked(count), saved=None, stroke=None, leaving=None)
 
 
 # Marks as history keeps them: one bit each, and none for what is not marked at all.

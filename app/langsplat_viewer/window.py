@@ -295,6 +295,7 @@ class Window:
         if viewer.state.selection.may_close:
             hello_imgui.get_runner_params().app_shall_exit = True
         self._began = time.perf_counter()
+        viewer.take_results()
         viewpoint.tick(viewer, imgui.get_time())
         training.watch_training(viewer)
         opening.fetch_photograph(viewer)

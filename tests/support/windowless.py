@@ -92,8 +92,10 @@ def settle(viewer: Viewer, seconds: float = 120.0) -> None:
     end = time.monotonic() + seconds
     while viewer.worker.current is not None:
         assert time.monotonic() < end, "the worker never finished"
+        viewer.take_results()
         viewpoint.tick(viewer, 0.0)
         time.sleep(0.002)
+    viewer.take_results()
     viewpoint.tick(viewer, 0.0)
 
 

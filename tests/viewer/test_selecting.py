@@ -120,8 +120,6 @@ def test_nothing_was_searched_or_found(searched):
     query.result = replace(query.result, found=False, probability=None, excess=None)
     selecting.select_query(searched)
     assert "'book' is not here" in searched.state.messages[-1].text
-    selecting.find_things(searched)
-    assert searched.worker.current is None
     queries.remove(searched, query)
     selecting.select_query(searched)
     assert "search for something first" in searched.state.messages[-1].text
@@ -129,15 +127,9 @@ def test_nothing_was_searched_or_found(searched):
 
 
 def test_things_of_an_answer_one_by_one(searched):
-    selecting.find_things(searched)
-    settle(searched)
-    things = searched.state.selection.things
-    assert things.phrase == "book"
-    assert len(things.found) == 1
-    selecting.select_thing(searched, 0)
-    np.testing.assert_array_equal(np.flatnonzero(marks_of(searched).selected), things.found[0].members)
-    selecting.select_thing(searched, 1)  # there is none
-    assert marks_of(searched).selected.sum() == things.found[0].count
+    (thing,) = searched.state.queries[0].things
+    selecting.select_thing(searched, thing)
+    np.testing.assert_array_equal(np.flatnonzero(marks_of(searched).selected), thing.members)
 
 
 def test_growing_and_shrinking_follow_the_surface(opened):

@@ -91,7 +91,7 @@ def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Cal
         viewer.state.opening = None
         viewer.state.say(reason, is_error=True)
 
-    viewer.worker.submit(f"opening {path.name}", work, done, failed)
+    viewer.run(f"opening {path.name}", work, done, failed)
 
 
 def cancel(viewer: Viewer) -> None:
@@ -151,11 +151,8 @@ def _compile_search(viewer: Viewer) -> None:
     engine = viewer.engine
     if engine is None or is_compiled(Path(surface.__file__)):
         return
-    viewer.worker.submit(
-        "compiling the search kernels, once per installation (half a minute)",
-        lambda progress: engine.regions,
-        lambda regions: None,
-        lambda reason: viewer.state.say(reason, is_error=True),
+    viewer.run(
+        "compiling the search kernels, once per installation (half a minute)", lambda progress: engine.regions
     )
 
 
@@ -164,12 +161,7 @@ def _warm_up_encoder(viewer: Viewer, encoder_id: str) -> None:
     first query that needs it."""
     if viewer.engine is None or not (encoder_id == DEMO or Path(encoder_id).expanduser().is_dir()):
         return
-    viewer.worker.submit(
-        "loading the text encoder",
-        viewer.engine.load_encoder,
-        lambda encoder: None,
-        lambda reason: viewer.state.say(reason, is_error=True),
-    )
+    viewer.run("loading the text encoder", viewer.engine.load_encoder)
 
 
 # Coming back to a scene.
@@ -336,7 +328,7 @@ def fetch_photograph(viewer: Viewer) -> None:
         if state.photograph is wanted:
             state.photograph = replace(wanted, reason=reason)
 
-    viewer.worker.submit(f"reading the photograph {camera.name}", work, done, failed)
+    viewer.run(f"reading the photograph {camera.name}", work, done, failed)
 
 
 def _folder(viewer: Viewer) -> str:

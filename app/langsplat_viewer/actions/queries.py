@@ -140,7 +140,7 @@ def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
         viewer.state.say(reason, is_error=True)
 
     query.pending = True
-    viewer.worker.submit(f"searching '{query.phrase}'", work, done, failed)
+    viewer.run(f"searching '{query.phrase}'", work, done, failed)
 
 
 def _take(query: Query, composed: ComposedResult, things: tuple[Instance, ...]) -> None:
@@ -244,7 +244,7 @@ def set_canonical(viewer: Viewer, text: str) -> None:
         state.say(f"compared with {', '.join(canonical)}")
         ask_again(viewer)
 
-    viewer.worker.submit("encoding canonical phrases", work, done, lambda reason: state.say(reason, True))
+    viewer.run("encoding canonical phrases", work, done)
 
 
 def save_queries(viewer: Viewer, folder: Path) -> Path | None:
@@ -305,7 +305,7 @@ def prepare_suggestions(viewer: Viewer) -> None:
         if viewer.state.scene is scene:
             viewer.state.suggestions = found
 
-    viewer.worker.submit("finding examples", work, done, lambda reason: None)
+    viewer.run("finding examples", work, done, lambda reason: None)
 
 
 def offers(viewer: Viewer) -> tuple[str, tuple[str, ...]]:

@@ -24,7 +24,7 @@ from langsplat_viewer import marks
 from langsplat_viewer.actions.history import remember
 from langsplat_viewer.camera.controls import eye_depth
 from langsplat_viewer.drawing.channels import UNCLIPPED
-from langsplat_viewer.marks import Drawn, Leaving, Marks, Mode, Stroke, Things, Tool
+from langsplat_viewer.marks import Drawn, Leaving, Marks, Mode, Stroke, Tool
 from langsplat_viewer.output.saving import free_name
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
@@ -135,11 +135,7 @@ def find(viewer: Viewer, label: str, work: Callable[[QueryEngine], Array], mode:
         if viewer.state.scene is scene:
             take(viewer, found, mode)
 
-    viewer.worker.submit(f"{label} the selection", lambda progress: work(engine), done, _failed(viewer))
-
-
-def _failed(viewer: Viewer) -> Callable[[str], None]:
-    return lambda reason: viewer.state.say(reason, is_error=True)
+    viewer.run(f"{label} the selection", lambda progress: work(engine), done)
 
 
 def chosen_query(viewer: Viewer) -> Query | None:
@@ -160,30 +156,10 @@ def select_query(viewer: Viewer, query: Query | None = None, mode: Mode | None =
         viewer.state.say("search for something first, then select what was found")
 
 
-def find_things(viewer: Viewer, query: Query | None = None) -> None:
-    """Have the worker take an answer apart into its things, for `select_thing`."""
-    query, engine = query or chosen_query(viewer), viewer.engine
-    if engine is None or query is None or query.result is None or query.result.verdict == "not here":
-        select_query(viewer, query)  # which says why not
-        return
-    phrase, result = query.phrase, query.result
-
-    def done(found: tuple[Instance, ...]) -> None:
-        if viewer.engine is engine:
-            viewer.state.selection = replace(viewer.state.selection, things=Things(phrase, result, found))
-
-    def work(progress: Progress) -> tuple[Instance, ...]:
-        return engine.instances(result)
-
-    viewer.worker.submit(f"taking '{phrase}' apart", work, done, _failed(viewer))
-
-
-def select_thing(viewer: Viewer, number: int, mode: Mode | None = None) -> None:
-    """One of the things that `find_things` found, counted from 0."""
-    selection = viewer.state.selection
-    if selection.things is not None and 0 <= number < len(selection.things.found):
-        members = selection.things.found[number].members
-        take(viewer, of_rows(members, len(selection.marks.selected)), mode)
+def select_thing(viewer: Viewer, thing: Instance, mode: Mode | None = None) -> None:
+    """Select one of the things that an answer found."""
+    if has_scene(viewer):
+        take(viewer, of_rows(thing.members, len(viewer.state.selection.marks.selected)), mode)
 
 
 def use_tool(viewer: Viewer, tool: Tool | None) -> None:
@@ -272,7 +248,7 @@ def export(
     def failed(reason: str) -> None:
         state.say(f"not saved: {reason}", is_error=True)
 
-    job = viewer.worker.submit(f"saving the {part}", work, done, failed)
+    job = viewer.run(f"saving the {part}", work, done, failed)
     state.selection = replace(state.selection, writing=job.future)
 
 

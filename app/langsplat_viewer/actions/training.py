@@ -72,12 +72,7 @@ def _show_checkpoint(viewer: Viewer, training: Training, checkpoint: Stamps) -> 
         else:
             open_scene(viewer, written)
 
-    viewer.worker.submit(
-        "reading the Gaussians so far",
-        lambda progress: watching.write_preview(path),
-        done,
-        lambda reason: viewer.state.say(reason, is_error=True),
-    )
+    viewer.run("reading the Gaussians so far", lambda progress: watching.write_preview(path), done)
 
 
 def _follow(viewer: Viewer, training: Training) -> None:

@@ -116,10 +116,8 @@ NEAREST = 0.004  # of the scene's radius: the closest that the eye comes to its 
 
 
 def tick(viewer: Viewer, now: float) -> None:
-    """Start of a frame at `now` seconds: take what the worker finished and move a gliding camera on."""
+    """Begin a frame at `now` seconds: move a gliding camera, or one that plays a path, on."""
     viewer.clock = now
-    viewer.worker.poll()
-    viewer.recorder.poll()
     glide = viewer.state.glide
     if glide is not None:
         t = (now - glide.began) / GLIDE_SECONDS
@@ -365,9 +363,7 @@ def _ask(viewer: Viewer, place: Hover) -> None:
         viewer.describer, place.found = found
         place.phrases = tuple(query.phrase for query in shown)
 
-    viewer.worker.submit(
-        "looking under the cursor", work, done, lambda reason: viewer.state.say(reason, is_error=True)
-    )
+    viewer.run("looking under the cursor", work, done)
 
 
 # Views with names: kept, listed, gone to.

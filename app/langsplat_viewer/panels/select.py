@@ -26,7 +26,6 @@ from langsplat_viewer.panels.style import (
 from langsplat_viewer.staging import TINT
 from langsplat_viewer.viewer import Viewer
 
-MOST_THINGS = 24  # of an answer that have a button
 Verb = tuple[str, Callable[[Viewer], object], str]  # button, action, tip
 CHANGES: tuple[Verb, ...] = (
     ("All", selecting.select_all, "Everything that is shown"),
@@ -114,24 +113,16 @@ def _found(viewer: Viewer) -> None:
     query = selecting.chosen_query(viewer)
     if query is None or query.result is None:
         return
-    button = imgui.calc_text_size("Things").x + 2 * imgui.get_style().frame_padding.x
-    room = imgui.get_content_region_avail().x - button - imgui.get_style().item_spacing.x
-    name = elided(query.phrase, room - hello_imgui.em_size(4), width_of)
+    name = elided(query.phrase, imgui.get_content_region_avail().x - hello_imgui.em_size(4), width_of)
     if imgui.button(f"Found: {name}##found"):
         selecting.select_query(viewer, query)
     tip("Select what the search has found")
-    imgui.same_line()
-    if imgui.button("Things"):
-        selecting.find_things(viewer, query)
-    tip("Take it apart, to select one thing at a time")
-    things = viewer.state.selection.things
-    if things is None or things.result is not query.result:
+    if query.result.verdict == "not here" or len(query.things) < 2:
         return
-    for number, thing in enumerate(things.found[:MOST_THINGS]):
-        if number:
-            beside(str(number + 1))
-        if imgui.button(f"{number + 1}##thing"):
-            selecting.select_thing(viewer, number)
+    for number, thing in enumerate(query.things, 1):
+        beside(str(number))
+        if imgui.button(f"{number}##thing"):
+            selecting.select_thing(viewer, thing)
         tip(f"{thing.count:,} Gaussians, {100 * thing.share:.0f} % of the answer, score {thing.score:.2f}")
 
 
