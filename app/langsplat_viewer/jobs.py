@@ -125,7 +125,7 @@ class Worker:
 
     @property
     def current(self) -> tuple[str, float] | None:
-        """What is being done and how far it is, for the status line; None when idle or only winding up."""
+        """Label and fraction of the present job, for the status line; None when idle or only winding up."""
         for job in self._jobs:
             if not job.stopped.is_set():
                 label, fraction = job.step
@@ -134,7 +134,7 @@ class Worker:
 
     @property
     def is_running(self) -> bool:
-        """Whether some job has not come to its end yet, cancelled or not."""
+        """True while some job has not come to its end, cancelled or not."""
         return any(not job.future.done() for job in self._jobs)
 
     def close(self, patience: float = 0.0) -> None:

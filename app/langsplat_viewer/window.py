@@ -1,4 +1,4 @@
-"""What the display can do, before a window is opened on it."""
+"""The window. This alone and the panels use hello_imgui and glfw; the rest is in actions."""
 
 import os
 import sys
@@ -69,7 +69,7 @@ def _gl_hints(major: int, minor: int) -> None:
     glfw.window_hint(glfw.OPENGL_FORWARD_COMPAT, True)
 
 
-# What one window leaves for the next: preferences, and the layout of the panels.
+# Preferences and the layout of the panels outlive the window.
 
 
 class Remembered:
@@ -121,8 +121,6 @@ class Remembered:
             self._state.say(f"settings not written: {one_line(error)}", is_error=True)
 
 
-# The window. Only this and `display_probe` use hello_imgui and glfw; the rest is in actions and panels.
-
 # imgui_bundle brings its own GLFW library and must be imported first, else the process holds two.
 
 
@@ -153,7 +151,7 @@ MakeRenderer = Callable[[moderngl.Context], Renderer]
 
 @dataclass(frozen=True)
 class WindowRequest:
-    """What the window opens with."""
+    """Scene, queries and settings that the window opens with."""
 
     path: Path
     queries: tuple[str, ...] = ()
@@ -334,13 +332,13 @@ class Window:
 
     @property
     def is_running(self) -> bool:
-        """Whether threads are still at work that would keep the process."""
+        """True while threads are at work that would keep the process."""
         workers = (self.viewer.worker, self.viewer.recorder)
         draws = self._canvas is not None and self._canvas.is_running
         return draws or any(worker.is_running for worker in workers)
 
     def is_minimised(self) -> bool:
-        """Whether nobody can see the window."""
+        """Return whether nobody can see the window."""
         return bool(glfw.get_window_attrib(glfw_window_hello_imgui(), glfw.ICONIFIED))
 
     def _title(self) -> None:
@@ -380,7 +378,6 @@ class Window:
         state.timing.wanted = False  # the panel says so again, if it is still seen
 
     def _may_close(self) -> bool:
-        """The window is asked to close."""
         glfw.post_empty_event()  # where there is a question, it is drawn now
         return selecting.may_close(self.viewer)
 

@@ -1,4 +1,4 @@
-"""Opening scenes, and stopping what is under way."""
+"""Opening scenes: read, shown, listed, returned to, chosen in the file browser; and their photographs."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -147,7 +147,6 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
 
 
 def _compile_search(viewer: Viewer) -> None:
-    """Have what queries run on compiled before the first one, and say so, unless an earlier run did it."""
     engine = viewer.engine
     if engine is None or is_compiled(Path(surface.__file__)):
         return
@@ -164,7 +163,7 @@ def _warm_up_encoder(viewer: Viewer, encoder_id: str) -> None:
     viewer.run("loading the text encoder", viewer.engine.load_encoder)
 
 
-# Coming back to a scene.
+# Visits: a scene that was shown before is found again as it was left.
 
 
 def return_to(viewer: Viewer, visit: Visit) -> None:
@@ -217,8 +216,7 @@ def keep_old(viewer: Viewer) -> None:
     viewer.watch.dismiss()
 
 
-# Several scenes to switch between. One is in memory at a time; of the others it is known where one stood and
-# what was asked.
+# The list of scenes. One is in memory at a time; of the others the visit is kept.
 
 MOST = 100  # scenes that are listed
 
@@ -268,7 +266,7 @@ def unlist_scene(viewer: Viewer, path: Path) -> None:
     viewer.visits.pop(path, None)
 
 
-# The photograph of the training camera at which one stands, laid over the picture.
+# The photograph of the training camera at which the view stands, laid over the image.
 
 SAME = 1e-6  # of the scene's radius, and of a rotation: nearer is the same place
 
@@ -292,7 +290,7 @@ def standing_at(state: ViewerState) -> Camera | None:
 
 
 def photograph_here(state: ViewerState) -> Photograph | None:
-    """That of the camera at which one stands, as far as it was looked for."""
+    """Return the photograph of the camera at which the view stands, as far as it was looked for."""
     photograph = state.photograph
     return photograph if photograph is not None and photograph.camera is standing_at(state) else None
 
@@ -352,7 +350,7 @@ def choose_photograph_folder(viewer: Viewer, folder: Path) -> None:
         state.preferences = with_photographs(state.preferences, state.path.absolute(), folder.absolute())
 
 
-# Which file is opened: chosen in the browser, typed, dropped onto the window, or open before.
+# The file browser, typed paths, files dropped onto the window, and recent scenes.
 
 COMPANIONS = (cameras.SUFFIX, language.SUFFIX)  # files beside a scene, read with it
 NAMED = 3  # files that a message names
@@ -450,7 +448,7 @@ def open_recent(viewer: Viewer, path: str) -> None:
 
 
 def type_path(viewer: Viewer, text: str) -> None:
-    """What stands in the box for a path."""
+    """Take the text of the box for a path."""
     viewer.state.path_typed = text
 
 

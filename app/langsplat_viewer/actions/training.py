@@ -15,7 +15,7 @@ WARNING = "warning: "  # before each doubt that `langsplat train` ends with
 
 
 def fill_in(viewer: Viewer, form: TrainingForm) -> None:
-    """What stands in the boxes."""
+    """Take the texts of the form."""
     viewer.state.training_form = form
 
 
@@ -76,7 +76,6 @@ def _show_checkpoint(viewer: Viewer, training: Training, checkpoint: Stamps) -> 
 
 
 def _follow(viewer: Viewer, training: Training) -> None:
-    """While its Gaussians are looked at, take the next checkpoint when it is there."""
     folder = work_folder(training.request.out)
     if viewer.state.path != folder / watching.NAME or viewer.worker.current is not None:
         return

@@ -1,4 +1,4 @@
-"""What a user chose once and wants again the next time: kept in the platform's folder for settings."""
+"""Preferences: choices that outlive a window, kept in the platform's folder for settings."""
 
 import json
 from collections.abc import Iterable
@@ -55,12 +55,13 @@ def _are_texts(values: Iterable[object]) -> bool:
 
 
 def preferences_folder() -> Path:
-    """Where they are kept; need not exist."""
+    """Return the folder of the preferences; it need not exist."""
     return Path(platformdirs.user_config_path("langsplat-viewer", appauthor=False))
 
 
 def load_preferences(folder: Path) -> Preferences:
-    """Those of `folder`, the defaults where there are none. InputError where the file makes no sense."""
+    """Read the preferences in `folder`, the defaults where there are none. InputError where the file makes no
+    sense."""
     path = folder / FILE_NAME
     try:
         text = path.read_bytes()[:LARGEST]

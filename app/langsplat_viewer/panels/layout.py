@@ -1,4 +1,4 @@
-"""The menus: the commands by the menu that each names, and which panels are open."""
+"""The layout of the window: menus, command palette, list of keys, docked panels, messages and timing."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -80,7 +80,7 @@ def _looks(viewer: Viewer) -> None:
         imgui.end_menu()
 
 
-# Everything that can be done, found by typing.
+# The command palette.
 
 WIDTH_EM, HEIGHT_EM = 26.0, 20.0
 GAP_EM = 0.6  # from the keys to the scrollbar
@@ -170,13 +170,13 @@ def _table() -> None:
         imgui.end_table()
 
 
-# Progress, messages and figures.
+# The panel "Messages".
 
 LEAST_LINES = 2  # of messages, however low the panel is
 
 
 def draw_messages(viewer: Viewer) -> None:
-    """What is being done, what was said (the latest first), and how fast pictures are made."""
+    """Draw progress, messages (the latest first) and the speed of images."""
     if viewer.worker.current is not None and stoppable(*viewer.worker.current):
         opening.cancel(viewer)
     line = imgui.get_text_line_height_with_spacing()
@@ -200,7 +200,7 @@ def figures(viewer: Viewer, frames_per_second: float | None) -> str:
     return "   ".join(part for part in parts if part)
 
 
-# Where the time goes, how much memory is held, and how right the picture is.
+# The panel "Timing".
 
 
 def draw_timing(viewer: Viewer) -> None:
@@ -244,7 +244,7 @@ def in_numbers(comparison: Comparison) -> str:
     return f"{what}: {errors}, PSNR {comparison.psnr:.1f} dB"
 
 
-# Where the panels lie: docked around the scene, each where its user left it.
+# Panels, docked around the scene, each where its user left it.
 
 LEFT, MIDDLE, FOOT = "Left", "Middle", "Foot"  # docks of the column beside the scene
 COLUMN = 345.0  # its width at first, window units
@@ -365,7 +365,7 @@ class Hiding:
 
 
 def draw_over(viewer: Viewer) -> None:
-    """What lies over the scene, after the panels."""
+    """Draw what lies over the scene, after the panels."""
     area = scene_area()
     said = _said(viewer)
     if said:
@@ -387,7 +387,7 @@ def draw_over(viewer: Viewer) -> None:
 
 
 def _said(viewer: Viewer) -> str:
-    """What there is to say in place of a picture; empty while there is one."""
+    """Return the words in place of an image; empty while there is one."""
     state = viewer.state
     if state.scene is None:
         return f"opening {state.opening.name} ..." if state.opening else "Drop a scene here, or use Open ..."

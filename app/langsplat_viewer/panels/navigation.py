@@ -1,4 +1,4 @@
-"""From the keys as `commands` writes them to those that are pressed."""
+"""Mouse and keys: pressed keys run commands, held keys and drags move the camera."""
 
 import math
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class Chord:
 
 @cache
 def chord(text: str) -> Chord:
-    """What is meant by "Ctrl+Shift+P", "F1", "R", "7" or "?". KeyError for an unknown key."""
+    """Parse a key such as "Ctrl+Shift+P", "F1", "R", "7" or "?". KeyError for an unknown key."""
     *held, name = text.split("+")
     if not name.isalnum():
         return Chord(character=name)
@@ -76,7 +76,7 @@ def muted_until_clicked(viewer: Viewer) -> None:
         settings.mute_letters(viewer, False)
 
 
-# Mouse and held keys over the scene -> camera moves; pressed keys -> commands.
+# Mouse and held keys over the scene.
 
 ROLL_SPEED = 1.0  # radians per second
 LONGEST_FRAME = 0.1  # seconds; a stalled frame must not throw a flying camera across the scene
@@ -97,7 +97,8 @@ def handle(viewer: Viewer, area: Area) -> None:
 
 
 def _pixel(area: Area) -> tuple[int, int] | None:
-    """Where the mouse is in the scene's area, pixels; None where a panel has it, or a button is held."""
+    """Return the mouse's place in the scene's area, pixels; None where a panel has it, or a button is
+    held."""
     io = imgui.get_io()
     if io.want_capture_mouse or any(imgui.is_mouse_down(button) for button in range(3)):
         return None
@@ -129,8 +130,8 @@ def _mouse(viewer: Viewer, area: Area) -> None:
 
 
 def _held(button: int) -> bool:
-    """Whether a button drags. Where frames are slow, the way to the place of the click and the click itself
-    fall into one frame; that way was no drag."""
+    """Return whether a button drags. Where frames are slow, the way to the place of the click and the click
+    itself fall into one frame; that way was no drag."""
     return imgui.is_mouse_down(button) and not imgui.is_mouse_clicked(button)
 
 

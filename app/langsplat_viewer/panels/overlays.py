@@ -1,4 +1,4 @@
-"""The pictures of the scene behind the panels, and the line between two of them."""
+"""The images of the scene behind the panels, and the overlays on them."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -75,7 +75,7 @@ def _divider(area: Area, at: float) -> None:
 
 
 def _titles(viewer: Viewer, area: Area) -> None:
-    """What each picture shows, at its upper edge: left and right of the line of a wipe."""
+    """Write what each image shows at its upper edge: left and right of the line of a wipe."""
     split, names = viewer.state.seeing.split, staging.labels(viewer.state)
     gap, top = hello_imgui.em_size(0.6), area.top + hello_imgui.em_size(0.5)
     if split.mode == "wipe":
@@ -104,7 +104,7 @@ def text_on_shade(text: str, x: float, y: float, area: Area) -> None:
 
 
 def draw_grip(viewer: Viewer, area: Area) -> None:
-    """What the line of a wipe is dragged by; a double click puts it into the middle."""
+    """Draw the grip of the line of a wipe; a double click puts it into the middle."""
     split = viewer.state.seeing.split
     if split.mode != "wipe" or viewer.state.scene is None:
         return
@@ -136,7 +136,7 @@ def _foreground() -> Any:
     return imgui.get_foreground_draw_list()
 
 
-# The photograph of a training camera over the picture of the scene, and the slider that fades it in.
+# The photograph of a training camera.
 
 
 class PhotographOverlay:
@@ -181,7 +181,7 @@ class PhotographOverlay:
         return self._texture
 
 
-# Lines over the pictures of the scene: training cameras, ground grid, ruler; and the clicks on them.
+# Lines: training cameras, boxes of instances, ground grid, ruler; and the clicks on them.
 
 REACH = 7.0  # window units from a line at which a click means it
 STILL = 4.0  # a click that moves farther is a drag
@@ -228,7 +228,7 @@ def draw_lines(viewer: Viewer, area: Area) -> None:
 
 
 def _orthographic(viewer: Viewer, area: Area) -> None:
-    """That there is no perspective, and how much the picture shows."""
+    """Write that the camera is orthographic, and its scale."""
     view, scene = viewer.state.view, viewer.state.scene
     if view is None or scene is None or not view.back:
         return
@@ -240,7 +240,7 @@ def _orthographic(viewer: Viewer, area: Area) -> None:
 
 
 def clicked(area: Area) -> bool:
-    """Whether the left button was clicked in the area, without modifiers and without a drag."""
+    """Return whether the left button was clicked in the area, without modifiers and without a drag."""
     io = imgui.get_io()
     if io.want_capture_mouse or io.key_ctrl or io.key_shift or not imgui.is_mouse_released(0):
         return False
@@ -264,7 +264,7 @@ def _lines(area: Area, segments: Array, colour: tuple[float, float, float, float
 
 
 def _cameras(viewer: Viewer, area: Area, camera: Camera) -> None:
-    """All but the one that one looks through; a click on one stands there."""
+    """Draw all but the one that the view looks through; a click on one stands there."""
     state = viewer.state
     assert state.scene is not None
     assert state.extent is not None
@@ -372,14 +372,14 @@ def _ruler(viewer: Viewer, area: Area, camera: Camera) -> None:
 
 
 def _place(camera: Camera, point: Array, least_depth: float) -> tuple[float, float] | None:
-    """Where a world point (3,) is in the picture; None where that is nowhere."""
+    """Project a world point (3,) to pixels; None outside the image."""
     pixels, depths = camera.project(point[None].astype(np.float64))
     x, y = (float(part) for part in pixels[0])
     inside = depths[0] > least_depth and 0 <= x <= camera.width and 0 <= y <= camera.height
     return (x, y) if inside else None
 
 
-# Over the scene: the scale of the heat, and what there is to say instead of a picture.
+# The legend of relevancy, and words in place of an image.
 
 STEPS = 32  # of a colour bar
 BAR_EM, BAR_HEIGHT_EM = 11.0, 0.8
@@ -459,7 +459,7 @@ def _opaque(colour: Array) -> Any:
     return imgui.get_color_u32((float(colour[0]), float(colour[1]), float(colour[2]), 1.0))
 
 
-# Beside the cursor: what lies under it.
+# The tooltip: what lies under the cursor.
 
 UNSURE = 0.02  # a word less probable than this is not said
 
@@ -500,7 +500,7 @@ def pointed_figures(hover: Hover) -> list[str]:
     return [*lines, f"at {x:.2f}  {y:.2f}  {z:.2f}, {hover.found.depth - hover.view.back:.2f} away"]
 
 
-# The view cube in the corner of the scene: a click on a face turns the view there.
+# The view cube; a click on a face turns the view there.
 
 SIDE_EM = 7.0  # of the corner that it takes
 EDGE = 0.24  # of that side, half the cube's edge: its corners reach 1.73 times as far

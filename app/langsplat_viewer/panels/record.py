@@ -179,7 +179,7 @@ def _film(viewer: Viewer) -> None:
     tip("The command that draws this picture without a window")
 
 
-# Views with names.
+# The panel "Bookmarks".
 
 
 def draw_bookmarks(viewer: Viewer) -> None:

@@ -1,4 +1,5 @@
-"""The file: what is open, opening another, saving pictures."""
+"""Files: the panels "Scene" and "Train", the file browser, and the questions about changed and unsaved
+files."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -88,7 +89,7 @@ def _figures(viewer: Viewer) -> str:
     return ", ".join(parts)
 
 
-# The file browser, over everything else.
+# The file browser.
 
 OPEN, PICK = "Open a scene", "Folder of the photographs"
 WIDTH_EM, HEIGHT_EM = 40.0, 30.0
@@ -120,7 +121,6 @@ def draw_browser(viewer: Viewer) -> None:
 
 
 def _foot(viewer: Viewer, listing: Listing) -> None:
-    """What can be done with the whole folder."""
     if viewer.state.picks_folder:
         if imgui.button("Take this folder"):
             opening.choose_photograph_folder(viewer, listing.folder)
@@ -129,7 +129,7 @@ def _foot(viewer: Viewer, listing: Listing) -> None:
 
 
 def has_several(listing: Listing) -> bool:
-    """Whether there is more than one scene to open."""
+    """Return whether there is more than one scene to open."""
     return sum(entry.is_file and is_scene(entry.path) for entry in listing.entries) > 1
 
 
@@ -206,7 +206,7 @@ def in_words(size: float) -> str:
     return f"{size:.0f} {UNITS[unit]}" if unit == 0 or size >= 100 else f"{size:.1f} {UNITS[unit]}"
 
 
-# A bar over the scene, while its file is another than the one that is shown.
+# The bar of a file that has changed.
 
 BAR = (
     imgui.WindowFlags_.no_decoration
@@ -220,7 +220,7 @@ BAR = (
 
 
 def draw_changed(viewer: Viewer, area: Area) -> None:
-    """What has changed, and what can be done about it."""
+    """Draw the file that has changed, and buttons to read it or not."""
     state = viewer.state
     if not viewer.watch.changed or state.path is None or state.opening is not None:
         return
@@ -271,7 +271,7 @@ def draw_unsaved(viewer: Viewer) -> None:
     imgui.end_popup()
 
 
-# From photographs to a scene, without leaving the window.
+# The panel "Train".
 
 PRESETS: tuple[TrainPreset, ...] = get_args(TrainPreset)
 LOSS_EM = 5.0  # height of its plot
@@ -313,7 +313,6 @@ def _form(viewer: Viewer) -> None:
 
 
 def _doubts(viewer: Viewer) -> None:
-    """What speaks against the scene that is shown, as its training found."""
     state = viewer.state
     if state.doubts and state.path is not None:
         imgui.separator_text(f"What speaks against {state.path.name}")

@@ -1,4 +1,4 @@
-"""The box to type a search in, and what is offered below it: examples, completions, corrections."""
+"""The panel "Search": the box with its offers, the list of queries, and the details of the chosen one."""
 
 import math
 from functools import lru_cache
@@ -49,7 +49,7 @@ def _box(viewer: Viewer) -> None:
 
 
 def hint(viewer: Viewer) -> str:
-    """What stands in the empty box: examples of this scene, once they are known."""
+    """Return the hint of the empty box: examples of this scene, once they are known."""
     examples = viewer.state.suggestions.examples[:HINT_EXAMPLES]
     return ", ".join((*examples, "...")) if examples else HINT
 
@@ -79,7 +79,7 @@ def _offer_buttons(viewer: Viewer, title: str, phrases: tuple[str, ...]) -> None
             tip(phrase)
 
 
-# Where an answer ends: a histogram of its relevancies, and a slider over it.
+# The threshold of an answer: a histogram of its relevancies, and a slider over it.
 
 BINS = 64
 HISTOGRAM_EM = 3.0
@@ -120,7 +120,7 @@ def histogram(result: QueryResult) -> tuple[float, float, Array]:
     return low, high, np.log1p(counts).astype(np.float32)
 
 
-# What was searched: one line each in an area of its own, and the details of the one that was chosen.
+# The list of queries.
 
 ROWS = 3.5  # that the list shows at least: the half one says that there are more
 BELOW = 10  # rows that the details of a query take, and what follows them in the panel
@@ -146,7 +146,7 @@ def _answers(viewer: Viewer) -> None:
 
 
 def rows_shown(count: int, room: float) -> float:
-    """Of `count` queries in a panel that has `room` for so many rows: all where the details fit below."""
+    """Return how many of `count` queries a panel with `room` rows shows: all where the details fit below."""
     return min(count or 1, max(ROWS, math.floor(room - BELOW) + 0.5))
 
 
@@ -227,7 +227,7 @@ def _details(viewer: Viewer, query: Query) -> None:
         small_wrapped(f"read as: {query.reading}", muted())
 
 
-# The search panel: a box to type in, and the list of what was searched.
+# The panel.
 
 CHOICES: tuple[LevelChoice, ...] = get_args(LevelChoice)
 
@@ -256,7 +256,7 @@ def draw(viewer: Viewer) -> None:
 
 
 def _canonical(viewer: Viewer) -> None:
-    """What everything is compared with."""
+    """Draw the canonical phrases."""
     if not imgui.collapsing_header("Compared with"):
         return
     state = viewer.state

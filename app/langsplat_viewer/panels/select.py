@@ -1,4 +1,4 @@
-"""The panel to select with: tools, what to do with what they find, and what becomes of it."""
+"""The panel "Select", and the strokes of its tools over the scene."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -109,7 +109,7 @@ def _tools(viewer: Viewer) -> None:
 
 
 def _found(viewer: Viewer) -> None:
-    """What the search found, whole or thing by thing."""
+    """Draw buttons that select an answer, whole or thing by thing."""
     query = selecting.chosen_query(viewer)
     if query is None or query.result is None:
         return
@@ -127,7 +127,6 @@ def _found(viewer: Viewer) -> None:
 
 
 def _buttons(viewer: Viewer, verbs: Sequence[Verb]) -> None:
-    """As many in a row as fit."""
     for place, (name, act, what) in enumerate(verbs):
         if place:
             beside(name)
@@ -143,7 +142,7 @@ def _slider(label: str, value: float, limits: tuple[float, float], text: str) ->
     return value
 
 
-# The left button while a tool selects: what it draws over the scene, and what is selected as it goes up.
+# Strokes: the left button while a tool selects.
 
 HINTS: dict[Tool, str] = {
     "thing": "click a thing",

@@ -1,4 +1,4 @@
-"""What is shown, and from where."""
+"""The panels "Display", "Camera" and "Overlays"."""
 
 import math
 from dataclasses import replace
@@ -23,7 +23,7 @@ BACKDROPS = {"Black": 0.0, "Grey": 0.5, "White": 1.0}
 
 
 def draw_display(viewer: Viewer) -> None:
-    """Which channel, and how strong the heat."""
+    """Draw the panel "Display"."""
     for _, group in groupby(DISPLAYS.values(), lambda row: (row.needs_field, row.needs_query)):
         _display_line(viewer, tuple(group))
     _compared(viewer)
@@ -77,7 +77,7 @@ def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, flo
 
 
 def _colour_map(viewer: Viewer) -> None:
-    """Where something is shown by it."""
+    """Draw the choice of a colour map where something is shown by it."""
     shown = {DISPLAYS[one.picture.display].name for one in staging.shown_pictures(viewer.state)}
     if not shown & {"relevancy", "depth"}:
         return
@@ -112,7 +112,7 @@ def _display_button(viewer: Viewer, button: Button) -> None:
 
 
 def _compared(viewer: Viewer) -> None:
-    """What is shown beside it."""
+    """Draw the choice of what is shown beside it."""
     state, split = viewer.state, viewer.state.seeing.split
     second = Button("", split.second, split.second_level if split.second == "latent" else None)
     shown = {"off": "nothing", "levels": "three levels", "wipe": compared_name(second)}[split.mode]
@@ -135,13 +135,13 @@ def _compared(viewer: Viewer) -> None:
 
 
 def compared_name(button: Button) -> str:
-    """What a display is called in the list of those that can be beside another."""
+    """Return the name of a display in the list of those that can be beside another."""
     row = DISPLAYS[button.display]
     return row.label if button.latent_level is None else f"{row.label}, {LEVELS[button.latent_level]}"
 
 
 def draw_overlays(viewer: Viewer) -> None:
-    """What lies over the scene, and the ruler."""
+    """Draw the panel "Overlays"."""
     state = viewer.state
     for name, title in OVERLAY_TITLES.items():
         changed, shown = imgui.checkbox(title.capitalize(), name in state.preferences.overlays)
@@ -167,7 +167,7 @@ def draw_overlays(viewer: Viewer) -> None:
 
 
 def draw_camera(viewer: Viewer) -> None:
-    """Training cameras, reset, lens, speed."""
+    """Draw the panel "Camera"."""
     state = viewer.state
     imgui.begin_disabled(state.view is None)
     if state.scene is not None and state.scene.cameras:
