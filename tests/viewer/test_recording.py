@@ -45,9 +45,9 @@ def drawn(viewer: Viewer, seconds: float = 60.0) -> None:
     end = time.monotonic() + seconds
     while viewer.recorder.current is not None:
         assert time.monotonic() < end, "never finished"
-        viewpoint.tick(viewer, viewer.clock)
+        viewer.take_results()
         time.sleep(0.002)
-    viewpoint.tick(viewer, viewer.clock)
+    viewer.take_results()
 
 
 def times(viewer: Viewer) -> list[float]:
