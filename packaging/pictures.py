@@ -12,8 +12,8 @@ from imgui_bundle.immapp import testing  # isort: skip
 
 from langsplat_core.io.hostile import opened
 from langsplat_viewer.actions import filming, selecting, settings, training, viewpoint
-from langsplat_viewer.drawing.frame import FrameRenderer
 from langsplat_viewer.options import scene_path, services
+from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.window import Window, WindowRequest
 
@@ -176,7 +176,7 @@ def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
     request = WindowRequest(
         scene_path(None), queries=queries, display="relevancy", size=(1280, 800), camera=CAMERA
     )
-    window = Window(request, services(""), FrameRenderer)
+    window = Window(request, services(""), GlRenderer)
     window.idles = False
     whole = path.with_suffix(".whole.png")
 

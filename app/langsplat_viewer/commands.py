@@ -11,9 +11,9 @@ from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions import filming, opening, queries, selecting, settings, undoing, viewpoint
 from langsplat_viewer.actions.selecting import Part
 from langsplat_viewer.camera.controls import Side, adopt_up, level
-from langsplat_viewer.drawing.channels import Overlay
 from langsplat_viewer.marks import TOOLS, Tool
 from langsplat_viewer.output import saving
+from langsplat_viewer.state import Overlay
 from langsplat_viewer.viewer import Viewer
 
 
@@ -28,7 +28,7 @@ class Button:
 
 def buttons_of(row: DisplayRow) -> tuple[Button, ...]:
     """One for the display, but for each level one where it shows latents."""
-    if row.extra != "latent":
+    if not row.by_level:
         return (Button(row.label, row.name),)
     return tuple(Button(f"{name}##{row.name}", row.name, index) for index, name in enumerate(LEVELS))
 

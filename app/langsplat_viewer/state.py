@@ -1,30 +1,77 @@
-"""Where the time goes, and how right the picture is: what the panel "Timing" knows."""
+"""The viewer's state: plain data that actions change, and that panels and the canvas read."""
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from statistics import median
+from typing import Literal, get_args
 
 import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice, PictureConfig, TrainPreset
-from langsplat_core.display.displays import DISPLAYS, MAX_QUERIES, HeatRanges
+from langsplat_core.display.displays import MAX_QUERIES
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.describe import Pointed, Suggestions
 from langsplat_core.query.instances import Instance
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
-from langsplat_viewer.drawing import channels
-from langsplat_viewer.drawing.channels import Seeing
 from langsplat_viewer.files.browsing import Listing
 from langsplat_viewer.files.flights import Bookmark
 from langsplat_viewer.files.photographs import Photograph
 from langsplat_viewer.files.preferences import Preferences
 from langsplat_viewer.marks import Selection
+from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
+from langsplat_viewer.rendering.request import (
+    EditedScene,
+    Pane,
+    RenderRequest,
+    Splats,
+    Split,
+    edited_scene,
+    panes,
+)
+
+# View settings and the ruler.
+
+
+@dataclass(frozen=True)
+class ViewSettings:
+    """How the scene is drawn, apart from display and camera; undone together."""
+
+    split: Split = field(default_factory=Split)
+    splats: Splats = field(default_factory=Splats)
+    clip: Clip = UNCLIPPED
+    transparent: bool = False  # images are saved without a background
+    fade: float = 0.0  # how much of the photograph of a training camera lies over the image, 0 to 1
+
+
+Overlay = Literal["things", "cameras", "cube", "grid"]
+OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
+Point = tuple[float, float, float]  # world units
+
+
+@dataclass(frozen=True)
+class Ruler:
+    """A distance between two points on the surface."""
+
+    measures: bool = False  # a click on the scene sets a point
+    points: tuple[Point, ...] = ()  # at most two
+
+    @property
+    def length(self) -> float | None:
+        """World units; None before there are two points."""
+        return math.dist(*self.points) if len(self.points) > 1 else None
+
+    def with_point(self, point: Point) -> "Ruler":
+        """Set the second point, or the first of a new measurement."""
+        return replace(self, points=(*self.points, point) if len(self.points) == 1 else (point,))
+
+
+# Times of the steps of drawing, and the comparison with the reference: the panel "Timing".
 
 KEPT = 31  # measurements of which the median is told
 STEPS = {  # names of laps, and what they are called; in the order of the panel
@@ -37,6 +84,13 @@ STEPS = {  # names of laps, and what they are called; in the order of the panel
     "panels": "Panels",
     "search": "Search",
 }
+LONGEST_SIDE = 160  # pixels of an image that is compared: the reference takes as long for more
+
+
+def compared_size(size: tuple[int, int]) -> tuple[int, int]:
+    """Pixels of the image that is compared, of the shape of a window of `size`."""
+    factor = min(LONGEST_SIDE / max(size), 1.0)
+    return max(round(size[0] * factor), 1), max(round(size[1] * factor), 1)
 
 
 @dataclass(frozen=True)
@@ -86,7 +140,7 @@ def memory_bytes() -> int | None:
     return 1024 * int(resident[0].split()[1]) if resident else None
 
 
-# What the panel "Record" knows: a camera path, where it is played, and what film is wanted of it.
+# Camera path and film: the panel "Record".
 
 SPACING = 2.0  # seconds from the last keyframe to one that is added
 TURN_SECONDS = 8.0
@@ -118,7 +172,7 @@ def flight_of(keyframes: tuple[Keyframe, ...]) -> Flight:
     return Flight(keyframes)
 
 
-# Everything a frame depends on, as one dataclass: actions change it, panels and the canvas read it.
+# The state as one dataclass.
 
 SLOTS = MAX_QUERIES  # queries shown at a time: one colour each
 MAX_MESSAGES = 50
@@ -201,7 +255,6 @@ class ViewerState:
     scenes: tuple[Path, ...] = ()  # to switch between, absolute
     opening: Path | None = None  # the file being read, until it is open or has failed
     extent: Extent | None = None  # there whenever a scene is
-    latent: Array | None = None  # (3, N, 3) latent colours per level, None without a language field
 
     view: OrbitCamera | None = None
     glide: Glide | None = None
@@ -221,7 +274,8 @@ class ViewerState:
 
     picture: PictureConfig = field(default_factory=PictureConfig)
     latent_level: int = 2  # index into scene.LEVELS
-    seeing: Seeing = field(default_factory=Seeing)
+    settings: ViewSettings = field(default_factory=ViewSettings)
+    ruler: Ruler = field(default_factory=Ruler)
     level: LevelChoice = "auto"
     queries: list[Query] = field(default_factory=list)
     selected: Query | None = None  # whose details are shown
@@ -252,6 +306,7 @@ class ViewerState:
     preferences: Preferences = field(default_factory=Preferences)
     selection: Selection = field(default_factory=Selection)
     letters_muted: bool = False  # letters are no keys: they were meant for a box that cannot be typed in
+    _edited: EditedScene | None = None  # of the last request
 
     def say(self, text: str, is_error: bool = False) -> None:
         """Add one line to the messages area."""
@@ -272,34 +327,25 @@ class ViewerState:
         """Their answers."""
         return tuple(None if query is None else query.result for query in self.shown())
 
-    def heat_ranges(self) -> HeatRanges:
-        """The values at which the heat of each slot is 0 and 1."""
-        return channels.heat_ranges(self.shown_results(), self.picture.display)
+    def panes(self) -> tuple[Pane, ...]:
+        """Displays in the scene's area, from left to right."""
+        return panes(self.picture, self.latent_level, self.shown_results(), self.settings.split)
 
-    def shown_picture(self) -> PictureConfig:
-        """The settings of the picture with what follows from the answers."""
-        return channels.fitted(self.picture, self.shown_results())
-
-    def layers_key(self) -> tuple[object, ...]:
-        """Changes exactly when `latent_rgb`, `relevancies` or the marks would. Holds the objects themselves:
-        the id of a result that is gone may be given to the next one."""
-        wants_latent = self._shows_latents() and self.latent is not None
-        segments = self.picture.display == "segmentation"
-        level = self.latent_level if wants_latent else None
-        return self.scene, level, segments, self.shown_results(), self.selection.marks
-
-    def latent_rgb(self) -> Array | None:
-        """(N, 3) colours of the latents, while they are shown."""
-        if not self._shows_latents() or self.latent is None:
-            return None
-        colours: Array = self.latent[self.latent_level]
-        return colours
-
-    def _shows_latents(self) -> bool:
-        return DISPLAYS[self.picture.display].extra == "latent"
-
-    def relevancies(self) -> Array | None:
-        """(N, Q) float32 of the shown queries, see `painting.columns`."""
-        if self.scene is None:
-            return None
-        return channels.columns(self.shown_results(), self.picture.display, len(self.scene.gaussians))
+    def request(self, size: tuple[int, int] | None = None, transparent: bool = False) -> RenderRequest:
+        """The image that the scene's area shows, or the same of another size (width, height) in pixels."""
+        assert self.scene is not None
+        assert self.view is not None
+        settings = self.settings
+        size = size or self.size
+        self._edited = edited_scene(self.scene, self.selection.marks, self._edited)
+        return RenderRequest(
+            self._edited,
+            self.view.camera(*settings.split.pane_size(size)),
+            size[0],
+            replace(self.picture, transparent=transparent),
+            self.latent_level,
+            self.shown_results(),
+            settings.split,
+            settings.splats,
+            settings.clip,
+        )

@@ -21,12 +21,13 @@ from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.flight import Keyframe
-from langsplat_viewer.drawing.channels import Clip, Ruler
 from langsplat_viewer.files.flights import Shelf
 from langsplat_viewer.files.watching import Stamps, Watch
 from langsplat_viewer.jobs import Job, Worker
 from langsplat_viewer.marks import Pair
-from langsplat_viewer.state import Query, ViewerState
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.request import RenderRequest
+from langsplat_viewer.state import Query, Ruler, ViewerState
 
 ALL = "all stages"  # the label under which the whole is reported
 LOSS = re.compile(r"\bloss (\d+\.\d+)")  # behind a stage's colon
@@ -175,8 +176,8 @@ def visit_of(state: ViewerState) -> Visit:
         selected=chosen[0] if chosen else None,
         canonical=state.canonical,
         keyframes=state.record.keyframes,
-        ruler=state.seeing.ruler,
-        clip=state.seeing.clip,
+        ruler=state.ruler,
+        clip=state.settings.clip,
     )
 
 
@@ -201,9 +202,8 @@ class Surface(Protocol):
         """(H, W) camera z of the surface all over the picture, world units, 0 where nothing is drawn; its
         size may be another than the window's. None while there is no picture."""
 
-    def capture(self, state: ViewerState) -> Array:
-        """(H, W, 3) uint8, or (H, W, 4) of a transparent picture: the scene as shown, at full resolution
-        and without panels."""
+    def capture(self, request: RenderRequest) -> Array:
+        """(H, W, 3) uint8, or (H, W, 4) of a transparent image: the request at full resolution."""
 
 
 @dataclass(frozen=True)

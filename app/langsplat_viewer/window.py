@@ -28,13 +28,12 @@ from langsplat_core.errors import LangSplatError
 from langsplat_viewer import fonts
 from langsplat_viewer.actions import filming, opening, queries, selecting, settings, training, viewpoint
 from langsplat_viewer.canvas import Canvas
-from langsplat_viewer.drawing.frame import Backend, FrameRenderer
-from langsplat_viewer.drawing.renderer import Renderer
 from langsplat_viewer.files.flights import Shelf
 from langsplat_viewer.jobs import give_memory_back, share_one_heap
 from langsplat_viewer.options import chosen_camera, latent_level
 from langsplat_viewer.panels import layout, navigation, overlays
 from langsplat_viewer.panels.style import scene_area
+from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.viewer import Services, Viewer
 
 # 4.3 sorts splats, 4.1 draws them on every system; 3.3 still shows the CPU's pictures.
@@ -146,7 +145,7 @@ DRAW_ERRORS = (
 
 RECORDER_PATIENCE = 5.0  # seconds for a film that is being drawn to leave nothing half written
 
-MakeRenderer = Callable[[moderngl.Context], Renderer]
+MakeRenderer = Callable[[moderngl.Context], GlRenderer]
 
 
 @dataclass(frozen=True)
@@ -170,7 +169,7 @@ class WindowRequest:
 def open_window(request: WindowRequest, services: Services) -> None:
     """Run until the window is closed. Raises BackendError where there is no display or no OpenGL."""
     share_one_heap()
-    window = Window(request, services, lambda ctx: FrameRenderer(ctx, request.backend))
+    window = Window(request, services, lambda ctx: GlRenderer(ctx, request.backend))
     immapp.run(window.params())
     if window.failure is not None:
         raise window.failure

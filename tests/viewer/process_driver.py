@@ -29,8 +29,7 @@ from langsplat_core.lab.speed.queries import repeated
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.camera.controls import orbit
-from langsplat_viewer.drawing import renderer as pacing
-from langsplat_viewer.drawing.frame import FrameRenderer
+from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest, open_window
 from tests.support.fakes import FakeEncoder
@@ -57,7 +56,7 @@ class Orbiting:
     cpu_to_sharp: list[float] = field(default_factory=list)
 
 
-class AtOnce(FrameRenderer):
+class AtOnce(GlRenderer):
     """Leaves nothing to other threads."""
 
     def ahead(self, *_: object) -> None:
@@ -137,7 +136,7 @@ def ride(
     count: int,
     seconds: float,
     size: tuple[int, int],
-    renderer: type[FrameRenderer] = FrameRenderer,
+    renderer: type[GlRenderer] = GlRenderer,
 ) -> Orbiting:
     def load(path: Path) -> Scene:
         found = load_scene(path)
@@ -184,7 +183,7 @@ def close() -> None:
 
 def idle(path: Path) -> None:
     services = Services(load_scene, lambda encoder_id: FakeEncoder())
-    window = Window(WindowRequest(path, size=(860, 620)), services, lambda ctx: FrameRenderer(ctx, "opengl"))
+    window = Window(WindowRequest(path, size=(860, 620)), services, lambda ctx: GlRenderer(ctx, "opengl"))
     params = window.params()
     frames, gui = [], params.callbacks.show_gui
 
@@ -230,11 +229,11 @@ if __name__ == "__main__":
     parser.add_argument("--slow", action="store_true", help="as if the machine were slow")
     asked = parser.parse_args()
     if asked.slow:
-        pacing.MOVING_BUDGET = 0.0
+        canvas.MOVING_BUDGET = 0.0
     if asked.idle:
         idle(asked.idle)
     elif asked.leave:
         leave(asked.leave)
     else:
-        renderer = AtOnce if asked.at_once else FrameRenderer
+        renderer = AtOnce if asked.at_once else GlRenderer
         print(json.dumps(asdict(ride(asked.scene, asked.count, asked.seconds, tuple(asked.size), renderer))))

@@ -9,13 +9,13 @@ import numpy as np
 from PIL import Image
 
 from imgui_bundle import imgui  # isort: skip
+from langsplat_viewer import canvas
 from langsplat_viewer.actions import queries, selecting, settings, viewpoint
 from langsplat_viewer.camera.overlays import Label, visible_faces
-from langsplat_viewer.drawing import renderer
-from langsplat_viewer.drawing.channels import ArrayChannels
 from langsplat_viewer.panels import overlays
 from langsplat_viewer.panels.overlays import EDGE
 from langsplat_viewer.panels.style import Area, scene_area
+from langsplat_viewer.rendering.renderer import ArrayChannels
 from tests.support.fakes import CENTRES
 
 MUG, BOOK, PLANT = CENTRES
@@ -32,7 +32,7 @@ def split_the_view(s: Any) -> None:
     rgb = s.shot("rgb")
     s.ctx.key_press(imgui.Key.v)
     s.settle()
-    assert s.state.seeing.split.mode == "wipe"
+    assert s.state.settings.split.mode == "wipe"
     both, area, before = s.shot("both"), scene_area(), s.state.view
     np.testing.assert_allclose(s.at(both, MUG), s.at(rgb, MUG), atol=2)
     assert np.abs(s.at(both, PLANT) - s.at(rgb, PLANT)).max() > 40  # depth
@@ -41,7 +41,7 @@ def split_the_view(s: Any) -> None:
     drawn = s.renderer.count
     s.drag((middle, y), (area.left + 0.9 * area.width, y))
     s.settle()
-    assert abs(s.state.seeing.split.at - 0.9) < 0.02
+    assert abs(s.state.settings.split.at - 0.9) < 0.02
     assert s.state.view is before
     assert s.renderer.count == drawn
     np.testing.assert_allclose(s.at(s.shot("wiped"), PLANT), s.at(rgb, PLANT), atol=2)
@@ -113,14 +113,14 @@ def draw_over_the_scene(s: Any) -> None:
     for thing in (MUG, BOOK):
         click(s, on_screen(s, thing))
     assert s.state.view is turned
-    assert abs(s.state.seeing.ruler.length - np.linalg.norm(MUG - BOOK)) < 0.2
+    assert abs(s.state.ruler.length - np.linalg.norm(MUG - BOOK)) < 0.2
     s.shot("ruler")
     drawn = s.renderer.count
     s.ctx.yield_(20)
     assert s.renderer.count == drawn
     s.ctx.key_press(imgui.Key.escape)
     s.ctx.yield_(2)
-    assert not s.state.seeing.ruler.measures
+    assert not s.state.ruler.measures
 
 
 def cut_by_depth(s: Any) -> None:
@@ -134,12 +134,12 @@ def cut_by_depth(s: Any) -> None:
     depths = [float((thing - s.state.view.eye) @ s.state.view.rotation[2]) for thing in CENTRES]
     s.ctx.item_input_value("//Camera/Near cut", max(min(depths), 0.1) + 0.6)
     s.settle()
-    assert s.state.seeing.clip.near > 0.5
+    assert s.state.settings.clip.near > 0.5
     cut = s.shot("cut")
     assert np.abs(cut - before)[100:, 400:].max() > 60
     s.ctx.item_input_value("//Camera/Near cut", 0.0)
     s.settle()
-    assert s.state.seeing.clip.near == 0
+    assert s.state.settings.clip.near == 0
     assert np.abs(s.shot("whole again") - before)[100:400, 400:].max() < 3
 
 
@@ -184,7 +184,7 @@ def faces_on_screen(s: Any, side: Any) -> list[tuple[str, tuple[float, float]]]:
 def rasterize_elsewhere(s: Any) -> None:
     """While a thread rasterizes the fine picture the window shows a coarse one and works; what goes wrong
     there is said once."""
-    gate, problems, rasterize = Event(), [], ArrayChannels.render_all
+    gate, problems, rasterize = Event(), [], ArrayChannels.render
 
     def gated(self: ArrayChannels, *arguments: Any) -> Any:
         if current_thread().name == "langsplat-worker":
@@ -193,8 +193,8 @@ def rasterize_elsewhere(s: Any) -> None:
                 raise problems[0]
         return rasterize(self, *arguments)
 
-    ArrayChannels.render_all = gated
-    renderer.MOVING_BUDGET = 0.0  # everything is slow
+    ArrayChannels.render = gated
+    canvas.MOVING_BUDGET = 0.0  # everything is slow
     begin(s)
     s.drag((600, 300), (656, 279))
     s.wait(lambda: s.window.viewer.surface.waits)
@@ -233,7 +233,7 @@ def measure_and_select(s: Any) -> None:
     s.ctx.yield_(2)
     for thing in (MUG, BOOK):
         click(s, on_screen(s, thing))
-    assert abs(s.state.seeing.ruler.length - np.linalg.norm(MUG - BOOK)) < 0.2
+    assert abs(s.state.ruler.length - np.linalg.norm(MUG - BOOK)) < 0.2
     s.ctx.key_press(imgui.Key.escape)
     s.ctx.yield_(2)
 

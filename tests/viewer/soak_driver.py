@@ -25,9 +25,10 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import opening, queries, settings, undoing
 from langsplat_viewer.commands import COMMANDS
-from langsplat_viewer.drawing.channels import Clip, Splats
-from langsplat_viewer.drawing.frame import Backend, FrameRenderer
 from langsplat_viewer.panels.layout import PANELS
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.renderer import Backend, GlRenderer
+from langsplat_viewer.rendering.request import Splats
 from langsplat_viewer.state import memory_bytes
 from tests.viewer.window_driver import Session
 
@@ -68,8 +69,8 @@ class SoakSession(Session):
         self._wanted: Callable[[], object] | None = None  # at the next frame
         super().__init__(folder, SCENES[0], backend=backend)
 
-    def _make_renderer(self, ctx: moderngl.Context) -> FrameRenderer:
-        return FrameRenderer(ctx, self.backend)
+    def _make_renderer(self, ctx: moderngl.Context) -> GlRenderer:
+        return GlRenderer(ctx, self.backend)
 
     def params(self) -> hello_imgui.RunnerParams:
         params = super().params()

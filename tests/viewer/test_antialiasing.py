@@ -10,8 +10,8 @@ from langsplat_core.io import load_scene, write_ply
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Scene
-from langsplat_viewer.drawing.channels import ArrayChannels, Layers, Sight
-from langsplat_viewer.drawing.frame import FrameRenderer
+from langsplat_viewer.rendering.depth import ArrayChannels, Layers, Sight
+from langsplat_viewer.rendering.renderer import GlRenderer
 from tests.support.scenes import random_camera, random_gaussians
 
 PICTURE = PictureConfig(display="alpha")
@@ -43,7 +43,7 @@ def test_a_marked_file_is_drawn_as_the_reference_draws_it(tmp_path, gl, antialia
     np.testing.assert_allclose(
         channels.depth_at(Sight(scene, camera), int(column), int(row))[1], want.max(), atol=1e-4
     )
-    frame = FrameRenderer(gl, "opengl", "single")
+    frame = GlRenderer(gl, "opengl", "single")
     frame.set_scene(scene)
     frame.draw(gl.simple_framebuffer((camera.width, camera.height)), camera, PICTURE)
     assert frame.depth_at(column + 0.5, row + 0.5) is not None

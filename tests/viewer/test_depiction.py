@@ -8,8 +8,8 @@ import pytest
 from langsplat_viewer import staging
 from langsplat_viewer.actions import queries, selecting, settings, viewpoint
 from langsplat_viewer.canvas import Canvas
-from langsplat_viewer.drawing.channels import Clip, LastView, Sight, Splats
-from langsplat_viewer.drawing.frame import FrameRenderer
+from langsplat_viewer.rendering.depth import Clip, LastView, Sight, Splats
+from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.staging import Depiction, depiction
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
@@ -104,7 +104,7 @@ def test_a_view_is_kept_while_the_sight_is_the_same():
 @pytest.mark.parametrize("backend", ["opengl", "cpu"])
 @pytest.mark.parametrize("name", CHANGES)
 def test_what_is_kept_gives_the_picture_that_a_new_renderer_gives(gl, asked, name, backend):
-    kept, fresh = FrameRenderer(gl, backend), FrameRenderer(gl, backend)
+    kept, fresh = GlRenderer(gl, backend), GlRenderer(gl, backend)
     canvas = Canvas(gl, kept)
     canvas.update(asked.state, 0.0)
     CHANGES[name](asked)

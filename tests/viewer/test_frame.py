@@ -13,9 +13,8 @@ from langsplat_core.config import PictureConfig
 from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, Channels, compose
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Gaussians, Scene, look_at
-from langsplat_viewer.drawing.channels import ArrayChannels, Layers, depth_range
-from langsplat_viewer.drawing.frame import FrameRenderer, suits_opengl
-from langsplat_viewer.drawing.renderer import ArraySource, GlSource
+from langsplat_viewer.rendering.depth import ArrayChannels, Layers, depth_range
+from langsplat_viewer.rendering.renderer import ArraySource, GlRenderer, GlSource, suits_opengl
 from tests.support.gl_context import gl_state
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
@@ -30,7 +29,7 @@ PICTURE = PictureConfig(background=(0.2, 0.5, 0.9))
 
 @pytest.fixture(params=["opengl", "cpu"])
 def frame(gl, request):
-    renderer = FrameRenderer(gl, request.param, "single")
+    renderer = GlRenderer(gl, request.param, "single")
     renderer.set_scene(SCENE)
     renderer.set_layers(LATENT, RELEVANCIES)
     yield renderer
@@ -67,7 +66,7 @@ def test_the_shader_composes_as_numpy_does(gl, monkeypatch, display, queries):
     shown = replace(channels, **dict.fromkeys(others))
     monkeypatch.setattr(ArrayChannels, "render_all", lambda *_: [shown])
     monkeypatch.setattr("langsplat_viewer.drawing.frame.depth_range", lambda *_: channels.depth_range)
-    renderer = FrameRenderer(gl, "cpu")
+    renderer = GlRenderer(gl, "cpu")
     renderer.set_scene(SCENE)
     renderer.set_layers(LATENT, random_values(COUNT, queries))
     picture = replace(PICTURE, display=display, heat_opacity=0.8, dim=0.4, threshold=0.55, alpha_gate=0.25)
@@ -96,7 +95,7 @@ def check_composition(gl, monkeypatch, picture: PictureConfig) -> None:
     shown = replace(channels, **dict.fromkeys({"latent", "relevancies", "depth_sum"} - {field}))
     monkeypatch.setattr(ArrayChannels, "render_all", lambda *_: [shown])
     monkeypatch.setattr("langsplat_viewer.drawing.frame.depth_range", lambda *_: channels.depth_range)
-    renderer = FrameRenderer(gl, "cpu")
+    renderer = GlRenderer(gl, "cpu")
     renderer.set_scene(SCENE)
     renderer.set_layers(LATENT, random_values(COUNT, 1))
     got = renderer.read(CAMERA.resized(50, 40), picture, ((0.5, 0.9),))
@@ -133,7 +132,7 @@ def test_the_backends_agree_on_a_screen(gl):
     """Half floats, the viewer's default, against the CPU rasterizer."""
     pictures = []
     for backend in ("opengl", "cpu"):
-        renderer = FrameRenderer(gl, backend)
+        renderer = GlRenderer(gl, backend)
         renderer.set_scene(SCENE)
         pictures.append(renderer.read(CAMERA, PICTURE))
         renderer.release()
@@ -201,7 +200,7 @@ FRONT = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
 def test_row_0_is_the_top(gl):
     """y points down: a red disc above the axis belongs into the upper half."""
     for backend in ("opengl", "cpu"):
-        renderer = FrameRenderer(gl, backend)
+        renderer = GlRenderer(gl, backend)
         renderer.set_scene(Scene(wall((1, 0, 0), (0, -1.0, 4.0), 0.2)))
         red = renderer.read(FRONT, PictureConfig())[..., 0].astype(float)
         assert red[:24].sum() > 100 * max(red[24:].sum(), 1)
@@ -246,7 +245,7 @@ def test_picking_finds_the_surface(gl):
     fields = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh")
     both = Gaussians(*(np.concatenate([getattr(solid, f), getattr(faint, f)]) for f in fields))
     for backend in ("opengl", "cpu"):
-        renderer = FrameRenderer(gl, backend)
+        renderer = GlRenderer(gl, backend)
         assert renderer.depth_at(32, 24) is None
         assert renderer.depth_map() is None
         renderer.set_scene(Scene(both))
@@ -275,7 +274,7 @@ def test_every_size(frame, size):
 
 def test_without_a_scene_and_with_an_empty_one_the_background_shows(gl):
     for backend in ("opengl", "cpu"):
-        renderer = FrameRenderer(gl, backend)
+        renderer = GlRenderer(gl, backend)
         want = np.round(255 * np.array(PICTURE.background))
         assert np.abs(renderer.read(CAMERA, PICTURE) - want).max() <= 1
         renderer.set_scene(Scene(SCENE.gaussians.take(np.zeros(COUNT, bool))))
@@ -287,7 +286,7 @@ def test_without_a_scene_and_with_an_empty_one_the_background_shows(gl):
 
 
 def test_auto_takes_the_cpu_where_the_driver_is_software(gl):
-    renderer = FrameRenderer(gl)
+    renderer = GlRenderer(gl)
     assert renderer.backend == ("opengl" if suits_opengl(gl) else "cpu")
     renderer.release()
 
@@ -297,15 +296,15 @@ import moderngl
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import BackendError
 from langsplat_core.scene import Scene
-from langsplat_viewer.drawing.frame import FrameRenderer
+from langsplat_viewer.rendering.renderer import GlRenderer
 from tests.support.scenes import random_camera, random_gaussians
 ctx = moderngl.create_context(standalone=True, backend="egl", require=330)
 assert ctx.version_code == 330, ctx.version_code
-renderer = FrameRenderer(ctx)
+renderer = GlRenderer(ctx)
 renderer.set_scene(Scene(random_gaussians(20)))
 print(renderer.backend, renderer.read(random_camera(), PictureConfig()).any(), ctx.error)
 try:
-    FrameRenderer(ctx, "opengl")
+    GlRenderer(ctx, "opengl")
 except BackendError as error:
     print(error)
 """

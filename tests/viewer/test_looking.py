@@ -13,9 +13,9 @@ from langsplat_core.io import save_scene, write_cameras
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_viewer import __main__ as program
 from langsplat_viewer.camera.controls import default_view, extent_of
-from langsplat_viewer.drawing.channels import near_plane, why_nothing, why_undrawable
-from langsplat_viewer.drawing.frame import FrameRenderer
 from langsplat_viewer.output.still import render_picture
+from langsplat_viewer.rendering.depth import near_plane, why_nothing, why_undrawable
+from langsplat_viewer.rendering.renderer import GlRenderer
 from tests.support.fakes import blob_scene
 
 SIZE = (160, 120)
@@ -102,7 +102,7 @@ def test_why_this_camera_sees_nothing():
 
 @pytest.mark.parametrize("backend", ["opengl", "cpu"])
 def test_the_renderer_knows_an_empty_picture(gl, backend):
-    renderer = FrameRenderer(gl, backend)
+    renderer = GlRenderer(gl, backend)
     assert not renderer.shows_nothing()  # nothing was drawn yet
     renderer.set_scene(blob_scene())
     for camera, nothing in ((blob_scene().cameras[0], False), (looking_away(), True)):

@@ -13,11 +13,11 @@ from numpy.testing import assert_allclose
 from langsplat_core.io import load_scene, save_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import filming, opening, queries, settings, viewpoint
-from langsplat_viewer.drawing.channels import UNCLIPPED, Clip
 from langsplat_viewer.files.browsing import MOST_LISTED, Entry, list_folder
 from langsplat_viewer.files.watching import Watch, stamps
 from langsplat_viewer.options import say_compiling
 from langsplat_viewer.panels.scene import has_several
+from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
 from tests.support.fakes import blob_scene
 from tests.support.windowless import SCENES, arrive, errors, settle
 
@@ -26,7 +26,6 @@ def test_open_shows_the_scene_from_its_first_camera(opened):
     state = opened.state
     assert state.scene is SCENES["blobs.ply"]
     assert state.opening is None
-    assert state.latent.shape == (3, 360, 3)
     assert state.camera_index == 0
     assert_allclose(
         state.view.camera(160, 120).world_to_camera, state.scene.cameras[0].world_to_camera, atol=1e-9
@@ -179,7 +178,7 @@ def test_camera_and_queries_of_each_are_found_again(three):
     assert three.state.scene is SCENES["bare.ply"]
     assert three.state.queries == []
     assert three.state.canonical == ()
-    assert three.state.seeing.clip == UNCLIPPED
+    assert three.state.settings.clip == UNCLIPPED
     queries.ask(three, "plant")
     settle(three)
     viewpoint.zoom_by(three, 2.0)
@@ -192,7 +191,7 @@ def test_camera_and_queries_of_each_are_found_again(three):
     assert state.queries[1].result.own_cut == 0.7
     assert state.canonical == three.engine.canonical_phrases == ("plant",)
     assert (state.camera_index, len(state.record.keyframes)) == (2, 1)
-    assert state.seeing.clip == Clip(1.0, 9.0)
+    assert state.settings.clip == Clip(1.0, 9.0)
     switch(three, BARE)
     assert three.state.view is bare
     assert [query.phrase for query in three.state.queries] == ["plant"]
@@ -423,7 +422,7 @@ def test_reload_keeps_camera_queries_and_settings(shown):
     viewpoint.go_to_camera(shown, 1)
     viewpoint.tick(shown, shown.clock + 10)
     filming.add_keyframe(shown)
-    settings.set_splats(shown, replace(shown.state.seeing.splats, size=0.5))
+    settings.set_splats(shown, replace(shown.state.settings.splats, size=0.5))
     settings.set_picture(shown, replace(shown.state.picture, dim=0.1))
     view, before = shown.state.view, shown.state.scene
     save_scene(shown.state.path, dyed())
@@ -437,7 +436,7 @@ def test_reload_keeps_camera_queries_and_settings(shown):
     assert [(q.phrase, q.slot, q.cut) for q in state.queries] == [("mug", 0, 0.6), ("book", None, None)]
     assert state.queries[0].result.own_cut == 0.6
     assert state.selected is state.queries[0]
-    assert (state.picture.display, state.picture.dim, state.seeing.splats.size) == ("relevancy", 0.1, 0.5)
+    assert (state.picture.display, state.picture.dim, state.settings.splats.size) == ("relevancy", 0.1, 0.5)
     assert len(state.record.keyframes) == 1
     assert state.camera_index == 1
     assert not look(shown)

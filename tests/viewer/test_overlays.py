@@ -413,7 +413,7 @@ def test_it_is_read_once_it_is_wanted_and_only_at_its_camera(beside_photograph):
     stand(beside_photograph, 1)
     assert beside_photograph.state.photograph is None
     opening.fade_photograph(beside_photograph, 3.0)
-    assert beside_photograph.state.seeing.fade == 1
+    assert beside_photograph.state.settings.fade == 1
     stand(beside_photograph, 1)
     found = opening.photograph_here(beside_photograph.state)
     assert found.image.shape == (120, 160, 3)

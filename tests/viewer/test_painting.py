@@ -11,7 +11,7 @@ from langsplat_core.display.displays import QUERY_COLOURS, SEGMENT_OPACITY, Chan
 from langsplat_core.query.answers import QueryResult
 from langsplat_viewer.actions import queries
 from langsplat_viewer.drawing import channels
-from langsplat_viewer.output.still import describe
+from langsplat_viewer.output.headless import describe
 from langsplat_viewer.panels.overlays import STEPS, bar_colours
 from tests.support.windowless import settle
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 from matplotlib.ft2font import FT2Font
-from numpy.testing import assert_allclose
 
 from langsplat_core.errors import InputError
 from langsplat_viewer import fonts, panels
@@ -118,19 +117,6 @@ def test_every_command_does_something_sensible_before_a_scene_is_open(viewer, tm
 
 
 # What is shown and how; messages; the worker.
-
-
-def test_layers_change_only_when_the_picture_needs_others(opened):
-    state = opened.state
-    key = state.layers_key()
-    settings.set_display(opened, "depth")
-    assert state.layers_key() == key
-    assert state.latent_rgb() is None
-    settings.set_display(opened, "latent", 2)
-    assert state.layers_key() != key
-    assert_allclose(state.latent_rgb(), state.latent[2])
-    settings.set_display(opened, "latent", 1)
-    assert_allclose(state.latent_rgb(), state.latent[1])
 
 
 def test_messages_do_not_grow_without_end(viewer):

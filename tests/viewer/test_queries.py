@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from langsplat_core.display.displays import NO_HEAT, Subject, relevancies
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.scene import CANONICAL_PHRASES, Reading
 from langsplat_viewer.actions import opening, queries, settings, undoing
-from langsplat_viewer.drawing.channels import NO_HEAT
 from langsplat_viewer.files.browsing import QuerySet, SavedQuery, read_queries, write_queries
-from langsplat_viewer.output.still import describe
+from langsplat_viewer.output.headless import describe
 from langsplat_viewer.panels.search import BINS, hint, histogram
 from langsplat_viewer.viewer import Services
 from tests.support.fakes import CENTRES, FakeEncoder, blob_scene, calibrated_for, language
@@ -30,7 +30,8 @@ def test_a_query_is_answered_and_shown(opened):
     assert query.result.level == 2
     assert_allclose(query.result.place, CENTRES[0], atol=0.25)
     assert opened.state.picture.display == "relevancy"
-    columns = opened.state.relevancies()
+    (pane,) = opened.state.panes()
+    columns = relevancies(Subject(360, answers=pane.answers))
     assert columns.shape == (360, 1)
     assert columns[:120].mean() > 0.9 > 0.6 > columns[120:].mean()
     assert opened.state.heat_ranges() == (query.result.heat_range,)
@@ -128,10 +129,11 @@ def test_hiding_keeps_the_colours_of_the_others(opened):
     settle(opened)
     mug, book = opened.state.queries
     queries.hide(opened, mug)
-    columns = opened.state.relevancies()
+    (pane,) = opened.state.panes()
+    columns = relevancies(Subject(360, answers=pane.answers))
     assert columns.shape == (360, 2)
     assert not columns[:, 0].any()
-    assert opened.state.heat_ranges() == (NO_HEAT, book.result.heat_range)
+    assert pane.ranges == (NO_HEAT, book.result.heat_range)
     assert columns[120:240, 1].mean() > 0.9
     queries.show(opened, mug)
     assert (mug.slot, book.slot) == (0, 1)

@@ -17,10 +17,11 @@ from langsplat_viewer import options
 from langsplat_viewer.actions import filming, opening, queries, settings, undoing, viewpoint
 from langsplat_viewer.actions.filming import subject_of
 from langsplat_viewer.camera.controls import orbit, zoom
-from langsplat_viewer.drawing.channels import Clip, Splats
 from langsplat_viewer.files.flights import read_flight
 from langsplat_viewer.output import film
 from langsplat_viewer.output.still import Subject, draw_something, painter
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.request import Splats
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import FakeEncoder, blob_scene
 from tests.support.windowless import arrive, errors, settle

@@ -8,10 +8,10 @@ from langsplat_core.scene import Scene
 from langsplat_viewer.actions import opening, settings
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import OVERLAY_TITLES, matching
-from langsplat_viewer.drawing.channels import OVERLAYS, Ruler, Splats, drawn_scene
-from langsplat_viewer.drawing.frame import FrameRenderer
 from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.output import saving
+from langsplat_viewer.rendering.depth import OVERLAYS, Ruler, Splats, drawn_scene
+from langsplat_viewer.rendering.renderer import GlRenderer
 from tests.support.scenes import random_gaussians
 from tests.support.windowless import rest, settle
 
@@ -66,13 +66,13 @@ def test_splats_are_drawn_smaller_and_of_one_colour():
 
 def test_splats_stay_within_their_range(opened):
     settings.set_splats(opened, Splats(7.0, 9))
-    assert opened.state.seeing.splats == Splats()
+    assert opened.state.settings.splats == Splats()
     settings.set_splats(opened, Splats(0.0, -1))
-    assert opened.state.seeing.splats == Splats(0.1, 0)
+    assert opened.state.settings.splats == Splats(0.1, 0)
 
 
 def test_the_canvas_takes_other_splats_once(gl, opened):
-    renderer = FrameRenderer(gl, "cpu")
+    renderer = GlRenderer(gl, "cpu")
     given = []
     original = renderer.set_scene
     renderer.set_scene = lambda scene: (given.append(scene), original(scene))
@@ -93,19 +93,19 @@ def test_the_canvas_takes_other_splats_once(gl, opened):
 
 def test_two_clicks_measure_and_a_third_begins_anew(opened):
     settings.toggle_measuring(opened)
-    assert opened.state.seeing.ruler.length is None
+    assert opened.state.ruler.length is None
     settings.measure_at(opened, 0.5, 0.5)
     settings.measure_at(opened, 0.8, 0.1)  # the fake surface: (u - 0.5, v - 0.5, 0)
-    assert opened.state.seeing.ruler.length == pytest.approx(0.5)
+    assert opened.state.ruler.length == pytest.approx(0.5)
     settings.measure_at(opened, 0.6, 0.6)
-    assert opened.state.seeing.ruler.length is None
-    assert len(opened.state.seeing.ruler.points) == 1
+    assert opened.state.ruler.length is None
+    assert len(opened.state.ruler.points) == 1
 
 
 def test_a_click_beside_everything_is_said(opened):
     settings.measure(opened, True)
     settings.measure_at(opened, 0.95, 0.5)
-    assert opened.state.seeing.ruler.points == ()
+    assert opened.state.ruler.points == ()
     assert "nothing under the cursor" in opened.state.messages[-1].text
 
 
@@ -117,4 +117,4 @@ def test_measuring_ends_with_esc_and_with_another_scene(opened):
         settings.measure_at(opened, 0.5, 0.5)
         end(opened)
         settle(opened)
-        assert opened.state.seeing.ruler == Ruler()
+        assert opened.state.ruler == Ruler()

@@ -13,8 +13,8 @@ from langsplat_core.scene import look_at
 from langsplat_viewer.actions import opening, queries, selecting, settings, undoing, viewpoint
 from langsplat_viewer.actions.selecting import take
 from langsplat_viewer.camera.controls import from_camera
-from langsplat_viewer.drawing.channels import Clip
 from langsplat_viewer.marks import Drawn, Stroke, outlines
+from langsplat_viewer.rendering.depth import Clip
 from tests.support.fakes import CENTRES, COLOURS, PER_BLOB
 from tests.support.selected import blob, marked, marks_of
 from tests.support.windowless import SCENES, FakeSurface, errors, settle

@@ -12,10 +12,9 @@ from langsplat_viewer import staging
 from langsplat_viewer.actions import queries, settings
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import COMMANDS
-from langsplat_viewer.drawing.channels import AT_RANGE, Layers, Split
-from langsplat_viewer.drawing.frame import FrameRenderer
-from langsplat_viewer.drawing.renderer import ArraySource, GlSource
 from langsplat_viewer.panels.view import compared_name
+from langsplat_viewer.rendering.depth import AT_RANGE, Layers, Split
+from langsplat_viewer.rendering.renderer import ArraySource, GlRenderer, GlSource
 from tests.support.scenes import random_camera, random_gaussians, random_values
 from tests.support.windowless import errors, rest, settle
 
@@ -38,7 +37,7 @@ def ask(viewer, phrase: str) -> None:
 
 def test_one_picture_is_the_state_itself(opened):
     assert staging.shown_pictures(opened.state) == (opened.state,)
-    assert staging.columns(opened.state.seeing.split) == 1
+    assert staging.columns(opened.state.settings.split) == 1
 
 
 def test_the_second_picture_is_what_the_state_would_show(opened):
@@ -84,24 +83,24 @@ def test_three_levels_of_an_answer_share_one_scale(opened):
 def test_the_line_stays_within_reach(opened):
     for at, kept in ((-3.0, AT_RANGE[0]), (0.3, 0.3), (2.0, AT_RANGE[1])):
         settings.move_line(opened, at)
-        assert opened.state.seeing.split.at == kept
+        assert opened.state.settings.split.at == kept
 
 
 def test_without_a_field_levels_and_latents_are_refused(viewer):
     viewer.state.scene = Scene(random_gaussians(5))
     settings.toggle_levels(viewer)
     settings.compare_with(viewer, "latent", 1)
-    assert viewer.state.seeing.split.mode == "off"
+    assert viewer.state.settings.split.mode == "off"
     assert len(errors(viewer)) == 1  # the same line is not said twice
     settings.toggle_wipe(viewer)
-    assert viewer.state.seeing.split.mode == "wipe"
+    assert viewer.state.settings.split.mode == "wipe"
 
 
 def test_commands_turn_it_on_and_off(opened):
     (wipe,) = (command for command in COMMANDS if "V" in command.keys)
     for mode in ("wipe", "off"):
         wipe.act(opened)
-        assert opened.state.seeing.split.mode == mode
+        assert opened.state.settings.split.mode == mode
 
 
 def test_every_display_has_a_name_of_its_own_beside_another():
@@ -135,7 +134,7 @@ def test_pictures_of_one_camera_share_one_pass(gl, monkeypatch, backend):
             return method(*arguments)
 
         monkeypatch.setattr(source, "render", noting)
-    renderer = FrameRenderer(gl, backend, "single")
+    renderer = GlRenderer(gl, backend, "single")
     renderer.set_scene(SCENE)
     looks = [(PictureConfig(display=display), layers) for display, layers in zip(LOOKS, LAYERS, strict=True)]
     alone = [renderer.read(CAMERA, picture, (), layers) for picture, layers in looks]
@@ -152,7 +151,7 @@ def test_pictures_of_one_camera_share_one_pass(gl, monkeypatch, backend):
 
 
 def test_the_canvas_draws_both_and_then_rests(gl, opened):
-    renderer = FrameRenderer(gl, "cpu")
+    renderer = GlRenderer(gl, "cpu")
     canvas, state = Canvas(gl, renderer), opened.state
     state.size = (60, 40)
     drawn = []
@@ -178,7 +177,7 @@ def test_the_canvas_draws_both_and_then_rests(gl, opened):
 
 
 def test_the_surface_is_found_in_every_column(gl, opened):
-    canvas, state = Canvas(gl, FrameRenderer(gl, "cpu")), opened.state
+    canvas, state = Canvas(gl, GlRenderer(gl, "cpu")), opened.state
     state.size = (240, 120)
     settings.toggle_levels(opened)
     rest(canvas, state, 1.0)

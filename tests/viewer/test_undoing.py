@@ -12,8 +12,9 @@ import pytest
 from langsplat_viewer.actions import opening, queries, selecting, settings, undoing
 from langsplat_viewer.actions.history import GESTURE, LONGEST
 from langsplat_viewer.actions.selecting import mark
-from langsplat_viewer.drawing.channels import Clip, Splats
 from langsplat_viewer.marks import Marks, hiding, unmarked
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.request import Splats
 from tests.support.windowless import settle
 
 
@@ -145,7 +146,7 @@ SETTINGS = {
 def looks(viewer) -> tuple[object, ...]:
     state = viewer.state
     kept = (state.preferences.overlays, state.preferences.colour_map)
-    return state.picture, state.seeing, state.latent_level, kept
+    return state.picture, state.settings, state.latent_level, kept
 
 
 @pytest.mark.parametrize("name", SETTINGS)
@@ -198,8 +199,8 @@ def test_the_ruler_is_not_undone(opened):
     settings.toggle_wipe(opened)
     settings.measure(opened, True)
     undoing.undo(opened)
-    assert opened.state.seeing.ruler.measures
-    assert opened.state.seeing.split.mode == "off"
+    assert opened.state.ruler.measures
+    assert opened.state.settings.split.mode == "off"
 
 
 def test_an_undone_setting_leaves_the_marks_the_same_objects(opened):

@@ -18,8 +18,8 @@ from langsplat_core.errors import BackendError
 from langsplat_core.io import load_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import settings
-from langsplat_viewer.drawing.frame import Backend, FrameRenderer
 from langsplat_viewer.panels.style import scene_area
+from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest
 from tests.support.fakes import CENTRES, FakeEncoder
@@ -35,16 +35,16 @@ def digit_key(digit: int) -> imgui.Key:
     return imgui.Key[f"_{digit}"]
 
 
-class CountingRenderer(FrameRenderer):
+class CountingRenderer(GlRenderer):
     """Counts the pictures it draws."""
 
     def __init__(self, ctx, backend: Backend) -> None:
         super().__init__(ctx, backend)
         self.count = 0
 
-    def draw(self, *args, **kwargs) -> None:
-        self.count += 1
-        super().draw(*args, **kwargs)
+    def draw(self, request, targets) -> None:
+        self.count += len(targets)
+        super().draw(request, targets)
 
 
 class Session:

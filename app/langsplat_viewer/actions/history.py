@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_viewer.camera.flight import Keyframe
-from langsplat_viewer.drawing.channels import Seeing
 from langsplat_viewer.marks import PackedMarks, pack
-from langsplat_viewer.state import Query
+from langsplat_viewer.state import Query, ViewSettings
 from langsplat_viewer.viewer import Viewer
 
 LONGEST = 100  # steps that can be undone
@@ -22,7 +21,7 @@ class Moment:
     picture: PictureConfig
     latent_level: int
     level: LevelChoice
-    seeing: Seeing  # its ruler is not undone
+    settings: ViewSettings
     overlays: tuple[str, ...]
     marks: PackedMarks
     keyframes: tuple[Keyframe, ...]
@@ -38,7 +37,7 @@ def now(viewer: Viewer) -> Moment:
         picture=state.picture,
         latent_level=state.latent_level,
         level=state.level,
-        seeing=state.seeing,
+        settings=state.settings,
         overlays=state.preferences.overlays,
         marks=viewer.history.marks.packed,
         keyframes=state.record.keyframes,

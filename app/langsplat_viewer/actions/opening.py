@@ -28,7 +28,6 @@ from langsplat_viewer.actions.selecting import leave
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.actions.viewpoint import opening_view
 from langsplat_viewer.camera.controls import Extent, extent_of
-from langsplat_viewer.drawing.channels import UNCLIPPED, Ruler, why_undrawable
 from langsplat_viewer.files import photographs
 from langsplat_viewer.files.browsing import SUFFIX as QUERIES
 from langsplat_viewer.files.browsing import Entry, is_scene, list_folder
@@ -37,7 +36,8 @@ from langsplat_viewer.files.photographs import Photograph
 from langsplat_viewer.files.preferences import with_photographs, with_recent
 from langsplat_viewer.files.watching import Stamps, stamps
 from langsplat_viewer.marks import of_scene
-from langsplat_viewer.state import Recording, ViewerState
+from langsplat_viewer.rendering.depth import UNCLIPPED, why_undrawable
+from langsplat_viewer.state import Recording, Ruler, ViewerState
 from langsplat_viewer.viewer import Viewer, Visit, unanswered, visit_of
 
 
@@ -48,7 +48,6 @@ class _Opened:
     scene: Scene
     unusable: dict[str, int]  # reason -> Gaussians that are therefore not drawn
     extent: Extent
-    latent: Array | None  # (3, N, 3) colours
     read: Stamps  # its files as they were before they were read
     doubts: tuple[str, ...]  # what the report of its training says against it
 
@@ -78,10 +77,11 @@ def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Cal
         progress(f"preparing {path.name}", 0.6)
         viewer.services.warm_up(scene, backend, progress)
         progress(f"preparing {path.name}", 0.9)
-        latent = None if scene.language is None else latent_colours(scene.language)
+        if scene.language is not None:
+            latent_colours(scene.language)  # kept for the window's thread
         unusable = scene.gaussians.invalid_rows()
         doubts = stated_doubts(path, len(scene.gaussians))
-        return _Opened(scene, unusable, extent_of(scene), latent, read, doubts)
+        return _Opened(scene, unusable, extent_of(scene), read, doubts)
 
     def done(opened: _Opened) -> None:
         _show_scene(viewer, path, opened)
@@ -115,13 +115,13 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     if path.absolute() not in state.scenes:
         state.scenes = (*state.scenes, path.absolute())
     viewer.watch.begin(opened.read)
-    state.scene, state.extent, state.latent = scene, opened.extent, opened.latent
+    state.scene, state.extent = scene, opened.extent
     state.doubts = opened.doubts
     state.queries, state.selected, state.glide = [], None, None
     state.canonical, state.canonical_typed = (), ""
     state.selection = of_scene(state.selection, len(scene.gaussians))
     state.camera_index = 0 if scene.cameras else None
-    state.seeing = replace(state.seeing, ruler=Ruler(), clip=UNCLIPPED)
+    state.settings, state.ruler = replace(state.settings, clip=UNCLIPPED), Ruler()
     forget(viewer)
     state.preferences = with_recent(state.preferences, path.absolute())
     state.opening_camera = None
@@ -175,7 +175,7 @@ def return_to(viewer: Viewer, visit: Visit) -> None:
     count = len(state.scene.cameras)
     if visit.camera_index is not None and visit.camera_index < count:
         state.camera_index = visit.camera_index
-    state.seeing = replace(state.seeing, ruler=visit.ruler, clip=visit.clip)
+    state.settings, state.ruler = replace(state.settings, clip=visit.clip), visit.ruler
     state.record.keyframes = visit.keyframes
     if state.scene.language is None and DISPLAYS[visit.display].needs_field:
         return
@@ -298,15 +298,15 @@ def photograph_here(state: ViewerState) -> Photograph | None:
 def fade_photograph(viewer: Viewer, fade: float) -> None:
     """How much of the photograph is laid over the picture, 0 to 1."""
     fade = min(max(fade, 0.0), 1.0)
-    if fade != viewer.state.seeing.fade:
+    if fade != viewer.state.settings.fade:
         remember(viewer, "fade")
-        viewer.state.seeing = replace(viewer.state.seeing, fade=fade)
+        viewer.state.settings = replace(viewer.state.settings, fade=fade)
 
 
 def fetch_photograph(viewer: Viewer) -> None:
     """Once per frame: have the worker look for the photograph that is wanted now and was not looked for."""
     state = viewer.state
-    camera = standing_at(state) if state.seeing.fade > 0 else None
+    camera = standing_at(state) if state.settings.fade > 0 else None
     if camera is None or state.path is None:
         return
     path, folder = state.path, _folder(viewer)

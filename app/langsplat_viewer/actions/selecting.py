@@ -23,9 +23,9 @@ from langsplat_core.scene import LEVELS, Scene
 from langsplat_viewer import marks
 from langsplat_viewer.actions.history import remember
 from langsplat_viewer.camera.controls import eye_depth
-from langsplat_viewer.drawing.channels import UNCLIPPED
 from langsplat_viewer.marks import Drawn, Leaving, Marks, Mode, Stroke, Tool
 from langsplat_viewer.output.saving import free_name
+from langsplat_viewer.rendering.depth import UNCLIPPED
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
 
@@ -365,7 +365,7 @@ def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
         return
     wanted = state.selection.only_visible and drawn.tool in marks.ON_SCREEN and viewer.surface is not None
     depths = viewer.surface.depths() if wanted and viewer.surface is not None else None
-    means, clip = state.scene.gaussians.means, state.seeing.clip.beyond(eye_depth(drawn.camera))
+    means, clip = state.scene.gaussians.means, state.settings.clip.beyond(eye_depth(drawn.camera))
     found = marks.caught(drawn, means, depths)
     if clip != UNCLIPPED and drawn.tool in marks.ON_SCREEN:  # what is not drawn lies under no outline
         found &= clip.keeps(means @ drawn.camera.rotation[2] + drawn.camera.world_to_camera[2, 3])

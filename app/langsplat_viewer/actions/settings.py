@@ -9,25 +9,16 @@ from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.selecting import leave_tool, stay
 from langsplat_viewer.actions.viewpoint import glide_to
 from langsplat_viewer.camera.overlays import facing
-from langsplat_viewer.drawing.channels import (
-    AT_RANGE,
-    MOST_DEGREE,
-    OVERLAYS,
-    SIZE_RANGE,
-    Clip,
-    Overlay,
-    Ruler,
-    Seeing,
-    Splats,
-    Split,
-)
 from langsplat_viewer.files.preferences import SCALES, Theme
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.request import AT_RANGE, MOST_DEGREE, SIZE_RANGE, Splats, Split
+from langsplat_viewer.state import OVERLAYS, Overlay, Ruler, ViewSettings
 from langsplat_viewer.viewer import Viewer
 
 
 def compare_with(viewer: Viewer, display: Display, latent_level: int | None = None) -> None:
     """Show a second display right of a line across the scene; `latent_level` indexes `scene.LEVELS`."""
-    split = viewer.state.seeing.split
+    split = viewer.state.settings.split
     level = split.second_level if latent_level is None else latent_level
     if _can_show(viewer, DISPLAYS[display].needs_field):
         _set_split(viewer, replace(split, mode="wipe", second=display, second_level=level))
@@ -35,7 +26,7 @@ def compare_with(viewer: Viewer, display: Display, latent_level: int | None = No
 
 def toggle_wipe(viewer: Viewer) -> None:
     """Show the second display that was chosen last, or one picture again."""
-    split = viewer.state.seeing.split
+    split = viewer.state.settings.split
     if split.mode == "wipe":
         show_one(viewer)
     else:
@@ -44,7 +35,7 @@ def toggle_wipe(viewer: Viewer) -> None:
 
 def toggle_levels(viewer: Viewer) -> None:
     """Show the three semantic levels side by side, or one picture again."""
-    split = viewer.state.seeing.split
+    split = viewer.state.settings.split
     if split.mode == "levels":
         show_one(viewer)
     elif _can_show(viewer, needs_field=True):
@@ -53,13 +44,13 @@ def toggle_levels(viewer: Viewer) -> None:
 
 def show_one(viewer: Viewer) -> None:
     """One picture fills the scene's area."""
-    _set_split(viewer, replace(viewer.state.seeing.split, mode="off"))
+    _set_split(viewer, replace(viewer.state.settings.split, mode="off"))
 
 
 def move_line(viewer: Viewer, at: float) -> None:
     """Where the line is that divides the two pictures, as a fraction of the area's width."""
     low, high = AT_RANGE
-    _set_split(viewer, replace(viewer.state.seeing.split, at=min(max(at, low), high)), "line")
+    _set_split(viewer, replace(viewer.state.settings.split, at=min(max(at, low), high)), "line")
 
 
 def set_colour_map(viewer: Viewer, colour_map: ColourMap) -> None:
@@ -73,7 +64,7 @@ def set_colour_map(viewer: Viewer, colour_map: ColourMap) -> None:
 
 def save_transparent(viewer: Viewer, transparent: bool) -> None:
     """Whether pictures are saved without their background."""
-    _see(viewer, replace(viewer.state.seeing, transparent=transparent))
+    _set(viewer, replace(viewer.state.settings, transparent=transparent))
 
 
 def set_splats(viewer: Viewer, splats: Splats) -> None:
@@ -81,14 +72,14 @@ def set_splats(viewer: Viewer, splats: Splats) -> None:
     low, high = SIZE_RANGE
     degree = min(max(splats.sh_degree, 0), MOST_DEGREE)
     kept = Splats(min(max(splats.size, low), high), degree)
-    _see(viewer, replace(viewer.state.seeing, splats=kept), "splats")
+    _set(viewer, replace(viewer.state.settings, splats=kept), "splats")
 
 
 def set_clip(viewer: Viewer, clip: Clip) -> None:
     """Between which depths Gaussians are drawn; the far one stays the farther."""
     near = max(clip.near, 0.0)
     kept = Clip(near, max(clip.far, near))
-    _see(viewer, replace(viewer.state.seeing, clip=kept), "clip")
+    _set(viewer, replace(viewer.state.settings, clip=kept), "clip")
 
 
 def show_overlay(viewer: Viewer, overlay: Overlay, shown: bool) -> None:
@@ -114,14 +105,14 @@ def turn_to_face(viewer: Viewer, face: str) -> None:
 
 def measure(viewer: Viewer, on: bool) -> None:
     """Whether clicks on the scene set the points of the ruler; what was measured goes when it ends."""
-    ruler = viewer.state.seeing.ruler
+    ruler = viewer.state.ruler
     if on != ruler.measures:
-        viewer.state.seeing = replace(viewer.state.seeing, ruler=Ruler(on))
+        viewer.state.ruler = Ruler(on)
 
 
 def toggle_measuring(viewer: Viewer) -> None:
     """Begin to measure, or end it."""
-    measure(viewer, not viewer.state.seeing.ruler.measures)
+    measure(viewer, not viewer.state.ruler.measures)
 
 
 def measure_at(viewer: Viewer, u: float, v: float) -> None:
@@ -131,8 +122,7 @@ def measure_at(viewer: Viewer, u: float, v: float) -> None:
         viewer.state.say("nothing under the cursor to measure from")
         return
     x, y, z = (float(part) for part in point)
-    seeing = viewer.state.seeing
-    viewer.state.seeing = replace(seeing, ruler=seeing.ruler.with_point((x, y, z)))
+    viewer.state.ruler = viewer.state.ruler.with_point((x, y, z))
 
 
 def _can_show(viewer: Viewer, needs_field: bool) -> bool:
@@ -145,14 +135,14 @@ def _can_show(viewer: Viewer, needs_field: bool) -> bool:
 
 
 def _set_split(viewer: Viewer, split: Split, setting: str = "") -> None:
-    _see(viewer, replace(viewer.state.seeing, split=split), setting)
+    _set(viewer, replace(viewer.state.settings, split=split), setting)
 
 
-def _see(viewer: Viewer, seeing: Seeing, setting: str = "") -> None:
-    """Look at the scene like that; `setting` as in `remember`."""
-    if seeing != viewer.state.seeing:
+def _set(viewer: Viewer, settings: ViewSettings, setting: str = "") -> None:
+    """Take other view settings; `setting` as in `remember`."""
+    if settings != viewer.state.settings:
         remember(viewer, setting)
-        viewer.state.seeing = seeing
+        viewer.state.settings = settings
 
 
 # What is shown and how; which parts of the window are.

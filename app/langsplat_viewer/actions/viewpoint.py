@@ -11,7 +11,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress
 from langsplat_core.query.describe import Describer, Pointed, look_at_pixel
 from langsplat_core.query.engine import no_field
-from langsplat_core.raster import load_lifting_rasterizer
+from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
 from langsplat_core.scene import Camera
 from langsplat_viewer.camera.controls import (
     OrbitCamera,
@@ -30,11 +30,11 @@ from langsplat_viewer.camera.controls import (
     zoom,
 )
 from langsplat_viewer.camera.flight import pose_at, pose_of, view_of
-from langsplat_viewer.drawing.channels import looking_settings
 from langsplat_viewer.files.flights import MOST_VIEWS, Bookmark, named
 from langsplat_viewer.jobs import one_line
-from langsplat_viewer.staging import reference_of, small
-from langsplat_viewer.state import GLIDE_SECONDS, Glide, Hover, Query, compared, flight_of
+from langsplat_viewer.rendering.depth import image_formation
+from langsplat_viewer.rendering.renderer import ArrayRenderer
+from langsplat_viewer.state import GLIDE_SECONDS, Glide, Hover, Query, compared, compared_size, flight_of
 from langsplat_viewer.viewer import Viewer
 
 
@@ -346,7 +346,7 @@ def _ask(viewer: Viewer, place: Hover) -> None:
         return
     camera = place.view.camera(*viewer.state.size)
     shown = [query for query in viewer.state.shown() if query is not None and query.result is not None]
-    settings = looking_settings(engine.scene, camera, viewer.state.seeing.clip)
+    settings = image_formation(engine.scene, camera, viewer.state.settings.clip)
     results = [query.result for query in shown if query.result is not None]
 
     def work(progress: Progress) -> tuple[Describer, Pointed | None]:
@@ -449,11 +449,11 @@ def compare_with_reference(viewer: Viewer) -> None:
     if viewer.recorder.current is not None:
         state.say("a film or a comparison is being drawn; wait for it or cancel it", is_error=True)
         return
-    here = small(state)
-    shown, draw, backend = viewer.surface.capture(here), reference_of(here), state.backend
+    request, backend = state.request(compared_size(state.size)), state.backend
+    shown = viewer.surface.capture(request)
 
     def work(progress: Progress) -> Array:
-        return draw()
+        return ArrayRenderer(load_rasterizer("reference")).read(request)
 
     def done(reference: Array) -> None:
         state.timing.comparison = compared(shown, reference, backend)

@@ -17,7 +17,7 @@ from langsplat_core.scene import Camera, Gaussians, Intrinsics, Scene, look_at
 @dataclass(frozen=True, eq=False)
 class FarCamera(Camera):
     """Stands behind the eye, with a lens so narrow that what is as far as the target keeps its size. It has
-    before it what lies behind the eye; `looking_settings` leaves that out."""
+    before it what lies behind the eye; `image_formation` leaves that out."""
 
     back: float = 0.0  # from it to the plane of the eye, world units
     distance: float = 1.0  # from there to the target, world units

@@ -31,7 +31,7 @@ class Preferences:
     recent: tuple[str, ...] = ()  # scenes that were opened, the latest first
     panels: tuple[str, ...] | None = None  # titles of those that are open; None: those that are at first
     colour_map: ColourMap = "turbo"  # of relevancy and depth
-    overlays: tuple[str, ...] = ()  # of `seeing.OVERLAYS`, those that lie over the scene
+    overlays: tuple[str, ...] = ()  # of `state.OVERLAYS`, those that lie over the scene
     photographs: dict[str, str] = field(default_factory=dict)  # scene -> folder; the latest chosen last
 
     def __post_init__(self) -> None:

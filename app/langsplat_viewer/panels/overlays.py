@@ -9,16 +9,14 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import ColourMap
-from langsplat_core.display.displays import QUERY_COLOURS, mapped
+from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, mapped, painted
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.describe import Words
 from langsplat_core.scene import LEVELS, Camera
-from langsplat_viewer import staging
 from langsplat_viewer.actions import opening, settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.overlays import Face, Label, face_at, placed, visible_faces, world_axes
-from langsplat_viewer.drawing import channels
 from langsplat_viewer.files.photographs import corners
 from langsplat_viewer.panels.style import Area, elided, muted, width_of
 from langsplat_viewer.state import Hover
@@ -40,7 +38,7 @@ UNMOVED = (
 
 def draw_pictures(viewer: Viewer, area: Area, textures: tuple[moderngl.Texture, ...]) -> None:
     """The textures of `Canvas.textures` where they belong, each with its name if there are several."""
-    split = viewer.state.seeing.split
+    split = viewer.state.settings.split
     if split.mode == "wipe" and len(textures) > 1:
         _image(area, textures[0], 0.0, split.at)
         _image(area, textures[1], split.at, 1.0)
@@ -76,7 +74,7 @@ def _divider(area: Area, at: float) -> None:
 
 def _titles(viewer: Viewer, area: Area) -> None:
     """Write what each image shows at its upper edge: left and right of the line of a wipe."""
-    split, names = viewer.state.seeing.split, staging.labels(viewer.state)
+    split, names = viewer.state.settings.split, tuple(pane.label for pane in viewer.state.panes())
     gap, top = hello_imgui.em_size(0.6), area.top + hello_imgui.em_size(0.5)
     if split.mode == "wipe":
         x = area.left + split.at * area.width
@@ -105,7 +103,7 @@ def text_on_shade(text: str, x: float, y: float, area: Area) -> None:
 
 def draw_grip(viewer: Viewer, area: Area) -> None:
     """Draw the grip of the line of a wipe; a double click puts it into the middle."""
-    split = viewer.state.seeing.split
+    split = viewer.state.settings.split
     if split.mode != "wipe" or viewer.state.scene is None:
         return
     x = area.left + split.at * area.width
@@ -151,14 +149,14 @@ class PhotographOverlay:
         """Over every picture in the area, where one stands at its camera."""
         state = viewer.state
         photograph = opening.photograph_here(state)
-        if state.seeing.fade == 0 or photograph is None or photograph.image is None or state.view is None:
+        if state.settings.fade == 0 or photograph is None or photograph.image is None or state.view is None:
             return
         texture = self._upload(photograph.image)
-        count = staging.columns(state.seeing.split)
+        count = state.settings.split.columns
         width, paint = area.width / count, imgui.get_background_draw_list()
         shown = state.view.camera(max(round(width), 1), max(round(area.height), 1))
         left, top, right, bottom = corners(photograph.camera, shown)
-        tint = imgui.get_color_u32((1.0, 1.0, 1.0, state.seeing.fade))
+        tint = imgui.get_color_u32((1.0, 1.0, 1.0, state.settings.fade))
         for column in range(count):
             x = area.left + column * width
             end = ImVec2(x + width, area.top + area.height)
@@ -203,7 +201,7 @@ def draw_lines(viewer: Viewer, area: Area) -> None:
     state = viewer.state
     if state.scene is None or state.view is None or state.extent is None:
         return
-    count = staging.columns(state.seeing.split)
+    count = state.settings.split.columns
     width = area.width / count
     paint = imgui.get_background_draw_list()
     for column in range(count):
@@ -220,7 +218,7 @@ def draw_lines(viewer: Viewer, area: Area) -> None:
         _ruler(viewer, part, camera)
         paint.pop_clip_rect()
     _orthographic(viewer, area)
-    if state.seeing.ruler.measures and not imgui.get_io().want_capture_mouse:
+    if state.ruler.measures and not imgui.get_io().want_capture_mouse:
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_all)
         if clicked(area):
             mouse = imgui.get_io().mouse_pos
@@ -275,7 +273,7 @@ def _cameras(viewer: Viewer, area: Area, camera: Camera) -> None:
     owners = rows // edges.shape[1]
     segments, owners = segments[away[owners]], owners[away[owners]]
     under = -1
-    if not (imgui.get_io().want_capture_mouse or state.seeing.ruler.measures):
+    if not (imgui.get_io().want_capture_mouse or state.ruler.measures):
         mouse = imgui.get_io().mouse_pos
         row, distance = overlays.nearest_segment(segments, (mouse.x - area.left, mouse.y - area.top))
         under = int(owners[row]) if distance < REACH else -1
@@ -351,7 +349,7 @@ def _grid(viewer: Viewer, area: Area, camera: Camera, is_named: bool) -> None:
 
 def _ruler(viewer: Viewer, area: Area, camera: Camera) -> None:
     """The points that were clicked, and what lies between them."""
-    ruler, scene = viewer.state.seeing.ruler, viewer.state.scene
+    ruler, scene = viewer.state.ruler, viewer.state.scene
     assert scene is not None
     paint, least = imgui.get_background_draw_list(), _least_depth(viewer)
     for point in ruler.points:
@@ -397,9 +395,8 @@ def draw_legend(viewer: Viewer, area: Area) -> None:
     """A colour bar with numbers for every query that is painted."""
     state = viewer.state
     shown = state.shown_results()
-    slots = channels.painted(shown)
-    heats = any(one.picture.display == "relevancy" for one in staging.shown_pictures(state))
-    if state.scene is None or not heats or not slots:
+    slots = painted(shown)
+    if state.scene is None or not slots or not any(pane.row.legend for pane in state.panes()):
         return
     corner = ImVec2(
         area.left + area.width - hello_imgui.em_size(0.7), area.top + area.height - hello_imgui.em_size(0.7)
@@ -410,7 +407,7 @@ def draw_legend(viewer: Viewer, area: Area) -> None:
     for slot in slots:
         result = shown[slot]
         if result is not None:
-            strength = channels.STRENGTH[result.verdict]
+            strength = STRENGTH[result.verdict]
             _bar(result, bar_colours(slot, strength, len(slots) == 1, state.picture.colour_map))
     imgui.end()
 

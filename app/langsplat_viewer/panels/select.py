@@ -23,7 +23,7 @@ from langsplat_viewer.panels.style import (
     tip,
     width_of,
 )
-from langsplat_viewer.staging import TINT
+from langsplat_viewer.rendering.request import TINT
 from langsplat_viewer.viewer import Viewer
 
 Verb = tuple[str, Callable[[Viewer], object], str]  # button, action, tip

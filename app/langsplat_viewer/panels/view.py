@@ -8,13 +8,13 @@ from imgui_bundle import imgui
 
 from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
-from langsplat_viewer import staging
 from langsplat_viewer.actions import opening, settings, viewpoint
 from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, adopt_up, level, with_fov
 from langsplat_viewer.camera.overlays import length_text
 from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of, with_key
-from langsplat_viewer.drawing.channels import MOST_DEGREE, SIZE_RANGE, Clip, Splats
 from langsplat_viewer.panels.style import beside, beside_boxed, leave_room, muted, small_wrapped, tip
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.request import MOST_DEGREE, SIZE_RANGE, Splats
 from langsplat_viewer.viewer import Viewer
 
 CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut can be chosen
@@ -39,7 +39,7 @@ def draw_display(viewer: Viewer) -> None:
     picture = replace(picture, colour_map=viewer.state.picture.colour_map)
     settings.set_picture(viewer, replace(picture, background=_backdrop(picture.background)))
     tip("What shows where the scene is not")
-    transparent = viewer.state.seeing.transparent
+    transparent = viewer.state.settings.transparent
     changed, transparent = imgui.checkbox("Save without backdrop", transparent)
     if changed:
         settings.save_transparent(viewer, transparent)
@@ -49,7 +49,7 @@ def draw_display(viewer: Viewer) -> None:
 
 def _splats(viewer: Viewer) -> None:
     """How the Gaussians are drawn."""
-    scene, splats = viewer.state.scene, viewer.state.seeing.splats
+    scene, splats = viewer.state.scene, viewer.state.settings.splats
     size = _slider("Splat size", splats.size, *SIZE_RANGE)
     tip("Smaller, every Gaussian can be seen; answers and files do not change")
     degree, most = splats.sh_degree, MOST_DEGREE if scene is None else scene.gaussians.sh_degree
@@ -78,8 +78,7 @@ def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, flo
 
 def _colour_map(viewer: Viewer) -> None:
     """Draw the choice of a colour map where something is shown by it."""
-    shown = {DISPLAYS[one.picture.display].name for one in staging.shown_pictures(viewer.state)}
-    if not shown & {"relevancy", "depth"}:
+    if not any(pane.row.uses_map for pane in viewer.state.panes()):
         return
     names = list(COLOUR_MAPS)
     leave_room("Colour map", WIDTH_EM)
@@ -113,8 +112,8 @@ def _display_button(viewer: Viewer, button: Button) -> None:
 
 def _compared(viewer: Viewer) -> None:
     """Draw the choice of what is shown beside it."""
-    state, split = viewer.state, viewer.state.seeing.split
-    second = Button("", split.second, split.second_level if split.second == "latent" else None)
+    state, split = viewer.state, viewer.state.settings.split
+    second = Button("", split.second, split.second_level if DISPLAYS[split.second].by_level else None)
     shown = {"off": "nothing", "levels": "three levels", "wipe": compared_name(second)}[split.mode]
     leave_room("Beside it", WIDTH_EM)
     if not imgui.begin_combo("Beside it", shown):
@@ -147,7 +146,7 @@ def draw_overlays(viewer: Viewer) -> None:
         changed, shown = imgui.checkbox(title.capitalize(), name in state.preferences.overlays)
         if changed:
             settings.show_overlay(viewer, name, shown)
-    ruler, scene = state.seeing.ruler, state.scene
+    ruler, scene = state.ruler, state.scene
     measure = with_key("Measure", settings.toggle_measuring)
     imgui.begin_disabled(scene is None)
     changed, measures = imgui.checkbox(f"{measure}###measure", ruler.measures)
@@ -221,7 +220,7 @@ def _projection(viewer: Viewer, view: OrbitCamera) -> None:
 
 def _cuts(viewer: Viewer) -> None:
     """Near and far cut; at the ends of their sliders there is none."""
-    extent, clip = viewer.state.extent, viewer.state.seeing.clip
+    extent, clip = viewer.state.extent, viewer.state.settings.clip
     if extent is None:
         return
     low, high = (share * extent.radius for share in CUT_RANGE)
@@ -264,11 +263,11 @@ def _photograph(viewer: Viewer) -> None:
     state = viewer.state
     leave_room("Photograph", WIDTH_EM)
     flags = imgui.SliderFlags_.always_clamp
-    changed, fade = imgui.slider_float("Photograph", state.seeing.fade, 0.0, 1.0, "%.2f", flags)
+    changed, fade = imgui.slider_float("Photograph", state.settings.fade, 0.0, 1.0, "%.2f", flags)
     if changed:
         opening.fade_photograph(viewer, fade)
     tip("Lay the photograph of the training camera over the picture")
-    if state.seeing.fade == 0:
+    if state.settings.fade == 0:
         return
     photograph = opening.photograph_here(state)
     if photograph is None:

@@ -16,7 +16,7 @@ from langsplat_core.lab.speed.report import table as speed_table
 from langsplat_core.lab.speed.truth import make_truth
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.opengl.scene_textures import create_egl_context
-from langsplat_viewer.drawing.frame import is_software
+from langsplat_viewer.rendering.renderer import is_software
 
 SIZE = (960, 720)
 ENDLESS = replace(INRIA, transmittance_min=0.0)  # OpenGL cannot stop where a pixel is full
