@@ -27,6 +27,7 @@ import glfw  # isort: skip
 from langsplat_core.io import load_scene
 from langsplat_core.lab.speed.queries import repeated
 from langsplat_core.scene import Scene
+from langsplat_viewer import canvas
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.rendering.renderer import GlRenderer

@@ -452,7 +452,6 @@ def test_a_reload_with_other_gaussians_asks_anew(shown):
     settle(shown)
     (query,) = shown.state.queries
     assert query.result.members.shape == (180,)
-    assert shown.state.relevancies().shape == (180, 1)
     assert shown.state.selection.marks.selected.shape == (180,)
 
 

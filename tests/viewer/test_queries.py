@@ -34,7 +34,7 @@ def test_a_query_is_answered_and_shown(opened):
     columns = relevancies(Subject(360, answers=pane.answers))
     assert columns.shape == (360, 1)
     assert columns[:120].mean() > 0.9 > 0.6 > columns[120:].mean()
-    assert opened.state.heat_ranges() == (query.result.heat_range,)
+    assert pane.ranges == (query.result.heat_range,)
 
 
 def test_an_unknown_word_takes_no_colour_and_says_what_may_be_meant(opened):
@@ -138,20 +138,20 @@ def test_hiding_keeps_the_colours_of_the_others(opened):
     queries.show(opened, mug)
     assert (mug.slot, book.slot) == (0, 1)
     queries.remove(opened, book)
-    assert opened.state.relevancies().shape == (360, 1)
+    assert len(opened.state.shown_results()) == 1
     queries.remove(opened, mug)
-    assert opened.state.relevancies() is None
+    assert opened.state.shown_results() == ()
 
 
 def test_level_applies_to_every_query(opened):
     queries.ask(opened, "plant")
     settle(opened)
     assert opened.state.queries[0].result.level == 2
-    key = opened.state.layers_key()
+    key = opened.state.panes()
     queries.set_level(opened, "part")
     settle(opened)
     assert opened.state.queries[0].result.level == 1
-    assert opened.state.layers_key() != key
+    assert opened.state.panes() != key
 
 
 def test_the_box_is_emptied_by_a_search_and_by_nothing_else(opened):
@@ -211,13 +211,13 @@ def test_an_answer_ends_where_one_says_and_can_end_by_itself_again(asked):
     automatic = query.result
     assert automatic.own_cut is None
     assert 0 < automatic.members.sum() < 360
-    key = asked.state.layers_key()
+    key = asked.state.panes()
     for cut in (0.0, float(np.median(automatic.even)), 1.1):
         queries.set_cut(asked, query, cut)
         assert query.result.cut == cut
         np.testing.assert_array_equal(query.result.members, automatic.even >= np.float32(cut))
         assert query.result.heat_range[0] <= min(cut, automatic.peak)
-    assert asked.state.layers_key() != key
+    assert asked.state.panes() != key
     queries.set_cut(asked, query, None)
     assert query.result is automatic
 

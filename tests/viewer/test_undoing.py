@@ -39,7 +39,7 @@ def test_a_query_is_undone_and_done_again(opened):
     assert phrases(opened) == ["mug", "book"]
     assert [query.slot for query in opened.state.queries] == [0, 1]
     assert opened.state.picture.display == "relevancy"
-    assert opened.state.relevancies().shape == (360, 2)
+    assert len(opened.state.shown_results()) == 2
     undoing.redo(opened)
     assert "nothing to redo" in opened.state.messages[-1].text
 
@@ -76,7 +76,7 @@ def test_history_keeps_no_answers_of_queries_that_are_gone(opened, leave):
         queries.ask(opened, word)
         settle(opened)
         gone.append(weakref.ref(opened.state.queries[-1].result))
-        opened.state.relevancies()
+        opened.state.panes()
         leave(opened)
     gc.collect()
     assert [there() for there in gone] == [None, None]

@@ -20,13 +20,12 @@ from langsplat_core.query import surface
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.encoders import DEMO
-from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.actions.filming import load_path
 from langsplat_viewer.actions.history import forget, remember
 from langsplat_viewer.actions.queries import ask_again, load_queries, set_canonical
 from langsplat_viewer.actions.selecting import leave
 from langsplat_viewer.actions.settings import open_panel
-from langsplat_viewer.actions.viewpoint import opening_view
+from langsplat_viewer.actions.viewpoint import opening_view, read_bookmarks
 from langsplat_viewer.camera.controls import Extent, extent_of
 from langsplat_viewer.files import photographs
 from langsplat_viewer.files.browsing import SUFFIX as QUERIES
@@ -37,7 +36,7 @@ from langsplat_viewer.files.preferences import with_photographs, with_recent
 from langsplat_viewer.files.watching import Stamps, stamps
 from langsplat_viewer.marks import of_scene
 from langsplat_viewer.rendering.depth import UNCLIPPED, why_undrawable
-from langsplat_viewer.state import Recording, Ruler, ViewerState
+from langsplat_viewer.state import Recording, SceneState, ViewerState
 from langsplat_viewer.viewer import Viewer, Visit, unanswered, visit_of
 
 
@@ -111,39 +110,46 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state, scene = viewer.state, opened.scene
     if state.path is not None:
         viewer.visits[state.path.absolute()] = visit_of(state)
-    state.opening, state.path = None, path
-    if path.absolute() not in state.scenes:
-        state.scenes = (*state.scenes, path.absolute())
-    viewer.watch.begin(opened.read)
-    state.scene, state.extent = scene, opened.extent
-    state.doubts = opened.doubts
-    state.queries, state.selected, state.glide = [], None, None
-    state.canonical, state.canonical_typed = (), ""
-    state.selection = of_scene(state.selection, len(scene.gaussians))
-    state.camera_index = 0 if scene.cameras else None
-    state.settings, state.ruler = replace(state.settings, clip=UNCLIPPED), Ruler()
-    forget(viewer)
-    state.preferences = with_recent(state.preferences, path.absolute())
-    state.opening_camera = None
-    viewpoint.load(viewer)
-    state.record = Recording(size=state.record.size, fps=state.record.fps)
-    state.view, state.nothing = opening_view(viewer), why_undrawable(scene.gaussians)
-    viewer.engine, viewer.describer, state.hover = viewer.services.engine(scene), None, None
-    state.pointing = state.pointing and scene.language is not None
-    if scene.language is None and DISPLAYS[state.picture.display].needs_field:
-        state.picture = replace(state.picture, display="rgb")
-    reasons = ", ".join(f"{count:,} with {reason}" for reason, count in opened.unusable.items())
-    not_drawn = f"; not drawn: {reasons}" if reasons else ""
-    state.say(f"{path.name}: {len(scene.gaussians):,} Gaussians{not_drawn}")
-    for reason in scene.unread:
-        state.say(f"opened without what lies beside it: {reason}", is_error=True)
-    for doubt in opened.doubts:
-        state.say(doubt, is_error=True)
+    fresh = SceneState(
+        scene=scene,
+        path=path,
+        extent=opened.extent,
+        doubts=opened.doubts,
+        nothing=why_undrawable(scene.gaussians),
+        camera_index=0 if scene.cameras else None,
+        bookmarks=read_bookmarks(viewer, path),
+        record=Recording(size=state.record.size, fps=state.record.fps),
+        selection=of_scene(state.selection, len(scene.gaussians)),
+    )
+    state.begin(fresh)
+    state.view, state.opening = opening_view(viewer), None
+    state.settings = replace(state.settings, clip=UNCLIPPED)
     if scene.language is None:
-        state.say(no_field(scene))
-    else:
+        state.pointing = False
+        if DISPLAYS[state.picture.display].needs_field:
+            state.picture = replace(state.picture, display="rgb")
+    add_scenes(viewer, [path])
+    state.preferences = with_recent(state.preferences, path.absolute())
+    viewer.engine, viewer.describer = viewer.services.engine(scene), None
+    viewer.watch.begin(opened.read)
+    forget(viewer)
+    _say_opened(viewer, path, opened)
+    if scene.language is not None:
         _compile_search(viewer)
         _warm_up_encoder(viewer, viewer.services.encoder_id or scene.language.encoder_id)
+
+
+def _say_opened(viewer: Viewer, path: Path, opened: _Opened) -> None:
+    scene = opened.scene
+    reasons = ", ".join(f"{count:,} with {reason}" for reason, count in opened.unusable.items())
+    not_drawn = f"; not drawn: {reasons}" if reasons else ""
+    viewer.state.say(f"{path.name}: {len(scene.gaussians):,} Gaussians{not_drawn}")
+    for reason in scene.unread:
+        viewer.say_error(f"opened without what lies beside it: {reason}")
+    for doubt in opened.doubts:
+        viewer.say_error(doubt)
+    if scene.language is None:
+        viewer.state.say(no_field(scene))
 
 
 def _compile_search(viewer: Viewer) -> None:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -409,16 +410,13 @@ def delete_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
     _keep(viewer)
 
 
-def load(viewer: Viewer) -> None:
-    """Take those of the scene that was opened."""
-    state = viewer.state
-    state.bookmarks, state.bookmark_typed = (), ""
-    if state.path is None:
-        return
+def read_bookmarks(viewer: Viewer, scene: Path) -> tuple[Bookmark, ...]:
+    """Read the bookmarks of a scene file; where they make no sense, say so."""
     try:
-        state.bookmarks = viewer.shelf.read(state.path)
+        return viewer.shelf.read(scene)
     except InputError as error:
-        state.say(str(error), is_error=True)
+        viewer.say_error(str(error))
+        return ()
 
 
 def _keep(viewer: Viewer) -> None:
