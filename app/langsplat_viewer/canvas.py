@@ -22,11 +22,10 @@ from langsplat_core.errors import BackendError
 from langsplat_core.progress import Progress, watched
 from langsplat_core.scene import Gaussians
 from langsplat_core.scene.gaussians import Merged, merged
-from langsplat_viewer import actions
+from langsplat_viewer.actions import selecting, undoing, viewpoint
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.jobs import Worker
-from langsplat_viewer.keys import Changed
 from langsplat_viewer.rendering.depth import UNCLIPPED, why_nothing, why_undrawable
 from langsplat_viewer.rendering.renderer import GlRenderer, Rasterized, Rasterizing
 from langsplat_viewer.rendering.request import FULL, Detail, RenderRequest
@@ -207,7 +206,7 @@ class Canvas:
         if self._unsure and self._shown is not None:
             self._unsure = False
             if self._renderer_of(self._shown).shows_nothing():
-                state.nothing = _why_nothing(self._shown, state.preferences.keys)
+                state.nothing = _why_nothing(self._shown)
 
     def _target(self, key: Key, count: int) -> moderngl.Framebuffer:
         """A framebuffer for one of `count` panes; those of the last few sizes are kept, because moving
@@ -247,16 +246,16 @@ class Canvas:
         return self._fine.read(request)
 
 
-def _why_nothing(request: RenderRequest, keys: Changed) -> str:
+def _why_nothing(request: RenderRequest) -> str:
     gaussians = request.scene.scene.gaussians
     if len(request.scene.source.gaussians) and not len(gaussians):
-        shown = with_key("show what is hidden", actions.show_hidden, keys)
-        return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', actions.undo, keys)}"
+        shown = with_key("show what is hidden", selecting.show_hidden)
+        return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', undoing.undo)}"
     if request.clip != UNCLIPPED and gaussians.valid().any():
         return NOTHING_BETWEEN
     reason = why_nothing(gaussians, request.camera)
     elsewhere = not why_undrawable(gaussians)  # another view would show something
-    back = with_key("return to the opening view", actions.reset_view, keys)
+    back = with_key("return to the opening view", viewpoint.reset_view)
     return f"{reason}: {back}" if elsewhere else reason
 
 

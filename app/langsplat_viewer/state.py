@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from statistics import median
@@ -20,10 +20,9 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.files.browsing import Listing
-from langsplat_viewer.files.flight_files import Bookmark
+from langsplat_viewer.files.flights import Bookmark
 from langsplat_viewer.files.photographs import Photograph
 from langsplat_viewer.files.preferences import Preferences
-from langsplat_viewer.keys import Keying
 from langsplat_viewer.marks import Selection
 from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
 from langsplat_viewer.rendering.request import (
@@ -248,45 +247,55 @@ class TrainingForm:
 
 
 @dataclass(eq=False)
-class ViewerState:
-    """The viewer without its window."""
+class SceneState:
+    """The part of the state that begins anew with every scene."""
 
     scene: Scene | None = None
     path: Path | None = None
-    scenes: tuple[Path, ...] = ()  # to switch between, absolute
-    opening: Path | None = None  # the file being read, until it is open or has failed
     extent: Extent | None = None  # there whenever a scene is
+    doubts: tuple[str, ...] = ()  # quality warnings of its training, with the remedies
+    nothing: str = ""  # why the image shows nothing of the scene, where it does not
 
     view: OrbitCamera | None = None
     glide: Glide | None = None
     opening_camera: Camera | None = None  # what R returns to, where that is not the scene's own choice
-    doubts: tuple[str, ...] = ()  # what its training says against the scene, with the remedies
-    nothing: str = ""  # why the picture shows nothing of the scene, where it does not
     camera_index: int | None = None  # training camera last jumped to
-    fly_speed: float = 0.5  # scene radii per second
-    walks: bool = False  # the keys fly level, as one walks
     photograph: Photograph | None = None  # that was looked for last
-    bookmarks: tuple[Bookmark, ...] = ()  # of the scene shown
+    bookmarks: tuple[Bookmark, ...] = ()
     bookmark_typed: str = ""
     record: Recording = field(default_factory=Recording)
-
-    pointing: bool = False  # it is said what lies under the cursor
     hover: Hover | None = None
+    ruler: Ruler = field(default_factory=Ruler)
+    selection: Selection = field(default_factory=Selection)
+
+    queries: list[Query] = field(default_factory=list)
+    selected: Query | None = None  # whose details are shown
+    canonical: tuple[str, ...] = ()  # phrases that everything is compared with; none: the scene's own
+    canonical_typed: str = ""
+    suggestions: Suggestions = field(default_factory=Suggestions)
+    suggestions_of: Scene | None = None  # the scene for which they were looked for
+    _edited: EditedScene | None = None  # of the last request
+
+
+@dataclass(eq=False)
+class ViewerState(SceneState):
+    """The viewer without its window."""
+
+    scenes: tuple[Path, ...] = ()  # to switch between, absolute
+    opening: Path | None = None  # the file being read, until it is open or has failed
 
     picture: PictureConfig = field(default_factory=PictureConfig)
     latent_level: int = 2  # index into scene.LEVELS
     settings: ViewSettings = field(default_factory=ViewSettings)
-    ruler: Ruler = field(default_factory=Ruler)
     level: LevelChoice = "auto"
-    queries: list[Query] = field(default_factory=list)
-    selected: Query | None = None  # whose details are shown
+    pointing: bool = False  # it is said what lies under the cursor
+    fly_speed: float = 0.5  # scene radii per second
+    walks: bool = False  # the keys fly level, as one walks
+    coarse_while_moving: bool = True
+
     typed: str = ""
-    canonical: tuple[str, ...] = ()  # phrases that everything is compared with; none: the scene's own
-    canonical_typed: str = ""
     asked: list[str] = field(default_factory=list)  # what was searched for, the oldest first
     recalled: int = 0  # index into `asked` of the phrase last recalled; its length: none
-    suggestions: Suggestions = field(default_factory=Suggestions)
-    suggestions_of: Scene | None = None  # the scene for which they were looked for
     focus_input: bool = False  # the query box takes the keyboard at the next frame
 
     training_form: TrainingForm = field(default_factory=TrainingForm)
@@ -296,19 +305,20 @@ class ViewerState:
     stats: FrameStats = field(default_factory=FrameStats)
     backend: str = ""
     size: tuple[int, int] = (1, 1)  # pixels of the scene's area
-    coarse_while_moving: bool = True
     wanted_panel: str = ""  # the title of one that is opened and brought to the front at the next frame
     show_panel: bool = True  # the panels, as many as are open
     show_help: bool = False
-    keying: Keying = field(default_factory=Keying)
     show_palette: bool = False
     palette_typed: str = ""
     browser: Listing | None = None  # the folder that the file browser shows, while it is open
     picks_folder: bool = False  # it is there to choose the folder of the photographs
     preferences: Preferences = field(default_factory=Preferences)
-    selection: Selection = field(default_factory=Selection)
     letters_muted: bool = False  # letters are no keys: they were meant for a box that cannot be typed in
-    _edited: EditedScene | None = None  # of the last request
+
+    def begin(self, fresh: SceneState) -> None:
+        """Show another scene: all that belongs to the one before is gone."""
+        for part in fields(SceneState):
+            setattr(self, part.name, getattr(fresh, part.name))
 
     def say(self, text: str, is_error: bool = False) -> None:
         """Add one line to the messages area."""

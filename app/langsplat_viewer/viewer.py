@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, Any, Protocol, TypeVar
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import Display, TrainPreset
@@ -21,9 +21,9 @@ from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.flight import Keyframe
-from langsplat_viewer.files.flight_files import Shelf
+from langsplat_viewer.files.flights import Shelf
 from langsplat_viewer.files.watching import Stamps, Watch
-from langsplat_viewer.jobs import Worker
+from langsplat_viewer.jobs import Job, Worker
 from langsplat_viewer.marks import Pair
 from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.request import RenderRequest
@@ -189,6 +189,9 @@ def unanswered(query: Query) -> Query:
 # The viewer without its window: its state, what acts on it, and what it needs from elsewhere.
 
 
+T = TypeVar("T")
+
+
 class Surface(Protocol):
     """The picture on screen, as far as actions need it."""
 
@@ -245,4 +248,24 @@ class Viewer:
     surface: Surface | None = None
     training: Training | None = None  # under way
     history: History = field(default_factory=History)
-    clock: float = 0.0  # seconds, as of the last `actions.tick`
+    clock: float = 0.0  # seconds, as of the last frame
+
+    def run(
+        self,
+        label: str,
+        work: Callable[[Progress], T],
+        done: Callable[[T], None] = lambda result: None,
+        failed: Callable[[str], None] | None = None,
+    ) -> Job:
+        """Have the worker do `work`; `take_results` then calls `done` with its result, or `failed` with the
+        reason, which by default is said."""
+        return self.worker.submit(label, work, done, failed or self.say_error)
+
+    def take_results(self) -> None:
+        """Hand over what the worker and the recorder have finished; the one place where results of other
+        threads arrive. Call once per frame."""
+        self.worker.poll()
+        self.recorder.poll()
+
+    def say_error(self, reason: str) -> None:
+        self.state.say(reason, is_error=True)

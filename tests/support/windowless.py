@@ -7,7 +7,7 @@ import numpy as np
 
 from langsplat_core.errors import FormatError
 from langsplat_core.scene import Scene
-from langsplat_viewer import actions
+from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.rendering.request import RenderRequest
 from langsplat_viewer.state import GLIDE_SECONDS, ViewerState
@@ -81,14 +81,16 @@ def settle(viewer: Viewer, seconds: float = 120.0) -> None:
     end = time.monotonic() + seconds
     while viewer.worker.current is not None:
         assert time.monotonic() < end, "the worker never finished"
-        actions.tick(viewer, 0.0)
+        viewer.take_results()
+        viewpoint.tick(viewer, 0.0)
         time.sleep(0.002)
-    actions.tick(viewer, 0.0)
+    viewer.take_results()
+    viewpoint.tick(viewer, 0.0)
 
 
 def arrive(viewer: Viewer) -> None:
     """Let a gliding camera arrive."""
-    actions.tick(viewer, viewer.clock + 2 * GLIDE_SECONDS)
+    viewpoint.tick(viewer, viewer.clock + 2 * GLIDE_SECONDS)
 
 
 def errors(viewer: Viewer) -> list[str]:

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from langsplat_viewer import __main__ as program
-from langsplat_viewer import actions, options
+from langsplat_viewer import options
+from langsplat_viewer.actions import opening
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import FakeEncoder
 from tests.support.windowless import FakeSurface, load, settle
@@ -27,7 +28,7 @@ def viewer() -> Iterator[Viewer]:
 @pytest.fixture
 def opened(viewer: Viewer) -> Viewer:
     """Shows the scene of three blobs."""
-    actions.open_scene(viewer, Path("blobs.ply"))
+    opening.open_scene(viewer, Path("blobs.ply"))
     settle(viewer)
     return viewer
 

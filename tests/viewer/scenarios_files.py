@@ -12,8 +12,9 @@ from PIL import Image
 from imgui_bundle import imgui  # isort: skip
 from langsplat_core.io import save_scene
 from langsplat_core.pipeline.report import REPORT
-from langsplat_viewer import actions
-from langsplat_viewer.panels.area import scene_area
+from langsplat_viewer import viewer as training
+from langsplat_viewer.actions import opening, settings, viewpoint
+from langsplat_viewer.panels.style import scene_area
 from tests.support.fakes import CENTRES, blob_scene
 
 
@@ -41,57 +42,6 @@ def reload_what_changed(s: Any) -> None:
     assert hot[0] > hot[2] + 60
 
 
-def change_a_key(s: Any) -> None:
-    """The key that is pressed is the command's from then on, and does nothing else while it is waited for."""
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
-    key, ctrl = imgui.Key, imgui.Key.mod_ctrl
-    s.menu("Help", "Change the keys")
-    s.ctx.yield_(3)
-    s.ctx.item_click("//Keys/##words")
-    s.ctx.key_chars("show")
-    s.ctx.yield_(3)
-    s.shot("some keys")
-    s.ctx.item_click("//**/show depth/2 ##key")
-    s.ctx.yield_(2)
-    assert s.state.keying.waiting == "show depth"
-    s.shot("waiting")
-    s.ctx.key_press(ctrl | key.z)  # of "undo"
-    s.ctx.yield_(3)
-    assert s.state.keying.conflict.owner == "undo"
-    s.shot("conflict")
-    s.ctx.item_click("//Keys/Leave it")
-    s.ctx.item_click("//**/show depth/2 ##key")
-    s.ctx.yield_(2)
-    s.ctx.key_press(key.space)
-    s.ctx.yield_(3)
-    assert s.state.preferences.keys == {"show depth": ("Space",)}
-    s.ctx.item_click("//**/show alpha/3 ##key")
-    s.ctx.yield_(2)
-    s.ctx.key_press(key.escape)
-    s.ctx.yield_(3)
-    assert s.state.show_help
-    assert s.state.keying.waiting == ""
-    s.ctx.item_click("//**/show alpha/3 ##key")
-    s.ctx.yield_(2)
-    s.ctx.key_chars("%")
-    s.ctx.yield_(3)
-    assert s.state.preferences.keys["show alpha"] == ("%",)
-    s.shot("changed keys")
-    s.ctx.key_press(key.escape)
-    s.ctx.yield_(3)
-    assert not s.state.show_help
-    s.ctx.key_press(digit_key(2))
-    s.ctx.yield_(3)
-    assert s.state.picture.display == "rgb"
-    s.ctx.key_press(key.space)
-    s.ctx.yield_(3)
-    assert s.state.picture.display == "depth"
-    s.ctx.key_chars("%")
-    s.ctx.yield_(3)
-    assert s.state.picture.display == "alpha"
-
-
 def fade_in_a_photograph(s: Any) -> None:
     """The slider lays it over the picture where the camera saw it; elsewhere there is none."""
     s.wait(lambda: s.state.scene is not None)
@@ -101,11 +51,11 @@ def fade_in_a_photograph(s: Any) -> None:
     colours = np.full((240, 320, 3), (250, 120, 10), np.uint8)
     colours[:, 160:] = (20, 60, 240)
     Image.fromarray(colours).save(folder / "photo_1.png")
-    actions.open_panel(viewer, "Camera")
-    actions.go_to_camera(viewer, 1)
+    settings.open_panel(viewer, "Camera")
+    viewpoint.go_to_camera(viewer, 1)
     s.settle()
     plain = s.shot("plain")
-    actions.fade_photograph(viewer, 1.0)
+    opening.fade_photograph(viewer, 1.0)
     s.settle()
     s.ctx.yield_(3)
     assert "no photograph 'photo_1'" in s.state.photograph.reason
@@ -125,14 +75,14 @@ def fade_in_a_photograph(s: Any) -> None:
     np.testing.assert_allclose(shot[middle, left + quarter], (250, 120, 10), atol=3)
     np.testing.assert_allclose(shot[middle, left + 3 * quarter], (20, 60, 240), atol=3)
     assert (shot[int(area.top) + 30, left + quarter] == plain[int(area.top) + 30, left + quarter]).all()
-    actions.fade_photograph(viewer, 0.5)
+    opening.fade_photograph(viewer, 0.5)
     s.ctx.yield_(3)
     half = s.shot("half")
     place = middle, left + quarter
     np.testing.assert_allclose(half[place], (shot[place] + plain[place]) / 2, atol=4)
     s.drag((600, 300), (656, 279))
     s.settle()
-    assert actions.photograph_here(s.state) is None
+    assert opening.photograph_here(s.state) is None
 
 
 def switch_between_scenes(s: Any) -> None:
@@ -181,9 +131,9 @@ def watch_a_training(s: Any) -> None:
     photographs.mkdir()
     for number in range(3):
         (photographs / f"{number}.jpg").write_bytes(b"")
-    viewer.command = lambda request: [sys.executable, "-c", TRAINS]
-    actions.choose_photographs(viewer, photographs)
-    actions.open_panel(viewer, "Train")
+    training.command = lambda request: [sys.executable, "-c", TRAINS]
+    opening.choose_photographs(viewer, photographs)
+    settings.open_panel(viewer, "Train")
     s.ctx.yield_(3)
     s.ctx.item_click("//Train/Train")
     s.wait(lambda: viewer.training is not None and len(viewer.training.progress.losses) > 50)
@@ -216,9 +166,9 @@ def read_what_speaks_against(s: Any) -> None:
     report = s.folder / "photos.work" / REPORT
     report.parent.mkdir()
     report.write_text(json.dumps({"gaussians": len(s.state.scene.gaussians), "doubts": DOUBTS}))
-    viewer.command = lambda request: [sys.executable, "-c", "print('photos.ply: 360 Gaussians')"]
-    actions.choose_photographs(viewer, photographs)
-    actions.open_panel(viewer, "Train")
+    training.command = lambda request: [sys.executable, "-c", "print('photos.ply: 360 Gaussians')"]
+    opening.choose_photographs(viewer, photographs)
+    settings.open_panel(viewer, "Train")
     s.ctx.yield_(3)
     before = s.shot("before")
     s.ctx.item_click("//Train/Train")
@@ -234,7 +184,7 @@ def read_what_speaks_against(s: Any) -> None:
     )
     reddish = (after[here].astype(int)[..., 0] - after[here][..., 2] > 40).sum()
     assert reddish > 200 > (before[here].astype(int)[..., 0] - before[here][..., 2] > 40).sum()
-    actions.switch_scene(viewer, s.folder / "blobs.ply")
+    opening.switch_scene(viewer, s.folder / "blobs.ply")
     s.wait(lambda: s.state.path.name == "blobs.ply")
     s.settle()
     assert s.state.doubts == ()
@@ -251,5 +201,4 @@ SCENARIOS: dict[str, Scenario] = {
     "switch_between_scenes": (switch_between_scenes, "blobs.ply", {}),
     "watch_a_training": (watch_a_training, "blobs.ply", {}),
     "read_what_speaks_against": (read_what_speaks_against, "blobs.ply", {}),
-    "change_a_key": (change_a_key, "blobs.ply", {}),
 }

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from typing import Any
 
 from imgui_bundle import imgui  # isort: skip
-from langsplat_viewer import actions
-from langsplat_viewer.panels.area import scene_area
+from langsplat_viewer.actions import settings
 from langsplat_viewer.panels.layout import PANELS
+from langsplat_viewer.panels.style import scene_area
 
 LONG = "mugg or boook or plent or mugg or boook or plent or mugg or boook or plent or mugg"
 
@@ -19,23 +19,22 @@ def large_letters(s: Any) -> None:
         s.search(phrase)
     assert s.state.queries[-1].meant  # a long one, and so is the button for it
     narrow = scene_area().left
-    actions.set_ui_scale(s.window.viewer, 2.0)
+    settings.set_ui_scale(s.window.viewer, 2.0)
     s.settle()
     assert 1.3 * narrow < scene_area().left <= 0.41 * 1280
     for panel in PANELS:
-        actions.open_panel(s.window.viewer, panel.title)
+        settings.open_panel(s.window.viewer, panel.title)
         s.settle()
         assert seen_items(s, panel.title), panel.title
         assert cut_off(s, panel.title) == [], panel.title
-    actions.edit_keys(s.window.viewer, True)
+    settings.show_help(s.window.viewer, True)
     s.settle()
     keys = s.ctx.window_info("//Keys").window
-    assert keys.scroll_max.y == 0  # the list in it scrolls, the window does not
     assert 0 <= keys.pos.x <= keys.pos.x + keys.size.x <= 1280
     assert 0 <= keys.pos.y <= keys.pos.y + keys.size.y <= 720
     s.shot("large letters")
-    actions.escape(s.window.viewer)
-    actions.set_ui_scale(s.window.viewer, 1.0)
+    settings.escape(s.window.viewer)
+    settings.set_ui_scale(s.window.viewer, 1.0)
     s.settle()
     assert abs(scene_area().left - narrow) < 0.15 * narrow
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from imgui_bundle import imgui  # isort: skip
-from langsplat_viewer import actions
-from langsplat_viewer.files.flight_files import read_flight
+from langsplat_viewer.actions import filming, settings
+from langsplat_viewer.files.flights import read_flight
 
 
 def record_and_play(s) -> None:
@@ -12,7 +12,7 @@ def record_and_play(s) -> None:
     s.wait(lambda: s.state.scene is not None)
     s.settle()
     record = s.state.record
-    actions.open_panel(s.window.viewer, "Record")
+    settings.open_panel(s.window.viewer, "Record")
     s.ctx.yield_(4)
     for end in ((656, 300), (700, 320)):
         s.ctx.key_press(imgui.Key.k)
@@ -27,7 +27,7 @@ def record_and_play(s) -> None:
     s.ctx.yield_(2)
     assert len(record.keyframes) == 3
 
-    actions.set_path_seconds(s.window.viewer, 1.0)
+    filming.set_path_seconds(s.window.viewer, 1.0)
     start = s.shot("start")
     s.ctx.item_click("//**/Play##path")
     s.wait(lambda: 0.2 < record.at < 1.0)
@@ -46,9 +46,9 @@ def record_and_play(s) -> None:
     s.ctx.item_click("//**/Save path")
     s.ctx.yield_(2)
     assert len(read_flight(s.folder / "blobs-001.path.json").keyframes) == 3
-    actions.set_film_size(s.window.viewer, 32, 24)
-    actions.set_film_fps(s.window.viewer, 4.0)
-    actions.type_film(s.window.viewer, "film")
+    filming.set_film_size(s.window.viewer, 32, 24)
+    filming.set_film_fps(s.window.viewer, 4.0)
+    filming.type_film(s.window.viewer, "film")
     s.ctx.item_click("//Record/Save film")
     s.wait(lambda: s.window.viewer.recorder.current is None)
     s.ctx.yield_(3)
@@ -65,7 +65,7 @@ def mark_and_return(s) -> None:
     s.ctx.key_press(imgui.Key.keypad7)
     s.settle()
     np.testing.assert_allclose(s.state.view.rotation[2], -start.up, atol=1e-6)
-    actions.open_panel(s.window.viewer, "Bookmarks")
+    settings.open_panel(s.window.viewer, "Bookmarks")
     s.ctx.yield_(4)
     s.ctx.item_click("//**/view 1##bookmark")
     s.settle()

@@ -9,11 +9,12 @@ import numpy as np
 from PIL import Image
 
 from imgui_bundle import imgui  # isort: skip
-from langsplat_viewer import actions, canvas
+from langsplat_viewer import canvas
+from langsplat_viewer.actions import queries, selecting, settings, viewpoint
 from langsplat_viewer.camera.overlays import Label, visible_faces
-from langsplat_viewer.panels import over
-from langsplat_viewer.panels.area import Area, scene_area
-from langsplat_viewer.panels.cube import EDGE
+from langsplat_viewer.panels import overlays
+from langsplat_viewer.panels.overlays import EDGE
+from langsplat_viewer.panels.style import Area, scene_area
 from langsplat_viewer.rendering.renderer import ArrayChannels
 from tests.support.fakes import CENTRES
 
@@ -125,9 +126,9 @@ def draw_over_the_scene(s: Any) -> None:
 def cut_by_depth(s: Any) -> None:
     """The sliders of the panel leave out what is nearer or farther; undone at their ends."""
     begin(s)
-    actions.open_panel(s.window.viewer, "Camera")
+    settings.open_panel(s.window.viewer, "Camera")
     s.ctx.yield_(3)
-    actions.look_from(s.window.viewer, "left")
+    viewpoint.look_from(s.window.viewer, "left")
     s.settle()
     before = s.shot("whole")
     depths = [float((thing - s.state.view.eye) @ s.state.view.rotation[2]) for thing in CENTRES]
@@ -145,12 +146,12 @@ def cut_by_depth(s: Any) -> None:
 def time_and_compare(s: Any) -> None:
     """The panel tells medians while it is seen, and the error of what is shown."""
     begin(s)
-    actions.open_panel(s.window.viewer, "Timing")
+    settings.open_panel(s.window.viewer, "Timing")
     s.ctx.yield_(3)
     for key in (imgui.Key["_2"], imgui.Key["_1"]):
         s.ctx.key_press(key)
         s.settle()
-    actions.ask(s.window.viewer, "mug")
+    queries.ask(s.window.viewer, "mug")
     s.settle()
     told = dict(s.state.timing.medians())
     assert {"Blend", "Picture, all of it", "Panels", "Search"} <= set(told)
@@ -236,7 +237,7 @@ def measure_and_select(s: Any) -> None:
     s.ctx.key_press(imgui.Key.escape)
     s.ctx.yield_(2)
 
-    actions.use_tool(s.window.viewer, "lasso")
+    selecting.use_tool(s.window.viewer, "lasso")
     middle = np.array(on_screen(s, BOOK))
     reach = 0.45 * (on_screen(s, PLANT)[0] - middle[0])
     turns = np.linspace(0, 2 * np.pi, 16)
@@ -252,7 +253,7 @@ def measure_and_select(s: Any) -> None:
     assert selected[0] == selected[2] == 0
     assert selected[1] > 40
     s.shot("selected")
-    actions.use_tool(s.window.viewer, None)
+    selecting.use_tool(s.window.viewer, None)
 
 
 def look_without_perspective(s: Any) -> None:
@@ -284,7 +285,7 @@ def look_without_perspective(s: Any) -> None:
     s.ctx.key_press(imgui.Key.home)
     s.settle()
     assert s.state.view.back > 0
-    actions.open_panel(s.window.viewer, "Camera")
+    settings.open_panel(s.window.viewer, "Camera")
     s.ctx.yield_(4)
     s.ctx.item_click("//Camera/###orthographic")
     s.settle()
@@ -294,7 +295,7 @@ def look_without_perspective(s: Any) -> None:
     s.ctx.key_press(imgui.Key.keypad5)
     s.ctx.yield_(2)
     assert s.state.view.back > 0
-    actions.zoom_by(s.window.viewer, 4.0)  # until all cameras are in the picture
+    viewpoint.zoom_by(s.window.viewer, 4.0)  # until all cameras are in the picture
     s.settle()
     s.shot("cameras")
     click(s, on_screen(s, s.state.scene.cameras[2].position))
@@ -305,21 +306,21 @@ def look_without_perspective(s: Any) -> None:
 def name_what_is_close(s: Any) -> None:
     """Things in one line of sight have their names one above the other."""
     begin(s)
-    actions.show_overlay(s.window.viewer, "things", True)
+    settings.show_overlay(s.window.viewer, "things", True)
     for word in ("mug", "book", "plant"):
         s.search(word)
-    actions.look_from(s.window.viewer, "left")
+    viewpoint.look_from(s.window.viewer, "left")
     s.settle()
-    written, write = [], over.text_on_shade
+    written, write = [], overlays.text_on_shade
 
     def remembered(text: str, x: float, y: float, area: Area) -> None:
         size = imgui.calc_text_size(text)
         written.append((text, Label(x, y, size.x, size.y)))
         write(text, x, y, area)
 
-    over.text_on_shade = remembered
+    overlays.text_on_shade = remembered
     s.ctx.yield_(2)
-    over.text_on_shade = write
+    overlays.text_on_shade = write
     frame = dict(written)
     assert set(frame) == {"mug", "book", "plant"}
     assert not any(a.covers(b) for a, b in combinations(frame.values(), 2))

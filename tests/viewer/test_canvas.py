@@ -16,11 +16,11 @@ import pytest
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import load_rasterizer
-from langsplat_viewer import actions
+from langsplat_viewer.actions import queries, selecting, settings, undoing, viewpoint
 from langsplat_viewer.camera.controls import default_view, extent_of, orbit
 from langsplat_viewer.canvas import FINE, MOVING_BUDGET, NOTHING_LEFT, REST_SECONDS, Canvas, Level, Pace
 from langsplat_viewer.marks import unmarked
-from langsplat_viewer.panels.timing import in_numbers
+from langsplat_viewer.panels.layout import in_numbers
 from langsplat_viewer.rendering import renderer as renderers
 from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer
@@ -212,17 +212,17 @@ def test_several_panes_are_drawn_and_then_it_rests(gl, opened):
     drawn, original = [], renderer.draw
     renderer.draw = lambda request, targets: (drawn.append(request), original(request, targets))
     for display in DISPLAYS:
-        actions.compare_with(opened, display)
+        settings.compare_with(opened, display)
         rest(canvas, state, 1.0)
         assert [texture.size for texture in canvas.textures] == [(60, 40)] * 2
     drawn.clear()
-    actions.move_line(opened, 0.2)  # the window draws the line
+    settings.move_line(opened, 0.2)  # the window draws the line
     rest(canvas, state, 2.0)
     assert drawn == []
     both = canvas.capture(state.request())
-    actions.show_one(opened)
+    settings.show_one(opened)
     np.testing.assert_array_equal(canvas.capture(state.request())[:, :12], both[:, :12])
-    actions.toggle_levels(opened)
+    settings.toggle_levels(opened)
     rest(canvas, state, 3.0)
     assert [texture.size for texture in canvas.textures] == [(20, 40)] * 3
     assert canvas.capture(state.request()).shape == (40, 60, 3)
@@ -232,12 +232,12 @@ def test_several_panes_are_drawn_and_then_it_rests(gl, opened):
 def test_the_surface_is_found_in_every_column(gl, opened):
     canvas, state = Canvas(gl, GlRenderer(gl, "cpu")), opened.state
     state.size = (240, 120)
-    actions.toggle_levels(opened)
+    settings.toggle_levels(opened)
     rest(canvas, state, 1.0)
     places = [canvas.point_at((column + 0.5) / 3, 0.5) for column in range(3)]
     assert all(place is not None for place in places)
     np.testing.assert_allclose(places[1:], [places[0]] * 2)
-    actions.show_one(opened)
+    settings.show_one(opened)
     rest(canvas, state, 2.0)
     np.testing.assert_allclose(canvas.point_at(0.5, 0.5), places[0], atol=0.1)
 
@@ -276,9 +276,9 @@ def gated(monkeypatch: pytest.MonkeyPatch) -> Gated:
 
 @pytest.fixture
 def asked(opened: Viewer) -> Viewer:
-    actions.ask(opened, "mug")
+    queries.ask(opened, "mug")
     settle(opened)
-    actions.resize(opened, *SIZE)
+    settings.resize(opened, *SIZE)
     return opened
 
 
@@ -337,16 +337,16 @@ def test_the_window_s_thread_projects_no_fine_picture(gl, asked, canvas, gated):
 
 
 CHANGES = {
-    "camera": lambda v: actions.look_from(v, "left"),
-    "undone camera": lambda v: (actions.look_from(v, "left"), actions.reset_view(v)),
-    "marks": actions.select_all,
-    "deleted": lambda v: (actions.select_all(v), actions.delete_selected(v)),
-    "undone": lambda v: (actions.select_all(v), actions.delete_selected(v), actions.undo(v)),
-    "splats": lambda v: actions.set_splats(v, Splats(0.5)),
-    "cut": lambda v: actions.set_clip(v, Clip(1.0)),
-    "display": lambda v: actions.set_display(v, "depth"),
-    "query": lambda v: actions.hide(v, v.state.queries[0]),
-    "size": lambda v: actions.resize(v, 100, 80),
+    "camera": lambda v: viewpoint.look_from(v, "left"),
+    "undone camera": lambda v: (viewpoint.look_from(v, "left"), viewpoint.reset_view(v)),
+    "marks": selecting.select_all,
+    "deleted": lambda v: (selecting.select_all(v), selecting.delete_selected(v)),
+    "undone": lambda v: (selecting.select_all(v), selecting.delete_selected(v), undoing.undo(v)),
+    "splats": lambda v: settings.set_splats(v, Splats(0.5)),
+    "cut": lambda v: settings.set_clip(v, Clip(1.0)),
+    "display": lambda v: settings.set_display(v, "depth"),
+    "query": lambda v: queries.hide(v, v.state.queries[0]),
+    "size": lambda v: settings.resize(v, 100, 80),
     "scene": lambda v: setattr(v.state, "scene", replace(v.state.scene)),
 }
 
@@ -359,8 +359,8 @@ def test_what_became_stale_is_dropped(gl, asked, canvas, gated, monkeypatch, nam
     canvas.update(asked.state, 0.0)
     until(lambda: len(gated.threads) == 1)  # it is under way
     CHANGES[name](asked)
-    actions.tick(asked, 10.0)
-    actions.tick(asked, 20.0)
+    viewpoint.tick(asked, 10.0)
+    viewpoint.tick(asked, 20.0)
     canvas.update(asked.state, 20.0)
     canvas.update(asked.state, 21.0)
     gated.gate.set()
@@ -373,7 +373,7 @@ def test_what_became_stale_is_dropped(gl, asked, canvas, gated, monkeypatch, nam
 def test_what_changes_no_projection_does_not_begin_anew(gl, asked, canvas, gated):
     canvas.update(asked.state, 0.0)
     until(lambda: len(gated.threads) == 1)
-    actions.set_picture(asked, replace(asked.state.picture, dim=0.1))
+    settings.set_picture(asked, replace(asked.state.picture, dim=0.1))
     canvas.update(asked.state, 1.0)
     gated.gate.set()
     rest(canvas, asked.state, 2.0)
@@ -384,8 +384,8 @@ def test_what_changes_no_projection_does_not_begin_anew(gl, asked, canvas, gated
 def test_a_camera_that_moves_on_is_followed_coarsely(asked, canvas, gated):
     canvas.update(asked.state, 0.0)
     until(lambda: len(gated.threads) == 1)
-    actions.look_from(asked, "left")
-    actions.tick(asked, 10.0)
+    viewpoint.look_from(asked, "left")
+    viewpoint.tick(asked, 10.0)
     canvas.update(asked.state, 10.0)
     assert gated.threads[1:] == [main_thread()]
     assert not canvas.waits
@@ -400,8 +400,8 @@ def test_told_to_stay_fine_it_draws_while_the_camera_moves(asked, canvas, gated)
     asked.state.coarse_while_moving = False
     gated.gate.set()
     rest(canvas, asked.state, 0.0)
-    actions.look_from(asked, "left")
-    actions.tick(asked, 10.0)
+    viewpoint.look_from(asked, "left")
+    viewpoint.tick(asked, 10.0)
     canvas.update(asked.state, 10.0)
     assert gated.threads[1:] == [main_thread()]
     assert asked.state.stats.scale == 1
@@ -417,7 +417,7 @@ def test_an_error_is_said_once_and_another_picture_is_tried(gl, asked, canvas, g
     assert not canvas.update(asked.state, 2.0)
     assert len(gated.threads) == 1
     gated.error = None
-    actions.set_clip(asked, Clip(1.0))
+    settings.set_clip(asked, Clip(1.0))
     rest(canvas, asked.state, 3.0)
     np.testing.assert_array_equal(on_screen(canvas), expected(gl, asked))
 
@@ -430,7 +430,7 @@ def test_until_it_is_there_merged_gaussians_show_what_was_changed(gl, asked, gat
     until(lambda: not canvas.is_running)
     gated.gate.clear()
     monkeypatch.setattr("langsplat_viewer.canvas.MERGED_SHARE", 1e-3)
-    actions.set_splats(asked, Splats(0.5))
+    settings.set_splats(asked, Splats(0.5))
     for now in (1.0, 2.0, 3.0):
         assert canvas.update(asked.state, now)
     assert sizes(quick) == [(60, 45)]
@@ -591,7 +591,7 @@ def drawn(gl, opened, request):
     renderer = GlRenderer(gl, request.param, "single")
     opened.surface = canvas = Canvas(gl, renderer)
     opened.state.backend = renderer.backend
-    actions.resize(opened, 400, 300)
+    settings.resize(opened, 400, 300)
     rest(canvas, opened.state, 0.0)
     yield opened
     renderer.release()
@@ -599,10 +599,10 @@ def drawn(gl, opened, request):
 
 def test_the_steps_of_a_picture_are_measured_while_the_panel_is_seen(drawn):
     assert drawn.state.timing.medians() == []
-    actions.measure_frame(drawn)
+    viewpoint.measure_frame(drawn)
     drawn.state.coarse_while_moving = False
-    actions.look_from(drawn, "left")
-    actions.tick(drawn, 10.0)
+    viewpoint.look_from(drawn, "left")
+    viewpoint.tick(drawn, 10.0)
     rest(drawn.surface, drawn.state, 10.0)
     laps, steps = drawn.state.timing.laps, {"projection", "sort", "blend", "compose"}
     if drawn.state.backend == "cpu":
@@ -614,20 +614,20 @@ def test_the_steps_of_a_picture_are_measured_while_the_panel_is_seen(drawn):
 def test_the_panel_has_a_picture_measured_when_it_opens(drawn):
     """All of its steps, though nothing has changed; once."""
     for now in (10.0, 11.0):
-        actions.measure_frame(drawn)
+        viewpoint.measure_frame(drawn)
         rest(drawn.surface, drawn.state, now)
         counts = {name: len(measured) for name, measured in drawn.state.timing.laps.items()}
         assert counts.keys() >= {"projection", "sort", "blend", "compose", "picture"}
         assert set(counts.values()) == {1}
     drawn.state.timing.wanted = False  # closed, and opened again
     rest(drawn.surface, drawn.state, 12.0)
-    actions.measure_frame(drawn)
+    viewpoint.measure_frame(drawn)
     rest(drawn.surface, drawn.state, 13.0)
     assert {len(measured) for measured in drawn.state.timing.laps.values()} == {2}
 
 
 def test_a_search_is_measured(opened):
-    actions.ask(opened, "mug")
+    queries.ask(opened, "mug")
     settle(opened)
     assert [title for title, _ in opened.state.timing.medians()] == ["Search"]
 
@@ -642,18 +642,18 @@ def wait(viewer) -> None:
 def test_what_is_shown_is_that_of_the_reference(drawn, look):
     """Whatever is chosen in the window: queries, split, marks, cuts, splats."""
     if look != "plain":
-        actions.ask(drawn, "mug")
+        queries.ask(drawn, "mug")
         settle(drawn)
     if look == "wipe":
-        actions.toggle_wipe(drawn)
+        settings.toggle_wipe(drawn)
     if look == "levels":
-        actions.toggle_levels(drawn)
+        settings.toggle_levels(drawn)
     if look == "changed":
-        actions.select_all(drawn)
-        actions.set_splats(drawn, Splats(0.5, 0))
-        actions.set_clip(drawn, Clip(1.0, 5.2))
-        actions.set_colour_map(drawn, "viridis")
-    actions.compare_with_reference(drawn)
+        selecting.select_all(drawn)
+        settings.set_splats(drawn, Splats(0.5, 0))
+        settings.set_clip(drawn, Clip(1.0, 5.2))
+        settings.set_colour_map(drawn, "viridis")
+    viewpoint.compare_with_reference(drawn)
     wait(drawn)
     found = drawn.state.timing.comparison
     assert errors(drawn) == []
@@ -671,7 +671,7 @@ def test_what_is_wrong_is_told(drawn, monkeypatch):
     )
     capture = drawn.surface.capture
     monkeypatch.setattr(drawn.surface, "capture", lambda state: 255 - capture(state))
-    actions.compare_with_reference(drawn)
+    viewpoint.compare_with_reference(drawn)
     wait(drawn)
     found = drawn.state.timing.comparison
     assert found.largest == 255
@@ -679,7 +679,7 @@ def test_what_is_wrong_is_told(drawn, monkeypatch):
 
 
 def test_the_picture_on_screen_is_drawn_again_after_it(drawn):
-    actions.compare_with_reference(drawn)
+    viewpoint.compare_with_reference(drawn)
     wait(drawn)
     rest(drawn.surface, drawn.state, 2.0)
     assert drawn.surface.textures[0].size == (400, 300)
@@ -688,14 +688,14 @@ def test_the_picture_on_screen_is_drawn_again_after_it(drawn):
 
 
 def test_there_is_nothing_to_compare_without_a_scene(viewer):
-    actions.compare_with_reference(viewer)
+    viewpoint.compare_with_reference(viewer)
     assert "open a scene first" in errors(viewer)[-1]
 
 
 def test_a_comparison_is_one_at_a_time_and_can_be_left(drawn):
-    actions.compare_with_reference(drawn)
-    actions.compare_with_reference(drawn)
+    viewpoint.compare_with_reference(drawn)
+    viewpoint.compare_with_reference(drawn)
     assert "wait for it or cancel it" in errors(drawn)[-1]
-    actions.stop_comparing(drawn)
+    viewpoint.stop_comparing(drawn)
     wait(drawn)
     assert drawn.state.timing.comparison is None

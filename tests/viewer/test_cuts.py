@@ -10,7 +10,7 @@ import pytest
 from langsplat_core.config import PictureConfig
 from langsplat_core.raster.protocol import farthest
 from langsplat_core.scene import look_at
-from langsplat_viewer import actions
+from langsplat_viewer.actions import opening, selecting, settings, viewpoint
 from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.canvas import NOTHING_BETWEEN, Canvas
 from langsplat_viewer.rendering.depth import UNCLIPPED, Clip, depth_range, image_formation
@@ -60,17 +60,17 @@ def test_the_scale_of_depth_is_that_of_what_is_left():
 
 
 def test_the_far_cut_stays_the_farther(opened):
-    actions.set_clip(opened, Clip(3.0, 2.0))
+    settings.set_clip(opened, Clip(3.0, 2.0))
     assert opened.state.settings.clip == Clip(3.0, 3.0)
-    actions.set_clip(opened, Clip(-1.0, 2.0))
+    settings.set_clip(opened, Clip(-1.0, 2.0))
     assert opened.state.settings.clip == Clip(0.0, 2.0)
 
 
 @pytest.fixture
 def beside(opened):
     """Stands at `SIDE`."""
-    actions.resize(opened, *SIZE)
-    actions.move(opened, lambda view: from_camera(SIDE, opened.state.extent))
+    settings.resize(opened, *SIZE)
+    viewpoint.move(opened, lambda view: from_camera(SIDE, opened.state.extent))
     return opened
 
 
@@ -78,31 +78,31 @@ def test_the_canvas_draws_another_cut_once_and_says_where_nothing_is_left(gl, be
     renderer = GlRenderer(gl, "cpu")
     canvas, state = Canvas(gl, renderer), beside.state
     rest(canvas, state, 0.0)
-    actions.set_clip(beside, BOOK_ALONE)
+    settings.set_clip(beside, BOOK_ALONE)
     rest(canvas, state, 1.0)
     book = np.frombuffer(canvas.textures[0].read(), np.uint8).reshape(120, 160, 4)[60, 80]
     assert book[:3].argmax() == 1
     assert abs(canvas.point_at(0.5, 0.5)[0] - CENTRES[1][0]) < 0.6  # of the surface that is seen
-    actions.set_clip(beside, Clip(20.0, 30.0))
+    settings.set_clip(beside, Clip(20.0, 30.0))
     rest(canvas, state, 2.0)
     assert state.nothing == NOTHING_BETWEEN
-    actions.set_clip(beside, UNCLIPPED)
+    settings.set_clip(beside, UNCLIPPED)
     rest(canvas, state, 3.0)
     assert state.nothing == ""
     renderer.release()
 
 
 def test_an_outline_does_not_select_what_is_cut_away(beside):
-    actions.use_tool(beside, "rectangle")
-    actions.set_clip(beside, BOOK_ALONE)
-    actions.begin_stroke(beside, 0.0, 0.0)
-    actions.extend_stroke(beside, 1.0, 1.0)
-    actions.end_stroke(beside)
+    selecting.use_tool(beside, "rectangle")
+    settings.set_clip(beside, BOOK_ALONE)
+    selecting.begin_stroke(beside, 0.0, 0.0)
+    selecting.extend_stroke(beside, 1.0, 1.0)
+    selecting.end_stroke(beside)
     assert marked(beside)[0] == "book"
 
 
 def test_another_scene_is_whole(beside):
-    actions.set_clip(beside, BOOK_ALONE)
-    actions.open_scene(beside, Path("bare.ply"))
+    settings.set_clip(beside, BOOK_ALONE)
+    opening.open_scene(beside, Path("bare.ply"))
     settle(beside)
     assert beside.state.settings.clip == UNCLIPPED

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from langsplat_core.errors import InputError
 from langsplat_viewer.camera.flight import Flight, Keyframe, Pose
-from langsplat_viewer.files.flight_files import MOST, read_flight, write_flight
+from langsplat_viewer.files.flights import MOST, read_flight, write_flight
 
 POSE = {"position": [0, 0, 0], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "fov_degrees": 50}
 

@@ -14,7 +14,7 @@ from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Scene
-from langsplat_viewer import actions
+from langsplat_viewer.actions import filming, opening, queries, selecting, settings, viewpoint
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matching
 from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
@@ -51,7 +51,7 @@ NOTHING = np.zeros(360, bool)
 
 def ask(viewer: Viewer, *phrases: str) -> None:
     for phrase in phrases:
-        actions.ask(viewer, phrase)
+        queries.ask(viewer, phrase)
     settle(viewer)
 
 
@@ -61,21 +61,21 @@ def ask(viewer: Viewer, *phrases: str) -> None:
 def edit_everything(viewer: Viewer, mode: str) -> None:
     """Every setting off its default: one blob hidden in part, one selected, one deleted in part."""
     state, odd = viewer.state, np.arange(360) % 2 == 1
-    actions.resize(viewer, 160, 120)
-    actions.look_from(viewer, "left")
-    actions.tick(viewer, viewer.clock + 10)
-    actions.tick(viewer, viewer.clock + 10)
+    settings.resize(viewer, 160, 120)
+    viewpoint.look_from(viewer, "left")
+    viewpoint.tick(viewer, viewer.clock + 10)
+    viewpoint.tick(viewer, viewer.clock + 10)
     ask(viewer, "mug", "plant")
     marks = Marks(blob("book") & odd, blob("mug") & odd, blob("plant") & odd)
     state.selection = replace(state.selection, marks=marks)
-    actions.set_splats(viewer, Splats(0.8, 0))
-    actions.set_clip(viewer, Clip(0.5, 6.5))
+    settings.set_splats(viewer, Splats(0.8, 0))
+    settings.set_clip(viewer, Clip(0.5, 6.5))
     picture = PictureConfig(
         heat_opacity=0.6, dim=0.7, threshold=0.3, alpha_gate=0.2, background=(0.1, 0.6, 0.3)
     )
-    actions.set_picture(viewer, picture)
-    actions.set_colour_map(viewer, "viridis")
-    actions.set_display(viewer, "relevancy", 1)
+    settings.set_picture(viewer, picture)
+    settings.set_colour_map(viewer, "viridis")
+    settings.set_display(viewer, "relevancy", 1)
     split = Split(mode, second="segmentation", second_level=0, at=0.4)
     state.settings = replace(state.settings, split=split)
 
@@ -85,9 +85,9 @@ def recorded(viewer: Viewer) -> None:
     end = time.monotonic() + 60
     while viewer.recorder.current is not None:
         assert time.monotonic() < end
-        actions.tick(viewer, viewer.clock)
+        viewpoint.tick(viewer, viewer.clock)
         time.sleep(0.002)
-    actions.tick(viewer, viewer.clock)
+    viewpoint.tick(viewer, viewer.clock)
 
 
 def image(path: Path) -> np.ndarray:
@@ -123,14 +123,14 @@ def test_screen_file_sized_image_film_and_reference_agree(gl, opened, tmp_path, 
 
     rest(canvas, state, 1.0)
     images = {"screen": on_screen(canvas, state), "saved": image(saving.save_picture(opened, tmp_path))}
-    actions.set_film_size(opened, *state.size)
-    actions.save_sized_picture(opened, tmp_path)
+    filming.set_film_size(opened, *state.size)
+    filming.save_sized_picture(opened, tmp_path)
     recorded(opened)
     images["sized"] = image(tmp_path / "blobs-160x120-001.png")
-    actions.set_turning(opened, True)
-    actions.set_path_seconds(opened, 1.0)
-    actions.set_film_fps(opened, 2.0)
-    actions.save_film(opened, tmp_path)
+    filming.set_turning(opened, True)
+    filming.set_path_seconds(opened, 1.0)
+    filming.set_film_fps(opened, 2.0)
+    filming.save_film(opened, tmp_path)
     recorded(opened)
     images["film"] = image(tmp_path / "blobs-film-001" / film.frame_name(0))
     expected = ArrayRenderer(ReferenceRasterizer()).read(request).astype(int)
@@ -139,7 +139,7 @@ def test_screen_file_sized_image_film_and_reference_agree(gl, opened, tmp_path, 
     for name, got in images.items():
         assert got.shape == expected.shape == (120, 160, 3), name
         assert (np.abs(got - expected).max(-1) > 2).mean() <= 2e-3, name
-    actions.compare_with_reference(opened)
+    viewpoint.compare_with_reference(opened)
     recorded(opened)
     assert state.timing.comparison.psnr > 45
     assert errors(opened) == []
@@ -148,12 +148,12 @@ def test_screen_file_sized_image_film_and_reference_agree(gl, opened, tmp_path, 
 
 def test_images_are_saved_without_background_if_so_chosen(gl, opened, tmp_path):
     opened.surface = Canvas(gl, GlRenderer(gl, "cpu"))
-    actions.resize(opened, 40, 30)
-    actions.set_film_size(opened, 40, 30)
+    settings.resize(opened, 40, 30)
+    filming.set_film_size(opened, 40, 30)
     assert image(saving.save_picture(opened, tmp_path)).shape == (30, 40, 3)
-    actions.save_transparent(opened, True)
+    settings.save_transparent(opened, True)
     saved = image(saving.save_picture(opened, tmp_path))
-    actions.save_sized_picture(opened, tmp_path)
+    filming.save_sized_picture(opened, tmp_path)
     recorded(opened)
     assert saved.shape == (30, 40, 4)
     np.testing.assert_allclose(image(tmp_path / "blobs-40x30-001.png"), saved, atol=1)
@@ -163,32 +163,32 @@ def test_images_are_saved_without_background_if_so_chosen(gl, opened, tmp_path):
 # Requests are equal where the image is.
 
 CHANGES = {
-    "display": lambda v: actions.set_display(v, "depth"),
-    "slider": lambda v: actions.set_picture(v, replace(v.state.picture, dim=0.1)),
-    "hidden query": lambda v: actions.hide(v, v.state.queries[0]),
-    "cut": lambda v: actions.set_cut(v, v.state.queries[0], 0.7),
-    "split": actions.toggle_wipe,
-    "splats": lambda v: actions.set_splats(v, Splats(0.5)),
-    "near cut": lambda v: actions.set_clip(v, Clip(1.0)),
-    "marks": actions.select_all,
-    "size": lambda v: actions.resize(v, 300, 200),
-    "view": lambda v: actions.look_from(v, "left"),
+    "display": lambda v: settings.set_display(v, "depth"),
+    "slider": lambda v: settings.set_picture(v, replace(v.state.picture, dim=0.1)),
+    "hidden query": lambda v: queries.hide(v, v.state.queries[0]),
+    "cut": lambda v: queries.set_cut(v, v.state.queries[0], 0.7),
+    "split": settings.toggle_wipe,
+    "splats": lambda v: settings.set_splats(v, Splats(0.5)),
+    "near cut": lambda v: settings.set_clip(v, Clip(1.0)),
+    "marks": selecting.select_all,
+    "size": lambda v: settings.resize(v, 300, 200),
+    "view": lambda v: viewpoint.look_from(v, "left"),
 }
 UNSEEN = {
-    "line": lambda v: actions.move_line(v, 0.3),  # the window draws it
-    "ruler": actions.toggle_measuring,
-    "tool": lambda v: actions.use_tool(v, "brush"),
-    "word": lambda v: actions.type_phrase(v, "plant"),
-    "chosen query": lambda v: actions.select(v, None),
-    "photograph": lambda v: actions.fade_photograph(v, 0.5),
-    "saved without background": lambda v: actions.save_transparent(v, True),
+    "line": lambda v: settings.move_line(v, 0.3),  # the window draws it
+    "ruler": settings.toggle_measuring,
+    "tool": lambda v: selecting.use_tool(v, "brush"),
+    "word": lambda v: queries.type_phrase(v, "plant"),
+    "chosen query": lambda v: queries.select(v, None),
+    "photograph": lambda v: opening.fade_photograph(v, 0.5),
+    "saved without background": lambda v: settings.save_transparent(v, True),
 }
 
 
 @pytest.fixture
 def asked(opened: Viewer) -> Viewer:
     ask(opened, "mug")
-    actions.resize(opened, 240, 180)
+    settings.resize(opened, 240, 180)
     return opened
 
 
@@ -197,8 +197,8 @@ def test_what_is_seen_is_in_it(asked, name):
     before = asked.state.request()
     assert asked.state.request() == before
     CHANGES[name](asked)
-    actions.tick(asked, asked.clock + 10)
-    actions.tick(asked, asked.clock + 10)
+    viewpoint.tick(asked, asked.clock + 10)
+    viewpoint.tick(asked, asked.clock + 10)
     assert asked.state.request() != before
 
 
@@ -210,7 +210,7 @@ def test_what_is_not_seen_is_not_in_it(asked, name):
 
 
 def test_equal_requests_have_equal_keys_and_the_same_channels(asked):
-    actions.set_display(asked, "relevancy")
+    settings.set_display(asked, "relevancy")
     first, again, inputs = asked.state.request(), asked.state.request(), Inputs()
     assert inputs.key(first) == inputs.key(again)
     assert hash(inputs.key(first)) == hash(inputs.key(again))
@@ -240,8 +240,8 @@ def test_what_is_kept_gives_the_image_that_a_new_renderer_gives(gl, asked, name,
     canvas = Canvas(gl, kept)
     canvas.update(asked.state, 0.0)
     CHANGES[name](asked)
-    actions.tick(asked, asked.clock + 10)
-    actions.tick(asked, asked.clock + 10)
+    viewpoint.tick(asked, asked.clock + 10)
+    viewpoint.tick(asked, asked.clock + 10)
     canvas.update(asked.state, 20.0)
     canvas.update(asked.state, 30.0)
     expected = fresh.read(asked.state.request())
@@ -255,17 +255,17 @@ def test_what_is_kept_gives_the_image_that_a_new_renderer_gives(gl, asked, name,
 
 def test_the_second_pane_is_what_the_display_would_show_alone(opened):
     ask(opened, "plant")
-    actions.set_display(opened, "rgb")
-    actions.compare_with(opened, "relevancy")
+    settings.set_display(opened, "rgb")
+    settings.compare_with(opened, "relevancy")
     first, second = opened.state.panes()
     assert (first.picture.display, second.picture.display) == ("rgb", "relevancy")
-    actions.show_one(opened)
-    actions.set_display(opened, "relevancy")
+    settings.show_one(opened)
+    settings.set_display(opened, "relevancy")
     assert opened.state.panes() == (second,)
 
 
 def test_three_levels_of_latents_or_of_answers(opened):
-    actions.toggle_levels(opened)
+    settings.toggle_levels(opened)
     assert [pane.label for pane in opened.state.panes()] == [
         "Latent, subpart",
         "Latent, part",
@@ -275,27 +275,27 @@ def test_three_levels_of_latents_or_of_answers(opened):
     request = opened.state.request()
     assert (request.camera.width, request.camera.height, request.size) == (66, 90, (200, 90))
     ask(opened, "plant")
-    actions.set_display(opened, "segmentation")
+    settings.set_display(opened, "segmentation")
     result = opened.state.queries[0].result
     panes, found = opened.state.panes(), Inputs().channels(opened.state.request())
     assert [pane.picture.display for pane in panes] == ["relevancy"] * 3
     for level, channel in enumerate(found):
         np.testing.assert_array_equal(channel.values[:, 0], result.relevancy[level])
     assert len({pane.ranges for pane in panes}) == 1  # they share one scale
-    actions.toggle_levels(opened)
+    settings.toggle_levels(opened)
     assert [pane.label for pane in opened.state.panes()] == ["Segmentation"]
 
 
 def test_the_line_stays_within_reach(opened):
     for at, kept in ((-3.0, AT_RANGE[0]), (0.3, 0.3), (2.0, AT_RANGE[1])):
-        actions.move_line(opened, at)
+        settings.move_line(opened, at)
         assert opened.state.settings.split.at == kept
 
 
 def test_without_a_field_levels_and_latents_are_refused(viewer):
     viewer.state.scene = Scene(random_gaussians(5))
-    actions.toggle_levels(viewer)
-    actions.compare_with(viewer, "latent", 1)
+    settings.toggle_levels(viewer)
+    settings.compare_with(viewer, "latent", 1)
     assert viewer.state.settings.split.mode == "off"
     assert len(errors(viewer)) == 1  # the same line is not said twice
     (wipe,) = (command for command in COMMANDS if "V" in command.keys)
@@ -408,7 +408,7 @@ def test_splats_are_drawn_smaller_and_of_one_colour(opened):
     np.testing.assert_array_equal(drawn.sh, scene.gaussians.sh[:, :4])
     assert with_splats(Scene(drawn), Splats(sh_degree=2)).gaussians is drawn  # it has no more
     for wanted, kept in ((Splats(7.0, 9), Splats()), (Splats(0.0, -1), Splats(0.1, 0))):
-        actions.set_splats(opened, wanted)
+        settings.set_splats(opened, wanted)
         assert opened.state.settings.splats == kept
 
 
@@ -417,12 +417,12 @@ def test_splats_are_drawn_smaller_and_of_one_colour(opened):
 
 def test_overlays_are_shown_and_remembered(opened, tmp_path):
     for name in reversed(OVERLAYS):
-        actions.toggle_overlay(opened, name)
+        settings.toggle_overlay(opened, name)
     assert opened.state.preferences.overlays == OVERLAYS
     save_preferences(tmp_path, opened.state.preferences)
     assert load_preferences(tmp_path).overlays == OVERLAYS
-    actions.show_overlay(opened, "cube", False)
-    actions.show_overlay(opened, "cube", False)
+    settings.show_overlay(opened, "cube", False)
+    settings.show_overlay(opened, "cube", False)
     assert opened.state.preferences.overlays == tuple(name for name in OVERLAYS if name != "cube")
 
 
@@ -434,7 +434,7 @@ def test_every_overlay_has_a_command(opened):
 
 
 def test_the_colour_map_is_remembered(opened, tmp_path):
-    actions.set_colour_map(opened, "cividis")
+    settings.set_colour_map(opened, "cividis")
     assert opened.state.request().picture.colour_map == "cividis"
     save_preferences(tmp_path, opened.state.preferences)
     assert load_preferences(tmp_path).colour_map == "cividis"
@@ -444,27 +444,27 @@ def test_the_colour_map_is_remembered(opened, tmp_path):
 
 
 def test_two_clicks_measure_and_a_third_begins_anew(opened):
-    actions.toggle_measuring(opened)
+    settings.toggle_measuring(opened)
     assert opened.state.ruler.length is None
-    actions.measure_at(opened, 0.5, 0.5)
-    actions.measure_at(opened, 0.8, 0.1)  # the fake surface: (u - 0.5, v - 0.5, 0)
+    settings.measure_at(opened, 0.5, 0.5)
+    settings.measure_at(opened, 0.8, 0.1)  # the fake surface: (u - 0.5, v - 0.5, 0)
     assert opened.state.ruler.length == pytest.approx(0.5)
-    actions.measure_at(opened, 0.6, 0.6)
+    settings.measure_at(opened, 0.6, 0.6)
     assert opened.state.ruler.length is None
     assert len(opened.state.ruler.points) == 1
 
 
 def test_a_click_beside_everything_is_said(opened):
-    actions.measure(opened, True)
-    actions.measure_at(opened, 0.95, 0.5)
+    settings.measure(opened, True)
+    settings.measure_at(opened, 0.95, 0.5)
     assert opened.state.ruler.points == ()
     assert "nothing under the cursor" in opened.state.messages[-1].text
 
 
 def test_measuring_ends_with_esc_and_with_another_scene(opened):
-    for end in (actions.escape, lambda viewer: actions.open_scene(viewer, Path("plain.ply"))):
-        actions.measure(opened, True)
-        actions.measure_at(opened, 0.5, 0.5)
+    for end in (settings.escape, lambda viewer: opening.open_scene(viewer, Path("plain.ply"))):
+        settings.measure(opened, True)
+        settings.measure_at(opened, 0.5, 0.5)
         end(opened)
         settle(opened)
         assert opened.state.ruler == Ruler()

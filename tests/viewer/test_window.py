@@ -57,7 +57,6 @@ def folder(tmp_path: Path) -> Path:
         "look_without_perspective",
         "name_what_is_close",
         "reload_what_changed",
-        "change_a_key",
         "cut_by_depth",
         "rasterize_elsewhere",
         "watch_a_training",

@@ -17,8 +17,8 @@ from langsplat_core.display.displays import QUERY_COLOURS
 from langsplat_core.errors import BackendError
 from langsplat_core.io import load_scene
 from langsplat_core.scene import Scene
-from langsplat_viewer import actions
-from langsplat_viewer.panels.area import scene_area
+from langsplat_viewer.actions import settings
+from langsplat_viewer.panels.style import scene_area
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest
@@ -294,10 +294,10 @@ def without_field(s: Session) -> None:
     s.wait(lambda: s.state.path.name == "blobs.ply")
     s.settle()
     assert s.ctx.item_exists("//**/##phrase")
-    actions.open_panel(s.window.viewer, "Scene")
+    settings.open_panel(s.window.viewer, "Scene")
     s.ctx.yield_(3)
     s.ctx.item_click("//**/Keys")
-    actions.open_panel(s.window.viewer, "Camera")
+    settings.open_panel(s.window.viewer, "Camera")
     s.ctx.yield_(3)
     s.ctx.item_click("//**/##next")
     s.wait(lambda: s.state.camera_index == 1)

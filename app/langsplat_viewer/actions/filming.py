@@ -15,9 +15,9 @@ from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.progress import Progress
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.actions.camera import glide_to, leave_path, path_seconds
 from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.settings import open_panel
+from langsplat_viewer.actions.viewpoint import glide_to, leave_path, path_seconds
 from langsplat_viewer.camera.controls import from_camera, in_perspective
 from langsplat_viewer.camera.flight import (
     LONGEST,
@@ -30,7 +30,7 @@ from langsplat_viewer.camera.flight import (
     view_of,
     with_keyframe,
 )
-from langsplat_viewer.files.flight_files import MOST, SUFFIX, read_flight, write_flight
+from langsplat_viewer.files.flights import MOST, SUFFIX, read_flight, write_flight
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import MAX_SIDE, say_compiling
 from langsplat_viewer.output.film import VIDEO, Shot, cameras_of, check_film, find_ffmpeg, make_film

@@ -1,4 +1,4 @@
-"""What was asked, shown and marked before, so that it can be undone."""
+"""History: queries, view settings and marks as they were before each change, to be undone."""
 
 from dataclasses import dataclass
 
@@ -28,7 +28,7 @@ class Moment:
 
 
 def now(viewer: Viewer) -> Moment:
-    """How things stand."""
+    """Return the present moment."""
     state = viewer.state
     viewer.history.marks = pack(state.selection.marks, viewer.history.marks)
     return Moment(
@@ -45,8 +45,8 @@ def now(viewer: Viewer) -> Moment:
 
 
 def remember(viewer: Viewer, setting: str = "") -> None:
-    """What follows can be undone: to be called before a change. `setting` names one that is moved, as sliders
-    are: its changes in quick succession are one step."""
+    """Make what follows one step that can be undone; call it before a change. `setting` names one that is
+    moved, as sliders are: its changes in quick succession are one step."""
     history = viewer.history
     goes_on = setting != "" and setting == history.setting and viewer.clock - history.set_at < GESTURE
     history.setting, history.set_at = setting, viewer.clock

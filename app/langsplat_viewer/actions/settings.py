@@ -5,12 +5,11 @@ from dataclasses import fields, replace
 from langsplat_core.config import ColourMap, Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
-from langsplat_viewer.actions.camera import glide_to
 from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.selecting import leave_tool, stay
+from langsplat_viewer.actions.viewpoint import glide_to
 from langsplat_viewer.camera.overlays import facing
 from langsplat_viewer.files.preferences import SCALES, Theme
-from langsplat_viewer.keys import Keying
 from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.request import AT_RANGE, MOST_DEGREE, SIZE_RANGE, Splats, Split
 from langsplat_viewer.state import OVERLAYS, Overlay, Ruler, ViewSettings
@@ -221,25 +220,13 @@ def note_panels(viewer: Viewer, titles: tuple[str, ...]) -> None:
 
 
 def show_help(viewer: Viewer, shown: bool) -> None:
-    """Whether the list of keys is there; it is only read at first."""
-    if shown != viewer.state.show_help:
-        viewer.state.show_help, viewer.state.keying = shown, Keying()
+    """Show or hide the list of keys."""
+    viewer.state.show_help = shown
 
 
 def toggle_help(viewer: Viewer) -> None:
     """Show the list of keys, or hide it again."""
     show_help(viewer, not viewer.state.show_help)
-
-
-def edit_keys(viewer: Viewer, edits: bool) -> None:
-    """Whether the list of keys is there to change them."""
-    show_help(viewer, True)
-    viewer.state.keying = Keying(edits)
-
-
-def type_keys(viewer: Viewer, text: str) -> None:
-    """What stands in the box of that list."""
-    viewer.state.keying = replace(viewer.state.keying, typed=text)
 
 
 def show_palette(viewer: Viewer, shown: bool) -> None:

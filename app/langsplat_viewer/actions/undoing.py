@@ -21,7 +21,6 @@ def redo(viewer: Viewer) -> None:
 
 
 def _step(viewer: Viewer, there: list[Moment], back: list[Moment], otherwise: str) -> None:
-    """Go to the nearest moment of `there`, and keep how things stand in `back`."""
     if not there:
         viewer.state.say(otherwise)
         return

@@ -27,7 +27,7 @@ from langsplat_viewer.camera.controls import (
     spanning,
 )
 from langsplat_viewer.camera.flight import Motion, turntable
-from langsplat_viewer.files.flight_files import read_flight
+from langsplat_viewer.files.flights import read_flight
 from langsplat_viewer.options import (
     ViewerOptions,
     check_display,

@@ -1,8 +1,9 @@
-"""Going along the camera path: played, or by hand."""
+"""The viewpoint: camera moves, the camera path as it is played, the cursor, bookmarks and the comparison."""
 
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -30,7 +31,7 @@ from langsplat_viewer.camera.controls import (
     zoom,
 )
 from langsplat_viewer.camera.flight import pose_at, pose_of, view_of
-from langsplat_viewer.files.flight_files import MOST_VIEWS, Bookmark, named
+from langsplat_viewer.files.flights import MOST_VIEWS, Bookmark, named
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.rendering.depth import image_formation
 from langsplat_viewer.rendering.renderer import ArrayRenderer
@@ -39,7 +40,7 @@ from langsplat_viewer.viewer import Viewer
 
 
 def path_seconds(viewer: Viewer) -> float:
-    """How long the path takes; 0 without one."""
+    """Return how long the path takes, seconds; 0 without one."""
     record = viewer.state.record
     if record.turns:
         return record.turn_seconds
@@ -110,16 +111,14 @@ def _view_at(viewer: Viewer, seconds: float) -> OrbitCamera | None:
     return view_of(pose_at(flight_of(record.keyframes), seconds), state.extent)
 
 
-# Time, and the camera that moves in it: at once, or gliding from view to view.
+# Camera moves, at once or gliding from view to view.
 
 NEAREST = 0.004  # of the scene's radius: the closest that the eye comes to its centre of turning
 
 
 def tick(viewer: Viewer, now: float) -> None:
-    """Start of a frame at `now` seconds: take what the worker finished and move a gliding camera on."""
+    """Begin a frame at `now` seconds: move a gliding camera, or one that plays a path, on."""
     viewer.clock = now
-    viewer.worker.poll()
-    viewer.recorder.poll()
     glide = viewer.state.glide
     if glide is not None:
         t = (now - glide.began) / GLIDE_SECONDS
@@ -171,8 +170,8 @@ def set_fly_speed(viewer: Viewer, speed: float) -> None:
 
 
 def opening_view(viewer: Viewer) -> OrbitCamera | None:
-    """Where a scene is first seen from: the camera that was asked for, else the first training camera, else a
-    view of everything in the window as it is now. None without a scene."""
+    """Return the first view of a scene: that of the camera that was asked for, else the first training
+    camera, else a view of everything in the window as it is now. None without a scene."""
     state = viewer.state
     if state.scene is None or state.extent is None:
         return None
@@ -194,7 +193,6 @@ def reset_view(viewer: Viewer) -> None:
 
 
 def _opens_framed(viewer: Viewer) -> bool:
-    """Whether the opening view is one of everything."""
     scene = viewer.state.scene
     return viewer.state.opening_camera is None and scene is not None and not scene.cameras
 
@@ -239,7 +237,7 @@ def open_orthographic(viewer: Viewer, span: float) -> None:
 
 
 def set_walking(viewer: Viewer, walks: bool) -> None:
-    """Whether the keys that fly ahead keep the height of the eye."""
+    """Set whether the keys that fly ahead keep the height of the eye."""
     viewer.state.walks = walks
 
 
@@ -309,7 +307,7 @@ def focus_pixel(viewer: Viewer, u: float, v: float) -> None:
     glide_to(viewer, focus(view, point, depth))
 
 
-# What is under the cursor, while it rests.
+# The cursor: what lies under it while it rests.
 
 REST_SECONDS = 0.2  # of the mouse, after which it is asked what lies there
 
@@ -365,12 +363,10 @@ def _ask(viewer: Viewer, place: Hover) -> None:
         viewer.describer, place.found = found
         place.phrases = tuple(query.phrase for query in shown)
 
-    viewer.worker.submit(
-        "looking under the cursor", work, done, lambda reason: viewer.state.say(reason, is_error=True)
-    )
+    viewer.run("looking under the cursor", work, done)
 
 
-# Views with names: kept, listed, gone to.
+# Bookmarks.
 
 
 def add_bookmark(viewer: Viewer, name: str = "") -> None:
@@ -396,7 +392,7 @@ def add_bookmark(viewer: Viewer, name: str = "") -> None:
 
 
 def type_bookmark(viewer: Viewer, text: str) -> None:
-    """What stands in the box for a name."""
+    """Take the text of the box for a name."""
     viewer.state.bookmark_typed = text
 
 
@@ -414,16 +410,13 @@ def delete_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
     _keep(viewer)
 
 
-def load(viewer: Viewer) -> None:
-    """Take those of the scene that was opened."""
-    state = viewer.state
-    state.bookmarks, state.bookmark_typed = (), ""
-    if state.path is None:
-        return
+def read_bookmarks(viewer: Viewer, scene: Path) -> tuple[Bookmark, ...]:
+    """Read the bookmarks of a scene file; where they make no sense, say so."""
     try:
-        state.bookmarks = viewer.shelf.read(state.path)
+        return viewer.shelf.read(scene)
     except InputError as error:
-        state.say(str(error), is_error=True)
+        viewer.say_error(str(error))
+        return ()
 
 
 def _keep(viewer: Viewer) -> None:
@@ -436,7 +429,7 @@ def _keep(viewer: Viewer) -> None:
         state.say(f"bookmarks not kept: {one_line(error)}", is_error=True)
 
 
-# What the panel "Timing" asks for.
+# Timing and the comparison with the reference.
 
 
 def measure_frame(viewer: Viewer) -> None:

@@ -1,4 +1,4 @@
-"""Camera paths as files: small JSON, with a version.
+"""Camera paths and bookmarks as files: small JSON, with a version.
 
 {"langsplat_flight": 1,
  "keyframes": [{"seconds": 0.0,             rising, 0 to 36000
@@ -38,7 +38,7 @@ MOST = 10_000  # keyframes
 
 
 def read_flight(path: Path | str) -> Flight:
-    """The path in a file. Raises InputError and FormatError, in one line."""
+    """Read the path in a file. Raises InputError and FormatError, in one line."""
     path = Path(path)
     top = read_json_file(path, SIZE_LIMIT)
     if not isinstance(top, dict) or MARK not in top:
@@ -103,7 +103,7 @@ def pose_from(entry: Any, what: str) -> Pose:
     return Pose(position, rotation.T, fov, span)
 
 
-# Views that have a name, kept per scene in the folder of the preferences.
+# Bookmarks, kept per scene in the folder of the preferences.
 
 FILE_NAME = "bookmarks.json"
 MOST_VIEWS, MOST_SCENES = 50, 200  # of a scene; scenes, those that were marked last
@@ -127,7 +127,7 @@ class Shelf:
     folder: Path | None = None  # of the preferences; None: nothing is read and nothing is written
 
     def read(self, scene: Path) -> tuple[Bookmark, ...]:
-        """Those of a scene. InputError where the file makes no sense."""
+        """Read the bookmarks of a scene. InputError where the file makes no sense."""
         entries = self._all().get(str(scene.absolute()), [])
         what = f"{self._path}: bookmark"
         if not isinstance(entries, list):

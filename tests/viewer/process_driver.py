@@ -1,17 +1,20 @@
-"""Orbits in the real window, as the program opens it, and says how fast; run by test_orbiting.py and by hand:
+"""Opens the real window as the program does, without the test engine, and measures it.
 
-    python -m tests.viewer.orbit_driver [--scene SCENE.ply] [--count 500000] [--seconds 10] [--size 1280 800]
-                                        [--at-once]
+    python -m tests.viewer.process_driver [--scene SCENE.ply] [--count 500000] [--seconds 10]
+                                          [--size 1280 800] [--at-once] [--slow]
+    python -m tests.viewer.process_driver --idle SCENE.ply | --leave SCENE.ply
 
-Prints JSON: pictures per second while the camera moves, seconds from the last move to the full picture, the
-longest that a frame kept the window's thread in either, and the processor time of both, which other work on
-the machine changes little. With --at-once full pictures are rasterized in the window's own thread. Needs a
-display (xvfb-run).
+By default the camera orbits. Prints JSON: pictures per second while it moves, seconds from the last move to
+the full picture, the longest that a frame kept the window's thread in either, and the processor time of both,
+which other work on the machine changes little. --at-once: full pictures are rasterized in the window's own
+thread. --idle: prints frames and the share of a core while nothing happens. --leave: closes the window while
+a scene is being read for a minute. Needs a display (xvfb-run).
 """
 
 import argparse
 import json
 import statistics
+import threading
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -24,11 +27,12 @@ import glfw  # isort: skip
 from langsplat_core.io import load_scene
 from langsplat_core.lab.speed.queries import repeated
 from langsplat_core.scene import Scene
-from langsplat_viewer import actions
+from langsplat_viewer import canvas
+from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.camera.controls import orbit
 from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.viewer import Services
-from langsplat_viewer.window import Window, WindowRequest
+from langsplat_viewer.window import Window, WindowRequest, open_window
 from tests.support.fakes import FakeEncoder
 
 DEMO = Path(__file__).parents[2] / "assets" / "demo" / "scene.ply"
@@ -102,7 +106,7 @@ class Rider:
         self._longest = max(self._longest, time.monotonic() - self._framed)
 
     def _turn(self) -> None:
-        actions.move(self.window.viewer, lambda view: orbit(view, STEP, 0.0))
+        viewpoint.move(self.window.viewer, lambda view: orbit(view, STEP, 0.0))
 
     def _stop(self, now: float) -> None:
         stats, count = self.window.viewer.state.stats, len(self._pictures)
@@ -164,13 +168,73 @@ def ride(
     return rider.seen
 
 
+SETTLE, MEASURE = 3.0, 8.0  # seconds
+
+
+def slow_load(path: Path):
+    time.sleep(60)
+    return load_scene(path)
+
+
+def close() -> None:
+    """As the cross in the window's corner does; from any thread."""
+    glfw.set_window_should_close(glfw_window_hello_imgui(), True)
+    glfw.post_empty_event()
+
+
+def idle(path: Path) -> None:
+    services = Services(load_scene, lambda encoder_id: FakeEncoder())
+    window = Window(WindowRequest(path, size=(860, 620)), services, lambda ctx: GlRenderer(ctx, "opengl"))
+    params = window.params()
+    frames, gui = [], params.callbacks.show_gui
+
+    def counted() -> None:
+        frames.append(time.monotonic())
+        gui()
+
+    def measure() -> None:
+        while window.viewer.state.scene is None or window.viewer.worker.current is not None:
+            time.sleep(0.05)
+        time.sleep(SETTLE)
+        process = psutil.Process()
+        before, count = process.cpu_times(), len(frames)
+        time.sleep(MEASURE)
+        after = process.cpu_times()
+        used = after.user + after.system - before.user - before.system
+        print(f"frames {len(frames) - count} share {used / MEASURE:.4f}", flush=True)
+        close()
+
+    params.callbacks.show_gui = counted
+    threading.Thread(target=measure, daemon=True).start()
+    immapp.run(params)
+
+
+def leave(path: Path) -> None:
+    def wait() -> None:
+        time.sleep(3)
+        close()
+
+    threading.Thread(target=wait, daemon=True).start()
+    open_window(WindowRequest(path, size=(860, 620)), Services(slow_load, lambda encoder_id: FakeEncoder()))
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
+    parser.add_argument("--idle", type=Path, help="a scene; in place of orbiting")
+    parser.add_argument("--leave", type=Path, help="a scene; in place of orbiting")
     parser.add_argument("--scene", type=Path, default=DEMO)
     parser.add_argument("--count", type=int, default=500_000, help="Gaussians; 0: as the file has")
     parser.add_argument("--seconds", type=float, default=10.0, help="of moving, three times")
     parser.add_argument("--size", type=int, nargs=2, default=(1280, 800))
     parser.add_argument("--at-once", action="store_true", help="full pictures in the window's thread")
+    parser.add_argument("--slow", action="store_true", help="as if the machine were slow")
     asked = parser.parse_args()
-    renderer = AtOnce if asked.at_once else GlRenderer
-    print(json.dumps(asdict(ride(asked.scene, asked.count, asked.seconds, tuple(asked.size), renderer))))
+    if asked.slow:
+        canvas.MOVING_BUDGET = 0.0
+    if asked.idle:
+        idle(asked.idle)
+    elif asked.leave:
+        leave(asked.leave)
+    else:
+        renderer = AtOnce if asked.at_once else GlRenderer
+        print(json.dumps(asdict(ride(asked.scene, asked.count, asked.seconds, tuple(asked.size), renderer))))
