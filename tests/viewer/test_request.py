@@ -1,6 +1,5 @@
 """Render requests: what they depend on, their panes, the edited scene; and that every image is one."""
 
-import time
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matchin
 from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.marks import Marks, unmarked
 from langsplat_viewer.output import film, saving
-from langsplat_viewer.panels.legend import STEPS, bar_colours
+from langsplat_viewer.panels.overlays import STEPS, bar_colours
 from langsplat_viewer.panels.view import compared_name
 from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer
@@ -43,7 +42,7 @@ from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene, cameras
 from tests.support.scenes import random_gaussians
 from tests.support.selected import blob
-from tests.support.windowless import errors, rest, settle
+from tests.support.windowless import errors, recorded, rest, settle
 
 SCENE = blob_scene()
 NOTHING = np.zeros(360, bool)
@@ -78,16 +77,6 @@ def edit_everything(viewer: Viewer, mode: str) -> None:
     settings.set_display(viewer, "relevancy", 1)
     split = Split(mode, second="segmentation", second_level=0, at=0.4)
     state.settings = replace(state.settings, split=split)
-
-
-def recorded(viewer: Viewer) -> None:
-    """Until the recorder has nothing left to do."""
-    end = time.monotonic() + 60
-    while viewer.recorder.current is not None:
-        assert time.monotonic() < end
-        viewpoint.tick(viewer, viewer.clock)
-        time.sleep(0.002)
-    viewpoint.tick(viewer, viewer.clock)
 
 
 def image(path: Path) -> np.ndarray:
