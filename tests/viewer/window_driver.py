@@ -327,12 +327,12 @@ def broken_renderer(s: Session) -> None:
     s.wait(lambda: s.state.scene is not None)
     s.settle()
     s.renderer.draw = fail
-    s.ctx.key_press(imgui.Key.r)
+    s.ctx.key_press(digit_key(2))
     s.settle()
     s.ctx.yield_(20)
     assert s.state.messages[-1].text == "the driver gave up; use --backend cpu"
     del s.renderer.draw
-    s.ctx.key_press(digit_key(2))
+    s.ctx.key_press(digit_key(3))
     assert s.shot("mended")[:, 400:].max() > 100
 
 
