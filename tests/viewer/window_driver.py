@@ -15,7 +15,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui  # isort: skip
 from imgui_bundle.immapp import testing  # isort: skip
 from langsplat_core.display.displays import QUERY_COLOURS
 from langsplat_core.errors import BackendError
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import settings
 from langsplat_viewer.panels.style import scene_area
