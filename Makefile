@@ -11,7 +11,7 @@ PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist
 export PIP_QUIET := 1
 .SILENT: $(STAMP) demo
 
-.PHONY: help demo quick test slow check format elsewhere parity bench gpu pictures app light bundle desktop clean
+.PHONY: help demo quick test slow check format elsewhere parity bench report gpu pictures app light bundle desktop clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -29,7 +29,9 @@ system: $(STAMP)
 	@$(PYTHON) packaging/system_libraries.py
 
 demo: system  ## install everything and open the bundled scene (without a display: pictures in demo_out/)
-	$(BIN)/python packaging/demo.py
+	if [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ] || [ "$$(uname)" != Linux ]; then $(BIN)/langsplat-viewer; \
+	else echo "No display: rendering the bundled scene to pictures instead of opening a window."; \
+	  $(BIN)/langsplat demo; fi
 
 quick: check  ## lint, types, and the tests that take no time: the loop while working
 	$(PYTEST) -m "not long"
@@ -69,6 +71,15 @@ parity: $(STAMP)  ## vectors and masks against those of open_clip, segment_anyth
 
 bench: system  ## speed against error, on this machine
 	$(BIN)/langsplat bench raster --out bench_out
+
+# Rooms are kept in eval_out and methods in docs/benchmarks/lifting.rows.jsonl: an interrupted run goes on.
+FRESH := --tiers clutter --seeds 401 402 403 404 405
+report: system  ## every report under docs/benchmarks, again: hours (ONLY="rooms scale": some of them)
+	$(if $(ONLY),,$(BIN)/langsplat bench raster --out docs/benchmarks)
+	$(if $(ONLY),,$(BIN)/langsplat bench query assets/demo/scene.ply --out docs/benchmarks)
+	for name in $(or $(ONLY),rooms verdicts phrases lifting scale); do \
+	  case $$name in rooms|verdicts|phrases) rooms="$(FRESH)";; *) rooms=;; esac; \
+	  $(BIN)/python -m tests.benchmarks $$name $$rooms --out docs/benchmarks || exit; done
 
 # WHEELS=folder installs from there without a network; SITE=1 keeps the packages that PYTHON has, torch among them.
 # PYTHON may be that of a virtual environment: then --system-site-packages alone would not see its packages.

@@ -10,7 +10,7 @@ from langsplat_core.errors import optional_imports
 
 if TYPE_CHECKING:
     from langsplat_core.config import TrainConfig
-    from langsplat_core.io import load_scene, save_scene
+    from langsplat_core.io.scenes import load_scene, save_scene
     from langsplat_core.pipeline.train import train_scene
     from langsplat_core.query.answers import QueryResult
     from langsplat_core.query.engine import QueryEngine
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
-    "load_scene": "langsplat_core.io",
-    "save_scene": "langsplat_core.io",
+    "load_scene": "langsplat_core.io.scenes",
+    "save_scene": "langsplat_core.io.scenes",
     "render": "langsplat_core.raster.render",
     "Rendering": "langsplat_core.raster.render",
     "load_rasterizer": "langsplat_core.raster",

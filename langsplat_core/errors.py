@@ -78,7 +78,6 @@ EXTRAS: Mapping[str, str] = MappingProxyType(  # name as imported -> extra, as i
         "tokenizers": "encoders",
         "huggingface_hub": "encoders",
         "ftfy": "encoders",
-        "open3d": "geometry",
         "matplotlib": "plots",
         "gsplat": "cuda",
     }

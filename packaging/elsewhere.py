@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "docs" / "benchmarks" / "elsewhere.md"
 OUT = ROOT / "elsewhere_out"
 COMPUTING = (
-    "raster scene query training semantics display compaction evaluation datasets lab formats "
+    "raster scene query training semantics display compaction evaluation datasets making benchmarks bench io "
     "pipeline/test_train.py pipeline/test_importing.py test_arrays.py test_compiled.py"
 )
 WRITING = "cli datasets formats parsing pipeline scene semantics test_files.py viewer/test_preferences.py"

@@ -10,16 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from langsplat_core.cli.bench import write_report
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
 from langsplat_core.evaluation.report import write_json
-from langsplat_core.io import save_scene, write_cameras, write_ply
+from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.langsplat_files import write_autoencoder, write_checkpoint, write_features
 from langsplat_core.io.language import write_language
+from langsplat_core.io.ply import write_ply
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.io.shapes import write_points
-from langsplat_core.lab.encoder.crops import CropSet
-from langsplat_core.lab.rooms.report import save_json as save_rooms
 from langsplat_core.pipeline.stages import kept, kept_array
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
@@ -56,12 +57,6 @@ def checkpoint(folder: Path) -> None:
     from langsplat_core.training.radiance.state import start
 
     save_checkpoint(folder / "c.safetensors", start(GAUSSIANS, 5, torch.device("cpu")), "abc")
-
-
-def crops(folder: Path) -> None:
-    CropSet(np.random.default_rng(0).integers(0, 255, (3, 64, 64, 3), dtype=np.uint8), ()).save(
-        folder / "c.npz"
-    )
 
 
 def features(folder: Path) -> None:
@@ -102,8 +97,7 @@ WRITERS: dict[str, Write] = {
     "checkpoint": checkpoint,
     "stage": stage,
     "stage's array": lambda folder: kept_array(folder / "a.npy", lambda: np.ones(999)),
-    "crops": crops,
-    "report of rooms": lambda folder: save_rooms(folder / "r.json", {"seed": 1}, []),
+    "report of a benchmark": lambda folder: write_report(folder, "r", "text", list(range(999))),
     "report of scores": lambda folder: write_json(folder / "r.json", list(range(999))),
     "picture": lambda folder: save_png(
         folder / "p.png", np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8)

@@ -35,10 +35,7 @@ def runner(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 @pytest.fixture
 def fake_sections(tmp_path: Path, runner: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Sections that do as they are called, in place of the real ones."""
-    folder = tmp_path / "gpu_sections"
-    folder.mkdir()
-    (folder / "__init__.py").write_text("")
-    (folder / "__main__.py").write_text(
+    (tmp_path / "gpu_sections.py").write_text(
         "import sys, time\nfrom pathlib import Path\n_, name, plan, report = sys.argv\n"
         "if name == 'opengl':\n    sys.exit(print('no driver', file=sys.stderr) or 3)\n"
         "Path(report).write_text(f'# {name}\\n\\nfound by {plan}\\n')\n"
@@ -51,7 +48,7 @@ def fake_sections(tmp_path: Path, runner: ModuleType, monkeypatch: pytest.Monkey
 
 
 def pieces(sections: ModuleType, name: str) -> str:
-    return "\n".join(importlib.import_module(f"gpu_sections.{name}").measure(sections.TINY))
+    return "\n".join(getattr(sections, f"measure_{name}")(sections.TINY))
 
 
 def numbers(text: str, first: str) -> list[float]:
@@ -89,10 +86,8 @@ def test_longer_sections_over_the_twin(sections: ModuleType, gsplat_twin: None) 
 
 @pytest.mark.long
 def test_opengl_tables_on_any_driver(sections: ModuleType, gl_session: object) -> None:
-    from gpu_sections import opengl
-
     with create_egl_context() as context:
-        said = "\n".join(opengl.tables(sections.TINY, context))
+        said = "\n".join(sections.tables(sections.TINY, context))
     errors = [line.split(" | ")[8] for line in said.splitlines() if "| splat | opengl single |" in line]
     assert len(errors) == 2
     assert max(map(float, errors)) < 1e-4
@@ -138,7 +133,7 @@ def test_a_section_that_fails_or_takes_too_long_does_not_stop_the_others(
 def test_what_needs_gsplat_is_not_begun_where_it_does_not_work(
     fake_sections: Path, runner: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    main = fake_sections / "gpu_sections" / "__main__.py"
+    main = fake_sections / "gpu_sections.py"
     main.write_text(main.read_text().replace("'gradients'", "'environment'"))
     monkeypatch.setattr(runner, "SECTIONS", {"environment": 60, "gradients": 60, "opengl": 60})
     monkeypatch.setattr(sys, "argv", ["run.py", "--out", str(fake_sections / "out")])
@@ -158,10 +153,10 @@ def test_unusable_arguments(
     assert words[0] in capsys.readouterr().err
 
 
-def test_every_section_has_a_module_and_a_row_in_the_docs(runner: ModuleType) -> None:
+def test_every_section_has_a_function_and_a_row_in_the_docs(runner: ModuleType, sections: ModuleType) -> None:
     page = (ROOT / "docs" / "gpu.md").read_text()
     for name, limit in runner.SECTIONS.items():
-        assert (GPU / "gpu_sections" / f"{name}.py").exists()
+        assert callable(getattr(sections, f"measure_{name}"))
         assert f"| {name} | {limit} |" in page
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from langsplat_viewer.files.browsing import SCENE_SUFFIXES
+from langsplat_core.io.scenes import FORMATS
 from langsplat_viewer.viewer import TrainingRequest, command
 
 PACKAGING = Path(__file__).resolve().parents[1] / "packaging"
@@ -47,7 +47,8 @@ def test_every_type_of_the_entry_is_described_and_every_kind_of_scene_has_one():
     globs = mime_globs()
     assert set(desktop_entry()["MimeType"].strip(";").split(";")) == set(globs)
     patterns = {pattern for some in globs.values() for pattern in some}
-    assert {f"*{suffix}" for suffix in SCENE_SUFFIXES} <= patterns
+    assert {f"*{row.suffix}" for row in FORMATS} <= patterns
+    assert {row.mime for row in FORMATS} == set(globs)
 
 
 def test_the_icon_is_a_square_with_a_transparent_corner_and_a_full_middle():

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 import pytest
 
-from langsplat_core import config
+from langsplat_core import bench, config
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.config import (
@@ -22,12 +22,11 @@ from langsplat_core.config import (
     numeric_settings,
 )
 from langsplat_core.errors import InputError
-from langsplat_core.lab import config as lab_config
 from langsplat_core.pipeline.train import train_scene
 
 CONFIGS = {
     name: value
-    for module in (config, lab_config)
+    for module in (config, bench)
     for name, value in vars(module).items()
     if dataclasses.is_dataclass(value) and isinstance(value, type) and value not in (Range, Setting)
 }
@@ -45,21 +44,8 @@ COMMANDS = [
     "scale s.ply",
     "convert s.ply t.ply",
     "compact s.ply",
-    "demo build --out s.ply",
-    "demo dataset --out d",
-    "demo encoder --out d",
-    "demo sheet --out s.png",
-    "eval synthetic",
     "bench raster",
-    "bench gains",
-    "bench lift",
-    "bench load",
-    "bench memory",
-    "bench phrases",
     "bench query s.ply",
-    "bench steps",
-    "bench verdict",
-    "bench words",
 ]
 
 
@@ -137,10 +123,7 @@ def test_every_number_of_every_command_has_a_range(line: str) -> None:
         ("train {d} --out {d}/s.ply --lift.chunk -1", "--lift.chunk -1"),
         ("train {d} --out {d}/s.ply --dataset.max-side 3", "--dataset.max-side 3"),
         ("convert a.npz b.ply --codec.steps 0", "--codec.steps 0"),
-        ("eval synthetic --codec.batch 1", "--codec.batch 1"),
-        ("eval synthetic --steps 0", "--steps 0: must be 1 to"),
         ("bench raster --sizes 320 240 0 7", "--sizes 320 240 0 7"),
-        ("demo sheet --out s.png --side 0", "--side 0"),
     ],
 )
 def test_the_command_line_names_the_option_as_typed(

@@ -12,15 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from langsplat_core import config
+from langsplat_core import bench, config
 from langsplat_core.config import Range, Setting
-from langsplat_core.lab import config as lab_config
 
 ROOT = Path(__file__).parent.parent
 SOURCES = [*ROOT.glob("langsplat_core/**/*.py"), *ROOT.glob("app/**/*.py")]
 CONFIGS = {
     name: value
-    for module in (config, lab_config)
+    for module in (config, bench)
     for name, value in vars(module).items()
     if dataclasses.is_dataclass(value) and isinstance(value, type) and value not in (Range, Setting)
 }

@@ -21,9 +21,8 @@ from langsplat_core.config import (
 )
 from langsplat_core.display.displays import DISPLAYS, MAX_QUERIES
 from langsplat_core.errors import InputError
-from langsplat_core.io import load_scene
 from langsplat_core.io.cameras import read_cameras
-from langsplat_core.io.sog import META_NAME
+from langsplat_core.io.scenes import format_of, load_scene
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import LEVELS, Camera, Scene
@@ -142,7 +141,7 @@ def scene_path(scene: Path | None) -> Path:
     try:
         if not scene.exists():
             raise InputError(f"{scene}: no such file; check the spelling and the folder")
-        if scene.is_dir() and not (scene / META_NAME).exists():
+        if scene.is_dir() and format_of(scene) is None:
             raise InputError(f"{scene}: is a folder, not a scene; name the .ply file in it")
     except OSError as error:  # a name too long, a folder that may not be looked into
         raise InputError(f"{str(scene)[:80]}: cannot be opened ({error.strerror})") from None

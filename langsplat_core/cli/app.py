@@ -27,45 +27,25 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
         "compact": "scenes.Compact",
         "inspect": "scenes.Inspect",
         "doctor": "scenes.Doctor",
+        "demo": "demo.Demo",
     }
 )
 # Name -> what it is about, and its commands.
 GROUPS: Mapping[str, tuple[str, Mapping[str, str]]] = MappingProxyType(
     {
-        "demo": (
-            "Make the bundled scene, its photographs and its encoder.",
-            {
-                "build": "demo.DemoBuild",
-                "dataset": "demo.DemoDataset",
-                "encoder": "demo.DemoEncoder",
-                "sheet": "demo.DemoSheet",
-            },
-        ),
         "eval": (
             "Measure a scene against ground truth.",
             {
-                "synthetic": "evaluate.EvalSynthetic",
-                "lerf-ovs": "evaluate_labels.EvalLerfOvs",
-                "3d-ovs": "evaluate_labels.EvalOvs3d",
-                "scannet": "evaluate_labels.EvalScanNet",
+                "lerf-ovs": "evaluate.EvalLerfOvs",
+                "3d-ovs": "evaluate.EvalOvs3d",
+                "scannet": "evaluate.EvalScanNet",
             },
         ),
         "bench": (
             "Speed against error, measured in one run.",
             {
                 "raster": "bench.BenchRaster",
-                "endurance": "bench_endurance.BenchEndurance",
-                "gains": "bench_gains.BenchGains",
-                "lift": "bench_lift.BenchLift",
-                "paper": "bench_paper.BenchPaper",
-                "load": "bench_load.BenchLoad",
-                "moving": "bench_moving.BenchMoving",
-                "memory": "bench_memory.BenchMemory",
-                "phrases": "bench_phrases.BenchPhrases",
-                "query": "bench_query.BenchQuery",
-                "steps": "bench_steps.BenchSteps",
-                "verdict": "bench_verdict.BenchVerdict",
-                "words": "bench_words.BenchWords",
+                "query": "bench.BenchQuery",
             },
         ),
     }

@@ -1,111 +1,44 @@
-"""`langsplat demo`: make the bundled scene, its photographs and its encoder again.
+"""`langsplat demo`: pictures of the bundled scene, and answers about it, without a window."""
 
-The work is imported when it is done: torch and open3d take seconds that --help need not pay.
-"""
-
-from dataclasses import dataclass, field
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from types import MappingProxyType
 
-import tyro
+from langsplat_core.cli.checks import OutFolder
+from langsplat_core.errors import LangSplatError
 
-from langsplat_core.cli.checks import OutFile, OutFolder
-from langsplat_core.config import Count, Seed
-from langsplat_core.io.files import atomic_path
-from langsplat_core.lab.config import DemoEncoderConfig, LabelLayout, MaskOrigin, Pixels, Size, Tier
-from langsplat_core.progress import TerminalProgress
+# Name of a picture -> options of the viewer.
+PICTURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "colours.png": (),
+        "latent_whole.png": ("--display", "latent", "--level", "whole"),
+        "latent_part.png": ("--display", "latent", "--level", "part"),
+        "blue_gift.png": ("--query", "blue gift"),
+        "keyboard.png": ("--query", "keyboard"),
+        "segmentation.png": (
+            *("--query", "teddy bear", "--query", "blue gift", "--query", "burger"),
+            *("--display", "segmentation"),
+        ),
+    }
+)
 
 
 @dataclass(frozen=True)
-class DemoDataset:
-    """Render a procedural room: photographs, cameras, points, and the truth at three levels."""
+class Demo:
+    """Render pictures of the bundled scene and answer phrases about it."""
 
-    out: OutFolder
+    out: OutFolder = Path("demo_out")
     """Folder to write."""
-    seed: Seed = 0
-    """Another seed is another room."""
-    views: Count = 72
-    """Number of photographs."""
-    size: Size = (640, 480)
-    """Width and height, pixels."""
-    tier: Tier = "clutter"
-    """How hard the room is: objects apart, cluttered, or packed with look-alikes."""
-    layout: LabelLayout = "plain"
-    """lerf-ovs, 3d-ovs: the photographs in OUT/room, and every eighth labelled as in that benchmark."""
 
     def run(self) -> None:
-        from langsplat_core.lab.rooms.label_layouts import write_labelled
-
-        with TerminalProgress() as progress:
-            folder = write_labelled(
-                self.out, self.layout, self.seed, self.views, self.size, progress, self.tier
-            )
-        print(f"{folder}: {self.views} photographs with ground truth")
-
-
-@dataclass(frozen=True)
-class DemoEncoder:
-    """Train the small demo CLIP on procedural crops. Resumes when interrupted."""
-
-    out: OutFolder
-    """Folder to write: model, tokenizer, vocabulary."""
-    config: Annotated[DemoEncoderConfig, tyro.conf.arg(name="")] = field(default_factory=DemoEncoderConfig)
-
-    def run(self) -> None:
-        from langsplat_core.lab.encoder.train import train_demo_encoder
-
-        with TerminalProgress() as progress:
-            train_demo_encoder(self.out, self.config, progress)
-        print(f"{self.out}: demo encoder")
-
-
-@dataclass(frozen=True)
-class DemoBuild:
-    """Make the demo scene: render its photographs, train it with the ordinary pipeline, compact it."""
-
-    out: OutFile
-    """The scene to write, *.ply."""
-    seed: Seed = 2
-    """Another seed is another room."""
-    tier: Tier = "clutter"
-    """How hard the room is: objects apart, cluttered, or packed with look-alikes."""
-    masks: MaskOrigin = "truth"
-    """Outlines as a perfect segmenter would find them, or those of the weight-free segmenter."""
-    steps: Count = 6_000
-    """Steps of radiance training."""
-    gaussians: Path | None = None
-    """Keep the Gaussians of this scene of the same room, and make only their language field again."""
-
-    def run(self) -> None:
-        from langsplat_core.lab.demo import build_demo
-
-        with TerminalProgress() as progress:
-            made = build_demo(
-                self.out, self.seed, self.tier, self.masks, self.steps, self.gaussians, progress
-            )
-        print(f"{self.out}: {made}")
-
-
-@dataclass(frozen=True)
-class DemoSheet:
-    """Draw every class of object that the generator knows, so that one sees what its words mean."""
-
-    out: OutFile
-    """The picture to write, *.png."""
-    seed: Seed = 0
-    """Another seed draws other examples."""
-    side: Pixels = 128
-    """Pixels per example."""
-    instances: Count = 3
-    """Examples of every class."""
-
-    def run(self) -> None:
-        from PIL import Image
-
-        from langsplat_core.lab.world.sheet import contact_sheet
-
-        with TerminalProgress() as progress:
-            picture = contact_sheet(self.instances, self.side, self.seed, progress)
-        with atomic_path(self.out) as path:
-            Image.fromarray(picture).save(path, "PNG")
-        print(f"{self.out}: {picture.shape[1]}x{picture.shape[0]} pixels")
+        viewer = [sys.executable, "-m", "langsplat_viewer"]
+        if getattr(sys, "frozen", False):  # `make bundle`: the programs lie side by side
+            viewer = [str(Path(sys.executable).with_stem("langsplat-viewer"))]
+        for name, options in PICTURES.items():
+            command = [*viewer, "--headless", "--size", "960x720", "--out", str(self.out / name), *options]
+            if code := subprocess.run(command, check=False).returncode:
+                raise LangSplatError(f"{self.out / name}: not rendered; the viewer ended with code {code}")
+        print(f"The pictures are in {self.out.resolve()}")

@@ -1,76 +1,169 @@
-"""`langsplat eval`: queries against ground truth."""
+"""`langsplat eval lerf-ovs | 3d-ovs | scannet`: the field's benchmarks."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from langsplat_core.cli.checks import OutFile, OutFolder
+from langsplat_core.config import ClipConfig, MaskConfig, TrainConfig, TrainPreset, with_preset
 from langsplat_core.errors import InputError
-from langsplat_core.io.files import check_output_folder
-from langsplat_core.lab.config import BenchmarkConfig
+from langsplat_core.evaluation.profiles import LERF_PROFILES, OVS_PROFILES, LerfProtocol, OvsProtocol, Profile
+from langsplat_core.io.language import SUFFIX
 from langsplat_core.progress import TerminalProgress
+
+if TYPE_CHECKING:
+    from langsplat_core.evaluation.labels import Benchmark
+
+SceneAndData = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[SCENE] DATA")]
 
 
 @dataclass(frozen=True)
-class EvalSynthetic:
-    """Localisation, segmentation and rejection in procedural rooms, in views that training did not see.
-
-    Without --scene, fresh rooms are rendered and trained first, some minutes each; an interrupted run
-    continues where it stopped."""
-
-    config: Annotated[BenchmarkConfig, tyro.conf.arg(name="")] = field(default_factory=BenchmarkConfig)
-    work: OutFolder = Path("eval_out")
-    """Folder for the rooms and all intermediate results."""
+class _Eval:
+    paths: tyro.conf.Positional[SceneAndData]
+    """A scene of ours, or a folder with one NAME.ply for each of the benchmark's scenes; then the folder of
+    the benchmark, or one scene's folder of it. With --maps the latter alone."""
+    maps: Path | None = None
+    """Score these maps of another system, files named VIEW/PHRASE.npy or .png, instead of a scene."""
+    only: tuple[str, ...] = ()
+    """Names of the benchmark's scenes to score; all of them if empty."""
     json: OutFile | None = None
     """Also write all figures to this file."""
-    scene: Path | None = None
-    """Measure this scene, trained on --dataset, instead of fresh rooms; of the settings, --cut applies."""
-    dataset: Path | None = None
-    """The room that --scene shows, as written by `langsplat demo dataset`."""
+    encoder: str = ""
+    """Text encoder folder or hub id, in place of the one the scene names."""
+
+    def scene_and_data(self) -> tuple[Path | None, Path]:
+        """The scene, None for maps, and the benchmark's folder."""
+        wanted = 1 if self.maps else 2
+        if len(self.paths) != wanted:
+            raise InputError(
+                "give the benchmark's folder alone with --maps"
+                if self.maps
+                else "give a scene and the benchmark's folder, or the folder alone and --maps FOLDER"
+            )
+        return (None if self.maps else self.paths[0]), self.paths[-1]
+
+
+@dataclass(frozen=True)
+class _EvalLabels(_Eval):
+    pictures: OutFolder | None = None
+    """Also write one picture per query into this folder."""
     paper_order: bool = False
-    """With --scene: blend latents and decode every pixel, as the paper does, not the relevancies."""
+    """Blend latents and decode every pixel, as the paper does, not the relevancies; no codebook can."""
+    train: bool = False
+    """Give DATA alone: every scene of it is trained from the photographs beside the labels first, with the
+    settings of `langsplat train`, which no benchmark has chosen; an interrupted run continues."""
+    out: OutFolder = Path("benchmark_scenes")
+    """Folder for the scenes of --train; those in it are not trained again."""
+    preset: TrainPreset = "full"
+    """Of --train, as of `langsplat train`."""
+    clip: ClipConfig = field(default_factory=ClipConfig)
+    masks: MaskConfig = field(default_factory=MaskConfig)
+
+    def scene_and_data(self) -> tuple[Path | None, Path]:
+        """See `_Eval`; the scenes of --train are those in --out."""
+        if not self.train:
+            return super().scene_and_data()
+        if self.maps or len(self.paths) != 1:
+            raise InputError("--train trains the scenes itself; give the benchmark's folder alone")
+        return self.out, self.paths[0]
+
+    def evaluate(self, benchmark: "Benchmark", profile: Profile) -> None:
+        """Train where that is asked for, score, print the tables, write what was asked for."""
+        from langsplat_core.evaluation.report import beside_published, save_json, table
+        from langsplat_core.evaluation.run import Subject, run_benchmark
+        from langsplat_core.semantics.encoders import load_text_encoder
+
+        failed = self._train(benchmark) if self.train else {}
+        left = [name for name in self.only or benchmark.scenes if name not in failed]
+        if failed and not left:
+            raise InputError("; ".join(f"{name}: {reason}" for name, reason in failed.items()))
+        only = tuple(left) if failed else self.only
+        subject = Subject(self.scene_and_data()[0], self.maps, self.encoder, self.paper_order)
+        with TerminalProgress() as progress:
+            report = run_benchmark(
+                benchmark, profile, subject, load_text_encoder, only, self.pictures, progress
+            )
+        print(table(report))
+        published = beside_published(report)
+        if published:
+            print(f"\n{published}")
+        if self.json is not None:
+            save_json(self.json, report)
+        if failed:
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in failed.items())
+            raise InputError(f"not trained, and not in the table: {reasons}")
+
+    def _train(self, benchmark: "Benchmark") -> dict[str, str]:
+        """Train the scenes that --out lacks; which could not be, and why."""
+        from langsplat_core.pipeline.train import train_scene
+
+        config = with_preset(TrainConfig(clip=self.clip, masks=self.masks), self.preset)
+        failed = {}
+        for name in self.only or benchmark.scenes:
+            scene, path = benchmark.scenes.get(name), self.out / f"{name}.ply"
+            if scene is None or (path.exists() and path.with_suffix(SUFFIX).exists()):
+                continue  # an unknown name is complained of where all are looked up
+            try:
+                with TerminalProgress() as progress:
+                    train_scene(scene.dataset, path, config, progress=progress)
+            except InputError as error:
+                failed[name] = str(error)
+        return failed
+
+
+@dataclass(frozen=True)
+class EvalLerfOvs(_EvalLabels):
+    """LERF-OVS: mIoU and localisation in labelled frames, by a named protocol.
+
+    DATA is the folder with label/SCENE/FRAME.json. Frames are matched to views by name; the cameras of those
+    that the scene was not trained on are taken from the dataset beside the labels."""
+
+    protocol: LerfProtocol = "langsplat-code"
+    """Whose constants: filters, cut and choice of level; docs/evaluating.md lists them."""
 
     def run(self) -> None:
-        if (self.scene is None) != (self.dataset is None):
-            raise InputError("--scene and --dataset belong together: a scene, and the room it was trained on")
-        if self.scene is not None and self.dataset is not None:
-            if self.json is not None:
-                raise InputError("--json holds the figures of fresh rooms; leave it out with --scene")
-            self._run_scene(self.scene, self.dataset)
-            return
-        if self.paper_order:
-            raise InputError("--paper-order needs --scene; for fresh rooms, --budget measures it beside ours")
-        self._run_rooms()
+        from langsplat_core.evaluation.labels import read_lerf_ovs
 
-    def _run_rooms(self) -> None:
-        check_output_folder(self.work)
-        from langsplat_core.lab.rooms.benchmark import run_benchmark
-        from langsplat_core.lab.rooms.report import (
-            budget_table,
-            room_table,
-            save_json,
-            score_table,
-        )
+        self.evaluate(read_lerf_ovs(self.scene_and_data()[1]), LERF_PROFILES[self.protocol])
 
+
+@dataclass(frozen=True)
+class EvalOvs3d(_EvalLabels):
+    """3D-OVS: mIoU of every class in every labelled view, by a named protocol.
+
+    DATA is a folder with segmentations/classes.txt and segmentations/VIEW/CLASS.png, or one of several."""
+
+    protocol: OvsProtocol = "langsplat-paper"
+    """Whose constants: cut and choice of level; docs/evaluating.md lists them."""
+
+    def run(self) -> None:
+        from langsplat_core.evaluation.labels import read_3d_ovs
+
+        self.evaluate(read_3d_ovs(self.scene_and_data()[1]), OVS_PROFILES[self.protocol])
+
+
+@dataclass(frozen=True)
+class EvalScanNet(_Eval):
+    """ScanNet, direct in 3D: mIoU and mAcc of 19, 15 and 10 classes among the labelled vertices.
+
+    DATA is a folder of NAME/NAME_vh_clean_2.labels.ply; maps are NAME.npy, one class id per vertex."""
+
+    def run(self) -> None:
+        from langsplat_core.evaluation.run import Subject
+        from langsplat_core.evaluation.scannet import point_table, read_scannet, run_scannet, save_point_json
+        from langsplat_core.semantics.encoders import load_text_encoder
+
+        scene, data = self.scene_and_data()
         with TerminalProgress() as progress:
-            reports = run_benchmark(self.config, self.work, progress)
-        tables = [score_table(reports), room_table(reports)]
-        if self.config.budget or self.config.ceiling:
-            tables.append(budget_table(reports))
-        print("\n\n".join(tables))
-        unknown = sum(len(report.measured[0].unknown) for report in reports)
-        if unknown:
-            print(f"\nleft out: {unknown} phrases with words that the encoder was never taught")
+            report = run_scannet(
+                read_scannet(data),
+                Subject(scene, self.maps, self.encoder),
+                load_text_encoder,
+                self.only,
+                progress,
+            )
+        print(point_table(report))
         if self.json is not None:
-            save_json(self.json, asdict(self.config), reports)
-
-    def _run_scene(self, path: Path, dataset: Path) -> None:
-        from langsplat_core.lab.rooms.of_scene import measure_scene
-        from langsplat_core.lab.rooms.scoring import Reading
-
-        reading = Reading(self.paper_order, self.config.cut)
-        with TerminalProgress() as progress:
-            report = measure_scene(path, dataset, reading, progress)
-        print(report)
+            save_point_json(self.json, report)

@@ -15,7 +15,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.cli.checks import OutputConsole
 from langsplat_core.config import Count, CountOrZero, LevelChoice, PictureConfig, Positive
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.answers import QueryResult, peak_pixel
 from langsplat_core.query.compose import check_phrase, combine, run_phrase

@@ -19,15 +19,10 @@ from langsplat_core import __version__
 from langsplat_core.cli.checks import OutFile, OutputConsole
 from langsplat_core.config import CodecConfig, CompactConfig, Positive, Range
 from langsplat_core.errors import EXTRAS, BackendError, InputError, LangSplatError, remedy
-from langsplat_core.io import (
-    check_writable,
-    load_scene,
-    load_without_language,
-    rematch_language,
-    save_scene,
-    write_metres,
-)
 from langsplat_core.io.files import check_output_folder
+from langsplat_core.io.language import rematch_language
+from langsplat_core.io.ply import write_metres
+from langsplat_core.io.scenes import check_writable, load_scene, load_without_language, save_scene
 from langsplat_core.io.summary import NEEDLE, OPACITY_EDGES, SceneSummary, disk_bytes, summarise
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import QueryEngine
@@ -35,7 +30,7 @@ from langsplat_core.scene import Scene
 from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import load_text_encoder
 
-OPTIONAL = ("torch", "transformers", "pycolmap", "open3d", "matplotlib", "gsplat")
+OPTIONAL = ("torch", "transformers", "pycolmap", "matplotlib", "gsplat")
 LIBRARIES = {
     "EGL": "libegl1",
     "GL": "libgl1",

@@ -15,7 +15,7 @@ from langsplat_core.cli.checks import OutFile
 from langsplat_core.cli.query import Unit, chosen, instance_json, table, unit_of
 from langsplat_core.config import Count, LevelChoice, NotNegative, Positive
 from langsplat_core.errors import InputError
-from langsplat_core.io import check_writable, load_scene, save_scene
+from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.io.shapes import (
     MESH_SUFFIXES,
     POINT_SUFFIXES,

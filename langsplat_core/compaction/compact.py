@@ -27,7 +27,7 @@ from langsplat_core.compaction.views import (
 from langsplat_core.config import CompactConfig, PictureConfig, check_settings
 from langsplat_core.display.displays import gated_mean, latent_colours
 from langsplat_core.errors import InputError
-from langsplat_core.io import check_writable, load_scene, save_scene
+from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.io.summary import disk_bytes
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult

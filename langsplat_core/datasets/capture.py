@@ -236,7 +236,7 @@ class Capture:
     colours: Array  # (M, 3) uint8
     metres_per_unit: float | None = None  # > 0, how long a unit of its world is; None: unknown
     photos: tuple[Photo, ...] = ()  # the files, in the same order; none for pictures made otherwise
-    drawn: bool = False  # by `lab.world`, where encoders are calibrated, see `scene.Reading.elsewhere`
+    drawn: bool = False  # by `assets.making`, where encoders are calibrated, see `scene.Reading.elsewhere`
 
     def __post_init__(self) -> None:
         if len(self.cameras) != len(self.images):

@@ -56,7 +56,7 @@ def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
     _report_missing(file, missing, len(frames))
     cameras, images, files = develop(list(photos.values()), max_side, progress)
     points, colours = _points(file, top.get("ply_file_path"))
-    drawn = top.get("drawn") is True  # ours, of `langsplat demo dataset`
+    drawn = top.get("drawn") is True  # ours, of `python -m assets.making dataset`
     return Capture(cameras, images, points, colours, _metres_per_unit(file, top), files, drawn)
 
 

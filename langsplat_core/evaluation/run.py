@@ -14,7 +14,7 @@ from langsplat_core.evaluation.profiles import MapRule, OwnRule, Profile
 from langsplat_core.evaluation.report import BenchmarkReport
 from langsplat_core.evaluation.scoring import score_scene
 from langsplat_core.evaluation.sources import MapSource, SceneSource, Source
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, no_field
 from langsplat_core.raster import load_rasterizer

@@ -9,7 +9,8 @@ import numpy as np
 
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.config import INRIA
-from langsplat_core.io import cameras, companion_path, language
+from langsplat_core.io import cameras, language
+from langsplat_core.io.scenes import companion_path
 from langsplat_core.io.sog import META_NAME
 from langsplat_core.scene import LEVELS, NO_THING, SH_COUNTS, Gaussians, LanguageField, Scene
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import InputError
-from langsplat_core.io import read_features, write_features
 from langsplat_core.io.foreign import write_autoencoder, write_checkpoint
+from langsplat_core.io.langsplat_files import read_features, write_features
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import LEVELS, AutoencoderCodec, LanguageField, Scene
 from langsplat_core.semantics.store import SUFFIX, FeatureStore, ImageFeatures

@@ -14,8 +14,9 @@ from langsplat_core.config import RadianceConfig, TrainConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
-from langsplat_core.io import check_writable, load_scene, read_ply, save_scene, write_ply
 from langsplat_core.io.files import check_output_folder, shown
+from langsplat_core.io.ply import read_ply, write_ply
+from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.pipeline.language import check_lift, check_masks, language_field
 from langsplat_core.pipeline.report import TrainReport, doubts, read_report, work_folder, write_report
 from langsplat_core.pipeline.stages import Crew, sole_use, stage_key

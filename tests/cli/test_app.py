@@ -10,7 +10,9 @@ import pytest
 from tyro.extras import get_parser
 
 from langsplat_core import __version__
+from langsplat_core.cli import demo
 from langsplat_core.cli.app import COMMANDS, GROUPS, entry, load_command, parse
+from langsplat_core.cli.run import main
 from langsplat_core.cli.scenes import Doctor
 from langsplat_core.errors import InputError
 from langsplat_viewer.__main__ import ViewerCommand
@@ -63,7 +65,7 @@ def test_versions(program, run, monkeypatch, capsys):
 @pytest.mark.parametrize(("flag", "level"), [("-q", "ERROR"), ("--verbose", "DEBUG")])
 def test_how_much_is_said_stands_anywhere(flag, level):
     log = logging.getLogger("langsplat")
-    for words in ([flag, "doctor"], ["doctor", flag], ["bench", flag, "load"], ["bench", "load", flag]):
+    for words in ([flag, "doctor"], ["doctor", flag], ["bench", flag, "raster"], ["bench", "raster", flag]):
         log.setLevel(logging.INFO)
         parse(words)
         assert logging.getLevelName(log.level) == level
@@ -82,7 +84,7 @@ try() {
   echo "${COMPREPLY[@]}"
 }
 try langsplat q
-try langsplat bench v
+try langsplat bench r
 try langsplat train --max
 try langsplat train --preset g
 """
@@ -102,7 +104,7 @@ def test_bash_completes_commands_options_and_choices(capsys):
         check=True,
         env=terminal,
     )
-    assert done.stdout.splitlines() == ["query", "verdict", "--max-relevancy-error", "good"]
+    assert done.stdout.splitlines() == ["query", "raster", "--max-relevancy-error", "good"]
 
 
 def test_a_shell_without_completion_is_named():
@@ -139,3 +141,13 @@ def test_asking_the_bundled_scene_imports_no_torch():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("teddy: found")
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.long
+def test_demo_renders_the_bundled_scene(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(demo, "PICTURES", {"gift.png": ("--query", "blue gift")})
+    assert main("langsplat", lambda: parse(["demo", "--out", str(tmp_path)])) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["gift.png"]
+    assert "'blue gift': found" in capfd.readouterr().out
+    monkeypatch.setattr(demo, "PICTURES", {"gift.png": ("--camera", "absent")})
+    assert main("langsplat", lambda: parse(["demo", "--out", str(tmp_path)])) == 2

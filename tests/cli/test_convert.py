@@ -13,7 +13,8 @@ from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.cli.scenes import Convert
 from langsplat_core.errors import InputError
-from langsplat_core.io import companion_path, language, load_scene, save_scene
+from langsplat_core.io import language
+from langsplat_core.io.scenes import companion_path, load_scene, save_scene
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
@@ -108,7 +109,7 @@ def test_a_write_that_fails_leaves_the_old_scene(tmp_path, monkeypatch):
     def full_disk(*_: object) -> None:
         raise OSError("No space left on device")
 
-    monkeypatch.setattr("langsplat_core.io.write_language", full_disk)
+    monkeypatch.setattr("langsplat_core.io.scenes.write_language", full_disk)
     with pytest.raises(OSError, match="No space"):
         save_scene(tmp_path / "a.spz", full_scene())
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

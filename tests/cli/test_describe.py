@@ -8,7 +8,7 @@ import pytest
 
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
 from tests.support.blob_words import NAMES, named_scene
 from tests.support.fakes import FakeEncoder

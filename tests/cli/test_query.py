@@ -14,12 +14,12 @@ from langsplat_core.cli import query
 from langsplat_core.cli.query import QueryScene
 from langsplat_core.config import INRIA
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
-from langsplat_core.io import load_scene, save_scene
-from langsplat_core.lab.rooms.scoring import ask, evaluate
+from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Reading, Scene
 from langsplat_core.semantics.encoder import OPEN_MODEL
+from tests.benchmarks.scoring import ask, evaluate
 from tests.support.fakes import FakeEncoder, axis, blobs, calibrated_for
 from tests.support.fakes import cameras as fake_cameras
 from tests.support.fakes import language as fake_language

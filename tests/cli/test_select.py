@@ -14,7 +14,7 @@ from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.cli.scenes import Scale
 from langsplat_core.errors import InputError
-from langsplat_core.io import load_scene, save_scene
+from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
 from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, axis, blob_scene

@@ -25,7 +25,7 @@ from langsplat_core.compaction.views import (
 from langsplat_core.config import CompactConfig
 from langsplat_core.datasets import Capture
 from langsplat_core.errors import InputError
-from langsplat_core.io import load_scene, save_scene
+from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.progress import silent
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer

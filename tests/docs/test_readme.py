@@ -11,10 +11,12 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from assets.making.__main__ import parse as parse_making
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import Command, main
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_viewer.__main__ import parse as parse_viewer
+from tests.benchmarks.__main__ import parse as parse_benchmarks
 from tests.support.file_samples import compressed_ply
 from tests.support.scenes import random_gaussians
 
@@ -30,7 +32,12 @@ TOML = re.compile(r"^```toml\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
-PARSERS: dict[str, Callable[[list[str]], Command]] = {"langsplat": parse, "langsplat-viewer": parse_viewer}
+PARSERS: dict[str, Callable[[list[str]], Command]] = {
+    "langsplat": parse,
+    "langsplat-viewer": parse_viewer,
+    "assets.making": parse_making,
+    "tests.benchmarks": parse_benchmarks,
+}
 
 
 def block_lines(text: str) -> list[str]:
@@ -46,7 +53,8 @@ def commands(text: str) -> list[list[str]]:
     spans = [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", PYTHON.sub("", text))]
     found = []
     for line in [*block_lines(text), *spans]:
-        program = line.split(" ")[0].removeprefix(".venv/bin/")
+        line = line.removeprefix(".venv/bin/").removeprefix("python -m ")
+        program = line.split(" ")[0]
         if program in (*PARSERS, "make") and "..." not in line and " " in line:
             found.append([program, *shlex.split(line, comments=True)[1:]])
     return found

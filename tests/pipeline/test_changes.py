@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from langsplat_core.config import TrainConfig
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.pipeline.train import train_scene
 from langsplat_core.progress import Cancelled
 from tests.support.another_user import bound_by_permissions

@@ -12,8 +12,9 @@ import torch
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CodecConfig
 from langsplat_core.errors import EncoderError, FormatError, InputError
-from langsplat_core.io import load_scene, read_features, save_scene, write_features
 from langsplat_core.io.foreign import read_foreign
+from langsplat_core.io.langsplat_files import read_features, write_features
+from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.pipeline.exporting import (
     export_langsplat,
     export_occam,

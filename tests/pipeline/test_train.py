@@ -21,8 +21,8 @@ from langsplat_core.config import (
     with_preset,
 )
 from langsplat_core.errors import EncoderError, FormatError, InputError
-from langsplat_core.io import load_scene
 from langsplat_core.io.ply import write_metres
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.pipeline import language, train
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import train_scene

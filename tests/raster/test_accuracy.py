@@ -14,7 +14,7 @@ import pytest
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import GSPLAT, INRIA, RasterSettings
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.raster.reference import ReferenceRasterizer, ReferenceView
 from langsplat_core.scene import Camera, Gaussians, Scene
 from tests.support.backends import Backend

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from langsplat_core.arrays import logit, psnr, rotation_matrices, sigmoid
-from langsplat_core.lab.speed.queries import repeated
+from langsplat_core.bench.query import repeated
 from langsplat_core.progress import Cancelled
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Gaussians, Scene

@@ -24,8 +24,8 @@ from imgui_bundle import immapp
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui
 
 import glfw  # isort: skip
-from langsplat_core.io import load_scene
-from langsplat_core.lab.speed.queries import repeated
+from langsplat_core.bench.query import repeated
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer import canvas
 from langsplat_viewer.actions import viewpoint

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from imgui_bundle import imgui  # isort: skip
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.pipeline.report import REPORT
 from langsplat_viewer import viewer as training
 from langsplat_viewer.actions import opening, settings, viewpoint

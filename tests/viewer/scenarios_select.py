@@ -7,7 +7,7 @@ import numpy as np
 from imgui_bundle import hello_imgui, imgui  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_viewer.panels.style import scene_area
 from langsplat_viewer.rendering.request import TINT
 from tests.support.fakes import CENTRES

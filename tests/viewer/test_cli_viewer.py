@@ -12,7 +12,9 @@ import pytest
 from PIL import Image
 
 from langsplat_core.config import Display
-from langsplat_core.io import companion_path, language, save_scene, write_cameras
+from langsplat_core.io import language
+from langsplat_core.io.cameras import write_cameras
+from langsplat_core.io.scenes import companion_path, save_scene
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer import __main__ as program
 from langsplat_viewer.options import DisplayChoice, latent_level, parse_size

@@ -14,7 +14,7 @@ from PIL import Image
 
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import InputError
-from langsplat_core.io import save_scene
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.progress import Cancelled
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.camera.flight import Flight, Keyframe

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from langsplat_core.io import load_scene, save_scene
+from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import filming, opening, queries, settings, viewpoint
 from langsplat_viewer.files.browsing import MOST_LISTED, Entry, list_folder

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from langsplat_core.config import PictureConfig
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.scene import Camera
 from langsplat_viewer.camera.controls import (

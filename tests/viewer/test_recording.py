@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose
 from PIL import Image
 
 from langsplat_core.config import PictureConfig
-from langsplat_core.io import save_scene
 from langsplat_core.io.cameras import read_cameras
+from langsplat_core.io.scenes import save_scene
 from langsplat_viewer.actions import filming, opening, queries, settings, undoing, viewpoint
 from langsplat_viewer.camera.controls import orbit, zoom
 from langsplat_viewer.files.flights import read_flight

@@ -11,7 +11,8 @@ import pytest
 from langsplat_core.arrays import Array
 from langsplat_core.config import INRIA, PictureConfig
 from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, Channels, compose
-from langsplat_core.io import load_scene, write_ply
+from langsplat_core.io.ply import write_ply
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Gaussians, Scene, look_at

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import look_at
 from langsplat_viewer.actions import opening, queries, selecting, settings, undoing, viewpoint
 from langsplat_viewer.actions.selecting import take

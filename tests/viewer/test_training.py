@@ -12,7 +12,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from langsplat_core.cli.app import parse
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.pipeline.report import REPORT
 from langsplat_core.scene import Scene
 from langsplat_viewer import viewer

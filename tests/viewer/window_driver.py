@@ -15,7 +15,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui  # isort: skip
 from imgui_bundle.immapp import testing  # isort: skip
 from langsplat_core.display.displays import QUERY_COLOURS
 from langsplat_core.errors import BackendError
-from langsplat_core.io import load_scene
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import Scene
 from langsplat_viewer.actions import settings
 from langsplat_viewer.panels.style import scene_area
@@ -327,12 +327,12 @@ def broken_renderer(s: Session) -> None:
     s.wait(lambda: s.state.scene is not None)
     s.settle()
     s.renderer.draw = fail
-    s.ctx.key_press(imgui.Key.r)
+    s.ctx.key_press(digit_key(2))
     s.settle()
     s.ctx.yield_(20)
     assert s.state.messages[-1].text == "the driver gave up; use --backend cpu"
     del s.renderer.draw
-    s.ctx.key_press(digit_key(2))
+    s.ctx.key_press(digit_key(3))
     assert s.shot("mended")[:, 400:].max() > 100
 
 

@@ -11,8 +11,8 @@ from langsplat_core.arrays import Array
 from langsplat_core.compiled import is_compiled
 from langsplat_core.display.displays import DISPLAYS, latent_colours
 from langsplat_core.errors import InputError
-from langsplat_core.io import cameras, language, scene_files
-from langsplat_core.io.sog import META_NAME
+from langsplat_core.io import cameras, language
+from langsplat_core.io.scenes import format_of, scene_files
 from langsplat_core.pipeline.forecast import count_photographs
 from langsplat_core.pipeline.report import stated_doubts
 from langsplat_core.progress import Progress
@@ -29,7 +29,7 @@ from langsplat_viewer.actions.viewpoint import opening_view, read_bookmarks
 from langsplat_viewer.camera.controls import Extent, extent_of
 from langsplat_viewer.files import photographs
 from langsplat_viewer.files.browsing import SUFFIX as QUERIES
-from langsplat_viewer.files.browsing import Entry, is_scene, list_folder
+from langsplat_viewer.files.browsing import Entry, list_folder
 from langsplat_viewer.files.flights import SUFFIX as PATHS
 from langsplat_viewer.files.photographs import Photograph
 from langsplat_viewer.files.preferences import with_photographs, with_recent
@@ -412,7 +412,7 @@ def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
     if not scenes:
         _ask_sets(viewer, sets)
         return
-    known = [path for path in scenes if is_scene(path)] or scenes[:1]
+    known = [path for path in scenes if format_of(path)] or scenes[:1]
     others = [path.name for path in scenes if path not in known]
     if others:
         more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
@@ -437,7 +437,7 @@ def open_all(viewer: Viewer) -> None:
     listing = viewer.state.browser
     if listing is not None:
         open_scenes(
-            viewer, [entry.path for entry in listing.entries if entry.is_file and is_scene(entry.path)]
+            viewer, [entry.path for entry in listing.entries if entry.is_file and format_of(entry.path)]
         )
         open_panel(viewer, "Scene")
 
@@ -469,6 +469,6 @@ def open_typed(viewer: Viewer) -> None:
 
 def _is_plain_folder(path: Path) -> bool:
     try:
-        return path.is_dir() and not (path / META_NAME).is_file()
+        return path.is_dir() and format_of(path) is None
     except OSError:  # a name that no file system takes: opening it says so
         return False

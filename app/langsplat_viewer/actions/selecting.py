@@ -13,7 +13,8 @@ from typing import Literal
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.io import cameras, language, save_scene
+from langsplat_core.io import cameras, language
+from langsplat_core.io.scenes import save_scene
 from langsplat_core.io.shapes import write_points
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import QueryEngine

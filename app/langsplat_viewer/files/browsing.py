@@ -9,7 +9,7 @@ from typing import Any, get_args
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import InputError, printable_line
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.sog import META_NAME
+from langsplat_core.io.scenes import format_of
 from langsplat_viewer.files.flights import SUFFIX as PATHS
 
 SUFFIX = ".queries.json"
@@ -86,7 +86,6 @@ def _is_phrase(text: Any) -> bool:
 
 # Folders, files that may be scenes, query sets and camera paths.
 
-SCENE_SUFFIXES = (".ply", ".spz", ".splat", ".ksplat", ".sog")
 MOST_LISTED = 2000  # entries of a folder that are listed
 
 
@@ -120,18 +119,13 @@ def list_folder(folder: Path) -> Listing:
     return Listing(folder, tuple(entries[:MOST_LISTED]), max(len(entries) - MOST_LISTED, 0))
 
 
-def is_scene(path: Path) -> bool:
-    """Return whether a file or folder is named as scenes are."""
-    return path.suffix.lower() in SCENE_SUFFIXES or path.name == META_NAME or (path / META_NAME).is_file()
-
-
 def _entry(path: Path) -> Entry | None:
     if path.name.startswith("."):
         return None
     try:
         if path.is_dir():
-            return Entry(path, is_file=(path / META_NAME).is_file())
-        if path.suffix.lower() in SCENE_SUFFIXES or path.name.endswith((SUFFIX, PATHS)):
+            return Entry(path, is_file=format_of(path) is not None)
+        if format_of(path) is not None or path.name.endswith((SUFFIX, PATHS)):
             return Entry(path, True, path.stat().st_size)
     except OSError:  # it may not be looked at
         pass

@@ -11,8 +11,8 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from langsplat_core.errors import InputError
-from langsplat_core.io import write_ply
 from langsplat_core.io.files import atomic_path
+from langsplat_core.io.ply import write_ply
 from langsplat_core.pipeline.report import work_folder
 from langsplat_core.scene import Gaussians
 

@@ -9,8 +9,9 @@ import numpy as np
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.config import TrainPreset
+from langsplat_core.io.scenes import format_of
 from langsplat_viewer.actions import opening, selecting, settings, training
-from langsplat_viewer.files.browsing import Entry, Listing, is_scene
+from langsplat_viewer.files.browsing import Entry, Listing
 from langsplat_viewer.output import saving
 from langsplat_viewer.panels.style import (
     Area,
@@ -130,7 +131,7 @@ def _foot(viewer: Viewer, listing: Listing) -> None:
 
 def has_several(listing: Listing) -> bool:
     """Return whether there is more than one scene to open."""
-    return sum(entry.is_file and is_scene(entry.path) for entry in listing.entries) > 1
+    return sum(entry.is_file and format_of(entry.path) is not None for entry in listing.entries) > 1
 
 
 def _path_box(viewer: Viewer) -> None:

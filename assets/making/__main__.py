@@ -1,0 +1,99 @@
+"""`python -m assets.making dataset|encoder|build`: make photographs, the demo encoder, the demo scene.
+
+The work is imported when it is done: torch and open3d take seconds that --help need not pay.
+"""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from assets.making.config import EncoderConfig, LabelLayout, Size, Tier
+from langsplat_core.cli.checks import OutFile, OutFolder
+from langsplat_core.cli.run import Command, main, parsed
+from langsplat_core.config import Count, Seed
+from langsplat_core.progress import TerminalProgress
+
+PROGRAM = "python -m assets.making"
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Render a procedural room: photographs, cameras, points, and the truth at three levels."""
+
+    out: OutFolder
+    """Folder to write."""
+    seed: Seed = 0
+    """Another seed is another room."""
+    views: Count = 72
+    """Number of photographs."""
+    size: Size = (640, 480)
+    """Width and height, pixels."""
+    tier: Tier = "clutter"
+    """How hard the room is: objects apart, cluttered, or packed with look-alikes."""
+    layout: LabelLayout = "plain"
+    """lerf-ovs, 3d-ovs: the photographs in OUT/room, and every eighth labelled as in that benchmark."""
+
+    def run(self) -> None:
+        from assets.making.dataset import write_labelled
+
+        with TerminalProgress() as progress:
+            folder = write_labelled(
+                self.out, self.layout, self.seed, self.views, self.size, progress, self.tier
+            )
+        print(f"{folder}: {self.views} photographs with ground truth")
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """Train the demo encoder on procedural crops, and measure it in new rooms. Resumes when interrupted."""
+
+    out: OutFolder
+    """Folder to write: model, tokenizer, vocabulary."""
+    config: Annotated[EncoderConfig, tyro.conf.arg(name="")] = field(default_factory=EncoderConfig)
+
+    def run(self) -> None:
+        from assets.making.encoder import report_table, train_encoder
+
+        with TerminalProgress() as progress:
+            rows = train_encoder(self.out, self.config, progress)
+        print(report_table(rows))
+
+
+@dataclass(frozen=True)
+class Build:
+    """Make the demo scene: render its photographs, train it with the ordinary pipeline, compact it."""
+
+    out: OutFile
+    """The scene to write, *.ply."""
+    seed: Seed = 2
+    """Another seed is another room."""
+    tier: Tier = "clutter"
+    """How hard the room is: objects apart, cluttered, or packed with look-alikes."""
+    masks: Literal["truth", "graph"] = "truth"
+    """Outlines as a perfect segmenter would find them, or those of the weight-free segmenter."""
+    steps: Count = 6_000
+    """Steps of radiance training."""
+    gaussians: Path | None = None
+    """Keep the Gaussians of this scene of the same room, and make only their language field again."""
+
+    def run(self) -> None:
+        from assets.making.scene import build_scene
+
+        with TerminalProgress() as progress:
+            made = build_scene(
+                self.out, self.seed, self.tier, self.masks, self.steps, self.gaussians, progress
+            )
+        print(f"{self.out}: {made}")
+
+
+def parse(args: list[str]) -> Command:
+    """The command that the words of a command line name; SystemExit as tyro raises it."""
+    command: Command = parsed(PROGRAM, Dataset | Encoder | Build, args, "Make the bundled files again.")
+    return command
+
+
+if __name__ == "__main__":
+    sys.exit(main(PROGRAM, lambda: parse(sys.argv[1:] or ["--help"])))

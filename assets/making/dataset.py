@@ -1,0 +1,305 @@
+"""Folders of photographs of a procedural room, with cameras, points and ground truth in three layouts."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+from PIL import Image
+from scipy.ndimage import binary_fill_holes, find_objects
+from scipy.ndimage import label as connected
+
+from assets.making.config import LabelLayout, Tier
+from assets.making.render import Light, Picture, Renderer
+from assets.making.truth import Phrase, Truth, read_truth
+from assets.making.world import World, build_room
+from langsplat_core.arrays import Array
+from langsplat_core.errors import InputError
+from langsplat_core.io.files import atomic_path
+from langsplat_core.progress import Progress
+from langsplat_core.scene import LEVELS, Camera, look_at
+
+POINTS = 20_000  # sparse points, as structure from motion would give
+_FIRST_ROOM = 2_000_000  # the demo encoder was trained in rooms of lower numbers only
+LIGHT_SAMPLES = 40  # rays per vertex towards the lamp, and again towards the sky
+LIGHT_CELL = 0.006  # metres between the places where light is gathered, where it varies
+_POINT_NOISE = 0.004  # metres, standard deviation
+LIGHT = Light(np.array([-1.25, -1.05, 1.55]))
+# (share of the views, elevation in degrees, distance in metres, height of the target above the table)
+_RINGS = ((0.3, 23.0, 1.5, 0.0), (0.3, 42.0, 1.25, 0.02), (0.25, 36.0, 1.0, 0.05), (0.15, 50.0, 1.75, -0.2))
+
+
+@dataclass(frozen=True)
+class Naming:
+    """File names of photographs."""
+
+    stem: str = "view_{:03d}"
+    suffix: str = ".png"
+    first: int = 0
+
+
+PLAIN = Naming()
+
+
+def write_dataset(
+    out: Path,
+    seed: int,
+    views: int,
+    size: tuple[int, int],
+    progress: Progress,
+    tier: Tier = "clutter",
+    naming: Naming = PLAIN,
+) -> None:
+    """Render the room of `seed` and difficulty `tier` into folder `out`.
+
+    views: number of photographs, >= 4; size: (width, height) in pixels, at least 16 each; naming: of the
+    photographs. Written are images/view_000.png ..., points.ply, truth/view_000.npz (`ids`: (3, H, W) int32
+    label ids at subpart, part and whole level, -1 where there is nothing; `depth`: (H, W) float32 metres
+    along the camera's z), truth/labels.json (id -> level, word, thing, colour, phrase, words) and, last,
+    transforms.json in nerfstudio's convention (OpenGL camera-to-world), marked as "drawn". A view counts as
+    done when its truth file is there, so an interrupted call goes on where it stopped. Raises InputError for
+    a size or number out of range.
+    """
+    if views < 4 or min(size) < 16:
+        raise InputError(
+            f"demo dataset: {views} views of {size[0]}x{size[1]}: it needs at least 4 views of 16x16"
+        )
+    world = photographed_room(seed, tier)
+    cameras = [
+        replace(camera, name=naming.stem.format(naming.first + k))
+        for k, camera in enumerate(orbit_cameras(views, size, seed))
+    ]
+    folder, truth = out / "images", out / "truth"
+    folder.mkdir(parents=True, exist_ok=True)
+    truth.mkdir(exist_ok=True)
+    progress("rendering photographs", 0.0)
+    renderer = Renderer(world, LIGHT, samples=LIGHT_SAMPLES, cell=LIGHT_CELL)
+    for done, camera in enumerate(cameras):
+        if not (truth / f"{camera.name}.npz").exists():
+            _write_view(renderer, world, camera, out, naming.suffix)
+        progress("rendering photographs", (done + 1) / views)
+    _write_labels(world, truth / "labels.json")
+    _write_points(world, renderer, seed, out / "points.ply")
+    _write_transforms(cameras, naming.suffix, out / "transforms.json")
+
+
+def photographed_room(seed: int, tier: Tier = "clutter") -> World:
+    """The room that `write_dataset` photographs; the demo encoder has never seen one of them."""
+    return build_room(_FIRST_ROOM + seed, tier)
+
+
+def truth_ids(world: World, picture: Picture) -> Array:
+    """(3, H, W) int32 label ids of a picture at subpart, part and whole level, -1 where nothing is."""
+    ids = np.where(picture.pieces[..., None] >= 0, world.ids[picture.pieces], -1)
+    return np.moveaxis(ids, -1, 0).astype(np.int32)
+
+
+def orbit_cameras(views: int, size: tuple[int, int], seed: int) -> list[Camera]:
+    """Cameras on four rings around the table, low, high, close and far; jittered by the seed.
+
+    Names are shuffled over the rings, so that every n-th view in name order is a fair sample of them.
+    """
+    rng = np.random.default_rng((seed, 3))
+    cameras: list[Camera] = []
+    counts = [round(share * views) for share, *_ in _RINGS[:-1]]
+    counts.append(views - sum(counts))
+    for (_, elevation, distance, height), count in zip(_RINGS, counts, strict=True):
+        for k in range(count):
+            azimuth = 2 * np.pi * (k + rng.uniform(-0.2, 0.2) + 0.37 * elevation) / count
+            tilt = np.radians(elevation + rng.uniform(-4, 4))
+            reach = distance * rng.uniform(0.95, 1.05)
+            out = np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
+            target = np.array([*rng.uniform(-0.12, 0.12, 2), height])
+            cameras.append(look_at(target + reach * out, target, np.array([0.0, 0, 1]), size, 46.0))
+    order = rng.permutation(views)
+    return [replace(cameras[row], name=f"view_{k:03d}") for k, row in enumerate(order)]
+
+
+def _write_view(renderer: Renderer, world: World, camera: Camera, out: Path, suffix: str) -> None:
+    picture = renderer.picture(camera)
+    with atomic_path(out / "images" / f"{camera.name}{suffix}") as path:
+        Image.fromarray(picture.image).save(path, quality=95)  # PNG has no quality and does not read it
+    with atomic_path(out / "truth" / f"{camera.name}.npz") as path:
+        np.savez_compressed(path, ids=truth_ids(world, picture), depth=picture.depth)
+
+
+def _write_labels(world: World, path: Path) -> None:
+    stated = ("word", "thing", "colour", "phrase", "words")
+    rows = {
+        str(number): {"level": LEVELS[label.level], **{name: getattr(label, name) for name in stated}}
+        for number, label in enumerate(world.labels)
+    }
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+def _write_points(world: World, renderer: Renderer, seed: int, path: Path) -> None:
+    """Points on the surfaces, denser on the objects than on the room, with noise and colours."""
+    from plyfile import PlyData, PlyElement
+
+    rng = np.random.default_rng((seed, 4))
+    corners = world.vertices[world.triangles].astype(np.float64)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    objects = world.solid & (corners[:, :, 2].max(1) > -0.05)
+    weight = area * np.where(objects, 8.0, 1.0)
+    chosen = rng.choice(len(area), POINTS, p=weight / weight.sum())
+    uv = np.sort(rng.random((POINTS, 2)), 1)
+    uv = np.stack([uv[:, 0], uv[:, 1] - uv[:, 0]], 1)
+    spread = np.stack([1 - uv.sum(1), uv[:, 0], uv[:, 1]], 1)
+    points = (corners[chosen] * spread[..., None]).sum(1) + rng.normal(0, _POINT_NOISE, (POINTS, 3))
+    colours = renderer.colours_at(chosen, uv, np.array([0.0, 0.0, 3.0]))
+    row = np.dtype([(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")])
+    table = np.empty(POINTS, row)
+    for axis, name in enumerate("xyz"):
+        table[name] = points[:, axis]
+    for channel, name in enumerate(("red", "green", "blue")):
+        table[name] = colours[:, channel]
+    with atomic_path(path) as temporary:
+        PlyData([PlyElement.describe(table, "vertex")]).write(str(temporary))
+
+
+def camera_to_world_gl(camera: Camera) -> Array:
+    """(4, 4) camera-to-world in OpenGL's frame (x right, y up, z backwards), as transforms.json has it."""
+    return np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def _write_transforms(cameras: list[Camera], suffix: str, path: Path) -> None:
+    first = cameras[0]
+    content = {
+        "camera_model": "PINHOLE",
+        "w": first.width,
+        "h": first.height,
+        "fl_x": first.fx,
+        "fl_y": first.fy,
+        "cx": first.cx,
+        "cy": first.cy,
+        "ply_file_path": "points.ply",
+        "metres_per_unit": 1.0,
+        "drawn": True,
+        "frames": [
+            {
+                "file_path": f"images/{camera.name}{suffix}",
+                "transform_matrix": camera_to_world_gl(camera).tolist(),
+            }
+            for camera in cameras
+        ],
+    }
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+SCENE = "room"  # the benchmark's name for it
+LABELLED_EVERY = 8  # views; those that training holds out unless told otherwise
+NAMES: Mapping[LabelLayout, Naming] = MappingProxyType(
+    {"plain": PLAIN, "lerf-ovs": Naming("frame_{:05d}", ".jpg", 1), "3d-ovs": Naming("{:02d}", ".jpg")}
+)
+ASKED = ("object", "colour+object", "part")  # kinds of phrases that LERF-OVS's labels are like
+MIN_PIXELS = 150  # a thing with fewer visible pixels in a view is not asked for there
+PIECES = np.ones((3, 3), int)  # pixels that touch at a corner are of one piece
+EDGE = 0.999  # height at which a mask's edge is traced: within a thousandth of the centres of its own pixels
+
+
+def write_labelled(
+    out: Path,
+    layout: LabelLayout,
+    seed: int,
+    views: int,
+    size: tuple[int, int],
+    progress: Progress,
+    tier: Tier = "clutter",
+) -> Path:
+    """Render a room as `write_dataset` does, into `out` itself or, in a benchmark's layout, into `out`/room,
+    and label every eighth view in that layout. Returns the photographs' folder. Raises as `write_dataset`."""
+    folder = out if layout == "plain" else out / SCENE
+    write_dataset(folder, seed, views, size, progress, tier, NAMES[layout])
+    if layout == "plain":
+        return folder
+    truth = read_truth(folder)
+    names = sorted(path.stem for path in (folder / "truth").glob("*.npz"))[::LABELLED_EVERY]
+    if layout == "lerf-ovs":
+        write_lerf_ovs(folder, out / "label" / SCENE, truth, names)
+    else:
+        write_3d_ovs(folder, truth, names)
+    return folder
+
+
+def _visible(truth: Truth, name: str, kinds: tuple[str, ...]) -> dict[Phrase, Array]:
+    """The phrases that are true for enough of a view to be asked there, and where."""
+    labels = truth.labels(name)
+    masks = {p: np.asarray(np.isin(labels, p.ids).any(axis=0)) for p in truth.phrases if p.kind in kinds}
+    return {phrase: mask for phrase, mask in masks.items() if mask.sum() >= MIN_PIXELS}
+
+
+def write_lerf_ovs(dataset: Path, labels: Path, truth: Truth, names: list[str]) -> None:
+    """label/<scene>/<frame>.json and .jpg. A mask of several pieces, or with holes, becomes several objects
+    of one category, whose polygons joined are the mask."""
+    for name in names:
+        photograph = (dataset / "images" / f"{name}.jpg").read_bytes()
+        with atomic_path(labels / f"{name}.jpg") as path:
+            path.write_bytes(photograph)
+        height, width = truth.labels(name).shape[1:]
+        objects = [
+            {"category": phrase.text, "bbox": box, "segmentation": polygon}
+            for phrase, mask in _visible(truth, name, ASKED).items()
+            for polygon, box in _objects(mask)
+        ]
+        info = {"name": f"{name}.jpg", "width": width, "height": height}
+        with atomic_path(labels / f"{name}.json") as path:
+            path.write_text(json.dumps({"info": info, "objects": objects}) + "\n", encoding="utf-8")
+
+
+def _objects(mask: Array) -> list[tuple[list[list[int]], list[int]]]:
+    """(polygon, box) of every piece of a mask; what a piece is cut into for its holes keeps its box."""
+    pieces, _ = connected(mask, PIECES)
+    found = []
+    for number, (rows, columns) in enumerate(find_objects(pieces), 1):
+        box = [columns.start, rows.start, columns.stop - 1, rows.stop - 1]
+        found += [(polygon.tolist(), box) for polygon in outlines(pieces == number)]
+    return found
+
+
+def write_3d_ovs(dataset: Path, truth: Truth, names: list[str]) -> None:
+    """segmentations/<view>/<class>.png and, last, classes.txt; a class is what one calls a whole thing."""
+    folder = dataset / "segmentations"
+    classes: dict[str, None] = {}
+    for name in names:
+        for phrase, mask in _visible(truth, name, ("object",)).items():
+            classes[phrase.text] = None
+            with atomic_path(folder / name / f"{phrase.text}.png") as path:
+                Image.fromarray(np.where(mask, 255, 0).astype(np.uint8)).save(path)
+    with atomic_path(folder / "classes.txt") as path:
+        path.write_text("\n".join(sorted(classes)) + "\n", encoding="utf-8")
+
+
+def outlines(mask: Array) -> list[Array]:
+    """(H, W) bool -> polygons, (K, 2) int x, y each, K >= 3, which filled, border included, give the mask.
+
+    A piece with a hole is cut through it into pieces without one.
+    """
+    found = []
+    pieces, _ = connected(mask, PIECES)
+    for number, part in enumerate(find_objects(pieces), 1):
+        piece = pieces[part] == number
+        corner = np.array([part[1].start, part[0].start])
+        holes = binary_fill_holes(piece) & ~piece
+        if holes.any():
+            column = int(np.flatnonzero(holes.any(0))[0])
+            left, right = piece.copy(), piece.copy()
+            left[:, column + 1 :], right[:, : column + 1] = False, False
+            found += [polygon + corner for polygon in outlines(left) + outlines(right)]
+        else:
+            found.append(_trace(piece) + corner)
+    return found
+
+
+def _trace(piece: Array) -> Array:
+    """(K, 2) the border of one piece without holes, pixel by pixel."""
+    from skimage.measure import find_contours
+
+    contours = find_contours(np.pad(piece.astype(float), 1), EDGE, fully_connected="high")
+    longest = max(contours, key=len)
+    corners = np.rint(longest - 1).astype(int)[:, ::-1]
+    corners = corners[np.r_[True, (np.diff(corners, axis=0) != 0).any(1)]]
+    return np.concatenate([corners, np.repeat(corners[-1:], max(0, 3 - len(corners)), 0)])

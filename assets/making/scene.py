@@ -1,0 +1,76 @@
+"""The bundled scene: a procedural room, photographed by our renderer, trained by our pipeline.
+
+The pipeline sees the photographs, their cameras, noisy points and, in place of SAM, the outlines of things
+and parts. Their names and colours it never sees: those come from the encoder.
+"""
+
+from pathlib import Path
+from typing import Literal
+
+from assets.making.config import Tier
+from assets.making.dataset import write_dataset
+from assets.making.truth import TruthMasks, read_truth
+from langsplat_core.compaction.compact import compact_scene
+from langsplat_core.config import (
+    ClipConfig,
+    CompactConfig,
+    DatasetConfig,
+    MaskConfig,
+    RadianceConfig,
+    TrainConfig,
+)
+from langsplat_core.pipeline.train import train_scene
+from langsplat_core.progress import Progress, silent
+
+SEED = 2
+VIEWS = 72
+SIZE = (640, 480)
+MAX_LOSS = 0.25  # dB that compaction may cost
+
+
+def scene_config(steps: int) -> TrainConfig:
+    """Settings of the bundled scene: a low SH degree and a cap on the count keep the file small."""
+    return TrainConfig(
+        dataset=DatasetConfig(max_side=max(SIZE), test_every=9),
+        radiance=RadianceConfig(steps=steps, sh_degree=1, max_gaussians=110_000),
+        masks=MaskConfig(source="graph"),
+        clip=ClipConfig(model="demo"),
+    )
+
+
+def build_scene(
+    out: Path,
+    seed: int = SEED,
+    tier: Tier = "clutter",
+    masks: Literal["truth", "graph"] = "truth",
+    steps: int = 6_000,
+    gaussians: Path | None = None,
+    progress: Progress = silent,
+) -> str:
+    """Render the room of `seed` and `tier`, train, and drop what the photographs do not miss; or, given
+    `gaussians`, a scene of that room, find only what those mean. What was made, in a line.
+
+    `masks`: "truth", the outlines that a perfect segmenter would find, or "graph", the weight-free one.
+
+    Photographs and truth stay in `<out>.work/photographs`, the scene as trained in `<out>.work/trained.ply`.
+    """
+    work = out.with_name(out.stem + ".work")
+    photographs, trained = work / "photographs", work / "trained.ply"
+    if not (photographs / "transforms.json").exists():
+        write_dataset(photographs, seed, VIEWS, SIZE, progress, tier)
+    source = (lambda capture: TruthMasks(capture, read_truth(photographs))) if masks == "truth" else None
+    config = scene_config(steps)
+    made = train_scene(
+        photographs,
+        out if gaussians else trained,
+        config,
+        work,
+        progress,
+        masks_of=source,
+        gaussians_from=gaussians,
+    )
+    if gaussians:
+        return f"{made.gaussians} Gaussians of {gaussians}, {made.codec} of {made.codec_size}"
+    report = compact_scene(trained, out, CompactConfig(max_psnr_loss=MAX_LOSS), photographs, progress)
+    kept, before = report.after, report.before.gaussians
+    return f"{kept.gaussians} Gaussians of {before} trained, held-out {kept.psnr:.2f} dB"

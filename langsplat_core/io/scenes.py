@@ -1,0 +1,236 @@
+"""Scenes on disk: one table of formats, which the loader, `langsplat convert`, the file browser, the desktop
+entry and the tests of damaged files all read; a scene's companions.
+
+A scene is `scene.ply` with, beside it, `scene.langsplat.safetensors` and `scene.cameras.json`, either of
+which may be absent. The same companions are looked for beside a compressed PLY, a SOG folder or a .sog. Those
+of `scene.spz`, `.splat` and `.ksplat` keep its suffix, `scene.spz.langsplat.safetensors`: the sidecar knows
+the rounded positions of that file, so that it could not serve a `scene.ply` in the same folder.
+"""
+
+import logging
+import os
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.errors import InputError
+from langsplat_core.io import cameras as camera_files
+from langsplat_core.io import language, ply
+from langsplat_core.io.cameras import read_cameras, write_cameras
+from langsplat_core.io.files import atomic_path, check_output_file
+from langsplat_core.io.hostile import exists
+from langsplat_core.io.language import read_language, write_language
+from langsplat_core.io.ply import metres_comment, read_ply_scene, write_ply
+from langsplat_core.io.sog import META_NAME, read_sog_scene
+from langsplat_core.io.splat import read_ksplat, read_splat, write_splat
+from langsplat_core.io.spz import read_spz_scene, write_spz
+from langsplat_core.scene import Gaussians, Scene
+
+log = logging.getLogger("langsplat")
+
+LOOKED_AT = 4096  # rows of a large scene, evenly taken, that tell whether most can be drawn
+
+
+@dataclass(frozen=True)
+class SceneFormat:
+    """A format of scenes: one row of `FORMATS`."""
+
+    suffix: str  # of its files, lower case
+    read: Callable[[Path], Scene]
+    write: Callable[[Path, Scene], None] | None = None  # None: read only
+    exact: bool = False  # positions are read as they were written
+    own_companions: bool = False  # companions keep the suffix: `a.spz.langsplat.safetensors`
+    folder_file: str = ""  # a folder with this file in it is a scene too, and so is the file
+    mime: str = "model/x-gaussian-splat"
+
+
+def _write_ply(path: Path, scene: Scene) -> None:
+    comments = [ply.COMMENT] if scene.antialiased else []
+    if scene.metres_per_unit is not None:
+        comments.append(metres_comment(scene.metres_per_unit))
+    write_ply(path, scene.gaussians, tuple(comments), scene.extras)
+
+
+FORMATS = (
+    SceneFormat(".ply", read_ply_scene, _write_ply, exact=True, mime="model/x-ply"),  # plain and compressed
+    SceneFormat(
+        ".spz",
+        read_spz_scene,
+        lambda path, scene: write_spz(path, scene.gaussians, scene.antialiased),
+        own_companions=True,
+    ),
+    SceneFormat(
+        ".splat",
+        lambda path: Scene(read_splat(path)),
+        lambda path, scene: write_splat(path, scene.gaussians),
+        own_companions=True,
+    ),
+    SceneFormat(".ksplat", lambda path: Scene(read_ksplat(path)), own_companions=True),
+    SceneFormat(".sog", read_sog_scene, folder_file=META_NAME),
+)
+WRITABLE = tuple(row.suffix for row in FORMATS if row.write is not None)
+SUPPORTED = ", ".join(
+    [row.suffix for row in FORMATS]
+    + [f"a folder with {row.folder_file} or that file" for row in FORMATS if row.folder_file]
+)
+
+
+def format_of(path: Path) -> SceneFormat | None:
+    """The format that `path` is named as, or, for a folder, has the file of; None for no scene."""
+    folder = os.path.isdir(path)  # which a name too long is not
+    for row in FORMATS:
+        if not folder and path.suffix.lower() == row.suffix:
+            return row
+        if row.folder_file and (path.name == row.folder_file or exists(path / row.folder_file)):
+            return row
+    return None
+
+
+def load_gaussians(path: Path | str) -> Gaussians:
+    """The Gaussians of a scene in any supported format, without its companions.
+
+    Raises InputError for what cannot be opened or is of no supported kind, FormatError for what breaks
+    the rules of its format.
+    """
+    return _read_scene(Path(path)).gaussians
+
+
+def load_scene(path: Path | str) -> Scene:
+    """A scene with its language field and cameras, where they lie beside it.
+
+    Cameras are `<scene>.cameras.json`, or for a PLY in the folder structure of the INRIA code
+    (`model/point_cloud/iteration_N/point_cloud.ply`) `model/cameras.json`. A companion that is unusable or
+    made for other Gaussians is left out, with the reason in `Scene.unread`. Raises InputError and FormatError
+    as `load_gaussians` does.
+    """
+    scene = load_without_language(path)
+    sidecar = companion_path(path, language.SUFFIX)
+    if not exists(sidecar):
+        return scene
+    try:
+        return replace(scene, language=read_language(sidecar, scene.gaussians.means))
+    except InputError as error:
+        return replace(scene, unread=(*scene.unread, str(error)))
+
+
+def load_without_language(path: Path | str) -> Scene:
+    """As `load_scene`, but without the language field, which is not even looked at."""
+    path = Path(path)
+    scene, cameras = replace(_read_scene(path), path=path), _cameras_path(path)
+    if not exists(cameras):
+        return scene
+    try:
+        return replace(scene, cameras=read_cameras(cameras))
+    except InputError as error:
+        log.warning("opened without its cameras: %s", error)
+        return replace(scene, unread=(str(error),))
+
+
+def _read_scene(path: Path) -> Scene:
+    """What the scene's own file holds; a warning where most of it cannot be drawn."""
+    scene = _read_by_kind(path)
+    count = len(scene.gaussians)
+    log.debug("%s: %d Gaussians", path, count)
+    looked_at = scene.gaussians.take(np.arange(0, count, max(1, count // LOOKED_AT)))
+    if 2 * looked_at.valid().sum() < len(looked_at):
+        reasons = looked_at.invalid_rows()
+        share = sum(reasons.values()) / len(looked_at)
+        told = f"{share:.0%} of the {count} Gaussians cannot be drawn ({', '.join(reasons)})"
+        log.warning("%s: %s; is the file damaged?", path, told)
+    return scene
+
+
+def _read_by_kind(path: Path) -> Scene:
+    if not exists(path):
+        raise InputError(f"{path}: no such file; check the spelling and the folder")
+    row = format_of(path)
+    if row is not None:
+        return row.read(path)
+    if path.is_dir():
+        inside = sorted(path.glob("**/*.ply"))
+        hint = f"; perhaps {inside[-1]}" if inside else ""
+        raise InputError(f"{path}: a folder without {META_NAME} is not a scene{hint}")
+    raise InputError(f"{path}: not a scene of a known kind; supported: {SUPPORTED}")
+
+
+def check_writable(path: Path | str) -> None:
+    """InputError unless `save_scene` can write a scene of this name, and its companions, where it lies."""
+    _writable(Path(path))
+    check_output_file(path)
+    for suffix in (language.SUFFIX, camera_files.SUFFIX):
+        check_output_file(companion_path(path, suffix))
+
+
+def _writable(path: Path) -> SceneFormat:
+    for row in FORMATS:
+        if row.suffix == path.suffix.lower() and row.write is not None:
+            return row
+    raise InputError(f"{path}: scenes are written as {', '.join(WRITABLE)}; choose such a name")
+
+
+def save_scene(path: Path | str, scene: Scene) -> None:
+    """Write `scene` as .ply, .spz or .splat, by its name, with its companions; those it lacks are removed.
+
+    Only the PLY keeps everything. .spz rounds it, without extras and scale; .splat moreover has neither view
+    dependence nor the mark of antialiasing. All keep the rows' order. All files are first written whole under
+    temporary names. Then the old companions are removed, the scene's file renamed into place, and last the
+    new companions. Interrupted anywhere, there is the old scene or the new one, perhaps without companions,
+    but never a scene beside companions of another. A scene with companions that could not be read is not
+    written: that would remove them. Raises InputError then, and as `check_writable`.
+    """
+    path = Path(path)
+    if scene.unread:
+        raise InputError(
+            f"not written without what lies beside it; mend or remove it first: {scene.unread[0]}"
+        )
+    check_writable(path)
+    row = _writable(path)
+    assert row.write is not None
+    sidecar, cameras = companion_path(path, language.SUFFIX), companion_path(path, camera_files.SUFFIX)
+    with ExitStack() as renames:  # which it makes in the reverse order of the following lines
+        if scene.cameras:
+            write_cameras(renames.enter_context(atomic_path(cameras)), scene.cameras)
+        new_sidecar = None if scene.language is None else renames.enter_context(atomic_path(sidecar))
+        new_file = renames.enter_context(atomic_path(path))
+        row.write(new_file, scene)
+        if scene.language is not None and new_sidecar is not None:
+            # The sidecar belongs to the positions as a reader finds them, rounded in some formats.
+            means = scene.gaussians.means if row.exact else load_gaussians(new_file).means
+            write_language(new_sidecar, scene.language, means)
+        for companion in (sidecar, cameras):
+            companion.unlink(missing_ok=True)
+
+
+def companion_path(scene: Path | str, suffix: str) -> Path:
+    """Where the file of a scene that ends in `suffix` lies: `a/b.ply` or .sog -> `a/b<suffix>`; a SOG folder
+    `a/b` (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder; `a/b.spz`, .splat or .ksplat ->
+    `a/b.spz<suffix>` and so on."""
+    scene = Path(scene)
+    if any(row.folder_file and scene.name == row.folder_file for row in FORMATS):
+        scene = scene.parent
+    row = None if os.path.isdir(scene) else format_of(scene)  # which a name too long is not
+    if row is not None:
+        return scene.with_name((scene.name if row.own_companions else scene.stem) + suffix)
+    whole = scene.resolve()  # "." has no name of its own
+    return whole.with_name(whole.name + suffix)
+
+
+def scene_files(path: Path | str) -> tuple[Path, ...]:
+    """The files that `load_scene` reads, the scene's own first (of a SOG folder its meta.json, then images),
+    then language field and cameras, whether these are there or not."""
+    path = Path(path)
+    own: tuple[Path, ...] = (path,)
+    if os.path.isdir(path) or path.name == META_NAME:  # which a name too long is not
+        folder = path if os.path.isdir(path) else path.parent
+        own = (folder / META_NAME, *sorted(folder.glob("*.webp")))
+    return (*own, companion_path(path, language.SUFFIX), _cameras_path(path))
+
+
+def _cameras_path(scene: Path) -> Path:
+    beside = companion_path(scene, camera_files.SUFFIX)
+    if not exists(beside) and scene.name == "point_cloud.ply":
+        return scene.parent.parent.parent / "cameras.json"
+    return beside

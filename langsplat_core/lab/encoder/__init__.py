@@ -1,1 +1,0 @@
-"""Training of the small CLIP that comes with the program."""

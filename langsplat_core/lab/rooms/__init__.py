@@ -1,1 +1,0 @@
-"""`langsplat eval synthetic`: the method measured in fresh rooms, beside oracles."""

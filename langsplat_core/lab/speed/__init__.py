@@ -1,1 +1,0 @@
-"""`langsplat bench`: speed against error."""

@@ -1,1 +1,0 @@
-"""Procedural rooms with labelled objects, photographed by ray casting: demo data and its truth."""

@@ -1,1 +1,0 @@
-"""Colour, substance, light and the camera that sees them."""

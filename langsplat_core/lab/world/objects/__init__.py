@@ -1,1 +1,0 @@
-"""What stands in a room: builders of every class of thing."""

@@ -1,0 +1,23 @@
+"""`python -m tests.benchmarks rooms|verdicts|phrases|lifting|scale`: one report each."""
+
+import sys
+
+from langsplat_core.cli.run import Command, main, parsed
+from tests.benchmarks.lifting import Lifting
+from tests.benchmarks.phrases import Phrases
+from tests.benchmarks.rooms import Rooms
+from tests.benchmarks.scale import Scale
+from tests.benchmarks.verdicts import Verdicts
+
+PROGRAM = "python -m tests.benchmarks"
+
+
+def parse(args: list[str]) -> Command:
+    """The report that the words of a command line name; SystemExit as tyro raises it."""
+    about = "Measure this project where the truth is known, and at large sizes."
+    command: Command = parsed(PROGRAM, Rooms | Verdicts | Phrases | Lifting | Scale, args, about)
+    return command
+
+
+if __name__ == "__main__":
+    sys.exit(main(PROGRAM, lambda: parse(sys.argv[1:] or ["--help"])))

@@ -1,0 +1,317 @@
+"""The report `phrases`: phrases with structure, asked whole and composed; names of regions, inventories.
+
+Phrases that are true of a room come from its geometry and its names; the second table is of `words`.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise, product
+
+import numpy as np
+
+from assets.making.dataset import MIN_PIXELS, photographed_room
+from assets.making.truth import Truth
+from assets.making.vocabulary import CATEGORIES
+from assets.making.world import World
+from langsplat_core.arrays import Array
+from langsplat_core.bench.measure import markdown
+from langsplat_core.evaluation.scoring import intersection_over_union
+from langsplat_core.progress import Progress, TerminalProgress, silent
+from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.compose import Body, Viewer, body, most, run_phrase, stands, upright, viewer
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.grammar import EXTREMES, SIDES, atoms, parse
+from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
+from langsplat_core.scene import Camera, LanguageField, Scene
+from tests.benchmarks.files import publish
+from tests.benchmarks.room import InRooms, Room, Seeds, Variant
+from tests.benchmarks.scoring import MIN_GAUSSIANS, masks_and_peaks
+from tests.benchmarks.words import name_regions, word_table
+
+POINTS = 3000  # on the surface of every thing, by which it is measured
+MOST_CASES = 16  # of one construction, drawn at random
+SHELL = ("floor", "wall")  # surround everything, and are not related to anything
+VIEWER_SAYS = ("left of", "right of", "behind", "in front of", "nearest", "farthest", "leftmost", "rightmost")
+FEWEST = 3  # things that a superlative chooses from
+CONSTRUCTIONS = (
+    *("part of thing", "subpart of thing", "thing part", "thing subpart", "A and B", "thing without part"),
+    *("kind, not thing", *SIDES, *EXTREMES),
+)
+
+
+@dataclass(frozen=True)
+class Phrases(InRooms):
+    """Every construction of the grammar, composed in 3D beside asked whole; words for every region, and the
+    inventory. Some minutes per room."""
+
+    seeds: Seeds = (301, 302, 303)
+    """One room of every tier each; never the bundled scene's. Composing was tuned on 201 and 202."""
+
+    def run(self) -> None:
+        composed, named = [], []
+        with TerminalProgress() as progress:
+            for room in self.rooms(progress):
+                field, _, _ = room.field(Variant("the method", "truth"))
+                composed += measure_phrases(room, field, progress)
+                named.append(name_regions(room, field))
+        tables = f"{phrase_table(composed)}\n{word_table(named)}"
+        publish(self, "phrases", "Phrases with structure, and names", tables, [*composed, *named])
+
+
+@dataclass(frozen=True)
+class Case:
+    """A phrase, how it is asked whole, and what it is true for."""
+
+    construction: str  # one of CONSTRUCTIONS
+    text: str
+    whole: str  # the same in the words in which the encoder knows it best
+    ids: tuple[int, ...]  # truth ids, of any level; none: nothing in the room is so
+    without: tuple[int, ...] = ()  # truth ids that are taken away from these
+
+    def mask(self, labels: Array) -> Array:
+        """(3, ...) truth ids -> (...) bool."""
+        right = np.isin(labels, self.ids).any(0) & ~np.isin(labels, self.without).any(0)
+        return np.asarray(right)
+
+
+@dataclass(frozen=True, eq=False)
+class Things:
+    """The single things in a room."""
+
+    words: Mapping[int, str]  # whole id -> its word
+    extents: Mapping[int, Body]
+
+    def called(self, word: str) -> list[int]:
+        """Ids of those that are of this word or kind."""
+        return [number for number, own in self.words.items() if word in (own, *CATEGORIES.get(own, ()))]
+
+
+def things_in(world: World, frame: Array, seed: int = 0) -> Things:
+    """From a room's triangles, in which the origin is that of its cameras. frame: see `instances.upright`."""
+    rng = np.random.default_rng((seed, 5))
+    corners = world.vertices[world.triangles].astype(np.float64)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    owner = world.ids[world.piece_of, 2]
+    words, extents = {}, {}
+    for number in np.unique(owner):
+        rows = np.flatnonzero(owner == number)
+        rows = rng.choice(rows, POINTS, p=area[rows] / area[rows].sum())
+        shares = rng.dirichlet((1, 1, 1), POINTS)  # even over a triangle
+        words[int(number)] = world.labels[number].thing
+        extents[int(number)] = body((corners[rows] * shares[..., None]).sum(1), frame)
+    return Things(words, extents)
+
+
+def cases(truth: Truth, things: Things, seen_by: Viewer, seed: int) -> list[Case]:
+    """At most `MOST_CASES` of every construction but of parts, of which there are all."""
+    rng = np.random.default_rng((seed, 7))
+    found: dict[str, list[Case]] = {name: [] for name in CONSTRUCTIONS}
+    every = [
+        *_parts(truth),
+        *_sets(things, rng),
+        *_relations(things, seen_by),
+        *_extremes(things, seen_by),
+    ]
+    for case in every:
+        found[case.construction].append(case)
+    drawn = []
+    for name, group in found.items():
+        if "part" in name or len(group) <= MOST_CASES:
+            drawn += group
+            continue
+        there = [case for case in group if case.ids]
+        absent = [case for case in group if not case.ids]
+        for some in (there, absent):
+            drawn += [some[row] for row in sorted(rng.permutation(len(some))[:MOST_CASES])]
+    return drawn
+
+
+def _parts(truth: Truth) -> Iterator[Case]:
+    names = {f"{item.thing} {item.word}": (item.thing, item.word) for item in truth.regions.values()}
+    for phrase in truth.phrases:
+        if phrase.kind in ("part", "subpart"):
+            thing, part = names[phrase.text]
+            text = f"{part} of the {thing}"
+            yield Case(f"{phrase.kind} of thing", text, phrase.text, phrase.ids)
+            yield Case(f"thing {phrase.kind}", phrase.text, phrase.text, phrase.ids)
+            wholes = tuple(
+                key for key, item in truth.regions.items() if item.level == "whole" and item.thing == thing
+            )
+            text = f"{thing} without its {part}"
+            yield Case("thing without part", text, f"{thing} without {part}", wholes, phrase.ids)
+
+
+def _sets(things: Things, rng: np.random.Generator) -> Iterator[Case]:
+    words = [str(word) for word in rng.permutation(sorted(set(things.words.values()) - set(SHELL)))]
+    for one, other in pairwise(words):
+        ids = (*things.called(one), *things.called(other))
+        yield Case("A and B", f"{one} and {other}", f"{one} and {other}", ids)
+    for kind in _kinds(things):
+        for word in sorted({things.words[number] for number in things.called(kind)}):
+            rest = tuple(number for number in things.called(kind) if things.words[number] != word)
+            if rest:
+                yield Case("kind, not thing", f"{kind}, not {word}", f"{kind} not {word}", rest)
+
+
+def _kinds(things: Things) -> list[str]:
+    return sorted({kind for word in things.words.values() for kind in CATEGORIES.get(word, ())})
+
+
+def _relations(things: Things, seen_by: Viewer) -> Iterator[Case]:
+    """Of a kind of which some stand so and others do not; and of single things, of which none does."""
+    objects = sorted(set(things.words.values()) - set(SHELL))
+    for side, anchor in product(SIDES, objects):
+        anchors = things.called(anchor)
+        for word in [*_kinds(things), *objects]:
+            candidates = [number for number in things.called(word) if number not in anchors]
+            right = tuple(
+                number
+                for number in candidates
+                if any(
+                    stands(side, things.extents[number], things.extents[other], seen_by) for other in anchors
+                )
+            )
+            some = 0 < len(right) < len(candidates)
+            if some or (word in objects and candidates and not right and side not in VIEWER_SAYS):
+                text = f"{word} {side} the {anchor}"
+                yield Case(side, text, text, right)
+
+
+def _extremes(things: Things, seen_by: Viewer) -> Iterator[Case]:
+    for kind, word in product(EXTREMES, _kinds(things)):
+        numbers = things.called(word)
+        if len(numbers) >= FEWEST:
+            one = numbers[most(kind, [things.extents[number] for number in numbers], [], seen_by)]
+            text = f"the {kind} {word}"
+            yield Case(kind, text, f"{kind} {word}", (one,))
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """An answer that is about to be compared with the truth."""
+
+    case: Case
+    values: Array  # (N,) relevancy
+    members: Array  # (N,) bool
+    found: bool
+    seconds: float
+
+
+@dataclass(frozen=True)
+class PhraseScore:
+    """One case in one room; means over views. NaN where nothing could be compared."""
+
+    construction: str
+    text: str
+    way: str  # "whole" or "composed"
+    seed: int
+    present: bool
+    found: bool
+    ious: tuple[float, ...]  # per view in which the truth is visible
+    hits: tuple[bool, ...]  # whether the peak lies on it
+    direct: float  # intersection over union of Gaussians
+    seconds: float
+
+
+def measure_phrases(room: Room, field: LanguageField, progress: Progress = silent) -> list[PhraseScore]:
+    """All cases of one room that the encoder knows the words of, whole and composed."""
+    scene, held_out = Scene(room.gaussians, field, tuple(room.capture.cameras)), room.held_out
+    engine = QueryEngine(scene, lambda _: room.encoder)
+    frame = upright(scene.up())
+    things = things_in(photographed_room(room.seed, room.tier), frame, room.seed)
+    asked = [
+        case
+        for case in cases(room.truth, things, viewer(held_out[0], frame), room.seed)
+        if not any(engine.unknown_words(atom.text) for atom in atoms(parse(case.text)))
+    ]
+    ways: dict[str, Callable[[Case], Judged]] = {
+        "whole": lambda case: _whole(engine, case),
+        "composed": lambda case: _composed(engine, case, held_out[0]),
+    }
+    rows: list[PhraseScore] = []
+    for way, answer in ways.items():
+        engine.run("object")  # so that no time goes into preparation
+        judged = [answer(case) for case in asked]
+        rows += _scores(room, judged, held_out, way)
+        progress(f"room {room.seed}, {way}", 1.0)
+    return rows
+
+
+def _whole(engine: QueryEngine, case: Case) -> Judged:
+    """Without the words that the encoder was never taught, such as "near": with them it refuses."""
+    unknown = set(engine.unknown_words(case.whole))
+    text = " ".join(word for word in case.whole.split() if word not in unknown)
+    start = time.perf_counter()
+    result = engine.run(text)
+    seconds = time.perf_counter() - start
+    return Judged(case, result.even, result.members, result.found, seconds)
+
+
+def _composed(engine: QueryEngine, case: Case, viewpoint: Camera) -> Judged:
+    start = time.perf_counter()
+    result: QueryResult = run_phrase(engine, case.text, viewpoint=viewpoint).answer
+    seconds = time.perf_counter() - start
+    return Judged(case, result.even, result.members, result.found, seconds)
+
+
+def _scores(room: Room, judged: Sequence[Judged], cameras: Sequence[Camera], way: str) -> list[PhraseScore]:
+    ious: list[list[float]] = [[] for _ in judged]
+    hits: list[list[bool]] = [[] for _ in judged]
+    for camera in cameras:
+        for row, iou, hit in _in_view(room, judged, camera):
+            ious[row].append(iou)
+            hits[row].append(hit)
+    seen = (room.labels >= 0).any(axis=0)
+    rows = []
+    for number, item in enumerate(judged):
+        right = item.case.mask(room.labels)[seen]
+        enough = right.sum() >= MIN_GAUSSIANS
+        direct = intersection_over_union(item.members[seen], right) if enough else float("nan")
+        rows.append(
+            PhraseScore(
+                item.case.construction, item.case.text, way, room.seed, bool(item.case.ids), item.found,
+                tuple(ious[number]), tuple(hits[number]), direct, item.seconds,
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _in_view(room: Room, judged: Sequence[Judged], camera: Camera) -> Iterator[tuple[int, float, bool]]:
+    """(number, IoU, whether the peak hits) of every answer whose truth is visible."""
+    labels = room.truth.labels(camera.name)
+    view = CpuRasterizer().view(room.gaussians, camera)
+    masks = [item.case.mask(labels) for item in judged]
+    visible = [row for row, mask in enumerate(masks) if mask.sum() >= MIN_PIXELS]
+    answers = [(judged[row].values, judged[row].members) for row in visible]
+    for row, (found, peak) in zip(visible, masks_and_peaks(view, answers), strict=True):
+        yield row, intersection_over_union(found, masks[row]), bool(masks[row][peak])
+
+
+def phrase_table(rows: Sequence[PhraseScore]) -> str:
+    """Markdown: per construction, whole / composed."""
+    lines = []
+    for name in CONSTRUCTIONS:
+        both = [
+            [row for row in rows if (row.construction, row.way) == (name, way)]
+            for way in ("whole", "composed")
+        ]
+        if both[0]:
+            here = [[row for row in way if row.present] for way in both]
+            lines.append((
+                name,
+                len(here[0]),
+                sum(len(row.ious) for row in here[0]),
+                _pair([[iou for row in way for iou in row.ious] for way in here]),
+                _pair([[hit for row in way for hit in row.hits] for way in here]),
+                _pair([[row.direct for row in way if not np.isnan(row.direct)] for way in here]),
+                _pair([[row.found for row in way] for way in here]),
+                _pair([[not row.found for row in way if not row.present] for way in both]),
+            ))  # fmt: skip
+    figures = ("mIoU %", "localisation %", "3D IoU %", "found %", "not there: rejected %")
+    return markdown(("construction", "phrases", "views", *figures), lines)
+
+
+def _pair(ways: Sequence[Sequence[float]]) -> str:
+    """Percent; "-" for no figures."""
+    return " / ".join(f"{100 * np.mean(way):.1f}" if len(way) else "-" for way in ways)

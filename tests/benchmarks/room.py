@@ -1,0 +1,369 @@
+"""One procedural room: photographs, Gaussians, masks, language fields and answers, each made once, by the
+ordinary pipeline, and compared with the truth."""
+
+import hashlib
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Literal, cast
+
+import numpy as np
+import tyro
+
+from assets.making.config import Size, Tier
+from assets.making.dataset import write_dataset
+from assets.making.objects import EVERYTHING
+from assets.making.scene import SEED
+from assets.making.truth import Truth, TruthMasks, read_truth
+from langsplat_core.arrays import Array
+from langsplat_core.cli.checks import OutFolder
+from langsplat_core.config import (
+    ClipConfig,
+    CodecConfig,
+    Count,
+    DatasetConfig,
+    LevelChoice,
+    LiftConfig,
+    MaskConfig,
+    PictureConfig,
+    RadianceConfig,
+    Range,
+    Seed,
+    TrainConfig,
+    check_settings,
+)
+from langsplat_core.datasets import load_capture
+from langsplat_core.datasets.capture import Capture
+from langsplat_core.errors import InputError
+from langsplat_core.io.hostile import write_npy
+from langsplat_core.io.language import means_checksum
+from langsplat_core.pipeline.language import Views, language_field
+from langsplat_core.pipeline.stages import stage_key
+from langsplat_core.pipeline.train import trained_gaussians
+from langsplat_core.progress import Progress
+from langsplat_core.query.answers import AnswerRule, CutRule
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
+from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
+from langsplat_core.scene import LEVELS, Camera, Gaussians, LanguageField, Scene
+from langsplat_core.semantics.encoder import Encoder
+from langsplat_core.semantics.encoders import load_encoder, model_path
+from langsplat_core.semantics.masks import MaskSource
+from langsplat_core.semantics.sources import load_mask_source
+from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture
+from langsplat_core.training.language.codec_fit import CodecReport
+from tests.benchmarks.clip_geometry import ClipGeometry, read_geometry
+from tests.benchmarks.oracles import (
+    TileMasks,
+    moved_to_pictures,
+    oracle_vectors,
+    phrase_vectors,
+    true_labels,
+    with_wrong_vectors,
+)
+from tests.benchmarks.scoring import (
+    Asked,
+    Judge,
+    MaskRule,
+    Measured,
+    ask,
+    codec_name,
+    evaluate,
+    evaluate_direct,
+    measured,
+)
+
+HOLD_OUT = 8  # every so many views, one is not trained on
+FRAMES = 5  # timed images of one phrase
+ViewCount = Annotated[int, Range(8, 100_000)]
+Seeds = Annotated[tuple[Seed, ...], Range(0, 2**32 - 1, some=True)]
+# The outlines a perfect segmenter would find; the same, but 15 % of the vectors are another region's; the
+# weight-free segmenter's; squares in place of masks.
+MaskOrigin = Literal["truth", "wrong", "graph", "tiles"]
+
+
+@dataclass(frozen=True)
+class RoomSettings:
+    """How rooms are photographed, trained and asked."""
+
+    views: ViewCount = 48  # photographs of each room; every eighth is held out
+    size: Size = (400, 300)  # width and height, pixels
+    steps: Count = 1_500  # of radiance training
+    max_gaussians: Count = 50_000  # of a room
+    encoder: str = "demo"
+    """"demo" for the bundled one, a folder, a hub id, or clip-geometry:OWN[,ALIKE]: vectors made from truth
+    with the geometry of CLIP, OWN being the cosine of an image with its words (0.22 to 0.32)."""
+    text_vectors: Path | None = None  # .npy of real text vectors for clip-geometry, names in a .txt beside it
+    cut: CutRule | Literal["regions"] = "regions"
+    """How an answer becomes a mask: whole regions, or a rule of `query.answers.cut_level` for the map."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One method: each stage the ordinary one, one that makes no mistake, or another's."""
+
+    name: str
+    masks: MaskOrigin
+    vectors: Literal["image", "text"] = "image"  # text: of every region's true words
+    codec: CodecConfig = CodecConfig()  # noqa: RUF009 (frozen)
+    lift: LiftConfig = LiftConfig()  # noqa: RUF009
+    query: Literal["blend answers", "paper"] = "blend answers"  # paper: blend latents, then decode
+    level: LevelChoice = "auto"  # that is asked
+
+
+def autoencoder(d: int = 3, steps: int = 4_000) -> CodecConfig:
+    """The paper's codec."""
+    return CodecConfig(kind="autoencoder", latent_dim=d, steps=steps)
+
+
+def ceiling(dim: int) -> CodecConfig:
+    """A codec that loses nothing: all `dim` numbers."""
+    return CodecConfig(kind="linear", latent_dim=dim)
+
+
+def weights_digest(model: str) -> str:
+    """Digest of an encoder's weights: a folder may be filled with others under the same name."""
+    found, digest = model_path(model, "--encoder"), hashlib.sha256()
+    for path in sorted([*found.glob("*.safetensors"), *found.glob("*.bin")]) if found.is_dir() else [found]:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def room_encoder(model: str, text_vectors: Path | None = None) -> tuple[Encoder | ClipGeometry, str]:
+    """An encoder, simulated ones included (`read_geometry`), and the digest of its weights."""
+    geometry = read_geometry(model, text_vectors)
+    if geometry is None:
+        return load_encoder(model), weights_digest(model)
+    return geometry, geometry.digest
+
+
+@dataclass(frozen=True)
+class InRooms:
+    """Options of every report that is measured in rooms with known truth."""
+
+    tiers: tuple[Tier, ...] = ("clutter",)  # how crowded the rooms are
+    seeds: Seeds = (301, 302, 303, 304, 305)
+    """One room of every tier each; never the bundled scene's. 201 to 203 calibrate the demo encoder."""
+    settings: Annotated[RoomSettings, tyro.conf.arg(name="")] = field(default_factory=RoomSettings)
+    work: OutFolder = Path("eval_out")
+    """Folder for the rooms and all intermediate results: an interrupted run goes on."""
+    out: OutFolder = Path("bench_out")
+    """Folder for the report: its tables (.md) and figures (.json, some .png)."""
+
+    def rooms(self, progress: Progress) -> "Iterator[Room]":
+        """Every room, not yet made. Raises InputError for settings without a room that can be measured."""
+        check_settings(self)
+        if not self.tiers:
+            raise InputError("name at least one of --tiers")
+        if SEED in self.seeds:
+            raise InputError(
+                f"--seeds {SEED} is the bundled scene's room, on which things were tuned; take another seed"
+            )
+        encoder = room_encoder(self.settings.encoder, self.settings.text_vectors)
+        for tier in self.tiers:
+            for seed in self.seeds:
+                yield Room(
+                    self.settings, tier, seed, self.work, encoder, labelled(progress, f"{tier} {seed}, ")
+                )
+
+
+class Room:
+    """One room and everything that is derived from it; each part is made once, when it is first needed."""
+
+    def __init__(
+        self,
+        config: RoomSettings,
+        tier: Tier,
+        seed: int,
+        work: Path,
+        encoder: tuple[Encoder | ClipGeometry, str],
+        progress: Progress,
+    ) -> None:
+        width, height = config.size
+        self.config, self.tier, self.seed, self.progress = config, tier, seed, progress
+        self.encoder, self.weights = encoder
+        self.folder = work / f"{tier}-{seed}-{config.views}x{width}x{height}"
+        self.settings = TrainConfig(
+            dataset=DatasetConfig(max_side=max(config.size), test_every=HOLD_OUT),
+            radiance=RadianceConfig(steps=config.steps, sh_degree=1, max_gaussians=config.max_gaussians),
+            clip=ClipConfig(model=config.encoder),
+        )
+        self.seconds: dict[str, float] = {}
+
+    @cached_property
+    def photographs(self) -> Path:
+        """Folder of the photographs, rendered if need be, with the truth in it."""
+        folder, start = self.folder / "photographs", time.perf_counter()
+        if not (folder / "transforms.json").exists():
+            write_dataset(folder, self.seed, self.config.views, self.config.size, self.progress, self.tier)
+            self._lap("photographs", start)
+        return folder
+
+    @cached_property
+    def capture(self) -> Capture:
+        """The photographs with their cameras."""
+        start = time.perf_counter()
+        capture = load_capture(self.photographs, self.settings.dataset, self.folder, self.progress)
+        self._lap("photographs", start)
+        return capture
+
+    @cached_property
+    def truth(self) -> Truth:
+        """Regions of the photographs and the phrases that are right for them."""
+        return read_truth(self.photographs)
+
+    @cached_property
+    def gaussians(self) -> Gaussians:
+        """Gaussians that were trained without the held-out views."""
+        train, _ = self.capture.split(HOLD_OUT)
+        start = time.perf_counter()
+        gaussians = trained_gaussians(self.capture, train, self.settings, self.folder, self.progress)
+        self._lap("radiance", start)
+        return gaussians
+
+    @cached_property
+    def labels(self) -> Array:
+        """(3, N) truth ids of every Gaussian."""
+        path = self.folder / f"{stage_key('labels', 1, means_checksum(self.gaussians.means))}.npy"
+        if not path.exists():
+            start = time.perf_counter()
+            views = [(camera, self.truth.labels(camera.name)) for camera in self.capture.cameras]
+            labels = true_labels(CpuRasterizer(), self.gaussians, views, self.progress)
+            write_npy(path, labels)
+            self._lap("labels of the Gaussians", start)
+        stored: Array = np.load(path, allow_pickle=False)
+        return stored
+
+    def views(self, variant: Variant) -> Views:
+        """The training views with masks and vectors."""
+        outlines = "truth" if variant.masks == "wrong" else variant.masks
+        source = self._masks(outlines)
+        train, _ = self.capture.split(HOLD_OUT)
+        cameras = [self.capture.cameras[i] for i in train]
+        start = time.perf_counter()
+        features: Sequence[ImageFeatures] = describe_capture(
+            [self.capture.images[i] for i in train],
+            [camera.name for camera in cameras],
+            source,
+            self.encoder,
+            FeatureStore(self.folder / f"features-{outlines}-{self.weights}"),
+            self.progress,
+        )
+        self._lap(f"masks ({variant.masks}) and vectors", start)
+        if isinstance(self.encoder, ClipGeometry):
+            features = [
+                self.encoder.describe(item, self.truth.labels(camera.name), self.truth, row)
+                for row, (item, camera) in enumerate(zip(features, cameras, strict=True))
+            ]
+        if variant.masks == "wrong":
+            features = [with_wrong_vectors(item, seed) for seed, item in enumerate(features)]
+        if variant.vectors == "text":
+            words = phrase_vectors(self.truth, self.encoder)
+            told = [
+                oracle_vectors(item, self.truth.labels(camera.name), words)
+                for item, camera in zip(features, cameras, strict=True)
+            ]
+            features = moved_to_pictures(told, features)
+        return list(zip(cameras, features, strict=True))
+
+    def _masks(self, outlines: MaskOrigin) -> MaskSource:
+        if outlines == "graph":
+            return load_mask_source(MaskConfig(source="graph"))
+        return TileMasks() if outlines == "tiles" else TruthMasks(self.capture, self.truth)
+
+    def field(self, variant: Variant, fresh: bool = False) -> tuple[LanguageField, CodecReport, float]:
+        """The language field, what its codec loses, and seconds; `fresh` takes nothing that was kept."""
+        views, start = self.views(variant), time.perf_counter()
+        settings = replace(self.settings, codec=variant.codec, lift=variant.lift)
+        with TemporaryDirectory(dir=self.folder) as empty:
+            work = Path(empty) if fresh else self.folder
+            encoder = cast(Encoder, self.encoder)
+            made = language_field(self.gaussians, views, encoder, settings, work, self.progress)
+        self._lap(f"language field ({variant.name})", start)
+        return *made, round(time.perf_counter() - start, 1)
+
+    def measure(self, variant: Variant, fresh: bool = False) -> Measured:
+        """Ask everything of a variant's field. fresh: take nothing that was kept, so that seconds count."""
+        field, loss, seconds = self.field(variant, fresh)
+        return replace(self.measure_field(field, variant), codec_loss=loss, fit_seconds=seconds)
+
+    def rule(self, variant: Variant) -> AnswerRule:
+        """How the engine answers; the paper's own order by the peak."""
+        return "regions" if self.config.cut == "regions" and variant.query != "paper" else "peak"
+
+    def measure_field(self, field: LanguageField, variant: Variant) -> Measured:
+        """Ask everything of a language field."""
+        start = time.perf_counter()
+        # What is no codec has its numbers at hand; going through a codec's interface takes seconds a phrase.
+        whole = field.codec.latent_dim == field.codec.vector_dim
+        engine = QueryEngine(
+            Scene(self.gaussians, field), lambda _: self.encoder, exact=whole, rule=self.rule(variant)
+        )
+        asked = ask(engine, self.texts, variant.level)
+        self._lap(f"queries ({variant.name})", start)
+        frame_ms = 1000 * median_seconds(lambda: self._frame(asked, variant))
+        return replace(
+            self.measure_asked(asked, variant),
+            codec=codec_name(field.codec),
+            bytes_per_gaussian=field.latents.nbytes / max(len(field), 1),
+            frame_ms=frame_ms,
+        )
+
+    @cached_property
+    def texts(self) -> list[str]:
+        """Phrases that are asked: everything that is there, and things that are not."""
+        return [*(phrase.text for phrase in self.truth.phrases), *self.truth.absent(EVERYTHING)]
+
+    def measure_asked(self, asked: Asked, variant: Variant, judge: Judge | None = None) -> Measured:
+        """Compare answers to `texts` with the truth. judge: of another system's answers (`scoring.evaluate`),
+        which are then cut half way between the floor and their peak among the Gaussians too."""
+        start = time.perf_counter()
+        rule = MaskRule(variant.query == "paper", self.config.cut)
+        progress = labelled(self.progress, f"{variant.name}: ")
+        scores = evaluate(asked, CpuRasterizer(), self.held_out, self.truth, rule, progress, judge)
+        direct = evaluate_direct(asked, self.labels, self.truth, "floor" if judge else self.config.cut)
+        result = measured(asked, self.truth, self.truth.absent(EVERYTHING), scores, direct)
+        self._lap(f"queries ({variant.name})", start)
+        return replace(
+            result, **{key: getattr(variant, key) for key in ("name", "masks", "vectors", "query")}
+        )
+
+    @cached_property
+    def held_out(self) -> list[Camera]:
+        """Cameras of the views that nothing was trained on."""
+        return [self.capture.cameras[i] for i in self.capture.split(HOLD_OUT)[1]]
+
+    def _frame(self, asked: Asked, variant: Variant) -> None:
+        """Project one held-out view and draw one phrase into it; in the paper's order its best level of
+        three, which takes all three of them."""
+        view = CpuRasterizer().view(self.gaussians, self.held_out[0])
+        answer = next(iter(asked.answers.values()))
+        if variant.query != "paper":
+            splatted_relevancy(view, answer.values[:, None], PictureConfig().alpha_gate)
+            return
+        for level in range(len(LEVELS)):
+            decoded_relevancy(
+                view, asked.engine.field, level, answer.vector[None], PictureConfig().alpha_gate
+            )
+
+    def _lap(self, name: str, start: float) -> None:
+        self.seconds[name] = round(self.seconds.get(name, 0.0) + time.perf_counter() - start, 1)
+
+
+def labelled(progress: Progress, prefix: str) -> Progress:
+    """`progress` under labels that begin with `prefix`."""
+    return lambda label, fraction: progress(prefix + label, fraction)
+
+
+def median_seconds(work: Callable[[], object]) -> float:
+    """Median of several runs; PyTorch's first takes longer."""
+    times = []
+    for _ in range(FRAMES):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)

@@ -1,0 +1,372 @@
+"""The report `scale`: time and memory of this project at large sizes, and whether memory grows.
+
+* load: a large PLY, read by this program and by plyfile, into the same five arrays. The file has just been
+  written, so it is in the system's cache.
+* lift: random masks lifted onto random Gaussians, at several sizes.
+* moving: the coarse images that the viewer draws while the camera moves, beside their distance from the full
+  one.
+* endurance: one process, a scene made large, large images and many phrases.
+
+Loading and lifting run in fresh interpreters (`fresh`), whose peak memory is that of everything in them.
+"""
+
+import itertools
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from statistics import mean, median
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, get_args
+
+import numpy as np
+import tyro
+from PIL import Image
+
+from langsplat_core.arrays import Array, psnr
+from langsplat_core.bench import Size
+from langsplat_core.bench.measure import markdown
+from langsplat_core.bench.memory import peak_memory, resident_memory, restart_peak
+from langsplat_core.bench.query import repeated
+from langsplat_core.cli.checks import OutFolder
+from langsplat_core.config import Count, CountOrZero, Range, RasterSettings
+from langsplat_core.errors import InputError
+from langsplat_core.io.scenes import load_scene
+from langsplat_core.progress import Progress, TerminalProgress, silent
+from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
+from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
+from langsplat_core.raster.render import render, splat_colours
+from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.scene.gaussians import merged
+from langsplat_core.semantics.encoders import load_text_encoder
+from langsplat_core.semantics.vocabulary import ADJECTIVES, NOUNS
+from tests.benchmarks.files import publish
+from tests.benchmarks.fresh import in_fresh_interpreter
+
+PROPERTIES = (  # 62, as INRIA writes them
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+    *(f"f_rest_{index}" for index in range(45)),
+    *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+BLOCK_ROWS = 50_000
+COARSE = ((1.0, False), (0.5, False), (0.25, False), (0.5, True), (0.25, True))  # resolution, whether merged
+PARTS = 4  # that phrases and images are measured in: what grows is seen from one to the next
+Part = Literal["load", "lift", "moving", "endurance"]
+LiftSizes = Annotated[tuple[tuple[Count, Count], ...], Range(1, 1_000_000_000, some=True)]
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Loading, lifting, images while the camera moves and a long session at large sizes: time and memory.
+    Half an hour and 8 GB as it stands."""
+
+    scene: tyro.conf.Positional[Path] = Path("assets/demo/scene.ply")
+    """A scene with a language field, and its cameras beside it, for moving and endurance."""
+    only: tuple[Part, ...] = get_args(Part)
+    """Parts to measure."""
+    rows: Count = 2_500_000
+    """load: Gaussians in the file, which takes 248 bytes each in the temporary folder while it runs."""
+    repeats: Count = 3
+    """load: readings with each program; the fastest counts."""
+    lifted: LiftSizes = ((100_000, 15), (100_000, 30), (200_000, 30), (400_000, 30))
+    """lift: numbers of Gaussians and of views."""
+    picture: Size = (720, 540)
+    """lift: width and height of the views, pixels."""
+    moving: CountOrZero = 500_000
+    """moving: Gaussians; the scene's are repeated, each beside itself. 0: as they are."""
+    moving_size: Size = (1280, 800)
+    """moving: width and height of the full image, pixels."""
+    views: Count = 12
+    """moving: cameras of the scene, evenly chosen."""
+    count: Count = 5_000_000
+    """endurance: Gaussians; the scene's are repeated until there are so many."""
+    size: Size = (7680, 4320)
+    """endurance: width and height of the images, pixels."""
+    images: Count = 8
+    """endurance: images that are drawn behind the first one."""
+    phrases: Count = 1_000
+    """endurance: phrases that are asked, one after the other; none twice."""
+    out: OutFolder = Path("bench_out")
+    """Folder for scale.md and scale.json."""
+
+    def run(self) -> None:
+        with TerminalProgress() as progress:
+            done = {part: MEASURED[part](self, progress) for part in self.only}
+        text = "\n".join(f"## {part}\n\n{TABLES[part](rows)}" for part, rows in done.items())
+        publish(self, "scale", "Large sizes", text, [row for rows in done.values() for row in rows])
+
+
+def open_scene(path: Path) -> Scene:
+    """A scene with a language field and cameras; InputError for any other."""
+    scene = load_scene(path)
+    if scene.language is None or not scene.cameras:
+        reason = no_field(scene) if scene.language is None else "it has no cameras beside it"
+        raise InputError(f"{path}: {reason}")
+    return scene
+
+
+@dataclass(frozen=True)
+class Loading:
+    """One reader on one file."""
+
+    reader: str
+    rows: int
+    file_bytes: int
+    seconds: float  # the least of several: other programs only ever add to it
+    kept_bytes: int  # of the arrays that remain
+    peak_bytes: int | None  # greatest resident memory of the process; None where the system does not tell
+    same: bool  # whether the arrays are those that "langsplat" read
+
+
+def measure_loading(command: Scale, progress: Progress = silent) -> list[Loading]:
+    """Write a binary PLY of degree 3 to a temporary folder, read it with both readers in turn, and remove it.
+    Raises InputError when the disk cannot take the file."""
+    runs: dict[str, list[dict[str, Any]]] = {"langsplat": [], "plyfile": []}
+    with tempfile.TemporaryDirectory(prefix="langsplat_load_") as folder:
+        path = Path(folder) / "scene.ply"
+        write_ply(path, command.rows)
+        size = path.stat().st_size
+        turns = list(itertools.product(range(command.repeats), runs))
+        for done, (_, reader) in enumerate(turns):
+            progress(f"reading with {reader}", done / len(turns))
+            runs[reader].append(in_fresh_interpreter("read", reader, path))
+    right = runs["langsplat"][0]["digest"]
+    return [
+        Loading(
+            reader, command.rows, size, min(run["seconds"] for run in found), found[0]["kept_bytes"],
+            max((run["peak_bytes"] for run in found if run["peak_bytes"]), default=None),
+            all(run["digest"] == right for run in found),
+        )
+        for reader, found in runs.items()
+    ]  # fmt: skip
+
+
+def write_ply(path: Path, rows: int) -> None:
+    """A PLY as the INRIA code writes it, block by block."""
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {rows}"]
+    header += [f"property float {name}" for name in PROPERTIES]
+    generator = np.random.default_rng(0)
+    try:
+        with path.open("wb") as file:
+            file.write(("\n".join([*header, "end_header"]) + "\n").encode())
+            for start in range(0, rows, BLOCK_ROWS):
+                shape = (min(BLOCK_ROWS, rows - start), len(PROPERTIES))
+                file.write(generator.standard_normal(shape, np.float32).astype("<f4").tobytes())
+    except OSError as error:
+        raise InputError(f"{path.parent}: cannot write {rows * 248 / 1e6:.0f} MB ({error})") from None
+
+
+def load_table(loadings: Sequence[Loading]) -> str:
+    """Markdown; ratios are to "langsplat"."""
+    first = loadings[0]
+    lines = (
+        (row.reader, f"{row.seconds:.3f}", f"{row.seconds / first.seconds:.1f}", _gb(row.kept_bytes))
+        + (_gb(row.peak_bytes), "yes" if row.same else "NO")
+        for row in loadings
+    )
+    head = ("reader", "seconds", "times ours", "kept, GB", "peak, GB", "same arrays")
+    return f"{first.rows} Gaussians, {first.file_bytes / 1e6:.0f} MB\n\n{markdown(head, lines)}"
+
+
+@dataclass(frozen=True)
+class LiftCost:
+    """Lifting at one size."""
+
+    gaussians: int
+    views: int
+    width: int
+    height: int
+    seconds: float
+    peak_bytes: int | None  # of the process; None where the system does not tell
+    kept_bytes: int  # in the work folder
+    relevancy_error: float  # mean, of the codebook
+
+
+def measure_lifts(command: Scale, progress: Progress = silent) -> list[LiftCost]:
+    """Every size, each in a fresh interpreter."""
+    costs = []
+    for count, views in command.lifted:
+        size = (count, views, *command.picture)
+        costs.append(LiftCost(*size, **in_fresh_interpreter("lift", *size)))
+        progress("lifting", len(costs) / len(command.lifted))
+    return costs
+
+
+def lift_table(costs: Sequence[LiftCost]) -> str:
+    """Markdown."""
+    lines = (
+        (cost.gaussians, cost.views, f"{cost.width}x{cost.height}", f"{cost.seconds:.0f}")
+        + (_gb(cost.peak_bytes), _gb(cost.kept_bytes), f"{cost.relevancy_error:.4f}")
+        for cost in costs
+    )
+    head = ("Gaussians", "views", "image", "seconds", "peak, GB", "kept on disk, GB", "relevancy error")
+    return markdown(head, lines)
+
+
+@dataclass(frozen=True)
+class MovingCost:
+    """One kind of coarse image; medians over images, errors are means."""
+
+    scale: float  # of the resolution
+    merged: bool
+    gaussians: int
+    milliseconds: float
+    processor: float  # milliseconds, all threads together
+    psnr: float  # dB, to the full image; 100 for itself
+    error: float  # mean absolute difference, values in [0, 1]
+
+
+def measure_moving(command: Scale, progress: Progress = silent) -> list[MovingCost]:
+    """Time of coarse images, each of another camera, and their distance from the full ones. A coarse image is
+    enlarged as a screen does."""
+    scene = open_scene(command.scene)
+    if command.moving:
+        scene = repeated(scene, command.moving)
+    chosen = np.linspace(0, len(scene.cameras) - 1, command.views).astype(int)
+    cameras = [scene.cameras[index].resized(*command.moving_size) for index in chosen]
+    fewer = merged(scene.gaussians).gaussians
+    rasterizer, settings = CpuRasterizer(), scene.raster_settings()
+    full = [_image(rasterizer, scene.gaussians, camera, settings) for camera in cameras]
+    costs = []
+    for done, (scale, is_merged) in enumerate(COARSE):
+        progress("drawing", done / len(COARSE))
+        drawn = fewer if is_merged else scene.gaussians
+        costs.append(_cost(rasterizer, drawn, cameras, settings, (scale, is_merged), full))
+    return costs
+
+
+def _cost(
+    rasterizer: CpuRasterizer,
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    settings: RasterSettings,
+    coarse: tuple[float, bool],
+    full: Sequence[Array],
+) -> MovingCost:
+    scale, is_merged = coarse
+    seconds, processor, decibels, errors = [], [], [], []
+    for camera, wanted in zip(cameras, full, strict=True):
+        small = camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
+        wall, cpu = time.perf_counter(), time.process_time()
+        image = _image(rasterizer, gaussians, small, settings)
+        seconds.append(time.perf_counter() - wall)
+        processor.append(time.process_time() - cpu)
+        shown = _enlarged(image, wanted.shape[1::-1])
+        decibels.append(psnr(shown, wanted))
+        errors.append(float(np.abs(shown - wanted).mean()))
+    times = 1e3 * median(seconds), 1e3 * median(processor)
+    return MovingCost(scale, is_merged, len(gaussians), *times, mean(decibels), mean(errors))
+
+
+def _image(
+    rasterizer: CpuRasterizer, gaussians: Gaussians, camera: Camera, settings: RasterSettings
+) -> Array:
+    """(H, W, 3) colours before black, in [0, 1]."""
+    return splat_colours(rasterizer.view(gaussians, camera, settings), gaussians, camera).colours.clip(0, 1)
+
+
+def _enlarged(image: Array, size: tuple[int, ...]) -> Array:
+    """To (width, height), between pixels as a texture is."""
+    width, height = size
+    channels = (Image.fromarray(np.ascontiguousarray(channel)) for channel in np.moveaxis(image, -1, 0))
+    enlarged = (channel.resize((width, height), Image.Resampling.BILINEAR) for channel in channels)
+    return np.stack([np.asarray(channel) for channel in enlarged], -1)
+
+
+def moving_table(costs: Sequence[MovingCost]) -> str:
+    """Markdown."""
+    lines = (
+        (f"{cost.scale:g}", f"{cost.gaussians}{' (merged)' if cost.merged else ''}")
+        + (f"{cost.milliseconds:.0f}", f"{1e3 / cost.milliseconds:.1f}", f"{cost.processor:.0f}")
+        + (f"{cost.psnr:.1f}", f"{cost.error:.1e}")
+        for cost in costs
+    )
+    head = ("resolution", "Gaussians", "image, ms", "a second", "processor, ms", "PSNR, dB", "mean error")
+    return markdown(head, lines)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Something done one or several times in one process."""
+
+    what: str
+    times: int
+    seconds: float  # all of them, on the clock of the wall
+    processor_seconds: float  # of all threads together: what other programs do changes them little
+    peak_bytes: int | None  # of the process meanwhile; None where the system does not tell
+    left_bytes: int | None  # of the process afterwards
+
+
+def measure_endurance(command: Scale, progress: Progress = silent) -> list[Stretch]:
+    """The scene repeated until it is large enough, its images, then its phrases."""
+    scene = open_scene(command.scene)
+    assert scene.language is not None
+    encoder = load_text_encoder(scene.language.encoder_id)
+    stretches: list[Stretch] = []
+
+    def measure(what: str, doings: Sequence[Callable[[], object]]) -> None:
+        restart_peak()
+        start, busy = time.perf_counter(), time.process_time()
+        for number, do in enumerate(doings):
+            progress(what, number / len(doings))
+            do()
+        seconds, busy = time.perf_counter() - start, time.process_time() - busy
+        peak = peak_memory()
+        restart_peak()  # which gives free pages back
+        stretches.append(Stretch(what, len(doings), seconds, busy, peak, resident_memory()))
+
+    made: list[Scene] = []
+    measure("the scene alone", [lambda: made.append(repeated(scene, command.count))])
+    large = made.pop()
+    camera = scene.cameras[0].resized(*command.size)
+    measure("the first image", [partial(_draw, large, camera)])
+    for part in parts([partial(_draw, large, camera)] * command.images):
+        measure("further images", part)
+    engine = QueryEngine(large, lambda _: encoder)
+    measure("surface and regions, once", [lambda: engine.regions])
+    asked = [partial(engine.run, text) for text in _two_words(encoder, command.phrases)]
+    measure("the first phrase", asked[:1])
+    for part in parts(asked[1:]):
+        measure("further phrases", part)
+    return stretches
+
+
+def _draw(scene: Scene, camera: Camera) -> None:
+    """An image that is not kept."""
+    render(scene, camera)
+
+
+def _two_words(encoder: TextEncoder, count: int) -> list[str]:
+    """Different phrases of an adjective and a noun that the encoder was taught, at most `count`."""
+    adjectives, nouns = ([w for w in words if not encoder.unknown_words(w)] for words in (ADJECTIVES, NOUNS))
+    return [f"{adjective} {noun}" for noun in nouns for adjective in adjectives][:count]
+
+
+def parts(doings: Sequence[Callable[[], object]]) -> list[Sequence[Callable[[], object]]]:
+    """`PARTS` stretches of about the same number, none of them empty."""
+    edges = [len(doings) * part // PARTS for part in range(PARTS + 1)]
+    return [doings[a:b] for a, b in itertools.pairwise(edges) if b > a]
+
+
+def endurance_table(stretches: Sequence[Stretch]) -> str:
+    """Markdown."""
+    lines = (
+        (row.what, row.times, f"{row.seconds / row.times:.3g}", f"{row.processor_seconds / row.times:.3g}")
+        + (_gb(row.peak_bytes), _gb(row.left_bytes))
+        for row in stretches
+    )
+    return markdown(("what", "times", "seconds each", "of the processor", "peak, GB", "left, GB"), lines)
+
+
+def _gb(size: int | None) -> str:
+    return "?" if size is None else f"{size / 1e9:.2f}"
+
+
+MEASURED: Mapping[Part, Callable[[Scale, Progress], list[Any]]] = MappingProxyType(
+    {"load": measure_loading, "lift": measure_lifts, "moving": measure_moving, "endurance": measure_endurance}
+)
+TABLES: Mapping[Part, Callable[[Any], str]] = MappingProxyType(
+    {"load": load_table, "lift": lift_table, "moving": moving_table, "endurance": endurance_table}
+)

@@ -1,0 +1,372 @@
+"""A scene against the ground truth of the procedural room it was photographed in.
+
+Scores follow LERF and LangSplat: localisation (is the peak of the mean-filtered relevancy map on the
+thing?) and segmentation (intersection over union), per view and phrase, averaged per kind of phrase; the same
+overlap directly among the Gaussians; and rejection: how many absent objects are answered with "not here".
+"""
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from assets.making.dataset import MIN_PIXELS
+from assets.making.truth import PHRASE_KINDS, Phrase, Truth
+from langsplat_core.arrays import Array
+from langsplat_core.config import LevelChoice, PictureConfig
+from langsplat_core.evaluation.scoring import intersection_over_union, majority
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.answers import CutRule, QueryResult, cut_level, peak_pixel
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
+from langsplat_core.query.surface import Regions
+from langsplat_core.raster.protocol import Rasterizer, View
+from langsplat_core.scene import Camera, Codec
+from langsplat_core.semantics.relevancy import FLOOR
+from langsplat_core.training.language.codec_fit import CodecReport
+
+MIN_GAUSSIANS = 20  # nor one with fewer Gaussians directly
+# px: the paper's mean filter for localisation, and its code's majority vote over a mask, both of pictures of
+# 731 rows; smaller pictures get smaller windows, or a part would be lost in one
+FILTER, VOTE, PAPER_ROWS = 20, 7, 731
+CHANNELS = 32  # phrases that are splatted at a time
+TOGETHER = 64  # phrases that are asked at a time
+TIMED = 15  # phrases that are asked alone
+HALF = 0.5  # of what a pixel shows: from there it belongs to an answer's Gaussians
+
+
+@dataclass(frozen=True)
+class MaskRule:
+    """How an answer becomes a map and a mask."""
+
+    paper_order: bool = False  # blend latents and decode pixels, instead of blending relevancies
+    cut: CutRule | Literal["regions"] = "regions"
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What the engine says to one phrase."""
+
+    vector: Array  # (D,) of the phrase
+    level: int
+    values: Array  # (N,) relevancy at that level
+    members: Array  # (N,) bool
+    even: Array  # (N,) relevancy, the same all over a region
+    peak: float
+    median: float  # of the values of Gaussians with a meaning
+    found: bool
+    probability: float | None = None
+
+
+Judge = Callable[[View, Sequence[Answer]], Iterable[tuple[Array, tuple[int, int]]]]
+"""The mask (H, W) of each answer in a view, and the row and column of its peak."""
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """Answers to all phrases, each asked once."""
+
+    engine: QueryEngine
+    answers: Mapping[str, Answer]
+    unknown: tuple[str, ...]  # phrases with words that the encoder was never taught: not asked
+    seconds: float  # median of one query from text to place; 0 where nothing was asked
+
+
+@dataclass(frozen=True)
+class Score:
+    """One kind of phrase, in views."""
+
+    kind: str
+    queries: int  # (view, phrase) pairs
+    mean_iou: float
+    localisation: float  # share of pairs whose peak lies on the thing
+
+
+@dataclass(frozen=True)
+class DirectScore:
+    """One kind of phrase, among the Gaussians themselves."""
+
+    kind: str
+    phrases: int
+    mean_iou: float
+    ceiling: float = 0.0  # mean IoU of the regions that are right, at the level where they fit best
+
+
+def ask(engine: QueryEngine, texts: Iterable[str], level: LevelChoice = "auto") -> Asked:
+    """Ask every phrase once, at a level, and some of them alone, for the time that one takes."""
+    texts = list(dict.fromkeys(texts))
+    unknown = [text for text in texts if engine.unknown_words(text)]
+    known = [text for text in texts if text not in unknown]
+    answers: dict[str, Answer] = {}
+    for start in range(0, len(known), TOGETHER):
+        some = known[start : start + TOGETHER]
+        vectors = engine.text_vectors(some)
+        for text, vector, result in zip(some, vectors, engine.run_many(some, level), strict=True):
+            answers[text] = _answer(engine, vector, result)
+    return Asked(engine, answers, tuple(unknown), _seconds(engine, known[:TIMED], level))
+
+
+def _answer(engine: QueryEngine, vector: Array, result: QueryResult) -> Answer:
+    values = result.relevancy[result.level]
+    known = engine.field.confidence[result.level] > 0
+    median = float(np.median(values[known])) if known.any() else 0.0
+    said = {name: getattr(result, name) for name in ("members", "even", "peak", "found", "probability")}
+    return Answer(vector=vector, level=result.level, values=values, median=median, **said)
+
+
+def _seconds(engine: QueryEngine, texts: Sequence[str], level: LevelChoice) -> float:
+    """Median of asking one; the engine has answered before, so that no time goes into preparation."""
+    seconds = []
+    for text in texts:
+        start = time.perf_counter()
+        engine.run(text, level)
+        seconds.append(time.perf_counter() - start)
+    return float(np.median(seconds)) if seconds else 0.0
+
+
+def evaluate(
+    asked: Asked,
+    rasterizer: Rasterizer,
+    cameras: Sequence[Camera],
+    truth: Truth,
+    rule: MaskRule | None = None,
+    progress: Progress = silent,
+    judge: Judge | None = None,
+) -> list[Score]:
+    """Every phrase that was asked, in every view where its thing is visible. judge: in place of `rule`."""
+    settled, scene = rule or MaskRule(), asked.engine.scene
+    judge = judge or (lambda view, answers: _judged(asked.engine, view, answers, settled))
+    results: dict[str, list[tuple[float, bool]]] = {}
+    for done, camera in enumerate(cameras):
+        labels = truth.labels(camera.name)
+        view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
+        masks = {p: _mask(labels, p) for p in truth.phrases if p.text in asked.answers}
+        visible = [phrase for phrase, mask in masks.items() if mask.sum() >= MIN_PIXELS]
+        answers = [asked.answers[phrase.text] for phrase in visible]
+        for phrase, result in zip(visible, judge(view, answers), strict=True):
+            found, peak = result
+            truth_mask = masks[phrase]
+            score = intersection_over_union(found, truth_mask), bool(truth_mask[peak])
+            results.setdefault(phrase.kind, []).append(score)
+        progress("asking phrases", (done + 1) / len(cameras))
+    return [
+        Score(kind, len(rows), float(np.mean([r[0] for r in rows])), float(np.mean([r[1] for r in rows])))
+        for kind, rows in sorted(results.items(), key=lambda item: PHRASE_KINDS.index(item[0]))
+    ]
+
+
+def relevancy_maps(
+    engine: QueryEngine, view: View, answers: Sequence[Answer], paper_order: bool
+) -> Iterator[Array]:
+    """(H, W) relevancy of each answer. A pixel is splatted, and in the paper's order decoded, once for all
+    phrases (at each level)."""
+    gate = PictureConfig().alpha_gate
+    if not paper_order:
+        for start in range(0, len(answers), CHANNELS):
+            values = np.stack([answer.values for answer in answers[start : start + CHANNELS]], 1)
+            yield from np.moveaxis(splatted_relevancy(view, values, gate), 2, 0)
+        return
+    maps: list[Array | None] = [None] * len(answers)
+    for level in {answer.level for answer in answers}:
+        rows = [row for row, answer in enumerate(answers) if answer.level == level]
+        vectors = np.stack([answers[row].vector for row in rows])
+        decoded = decoded_relevancy(view, engine.field, level, vectors, gate)
+        for column, row in enumerate(rows):
+            maps[row] = decoded[..., column]
+    yield from (item for item in maps if item is not None)
+
+
+def _mask(labels: Array, phrase: Phrase) -> Array:
+    return np.asarray(np.isin(labels, phrase.ids).any(axis=0))
+
+
+def _judged(
+    engine: QueryEngine, view: View, answers: Sequence[Answer], rule: MaskRule
+) -> Iterator[tuple[Array, tuple[int, int]]]:
+    """The mask (H, W) of each answer, and the row and column of its peak."""
+    if rule.cut == "regions" and not rule.paper_order:
+        yield from masks_and_peaks(view, [(answer.even, answer.members) for answer in answers])
+        return
+    level: CutRule = "floor" if rule.cut == "regions" else rule.cut
+    for answer, relevancy in zip(
+        answers, relevancy_maps(engine, view, answers, rule.paper_order), strict=True
+    ):
+        cut = cut_level(level, relevancy, answer.peak, answer.median)
+        yield _smoothed_mask(relevancy > cut), _peak(relevancy)
+
+
+def masks_and_peaks(
+    view: View, answers: Sequence[tuple[Array, Array]]
+) -> Iterator[tuple[Array, tuple[int, int]]]:
+    """(N,) relevancy and (N,) bool members of each answer -> its mask (H, W): where members are more than
+    half of what a pixel shows; and the row and column of the peak."""
+    for start in range(0, len(answers), CHANNELS // 2):
+        some = answers[start : start + CHANNELS // 2]
+        columns = [*(values for values, _ in some), *(members for _, members in some)]
+        maps = splatted_relevancy(view, np.stack(columns, 1), PictureConfig().alpha_gate)
+        maps = np.moveaxis(maps, 2, 0)
+        for relevancy, share in zip(maps[: len(some)], maps[len(some) :], strict=True):
+            yield _smoothed_mask(share > HALF), _peak(relevancy)
+
+
+def masks_of_maps(maps: Iterable[Array]) -> Iterator[tuple[Array, tuple[int, int]]]:
+    """(H, W) relevancy -> the mask of what is above half way between the floor and its maximum; its peak."""
+    for relevancy in maps:
+        cut = cut_level("floor", relevancy, float(relevancy.max()), FLOOR)
+        yield _smoothed_mask(relevancy > cut), _peak(relevancy)
+
+
+def _smoothed_mask(mask: Array) -> Array:
+    return majority(mask, round(VOTE * len(mask) / PAPER_ROWS) | 1)
+
+
+def _peak(relevancy: Array) -> tuple[int, int]:
+    column, row, _ = peak_pixel(relevancy, round(FILTER * len(relevancy) / PAPER_ROWS))
+    return row, column
+
+
+def evaluate_direct(
+    asked: Asked, labels: Array, truth: Truth, rule: CutRule | Literal["regions"] = "regions"
+) -> list[DirectScore]:
+    """The overlap without any view. labels: (3, N) the true id of every Gaussian at each level, -1 for those
+    that no photograph shows, which count on neither side (see `oracles.true_labels`)."""
+    seen = np.asarray((labels >= 0).any(axis=0))
+    results: dict[str, list[tuple[float, float]]] = {}
+    for phrase in truth.phrases:
+        right = _mask(labels, phrase)[seen]
+        if phrase.text not in asked.answers or right.sum() < MIN_GAUSSIANS:
+            continue
+        answer = asked.answers[phrase.text]
+        values = answer.values[seen]
+        if rule == "regions":
+            found = answer.members[seen]
+        else:
+            found = values > cut_level(rule, values, answer.peak, answer.median)
+        best = _ceiling(asked.engine.regions, seen, right) if rule == "regions" else 0.0
+        results.setdefault(phrase.kind, []).append((intersection_over_union(found, right), best))
+    return [
+        DirectScore(
+            kind, len(rows), float(np.mean([r[0] for r in rows])), float(np.mean([r[1] for r in rows]))
+        )
+        for kind, rows in sorted(results.items(), key=lambda item: PHRASE_KINDS.index(item[0]))
+    ]
+
+
+def _ceiling(regions: Regions, seen: Array, right: Array) -> float:
+    """The largest overlap of a union of one level's regions with `right`, of the `seen` Gaussians; regions
+    are taken in the order of the share that is right."""
+    best = 0.0
+    for everywhere in regions.everywhere[:, seen]:
+        near = everywhere >= 0
+        sizes = np.bincount(everywhere[near])
+        hits = np.bincount(everywhere[near & right], minlength=len(sizes))
+        order = np.argsort(-hits / np.maximum(sizes, 1), kind="stable")
+        hit, size = np.cumsum(hits[order]), np.cumsum(sizes[order])
+        best = max(best, float((hit / (size + right.sum() - hit)).max(initial=0)))
+    return best
+
+
+def found_rate(asked: Asked, texts: Iterable[str]) -> tuple[float, int]:
+    """Share of `texts` that were answered with a place, and of how many; unknown phrases do not count."""
+    found = [asked.answers[text].found for text in texts if text in asked.answers]
+    return (float(np.mean(found)) if found else 0.0), len(found)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One variant of the method in one room."""
+
+    scores: tuple[Score, ...]
+    direct: tuple[DirectScore, ...]
+    accepted: float  # share of the room's objects that are answered with a place
+    objects: int  # that were asked
+    rejected: float  # share of absent objects that are answered with "not here"
+    absent: int  # that were asked
+    separation: (
+        float  # chance that a present object's peak exceeds an absent one's: 1 where a threshold exists
+    )
+    peaks: dict[str, float]  # smoothed peak relevancy of every object that was asked, absent ones included
+    unknown: tuple[str, ...]  # phrases left out, because the encoder was never taught their words
+    query_ms: float  # median, from text to place
+    name: str = ""
+    masks: str = ""
+    vectors: str = ""
+    codec: str = ""
+    query: str = ""
+    bytes_per_gaussian: float = 0.0  # of its meanings at three levels
+    codec_loss: CodecReport = CodecReport(1.0, 0.0, 0.0)  # noqa: RUF009 (frozen)
+    fit_seconds: float = 0.0  # from masks to latents; what an earlier run has made is not in it
+    frame_ms: float = 0.0  # median, one phrase into one view
+
+
+def measured(
+    asked: Asked, truth: Truth, absent: Sequence[str], scores: Sequence[Score], direct: Sequence[DirectScore]
+) -> Measured:
+    """Collect what was asked of a scene."""
+    present = [phrase.text for phrase in truth.phrases if phrase.kind == "object"]
+    accepted, objects = found_rate(asked, present)
+    found, count = found_rate(asked, absent)
+    peaks = {
+        text: round(asked.answers[text].peak, 4) for text in [*present, *absent] if text in asked.answers
+    }
+    inside = np.array([peaks[text] for text in present if text in peaks])
+    outside = np.array([peaks[text] for text in absent if text in peaks])
+    return Measured(
+        scores=tuple(scores),
+        direct=tuple(direct),
+        accepted=accepted,
+        objects=objects,
+        rejected=1 - found,
+        absent=count,
+        separation=separation(inside, outside),
+        peaks=peaks,
+        unknown=asked.unknown,
+        query_ms=1000 * asked.seconds,
+    )
+
+
+def codec_name(codec: Codec) -> str:
+    """Such as "codebook 512" or "autoencoder 3"."""
+    return f"{codec.kind} {codec.index_size or codec.latent_dim}"
+
+
+def separation(present: Array, absent: Array) -> float:
+    """Chance that one of `present` (P,) exceeds one of `absent` (A,), ties half; 1 without either."""
+    if len(present) == 0 or len(absent) == 0:
+        return 1.0
+    above = (present[:, None] > absent).mean() + 0.5 * (present[:, None] == absent).mean()
+    return float(above)
+
+
+def pooled(scores: Iterable[Score]) -> tuple[int, float, float]:
+    """Number of queries, mean IoU and localisation over all of them; 0 where nothing was asked."""
+    rows = list(scores)
+    count = sum(score.queries for score in rows)
+    weights = [score.queries / max(count, 1) for score in rows]
+    iou = float(np.dot(weights, [score.mean_iou for score in rows])) if rows else 0.0
+    localisation = float(np.dot(weights, [score.localisation for score in rows])) if rows else 0.0
+    return count, iou, localisation
+
+
+def of_kind(measured: Measured, kind: str) -> tuple[int, float, float, float]:
+    """Queries, mean IoU, localisation and 3-D IoU of one kind of phrase, or of all."""
+    direct = direct_share(measured, kind, "mean_iou")
+    return (*pooled(s for s in measured.scores if kind in (s.kind, "all")), direct)
+
+
+def loss_cells(measured: Sequence[Measured]) -> tuple[str, str, str]:
+    """Codec, its relevancy error, and its bytes per Gaussian, means over the rooms."""
+    mean = np.mean([m.codec_loss.error_mean for m in measured])
+    p99 = np.mean([m.codec_loss.error_p99 for m in measured])
+    names = dict.fromkeys(m.codec for m in measured)
+    bytes_each = np.mean([m.bytes_per_gaussian for m in measured])
+    return ", ".join(names), f"{mean:.4f} / {p99:.3f}", f"{bytes_each:.0f}"
+
+
+def direct_share(measured: Measured, kind: str, name: Literal["mean_iou", "ceiling"]) -> float:
+    """Mean over the phrases of a kind, or of all, among the Gaussians."""
+    scores = [score for score in measured.direct if kind in (score.kind, "all")]
+    count = sum(score.phrases for score in scores)
+    return float(sum(getattr(score, name) * score.phrases for score in scores) / max(count, 1))

@@ -1,0 +1,134 @@
+"""Phrases with structure that are true of a procedural room; names and inventories against its truth."""
+
+import json
+
+import numpy as np
+import pytest
+
+from assets.making.truth import Region, Truth, read_truth
+from assets.making.world import World, build_room
+from langsplat_core.query.compose import upright, viewer
+from langsplat_core.query.describe import Entry, Spot
+from langsplat_core.query.grammar import Atom, parse
+from langsplat_core.scene import look_at
+from tests.benchmarks.phrases import CONSTRUCTIONS, Case, PhraseScore, cases, phrase_table, things_in
+from tests.benchmarks.words import InventoryScore, LevelNames, RoomWords, score_inventory, word_table
+
+UP = np.array([0.0, 0.0, 1.0])
+FRAME = upright(UP)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> tuple[World, Truth]:
+    world = build_room(3, "separate")
+    folder = tmp_path_factory.mktemp("room") / "truth"
+    folder.mkdir()
+    names = ("subpart", "part", "whole")
+    items = {
+        str(number): {
+            **{key: getattr(label, key) for key in ("word", "thing", "colour", "phrase", "words")},
+            "level": names[label.level],
+        }
+        for number, label in enumerate(world.labels)
+    }
+    (folder / "labels.json").write_text(json.dumps(items))
+    return world, read_truth(folder.parent)
+
+
+@pytest.fixture(scope="module")
+def found(room) -> list[Case]:
+    world, truth = room
+    camera = look_at(np.array([0.0, -2.0, 1.0]), np.zeros(3), UP, (160, 120))
+    return cases(truth, things_in(world, FRAME), viewer(camera, FRAME), 0)
+
+
+def test_things_are_where_the_room_has_them(room):
+    world, _ = room
+    things = things_in(world, FRAME)
+    table = things.extents[things.called("table")[0]]
+    assert table.high[2] == pytest.approx(0, abs=0.02)  # the origin is the middle of the table's top
+    assert len(things.called("wall")) == 4
+    assert set(things.called("furniture")) > set(things.called("chair"))
+
+
+@pytest.mark.long
+def test_what_is_on_the_table_is_above_its_top(room, found):
+    things = things_in(room[0], FRAME)
+    rows = [case for case in found if case.construction == "on" and case.text.endswith("the table")]
+    for case in rows:
+        assert all(things.extents[number].low[2] > -0.05 for number in case.ids)
+
+
+@pytest.mark.long
+def test_every_case_has_structure_and_a_truth_that_says_so(room, found):
+    _, truth = room
+    assert {case.construction for case in found} <= set(CONSTRUCTIONS)
+    assert {"part of thing", "A and B", "kind, not thing", "near", "highest"} <= {
+        c.construction for c in found
+    }
+    known = set(truth.regions)
+    for case in found:
+        assert set(case.ids) | set(case.without) <= known
+        # "picture of a cat" is a picture, and a part that is in no list is asked whole
+        assert "part" in case.construction or not isinstance(parse(case.text), Atom)
+
+
+def test_what_is_taken_away_is_no_longer_true():
+    case = Case("thing without part", "mug without its handle", "mug", (2,), (5,))
+    labels = np.array([[[0, 5, 9]], [[1, 5, 9]], [[2, 2, 3]]])
+    np.testing.assert_array_equal(case.mask(labels), [[True, False, False]])
+
+
+def test_the_table_pairs_whole_and_composed():
+    row = PhraseScore(
+        "A and B", "mug and book", "whole", 1, True, False, (0.25, 0.75), (True, False), 0.5, 0.1
+    )
+    absent = PhraseScore("A and B", "mug and oak", "whole", 1, False, False, (), (), float("nan"), 0.1)
+    rows = [
+        row,
+        absent,
+        PhraseScore("A and B", "mug and book", "composed", 1, True, True, (1.0, 1.0), (True, True), 1.0, 0.1),
+    ]
+    assert (
+        "| A and B | 1 | 2 | 50.0 / 100.0 | 50.0 / 100.0 | 50.0 / 100.0 | 0.0 / 100.0 | 100.0 / - |"
+        in phrase_table(rows)
+    )
+
+
+TRUTH = {
+    0: Region("whole", "mug", "mug", words=("mug", "cup", "red mug")),
+    1: Region("whole", "table", "table", words=("table",)),
+    2: Region("whole", "duck", "duck", words=("duck",)),
+}
+LABELS = np.stack([np.repeat([-1, -1, -1, -1], 30), np.repeat([-1] * 4, 30), np.repeat([0, 1, 2, -1], 30)])
+
+
+def entry(phrase: str, rows: range, level: int = 2) -> Entry:
+    spot = Spot(np.zeros(3), np.zeros((2, 3)), np.array(rows), 0.1, None, None)
+    return Entry(phrase, (), level, 0.9, 0.9, 0.1, (spot,))
+
+
+def test_an_entry_is_true_where_most_of_its_surface_is():
+    entries = [
+        entry("cup", range(35)),  # the mug, and a little of the table
+        entry("duck", range(50, 70)),  # half the table
+        entry("lamp", range(60, 90)),  # the duck
+        entry("table", range(30, 60), level=1),  # no whole thing
+    ]
+    score = score_inventory(entries, LABELS, TRUTH, np.ones(120), ["cup", "duck", "table"])
+    assert score == InventoryScore(entries=3, true=1 / 3, things=3, named=1 / 3, seconds=0.0)
+
+
+def test_things_without_a_word_in_the_vocabulary_do_not_count():
+    areas = np.ones(120)
+    areas[:30] = 10
+    score = score_inventory([entry("mug", range(60))], LABELS, TRUTH, areas, ["mug"])
+    assert (score.true, score.things, score.named) == (1, 1, 1)
+    assert score_inventory([], LABELS, TRUTH, areas, []).named == 0
+
+
+def test_the_table_has_a_row_for_each_figure():
+    names = (LevelNames("plain cosine", "whole", 30, 0.5, 0.9, 0.7, 0.6),)
+    text = word_table([RoomWords(7, names, 0.93, InventoryScore(20, 0.8, 25, 0.6, 1.25))])
+    assert "| 7 | plain cosine | whole | 30 | 50 | 90 | 0.70 | 0.60 |" in text
+    assert "| 7 | 20 | 80 | 25 | 60 | 93 | 1.2 |" in text

@@ -1,0 +1,257 @@
+"""The reports in rooms with known truth: the whole commands on a tiny room."""
+
+import json
+from dataclasses import asdict, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from assets.making import dataset
+from assets.making.scene import SEED
+from assets.making.truth import MIN_REGION, TruthMasks, read_truth
+from langsplat_core.cli.run import main
+from langsplat_core.config import DatasetConfig, numeric_settings
+from langsplat_core.datasets import load_capture
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.io.scenes import save_scene
+from langsplat_core.progress import silent
+from langsplat_core.scene import Scene
+from langsplat_core.semantics.masks import label_maps
+from tests.benchmarks import oracles, patches, scoring
+from tests.benchmarks.__main__ import PROGRAM, parse
+from tests.benchmarks.files import KeptRows
+from tests.benchmarks.lifting import (
+    OURS,
+    PATCHES,
+    Lifting,
+    MethodRow,
+    measure_methods,
+    method_table,
+    methods,
+    plot,
+)
+from tests.benchmarks.phrases import Phrases
+from tests.benchmarks.room import HOLD_OUT, RoomSettings, Variant
+from tests.benchmarks.rooms import Rooms, variants
+from tests.benchmarks.scoring import DirectScore, Measured, Score
+from tests.benchmarks.verdicts import measure_verdicts
+
+SETTINGS = RoomSettings(views=8, size=(64, 48), steps=60, max_gaussians=3_000)
+TINY = Rooms(tiers=("separate",), seeds=(101,), settings=SETTINGS, budget=True, codec_steps=60)
+DECODED, PAPER = "autoencoder, d = 3", "autoencoder, the paper's order"
+BUDGET = ("the method", "perfect embeddings", "no codec", DECODED, PAPER)
+
+
+def written(folder):
+    """Every file and when it was written."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The whole command on a tiny room: its output, its figures, and its work folder."""
+    folder = tmp_path_factory.mktemp("benchmark")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dataset, "LIGHT_SAMPLES", 2)
+        patch.setattr(dataset, "LIGHT_CELL", 0.0)
+        patch.setattr(scoring, "MIN_PIXELS", 12)
+        command = replace(TINY, work=folder / "work", out=folder / "out")
+        command.run()
+        first = written(folder / "work")
+        command.run()
+        second = written(folder / "work")
+        (room,) = command.rooms(silent)
+        yield SimpleNamespace(
+            room=room,
+            first=first,
+            second=second,
+            work=folder / "work",
+            photographs=folder / "work" / "separate-101-8x64x48" / "photographs",
+            page=(folder / "out" / "rooms.md").read_text(),
+            figures=json.loads((folder / "out" / "rooms.json").read_text()),
+        )
+
+
+@pytest.fixture(scope="module")
+def capture(run):
+    return load_capture(run.photographs, DatasetConfig(max_side=64), run.room.folder, silent)
+
+
+@pytest.mark.long
+def test_the_command_measures_every_stage(run):
+    (room,) = run.figures["rows"]
+    assert (room["views"], room["held_out"]) == (7, 1)
+    assert tuple(row["name"] for row in room["measured"]) == BUDGET
+    for row in room["measured"]:
+        assert sum(score["queries"] for score in row["scores"]) > 3
+        assert all(0 <= score["mean_iou"] <= 1 for score in [*row["scores"], *row["direct"]])
+        assert row["absent"] > 0
+        assert row["query_ms"] > 0
+    assert run.figures["settings"]["seeds"] == [101]
+    assert all(f"| {name} |" in run.page for name in BUDGET[1:])
+
+
+@pytest.mark.long
+def test_rows_differ_in_the_named_stage(run):
+    by_name = {row["name"]: row for row in run.figures["rows"][0]["measured"]}
+    ours = by_name["the method"]
+    # The paper's order asks the very same field and reads it by the peak; another codec is another field.
+    decoded, paper = by_name[DECODED], by_name[PAPER]
+    assert decoded["codec_loss"] == paper["codec_loss"]
+    asked = [[(score["kind"], score["phrases"]) for score in row["direct"]] for row in (decoded, paper)]
+    assert asked[0] == asked[1]
+    assert decoded["direct"] != paper["direct"]
+    assert by_name["no codec"]["codec"] == "linear 512"
+    errors = [by_name[name]["codec_loss"]["error_mean"] for name in ("no codec", "the method")]
+    assert errors[0] < 1e-5 < errors[1] < decoded["codec_loss"]["error_mean"]
+    assert (ours["bytes_per_gaussian"], decoded["bytes_per_gaussian"]) == (6, 36)
+    assert ours["codec"].startswith("codebook ")
+
+
+@pytest.mark.long
+def test_a_second_run_makes_nothing_again(run):
+    assert run.first == run.second
+
+
+@pytest.mark.parametrize("masks", ["truth", "graph"])
+def test_variants_swap_one_stage_at_a_time(masks):
+    command = replace(TINY, masks=masks)
+    method, *others = (asdict(variant) for variant in variants(command, 512))
+    swapped = [{key for key in method if key != "name" and method[key] != other[key]} for other in others]
+    expected = [{"vectors"}, {"codec"}, {"codec"}, {"codec", "query"}]
+    assert swapped == ([{"masks"}] if masks == "graph" else []) + expected
+    assert len(variants(replace(command, budget=False), 512)) == 1
+    both = variants(replace(command, budget=False, ceiling=True), 512)
+    assert [variant.codec.latent_dim for variant in both if variant.name == "no codec"] == [512]
+
+
+@pytest.mark.long
+def test_truth_masks_are_the_truth(run, capture):
+    truth = read_truth(run.photographs)
+    source = TruthMasks(capture, truth)
+    for image, camera in zip(capture.images[:3], capture.cameras, strict=False):
+        ids = truth.labels(camera.name)
+        for level, rows in zip(ids, label_maps(source(image, silent)), strict=True):
+            expected = {n: level == n for n in np.unique(level[level >= 0])}
+            expected = {n: mask for n, mask in expected.items() if mask.sum() >= MIN_REGION}
+            got = [rows == row for row in np.unique(rows[rows >= 0])]
+            assert len(got) == len(expected) > 0
+            assert {mask.tobytes() for mask in got} == {mask.tobytes() for mask in expected.values()}
+    with pytest.raises(InputError, match="no truth for this photograph"):
+        source(255 - capture.images[0], silent)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (f"rooms --seeds 101 {SEED}", "bundled scene's room"),
+        (f"verdicts --seeds {SEED}", "bundled scene's room"),
+        ("phrases --seeds", "give at least one number"),
+        ("rooms --tiers", "at least one of --tiers"),
+        ("rooms --views 5", "--views 5: must be 8 to"),
+        ("rooms --codec.batch 1", "--codec.batch 1"),
+        ("rooms --scene a.ply", "belong together"),
+        ("rooms --paper-order", "needs --scene"),
+        ("rooms --encoder clip-geometry:0.9", "no vectors have these cosines"),
+        ("scale --lifted 0 2", "--lifted 0 2"),
+    ],
+)
+def test_mistakes_end_with_one_line(words, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(PROGRAM, lambda: parse(words.split())) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["rooms", "verdicts", "phrases", "lifting", "scale"])
+def test_every_number_of_every_report_has_a_range(name):
+    assert [setting.option for setting in numeric_settings(parse([name])) if setting.range is None] == []
+
+
+@pytest.mark.long
+def test_a_given_scene_is_measured_against_its_room(run, tmp_path, capsys):
+    field, _, _ = run.room.field(variants(TINY, 512)[0])
+    train, _ = run.room.capture.split(HOLD_OUT)
+    path = tmp_path / "scene.ply"
+    cameras = tuple(run.room.capture.cameras[i] for i in train)
+    save_scene(path, Scene(run.room.gaussians, field, cameras))
+    Rooms(scene=path, dataset=run.photographs).run()
+    assert "absent objects rejected" in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_verdicts_and_phrases_are_asked_of_the_same_room(run, tmp_path):
+    rows = measure_verdicts(run.room, Variant("the method", "truth", codec=TINY.codec))
+    assert {"object", "absent", "part", "absent part"} <= {row.kind for row in rows}
+    Phrases(("separate",), (101,), SETTINGS, run.work, tmp_path).run()
+    figures = json.loads((tmp_path / "phrases.json").read_text())["rows"]
+    assert {row["way"] for row in figures if "way" in row} == {"whole", "composed"}
+    (named,) = [row for row in figures if "inventory" in row]
+    assert {row["level"] for row in named["names"]} == {"subpart", "part", "whole"}
+
+
+LIFTING = Lifting(("separate",), (101,), SETTINGS, codec_steps=40, gradient_steps=20)
+
+
+@pytest.mark.long
+def test_methods_are_compared_in_one_room(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(patches, "SCALES", (0.3, 0.5))  # of the smallest there are thousands in every image
+    monkeypatch.setattr(oracles, "SIDES", (1 / 8, 1 / 4, 1 / 2))
+    command = replace(
+        LIFTING, only=("LERF", "trained", "d = 1", "codebook of 256", "all 512", "subpart alone", "squares")
+    )
+    kept = tmp_path / "lifting.rows.jsonl"
+    rows = list(measure_methods(run.room, command, KeptRows(kept)))
+    again = list(measure_methods(run.room, command, KeptRows(kept)))
+    assert again == rows  # seconds too: nothing was made again
+    by_name = {row.measured.name: row.measured for row in rows}
+    trained, zeros, one_pass, codebook, everything, subpart, squares, lerf = by_name.values()
+    assert (lerf.query, one_pass.query, squares.masks) == ("blend answers", "paper", "tiles")
+    assert lerf.bytes_per_gaussian == 2 * 512 * 4
+    assert codebook.bytes_per_gaussian == 6
+    assert everything.codec_loss.error_mean < 1e-5
+    assert trained.peaks != zeros.peaks
+    assert min(min(row.frame_ms, len(row.scores)) for row in by_name.values()) > 0
+    assert len({row.scores for row in (lerf, trained, subpart, squares)}) == 4
+    assert method_table(rows).count("\n") == 2 + len(rows)
+    kept.write_text(kept.read_text()[:-20])
+    with pytest.raises(FormatError, match="delete it"):
+        KeptRows(kept)
+
+
+def method_row(name: str, seed: int, share: float, **changes: object) -> MethodRow:
+    scores = (Score("object", 10, share, 0.9), Score("part", 30, share / 2, 0.5))
+    made = Measured(
+        scores=scores, direct=(DirectScore("object", 5, 0.25),), accepted=0, objects=0, rejected=0, absent=0,
+        separation=1, peaks={}, unknown=(), query_ms=30.0, name=name, query="blend answers", frame_ms=12.0,
+    )  # fmt: skip
+    return MethodRow(seed, replace(made, **changes))
+
+
+def test_the_table_has_means_and_spreads_and_a_plot(tmp_path):
+    rows = [method_row(OURS, 1, 0.8), method_row(OURS, 2, 0.6)]
+    rows.append(method_row("the paper", 1, 0.4, query="paper"))
+    table = method_table(rows).splitlines()
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in table]
+    assert [line[1] for line in lines[2:]] == [OURS, "the paper"]
+    assert lines[2][2] == "70.0 / 90.0 / 25.0 +/- 14.1"
+    assert lines[2][5].startswith("43.8 / 60.0")  # (10 * 0.7 + 30 * 0.35) / 40
+    assert [line[-1] for line in lines[2:]] == ["42", "12"]  # the paper's image is its answer
+    assert method_row(PATCHES, 1, 0.5).image_ms == 12
+    plot(rows, tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as drawn:
+        assert drawn.width > 900
+        assert np.asarray(drawn.convert("L")).std() > 5
+
+
+def test_every_method_has_a_name_of_its_own():
+    made = methods(Lifting(), "truth", 512)
+    assert len({variant.name for variant in made}) == len(made)
+    assert {variant.masks for variant in methods(Lifting(), "wrong", 512)} == {"wrong"}
+    room = SimpleNamespace(encoder=SimpleNamespace(dim=512))
+    with pytest.raises(InputError, match="--only nothing: no method has that; they are ours"):
+        list(measure_methods(room, Lifting(only=("nothing",)), None))

@@ -1,0 +1,439 @@
+"""Files of other methods, read: what is found in them, and which belong together."""
+
+import json
+import os
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from langsplat_core.arrays import Array, unit
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.io.foreign import ForeignScene, read_foreign
+from langsplat_core.io.ply import write_ply
+from langsplat_core.scene import Gaussians
+from tests.support.foreign_files import (
+    autoencoder,
+    faiss_index,
+    geometry,
+    save_fvdb,
+    save_model,
+    tensor,
+    training_state,
+)
+from tests.support.same import assert_same
+from tests.support.scenes import random_gaussians
+
+N, D = 20, 24
+G = random_gaussians(N, sh_degree=3)
+rng = np.random.default_rng(3)
+VECTORS = rng.normal(size=(3, N, D)).astype(np.float32)
+LATENTS = unit(rng.normal(size=(3, N, 3))).astype(np.float32)
+CENTROIDS = rng.normal(size=(4, 256, D // 4)).astype(np.float32)
+ALL = np.arange(N)
+
+
+def rows(scene: ForeignScene, level: int) -> Array:
+    return scene.rows(level, np.arange(len(scene.scene.gaussians)))
+
+
+def langsplat(folder: Path, levels: tuple[int, ...] = (1, 2, 3), g: Gaussians = G) -> list[Path]:
+    return [
+        save_model(folder / f"teatime_{level}" / "chkpnt30000.pth", g, tensor(LATENTS[level - 1]))
+        for level in levels
+    ]
+
+
+def best_ckpt(folder: Path, **widths: tuple[int, ...]) -> Path:
+    torch.save(autoencoder(D, **widths).state_dict(), folder / "best_ckpt.pth")
+    return folder / "best_ckpt.pth"
+
+
+def test_plain_gaussians(tmp_path):
+    got = read_foreign([save_model(tmp_path / "chkpnt30000.pth", G)])
+    assert_same(got.scene.gaussians, G)
+    assert got.levels == (None, None, None)
+    assert got.dim == 0
+
+
+def test_langsplat_and_its_autoencoder(tmp_path):
+    paths = [best_ckpt(tmp_path), *reversed(langsplat(tmp_path))]  # in any order
+    got = read_foreign(paths)
+    assert got.method == "LangSplat"
+    assert_same(got.scene.gaussians, G)
+    for level in range(3):
+        np.testing.assert_array_equal(rows(got, level), LATENTS[level])
+    assert "by the names of files and folders" in got.notes[0]
+
+
+@pytest.mark.parametrize(
+    "widths",
+    [
+        {},
+        {"encoder": (40, 8), "decoder": (30, 50)},
+        {"encoder": (8,), "decoder": ()},
+        {"encoder": (64, 32, 1), "decoder": (7,)},
+    ],
+)
+def test_the_autoencoder_is_the_networks(tmp_path, widths):
+    network = autoencoder(D, **widths)
+    torch.save(network.state_dict(), tmp_path / "best_ckpt.pth")
+    d = network.encoder[-1].out_features
+    latents = unit(rng.normal(size=(N, d))).astype(np.float32)
+    save_model(tmp_path / "a_1" / "c.pth", G, tensor(latents))
+    codec = read_foreign([tmp_path / "a_1" / "c.pth", tmp_path / "best_ckpt.pth"]).codec
+    assert codec is not None
+    with torch.no_grad():
+        decoded = network.decode(torch.from_numpy(latents)).numpy()
+        encoded = network.encode(torch.from_numpy(VECTORS[0])).numpy()
+    np.testing.assert_allclose(codec.decode(latents), decoded, atol=1e-5)
+    np.testing.assert_allclose(codec.encode(VECTORS[0]), encoded, atol=1e-5)
+
+
+def test_levels_may_be_missing_and_are_told_apart(tmp_path):
+    ae = best_ckpt(tmp_path)
+    got = read_foreign([*langsplat(tmp_path, (3, 1)), ae])
+    np.testing.assert_array_equal(rows(got, 0), LATENTS[0])
+    np.testing.assert_array_equal(rows(got, 2), LATENTS[2])
+    assert got.levels[1] is None
+    assert "without meanings: part" in got.notes
+    nameless = [save_model(tmp_path / f"{name}.pth", G, tensor(LATENTS[i])) for i, name in enumerate("xyz")]
+    assert "by their order" in read_foreign([*nameless, ae]).notes[0]
+    assert "one alone is taken for the whole" in read_foreign([nameless[0], ae]).notes[0]
+    with pytest.raises(InputError, match="of which levels"):
+        read_foreign([*nameless[:2], ae])
+    asked = read_foreign([*nameless[:2], ae], ["whole", "subpart"])
+    np.testing.assert_array_equal(rows(asked, 2), LATENTS[0])
+    np.testing.assert_array_equal(rows(asked, 0), LATENTS[1])
+    for levels in (["whole"], ["part", "part"]):
+        with pytest.raises(InputError, match="name a level for each"):
+            read_foreign([*nameless[:2], ae], levels)
+
+
+def mixture(logits: Array, codebooks: Array, topk: int) -> Array:
+    """By torch, the way it is defined: softmax, the largest, their sum made 1."""
+    out = torch.zeros(len(logits), codebooks.shape[2])
+    for layer, words in enumerate(torch.from_numpy(codebooks)):
+        k = len(words)
+        soft = torch.from_numpy(logits[:, layer * k : (layer + 1) * k]).softmax(1)
+        kept, index = soft.topk(topk, 1)
+        kept = kept / (kept.sum(1, keepdim=True) + 1e-10)
+        out += torch.zeros_like(soft).scatter_(1, index, kept) @ words
+    return out.numpy()
+
+
+def test_langsplat_v2(tmp_path):
+    logits = rng.normal(size=(N, 64)).astype(np.float32) * 3
+    logits[5] = 0  # never trained
+    codebooks = rng.normal(size=(1, 64, D)).astype(np.float32)
+    path = save_model(tmp_path / "teatime_0_2" / "chkpnt10000.pth", G, tensor(logits), tensor(codebooks))
+    got = read_foreign([path])
+    assert (got.method, got.dim) == ("LangSplatV2", D)
+    want = mixture(logits, codebooks, 4)
+    want[5] = 0
+    np.testing.assert_allclose(rows(got, 1), want, atol=1e-5)
+    assert got.levels[0] is got.levels[2] is None
+
+
+def test_fvdb(tmp_path):
+    logits = rng.normal(size=(N, 2 * 16)).astype(np.float32)
+    codebooks = rng.normal(size=(2, 16, D)).astype(np.float32)
+    write_ply(tmp_path / "scene.ply", G)
+    path = save_fvdb(tmp_path / "any.pt", logits, codebooks, level=1, topk=3)
+    got = read_foreign([path, tmp_path / "scene.ply"])
+    np.testing.assert_allclose(rows(got, 0), mixture(logits, codebooks, 3), atol=1e-5)
+    assert_same(got.scene.gaussians, G)
+    with pytest.raises(InputError, match="keeps no Gaussians; name the scene's PLY"):
+        read_foreign([path])
+    write_ply(tmp_path / "other.ply", random_gaussians(N + 1))
+    with pytest.raises(FormatError, match="features of 20 Gaussians, the scene has 21"):
+        read_foreign([path, tmp_path / "other.ply"])
+    default = save_fvdb(tmp_path / "default.pt", logits, codebooks, level=0)
+    with pytest.raises(InputError, match="of which levels"):
+        read_foreign([default, tmp_path / "scene.ply"])
+    torch.save({"magic": "LangSplatV2Checkpoint", "model": {"a": torch.zeros(3)}}, tmp_path / "no.pt")
+    with pytest.raises(FormatError, match="0 tensors of logits"):
+        read_foreign([tmp_path / "no.pt", tmp_path / "scene.ply"])
+
+
+def occam(folder: Path, kept: tuple[Array, ...]) -> list[Path]:
+    return [
+        save_model(folder / f"chkpnt30000_langfeat_{level + 1}.pth", G.take(k), tensor(VECTORS[level][k]))
+        for level, k in enumerate(kept)
+    ]
+
+
+def test_occam(tmp_path):
+    got = read_foreign(occam(tmp_path, (ALL, ALL, ALL)))
+    assert got.method == "Occam's LGS"
+    for level in range(3):
+        np.testing.assert_array_equal(rows(got, level), VECTORS[level])
+
+
+@pytest.mark.parametrize("with_all", [False, True])
+def test_occam_where_levels_lack_different_gaussians(tmp_path, with_all):
+    kept = (ALL[2:], np.r_[0:7, 9:19], ALL[1:15][::-1])
+    paths = occam(tmp_path, kept)
+    if with_all:
+        paths.append(save_model(tmp_path / "chkpnt30000.pth", G))
+    got = read_foreign(paths)
+    means = got.scene.gaussians.means
+    assert len(means) == N  # every Gaussian is in one of the three
+    order = np.array([np.flatnonzero((G.means == mean).all(1))[0] for mean in means])
+    assert_same(got.scene.gaussians, G.take(order))
+    for level in range(3):
+        want = np.where(np.isin(order, kept[level])[:, None], VECTORS[level][order], 0)
+        np.testing.assert_array_equal(rows(got, level), want)
+    assert "lack some Gaussians" in got.notes[-1]
+
+
+def test_gaussians_at_one_place_are_kept_apart(tmp_path):
+    g = replace(G, means=np.repeat(G.means[:5], 4, axis=0))
+    path = save_model(tmp_path / "a_langfeat_1.pth", g, tensor(VECTORS[0]))
+    less = save_model(tmp_path / "a_langfeat_2.pth", g.take(ALL[:15]), tensor(VECTORS[1][:15]))
+    got = read_foreign([path, less])
+    assert len(got.scene.gaussians) == N
+    np.testing.assert_array_equal(rows(got, 1), np.concatenate([VECTORS[1][:15], np.zeros((5, D))]))
+
+
+def test_dr_splat(tmp_path):
+    codes = rng.integers(0, 256, (N, 4)).astype(np.uint8)
+    codes[3] = 255
+    want = np.stack([CENTROIDS[part, codes[:, part]] for part in range(4)], 1).reshape(N, D)
+    want[3] = 0
+    path = save_model(tmp_path / "figurines_1_pq_openclip" / "chkpnt0.pth", G, tensor(codes))
+    for metric in (0, 1, 4):
+        (tmp_path / "pq_index.faiss").write_bytes(faiss_index(CENTROIDS, metric=metric))
+        got = read_foreign([path, tmp_path / "pq_index.faiss"])
+        np.testing.assert_array_equal(rows(got, 0), want)
+    np.save(tmp_path / "a.npy", CENTROIDS)
+    np.savez(tmp_path / "a.npz", centroids=CENTROIDS)
+    torch.save(torch.from_numpy(CENTROIDS), tmp_path / "a.pt")
+    for name in ("a.npy", "a.npz", "a.pt"):
+        np.testing.assert_array_equal(rows(read_foreign([tmp_path / name, path]), 0), want)
+    with pytest.raises(InputError, match=r"name its pq_index\.faiss"):
+        read_foreign([path])
+    np.save(tmp_path / "a.npy", CENTROIDS[:3])
+    with pytest.raises(FormatError, match=r"4 codes per Gaussian, .* 3 parts"):
+        read_foreign([path, tmp_path / "a.npy"])
+
+
+def leaves(path: Path, index: Array, count: int = 6) -> Array:
+    vectors = VECTORS[0][:count]
+    occurrences = np.array([3, 1, 0, 9, 9, 9][:count])
+    np.savez(path, leaf_feat=vectors, leaf_score=np.ones(count), occu_count=occurrences, leaf_ind=index)
+    return np.where(occurrences[:, None] > 0, vectors, 0)
+
+
+@pytest.mark.parametrize("as_ply", [False, True])
+def test_open_gaussian(tmp_path, as_ply):
+    index = rng.integers(0, 6, N)
+    index[:2] = 6, -1  # of no cluster
+    vectors = leaves(tmp_path / "cluster_lang.npz", index)
+    names = ("ins_feat_r", "ins_feat_g", "ins_feat_b", "ins_feat_r2", "ins_feat_g2", "ins_feat_b2")
+    instance = rng.normal(size=(N, 6)).astype(np.float32)
+    if as_ply:
+        path = tmp_path / "point_cloud.ply"
+        write_ply(path, G, extras=dict(zip(names, instance.T, strict=True)))
+    else:
+        path = save_model(tmp_path / "chkpnt90000.pth", G, tensor(instance), tensor(instance))
+        with pytest.raises(InputError, match=r"name its cluster_lang\.npz"):
+            read_foreign([path])
+    got = read_foreign([path, tmp_path / "cluster_lang.npz"])
+    assert got.method == "OpenGaussian"
+    want = np.where((index >= 0)[:, None] & (index < 6)[:, None], vectors[index.clip(0, 5)], 0)
+    np.testing.assert_array_equal(rows(got, 2), want)
+    assert got.levels[:2] == (None, None)
+    leaves(tmp_path / "cluster_lang.npz", index[1:])
+    with pytest.raises(FormatError, match="clusters of 19 Gaussians"):
+        read_foreign([path, tmp_path / "cluster_lang.npz"])
+    leaves(tmp_path / "cluster_lang.npz", index + 100)
+    with pytest.raises(FormatError, match="names none of the 6 clusters"):
+        read_foreign([path, tmp_path / "cluster_lang.npz"])
+
+
+def test_feature_3dgs(tmp_path):
+    ply = tmp_path / "a.ply"
+    extras = {f"semantic_{i}": VECTORS[0][:, i] for i in reversed(range(D))} | {"kept": VECTORS[0][:, 0]}
+    write_ply(ply, G, extras=extras)
+    got = read_foreign([ply])
+    np.testing.assert_array_equal(rows(got, 2), VECTORS[0])
+    assert list(got.scene.extras) == ["kept"]
+    for shape in ((N, 1, D), (N, D, 1), (N, D)):
+        path = save_model(tmp_path / "c.pth", G, behind=(tensor(VECTORS[0].reshape(shape)),))
+        got = read_foreign([path])
+        assert got.method == "Feature-3DGS"
+        np.testing.assert_array_equal(rows(got, 2), VECTORS[0])
+    torch.save({"conv.weight": torch.zeros(D, 8, 1, 1), "conv.bias": torch.zeros(D)}, tmp_path / "dec.pth")
+    with pytest.raises(FormatError, match="decodes pictures, not Gaussians"):
+        read_foreign([path, tmp_path / "dec.pth"])
+    write_ply(ply, G, extras={"semantic_0": VECTORS[0][:, 0], "semantic_2": VECTORS[0][:, 0]})
+    with pytest.raises(FormatError, match="without gaps"):
+        read_foreign([ply])
+
+
+def test_half_precision_and_older_files(tmp_path):
+    """bfloat16 has no NumPy type; files before torch 1.6 are no archives."""
+    for kind in (torch.bfloat16, torch.float16):
+        want = torch.from_numpy(VECTORS[0]).to(kind)
+        path = save_model(tmp_path / "c.pth", G, want)
+        np.testing.assert_array_equal(rows(read_foreign([path]), 2), want.float().numpy())
+    content = ((*geometry(G), tensor(VECTORS[0]), *training_state(G)), 7)
+    torch.save(content, tmp_path / "old.pth", _use_new_zipfile_serialization=False)
+    np.testing.assert_array_equal(rows(read_foreign([tmp_path / "old.pth"]), 2), VECTORS[0])
+
+
+def test_cameras_of_the_models_folder(tmp_path):
+    entry = {"id": 0, "img_name": "a", "width": 40, "height": 30, "position": [0, 0, -3]}
+    entry |= {"rotation": np.eye(3).tolist(), "fx": 30, "fy": 30}
+    path = save_model(tmp_path / "chkpnt30000.pth", G)
+    (tmp_path / "cameras.json").write_text(json.dumps([entry]))
+    assert [camera.width for camera in read_foreign([path]).scene.cameras] == [40]
+
+
+# Files of other methods that are refused: one line each, which names the file.
+
+
+class Harmful:
+    """Would run a command when unpickled."""
+
+    def __reduce__(self):
+        return (os.system, ("exit 1",))
+
+
+def read_whole(paths: list[Path]) -> None:
+    scene = read_foreign(paths)
+    for level in range(3):
+        if scene.levels[level] is not None:
+            scene.rows(level, ALL)
+
+
+def refused(paths: list[Path], message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        read_whole(paths)
+    assert "\n" not in str(caught.value)
+    assert any(str(caught.value).startswith(str(path)) for path in paths)
+
+
+def test_classes_are_not_unpickled(tmp_path):
+    path = save_model(tmp_path / "c.pth", G, behind=(Harmful(),))
+    refused([path], r"needs '(posix|nt).system'; only tensors")
+    path.write_bytes(pickle.dumps(Harmful()))
+    refused([path], r"needs 'posix.system'|not a whole file")
+
+
+def wrong(index: int, value: object) -> tuple[object, ...]:
+    elements = [*geometry(G), tensor(VECTORS[0]), *training_state(G)]
+    elements[index] = value
+    return tuple(elements)
+
+
+@pytest.mark.parametrize(
+    ("index", "value", "message"),
+    [
+        (1, torch.zeros(N, 2), r"element 1 has the shape \(20, 2\); expected positions"),
+        (1, None, "element 1 holds no positions"),
+        (3, torch.zeros(N, 7, 3), "7 SH coefficients"),
+        (4, torch.zeros(N, 2), r"element 4 has the shape \(20, 2\); expected log scales"),
+        (5, torch.zeros(N + 1, 4), r"expected rotations \(20, 4\)"),
+        (6, torch.zeros(N, 1, dtype=torch.int64), "element 6 holds no opacities"),
+        (7, torch.zeros(N + 1, D), r"features \(21, 24\) for 20 Gaussians"),
+        (7, torch.zeros(N, D, dtype=torch.int32), "features of the type int32"),
+        (7, torch.zeros(1).expand(10**9, 24), "more numbers than the file has"),
+        (7, torch.zeros(N, D, dtype=torch.complex64), "needs 'torch.ComplexFloatStorage'"),
+        (7, torch.full((N, D), torch.nan), "features are not finite, as those of Gaussian 0"),
+    ],
+)
+def test_wrong_elements(tmp_path, index, value, message):
+    torch.save((wrong(index, value), 1), tmp_path / "c.pth")
+    refused([tmp_path / "c.pth"], message)
+
+
+def test_files_that_do_not_go_together(tmp_path):
+    ae, levels = best_ckpt(tmp_path), langsplat(tmp_path)
+    refused(levels, "3 numbers per Gaussian, latents of LangSplat's autoencoder; name its best_ckpt.pth")
+    refused([ae], "belongs to checkpoints with features")
+    plain = save_model(tmp_path / "plain.pth", G)
+    refused([ae, plain], "belongs to checkpoints with features")
+    refused([plain, plain], "two scenes without features")
+    refused([ae, ae, *levels], "two autoencoders")
+    moved = langsplat(tmp_path / "other", (2,), random_gaussians(N, seed=1, sh_degree=3))
+    refused([levels[0], *moved, ae], "its 20 Gaussians are not the 20 of the other files")
+    fewer = save_model(tmp_path / "f_2.pth", G.take(ALL[1:]), tensor(LATENTS[1][1:]))
+    refused([levels[0], fewer, ae], "its 19 Gaussians are not the 20")
+    apart = save_model(tmp_path / "f_3.pth", random_gaussians(N, 1, 3), tensor(VECTORS[1]))
+    whole = save_model(tmp_path / "g_1.pth", G, tensor(VECTORS[0]))
+    refused([whole, apart], "0 of 20 Gaussians are at positions of the other files'")
+    refused([whole, levels[1], ae], "give the files of one method")
+    refused([*levels, levels[0], ae], "a fourth checkpoint")
+    d4 = save_model(tmp_path / "d4.pth", G, tensor(VECTORS[0][:, :4]))
+    refused([d4, ae], "4 numbers per Gaussian, but .* makes 3")
+
+
+def test_damaged_autoencoders(tmp_path):
+    good, checkpoint = autoencoder(D).state_dict(), langsplat(tmp_path, (1,))[0]
+    missing = {name: value for name, value in good.items() if name != "encoder.3.bias"}
+    infinite = good | {"decoder.4.bias": good["decoder.4.bias"] * torch.nan}
+    short = good | {"decoder.0.weight": torch.zeros(16, 4)}
+    for state, message in (
+        (missing, "not an autoencoder of LangSplat's kind"),
+        (short, "not an autoencoder of LangSplat's kind"),
+        (infinite, "weights are not finite"),
+        ({"layer.weight": torch.zeros(3, 3)}, "not a checkpoint or autoencoder of a known method"),
+    ):
+        torch.save(state, tmp_path / "ae.pth")
+        refused([tmp_path / "ae.pth", checkpoint], message)
+
+
+def test_damaged_quantisers(tmp_path):
+    path, checkpoint = tmp_path / "pq", save_model(tmp_path / "c.pth", G, tensor(np.zeros((N, 4), np.uint8)))
+    good = faiss_index(CENTROIDS)
+    for content, message in (
+        (faiss_index(CENTROIDS, b"IwPQ"), "of the kind 'IwPQ'"),
+        (faiss_index(CENTROIDS, bits=4), "parts of 4 bits"),
+        (good[:2000], "truncated: 6144 centroid numbers"),
+        (good[:40], "ends in its header"),
+        (faiss_index(CENTROIDS * np.nan), "not finite"),
+        (b"something else", "neither a PLY nor a file of torch"),
+        (b"", "neither a PLY nor a file of torch"),
+    ):
+        path.write_bytes(content)
+        refused([path, checkpoint], message)
+    np.savez(tmp_path / "x.npz", a=np.zeros((3, 4)))
+    refused([tmp_path / "x.npz", checkpoint], r"holds arrays \(3, 4\)")
+
+
+SAMPLES = {
+    "checkpoint": lambda folder: save_model(folder / "c.pth", G.take(ALL[:4]), tensor(VECTORS[0][:4])),
+    "autoencoder": lambda folder: best_ckpt(folder, encoder=(8, 3), decoder=(5,)),
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", SAMPLES)
+def test_damage_anywhere_is_one_line(tmp_path, kind):
+    path = SAMPLES[kind](tmp_path)
+    plain = save_model(tmp_path / "plain_1.pth", G.take(ALL[:4]), tensor(LATENTS[0][:4]))
+    given = [path] if kind == "checkpoint" else [path, plain]
+    good, messages = path.read_bytes(), []
+    generator = np.random.default_rng(0)
+    for round_ in range(150):
+        data = bytearray(good)
+        place = int(generator.integers(len(data)))
+        match round_ % 3:
+            case 0:
+                data = data[:place]
+            case 1:
+                data[place : place + 4] = generator.bytes(4)
+            case _:
+                del data[place : place + int(generator.integers(1, 9))]
+        path.write_bytes(bytes(data))
+        try:
+            read_foreign(given)
+        except InputError as error:
+            messages.append(str(error))
+    assert len(messages) > 40
+    assert all("\n" not in message and str(tmp_path) in message for message in messages)

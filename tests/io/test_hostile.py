@@ -1,0 +1,513 @@
+"""Archives that lie or use what nobody needs: one error each."""
+
+import gzip
+import io
+import json
+import re
+import struct
+import warnings
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from PIL import EpsImagePlugin, Image
+
+from langsplat_core.datasets.capture import find_photos, read_photo
+from langsplat_core.errors import FormatError
+from langsplat_core.io.cameras import read_cameras
+from langsplat_core.io.hostile import (
+    MOST_PIXELS,
+    PictureError,
+    opened,
+    opened_archive,
+    picture_size,
+    read_npy,
+    read_npz,
+)
+from langsplat_core.io.language import read_language, write_language
+from langsplat_core.io.ply import read_ply
+from langsplat_core.io.ply_table import GREY, read_cloud
+from langsplat_core.io.scenes import load_gaussians
+from langsplat_core.io.sog import read_sog
+from langsplat_core.io.splat import read_ksplat
+from langsplat_core.io.spz import read_spz_scene
+from tests.support.file_samples import (
+    ksplat_bytes,
+    plain_ply,
+    random_field,
+    sog_files,
+    spz_bytes,
+    write_folder,
+)
+from tests.support.scenes import random_gaussians
+
+
+def packed(method: int, name: str = "a", content: bytes = b"content" * 100) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", method) as archive:
+        archive.writestr(name, content)
+    return buffer.getvalue()
+
+
+def read(folder: Path, data: bytes, name: str = "a", limit: int = 10_000) -> bytes:
+    (folder / "made.zip").write_bytes(data)
+    with opened_archive(folder / "made.zip", "archive") as archive:
+        return archive.read(name, limit)
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_members_are_read(tmp_path: Path, method: int) -> None:
+    assert read(tmp_path, packed(method)) == b"content" * 100
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_other_methods_are_refused_before_they_run(tmp_path: Path, method: int) -> None:
+    with pytest.raises(FormatError, match=f"packed by method {method}; pack the archive again with deflate"):
+        read(tmp_path, packed(method))
+
+
+def test_what_unfolds_beyond_the_limit_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="has more than 699 bytes"):
+        read(tmp_path, packed(zipfile.ZIP_DEFLATED), limit=699)
+    assert len(read(tmp_path, packed(zipfile.ZIP_DEFLATED), limit=700)) == 700
+
+
+def test_every_changed_byte_is_one_error_or_none(tmp_path: Path) -> None:
+    """zipfile raises IndexError, struct.error, zlib.error, NotImplementedError ... over these."""
+    good, messages = packed(zipfile.ZIP_DEFLATED), []
+    for place in range(len(good)):
+        for value in (0, 255, good[place] ^ 1):
+            try:
+                read(tmp_path, good[:place] + bytes([value]) + good[place + 1 :])
+            except FormatError as error:
+                messages.append(str(error))
+    assert len(messages) > len(good)
+    assert all(message.isprintable() for message in messages)
+
+
+def test_an_array_of_text_that_is_none(tmp_path: Path) -> None:
+    np.savez(tmp_path / "good.npz", key=np.array("abc"))
+    assert str(read_npz(tmp_path / "good.npz")["key"]) == "abc"
+    buffer = io.BytesIO()
+    np.save(buffer, np.array("abc"))
+    for bad in (b"\xff\xff\xff\x7f", b"\x00\xd8\x00\x00"):
+        content = buffer.getvalue()[:-4] + bad
+        (tmp_path / "bad.npz").write_bytes(packed(zipfile.ZIP_DEFLATED, "key.npy", content))
+        with pytest.raises(FormatError, match="not Unicode"):
+            read_npz(tmp_path / "bad.npz")
+
+
+# Point clouds: every type of coordinate and colour, and numbers beyond what either can hold.
+
+
+def ascii_cloud(folder: Path, colour: str, *rows: str) -> Path:
+    """Of double positions; `colour` is the type of the colours, none where it is empty."""
+    channels = [f"property {colour} {name}" for name in ("red", "green", "blue")] if colour else []
+    axes = [f"property double {axis}" for axis in "xyz"]
+    header = ["ply", "format ascii 1.0", f"element vertex {len(rows)}", *axes, *channels, "end_header"]
+    path = folder / "cloud.ply"
+    path.write_text("\n".join([*header, *rows]) + "\n")
+    return path
+
+
+def test_colours_of_every_type(tmp_path: Path) -> None:
+    points, colours = read_cloud(ascii_cloud(tmp_path, "uchar", "1 2 3 0 128 255", "4 5 6 7 8 9"))
+    np.testing.assert_array_equal(points, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(colours, [[0, 128, 255], [7, 8, 9]])
+    assert read_cloud(ascii_cloud(tmp_path, "float", "0 0 0 0 0.5 1"))[1].tolist() == [[0, 128, 255]]
+    assert read_cloud(ascii_cloud(tmp_path, "", "0 0 0"))[1].tolist() == [[GREY] * 3]
+
+
+@pytest.mark.parametrize(
+    ("colour", "shade", "want"), [("int", "300", 255), ("int", "-5", 0), ("float", "1e308", 255)]
+)
+def test_colours_beyond_a_byte_are_clipped(tmp_path: Path, colour: str, shade: str, want: int) -> None:
+    assert read_cloud(ascii_cloud(tmp_path, colour, f"0 0 0 {shade} 0 0"))[1][0, 0] == want
+
+
+def test_integers_beyond_any_float(tmp_path: Path) -> None:
+    points, colours = read_cloud(ascii_cloud(tmp_path, "uchar", f"1{'0' * 400} 0 nan 1{'0' * 30} 0 nan"))
+    assert not np.isfinite(points).any(where=[True, False, True])
+    assert colours.tolist() == [[255, 0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("element vertex", "element corner", "no element 'vertex'"),
+        ("property double y", "property double q", "no number 'y'"),
+        ("property double z", "property list uchar int l\nproperty double z", "hold lists"),
+        ("element vertex 1", "element vertex 1000000000000", "truncated"),
+    ],
+)
+def test_what_is_no_cloud_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = ascii_cloud(tmp_path, "uchar", "1 2 3 4 5 6")
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(FormatError, match=message):
+        read_cloud(path)
+
+
+# Headers of .npy files: what NumPy writes is read, anything else refused, whatever it looks like.
+
+
+def npy(shape: str, values: int = 0) -> bytes:
+    """A .npy file of float32 with a header that says `shape`."""
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({shape}), }}".encode()
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(4 * values)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (0,), (2, 3), (1, 2, 1, 2, 1, 2, 1, 2)])
+def test_what_numpy_writes_is_read(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    array = np.arange(np.prod(shape, dtype=int), dtype=np.float32).reshape(shape)
+    np.save(tmp_path / "a.npy", array)
+    np.testing.assert_array_equal(read_npy(tmp_path / "a.npy"), array)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        "9" * 400 + "x",  # may be divided in so many ways that trying all of them would never end
+        "1, " * 400 + "x",
+        "1, 1, 1, 1, 1, 1, 1, 1, 1",
+        "1" * 19 + ",",
+        "1 1,",
+        ",",
+        "-1,",
+    ],
+)
+def test_other_shapes_are_refused_at_once(tmp_path: Path, shape: str) -> None:
+    (tmp_path / "a.npy").write_bytes(npy(shape, 1))
+    with pytest.raises(FormatError, match=r"not a \.npy file of plain numbers"):
+        read_npy(tmp_path / "a.npy")
+
+
+# Pictures are opened by their content, in one place, within limits, and every failure is one error.
+
+ROOT = Path(__file__).parents[2]
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\nshowpage\n%%EOF\n"
+
+
+def saved(kind: str, size: tuple[int, int] = (20, 15), **options: object) -> bytes:
+    pixels = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+def png_that_claims(width: int, height: int) -> bytes:
+    data = bytearray(saved("PNG"))
+    data[16:24] = struct.pack(">II", width, height)
+    data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    return bytes(data)
+
+
+def test_nothing_else_opens_pictures() -> None:
+    sources = [
+        path for folder in ("langsplat_core", "app", "packaging") for path in (ROOT / folder).rglob("*.py")
+    ]
+    openers = [path.name for path in sources if re.search(r"\bImage\.open\(", path.read_text())]
+    assert openers == ["hostile.py"]
+    assert (ROOT / "langsplat_core/io/hostile.py") in sources
+
+
+def test_postscript_starts_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[object] = []
+    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *args: started.append(args))
+    (tmp_path / "a.png").write_bytes(EPS)
+    with pytest.raises(PictureError, match="the content is none of JPEG, PNG"):
+        read_photo(tmp_path / "a.png", upright=False)
+    assert not started
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "TIFF", "BMP"])
+def test_the_content_tells_the_kind(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "a.jpg").write_bytes(saved(kind))
+    assert picture_size(tmp_path / "a.jpg") == (20, 15)
+    assert read_photo(tmp_path / "a.jpg", upright=True).size == (20, 15)
+
+
+@pytest.mark.parametrize("kind", ["GIF", "PPM", "TGA", "ICO", "DDS", "PCX"])
+def test_kinds_that_are_not_claimed_are_refused(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "a.png").write_bytes(saved(kind))
+    with pytest.raises(PictureError, match="the content is none of"):
+        picture_size(tmp_path / "a.png")
+
+
+def test_bitmaps_and_new_kinds_are_photographs(tmp_path: Path) -> None:
+    for name in ("a.bmp", "b.avif", "c.heic", "d.gif"):
+        (tmp_path / name).write_bytes(b"x")
+    assert [path.name for path in find_photos(tmp_path)] == ["a.bmp", "b.avif", "c.heic"]
+
+
+@pytest.mark.parametrize("size", [(12_000, 12_000), (1, 2**31 - 1), (5000, 5000), (40_000, 40_000)])
+def test_a_declared_size_is_judged_before_decoding(size: tuple[int, int]) -> None:
+    """Pillow's own limit would let the first and the third through: 430 and 75 MB out of a kilobyte."""
+    with pytest.raises(PictureError, match="declares"), opened(png_that_claims(*size)) as picture:
+        pytest.fail(f"opened {picture.size}")
+
+
+def test_large_photographs_are_let_through() -> None:
+    """Judged by the size of the file: 100 megapixels of a real camera take at least a megabyte."""
+    data = png_that_claims(12_000, 8_000)
+    padding = b"\0" * 1_000_000
+    with opened(data + padding) as picture:
+        assert picture.size == (12_000, 8_000)
+    assert MOST_PIXELS >= 151_000_000  # the largest sensor that is sold
+
+
+@pytest.mark.parametrize(
+    "error", [IndexError, AssertionError, TypeError, NotImplementedError, RuntimeError, MemoryError]
+)
+def test_whatever_a_decoder_raises_is_one_error(tmp_path: Path, error: type[Exception]) -> None:
+    (tmp_path / "a.png").write_bytes(saved("PNG"))
+    with pytest.raises(PictureError) as caught, opened(tmp_path / "a.png"):
+        raise error("inside\nPillow")
+    assert str(caught.value) == f"{tmp_path / 'a.png'}: not a readable picture (damaged: inside Pillow)"
+    assert caught.value.reason == "damaged: inside Pillow"
+
+
+def test_what_the_reader_itself_refuses_is_kept() -> None:
+    with pytest.raises(FormatError, match="too small"), opened(saved("PNG")):
+        raise FormatError("too small")
+
+
+def test_damaged_tiff_says_nothing_on_the_standard_error(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], recwarn: pytest.WarningsRecorder
+) -> None:
+    """libtiff's own messages, Pillow's loggers and its warnings about tags."""
+    good = saved("TIFF", compression="tiff_lzw")
+    rng = np.random.default_rng(0)
+    refused = 0
+    for place in range(8, len(good), 31):
+        (tmp_path / "a.tif").write_bytes(good[:place] + rng.bytes(3) + good[place + 3 :])
+        try:
+            read_photo(tmp_path / "a.tif", upright=True)
+        except PictureError:
+            refused += 1
+    assert refused > 3
+    assert capfd.readouterr().err == ""
+    assert not recwarn.list
+
+
+def test_warnings_are_back_when_the_last_picture_is_closed() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        before = list(warnings.filters)
+        first, second = opened(saved("PNG")), opened(saved("BMP"))
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        warnings.warn("the second is still open", UserWarning, stacklevel=1)
+        second.__exit__(None, None, None)
+        assert warnings.filters == before
+        with pytest.raises(UserWarning):
+            warnings.warn("none is", UserWarning, stacklevel=1)
+
+
+# Files made to exhaust memory: what they claim or unfold to is refused before it is held.
+
+SCENE = random_gaussians(20, sh_degree=1)
+
+
+def black_webp(width: int, height: int) -> bytes:
+    buffer = io.BytesIO()
+    Image.new("RGBA", (width, height), (0, 0, 0, 255)).save(buffer, "WEBP", lossless=True, method=0)
+    return buffer.getvalue()
+
+
+def webp_that_claims(width: int, height: int) -> bytes:
+    """A lossless WebP whose header gives another size; the pixels behind it are those of a small one."""
+    data = bytearray(black_webp(4, 4))
+    at = data.index(b"VP8L") + 9  # 4-byte name, 4-byte length, signature; then two 14-bit sizes less one
+    flags = struct.unpack("<I", data[at : at + 4])[0] & ~((1 << 28) - 1)
+    data[at : at + 4] = struct.pack("<I", flags | (width - 1) | (height - 1) << 14)
+    return bytes(data)
+
+
+@pytest.mark.parametrize("width", [200, 16384])
+@pytest.mark.parametrize("name", ["means_l.webp", "quats.webp", "shN_centroids.webp", "shN_labels.webp"])
+def test_images_that_unfold_to_gigabytes(tmp_path, bounded, name, width):
+    files = sog_files(SCENE)
+    files[name] = webp_that_claims(width, 16384)
+    with pytest.raises(FormatError, match=name):
+        read_sog(write_folder(tmp_path / "a", files))
+
+
+def test_a_count_that_the_images_would_have_to_be_bombs_for(tmp_path, bounded):
+    files = sog_files(SCENE)
+    meta = json.loads(files["meta.json"])
+    meta["count"] = 16384 * 16384
+    for name in list(files):
+        files[name] = webp_that_claims(16384, 16384)
+    files["meta.json"] = json.dumps(meta).encode()
+    with pytest.raises(FormatError, match="too few for 268435456 Gaussians"):
+        read_sog(write_folder(tmp_path / "a", files))
+
+
+@pytest.mark.long
+def test_an_archive_that_unfolds_to_gigabytes(tmp_path, bounded):
+    files = sog_files(SCENE)
+    path = tmp_path / "a.sog"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            if name != "quats.webp":
+                archive.writestr(name, content)
+        with archive.open("quats.webp", "w") as member:
+            for _ in range(300):
+                member.write(bytes(1 << 20))
+    assert path.stat().st_size < 1 << 20
+    with pytest.raises(FormatError, match=r"'quats\.webp' inside has more than"):
+        read_sog(path)
+
+
+def test_a_meta_of_gigabytes(tmp_path, bounded):
+    files = sog_files(SCENE)
+    folder = write_folder(tmp_path / "a", files)
+    with (folder / "meta.json").open("wb") as file:
+        file.truncate(3 << 30)  # a hole: takes no room on the disk
+    with pytest.raises(FormatError, match=r"meta\.json: 3221225472 bytes; expected at most"):
+        read_sog(folder)
+    with pytest.raises(FormatError, match="never exceeds"):
+        read_cameras(folder / "meta.json")
+
+
+def zeros(size: int) -> Iterator[bytes]:
+    for _ in range(size >> 20):
+        yield bytes(1 << 20)
+
+
+@pytest.mark.long
+def test_spz_streams_that_unfold_to_gigabytes(tmp_path, bounded):
+    """Zeros are legal Gaussians, and compress a thousand times or more."""
+    path = tmp_path / "a.spz"
+    count = (128 << 20) // 20
+    for claimed, message in ((count, "the file can hold"), (5, "too many bytes behind")):
+        with gzip.open(path, "wb", compresslevel=1) as file:
+            file.write(b"NGSP" + struct.pack("<IIBBBB", 3, claimed, 0, 12, 0, 0))
+            for part in zeros(129 << 20):
+                file.write(part)
+        assert path.stat().st_size < 1 << 20
+        with pytest.raises(FormatError, match=message):
+            read_spz_scene(path)
+
+
+def spz_4_of_zeros(count: int, claimed: int, path: Path) -> None:
+    """Streams for `count` Gaussians in a file that says `claimed`."""
+    frames, sizes = [], [9, 1, 3, 3, 4]
+    for width in sizes:
+        packer = zstandard.ZstdCompressor().compressobj()  # without the size in its header
+        frames.append(
+            b"".join(packer.compress(part) for part in zeros(count * width + 1048575)) + packer.flush()
+        )
+    table = [struct.pack("<QQ", len(f), claimed * w) for f, w in zip(frames, sizes, strict=True)]
+    header = b"NGSP" + struct.pack("<IIBBBBI12x", 4, claimed, 0, 12, 0, 5, 32)
+    path.write_bytes(header + b"".join(table) + b"".join(frames))
+
+
+def test_spz_4_streams_that_unfold_to_gigabytes(tmp_path, bounded):
+    path = tmp_path / "a.spz"
+    for claimed, message in ((1 << 23, "cannot be in a file of"), (5, "fewer or more than the 45 bytes")):
+        spz_4_of_zeros(1 << 23, claimed, path)
+        assert path.stat().st_size < 1 << 20
+        with pytest.raises(FormatError, match=message):
+            read_spz_scene(path)
+    frame = zstandard.ZstdCompressor().compress(bytes(100))
+    frame = frame[:4] + bytes([0xE0]) + struct.pack("<Q", 10**12) + frame[6:]  # of a size of 10^12
+    content = spz_bytes(random_gaussians(5), 4)
+    old = struct.unpack_from("<Q", content, 32)[0]
+    start = 32 + 5 * 16
+    path.write_bytes(
+        content[:32] + struct.pack("<Q", len(frame)) + content[40:start] + frame + content[start + old :]
+    )
+    with pytest.raises(FormatError, match=r"cannot be unpacked|fewer or more"):
+        read_spz_scene(path)
+
+
+@pytest.mark.parametrize("at", [4, 16, 4096, 4100, 4108, 4132])
+@pytest.mark.parametrize("count", [10**6, 2**31, 2**32 - 1])
+def test_ksplat_counts_of_what_is_not_there(tmp_path, bounded, at, count):
+    content = bytearray(ksplat_bytes([SCENE], 1))
+    struct.pack_into("<I", content, at, count)
+    (tmp_path / "a.ksplat").write_bytes(content)
+    with pytest.raises(FormatError):
+        read_ksplat(tmp_path / "a.ksplat")
+
+
+@pytest.mark.parametrize("name", ["a.ksplat", "a.spz"])
+def test_files_of_a_terabyte_of_nothing(tmp_path, bounded, name):
+    with (tmp_path / name).open("wb") as file:
+        file.truncate(10**12)  # a hole: takes no room on the disk
+    with pytest.raises(FormatError):
+        load_gaussians(tmp_path / name)
+
+
+def ply_with(line: str, body: bytes = b"") -> bytes:
+    sample = plain_ply(SCENE)
+    old = f"element vertex {len(SCENE)}".encode()
+    assert old in sample
+    return sample.replace(old, line.encode()) + body
+
+
+@pytest.mark.parametrize("count", [21, 10**6, 10**12, 2**63, 2**64 - 1, 10**19])
+def test_vertices_that_are_not_there(tmp_path, bounded, count):
+    (tmp_path / "a.ply").write_bytes(ply_with(f"element vertex {count}"))
+    with pytest.raises(FormatError, match=f"truncated: {count} rows of element vertex"):
+        read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    "front", ["element nothing 1000000000000", "element face 9000\nproperty list uchar int i"]
+)
+def test_elements_in_front_that_cost_nothing_or_everything(tmp_path, bounded, front):
+    """An element without properties takes no bytes, however many rows it has; empty lists take one each."""
+    content = ply_with(f"{front}\nelement vertex {len(SCENE)}")
+    (tmp_path / "a.ply").write_bytes(content)
+    if "nothing" in front:
+        assert len(read_ply(tmp_path / "a.ply")) == len(SCENE)
+    else:
+        with pytest.raises(FormatError, match="truncated"):
+            read_ply(tmp_path / "a.ply")
+
+
+def test_a_header_of_many_properties(tmp_path, bounded):
+    lines = "".join(f"property char a{i}\n" for i in range(3000))
+    content = plain_ply(SCENE).replace(b"property float x\n", lines.encode() + b"property float x\n")
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(FormatError, match="truncated"):
+        read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("length", [2**63 - 1, 2**40, 100_000_001])
+def test_a_sidecar_whose_header_claims_gigabytes(tmp_path, bounded, length):
+    path = tmp_path / "a.langsplat.safetensors"
+    path.write_bytes(struct.pack("<Q", length) + b"{" * 100)
+    with pytest.raises(FormatError, match="not a whole safetensors file"):
+        read_language(path, SCENE.means)
+
+
+def test_a_sidecar_with_weights_that_do_not_fit_each_other(tmp_path, bounded):
+    """Shapes are checked before any product is formed: nothing is broadcast, nothing blows up."""
+    field = random_field(20)
+    path = tmp_path / "a.langsplat.safetensors"
+    write_language(path, field, SCENE.means)
+    raw = path.read_bytes()
+    size = struct.unpack("<Q", raw[:8])[0]
+    header = json.loads(raw[8 : 8 + size])
+
+    def attempt(name: str, shape: list[int]) -> None:
+        changed = json.dumps(header | {name: header[name] | {"shape": shape}}).encode()
+        path.write_bytes(struct.pack("<Q", len(changed)) + changed + raw[8 + size :])
+        with pytest.raises(FormatError):
+            read_language(path, SCENE.means)
+
+    for name, entry in header.items():
+        if name == "__metadata__":
+            continue
+        count = int(np.prod(entry["shape"]))
+        for shape in ([count], [1, count], [count, 1], [1, 1, count], [count, 1, 1], []):
+            if shape != entry["shape"]:
+                attempt(name, shape)

@@ -1,0 +1,553 @@
+"""Reading and writing the INRIA PLY, in all the variants that are found in the wild."""
+
+import io
+import json
+import tracemalloc
+from dataclasses import fields, replace
+
+import numpy as np
+import plyfile
+import pytest
+
+from langsplat_core.arrays import rotation_matrices, sigmoid
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.io import ply
+from langsplat_core.io.ply import (
+    metres_by_comments,
+    metres_comment,
+    read_ply,
+    read_ply_scene,
+    write_metres,
+    write_ply,
+)
+from langsplat_core.io.scenes import load_scene, save_scene
+from langsplat_core.io.sog import read_sog_scene
+from langsplat_core.scene import Scene
+from tests.support.extras import random_extras
+from tests.support.fakes import blob_scene
+from tests.support.file_samples import (
+    C0,
+    SHARED_DATA,
+    ascii_ply,
+    columns,
+    compressed_ply,
+    inria_names,
+    plain_ply,
+    ply_bytes,
+    sog_files,
+    vertex_table,
+    write_folder,
+)
+from tests.support.same import assert_same, assert_same_extras
+from tests.support.scenes import random_gaussians
+
+
+@pytest.fixture
+def put(tmp_path):
+    def write(content: bytes):
+        path = tmp_path / "scene.ply"
+        path.write_bytes(content)
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("count", [0, 1, 50])
+def test_what_is_written_is_read_back_bit_for_bit(tmp_path, degree, count):
+    want = random_gaussians(count, sh_degree=degree)
+    write_ply(tmp_path / "a.ply", want, comments=("vertical axis: y", "Tür"))
+    assert_same(read_ply(tmp_path / "a.ply"), want)
+
+
+@pytest.mark.parametrize("encode", [plain_ply, ascii_ply])
+def test_more_rows_than_one_chunk(tmp_path, encode):
+    want = random_gaussians(2 * 8192 + 3)
+    (tmp_path / "a.ply").write_bytes(encode(want))
+    assert_same(read_ply(tmp_path / "a.ply"), want)
+
+
+def test_tabs_and_blank_lines_in_the_header(put):
+    want = random_gaussians(3)
+    content = plain_ply(want).replace(b"property float x\n", b"\nproperty\tfloat \t x\t\ncomment\n")
+    assert_same(read_ply(put(content)), want)
+
+
+def test_rows_that_cannot_be_drawn_are_kept_as_they_are(tmp_path):
+    want = random_gaussians(8)
+    want.means[0] = np.nan
+    want.log_scales[1] = -np.inf
+    want.quats_wxyz[2] = 0
+    want.opacity_logits[3:5] = np.inf, -np.inf
+    want.sh[5] = -0.0
+    write_ply(tmp_path / "a.ply", want)
+    assert_same(read_ply(tmp_path / "a.ply"), want)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_the_file_written_is_what_another_reader_expects(tmp_path, degree):
+    scene = random_gaussians(20, sh_degree=degree)
+    write_ply(tmp_path / "a.ply", scene)
+    other = plyfile.PlyData.read(tmp_path / "a.ply")
+    assert [element.name for element in other.elements] == ["vertex"]
+    assert [prop.name for prop in other["vertex"].properties] == inria_names(degree)
+    for name, values in columns(scene).items():
+        np.testing.assert_array_equal(other["vertex"][name], values, name)
+
+
+@pytest.mark.parametrize("byte_order", ["<", ">"])
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("code", ["f4", "f8"])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_files_of_another_writer(tmp_path, byte_order, text, code, degree):
+    want = random_gaussians(30, sh_degree=degree)
+    names = inria_names(degree, normals=False)
+    np.random.default_rng(1).shuffle(names)  # the order of properties means nothing
+    vertices = plyfile.PlyElement.describe(vertex_table(want, [*names, "segment"], code), "vertex")
+    face = np.array([([0, 1, 2],), ([2, 1, 0],)], dtype=[("vertex_indices", "i4", (3,))])
+    extra = np.array([(1.5, 2)], dtype=[("focal", "f4"), ("size", "u2")])
+    elements = [
+        plyfile.PlyElement.describe(face, "face"),
+        vertices,
+        plyfile.PlyElement.describe(extra, "camera"),
+    ]
+    path = tmp_path / "a.ply"
+    plyfile.PlyData(elements, text=text, byte_order=byte_order, comments=["end_header is near"]).write(path)
+    assert_same(read_ply(path), want)
+
+
+def test_integer_columns(put):
+    scene = random_gaussians(4)
+    table = vertex_table(scene, inria_names(0), "<f4")
+    kinds = [(name, "<i2" if name == "opacity" else "<f4") for name in table.dtype.names]
+    header = ["format binary_little_endian 1.0", "element vertex 4"]
+    header += [f"property {'short' if kind == '<i2' else 'float32'} {name}" for name, kind in kinds]
+    table = table.astype(kinds)
+    got = read_ply(put(ply_bytes(header, table.tobytes())))
+    np.testing.assert_array_equal(got.opacity_logits, table["opacity"])
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+@pytest.mark.parametrize("normals", [False, True])
+def test_line_ends_and_normals(put, newline, normals):
+    want = random_gaussians(9, sh_degree=1)
+    # a body that begins with a line feed must not be taken for a part of the header
+    want.means[0, 0] = np.frombuffer(b"\n\r\n\x3f", "<f4")[0]
+    assert_same(read_ply(put(plain_ply(want, inria_names(1, normals), newline=newline))), want)
+
+
+def test_lists_in_front_are_skipped(put):
+    want = random_gaussians(9)
+    front = b"\x02" + bytes(8) + b"\x00"  # two rows: a list of two, an empty one
+    assert_same(read_ply(put(plain_ply(want, front=front))), want)
+
+
+def test_ascii_with_lists_and_blank_lines(put):
+    want = random_gaussians(9, sh_degree=2)
+    assert_same(read_ply(put(ascii_ply(want))), want)
+
+
+def test_ascii_infinities(put):
+    scene = random_gaussians(3)
+    scene.opacity_logits[:] = np.inf, -np.inf, np.nan
+    np.testing.assert_array_equal(read_ply(put(ascii_ply(scene))).opacity_logits, scene.opacity_logits)
+
+
+def test_a_double_beyond_float32_becomes_infinite(put):
+    scene = random_gaussians(2)
+    table = vertex_table(scene, inria_names(0), "<f8")
+    table["scale_0"][1] = 1e300
+    header = ["format binary_little_endian 1.0", "element vertex 2"]
+    header += [f"property double {name}" for name in table.dtype.names]
+    got = read_ply(put(ply_bytes(header, table.tobytes())))
+    assert got.log_scales[1, 0] == np.inf
+    assert list(got.valid()) == [True, False]
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "a.ply"
+    old = random_gaussians(5)
+    write_ply(path, old)
+
+    def full_disk(part):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(ply, "sh_to_channel_major", full_disk)
+    with pytest.raises(OSError, match="No space"):
+        write_ply(path, random_gaussians(9))
+    assert_same(read_ply(path), old)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_comment_of_two_lines_is_refused(tmp_path):
+    with pytest.raises(InputError, match="single line"):
+        write_ply(tmp_path / "a.ply", random_gaussians(1), comments=("x\nend_header",))
+
+
+def test_the_samples_are_what_plyfile_reads():
+    """The bytes built by hand for the tests above are themselves good PLY files."""
+    scene = random_gaussians(3, sh_degree=1)
+    for content in (plain_ply(scene), ascii_ply(scene).replace(b"\n\n", b"\n")):  # it refuses blank lines
+        other = plyfile.PlyData.read(io.BytesIO(content))
+        np.testing.assert_array_equal(other["vertex"]["rot_3"], scene.quats_wxyz[:, 3])
+
+
+# How files say that a scene was trained with antialiasing.
+
+MARKS = [
+    ((), False),
+    (("Exported from Brush", "SplatRenderMode: mip"), True),
+    (("SplatRenderMode: default",), False),
+    (("SplatRenderMode: 2dgs",), False),
+    (("  SPLATRENDERMODE:   MIP ",), True),
+    (("SplatRenderMode:mip",), True),
+    (("antialiased 1",), True),
+    (("antialiased 0",), False),
+    (("antialiased",), False),
+    (("the antialiased 1 of them",), False),
+    (("train_flags exposure antialiasing",), True),
+    (("train_flags exposure",), False),
+    (("antialiased 1", "SplatRenderMode: default"), False),
+    (("SplatRenderMode: default", "antialiased 1"), True),
+]
+
+
+@pytest.mark.parametrize(("comments", "antialiased"), MARKS)
+def test_the_marks_of_other_programs(tmp_path, comments, antialiased):
+    write_ply(tmp_path / "a.ply", random_gaussians(3), comments)
+    assert load_scene(tmp_path / "a.ply").antialiased is antialiased
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_mark_is_written_back(tmp_path, antialiased):
+    save_scene(tmp_path / "a.ply", Scene(random_gaussians(3), antialiased=antialiased))
+    assert load_scene(tmp_path / "a.ply").antialiased is antialiased
+    assert (b"comment SplatRenderMode: mip\n" in (tmp_path / "a.ply").read_bytes()) is antialiased
+
+
+def test_the_mark_of_a_compressed_ply(tmp_path):
+    content = compressed_ply(random_gaussians(300))
+    (tmp_path / "a.ply").write_bytes(content.replace(b"made by a test", b"antialiased 1"))
+    assert read_ply_scene(tmp_path / "a.ply").antialiased
+    (tmp_path / "a.ply").write_bytes(content)
+    assert not read_ply_scene(tmp_path / "a.ply").antialiased
+
+
+@pytest.mark.parametrize(
+    ("entry", "antialiased"),
+    [
+        ({}, False),
+        ({"model": "antialiased"}, True),
+        ({"model": "2dgs"}, False),
+        ({"model": ["antialiased"]}, False),
+        ({"antialias": True}, True),
+        ({"antialias": False}, False),
+        ({"antialias": "no"}, False),
+    ],
+)
+def test_the_mark_of_a_sog(tmp_path, entry, antialiased):
+    files = sog_files(random_gaussians(20))
+    files["meta.json"] = json.dumps(json.loads(files["meta.json"]) | entry).encode()
+    assert read_sog_scene(write_folder(tmp_path / "a", files)).antialiased is antialiased
+
+
+# How long a unit is, as the header of a PLY says.
+
+
+@pytest.mark.parametrize("metres", [0.25, 1.0, 1 / 3, 1e-12, 12345.678])
+def test_a_scene_keeps_its_scale(tmp_path, metres):
+    scene = replace(blob_scene(), metres_per_unit=metres, antialiased=True)
+    save_scene(tmp_path / "a.ply", scene)
+    back = load_scene(tmp_path / "a.ply")
+    assert back.metres_per_unit == metres
+    assert back.antialiased
+    assert back.take(np.arange(3)).metres_per_unit == metres
+    assert metres_by_comments((metres_comment(metres),)) == metres
+
+
+@pytest.mark.parametrize(
+    ("comments", "want"),
+    [
+        ((), None),
+        (("made by hand", "metres_per_unit 2"), 2.0),
+        (("metres_per_unit: 2.5e-1",), 0.25),
+        (("metres_per_unit 2", "metres_per_unit 3"), 3.0),
+        (("metres_per_unit 2", "metres_per_unit none"), None),
+        (("metres_per_unit 0",), None),
+        (("metres_per_unit -1",), None),
+        (("metres_per_unit nan",), None),
+        (("metres_per_unit inf",), None),
+        (("metres_per_unit 2 3",), None),
+    ],
+)
+def test_comments(comments, want):
+    assert metres_by_comments(comments) == want
+
+
+@pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, np.inf])
+def test_no_scene_has_a_length_that_is_none(wrong, tmp_path):
+    with pytest.raises(ValueError, match="must be above 0"):
+        Scene(random_gaussians(2), metres_per_unit=wrong)
+    save_scene(tmp_path / "a.ply", Scene(random_gaussians(2)))
+    with pytest.raises(InputError, match="must be above 0"):
+        write_metres(tmp_path / "a.ply", wrong)
+
+
+def test_only_the_header_changes(tmp_path):
+    path = tmp_path / "a.ply"
+    save_scene(path, blob_scene())
+    plain = path.read_bytes()
+    write_metres(path, 0.5)
+    write_metres(path, 0.25)
+    head, body = path.read_bytes().split(b"end_header\n", 1)
+    assert head.count(b"metres_per_unit") == 1
+    assert head.replace(b"comment metres_per_unit 0.25\n", b"") + b"end_header\n" + body == plain
+    scene = load_scene(path)
+    assert scene.metres_per_unit == 0.25
+    assert scene.language is not None  # the sidecar still fits
+
+
+def test_other_plies_stay_what_they_are(tmp_path):
+    path = tmp_path / "a.compressed.ply"
+    path.write_bytes(compressed_ply(random_gaussians(300)))
+    before = load_scene(path).gaussians
+    write_metres(path, 2)
+    after = load_scene(path)
+    assert after.metres_per_unit == 2
+    np.testing.assert_array_equal(after.gaussians.means, before.means)
+
+    save_scene(path, Scene(random_gaussians(3)))
+    head, body = path.read_bytes().split(b"end_header\n", 1)
+    path.write_bytes(head.replace(b"\n", b"\r\n") + b"end_header\r\n" + body)
+    write_metres(path, 3)
+    assert b"comment metres_per_unit 3.0\r\nend_header\r\n" in path.read_bytes()
+    assert load_scene(path).metres_per_unit == 3
+
+
+def test_what_cannot_keep_a_scale(tmp_path):
+    save_scene(tmp_path / "a.spz", Scene(random_gaussians(3)))
+    with pytest.raises(InputError, match="keeps a scale; make one"):
+        write_metres(tmp_path / "a.spz", 1)
+    with pytest.raises(InputError, match="no such file"):
+        write_metres(tmp_path / "b.ply", 1)
+    (tmp_path / "c.ply").write_bytes(b"plx\n")
+    with pytest.raises(FormatError, match="not a PLY"):
+        write_metres(tmp_path / "c.ply", 1)
+    assert (tmp_path / "c.ply").read_bytes() == b"plx\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.spz", "c.ply"]
+
+
+# Further properties of a scene: they survive, in their own types, and cost their own memory only.
+
+N = 40
+
+
+def test_extra_properties_survive_in_their_own_types(tmp_path):
+    scene = Scene(random_gaussians(N, sh_degree=2), extras=random_extras())
+    save_scene(tmp_path / "a.ply", scene)
+    got = load_scene(tmp_path / "a.ply")
+    assert_same_extras(got.extras, scene.extras)
+    np.testing.assert_array_equal(got.gaussians.sh, scene.gaussians.sh)
+    save_scene(tmp_path / "b.ply", got)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_another_reader_finds_them_behind_the_layout(tmp_path):
+    scene, extras = random_gaussians(N, sh_degree=1), random_extras()
+    write_ply(tmp_path / "a.ply", scene, extras=extras)
+    vertex = plyfile.PlyData.read(tmp_path / "a.ply")["vertex"]
+    assert [prop.name for prop in vertex.properties] == [*inria_names(1), *extras]
+    for name, values in (columns(scene) | extras).items():
+        np.testing.assert_array_equal(vertex[name], values, name)
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("byte_order", ["<", ">"])
+def test_extra_properties_of_another_writer(tmp_path, text, byte_order):
+    """Anywhere among the others, in any encoding; normals are none of them."""
+    scene, extras = random_gaussians(N), random_extras()
+    values = columns(scene) | extras
+    names = list(values)
+    np.random.default_rng(0).shuffle(names)
+    table = np.zeros(N, [(name, values[name].dtype) for name in names])
+    for name in names:
+        table[name] = values[name]
+    element = plyfile.PlyElement.describe(table, "vertex")
+    plyfile.PlyData([element], text=text, byte_order=byte_order).write(tmp_path / "a.ply")
+    got = read_ply_scene(tmp_path / "a.ply")
+    assert_same_extras(got.extras, {name: extras[name] for name in names if name in extras})
+    np.testing.assert_array_equal(got.gaussians.quats_wxyz, scene.quats_wxyz)
+
+
+def test_numbers_that_an_integer_column_cannot_hold_are_read_without_a_word(tmp_path, recwarn):
+    content = ascii_ply(random_gaussians(1)).decode()
+    content = content.replace("end_header", "property uchar extra\nend_header")
+    for number in ("300", "-1", "nan", "1e300"):
+        (tmp_path / "a.ply").write_text(f"{content} {number}")
+        assert read_ply_scene(tmp_path / "a.ply").extras["extra"].dtype == np.uint8
+    assert not recwarn.list
+
+
+def test_rows_that_are_removed_take_their_extras_along(tmp_path):
+    scene = Scene(random_gaussians(N), extras=random_extras())
+    save_scene(tmp_path / "a.ply", scene)
+    save_scene(tmp_path / "b.ply", load_scene(tmp_path / "a.ply").take(np.arange(N) % 3 == 0))
+    got = load_scene(tmp_path / "b.ply")
+    assert_same_extras(got.extras, {name: values[::3] for name, values in scene.extras.items()})
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype", "says"),
+    [
+        ("x", "f4", "rename"),
+        ("nx", "f4", "rename"),
+        ("f_rest_3", "f4", "rename"),
+        ("two words", "f4", "rename"),
+        ("a\nend_header", "f4", "rename"),
+        ("", "f4", "rename"),
+        ("long", "i8", "type int64"),
+        ("flag", "?", "type bool"),
+        ("half", "f2", "type float16"),
+    ],
+)
+def test_extras_that_no_ply_can_hold(tmp_path, name, dtype, says):
+    with pytest.raises(InputError, match=says):
+        write_ply(tmp_path / "a.ply", random_gaussians(3), extras={name: np.zeros(3, dtype)})
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("extra", ["", "f4", "u1"])
+def test_loading_holds_little_beside_the_arrays_it_keeps(tmp_path, extra):
+    gaussians = random_gaussians(50_000, sh_degree=3)
+    extras = {"extra": np.zeros(len(gaussians), extra)} if extra else {}
+    write_ply(tmp_path / "a.ply", gaussians, extras=extras)
+    tracemalloc.start()
+    scene = load_scene(tmp_path / "a.ply")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    arrays = [getattr(scene.gaussians, field.name) for field in fields(scene.gaussians)]
+    kept = sum(array.nbytes for array in (*arrays, *scene.extras.values()))
+    assert kept > 50_000 * 4 * 58
+    assert kept < peak < kept + 4e6  # a few chunks; a copy of the coefficients would be 10 MB
+
+
+# Reading SuperSplat's compressed PLY.
+
+GUITAR = SHARED_DATA / "gaussians" / "guitar.compressed.ply"
+
+
+@pytest.fixture
+def put_compressed(tmp_path):
+    def write(content: bytes):
+        path = tmp_path / "scene.compressed.ply"
+        path.write_bytes(content)
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("colours", [True, False])
+def test_decoding_is_exact_up_to_the_quantisation(put, degree, colours):
+    want = random_gaussians(600, sh_degree=degree)  # two chunks and a part of one
+    got = read_ply(put(compressed_ply(want, colours=colours)))
+    assert len(got) == 600
+    assert got.sh_degree == degree
+    # Half a step of the coarsest field, with bounds over at most the whole scene; 10 % for float32.
+    for name, bits in (("means", 10), ("log_scales", 10)):
+        step = np.ptp(getattr(want, name), axis=0) / (2**bits - 1)
+        assert (np.abs(getattr(got, name) - getattr(want, name)) <= 0.55 * step).all()
+    step = (np.ptp(want.sh[:, 0], axis=0) if colours else 1 / C0) / 255
+    if not colours:  # without bounds the colours are 0..1
+        want.sh[:, 0] = (np.clip(0.5 + C0 * want.sh[:, 0], 0, 1) - 0.5) / C0
+    assert (np.abs(got.sh[:, 0] - want.sh[:, 0]) <= 0.55 * step).all()
+    assert np.abs(sigmoid(got.opacity_logits) - sigmoid(want.opacity_logits)).max() <= 0.5 / 255 + 1e-6
+    # 10 bits over [-0.71, 0.71]: 7e-4 a component, amplified at most 2.5 times in the matrix and in the
+    # component that is reconstructed
+    turned = rotation_matrices(got.quats_wxyz.astype(float)) - rotation_matrices(
+        want.quats_wxyz.astype(float)
+    )
+    assert np.abs(turned).max() <= 6e-3
+    if degree:
+        # 8 bits over [-4, 4]: half a step is 1/64
+        assert np.abs(got.sh[:, 1:] - want.sh[:, 1:]).max() <= 1 / 64 + 1e-6
+
+
+def test_the_first_and_last_bits_of_every_field(put):
+    """A file made of literal words, with the numbers worked out by hand."""
+    header = ["ply", "format binary_little_endian 1.0", "element chunk 1"]
+    header += [f"property float {end}_{axis}" for end in ("min", "max") for axis in "xyz"]
+    header += [f"property float {end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"]
+    header += ["element vertex 4"]
+    header += [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
+    bounds = np.array([[0, 10, 20, 1, 20, 40, -9, -8, -7, -1, -2, -3]], "<f4")
+    half = 0b1000000000  # 512 of 1023: 0.0005 above the middle
+    words = np.array(
+        [
+            [0, 0b00 << 30 | half << 20 | half << 10 | half, 0, 0x00000000],
+            [2047 << 21, 0b01 << 30 | half << 20 | half << 10 | half, 2047 << 21, 0xFF000000],
+            [1023 << 11, 0b10 << 30 | half << 20 | half << 10 | half, 1023 << 11, 0x00FF00FF],
+            [2047, 0b11 << 30 | 1023 << 20 | half << 10 | half, 2047, 0x0000FF80],
+        ],
+        "<u4",
+    )
+    body = bounds.tobytes() + words.tobytes()
+    got = read_ply(put(("\n".join(header) + "\nend_header\n").encode() + body))
+    np.testing.assert_allclose(got.means, [[0, 10, 20], [1, 10, 20], [0, 20, 20], [0, 10, 40]])
+    np.testing.assert_allclose(got.log_scales, [[-9, -8, -7], [-1, -8, -7], [-9, -2, -7], [-9, -8, -3]])
+    np.testing.assert_allclose(got.quats_wxyz[:3], np.eye(4)[:3], atol=1e-3)
+    np.testing.assert_allclose(got.quats_wxyz[3], [0.5**0.5, 0, 0, 0.5**0.5], atol=1e-3)
+    np.testing.assert_allclose(
+        0.5 + C0 * got.sh[:, 0], [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], atol=1e-6
+    )
+    assert got.opacity_logits[0] == got.opacity_logits[1] == -np.inf
+    assert got.opacity_logits[2] == np.inf
+    np.testing.assert_allclose(sigmoid(got.opacity_logits[3]), 128 / 255, rtol=1e-6)
+
+
+BROKEN = {
+    "too few chunks": (b"element chunk 3\n", b"element chunk 2\n", "2 chunks for 600 Gaussians"),
+    "a bound missing": (b"float max_y\n", b"float ceiling\n", "without the number 'max_y' in element chunk"),
+    "a word missing": (b"uint packed_scale\n", b"uint size\n", "without the number 'packed_scale'"),
+    "a list of bounds": (b"float max_y\n", b"list uchar float max_y\n", "without the number 'max_y'"),
+    "coefficients of fewer": (b"element sh 600\n", b"element sh 599\n", "element sh has 599 rows of 9"),
+    "a coefficient missing": (b"property uchar f_rest_8\n", b"", "element sh has 600 rows of 8"),
+    "coefficients of floats": (b"uchar f_rest_3", b"char f_rest_3", "beyond 0..255"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_every_broken_rule_has_its_message(put, case):
+    old, new, message = BROKEN[case]
+    content = compressed_ply(random_gaussians(600, sh_degree=1))
+    assert old in content
+    with pytest.raises(FormatError, match=message):
+        read_ply(put(content.replace(old, new)))
+
+
+def test_truncated(put):
+    content = compressed_ply(random_gaussians(600, sh_degree=1))
+    for lost in (1, 600 * 9 + 1, 600 * (9 + 16) + 1):
+        with pytest.raises(FormatError, match="truncated"):
+            read_ply(put(content[:-lost]))
+
+
+def test_infinite_bounds_make_rows_that_are_dropped(put):
+    content = compressed_ply(random_gaussians(300))
+    start = content.index(b"end_header\n") + len(b"end_header\n")
+    content = content[:start] + np.float32(np.inf).tobytes() + content[start + 4 :]
+    got = read_ply(put(content))
+    assert not got.valid()[:256].any()
+    assert got.valid()[256:].all()
+
+
+@pytest.mark.skipif(not GUITAR.exists(), reason="the shared data are not here")
+def test_a_real_file():
+    got = read_ply(GUITAR)
+    assert len(got) == 90854
+    assert got.valid().all()
+    assert np.isposinf(got.opacity_logits).sum() == 667
+    scales = np.exp(got.log_scales.astype(np.float64))
+    assert 2.4e7 < (scales.max(1) / scales.min(1)).max() < 2.6e7
+    np.testing.assert_allclose(np.linalg.norm(got.quats_wxyz, axis=1), 1, atol=1e-6)
+    assert ((0.5 + C0 * got.sh[:, 0]) > -0.5).all()

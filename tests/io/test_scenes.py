@@ -1,0 +1,587 @@
+"""Scenes saved and loaded as a whole, with what lies beside them."""
+
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from langsplat_core.cli.query import QueryScene
+from langsplat_core.cli.scenes import Inspect
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.io import language
+from langsplat_core.io.cameras import read_cameras, write_cameras
+from langsplat_core.io.language import write_language
+from langsplat_core.io.ply import write_ply
+from langsplat_core.io.scenes import (
+    companion_path,
+    load_gaussians,
+    load_scene,
+    load_without_language,
+    save_scene,
+    scene_files,
+)
+from langsplat_core.io.shapes import base_colours, write_meshes, write_points
+from langsplat_core.io.summary import disk_bytes, duplicates, summarise
+from langsplat_core.query.engine import NO_FIELD, QueryEngine
+from langsplat_core.scene import NO_THING, Calibration, Gaussians, Odds, Reading, Scene
+from tests.support.fakes import blob_scene
+from tests.support.file_samples import compressed_ply, random_field, sog_files, write_folder
+from tests.support.same import assert_same_field
+from tests.support.scenes import random_camera, random_gaussians
+
+N = 60
+
+
+def full_scene(seed: int = 0) -> Scene:
+    cameras = tuple(replace(random_camera(i), name=f"view.{i}") for i in range(3))
+    return Scene(random_gaussians(N, seed, sh_degree=1), random_field(N, seed=seed), cameras)
+
+
+def test_a_saved_scene_is_loaded_whole(tmp_path):
+    want = full_scene()
+    path = tmp_path / "new folder" / "scene.ply"
+    save_scene(path, want)
+    got = load_scene(path)
+    np.testing.assert_array_equal(got.gaussians.sh, want.gaussians.sh)
+    assert got.language is not None
+    assert_same_field(got.language, want.language)
+    assert [camera.name for camera in got.cameras] == ["view.0", "view.1", "view.2"]
+    assert got.path == path
+    assert sorted(p.name for p in path.parent.iterdir()) == [
+        "scene.cameras.json",
+        "scene.langsplat.safetensors",
+        "scene.ply",
+    ]
+
+
+def test_a_scene_without_companions_removes_those_of_the_one_it_replaces(tmp_path):
+    save_scene(tmp_path / "scene.ply", full_scene())
+    save_scene(tmp_path / "scene.ply", Scene(random_gaussians(5)))
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.ply"]
+    got = load_scene(tmp_path / "scene.ply")
+    assert got.language is None
+    assert got.cameras == ()
+
+
+class Interrupted(BaseException):
+    """Like KeyboardInterrupt, at a chosen place."""
+
+
+@pytest.mark.parametrize("after", range(20))
+def test_an_interruption_never_leaves_a_mixture(tmp_path, monkeypatch, after):
+    """Saving over another scene is stopped before its `after`-th change of a file name."""
+    path = tmp_path / "scene.ply"
+    old, new = full_scene(0), full_scene(1)
+    save_scene(path, old)
+    changes = iter(range(100))
+    for name in ("replace", "unlink"):
+        original = getattr(Path, name)
+
+        def step(self, *args, original=original, **kwargs):
+            # removing leftovers is what happens after an interruption, not a step of the saving
+            is_step = original.__name__ == "replace" or not self.name.startswith(".")
+            if is_step and next(changes) == after:
+                raise Interrupted
+            return original(self, *args, **kwargs)
+
+        monkeypatch.setattr(Path, name, step)
+    try:
+        save_scene(path, new)
+        finished = True
+    except Interrupted:
+        finished = False
+    monkeypatch.undo()
+    got = load_scene(path)  # raises if the sidecar is of the other scene
+    is_new = np.array_equal(got.gaussians.means, new.gaussians.means)
+    assert is_new or np.array_equal(got.gaussians.means, old.gaussians.means)
+    source = new if is_new else old
+    if got.language is not None:
+        assert_same_field(got.language, source.language)
+    if finished:
+        assert is_new
+        assert got.language is not None
+        assert got.cameras
+    leftovers = [p.name for p in tmp_path.iterdir() if p.name.startswith(".")]
+    assert not leftovers
+    assert after < 8 or finished  # the parameters cover every step
+
+
+def test_a_failure_while_writing_changes_nothing(tmp_path, monkeypatch):
+    path = tmp_path / "scene.ply"
+    save_scene(path, full_scene(0))
+    before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+
+    def full_disk(*args):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("langsplat_core.io.scenes.write_ply", full_disk)
+    with pytest.raises(OSError, match="No space"):
+        save_scene(path, full_scene(1))
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+def test_formats_that_are_not_written(tmp_path):
+    with pytest.raises(InputError, match=r"scenes are written as \.ply, \.spz, \.splat"):
+        save_scene(tmp_path / "scene.sog", full_scene())
+    assert not list(tmp_path.iterdir())
+
+
+def test_companions_lie_beside_every_kind_of_scene(tmp_path):
+    scene = random_gaussians(N)
+    packed = tmp_path / "a.compressed.ply"
+    packed.write_bytes(compressed_ply(scene))
+    folder = write_folder(tmp_path / "b.v2", sog_files(scene))
+    for path, sidecar in (
+        (packed, "a.compressed.langsplat.safetensors"),
+        (folder, "b.v2.langsplat.safetensors"),
+        (folder / "meta.json", "b.v2.langsplat.safetensors"),
+    ):
+        place = companion_path(path, language.SUFFIX)
+        assert place == tmp_path / sidecar
+        write_language(place, random_field(N), load_gaussians(path).means)
+        loaded = load_scene(path)
+        assert loaded.language is not None
+        assert_same_field(loaded.language, random_field(N))
+
+
+@pytest.mark.parametrize("inner", ["", "meta.json"])
+def test_the_files_of_a_scene_are_its_own_and_its_companions(tmp_path, inner):
+    folder = write_folder(tmp_path / "b", sog_files(random_gaussians(N)))
+    meta, *images, sidecar, cameras = scene_files(folder / inner)
+    assert meta == folder / "meta.json"
+    assert {path.name for path in images} == {path.name for path in folder.iterdir()} - {"meta.json"}
+    beside = (tmp_path / "b.langsplat.safetensors", tmp_path / "b.cameras.json")
+    assert (sidecar, cameras) == beside
+    assert scene_files(tmp_path / "b.ply") == (tmp_path / "b.ply", *beside)
+
+
+def test_cameras_of_an_inria_model(tmp_path):
+    model = tmp_path / "model"
+    save_scene(model / "other.ply", full_scene())
+    (model / "other.cameras.json").rename(model / "cameras.json")
+    path = model / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    write_ply(path, random_gaussians(5))
+    assert len(load_scene(path).cameras) == 3
+
+
+def test_what_is_not_a_scene(tmp_path):
+    (tmp_path / "a.obj").write_bytes(b"x")
+    with pytest.raises(InputError, match=r"a\.obj: not a scene of a known kind; supported: \.ply, .*\.sog"):
+        load_scene(tmp_path / "a.obj")
+    for nowhere in ("nowhere", "nowhere.ply", "nowhere.sog", "n" * 5000 + ".ply", "nul\0.ply"):
+        with pytest.raises(InputError, match="no such file"):
+            load_scene(tmp_path / nowhere)
+    write_ply(tmp_path / ("n" * 240 + ".ply"), random_gaussians(1))  # its companions' names would be too long
+    assert load_scene(tmp_path / ("n" * 240 + ".ply")).language is None
+    write_ply(tmp_path / "model" / "iteration_7" / "point_cloud.ply", random_gaussians(1))
+    with pytest.raises(InputError, match=r"perhaps .*model/iteration_7/point_cloud\.ply"):
+        load_scene(tmp_path / "model")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"a folder without meta\.json is not a scene$"):
+        load_scene(tmp_path / "empty")
+
+
+def test_an_unusable_companion_is_left_out_with_its_reason(tmp_path):
+    save_scene(tmp_path / "scene.ply", full_scene())
+    write_ply(tmp_path / "scene.ply", random_gaussians(N - 1))
+    (reason,) = load_scene(tmp_path / "scene.ply").unread
+    assert "made for 60 Gaussians, the scene has 59" in reason
+    (tmp_path / "scene.langsplat.safetensors").unlink()
+    (tmp_path / "scene.cameras.json").write_text("[")
+    (reason,) = load_scene(tmp_path / "scene.ply").unread
+    assert "scene.cameras.json: not readable as JSON" in reason
+
+
+def test_a_scene_of_which_most_cannot_be_drawn_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    gaussians = random_gaussians(N)
+    for broken, told in ((N // 2, False), (N // 2 + 1, True)):
+        means = gaussians.means.copy()
+        means[:broken] = np.nan
+        write_ply(tmp_path / "a.ply", replace(gaussians, means=means))
+        caplog.clear()
+        assert len(load_scene(tmp_path / "a.ply").gaussians) == N
+        assert bool(caplog.messages) == told
+    assert f"52% of the {N} Gaussians cannot be drawn (position not finite)" in caplog.messages[0]
+
+
+# A scene whose companions are broken opens without them, and says why.
+
+CAMERAS, FIELD = "a.cameras.json", "a.langsplat.safetensors"
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A scene with a field and cameras."""
+    path = tmp_path / "a.ply"
+    save_scene(path, replace(blob_scene(phrasebook=True), path=None))
+    return path
+
+
+def spoil(path: Path, name: str) -> None:
+    companion = path.with_name(name)
+    companion.write_bytes(companion.read_bytes()[:50])
+
+
+def test_cameras_that_cannot_be_read(path, caplog):
+    spoil(path, CAMERAS)
+    scene = load_scene(path)
+    assert (scene.cameras, len(scene.gaussians)) == ((), 360)
+    assert scene.language is not None
+    (reason,) = scene.unread
+    assert CAMERAS in reason
+    assert "\n" not in reason
+    assert reason in caplog.text
+    assert load_without_language(path).unread == scene.unread
+    assert QueryEngine(scene).run("book").found
+
+
+@pytest.mark.parametrize("other", [False, True])
+def test_a_field_that_cannot_be_read_or_is_of_another_scene(path, capsys, other):
+    if other:
+        scene = load_scene(path)
+        save_scene(path.with_name("b.ply"), scene.take([1, 0, 2]))
+        path.with_name("b.langsplat.safetensors").replace(path.with_name(FIELD))
+    else:
+        spoil(path, FIELD)
+    scene = load_scene(path)
+    assert scene.language is None
+    assert len(scene.cameras) == 3
+    (reason,) = scene.unread
+    assert FIELD in reason
+    for ask in (lambda: QueryEngine(scene).run("book"), QueryScene(path, ("book",)).run):
+        with pytest.raises(InputError, match="looked at, not searched") as refused:
+            ask()
+        assert reason in str(refused.value)
+    Inspect(path, json=True).run()
+    assert json.loads(capsys.readouterr().out)["unread"] == [reason]
+    Inspect(path).run()
+    assert "not read" in capsys.readouterr().out
+
+
+def test_a_scene_without_a_field_says_how_to_make_one(tmp_path):
+    save_scene(tmp_path / "a.ply", blob_scene(field=False))
+    scene = load_scene(tmp_path / "a.ply")
+    assert scene.unread == ()
+    with pytest.raises(InputError) as refused:
+        QueryEngine(scene).run("book")
+    assert str(refused.value) == NO_FIELD
+
+
+@pytest.mark.parametrize("name", [CAMERAS, FIELD])
+def test_what_could_not_be_read_is_not_removed_by_writing(path, name):
+    spoil(path, name)
+    before = path.with_name(name).read_bytes()
+    with pytest.raises(InputError, match="mend or remove it first"):
+        save_scene(path, load_scene(path))
+    assert path.with_name(name).read_bytes() == before
+
+
+# What `langsplat inspect` says of scenes whose faults are known.
+
+
+def joined(*parts: Gaussians) -> Gaussians:
+    return Gaussians(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Gaussians)))
+
+
+def test_planted_faults_are_counted():
+    clean = random_gaussians(40, seed=1, sh_degree=1)
+    broken = random_gaussians(4, seed=2, sh_degree=1)
+    broken.means[0, 1] = np.nan
+    broken.quats_wxyz[1] = 0
+    broken.opacity_logits[2] = np.nan
+    broken.sh[3, 0, 0] = np.inf
+    needles = random_gaussians(2, seed=3, sh_degree=1)
+    needles.log_scales[:] = np.log([1.0, 1e-4, 1e-2])
+    found = summarise(Scene(joined(clean, broken, needles, clean.take(np.arange(5)))))
+    assert found.gaussians == 51
+    assert found.invalid_rows == 4
+    assert sum(found.invalid.values()) == 4
+    assert len(found.invalid) == 4
+    assert found.duplicates == 5
+    assert found.needles == 2
+    assert found.anisotropy[2] == pytest.approx(1e4, rel=1e-5)
+
+
+def test_rows_that_differ_in_one_number_are_no_duplicates():
+    gaussians = joined(*[random_gaussians(1, seed=1)] * 3)
+    assert duplicates(gaussians) == 2
+    gaussians.sh[1, 0, 2] += 1e-3
+    assert duplicates(gaussians) == 1
+
+
+def test_opacity_shares_and_energy():
+    gaussians = random_gaussians(4, sh_degree=2)
+    gaussians.opacity_logits[:] = [-np.inf, -6.0, 0.1, np.inf]  # opacities 0, 0.0025, 0.525, 1
+    gaussians.sh[:] = 0
+    gaussians.sh[:, 0] = 0.5 / 0.28209479177387814  # with the offset, colour 1 everywhere
+    gaussians.sh[:, 4] = 2 / 0.28209479177387814
+    found = summarise(Scene(gaussians))
+    assert found.opacity_shares == (0.5, 0.0, 0.0, 0.25, 0.25)
+    assert found.sh_energy == pytest.approx((0.2, 0.0, 0.8))
+
+
+def test_flat_and_empty_scenes_have_an_answer():
+    flat = random_gaussians(3)
+    flat.log_scales[:, 0] = -np.inf
+    assert summarise(Scene(flat)).anisotropy == (None, None, None)
+    assert summarise(Scene(flat)).needles == 3
+    empty = summarise(Scene(random_gaussians(0)))
+    assert (empty.gaussians, empty.duplicates, empty.needles) == (0, 0, 0)
+
+
+def test_the_command_prints_a_table_and_json(tmp_path, capsys):
+    gaussians = random_gaussians(30, sh_degree=1)
+    path = tmp_path / "scene.ply"
+    field = random_field(30)
+    extras = {"age": np.arange(30, dtype=np.float32)}
+    scene = Scene(gaussians, field, (random_camera(),), antialiased=True, extras=extras)
+    save_scene(path, scene)
+    Inspect(path).run()
+    text = capsys.readouterr().out
+    for words in ("Gaussians         30\n", "yes (Mip-Splatting)", "age", "codec"):
+        assert words in "\n".join(line.rstrip() for line in text.splitlines()) + "\n", words
+    Inspect(path, json=True).run()
+    answer = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert answer["gaussians"] == 30
+    assert answer["cameras"] == 1
+    assert answer["disk_bytes"] == sum(file.stat().st_size for file in tmp_path.iterdir())
+    assert answer["memory_bytes"] == 4 * 30 * (3 + 3 + 4 + 1 + 12 + 1 + 3 * (field.latents.shape[2] + 1))
+    flat = replace(gaussians, log_scales=np.full((30, 3), [-np.inf, 0, 0]))
+    save_scene(path, Scene(flat))
+    Inspect(path, json=True).run()
+    json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+
+
+def test_size_of_a_folder_counts_its_files(real_data):
+    folder = real_data / "gaussians" / "playbot_8k_sog"
+    expected = sum(file.stat().st_size for file in folder.iterdir())
+    assert disk_bytes(folder) == disk_bytes(folder / "meta.json") == expected
+
+
+def test_things_are_counted():
+    field = random_field(40)
+    things = np.array([3, 3, 9, NO_THING] * 10, np.uint16)
+    plain, named = (
+        summarise(Scene(random_gaussians(40), made)) for made in (field, replace(field, things=things))
+    )
+    assert (plain.language.things, named.language.things) == (None, 2)
+    assert named.language.bytes - plain.language.bytes == things.nbytes
+    assert named.memory_bytes - plain.memory_bytes == things.nbytes
+    odds = Odds(0, 1, 0)
+    sure = replace(field, reading=Reading(calibration=Calibration(odds, odds, odds)))
+    assert not plain.language.calibrated
+    assert summarise(Scene(random_gaussians(40), sure)).language.calibrated
+
+
+# Point clouds and meshes, read back by other programs.
+
+TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+
+
+def meshes():
+    one = SimpleNamespace(
+        name="red mug 1", vertices=TETRAHEDRON, triangles=FACES, colour=np.array([1, 0, 0.5])
+    )
+    two = SimpleNamespace(name="two", vertices=TETRAHEDRON + 5, triangles=FACES, colour=np.array([0, 1, 0]))
+    return [one, two]
+
+
+def test_points_have_colours_and_what_else_is_given(tmp_path):
+    gaussians = random_gaussians(40, sh_degree=1)
+    gaussians.means[7] = np.nan
+    relevancy = np.linspace(0, 1, 40)
+    assert write_points(tmp_path / "a.ply", gaussians, {"relevancy": relevancy}) == 39
+    vertex = PlyData.read(tmp_path / "a.ply")["vertex"]
+    kept = np.delete(np.arange(40), 7)
+    np.testing.assert_array_equal(np.stack([vertex[k] for k in "xyz"], 1), gaussians.means[kept])
+    colours = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
+    want = np.clip(0.5 + 0.28209479177 * gaussians.sh[kept, 0].astype(np.float64), 0, 1)
+    assert np.abs(colours / 255 - want).max() <= 0.5 / 255 + 1e-9
+    np.testing.assert_allclose(vertex["relevancy"], relevancy[kept], atol=1e-7)
+
+
+def test_colours_stay_colours():
+    gaussians = random_gaussians(4)
+    gaussians.sh[:, 0] = [[np.nan, np.inf, -np.inf], [9, -9, 0], [0, 0, 0], [1, 1, 1]]
+    colours = base_colours(gaussians)
+    assert ((colours >= 0) & (colours <= 1)).all()
+    assert colours[1].tolist() == [1, 0, 0.5]
+
+
+def test_a_ply_mesh_holds_all_of_them(tmp_path):
+    write_meshes(tmp_path / "a.ply", meshes())
+    data = PlyData.read(tmp_path / "a.ply")
+    places = np.stack([data["vertex"][k] for k in "xyz"], 1)
+    np.testing.assert_array_equal(places, np.concatenate([TETRAHEDRON, TETRAHEDRON + 5]))
+    faces = np.stack(data["face"]["vertex_indices"])
+    np.testing.assert_array_equal(faces, np.concatenate([FACES, FACES + 4]))
+    assert data["vertex"]["red"].tolist() == [255] * 4 + [0] * 4
+
+
+def test_an_obj_names_its_objects(tmp_path):
+    write_meshes(tmp_path / "a.OBJ", meshes())
+    lines = (tmp_path / "a.OBJ").read_text().splitlines()
+    assert [line for line in lines if line.startswith("o ")] == ["o red_mug_1", "o two"]
+    assert lines[1] == "v 0 0 0 1.0000 0.0000 0.5000"
+    faces = np.array([line.split()[1:] for line in lines if line.startswith("f ")], int)
+    np.testing.assert_array_equal(faces, np.concatenate([FACES, FACES + 4]) + 1)
+
+
+@pytest.mark.long
+def test_open3d_reads_them(tmp_path):
+    import open3d
+
+    for name in ("a.ply", "a.obj"):
+        write_meshes(tmp_path / name, meshes())
+        mesh = open3d.io.read_triangle_mesh(str(tmp_path / name))
+        assert len(mesh.triangles) == 8
+        assert mesh.is_watertight()
+        assert mesh.get_volume() == pytest.approx(1 / 3)
+    write_points(tmp_path / "p.ply", random_gaussians(10))
+    assert len(open3d.io.read_point_cloud(str(tmp_path / "p.ply")).points) == 10
+
+
+def test_another_suffix_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"\.ply; choose"):
+        write_points(tmp_path / "a.obj", random_gaussians(3))
+    with pytest.raises(InputError, match=r"\.ply or \.obj"):
+        write_meshes(tmp_path / "a.stl", meshes())
+    assert list(tmp_path.iterdir()) == []
+
+
+# INRIA's cameras.json.
+
+
+def entry(**changes):
+    """A camera at (1, 2, 3) that is turned by 90 degrees about its down axis: it looks along world +x."""
+    plain = {
+        "id": 0,
+        "img_name": "frame_01",
+        "width": 64,
+        "height": 48,
+        "position": [1.0, 2.0, 3.0],
+        "rotation": [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]],
+        "fx": 50.0,
+        "fy": 55.0,
+    }
+    return {key: value for key, value in (plain | changes).items() if value is not None}
+
+
+@pytest.fixture
+def put(tmp_path):
+    def write(value):
+        path = tmp_path / "scene.cameras.json"
+        path.write_text(value if isinstance(value, str) else json.dumps(value))
+        return path
+
+    return write
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    want = tuple(replace(random_camera(i, width=70 + i), name=f"Tür {i}.a") for i in range(5))
+    write_cameras(tmp_path / "a.json", want)
+    got = read_cameras(tmp_path / "a.json")
+    for a, b in zip(got, want, strict=True):
+        assert (a.width, a.height, a.fx, a.fy, a.cx, a.cy, a.name) == (
+            b.width,
+            b.height,
+            b.fx,
+            b.fy,
+            b.cx,
+            b.cy,
+            b.name,
+        )
+        # the centre of projection is stored instead of the translation: a few rounding errors
+        np.testing.assert_allclose(a.world_to_camera, b.world_to_camera, atol=1e-14)
+
+
+def test_no_cameras(tmp_path):
+    write_cameras(tmp_path / "a.json", ())
+    assert read_cameras(tmp_path / "a.json") == ()
+
+
+def test_numpy_numbers_are_written(tmp_path):
+    camera = replace(random_camera(), fx=np.float32(50.5), width=np.int64(64))
+    write_cameras(tmp_path / "a.json", (camera,))
+    assert read_cameras(tmp_path / "a.json")[0].fx == 50.5
+
+
+def test_the_inria_convention(put):
+    camera = read_cameras(put([entry()]))[0]
+    np.testing.assert_allclose(camera.position, [1, 2, 3])
+    np.testing.assert_allclose(camera.rotation[2], [1, 0, 0])  # forward, in the world
+    pixel, depth = camera.project(np.array([[6.0, 2.0, 3.0], [6.0, 3.0, 3.0], [6.0, 2.0, 2.0]]))
+    np.testing.assert_allclose(depth, 5)
+    # the middle; below it, since y points down; to the right of it, which is world -z
+    np.testing.assert_allclose(pixel, [[32, 24], [32, 24 + 55 / 5], [32 + 50 / 5, 24]])
+    assert camera.name == "frame_01"
+
+
+@pytest.mark.parametrize(
+    ("stored", "name"),
+    [("a.jpg", "a"), ("a.JPEG", "a"), ("frame.01", "frame.01"), ("x/y.png", "x/y"), ("", "")],
+)
+def test_names_lose_the_suffix_of_an_image(put, stored, name):
+    assert read_cameras(put([entry(img_name=stored)]))[0].name == name
+
+
+def test_principal_point(put):
+    camera = read_cameras(put([entry(cx=30, cy=20.5)]))[0]
+    assert (camera.cx, camera.cy) == (30, 20.5)
+
+
+TURNED = entry()["rotation"]
+BROKEN = {
+    "not a list": ({"a": 1}, "expected a list of cameras"),
+    "not objects": ([1], "camera 0: expected an object"),
+    "no width": ([entry(), entry(width=None)], "camera 1: 'width' is missing"),
+    "width of nought": ([entry(width=0)], "'width' is 0; expected whole pixels"),
+    "half a pixel": ([entry(height=47.5)], "'height' is 47.5; expected whole pixels"),
+    "a width for gigabytes": ([entry(width=10**9)], "'width' is 1e[+]09; expected whole pixels, 1 to 65536"),
+    "a width beyond float": ([entry(width=10**400)], "'width' is not a number"),
+    "a width of text": ([entry(width="64")], "'width' is not a number"),
+    "a width of truth": ([entry(width=True)], "'width' is not a number"),
+    "two numbers for a place": ([entry(position=[1, 2])], "'position' is not 3 numbers"),
+    "an infinite place": ("[" + json.dumps(entry()).replace("3.0]", "Infinity]") + "]", "'position' is not"),
+    "a place beyond sense": ([entry(position=[0, 2e9, 0])], "more than 1e[+]09 units from the origin"),
+    "a rotation that overflows": ([entry(rotation=[[1e200] * 3] * 3)], "'rotation' is not a rotation"),
+    "ragged rotation": ([entry(rotation=[[1, 0, 0], [0, 1], [0, 0, 1]])], "'rotation' is not 3 rows"),
+    "a scaled rotation": (
+        [entry(rotation=[[2 * x for x in row] for row in TURNED])],
+        "'rotation' is not a rotation",
+    ),
+    "a mirror": ([entry(rotation=[[-x for x in row] for row in TURNED])], "'rotation' is not a rotation"),
+    "no focal length": ([entry(fx=0)], "fx and fy must be positive"),
+    "a name of numbers": ([entry(img_name=7)], "'img_name' is not a text"),
+    "half a file": (json.dumps([entry()])[:-9], "not readable as JSON"),
+    "nesting": ("[" * 100_000, "not readable as JSON"),
+    "digits": ("[" + "9" * 5000 + "]", "not readable as JSON"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_every_broken_rule_has_its_message(put, case):
+    value, message = BROKEN[case]
+    path = put(value)
+    with pytest.raises(FormatError, match=message) as caught:
+        read_cameras(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_bytes_that_are_no_text(tmp_path):
+    (tmp_path / "a.json").write_bytes(b"[\xff\xfe\x00")
+    with pytest.raises(FormatError, match="not readable as JSON"):
+        read_cameras(tmp_path / "a.json")
+
+
+def test_a_missing_file(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_cameras(tmp_path / "a.json")

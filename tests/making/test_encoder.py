@@ -1,0 +1,262 @@
+"""The demo encoder: crops, phrases, tokenizer, loss, a training in miniature, and the bundled weights."""
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from transformers import AutoTokenizer, CLIPTokenizerFast
+
+from assets.making import encoder as demo_encoder
+from assets.making.config import EncoderConfig
+from assets.making.crops import CropSet, plain_crops, room_crops
+from assets.making.encoder import (
+    CANONICAL_COSINE,
+    begin_from,
+    build_model,
+    calibrate_canonical,
+    loss_of,
+    report,
+    report_table,
+    text_vectors,
+    train_encoder,
+    word_list,
+    word_merges,
+    write_tokenizer,
+)
+from assets.making.kit import COLOURS, to_lch
+from assets.making.vocabulary import Label, phrase_book
+from langsplat_core.errors import EncoderError
+from langsplat_core.progress import Cancelled, silent
+from langsplat_core.scene import CANONICAL_PHRASES
+from langsplat_core.semantics.encoders import load_encoder
+
+pytestmark = pytest.mark.long
+
+MUG = Label(2, "mug", "mug", "red", "red", ("red", "white"))
+HANDLE = Label(1, "handle", "mug", "red", "red", ("red",))
+BODY = Label(1, "body", "mug", "red", "red", ("red", "white"))
+RIM = Label(0, "rim", "mug", "white", "red", ("white",))
+CLUTTER = Label(-1, "", "", "", "", ())
+GREEN = Label(-1, "", "", "green", "", ("green",))
+LEG = Label(1, "leg", "chair", "brown", "red", ("brown",), "wood", ("wood",))
+CHAIR = Label(2, "chair", "chair", "red", "red", ("brown", "red"), "wood", ("cloth", "wood"))
+PIPE = Label(1, "handle", "pan", "gray", "gray", ("gray",), "metal", ("metal",))
+CUSHION = Label(0, "cushion", "chair", "red", "red", ("red",), "cloth", ("cloth",))
+LABELS = [MUG, HANDLE, BODY, RIM, CLUTTER, GREEN, LEG, CHAIR, PIPE, CUSHION]
+
+
+@pytest.fixture(scope="module")
+def book():
+    return phrase_book(LABELS)
+
+
+@pytest.fixture(scope="module")
+def unseen_room():
+    return room_crops(3_000_000, views=2)
+
+
+def fit(book, label, phrase):
+    return int(book.fits[book.labels.index(label), book.phrases.index(phrase)])
+
+
+@pytest.mark.parametrize(
+    ("label", "phrase", "expected"),
+    [
+        (MUG, "mug", 1),
+        (MUG, "red cup", 1),
+        (MUG, "something red", 1),
+        (MUG, "blue mug", 0),
+        (MUG, "handle", 0),
+        (MUG, "object", 0),
+        (MUG, "white", -1),  # its rim is white: the word is neither right nor wrong
+        (MUG, "mug body", -1),
+        (BODY, "red mug", -1),  # the body may pass for the mug
+        (BODY, "mug body", 1),
+        (HANDLE, "mug", 0),
+        (HANDLE, "handle of the red mug", 1),
+        (RIM, "white rim", 1),
+        (RIM, "rim of the red mug", 1),
+        (RIM, "red", 0),
+        (CLUTTER, "stuff", 1),
+        (CLUTTER, "mug", 0),
+        (CLUTTER, "red", -1),
+        (GREEN, "green thing", 1),
+        (GREEN, "wooden thing", -1),  # a patch of colour may be of anything
+        (LEG, "wooden leg", 1),
+        (LEG, "wooden chair leg", 1),
+        (LEG, "something wooden", 1),
+        (LEG, "metal", 0),
+        (CHAIR, "wooden chair", 1),
+        (CHAIR, "furniture", 1),
+        (CHAIR, "cloth", -1),  # its cushion is
+        (MUG, "wooden", -1),  # not known what it is made of
+        (GREEN, "red", 0),
+    ],
+)
+def test_which_phrases_are_right(book, label, phrase, expected):
+    assert fit(book, label, phrase) == expected
+
+
+def test_every_word_is_one_token_and_reloads(book, tmp_path):
+    words = word_list(book)
+    assert {"of", "the", *CANONICAL_PHRASES, *COLOURS} <= set(words)
+    write_tokenizer(words, tmp_path)
+    for kind in (CLIPTokenizerFast, AutoTokenizer):
+        tokenizer = kind.from_pretrained(tmp_path)
+        tokens = tokenizer([*words, "Handle of the RED mug", "quartz"])["input_ids"]
+        assert all(len(row) == 3 for row in tokens[: len(words)])
+        assert len({row[1] for row in tokens[: len(words)]}) == len(words)
+        assert len(tokens[-2]) == 7
+        assert tokens[-1] == [tokenizer.bos_token_id, *tokens[-1][1:-1], tokenizer.eos_token_id]
+        assert len(tokens[-1]) > 3  # an unknown word is spelled out
+    assert (tmp_path / "vocabulary.txt").read_text().split() == words
+
+
+def test_token_numbers_depend_on_the_words_alone(book, tmp_path):
+    """A resumed training must find its embeddings where they were."""
+    for name in ("one", "two"):
+        write_tokenizer(word_list(book), tmp_path / name)
+    assert (tmp_path / "one" / "tokenizer.json").read_bytes() == (
+        tmp_path / "two" / "tokenizer.json"
+    ).read_bytes()
+    assert word_merges(["aba", "ab"]) == [("a", "b"), ("a", "b</w>"), ("ab", "a</w>")]
+
+
+def test_loss_wants_right_above_canonical_above_wrong():
+    fits = torch.tensor([[0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]], dtype=torch.int8)
+    nameable = torch.tensor([True, True])
+    good = torch.tensor([[CANONICAL_COSINE] * 4 + [0.9, -0.2], [CANONICAL_COSINE] * 4 + [-0.2, 0.9]])
+    swapped = good[:, [0, 1, 2, 3, 5, 4]]
+    loud = good.clone()
+    loud[:, :4] = 0.8
+    best = loss_of(good, fits, nameable)
+    assert best < 0.05
+    assert loss_of(swapped, fits, nameable) > 5
+    assert loss_of(loud, fits, nameable) > best + 1
+
+
+def test_loss_ignores_pairs_that_are_neither():
+    fits = torch.tensor([[0, 0, 0, 0, 1, -1]], dtype=torch.int8)
+    cosines = torch.full((1, 6), CANONICAL_COSINE)
+    other = cosines.clone()
+    other[0, 5] = 0.9
+    nameable = torch.tensor([True])
+    assert loss_of(cosines, fits, nameable) == loss_of(other, fits, nameable)
+
+
+def test_crops_of_a_room(unseen_room, tmp_path):
+    levels = [label.level for label in unseen_room.labels]
+    assert {-1, 0, 1, 2} == set(levels)
+    assert len(levels) > 60
+    assert unseen_room.images.shape == (len(levels), 64, 64, 3)
+    assert (unseen_room.images.reshape(len(levels), -1).max(1) > 20).mean() > 0.95
+    unseen_room.save(tmp_path / "room.npz")
+    again = CropSet.load(tmp_path / "room.npz")
+    np.testing.assert_array_equal(again.images, unseen_room.images)
+    assert again.labels == unseen_room.labels
+
+
+def test_plain_crops_have_their_colour():
+    crops = plain_crops(60, 1)
+    for image, label in zip(crops.images, crops.labels, strict=True):
+        if label.colour == "green":
+            shown = image[image.max(2) > 30] / 255
+            hue = to_lch(np.median(shown, 0))[2]
+            assert 95 < hue < 190
+    assert {label.colour for label in crops.labels} > {"red", "blue", ""}
+
+
+@pytest.fixture
+def few_crops(monkeypatch):
+    """Crops that are trained with in place of those of 400 rooms."""
+    crops = plain_crops(40, 2)
+    monkeypatch.setattr(demo_encoder, "write_crops", lambda folder, config, progress: None)
+    monkeypatch.setattr(demo_encoder, "read_crops", lambda folder: (crops, crops))
+    return crops
+
+
+def test_training_in_miniature(monkeypatch, few_crops, tmp_path):
+    """Two steps, an interruption, the rest: what is written loads and answers; all steps were taken."""
+    monkeypatch.setattr(demo_encoder, "SAVE_EVERY", 2)
+    config = EncoderConfig(steps=4, batch=8, phrases=8)
+
+    def interrupt(label: str, fraction: float) -> None:
+        if fraction > 0.7:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        train_encoder(tmp_path, config, interrupt)
+    seen = []
+    figures = train_encoder(tmp_path, config, lambda label, fraction: seen.append(fraction))
+    assert "| colour |" in report_table(figures)
+    assert seen == [0.75, 1.0]  # went on at step 3 of 4
+    encoder = load_encoder(str(tmp_path), "cpu")
+    assert (encoder.dim, encoder.image_size) == (512, 64)
+    vectors = encoder.encode_images(few_crops.images[:3])
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-5)
+    with pytest.raises(EncoderError, match="xylophone"):
+        encoder.encode_texts(["red xylophone"])
+    size = sum(path.stat().st_size for path in tmp_path.iterdir() if path.is_file())
+    assert size < 12e6
+
+
+def test_training_twice_gives_the_same_model(few_crops, tmp_path):
+    weights = []
+    for name, seed in (("one", 0), ("two", 0), ("other", 1)):
+        # The learning rate starts at a 300th of this: steps large enough to be seen in half precision.
+        config = EncoderConfig(steps=2, batch=8, phrases=8, lr=0.1, seed=seed)
+        train_encoder(tmp_path / name, config, silent)
+        tensors = load_file(tmp_path / name / "model.safetensors")
+        weights.append(np.concatenate([tensor.float().numpy().ravel() for tensor in tensors.values()]))
+    # Not all: sums in bfloat16 may be added in another order, and Adam enlarges gradients that are zero
+    # but for rounding (the biases of attention keys).
+    assert np.isclose(weights[0], weights[1], atol=1e-3).mean() > 0.97
+    assert np.isclose(weights[0], weights[2], atol=1e-3).mean() < 0.5
+
+
+def test_training_may_begin_from_an_earlier_encoder(few_crops, tmp_path):
+    """Weights are taken over, and so is the vector of every token that the earlier vocabulary had."""
+    train_encoder(tmp_path / "old", EncoderConfig(steps=1, batch=8, phrases=8), silent)
+    write_tokenizer(["red", "zebra"], tmp_path / "new")
+    tokenizer = CLIPTokenizerFast.from_pretrained(tmp_path / "new")
+    model = build_model(len(tokenizer), tokenizer.bos_token_id, tokenizer.eos_token_id)
+    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    begin_from(model, tokenizer.get_vocab(), tmp_path / "old")
+    after, old = model.state_dict(), load_file(tmp_path / "old" / "model.safetensors")
+    words = "text_model.embeddings.token_embedding.weight"
+    for name in after:
+        if name != words:
+            torch.testing.assert_close(after[name], old[name].to(after[name].dtype))
+    rows, old_rows = tokenizer.get_vocab(), CLIPTokenizerFast.from_pretrained(tmp_path / "old").get_vocab()
+    torch.testing.assert_close(after[words][rows["red</w>"]], old[words][old_rows["red</w>"]].float())
+    torch.testing.assert_close(after[words][rows["zebra</w>"]], before[words][rows["zebra</w>"]])
+    assert not torch.equal(after[words][rows["red</w>"]], after[words][rows["zebra</w>"]])
+
+
+def test_calibration_moves_the_canonical_phrases_only(tmp_path):
+    words = [*CANONICAL_PHRASES, "red"]
+    write_tokenizer(words, tmp_path)
+    tokenizer = CLIPTokenizerFast.from_pretrained(tmp_path)
+    torch.manual_seed(0)
+    model = build_model(len(tokenizer), tokenizer.bos_token_id, tokenizer.eos_token_id).eval()
+    tokens = tokenizer(words, return_tensors="pt", padding=True).input_ids
+    with torch.no_grad():
+        before = text_vectors(model, tokens)
+        images = torch.nn.functional.normalize(before[:4].mean(0) + 0.05 * torch.randn(64, 512), dim=-1)
+        start = (images @ before[:4].T).mean()
+    calibrate_canonical(model, tokens[:4], images, float(start) - 0.1)
+    with torch.no_grad():
+        after = text_vectors(model, tokens)
+    assert abs((images @ after[:4].T).mean() - (start - 0.1)) < 0.01
+    torch.testing.assert_close(after[4], before[4])
+
+
+def test_bundled_encoder_in_a_room_it_never_saw(unseen_room):
+    bundled = load_encoder("demo", "cpu")
+    figures = {row.kind: row for row in report(bundled, unseen_room)}
+    for kind, top1, separation in (("colour", 0.82, 0.97), ("object", 0.75, 0.88)):
+        assert figures[kind].top1 > top1
+        assert figures[kind].separation > separation
+    assert figures["object"].wrong_found < 0.07
+    assert bundled.unknown_words("the handle of a red mug with stuff and things") == ()
+    assert bundled.unknown_words("xylophone") == ("xylophone",)

@@ -1,0 +1,320 @@
+"""Procedural rooms: geometry, colours, light, pictures, and the folders they are written to."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from assets.making import dataset, shapes
+from assets.making.__main__ import PROGRAM, parse
+from assets.making.dataset import MIN_PIXELS, outlines, write_dataset, write_labelled
+from assets.making.kit import COLOURS, colour_word, from_lch, random_colour, to_lch
+from assets.making.render import Light, Renderer, Tracer, bake, noise
+from assets.making.truth import read_truth
+from assets.making.world import apart, build_room, footprint, furnished
+from langsplat_core.cli.app import parse as parse_product
+from langsplat_core.cli.run import main
+from langsplat_core.config import numeric_settings
+from langsplat_core.datasets.nerfstudio import load_nerfstudio
+from langsplat_core.errors import InputError
+from langsplat_core.evaluation.labels import Outlines, read_3d_ovs, read_lerf_ovs
+from langsplat_core.progress import silent
+from langsplat_core.scene import look_at
+
+pytestmark = pytest.mark.long
+
+UP = np.array([0.0, 0.0, 1.0])
+SEED, VIEWS, SIZE = 2, 9, (160, 120)  # the room of the bundled scene
+
+
+@pytest.fixture
+def coarse_light(monkeypatch):
+    monkeypatch.setattr(dataset, "LIGHT_SAMPLES", 2)
+    monkeypatch.setattr(dataset, "LIGHT_CELL", 0.0)
+
+
+@pytest.fixture(scope="module")
+def world():
+    return build_room(3)
+
+
+@pytest.fixture(scope="module")
+def renderer(world):
+    return Renderer(world, Light(np.array([-0.9, -1.0, 1.7])), samples=4)
+
+
+def volume(mesh):
+    """Signed: positive when the triangles face outwards."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles], 1, 0)
+    return float((np.cross(a, b) * c).sum() / 6)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "expected"),
+    [
+        (shapes.box(0.2, 0.3, 0.4), 0.024),
+        (shapes.ball(0.1, 64), 4 / 3 * np.pi * 1e-3),
+        (shapes.cylinder(0.1, 0.2, 64), np.pi * 2e-3),
+        (shapes.slab([(0, 0), (0.4, 0), (0.4, 0.2), (0, 0.2)], 0.1), 0.008),
+        (shapes.tube(np.array([(0, 0, z) for z in np.linspace(0, 1, 9)]), 0.1, 64), 0.01 * np.pi),
+    ],
+)
+def test_solids_face_outwards_and_hold_their_volume(mesh, expected):
+    # 1 %: a circle of 64 corners has 0.2 % less area, and the tube's ends are open but planar
+    ratio = volume(mesh) / expected
+    assert ratio == pytest.approx(1, rel=0.01) or (0.64 < ratio < 0.68 and mesh.vertices[:, 2].max() == 1)
+
+
+def test_colour_words_cover_what_they_draw():
+    rng = np.random.default_rng(0)
+    for word in COLOURS:
+        assert {colour_word(random_colour(word, rng)) for _ in range(20)} == {word}
+    assert colour_word(np.array([0.9, 0.6, 0.15])) in ("orange", None)
+    display = rng.uniform(0, 1, (50, 3))
+    np.testing.assert_allclose(from_lch(to_lch(display)), display, atol=1e-6)
+
+
+def test_noise_is_periodic_and_spread():
+    points = np.random.default_rng(2).uniform(0, 1, (4000, 3))
+    values = noise(points, 0.5)
+    np.testing.assert_allclose(noise(points + 0.5, 0.5), values, atol=1e-4)
+    assert 0.6 < values.std() < 1.3
+
+
+def test_truth_is_nested(world):
+    for fine, coarse in ((0, 1), (1, 2)):
+        owner = {}
+        for row in world.ids:
+            assert owner.setdefault(row[fine], row[coarse]) == row[coarse]
+    assert [world.labels[i].level for i in world.ids[0]] == [0, 1, 2]
+    assert len(np.unique(world.ids)) == len(world.labels)
+    assert world.piece_of.max() + 1 == len(world.ids) == len(world.materials)
+
+
+def test_same_seed_same_world_other_seed_other_world(world):
+    again, other = build_room(3), build_room(4)
+    np.testing.assert_array_equal(world.vertices, again.vertices)
+    assert world.labels == again.labels
+    assert world.labels != other.labels
+
+
+def test_two_views_agree_where_they_see_the_same_point(world, renderer):
+    one = look_at(np.array([0.2, -1.3, 0.8]), np.zeros(3), UP, (120, 90))
+    two = look_at(np.array([0.7, -1.1, 0.8]), np.zeros(3), UP, (120, 90))
+    a, b = renderer.picture(one, oversample=2), renderer.picture(two, oversample=2)
+    rows, columns = np.nonzero(np.isfinite(a.depth))
+    points = np.array(
+        [one.unproject((c + 0.5, r + 0.5), a.depth[r, c]) for r, c in zip(rows, columns, strict=True)]
+    )
+    pixels, depth = two.project(points)
+    x, y = np.floor(pixels).astype(int).T
+    inside = (x >= 0) & (x < 120) & (y >= 0) & (y < 90) & (depth > 0)
+    rows, columns, x, y, depth = rows[inside], columns[inside], x[inside], y[inside], depth[inside]
+    same = np.abs(b.depth[y, x] - depth) < 0.005
+    assert same.mean() > 0.3
+    labels = (a.pieces[rows, columns] == b.pieces[y, x])[same]
+    assert labels.mean() > 0.97  # the rest lies within a pixel of an edge
+    difference = np.abs(a.image[rows, columns].astype(float) - b.image[y, x])[same]
+    assert np.median(difference) < 8  # of 255: highlights move, textures are sampled half a pixel apart
+
+
+def test_depth_and_labels_of_a_known_point(world, renderer):
+    camera = look_at(np.array([0.0, 0.0, 1.5]), np.array([0.0, 0.0, 0.0]), UP, (31, 31), 40)
+    picture = renderer.picture(camera, oversample=1)
+    table = [i for i, row in enumerate(world.ids) if world.labels[row[2]].word == "table"]
+    on_table = np.isin(picture.pieces, table)
+    assert on_table.any()
+    np.testing.assert_allclose(picture.depth[on_table], 1.5, atol=1e-4)
+    assert (picture.depth[~on_table & (picture.pieces >= 0)] < 1.5).any()
+
+
+def test_things_cast_shadows(world, renderer):
+    table = [i for i, row in enumerate(world.ids) if world.labels[row[2]].word == "table"]
+    camera = look_at(np.array([0.0, -0.01, 1.8]), np.zeros(3), UP, (120, 90), 40)
+    picture = renderer.picture(camera, oversample=1)
+    brightness = picture.image[np.isin(picture.pieces, table)].mean(1)
+    assert np.quantile(brightness, 0.02) < 0.7 * np.median(brightness)
+
+
+def test_dataset_on_disk(tmp_path, coarse_light):
+    write_dataset(tmp_path, 1, 5, (64, 48), silent)
+    capture = load_nerfstudio(tmp_path / "transforms.json", 800, silent)
+    assert (capture.metres_per_unit, capture.drawn) == (1, True)
+    assert len(capture) == 5
+    assert capture.images[0].shape == (48, 64, 3)
+    assert len(capture.points) == 20_000
+    labels = json.loads((tmp_path / "truth" / "labels.json").read_text())
+    with np.load(tmp_path / "truth" / "view_000.npz") as truth:
+        ids, depth = truth["ids"], truth["depth"]
+    assert ids.shape == (3, 48, 64)
+    assert [labels[str(ids[level, 24, 32])]["level"] for level in range(3)] == ["subpart", "part", "whole"]
+    camera = next(camera for camera in capture.cameras if camera.name == "view_000")
+    point = camera.unproject((32.5, 24.5), float(depth[24, 32]))
+    nearest = np.linalg.norm(capture.points - point, axis=1).min()
+    assert nearest < 0.1  # the cloud covers what the camera sees: conventions of both agree
+
+
+def test_interrupted_dataset_goes_on(tmp_path, coarse_light):
+    write_dataset(tmp_path, 1, 4, (32, 24), silent)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("images/*")}
+    image = np.asarray(Image.open(tmp_path / "images" / "view_002.png"))
+    (tmp_path / "truth" / "view_002.npz").unlink()
+    write_dataset(tmp_path, 1, 4, (32, 24), silent)
+    changed = {path.stem for path, when in before.items() if path.stat().st_mtime_ns != when}
+    assert changed == {"view_002"}
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "images" / "view_002.png")), image)
+
+
+def small_things(placed):
+    """Things put down on the table or the floor, without the fruit in bowls and on plates."""
+    hosts = [p for p in placed if p.scale != 1.0]
+    held = {"orange", "apple"}
+    return [p for p in hosts if p.thing.word not in held or p.offset[2] < 0.004]
+
+
+def test_a_room_of_too_few_views_is_refused(tmp_path):
+    with pytest.raises(InputError, match="at least 4 views"):
+        write_dataset(tmp_path, 0, 2, (64, 48), silent)
+
+
+@pytest.mark.parametrize(
+    ("line", "wrong"),
+    [("dataset --out d", "--views 0"), ("encoder --out d", "--batch 0"), ("build --out s.ply", "--steps 0")],
+)
+def test_commands_refuse_what_lies_outside_a_range(line, wrong, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert all(setting.range for setting in numeric_settings(parse(line.split())))
+    assert main(PROGRAM, lambda: parse(f"{line} {wrong}".split())) == 2
+    assert f"{wrong}: must be" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("tier", ["separate", "clutter", "occlusion"])
+def test_things_stand_apart_on_a_surface(tier):
+    placed = small_things(furnished(5, tier))
+    assert len(placed) >= 6
+    for item in placed:
+        lowest = min(
+            (p.mesh.vertices @ item.turn.T * item.scale + item.offset)[:, 2].min() for p in item.thing.pieces
+        )
+        height = min((0.0, -0.72, -0.708), key=lambda level: abs(level - lowest))  # table, floor, rug
+        assert lowest - height == pytest.approx(0.001, abs=2e-4)
+    corners = [footprint(item) for item in placed]
+    for row, one in enumerate(corners):
+        for other, item in zip(corners[:row], placed, strict=False):
+            if abs(item.offset[2] - placed[row].offset[2]) < 0.4:
+                assert apart(one, other, 0.0)
+
+
+def test_rectangles_that_touch_are_not_apart():
+    square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
+    turned = (square - 0.5) @ shapes.rotation_about("z", 45)[:2, :2].T
+    assert apart(square, square + (1.1, 0), 0.05)
+    assert not apart(square, square + (1.1, 0), 0.2)
+    assert not apart(square, turned + (1.6, 0.5), 0.0)  # its corner reaches to 0.89
+    assert apart(square, turned + (1.75, 0.5), 0.0)
+
+
+def test_tiers_grow_harder():
+    rooms = {tier: build_room(5, tier) for tier in ("separate", "clutter", "occlusion")}
+    wholes = {tier: [x for x in room.labels if x.level == 2] for tier, room in rooms.items()}
+    assert len(wholes["separate"]) < len(wholes["clutter"]) < len(wholes["occlusion"])
+    words = [label.word for label in wholes["occlusion"]]
+    alike = {word for word in set(words) if words.count(word) >= 3} - {"wall"}
+    hues = {word: {x.colour for x in wholes["occlusion"] if x.word == word} for word in alike}
+    assert sum(len(colours) >= 2 for colours in hues.values()) >= 3  # the same class in other colours
+    again = build_room(5, "occlusion")
+    np.testing.assert_array_equal(again.vertices, rooms["occlusion"].vertices)
+
+
+def test_baked_light_agrees_with_what_it_is_made_of(world):
+    """An open table under the lamp: no bounce but the sky's; the lattice agrees with the vertices."""
+    light = Light(np.array([-0.9, -1.0, 1.7]))
+    tracer = Tracer(world)
+    coarse, fine = bake(tracer, world, light, 6, 0.0), bake(tracer, world, light, 6, 0.006)
+    np.testing.assert_array_equal(coarse.vertices, fine.vertices)
+    assert (coarse.cells == 0).all()
+    rows = np.flatnonzero(fine.cells > 0)
+    assert len(rows) > 500
+    n = fine.cells[rows]
+    corners = np.stack(
+        [fine.start[rows], fine.start[rows] + (n + 1) * (n + 2) // 2 - 1, fine.start[rows] + n], 1
+    )
+    # Corner order: first (0, 0), second (n, 0), third (0, n). The same points, gathered again.
+    np.testing.assert_allclose(fine.lattice[corners], fine.vertices[world.triangles[rows]], atol=1e-5)
+    assert fine.lattice.min() >= 0
+    assert fine.lattice[:, 3].max() <= 1.6
+
+
+def drawn(mask):
+    polygons = outlines(mask)
+    assert all(len(polygon) >= 3 for polygon in polygons)
+    size = (mask.shape[1], mask.shape[0])
+    return Outlines(size, tuple(polygon.astype(float) for polygon in polygons)).draw(size)
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("sigma", [0.0, 0.7, 2.0])
+def test_polygons_give_back_the_mask(seed, sigma):
+    """Pieces, holes, islands in holes, single pixels, diagonal lines, the picture's border."""
+    values = gaussian_filter(np.random.default_rng(seed).normal(size=(40, 50)), sigma)
+    mask = values > np.quantile(values, 0.35 if seed % 2 else 0.6)
+    np.testing.assert_array_equal(drawn(mask), mask)
+
+
+def test_polygons_of_simple_shapes():
+    ring = np.zeros((9, 9), bool)
+    ring[1:8, 1:8], ring[3:6, 3:6] = True, False
+    for mask in (ring, ~ring, np.eye(6, dtype=bool), np.ones((3, 4), bool), np.ones((1, 1), bool)):
+        np.testing.assert_array_equal(drawn(mask), mask)
+    assert outlines(np.zeros((4, 4), bool)) == []
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    """The same room in both layouts, in plain light."""
+    out = tmp_path_factory.mktemp("rooms")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dataset, "LIGHT_SAMPLES", 2)
+        patch.setattr(dataset, "LIGHT_CELL", 0.0)
+        for layout in ("lerf-ovs", "3d-ovs"):
+            write_labelled(out / layout, layout, SEED, VIEWS, SIZE, silent)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("layout", "read", "kinds", "names"),
+    [
+        ("lerf-ovs", read_lerf_ovs, ("object", "colour+object", "part"), ["frame_00001", "frame_00009"]),
+        ("3d-ovs", read_3d_ovs, ("object",), ["00", "08"]),
+    ],
+)
+def test_labels_are_the_truth(rooms, layout, read, kinds, names):
+    (scene,) = read(rooms / layout).scenes.values()
+    assert [frame.name for frame in scene.frames] == names
+    truth, several = read_truth(scene.dataset), 0
+    for frame in scene.frames:
+        labels = truth.labels(frame.name)
+        masks = {p.text: np.isin(labels, p.ids).any(0) for p in truth.phrases if p.kind in kinds}
+        masks = {text: mask for text, mask in masks.items() if mask.sum() >= MIN_PIXELS}
+        assert {label.phrase for label in frame.labels} == set(masks)
+        for label in frame.labels:
+            np.testing.assert_array_equal(label.truth.draw(SIZE), masks[label.phrase])
+            several += layout == "lerf-ovs" and len(label.boxes) > 1
+    assert several > 5 or layout == "3d-ovs"
+
+
+@pytest.mark.parametrize(("layout", "protocol"), [("lerf-ovs", "langsplat-code"), ("3d-ovs", "ours")])
+def test_the_whole_command_on_a_complete_set(rooms, tmp_path, capsys, layout, protocol):
+    """The bundled scene shows the same room; it has never seen these views, whose cameras the dataset has."""
+    out = tmp_path / "out.json"
+    words = ["eval", layout, "assets/demo/scene.ply", str(rooms / layout), "--protocol", protocol]
+    parse_product([*words, "--json", str(out), "--pictures", str(tmp_path / "pictures")]).run()
+    content = json.loads(out.read_text())
+    micro = content["means"]["micro, mean of queries"]
+    assert micro["queries"] == len(content["queries"]) > 20
+    assert micro["iou"] > 0.4
+    assert "macro, mean of frames" in capsys.readouterr().out
+    assert len(list((tmp_path / "pictures").rglob("*.png"))) == micro["queries"]

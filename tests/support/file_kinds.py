@@ -1,0 +1,267 @@
+"""Every kind of input file that is damaged in tests: good samples, how to damage them, and how they are
+read."""
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from langsplat_core.arrays import unit
+from langsplat_core.datasets.capture import Capture, read_photo
+from langsplat_core.datasets.colmap import load_colmap
+from langsplat_core.datasets.nerfstudio import load_nerfstudio
+from langsplat_core.io.cameras import read_cameras, write_cameras
+from langsplat_core.io.hostile import picture_size
+from langsplat_core.io.language import read_language, write_language
+from langsplat_core.io.scenes import load_scene
+from langsplat_core.progress import silent
+from langsplat_core.semantics.store import FeatureStore, ImageFeatures
+from tests.support.file_samples import (
+    ascii_ply,
+    compressed_ply,
+    ksplat_bytes,
+    plain_ply,
+    random_field,
+    sog_files,
+    splat_bytes,
+    spz_bytes,
+    zipped,
+)
+from tests.support.mutation import Mutation, in_gzip, in_png, in_zip, mutant
+from tests.support.scenes import random_camera, random_gaussians
+from tests.support.small_datasets import write_colmap, write_nerfstudio
+
+SCENE = random_gaussians(20, sh_degree=1)
+PLAIN = random_gaussians(300, seed=1)
+
+
+@dataclass(frozen=True)
+class FileKind:
+    """One format."""
+
+    file: str  # where the mutants are written, below the folder of the test
+    samples: Callable[[Path], list[bytes]]  # also writes what has to lie beside them into the folder
+    read: Callable[[Path], float]  # the share of sound content
+    damage: Mutation = mutant
+
+
+def scene_share(path: Path) -> float:
+    """Also makes what a viewer makes first: the camera that frames the scene."""
+    scene = load_scene(path)
+    scene.framing_camera((64, 48))
+    gaussians = scene.gaussians
+    assert sum(gaussians.invalid_rows().values()) == len(gaussians) - gaussians.valid().sum()
+    return float(gaussians.valid().mean()) if len(gaussians) else 1.0
+
+
+def _whole(read: Callable[[Path], object]) -> Callable[[Path], float]:
+    """Of a format in which nothing may be unsound."""
+
+    def share(path: Path) -> float:
+        read(path)
+        return 1.0
+
+    return share
+
+
+# -- samples -------------------------------------------------------------------------------------------------
+
+
+def sidecars(folder: Path) -> list[bytes]:
+    """Of every codec; version 2."""
+    made = []
+    for kind in ("codebook", "autoencoder", "linear"):
+        write_language(folder / "made", random_field(len(SCENE), kind), SCENE.means)
+        made.append((folder / "made").read_bytes())
+    return made
+
+
+def camera_files(folder: Path) -> list[bytes]:
+    write_cameras(folder / "made", (random_camera(), random_camera(1)))
+    return [(folder / "made").read_bytes()]
+
+
+def camera_list(path: Path) -> float:
+    for camera in read_cameras(path):
+        assert np.isfinite([*camera.position, camera.intrinsics.fov_degrees]).all()
+    return 1.0
+
+
+def feature_files(folder: Path) -> list[bytes]:
+    rng = np.random.default_rng(0)
+    store = FeatureStore(folder)
+    for seed, count in enumerate((5, 1)):
+        vectors = unit(rng.normal(size=(count, 8))).astype(np.float32)
+        labels = rng.integers(-1, count, (3, 12, 16)).astype(np.int32)
+        store.save(f"made{seed}", ImageFeatures(labels, vectors), "k" * seed)
+    return [store.path(f"made{seed}").read_bytes() for seed in range(2)]
+
+
+def stored_features(path: Path) -> float:
+    store = FeatureStore(path.parent)
+    there = store.has("a")
+    if not there:  # which was said, and is not an error: they are made again
+        return 0.0
+    store.load("a")
+    return 1.0
+
+
+def transforms(folder: Path) -> list[bytes]:
+    lenses = [
+        {
+            "fl_x": 50.0,
+            "fl_y": 51.0,
+            "cx": 20,
+            "cy": 15,
+            "w": 40,
+            "h": 30,
+            "k1": 0.01,
+            "k2": 0.001,
+            "p1": 1e-4,
+        },
+        {"camera_angle_x": 0.8, "camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k4": 0.0},
+        {"fl_x": 50, "metres_per_unit": 0.5, "applied_transform": np.eye(4)[:3].tolist()},
+    ]
+    made = []
+    for lens in lenses:
+        write_nerfstudio(folder, **lens, ply_file_path="cloud.ply")
+        made.append((folder / "transforms.json").read_bytes())
+    (folder / "cloud.ply").write_bytes(clouds(folder)[0])
+    return made
+
+
+def clouds(_: Path) -> list[bytes]:
+    rng = np.random.default_rng(0)
+    axes = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+    made = []
+    for colour in ("u1", "<f4", "<i4"):
+        table = np.zeros(12, [*axes, *((name, colour) for name in ("red", "green", "blue"))])
+        for name in table.dtype.names or ():
+            table[name] = rng.uniform(0, 1 if colour == "<f4" else 200, 12)
+        kinds = {"u1": "uchar", "<f4": "float", "<i4": "int"}
+        header = ["ply", "format binary_little_endian 1.0", "element vertex 12"]
+        header += [f"property float {name}" for name in "xyz"]
+        header += [f"property {kinds[colour]} {name}" for name in ("red", "green", "blue")]
+        made.append("\n".join([*header, "end_header\n"]).encode() + table.tobytes())
+        header[1] = "format ascii 1.0"
+        rows = [" ".join(str(value) for value in row) for row in table.tolist()]
+        made.append("\n".join([*header, "end_header", *rows]).encode() + b"\n")
+    return made
+
+
+def cloud_folder(folder: Path) -> list[bytes]:
+    write_nerfstudio(folder, ply_file_path="cloud.ply")
+    return clouds(folder)
+
+
+def beside_transforms(path: Path) -> float:
+    return _usable(load_nerfstudio(path.parent / "transforms.json", 64, silent))
+
+
+def _usable(capture: Capture) -> float:
+    """All that training asks of a capture without looking at pixels; lost points were told of."""
+    assert np.isfinite(capture.points).all()
+    assert np.isfinite(capture.extent())
+    assert all(np.isfinite(camera.position).all() for camera in capture.cameras)
+    return 1.0
+
+
+def colmap(part: str) -> FileKind:
+    """`part`: cameras.bin, for one."""
+
+    def samples(folder: Path) -> list[bytes]:
+        return [(write_colmap(folder, part.rpartition(".")[2]) / part).read_bytes()]
+
+    def read(path: Path) -> float:
+        return _usable(load_colmap(path.parent.parent.parent, path.parent, 64, silent))
+
+    return FileKind(f"sparse/0/{part}", samples, read)
+
+
+def pictures(kind: str) -> Callable[[Path], list[bytes]]:
+    """Of every mode that the kind has, with EXIF data."""
+
+    def samples(_: Path) -> list[bytes]:
+        rng = np.random.default_rng(0)
+        noise = Image.fromarray(rng.integers(0, 256, (15, 20, 3), dtype=np.uint8)).resize((20, 15))
+        exif = Image.Exif()
+        exif.update({0x0112: 6, 0x010F: "maker", 0x0110: "model"})
+        exif.get_ifd(0x8769).update({0x920A: 35.0, 0xA405: 28})
+        deep = Image.fromarray(np.asarray(noise.convert("L")).astype(np.uint16) * 257)
+        modes: dict[str, list[tuple[Image.Image, dict[str, object]]]] = {
+            "PNG": [(noise.convert(mode), {}) for mode in ("RGB", "RGBA", "P", "L", "LA", "1")]
+            + [(deep, {}), (noise, {"save_all": True, "append_images": [noise.convert("RGB")]})],
+            "JPEG": [
+                (noise, {}),
+                (noise, {"progressive": True}),
+                (noise.convert("L"), {}),
+                (noise.convert("CMYK"), {}),
+            ],
+            "WEBP": [(noise, {}), (noise, {"lossless": True}), (noise.convert("RGBA"), {"lossless": True})]
+            + [(noise, {"save_all": True, "append_images": [noise.rotate(90)]})],
+            "TIFF": [
+                (noise, {"compression": way})
+                for way in (None, "tiff_lzw", "tiff_adobe_deflate", "packbits", "jpeg")
+            ]
+            + [(deep, {}), (noise.convert("1"), {"compression": "group4"}), (noise.convert("CMYK"), {})]
+            + [(noise.convert("P"), {})],
+            "BMP": [(noise.convert(mode), {}) for mode in ("RGB", "P", "L", "1", "RGBA")],
+            "AVIF": [(noise, {"speed": 10}), (noise.convert("RGBA"), {"speed": 10})],
+        }
+        made = []
+        for picture, options in modes[kind]:
+            buffer = io.BytesIO()
+            picture.save(buffer, kind, **({} if kind == "BMP" else {"exif": exif}), **options)
+            made.append(buffer.getvalue())
+        return made
+
+    return samples
+
+
+def photograph(path: Path) -> float:
+    width, height = picture_size(path)
+    for upright in (False, True):
+        picture = read_photo(path, upright)
+        assert picture.mode == "RGB"
+        assert {*picture.size} == {width, height}
+    return 1.0
+
+
+def _photographs(kind: str, damage: Mutation = mutant) -> FileKind:
+    return FileKind("a.png", pictures(kind), photograph, damage)  # the name's ending plays no part
+
+
+def _scenes(file: str, *samples: bytes, damage: Mutation = mutant) -> FileKind:
+    return FileKind(file, lambda _: [*samples], scene_share, damage)
+
+
+KINDS = {
+    "INRIA PLY": _scenes("a.ply", plain_ply(SCENE), plain_ply(PLAIN), ascii_ply(random_gaussians(5))),
+    "compressed PLY": _scenes("a.ply", compressed_ply(SCENE), compressed_ply(PLAIN, colours=False)),
+    "SOG": _scenes("a.sog", zipped(sog_files(SCENE)), zipped(sog_files(PLAIN)), damage=in_zip),
+    **{
+        f"SPZ {v}": _scenes("a.spz", spz_bytes(SCENE, v), spz_bytes(PLAIN, v), damage=in_gzip)
+        for v in (1, 2, 3, 4)
+    },
+    ".splat": _scenes("a.splat", splat_bytes(SCENE), splat_bytes(PLAIN)),
+    ".ksplat": _scenes(
+        "a.ksplat", *(ksplat_bytes([SCENE, PLAIN][: 1 + level % 2], level) for level in range(3))
+    ),
+    "sidecar": FileKind(
+        "a.langsplat.safetensors", sidecars, _whole(lambda path: read_language(path, SCENE.means))
+    ),
+    "cameras.json": FileKind("a.cameras.json", camera_files, camera_list),
+    "transforms.json": FileKind("transforms.json", transforms, beside_transforms),
+    "point-cloud PLY": FileKind("cloud.ply", cloud_folder, beside_transforms),
+    **{
+        f"COLMAP {part}.{form}": colmap(f"{part}.{form}")
+        for form in ("bin", "txt")
+        for part in ("cameras", "images", "points3D")
+    },
+    ".features.npz": FileKind("a.features.npz", feature_files, stored_features, in_zip),
+    "PNG": _photographs("PNG", in_png),
+    **{kind: _photographs(kind) for kind in ("JPEG", "WEBP", "TIFF", "BMP", "AVIF")},
+}

@@ -1,0 +1,420 @@
+"""Damaged versions of good files: seeded mutations of every kind, for binary and text formats alike."""
+
+import gzip
+import io
+import logging
+import os
+import re
+import struct
+import tempfile
+import time
+import traceback
+import warnings
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.errors import InputError, printable_line
+
+HEADER = 600  # bytes at the beginning in which half of the mutations fall
+INTEGERS = (
+    0,
+    1,
+    -1,
+    127,
+    128,
+    255,
+    256,
+    2**15,
+    2**16 - 1,
+    2**24,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**53,
+    2**63 - 1,
+)
+FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-45, 1e-38, 1e9, 1e20, 3.4e38, float("inf"), float("-inf"), float("nan"))
+TOKENS = (
+    *(
+        b"0",
+        b"-1",
+        b"1",
+        b"256",
+        b"65536",
+        b"4294967296",
+        b"18446744073709551616",
+        b"9" * 30,
+        b"1" + b"0" * 400,
+    ),
+    *(
+        b"9" * 5000,
+        b"1e308",
+        b"1e999",
+        b"-1e999",
+        b"1e-320",
+        b"nan",
+        b"NaN",
+        b"inf",
+        b"-Infinity",
+        b"0x10",
+        b"1_0",
+    ),
+    *(
+        b"null",
+        b"true",
+        b"[]",
+        b"{}",
+        b'""',
+        b'"a"',
+        b"[[[[",
+        b"\x00",
+        b"\x1b[2J",
+        b"\xff\xfe",
+        b"\n",
+        b"\r",
+        b"#",
+    ),
+    *("٣".encode(), "\u2028".encode(), b"\\ud800", b"../../x", b"/dev/zero", b"%s%n", b"a" * 5000),
+)
+_WORD = re.compile(rb"[^\s,:\[\]{}\"]+")
+_NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
+
+
+def mutant(sample: bytes, others: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """`sample` with one to four mutations; `others` are files of the same kind to splice with."""
+    data = sample
+    for _ in range(int(rng.choice([1, 1, 1, 2, 2, 3, 4]))):
+        data = MUTATIONS[int(rng.integers(len(MUTATIONS)))](data, others, rng)
+    return data
+
+
+Mutation = Callable[[bytes, Sequence[bytes], np.random.Generator], bytes]
+
+
+def _place(data: bytes, rng: np.random.Generator) -> int:
+    inside = min(len(data), HEADER) if rng.random() < 0.5 else len(data)
+    return int(rng.integers(0, max(inside, 1)))
+
+
+def _flip_bits(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    out = bytearray(data)
+    for _ in range(int(rng.integers(1, 9)) if data else 0):
+        out[_place(data, rng)] ^= 1 << int(rng.integers(8))
+    return bytes(out)
+
+
+def _truncate(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    return data[: _place(data, rng)]
+
+
+def _cut_out(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    place = _place(data, rng)
+    return data[:place] + data[place + int(2 ** rng.uniform(0, 8)) :]
+
+
+def _insert(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    place, length = _place(data, rng), int(2 ** rng.uniform(0, 8))
+    new = rng.bytes(length) if rng.random() < 0.5 else data[place : place + length]
+    return data[:place] + new + data[place:]
+
+
+def _fill(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """A run of one byte."""
+    place, length = _place(data, rng), int(2 ** rng.uniform(0, 8))
+    value = bytes([int(rng.choice([0, 255, 127, 128, 32, 9]))])
+    return data[:place] + value * min(length, len(data) - place) + data[place + length :]
+
+
+def _extreme_number(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """A binary number of any width, either byte order, at any place or an aligned one."""
+    order = "<>"[int(rng.integers(2))]
+    if rng.random() < 0.6:
+        width = int(rng.choice([1, 2, 4, 8]))
+        value = int(rng.choice(np.array(INTEGERS, object))) + int(rng.integers(-1, 2))
+        new = (value % 256**width).to_bytes(width, "little" if order == "<" else "big")
+    else:
+        new = struct.pack(f"{order}{rng.choice(['f', 'd'])}", float(rng.choice(FLOATS)))
+    place = _place(data, rng)
+    place -= place % len(new) if rng.random() < 0.5 else 0
+    return data[:place] + new + data[place + len(new) :]
+
+
+def _inflate(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """A number in text becomes another."""
+    return _replace(data, _NUMBER, rng)
+
+
+def _other_word(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    return _replace(data, _WORD, rng)
+
+
+def _replace(data: bytes, what: re.Pattern[bytes], rng: np.random.Generator) -> bytes:
+    start = _place(data, rng)
+    match = what.search(data, start) or what.search(data)
+    if match is None:
+        return data
+    return data[: match.start()] + TOKENS[int(rng.integers(len(TOKENS)))] + data[match.end() :]
+
+
+def _swap_lines(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """Two lines, or blocks of 16 bytes where there are none, in each other's place; or one of them twice."""
+    lines = data[:20_000].splitlines(keepends=True)
+    if len(lines) < 4:
+        lines = [data[i : i + 16] for i in range(0, len(data[:20_000]), 16)]
+    if len(lines) < 2:
+        return data
+    a, b = (int(i) for i in rng.integers(0, len(lines), 2))
+    if rng.random() < 0.5:
+        lines[a], lines[b] = lines[b], lines[a]
+    else:
+        lines[a] = lines[b]
+    return b"".join(lines) + data[20_000:]
+
+
+def _splice(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """The beginning of one file and the end of another."""
+    other = others[int(rng.integers(len(others)))] if others else data
+    place = _place(data, rng)
+    shift = int(rng.choice([0, 0, -1, 1, 4, -8]))
+    return data[:place] + other[max(place + shift, 0) :]
+
+
+MUTATIONS: tuple[Mutation, ...] = (
+    *(_flip_bits, _flip_bits, _truncate, _cut_out, _insert, _fill),
+    *(_extreme_number, _extreme_number, _inflate, _inflate, _other_word, _swap_lines, _splice),
+)
+
+
+# Damage below a wrapping that would notice it: members of archives, gzip streams, chunks of PNG.
+
+CHUNKS = (*(b"IHDR", b"PLTE", b"tRNS", b"iCCP", b"tEXt"), *(b"zTXt", b"iTXt", b"eXIf", b"acTL", b"fcTL"))
+
+
+def _half(inner: Mutation) -> Mutation:
+    return lambda data, others, rng: (inner if rng.random() < 0.6 else mutant)(data, others, rng)
+
+
+@_half
+def in_zip(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """One member is damaged, missing, or packed by another method; the checksums are right."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = str(rng.choice(list(members)))
+    same = [member for member in members.values() if len(member) > 100]
+    buffer = io.BytesIO()
+    methods = [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]
+    method = methods[int(rng.choice([0, 0, 1, 1, 1, 1, 1, 2, 3]))]
+    with zipfile.ZipFile(buffer, "w", method) as archive:
+        for other, content in members.items():
+            if other == name:
+                content = (
+                    in_png(content, same, rng) if content[:4] == b"\x89PNG" else mutant(content, same, rng)
+                )
+            archive.writestr(other, content)
+    packed = buffer.getvalue()
+    return mutant(packed, others, rng) if rng.random() < 0.2 else packed
+
+
+@_half
+def in_gzip(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    if data[:2] != b"\x1f\x8b":
+        return mutant(data, others, rng)
+    plain = [gzip.decompress(other) for other in others if other[:2] == b"\x1f\x8b"]
+    return gzip.compress(mutant(gzip.decompress(data), plain, rng), 1)
+
+
+def _unfolded(content: bytes) -> bytes:
+    try:
+        return zlib.decompress(content)
+    except zlib.error:  # damaged already
+        return content
+
+
+@_half
+def in_png(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """Chunks whose content, order or number is damaged, with right lengths and checksums."""
+    chunks, place = [], 8
+    while place + 8 <= len(data):
+        (length,) = struct.unpack(">I", data[place : place + 4])
+        chunks.append((data[place + 4 : place + 8], data[place + 8 : place + 8 + length]))
+        place += 12 + length
+    for _ in range(int(rng.integers(1, 3))):
+        index = int(rng.integers(len(chunks)))
+        name, content = chunks[index]
+        match int(rng.integers(6)):
+            case 0:
+                chunks.insert(int(rng.integers(len(chunks) + 1)), chunks[index])
+            case 1 if len(chunks) > 1:
+                del chunks[index]
+            case 2:
+                chunks[index] = (CHUNKS[int(rng.integers(len(CHUNKS)))], content)
+            case 3 if name == b"IDAT":
+                chunks[index] = (name, zlib.compress(mutant(_unfolded(content), [], rng)))
+            case _:
+                chunks[index] = (name, mutant(content, [], rng))
+    body = b"".join(
+        struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+        for name, content in chunks
+    )
+    return data[:8] + body
+
+
+# What a reader may do with a damaged file: load it, or refuse it in one short printable line. Everything
+# else is a fault, and so are memory, time, Python warnings, and lines on the standard error that nobody
+# wrote.
+
+MEMORY_FACTOR, MEMORY_SLACK = 4, 300_000_000  # bytes: beyond the file's size times the factor
+LINE = 300  # characters of a message, with the short path of a test
+SECONDS = 20.0  # of the processor: what the worst mutants need is hundredths
+
+
+@dataclass
+class Outcome:
+    """What became of many mutants of one kind."""
+
+    tried: int = 0
+    loaded: int = 0
+    warned: int = 0  # of those, with a warning of ours
+    faults: Counter[str] = field(default_factory=Counter)  # description -> mutants
+    examples: dict[str, bytes] = field(default_factory=dict)  # the first mutant of each fault
+    peak: int = 0  # most bytes that one mutant took
+    slowest: float = 0.0  # most seconds of the processor
+
+    def fault(self, what: str, content: bytes) -> None:
+        self.faults[what] += 1
+        self.examples.setdefault(what, content)
+
+    @property
+    def refused(self) -> int:
+        return self.tried - self.loaded - self.faults.total()
+
+    def summary(self) -> str:
+        lines = [
+            f"{self.tried} tried, {self.loaded} loaded ({self.warned} with a warning), "
+            f"{self.refused} refused, {self.faults.total()} faults; "
+            f"most memory {self.peak / 1e6:.0f} MB, longest {self.slowest:.2f} s"
+        ]
+        return "\n".join([*lines, *(f"  {count} x {what}" for what, count in self.faults.most_common())])
+
+
+class FuzzRun:
+    """`read(path)` returns the share of sound content, in [0, 1]; below a half a warning is due."""
+
+    def __init__(self, path: Path, read: Callable[[Path], float]) -> None:
+        self.path, self._read = path, read
+        self.outcome = Outcome()
+
+    def run(self, mutants: Iterator[bytes]) -> Outcome:
+        """Try all of them."""
+        with _listening() as said, _standard_error() as stray:
+            for content in mutants:
+                said.clear()
+                self._try(content, said, stray)
+        return self.outcome
+
+    def _try(self, content: bytes, said: list[str], stray: Callable[[], str]) -> None:
+        outcome = self.outcome
+        outcome.tried += 1
+        self.path.write_bytes(content)
+        before, began = _resident(), time.process_time()
+        what = self._verdict(said)
+        took, seconds = _peak() - before, time.process_time() - began
+        outcome.peak, outcome.slowest = max(outcome.peak, took), max(outcome.slowest, seconds)
+        if what is None and took > MEMORY_FACTOR * len(content) + MEMORY_SLACK:
+            what = f"memory: {took / 1e6:.0f} MB for {len(content)} bytes"
+        if what is None and seconds > SECONDS:
+            what = f"time: {seconds:.0f} s for {len(content)} bytes"
+        if text := stray():
+            what = what or f"on the standard error: {text[:100]!r}"
+        if what is not None:
+            outcome.fault(what, content)
+
+    def _verdict(self, said: list[str]) -> str | None:
+        """The fault, if any; counts what loaded."""
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                sound = self._read(self.path)
+        except InputError as error:
+            return _bad_line(str(error))
+        except Exception as error:  # noqa: BLE001  which is what is looked for
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            return f"{type(error).__name__} ({str(error)[:80]}) at {Path(last.filename).name}:{last.lineno}"
+        bad = next((line for line in map(_bad_line, said) if line), None)
+        if bad is None and sound < 0.5 and not said:
+            bad = "mostly unsound, unsaid"
+        self.outcome.loaded += bad is None
+        self.outcome.warned += bad is None and bool(said)
+        return bad
+
+
+def _bad_line(text: str) -> str | None:
+    if not text or len(text) >= LINE or not text.isprintable():
+        return f"message: {len(text)} characters, {text[:60]!r} ... {text[-60:]!r}"
+    return None
+
+
+@contextmanager
+def _listening() -> Iterator[list[str]]:
+    """What the logger "langsplat" says, as the command line shows it."""
+    said: list[str] = []
+    handler = logging.Handler()
+    handler.emit = lambda record: said.append(printable_line(record.getMessage()))  # type: ignore[method-assign]
+    logger = logging.getLogger("langsplat")
+    logger.addHandler(handler)
+    try:
+        yield said
+    finally:
+        logger.removeHandler(handler)
+
+
+@contextmanager
+def _standard_error() -> Iterator[Callable[[], str]]:
+    """A function that returns what was written to the standard error, by native code too, since its last
+    call."""
+    kept, propagate = os.dup(2), logging.getLogger("langsplat").propagate
+    logging.getLogger("langsplat").propagate = False
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), 2)
+
+        def since() -> str:
+            text = os.pread(file.fileno(), 10_000, 0)
+            if text:
+                file.truncate(0)
+                os.lseek(2, 0, os.SEEK_SET)
+            return text.decode("utf-8", "replace")
+
+        try:
+            yield since
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            logging.getLogger("langsplat").propagate = propagate
+
+
+def _resident() -> int:
+    """Bytes of memory in use, after the peak was made to begin here; 0 where the system does not tell."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return 0
+    return _status("VmRSS")
+
+
+def _peak() -> int:
+    return _status("VmHWM")
+
+
+def _status(key: str) -> int:
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return 0
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(key + ":")), 0)
