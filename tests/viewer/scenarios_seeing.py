@@ -217,7 +217,7 @@ def rasterize_elsewhere(s: Any) -> None:
     s.settle()
     s.ctx.yield_(20)
     said = [message.text for message in s.state.messages if message.is_error]
-    assert said == ["internal error: FloatingPointError: out of range"]
+    assert said == ["internal error: FloatingPointError: out of range"], said
     problems.clear()
     s.drag((600, 300), (656, 279))
     s.settle()
