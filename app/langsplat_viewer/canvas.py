@@ -108,12 +108,12 @@ class Canvas:
 
     @property
     def waits(self) -> bool:
-        """Whether another thread rasterizes the image; it calls what `wake_with` was given when it has."""
+        """True while another thread rasterizes the image; it calls what `wake_with` was given when it has."""
         return self._background.waits
 
     @property
     def is_running(self) -> bool:
-        """Whether other threads are at work, wanted or not."""
+        """True while other threads are at work, wanted or not."""
         return self._background.worker.is_running or self._merger.worker.is_running
 
     def wake_with(self, wake: Callable[[], None]) -> None:
@@ -153,7 +153,7 @@ class Canvas:
                 self._draw(state, self._at(request, level))
 
     def _changes(self, request: RenderRequest) -> bool:
-        """Whether the image on screen is of another request, at any level of detail."""
+        """True where the image on screen is of another request, at any level of detail."""
         return self._tried is None or replace(self._tried, detail=FULL) != request
 
     def _merged(self, request: RenderRequest) -> Merged | None:
@@ -204,7 +204,7 @@ class Canvas:
         state.nothing, self._unsure = "", True
 
     def _begins_timing(self, state: ViewerState, moving: bool) -> bool:
-        """Whether this is the first frame whose steps are measured: what was kept of earlier ones would have
+        """True for the first frame whose steps are measured: what was kept of earlier ones would have
         taken no time."""
         if state.timing.wanted and moving:
             return False  # once it rests
@@ -310,7 +310,7 @@ class Pace:
 
     @property
     def is_slow(self) -> bool:
-        """Whether full images are too slow to follow a movement."""
+        """True where full images are too slow to follow a movement."""
         return not self._is_within(FINE)
 
     def drew(self, level: Level, milliseconds: float) -> None:
@@ -359,7 +359,7 @@ class Latest(Generic[W, M]):
 
     @property
     def waits(self) -> bool:
-        """Whether something is wanted that has not been dropped."""
+        """True while something is wanted that has not been dropped."""
         return self._wanted is not None
 
     def want(self, wanted: W) -> None:

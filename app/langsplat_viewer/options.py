@@ -111,7 +111,7 @@ class ViewerOptions:
 
     @property
     def is_film(self) -> bool:
-        """Whether `--headless` makes a film."""
+        """True where `--headless` makes a film."""
         return self.path is not None or self.turntable is not None
 
     @property

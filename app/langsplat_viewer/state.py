@@ -40,7 +40,7 @@ from langsplat_viewer.rendering.request import (
 
 @dataclass(frozen=True)
 class ViewSettings:
-    """How the scene is drawn, apart from display and camera; undone together."""
+    """View settings of the scene, apart from display and camera; undone together."""
 
     split: Split = field(default_factory=Split)
     splats: Splats = field(default_factory=Splats)
@@ -95,7 +95,7 @@ def compared_size(size: tuple[int, int]) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What is shown against the reference, at a small size; errors in display values, 0 to 255."""
+    """Differences of an image from the reference, at a small size; errors in display values, 0 to 255."""
 
     size: tuple[int, int]  # pixels
     largest: int
@@ -105,7 +105,7 @@ class Comparison:
 
 
 def compared(shown: Array, reference: Array, backend: str) -> Comparison:
-    """Of two (H, W, C) uint8 pictures of one size."""
+    """Return the differences of two (H, W, C) uint8 images of one size."""
     errors = np.abs(shown.astype(np.float64) - reference)
     squared = float((errors**2).mean())
     psnr = math.inf if squared == 0 else 10 * math.log10(255**2 / squared)
@@ -122,16 +122,16 @@ class Timing:
     comparison: Comparison | None = None  # the last one
 
     def add(self, name: str, milliseconds: float) -> None:
-        """One measurement more."""
+        """Add one measurement."""
         self.laps.setdefault(name, deque(maxlen=KEPT)).append(milliseconds)
 
     def medians(self) -> list[tuple[str, float]]:
-        """What was measured, in words, and the median of its last measurements in milliseconds."""
+        """Return the steps measured, in words, and the median of its last measurements in milliseconds."""
         return [(title, median(self.laps[name])) for name, title in STEPS.items() if self.laps.get(name)]
 
 
 def memory_bytes() -> int | None:
-    """What this process holds in memory; None where the system does not tell."""
+    """Bytes that this process holds in memory; None where the system does not tell."""
     try:
         lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     except OSError:
@@ -215,7 +215,7 @@ class Glide:
 
 @dataclass(frozen=True)
 class FrameStats:
-    """How the picture on screen was made."""
+    """Size and time of the image on screen."""
 
     milliseconds: float = 0.0
     width: int = 0  # pixels
@@ -238,7 +238,7 @@ class Hover:
 
 @dataclass(frozen=True)
 class TrainingForm:
-    """What is typed in the panel that trains scenes."""
+    """Fields of the panel that trains scenes."""
 
     dataset: str = ""
     out: str = ""

@@ -37,7 +37,7 @@ KEPT = 20  # lines of what it says that are kept
 
 @dataclass(frozen=True)
 class TrainingRequest:
-    """What to train."""
+    """Options of a training run."""
 
     dataset: Path
     out: Path  # *.ply
@@ -47,7 +47,7 @@ class TrainingRequest:
 
 @dataclass(eq=False)
 class TrainingProgress:
-    """Where it is. Written by the listening thread, read by the window's."""
+    """Progress of a training run. Written by the listening thread, read by the window's."""
 
     stages: dict[str, float] = field(default_factory=dict)  # label -> fraction in [0, 1], in their order
     overall: float = 0.0
@@ -148,7 +148,7 @@ class Training:
 
 @dataclass(frozen=True, eq=False)
 class Visit:
-    """What is found again."""
+    """State of a scene that was left, to be found again."""
 
     view: OrbitCamera | None
     opening_camera: Camera | None
@@ -164,7 +164,7 @@ class Visit:
 
 
 def visit_of(state: ViewerState) -> Visit:
-    """How things stand."""
+    """Return the state to be found again."""
     chosen = [place for place, query in enumerate(state.queries) if query is state.selected]
     return Visit(
         view=state.view,
@@ -182,7 +182,7 @@ def visit_of(state: ViewerState) -> Visit:
 
 
 def unanswered(query: Query) -> Query:
-    """The same question, to be asked again."""
+    """Return the same question without its answer, to be asked again."""
     return Query(query.phrase, query.slot, query.shown_since, cut=query.cut)
 
 
@@ -208,7 +208,7 @@ class Surface(Protocol):
 
 @dataclass(frozen=True)
 class Services:
-    """What the viewer needs from the layers below; tests put small fakes here."""
+    """Functions that the viewer needs from the layers below; tests put small fakes here."""
 
     load_scene: Callable[[Path], Scene]
     load_encoder: LoadEncoder
@@ -217,7 +217,7 @@ class Services:
     warm_up: Callable[[Scene, str, Progress], None] = lambda scene, backend, progress: None
 
     def engine(self, scene: Scene) -> QueryEngine:
-        """What answers queries on `scene`."""
+        """Engine that answers queries on `scene`."""
         return QueryEngine(scene, self.load_encoder, encoder_id=self.encoder_id)
 
 

@@ -1,4 +1,4 @@
-"""What can be shown: one table of displays, and how rasterized channels become an image.
+"""Displays: one table of what can be shown, and how rasterized channels become an image.
 
 A rasterizer delivers premultiplied channels (colours, and the one further channel of the display) and alpha;
 `compose` turns them into what a person sees. Every display is drawn twice, here in NumPy and in
@@ -92,7 +92,7 @@ Answers = Sequence[Answer | None]  # by colour slot; None: the slot has no answe
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What a display's channel is made of."""
+    """Input of a display's channel function."""
 
     count: int  # Gaussians
     language: LanguageField | None = None
@@ -139,7 +139,7 @@ def heat_ranges(answers: Answers) -> Ranges:
 
 
 def member_ranges(answers: Answers) -> Ranges:
-    """The same of members, which are 0 or 1; a weak match is half as opaque."""
+    """Range of members for each slot, which are 0 or 1; a weak match is half as opaque."""
     return _weakened(answers, lambda answer: (0.0, 1.0))
 
 
@@ -193,7 +193,7 @@ LEAST_ALPHA = 1 / 255  # that colours are divided by; what is less is not seen i
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """What one camera sees, as rasterized: every colour-like channel is premultiplied by alpha."""
+    """Rasterized view of one camera: every colour-like channel is premultiplied by alpha."""
 
     rgb: Array  # (H, W, 3)
     alpha: Array  # (H, W) in [0, 1]
@@ -202,7 +202,7 @@ class Channels:
 
 @dataclass(frozen=True, eq=False)
 class _Sheet:
-    """What a display draws from."""
+    """Input of a display's drawing."""
 
     channels: Channels
     extra: Array  # (H, W, C) the display's further channel; alpha for displays without one
@@ -266,8 +266,8 @@ def _latent(sheet: _Sheet) -> Array:
 
 
 def _heat(sheet: _Sheet) -> Array:
-    """One query by the colour map. Several by their own colours: where they overlap, the mean of the colours,
-    weighted by heat, as opaque as the hottest of them."""
+    """Heat map: one query by the colour map, several by their own colours. Where they overlap, the mean of
+    the colours, weighted by heat, as opaque as the hottest of them."""
     picture, relevancy = sheet.picture, sheet.mean()
     count = relevancy.shape[-1]
     low, high = np.transpose(full_ranges(sheet.ranges, count))

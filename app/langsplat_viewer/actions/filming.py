@@ -72,7 +72,7 @@ def delete_keyframe(viewer: Viewer, key: Keyframe) -> None:
 
 
 def move_keyframe(viewer: Viewer, key: Keyframe, seconds: float) -> None:
-    """To another time; to that of another one: beside it."""
+    """Move it to another time, or beside a keyframe that has that time."""
     others = tuple(other for other in viewer.state.record.keyframes if other is not key)
     seconds = min(max(seconds, 0.0), LONGEST)
     while any(abs(other.seconds - seconds) < SAME_TIME for other in others):
@@ -115,18 +115,18 @@ def _set(viewer: Viewer, keyframes: tuple[Keyframe, ...], chosen: Keyframe | Non
 
 
 def set_turning(viewer: Viewer, turns: bool) -> None:
-    """Whether the path goes once around what the view turns around, in place of the keyframes."""
+    """Have the path go once around what the view turns around, in place of the keyframes."""
     leave_path(viewer)
     viewer.state.record.turns, viewer.state.record.at = turns, 0.0
 
 
 def set_looping(viewer: Viewer, loops: bool) -> None:
-    """Whether a played path begins again at its end."""
+    """Have a played path begin again at its end."""
     viewer.state.record.loops = loops
 
 
 def type_path_file(viewer: Viewer, text: str) -> None:
-    """What stands in the box for a file with a path."""
+    """Set the text of the box for a file with a path."""
     viewer.state.record.path_typed = text
 
 
@@ -178,7 +178,7 @@ def load_typed_path(viewer: Viewer, folder: Path) -> None:
 
 
 def set_film_size(viewer: Viewer, width: int, height: int) -> None:
-    """Of films and of pictures of any size, pixels."""
+    """Set the size of films and of images of any size, pixels."""
     width, height = (min(max(side, 1), MAX_SIDE) for side in (width, height))
     viewer.state.record.size = (width, height)
 
@@ -189,7 +189,7 @@ def set_film_fps(viewer: Viewer, fps: float) -> None:
 
 
 def type_film(viewer: Viewer, text: str) -> None:
-    """What stands in the box for where the film goes."""
+    """Set the text of the box for where the film goes."""
     viewer.state.record.film_typed = text
 
 
@@ -290,7 +290,7 @@ def copy_command(viewer: Viewer, folder: Path) -> str:
 
 
 def take_clipboard(viewer: Viewer) -> str:
-    """What is put on the clipboard now, "" for nothing; said once."""
+    """Return what is put on the clipboard now, "" for nothing; once."""
     text, viewer.state.record.clipboard = viewer.state.record.clipboard, ""
     return text
 
@@ -309,7 +309,7 @@ def _training_camera(state: ViewerState) -> str | None:
 
 
 def _display_words(state: ViewerState) -> list[str]:
-    """What is shown, as options; queries only where the display shows them."""
+    """Return what is shown as options; queries only where the display shows them."""
     row, picture = DISPLAYS[state.picture.display], state.picture
     words = ["--display", picture.display]
     if row.by_level:
@@ -336,7 +336,7 @@ def _display_words(state: ViewerState) -> list[str]:
 
 
 def _look_words(state: ViewerState) -> list[str]:
-    """How it is shown, as options; what has none is said."""
+    """Return how it is shown as options; say what has none."""
     clip, picture = state.settings.clip, state.picture
     words = []
     if picture.colour_map != PictureConfig.colour_map:

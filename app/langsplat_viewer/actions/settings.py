@@ -43,18 +43,18 @@ def toggle_levels(viewer: Viewer) -> None:
 
 
 def show_one(viewer: Viewer) -> None:
-    """One picture fills the scene's area."""
+    """Have one image fill the scene's area."""
     _set_split(viewer, replace(viewer.state.settings.split, mode="off"))
 
 
 def move_line(viewer: Viewer, at: float) -> None:
-    """Where the line is that divides the two pictures, as a fraction of the area's width."""
+    """Move the line that divides the two pictures, as a fraction of the area's width."""
     low, high = AT_RANGE
     _set_split(viewer, replace(viewer.state.settings.split, at=min(max(at, low), high)), "line")
 
 
 def set_colour_map(viewer: Viewer, colour_map: ColourMap) -> None:
-    """The colours of relevancy and depth; remembered."""
+    """Set the colours of relevancy and depth; remembered."""
     state = viewer.state
     if colour_map != state.picture.colour_map:
         remember(viewer)
@@ -63,12 +63,12 @@ def set_colour_map(viewer: Viewer, colour_map: ColourMap) -> None:
 
 
 def save_transparent(viewer: Viewer, transparent: bool) -> None:
-    """Whether pictures are saved without their background."""
+    """Set whether images are saved without their background."""
     _set(viewer, replace(viewer.state.settings, transparent=transparent))
 
 
 def set_splats(viewer: Viewer, splats: Splats) -> None:
-    """How the Gaussians are drawn, within what there is."""
+    """Set how the Gaussians are drawn, within the range of settings."""
     low, high = SIZE_RANGE
     degree = min(max(splats.sh_degree, 0), MOST_DEGREE)
     kept = Splats(min(max(splats.size, low), high), degree)
@@ -76,14 +76,14 @@ def set_splats(viewer: Viewer, splats: Splats) -> None:
 
 
 def set_clip(viewer: Viewer, clip: Clip) -> None:
-    """Between which depths Gaussians are drawn; the far one stays the farther."""
+    """Set between which depths Gaussians are drawn; the far one stays the farther."""
     near = max(clip.near, 0.0)
     kept = Clip(near, max(clip.far, near))
     _set(viewer, replace(viewer.state.settings, clip=kept), "clip")
 
 
 def show_overlay(viewer: Viewer, overlay: Overlay, shown: bool) -> None:
-    """Whether something lies over the scene; remembered."""
+    """Set whether something lies over the scene; remembered."""
     preferences = viewer.state.preferences
     kept = {*preferences.overlays, overlay} if shown else {*preferences.overlays} - {overlay}
     overlays = tuple(name for name in OVERLAYS if name in kept)
@@ -104,7 +104,7 @@ def turn_to_face(viewer: Viewer, face: str) -> None:
 
 
 def measure(viewer: Viewer, on: bool) -> None:
-    """Whether clicks on the scene set the points of the ruler; what was measured goes when it ends."""
+    """Set whether clicks on the scene set the points of the ruler; what was measured goes when it ends."""
     ruler = viewer.state.ruler
     if on != ruler.measures:
         viewer.state.ruler = Ruler(on)
@@ -126,7 +126,7 @@ def measure_at(viewer: Viewer, u: float, v: float) -> None:
 
 
 def _can_show(viewer: Viewer, needs_field: bool) -> bool:
-    """Whether the scene has a language field where one is needed; says so where it has none."""
+    """Return whether the scene has a language field where one is needed; says so where it has none."""
     scene = viewer.state.scene
     if needs_field and scene is not None and scene.language is None:
         viewer.state.say(no_field(scene), is_error=True)
@@ -170,7 +170,7 @@ def set_picture(viewer: Viewer, picture: PictureConfig) -> None:
 
 
 def set_coarse_while_moving(viewer: Viewer, coarse: bool) -> None:
-    """Whether a slow machine draws fewer pixels while the camera moves."""
+    """Set whether a slow machine draws fewer pixels while the camera moves."""
     viewer.state.coarse_while_moving = coarse
 
 
@@ -180,7 +180,7 @@ def set_theme(viewer: Viewer, theme: Theme) -> None:
 
 
 def set_ui_scale(viewer: Viewer, scale: float) -> None:
-    """How large letters and widgets are, within `preferences.SCALES`."""
+    """Set how large letters and widgets are, within `preferences.SCALES`."""
     low, high = SCALES
     viewer.state.preferences = replace(viewer.state.preferences, ui_scale=min(max(scale, low), high))
 
@@ -191,7 +191,7 @@ def resize(viewer: Viewer, width: int, height: int) -> None:
 
 
 def show_panel(viewer: Viewer, shown: bool) -> None:
-    """Whether the panels are there."""
+    """Set whether the panels are there."""
     viewer.state.show_panel = shown
 
 
@@ -230,17 +230,17 @@ def toggle_help(viewer: Viewer) -> None:
 
 
 def show_palette(viewer: Viewer, shown: bool) -> None:
-    """Whether the list of everything that can be done is there, its box empty."""
+    """Set whether the list of everything that can be done is there, its box empty."""
     viewer.state.show_palette, viewer.state.palette_typed = shown, ""
 
 
 def type_command(viewer: Viewer, text: str) -> None:
-    """What stands in the box of that list."""
+    """Set the text of the box of that list."""
     viewer.state.palette_typed = text
 
 
 def mute_letters(viewer: Viewer, muted: bool) -> None:
-    """Whether letters do nothing for now: they were meant for a box that cannot be typed in."""
+    """Set whether letters do nothing for now: they were meant for a box that cannot be typed in."""
     viewer.state.letters_muted = muted
 
 

@@ -42,7 +42,7 @@ Draw = Callable[[int], Array]  # (H, W, 3) uint8 picture by its number from 0
 
 @dataclass(frozen=True)
 class Film:
-    """What is to be written."""
+    """A film to be written."""
 
     out: Path  # .mp4, .webp or .gif; else a folder
     count: int  # pictures
@@ -52,7 +52,7 @@ class Film:
 
 
 def check_film(out: Path | None, size: tuple[int, int] | None) -> Path:
-    """Where the film goes: `out`, or, for a video where the system has no ffmpeg, a folder of its name.
+    """Return where the film goes: `out`, or, for a video on a system without ffmpeg, a folder of its name.
     InputError where that cannot work, before anything slow is done."""
     if out is None:
         raise InputError("--headless needs somewhere to draw to; add --out film.mp4, or --out folder/")
@@ -72,7 +72,7 @@ def check_film(out: Path | None, size: tuple[int, int] | None) -> Path:
 
 
 def is_folder(out: Path) -> bool:
-    """Whether a film to `out` is a folder of pictures."""
+    """True where a film to `out` is a folder of pictures."""
     return out.is_dir() or not out.suffix
 
 
@@ -95,7 +95,7 @@ def write_film(film: Film, draw: Draw) -> int:
 
 
 def frame_name(number: int) -> str:
-    """Of a picture in a folder."""
+    """Name of an image in a folder."""
     return f"frame-{number:05d}.png"
 
 
@@ -108,7 +108,7 @@ def _check_own(folder: Path) -> None:
 
 
 def _write_pictures(film: Film, draw: Draw) -> int:
-    """Those that are missing."""
+    """Write the images that are missing."""
     folder = film.out
     folder.mkdir(parents=True, exist_ok=True)
     _check_own(folder)
@@ -192,7 +192,7 @@ def _ffmpeg(film: Film, target: Path) -> list[str]:
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """Of whatever is left of it."""
+    """End the process and close what is left of it."""
     if process.poll() is None:
         process.kill()
     process.wait()
@@ -272,7 +272,7 @@ def in_one_line(out: Path, size: str) -> Iterator[None]:
 
 
 def fingerprint(shot: Shot) -> str:
-    """The same for shots that give the same images, whoever asks for them."""
+    """Return a digest that is the same for shots that give the same images, whoever asks for them."""
     digest, inputs = hashlib.sha256(), Inputs()
     request = shot.request
     scene = inputs.key(request).scene

@@ -57,7 +57,7 @@ class Prepared:
 
 
 def check_options(options: ViewerOptions) -> Path:
-    """Where the image or film goes. InputError where that cannot work, before anything slow is done."""
+    """Return where the image or film goes. InputError, before anything slow is done, where that cannot work."""
     if options.path is not None and options.turntable is not None:
         raise InputError("--path and --turntable are two films; choose one")
     if options.path is not None and options.orthographic is not None:
@@ -157,13 +157,13 @@ def first_camera(scene: Scene, choice: str, size: tuple[int, int] | None) -> Cam
 
 
 def without_perspective(scene: Scene, camera: Camera, span: float) -> Camera:
-    """From the same eye in parallel projection, `span` world units across the picture's shorter side."""
+    """Return the camera in parallel projection, `span` world units across the image's shorter side."""
     extent = extent_of(scene)
     return spanning(from_camera(camera, extent), span, extent).camera(camera.width, camera.height)
 
 
 def describe(result: QueryResult) -> str:
-    """One line for people and for scripts."""
+    """Return the answer as a line for people and for scripts."""
     shown = None if result.verdict == "not here" else result.place
     place = "none" if shown is None else "({})".format(", ".join(f"{v:.3f}" for v in shown))
     verdict: str = result.verdict
@@ -248,13 +248,13 @@ def by_colour(results: Sequence[QueryResult], colours: tuple[int, ...]) -> tuple
 
 
 def say_drawing(backend: Backend, progress: Progress) -> None:
-    """Before the first picture: say where the CPU's kernels will be compiled."""
+    """Say, before the first image, where the CPU's kernels will be compiled."""
     if backend in ("auto", "cpu"):
         say_compiling(progress)
 
 
 def say_unread(scene: Scene) -> None:
-    """After the last picture: say what lay beside the scene and could not be read."""
+    """Say, after the last image, what lay beside the scene and could not be read."""
     for reason in scene.unread:
         if SUFFIX in reason:  # of the cameras it was said when they were read
             log.warning("opened without its language field: %s", reason)

@@ -1,1 +1,1 @@
-"""From a scene, a camera and settings to pixels. Knows nothing of the window's state."""
+"""Render requests and the renderers that draw them; nothing of the window's state."""

@@ -15,14 +15,14 @@ from langsplat_viewer.camera.controls import eye_depth
 
 @dataclass(frozen=True)
 class Clip:
-    """Between which depths Gaussians are drawn, told by their centres; world units from the eye. For looking
-    into things: answers and files have all of them."""
+    """Range of depths in which Gaussians are drawn, by their centres; world units from the eye. Answers and
+    files have all of them."""
 
     near: float = 0.0
     far: float = math.inf
 
     def beyond(self, plane: float) -> "Clip":
-        """The same in depths of a camera before which the eye's plane lies `plane` away."""
+        """Return the same range in depths of a camera before which the eye's plane lies `plane` away."""
         return Clip(self.near + plane, self.far + plane)
 
     def keeps(self, depths: Array) -> Array:
@@ -102,7 +102,7 @@ def surface_depths(view: View, count: int) -> Array:
 
 
 def why_undrawable(gaussians: Gaussians) -> str:
-    """Why no camera could see anything of these; empty where one could."""
+    """Return why no camera could see anything of these; empty where one could."""
     count = len(gaussians)
     if count == 0:
         return "the scene holds no Gaussians"
@@ -116,7 +116,7 @@ def why_undrawable(gaussians: Gaussians) -> str:
 
 
 def why_nothing(gaussians: Gaussians, camera: Camera) -> str:
-    """Why a picture that shows nothing does."""
+    """Return why an image shows nothing."""
     reason = why_undrawable(gaussians)
     if reason:
         return reason

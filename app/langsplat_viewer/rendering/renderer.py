@@ -75,7 +75,7 @@ def render_image(request: RenderRequest, backend: Backend = "auto") -> Array:
 
 
 def suits_opengl(ctx: moderngl.Context) -> bool:
-    """Whether backend "auto" becomes "opengl": not on a driver before 4.1, and not on one that draws on
+    """True where backend "auto" becomes "opengl": not on a driver before 4.1, and not on one that draws on
     the CPU, where the compiled CPU rasterizer is several times faster."""
     return ctx.version_code >= 410 and not is_software(ctx)
 
@@ -180,7 +180,7 @@ class ArrayRenderer:
         return request.split.joined(images, request.width)
 
     def shows_nothing(self) -> bool:
-        """Whether the last image holds nothing of the scene."""
+        """True where the last image holds nothing of the scene."""
         return self._shows_nothing
 
 
@@ -188,14 +188,14 @@ class ArrayRenderer:
 
 
 class ChannelSource(Protocol):
-    """Where channel textures come from."""
+    """Source of channel textures."""
 
     def render(self, key: RenderKey, wanted: Sequence[Channel]) -> Textures:
         """Colours, then the texture of each channel (the colours' for an absent one), valid until the next
         call. At most three with values, none of them twice."""
 
     def ahead(self, key: RenderKey, wanted: Sequence[Channel]) -> Ahead | None:
-        """What of `render` another thread can do, whatever is rendered here meanwhile; None: nothing."""
+        """Part of `render` that another thread can do, whatever is rendered here meanwhile; None: nothing."""
 
     def depth_at(self, key: RenderKey, column: int, row: int) -> tuple[float, float]:
         """Surface depth (world units, 0: nothing) and alpha of one pixel."""
@@ -363,7 +363,7 @@ class Rasterizing:
 
 @dataclass(frozen=True)
 class Rasterized:
-    """Its result."""
+    """Result of a `Rasterizing`."""
 
     of: Rasterizing
     finish: Callable[[], Textures]  # what its work returned
@@ -467,7 +467,7 @@ class GlRenderer:
         return key, wanted
 
     def _missing(self, key: RenderKey, wanted: Sequence[Channel]) -> list[Channel] | None:
-        """What to rasterize beside colours to have `wanted`; None where all of it is held."""
+        """Channels to rasterize beside colours to have `wanted`; None where all of it is held."""
         held = {channel.key for channel in self._channels}
         needed = {channel.key: channel for channel in wanted if not channel.is_absent}
         return None if self._held == key and needed.keys() <= held else list(needed.values())
@@ -486,7 +486,7 @@ class GlRenderer:
         target.use()
 
     def shows_nothing(self) -> bool:
-        """Whether the last image, if there was one, holds nothing of the scene."""
+        """True where the last image, if there was one, holds nothing of the scene."""
         if self._held is None:
             return False
         colours = self._textures[0]
@@ -529,7 +529,7 @@ class GlRenderer:
 
 
 def _uniforms(pane: Pane, ranges: Ranges, is_absent: bool) -> dict[str, object]:
-    """Of the shader. Without its channel a display shows the plain colours."""
+    """Uniforms of the shader. Without its channel a display shows the plain colours."""
     picture = pane.picture
     return {
         "colours": 0,

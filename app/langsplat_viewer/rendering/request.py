@@ -69,7 +69,7 @@ class Split:
 
 @dataclass(frozen=True)
 class Splats:
-    """How the Gaussians are drawn; answers and files have them as they are."""
+    """Sizes and colours of the Gaussians as drawn; answers and files have them as they are."""
 
     size: float = 1.0  # factor of every axis, within SIZE_RANGE: small ones are points, and show gaps
     sh_degree: int = MOST_DEGREE  # at most; 0: colours that do not depend on the direction
