@@ -57,7 +57,7 @@ class Prepared:
 
 
 def check_options(options: ViewerOptions) -> Path:
-    """Return where the image or film goes. InputError, before anything slow is done, where that cannot work."""
+    """Return where the image or film goes. InputError where that cannot work, before anything slow."""
     if options.path is not None and options.turntable is not None:
         raise InputError("--path and --turntable are two films; choose one")
     if options.path is not None and options.orthographic is not None:
