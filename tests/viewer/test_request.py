@@ -20,7 +20,7 @@ from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matchin
 from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
 from langsplat_viewer.marks import Marks, unmarked
 from langsplat_viewer.output import film, saving
-from langsplat_viewer.panels.legend import STEPS, bar_colours
+from langsplat_viewer.panels.overlays import STEPS, bar_colours
 from langsplat_viewer.panels.view import compared_name
 from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer
@@ -85,9 +85,9 @@ def recorded(viewer: Viewer) -> None:
     end = time.monotonic() + 60
     while viewer.recorder.current is not None:
         assert time.monotonic() < end
-        viewpoint.tick(viewer, viewer.clock)
+        viewer.take_results()
         time.sleep(0.002)
-    viewpoint.tick(viewer, viewer.clock)
+    viewer.take_results()
 
 
 def image(path: Path) -> np.ndarray:
