@@ -11,9 +11,9 @@ Needs a GL context but no window. It is in one of three phases:
 
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Generic, Literal, TypeVar
 
 import moderngl
 
@@ -53,7 +53,11 @@ class Canvas:
         """`clock`, in seconds, times the drawing. `quick`: another renderer, which draws merged Gaussians
         while the camera moves, where images take long."""
         self._ctx, self._fine, self._quick, self._clock = ctx, renderer, quick, clock
-        self._merger, self._background, self._pace = Merger(), Background(clock), Pace()
+        self._merger: Latest[Gaussians, Merged] = Latest(merged)
+        self._background: Latest[Rasterizing, Rasterized] = Latest(
+            lambda wanted, report: _rasterize(wanted, report, clock)
+        )
+        self._pace = Pace()
         self._targets: dict[Key, moderngl.Framebuffer] = {}  # the latest used last
         self._textures: dict[Key, moderngl.Texture] = {}
         self.phase: Phase = "still"
@@ -110,7 +114,7 @@ class Canvas:
     @property
     def is_running(self) -> bool:
         """Whether other threads are at work, wanted or not."""
-        return self._background.worker.is_running or self._merger.is_running
+        return self._background.worker.is_running or self._merger.worker.is_running
 
     def wake_with(self, wake: Callable[[], None]) -> None:
         """Have `wake` called on another thread when `update` should be."""
@@ -133,12 +137,15 @@ class Canvas:
             self._background.drop()
             self._draw(state, request)
             return
+        self._background.want(rasterizing)
         try:
-            made = self._background.get(rasterizing)
+            made = self._background.made(rasterizing)
         except BackendError:
+            self._background.drop()
             self._tried = request
             raise
         if made is not None:
+            self._background.drop()
             self._draw(state, request, made)
         elif self._changes(request) and state.coarse_while_moving and self._merged(request) is not None:
             level = self._pace.stand_in()
@@ -151,7 +158,10 @@ class Canvas:
 
     def _merged(self, request: RenderRequest) -> Merged | None:
         """Gaussians that the quick renderer can draw, if they are there."""
-        return None if self._quick is None else self._merger.made_of(request.scene.scene.gaussians)
+        if self._quick is not None:
+            with suppress(BackendError):  # for want of memory: images stay as they are
+                return self._merger.made(request.scene.scene.gaussians)
+        return None
 
     def _at(self, request: RenderRequest, level: "Level") -> RenderRequest:
         fewer = self._merged(request) if level.merged else None
@@ -226,7 +236,7 @@ class Canvas:
     def close(self) -> None:
         """The window closes."""
         self._background.worker.close()
-        self._merger.close()
+        self._merger.worker.close()
 
     def point_at(self, u: float, v: float) -> Array | None:
         """See `viewer.Surface`."""
@@ -332,36 +342,41 @@ class Pace:
 # Other threads: one rasterizes the full image of a large scene, one merges its Gaussians.
 
 
-class Background:
-    """Rasterizes one image at a time: the one that is wanted now. Results of others are dropped."""
+W = TypeVar("W")
+M = TypeVar("M")
 
-    def __init__(self, clock: Callable[[], float]) -> None:
-        """`clock` in seconds."""
+
+class Latest(Generic[W, M]):
+    """Makes one thing at a time on a thread of its own: the one that is wanted now. Results of others are
+    dropped."""
+
+    def __init__(self, make: Callable[[W, Progress], M]) -> None:
         self.worker = Worker()
-        self._clock = clock
-        self._wanted: Rasterizing | None = None
-        self._made: Rasterized | None = None
+        self._make = make
+        self._wanted: W | None = None
+        self._made: M | None = None
         self._problem = ""
 
     @property
     def waits(self) -> bool:
-        """Whether something is wanted that has not been taken yet."""
+        """Whether something is wanted that has not been dropped."""
         return self._wanted is not None
 
-    def get(self, wanted: Rasterizing) -> Rasterized | None:
-        """The result, once; None while it is being made, which this begins. Raises BackendError, once,
-        where it failed."""
+    def want(self, wanted: W) -> None:
+        """Begin with it, unless that was done."""
         if wanted != self._wanted:
             self.drop()
             self._wanted = wanted
-            self.worker.submit("", self._work(wanted), self._keep, self._say)
+            make = self._make
+            self.worker.submit("", lambda report: make(wanted, report), self._keep, self._fail)
+
+    def made(self, wanted: W) -> M | None:
+        """The result, if it is ready. Raises BackendError, once, where it failed."""
         self.worker.poll()
-        made, problem = self._made, self._problem
-        if made is not None or problem:
-            self.drop()
+        problem, self._problem = self._problem, ""
         if problem:
             raise BackendError(problem)
-        return made
+        return self._made if wanted == self._wanted else None
 
     def drop(self) -> None:
         """Nothing is wanted any more."""
@@ -369,52 +384,15 @@ class Background:
         self.worker.poll()  # so that nothing of a job that was left is held
         self._wanted, self._made, self._problem = None, None, ""
 
-    def _work(self, wanted: Rasterizing) -> Callable[[Progress], Rasterized]:
-        def work(report: Progress) -> Rasterized:
-            began = self._clock()
-            with watched() as laps:
-                finish = wanted.work(report)
-            return Rasterized(wanted, finish, 1e3 * (self._clock() - began), laps)
-
-        return work
-
-    def _keep(self, made: Rasterized) -> None:
+    def _keep(self, made: M) -> None:
         self._made = made
 
-    def _say(self, problem: str) -> None:
+    def _fail(self, problem: str) -> None:
         self._problem = problem
 
 
-class Merger:
-    """Merges the Gaussians of a scene on a thread of its own; nobody waits for it."""
-
-    def __init__(self) -> None:
-        self._worker = Worker()
-        self._source: Gaussians | None = None  # whose merged ones are made, or are there
-        self._made: Merged | None = None
-
-    def want(self, gaussians: Gaussians) -> None:
-        """Begin with these, unless that was done."""
-        if self._source is gaussians:
-            return
-        self._worker.cancel()
-        self._source, self._made = gaussians, None
-        # Where it fails, for want of memory, images stay as they are.
-        self._worker.submit("", lambda report: merged(gaussians, report), self._keep, lambda _: None)
-
-    def _keep(self, made: Merged) -> None:
-        self._made = made
-
-    def made_of(self, gaussians: Gaussians) -> Merged | None:
-        """The merged ones of these, if they are ready."""
-        self._worker.poll()
-        return self._made if self._source is gaussians else None
-
-    @property
-    def is_running(self) -> bool:
-        """Whether it is at work."""
-        return self._worker.is_running
-
-    def close(self) -> None:
-        """Begin nothing more."""
-        self._worker.close()
+def _rasterize(wanted: Rasterizing, report: Progress, clock: Callable[[], float]) -> Rasterized:
+    began = clock()
+    with watched() as laps:
+        finish = wanted.work(report)
+    return Rasterized(wanted, finish, 1e3 * (clock() - began), laps)

@@ -21,7 +21,7 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
         "train": "train.Train",
         "query": "query.QueryScene",
         "describe": "query.Describe",
-        "select": "select.Select",
+        "select": "query.Select",
         "scale": "scenes.Scale",
         "convert": "scenes.Convert",
         "compact": "scenes.Compact",

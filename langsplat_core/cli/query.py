@@ -1,9 +1,10 @@
-"""`langsplat query`: where in a scene a phrase is true."""
+"""`langsplat query`, `select` and `describe`: where in a scene a phrase is true, that alone as a scene of its
+own, and words for what is there."""
 
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,18 +13,27 @@ import tyro
 from rich.table import Table
 
 from langsplat_core.arrays import Array
-from langsplat_core.cli.checks import OutputConsole
-from langsplat_core.config import Count, CountOrZero, LevelChoice, PictureConfig, Positive
+from langsplat_core.cli.checks import OutFile, OutputConsole
+from langsplat_core.config import Count, CountOrZero, LevelChoice, NotNegative, PictureConfig, Positive
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
-from langsplat_core.io.scenes import load_scene
+from langsplat_core.io.scenes import check_writable, load_scene, save_scene
+from langsplat_core.io.shapes import (
+    MESH_SUFFIXES,
+    POINT_SUFFIXES,
+    base_colours,
+    check_suffix,
+    write_meshes,
+    write_points,
+)
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.answers import QueryResult, peak_pixel
-from langsplat_core.query.compose import check_phrase, combine, run_phrase
-from langsplat_core.query.describe import Describer, Entry, Levels, Spot, Word, Words
+from langsplat_core.query.compose import Combination, check_phrase, combine, run_phrase
+from langsplat_core.query.describe import Describer, Entry, Words
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, no_field
 from langsplat_core.query.grammar import Atom
-from langsplat_core.query.instances import Instance, find_instances
+from langsplat_core.query.instances import Instance, hulls
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
+from langsplat_core.query.selection import grow, of_rows, shrink
 from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.language import split_phrases
@@ -31,6 +41,7 @@ from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.vocabulary import read_vocabulary
 
 PAPER_FILTER = 20  # px, mean filter before the peak is taken (paper, implementation details)
+WIDTH = 118  # characters of a table that is not written to a terminal
 
 
 @dataclass(frozen=True)
@@ -60,27 +71,21 @@ class QueryScene:
     """Print JSON, lengths in world units."""
 
     def run(self) -> None:
-        scene = load_scene(self.scene)
-        if scene.language is None:
-            raise InputError(f"{self.scene}: {no_field(scene)}")
+        scene = _searchable(self.scene)
         if not self.texts:
             raise InputError("no phrase given; for example: langsplat query scene.ply 'red cup'")
-        camera = _camera(scene, self.camera)
+        camera = _camera(scene, self.camera) if scene.cameras else None
         engine = QueryEngine(scene, _once(load_text_encoder), encoder_id=self.encoder)
-        unit = unit_of(scene, self.scale)
+        unit = _unit(scene, self.scale)
         answers, tables = [], []
         for text in self._askable(engine, camera):
             result, understood = self._ask(engine, text, camera)
             answer = _answer(result, scene, engine, camera, self.mode) | {"reading": understood}
-            answer |= {"encoder": engine.basis.encoder, "calibration": engine.basis.calibration}
             things = engine.instances(result, self.instances) if result.found else ()
-            answer["metres_per_unit"] = unit.length if unit.name == "m" else None
-            answer["instances"] = [instance_json(thing, number) for number, thing in enumerate(things, 1)]
-            answers.append(answer)
-            tables.append(table(things, unit))
+            answers.append(answer | _basis(engine) | {"metres_per_unit": unit.metres, **_listed(things)})
+            tables.append(_table(things, unit))
         if self.json:
-            json.dump(answers, sys.stdout, indent=1)
-            print()
+            _print_json(answers)
             return
         for answer, lines in zip(answers, tables, strict=True):
             verdict, reading = answer["verdict"], answer["reading"]
@@ -97,8 +102,8 @@ class QueryScene:
         print(f"answers: {engine.basis.long}")
 
     def _askable(self, engine: QueryEngine, camera: Camera | None) -> list[str]:
-        """The phrases that can be asked; of the others it is said why on stderr, before anything is searched.
-        Raises that reason where none is left."""
+        """The phrases that can be asked; the others are named on stderr with the reason, before anything is
+        searched. Raises that reason where none is left."""
         phrases = [phrase for text in self.texts for phrase in split_phrases(text) or [text]]
         problems: dict[str, LangSplatError] = {}
         for phrase in phrases:
@@ -132,7 +137,7 @@ class QueryScene:
 
 
 def _once(load: LoadEncoder) -> LoadEncoder:
-    """Fails as it first did: a hub out of reach is not asked again by every phrase."""
+    """`load`, but a hub out of reach is not asked again by every phrase: it fails as it first did."""
     failed: list[EncoderError] = []
 
     def load_once(model: str) -> TextEncoder:
@@ -147,9 +152,7 @@ def _once(load: LoadEncoder) -> LoadEncoder:
     return load_once
 
 
-def _camera(scene: Scene, index: int) -> Camera | None:
-    if not scene.cameras:
-        return None
+def _camera(scene: Scene, index: int) -> Camera:
     if not 0 <= index < len(scene.cameras):
         raise InputError(f"--camera {index}: the scene has cameras 0 to {len(scene.cameras) - 1}")
     return scene.cameras[index]
@@ -186,87 +189,125 @@ def _answer(
     return answer
 
 
-# Instances of an answer, for people and as JSON.
+# `langsplat select`.
 
-HEADING = ("", "score", "share", "Gaussians", "centre", "size")
+Shape = Literal["scene", "points", "hull"]
 
 
 @dataclass(frozen=True)
-class Unit:
-    """The unit that lengths are printed and given in."""
+class Select:
+    """Write what a phrase names as a scene of its own, with its language field and cameras, as points or as a
+    mesh; or, with --remove, the scene without it. Prints the things that were found, best first."""
 
-    name: str  # "m" or "units"
-    length: float  # world units -> this
+    scene: tyro.conf.Positional[Path]
+    """A trained scene, *.ply with its language field beside it."""
+    texts: tyro.conf.Positional[tuple[str, ...]]
+    """Phrases, each in quotes if it has several words."""
+    out: OutFile
+    """File to write: .ply, .spz or .splat for a scene, .ply for points, .ply or .obj for hulls."""
+    remove: bool = False
+    """Write everything else instead."""
+    combine: Combination = "union"
+    """What several phrases make: what any of them names, what all name, or the first without the others."""
+    level: LevelChoice = "auto"
+    """Semantic level; auto takes for each phrase the one with the highest score."""
+    instance: tuple[Count, ...] = ()
+    """Numbers of the things to take, as printed, the best is 1; all if none is given."""
+    grow: NotNegative = 0.0
+    """Take also what is so near along the surface: metres if the scene has a scale, else world units."""
+    shrink: NotNegative = 0.0
+    """Leave out what is so near to the rest along the surface, in the same unit; after growing."""
+    shape: Annotated[Shape, tyro.conf.arg(name="as")] = "scene"
+    """scene: Gaussians. points: their centres, with colour and relevancy. hull: a closed mesh around each."""
+    scale: Positive | None = None
+    """Metres per world unit, in place of what the scene says."""
+    encoder: str = ""
+    """Text encoder folder or hub id, in place of the one the scene names."""
+    json: bool = False
+    """Print JSON, lengths in world units."""
 
-    def format(self, values: Array, between: str = " ") -> str:
-        """World units as text, in this unit, without it."""
-        return between.join(f"{self.length * value:.3f}" for value in values)
+    def run(self) -> None:
+        self._check()
+        scene = _searchable(self.scene)
+        unit = _unit(scene, self.scale)
+        engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
+        answer = combine([run_phrase(engine, text, self.level).answer for text in self.texts], self.combine)
+        found = engine.instances(answer)
+        rows = np.concatenate([instance.members for instance in _chosen(found, self.instance)])
+        selected = self._reshaped(engine, of_rows(rows, len(answer.members)), unit)
+        written = self._write(engine, replace(answer, members=selected))
+        self._print(found, unit, int(selected.sum()), written)
+
+    def _check(self) -> None:
+        """InputError for what needs no scene to be known: it should not cost the loading of one."""
+        if not self.texts:
+            raise InputError(
+                "no phrase given; for example: langsplat select scene.ply 'red cup' --out cup.ply"
+            )
+        if self.shape == "scene":
+            check_writable(self.out)
+        else:
+            check_suffix(self.out, POINT_SUFFIXES if self.shape == "points" else MESH_SUFFIXES)
+        if self.shape == "hull" and self.remove:
+            raise InputError(
+                "--as hull is the shape of things; what is left after --remove is written as points"
+            )
+        if self.out.resolve() == self.scene.resolve():
+            raise InputError(f"{self.out}: would replace the original scene; choose another --out")
+        folder = self.out.parent
+        if not folder.is_dir():
+            raise InputError(f"{folder}: no such folder for {self.out.name}; make it first")
+
+    def _reshaped(self, engine: QueryEngine, selected: Array, unit: "Unit") -> Array:
+        if self.grow:
+            selected = grow(engine.surface, selected, self.grow / unit.length)
+        if self.shrink:
+            selected = shrink(engine.surface, selected, self.shrink / unit.length)
+        if not selected.any():
+            raise InputError(f"--shrink {self.shrink:g}: nothing is left; shrink by less")
+        if self.remove and selected.all():
+            raise InputError("the selection is the whole scene: nothing would be left after --remove")
+        return selected
+
+    def _write(self, engine: QueryEngine, answer: QueryResult) -> int:
+        """Number of Gaussians, points or meshes that were written."""
+        scene, rows = engine.scene, np.flatnonzero(~answer.members if self.remove else answer.members)
+        if self.shape == "points":
+            relevancy = answer.relevancy[answer.level][rows]
+            return write_points(self.out, scene.gaussians.take(rows), {"relevancy": relevancy})
+        if self.shape == "hull":
+            colours = base_colours(scene.gaussians)
+            meshes = hulls(engine.instances(answer), scene.gaussians, colours, " ".join(self.texts))
+            write_meshes(self.out, meshes)
+            return len(meshes)
+        save_scene(self.out, replace(scene.take(rows), path=self.out))
+        return len(rows)
+
+    def _print(self, found: Sequence[Instance], unit: "Unit", selected: int, written: int) -> None:
+        if self.json:
+            content = {
+                "phrases": list(self.texts),
+                "combine": self.combine,
+                "metres_per_unit": unit.metres,
+                **_listed(found),
+                "taken": list(self.instance) or list(range(1, len(found) + 1)),
+                "selected": selected,
+                "as": self.shape,
+                "removed": self.remove,
+                "written": written,
+                "out": str(self.out),
+            }
+            _print_json(content)
+            return
+        print("\n".join(_table(found, unit)))
+        what = {"scene": "Gaussians", "points": "points", "hull": "closed hulls"}[self.shape]
+        of = f"all but the {selected} selected" if self.remove else f"of {selected} selected Gaussians"
+        print(f"{self.out}: {written} {what}, {of}")
 
 
-def unit_of(scene: Scene, metres_per_unit: float | None = None) -> Unit:
-    """Metres by `metres_per_unit`, else by the scene's own, else world units. InputError unless > 0."""
-    if metres_per_unit is not None and not 0 < metres_per_unit < float("inf"):
-        raise InputError(f"--scale {metres_per_unit:g}: must be above 0, metres per unit")
-    metres = metres_per_unit or scene.metres_per_unit
-    return Unit("units", 1.0) if metres is None else Unit("m", metres)
-
-
-def table(instances: Sequence[Instance], unit: Unit, first: int = 1) -> list[str]:
-    """Aligned lines under a heading, one for each instance, numbered from `first`; none without instances."""
-    if not instances:
-        return []
-    rows = [(*HEADING[:4], f"{HEADING[4]}, {unit.name}", f"{HEADING[5]}, {unit.name}")]
-    rows += [
-        (
-            str(number),
-            f"{instance.score:.3f}",
-            f"{100 * instance.share:.0f} %",
-            f"{instance.count}",
-            unit.format(instance.centre),
-            unit.format(instance.size, " x "),
-        )
-        for number, instance in enumerate(instances, first)
-    ]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  " + "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows
-    ]
-
-
-def instance_json(instance: Instance, number: int) -> dict[str, Any]:
-    """Lengths in world units."""
-    box = instance.oriented
-    return {
-        "number": number,
-        "score": instance.score,
-        "mean": instance.mean,
-        "share": instance.share,
-        "gaussians": instance.count,
-        "centre": instance.centre.tolist(),
-        "size": instance.size.tolist(),
-        "box": instance.box.tolist(),
-        "oriented_box": {
-            "centre": box.centre.tolist(),
-            "rotation": box.axes.tolist(),
-            "half_extents": box.half_extents.tolist(),
-        },
-    }
-
-
-def chosen(found: Sequence[Instance], numbers: Sequence[int]) -> Sequence[Instance]:
-    """The instances of these numbers, the best is 1; all without numbers. Raises InputError for another."""
-    if not found:
-        raise InputError("what was found lies nowhere on a surface: nothing to select")
-    for number in numbers:
-        if not 1 <= number <= len(found):
-            raise InputError(f"--instance {number}: there are {len(found)}, numbered from 1")
-    return [found[number - 1] for number in numbers] or found
-
-
-# `langsplat describe`: words for what is in a scene.
+# `langsplat describe`.
 
 Level = Literal["subpart", "part", "whole"]
-WIDTH = 118  # characters of a table that is not written to a terminal
 
 
 @dataclass(frozen=True)
@@ -299,16 +340,14 @@ class Describe:
 
     def run(self) -> None:
         phrases = None if self.vocabulary is None else read_vocabulary(self.vocabulary)
-        scene = load_scene(self.scene)
+        scene = _searchable(self.scene)
         self._check(scene)
         with TerminalProgress() as progress:
             engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
             describer = Describer(engine, phrases, progress)
-            answer = self._entries(describer, progress) if self._everything else self._words(describer)
-        answer |= {"encoder": engine.basis.encoder, "calibration": engine.basis.calibration}
+            answer = self._described(describer, progress)
         if self.json:
-            json.dump(answer, sys.stdout, indent=1)
-            print()
+            _print_json(answer | _basis(engine))
             return
         if self._everything:
             _print_inventory(answer["inventory"])
@@ -334,8 +373,6 @@ class Describe:
 
     def _check(self, scene: Scene) -> None:
         """InputError for arguments that do not go with the scene or each other, before anything is loaded."""
-        if scene.language is None:
-            raise InputError(f"{self.scene}: {no_field(scene)}")
         if len(self._asked_of) > 1:
             raise InputError(f"{' and '.join(self._asked_of)} are several questions; ask one of them")
         if self.phrase is None and self.instance != 1:
@@ -349,95 +386,59 @@ class Describe:
             return
         if not scene.cameras:
             raise InputError(f"{self.scene}: has no cameras, so --pixel means nothing; ask by --gaussian")
-        if not 0 <= self.camera < len(scene.cameras):
-            raise InputError(f"--camera {self.camera}: the scene has cameras 0 to {len(scene.cameras) - 1}")
-        camera, (column, row) = scene.cameras[self.camera], self.pixel
+        camera, (column, row) = _camera(scene, self.camera), self.pixel
         if not (0 <= column < camera.width and 0 <= row < camera.height):
             raise InputError(
                 f"--pixel {column} {row}: camera {self.camera} has columns 0 to {camera.width - 1} and rows "
                 f"0 to {camera.height - 1}"
             )
 
-    def _entries(self, describer: Describer, progress: Progress) -> dict[str, Any]:
-        """The inventory, ready for JSON."""
-        sure = describer.engine.basis.calibration is not None
-        entries = [
-            _entry(entry, sure)
-            for entry in describer.inventory(progress)
-            if self.level in (None, LEVELS[entry.level])
-        ]
-        return _asked(describer) | {"inventory": entries}
-
-    def _words(self, describer: Describer) -> dict[str, Any]:
-        """Words of the pixel or Gaussian, ready for JSON."""
-        scene = describer.engine.scene
-        levels: Levels
+    def _described(self, describer: Describer, progress: Progress) -> dict[str, Any]:
+        """The inventory, or the words of the place that is asked for, ready for JSON."""
+        engine = describer.engine
+        found: Sequence[Words | Entry]
+        place: dict[str, Any] = {}
         if self.pixel is not None:
-            camera = scene.cameras[self.camera]
-            levels = describer.at_pixel(load_lifting_rasterizer("cpu"), camera, self.pixel, self.top)
-            place: dict[str, Any] = {"camera": self.camera, "view": camera.name, "pixel": list(self.pixel)}
+            camera = engine.scene.cameras[self.camera]
+            found = describer.at_pixel(load_lifting_rasterizer("cpu"), camera, self.pixel, self.top)
+            place = {"camera": self.camera, "view": camera.name, "pixel": list(self.pixel)}
         elif self.phrase is not None:
-            thing = self._thing(describer.engine, self.phrase)
-            levels = describer.at_gaussians(thing.members, top=self.top)
-            place = {"phrase": self.phrase, "thing": instance_json(thing, self.instance)}
-        else:
-            levels = describer.at_gaussians(np.array([self.gaussian]), np.ones(1), self.top)
+            answer = combine([run_phrase(engine, self.phrase).answer], "union")
+            thing = _chosen(engine.instances(answer), [self.instance])[0]
+            found = describer.at_gaussians(thing.members, top=self.top)
+            place = {"phrase": self.phrase, "thing": _instance(thing, self.instance)}
+        elif self.gaussian is not None:
+            found = describer.at_gaussians(np.array([self.gaussian]), np.ones(1), self.top)
             place = {"gaussian": self.gaussian}
-        wanted = [words for words in levels if self.level in (None, LEVELS[words.level])]
-        sure = describer.engine.basis.calibration is not None
-        return place | _asked(describer) | {"levels": [_level(words, sure) for words in wanted]}
-
-    def _thing(self, engine: QueryEngine, phrase: str) -> Instance:
-        answer = combine([run_phrase(engine, phrase, "auto").answer], "union")
-        found = find_instances(engine.surface, engine.scene.gaussians, answer.members, answer.relevancy)
-        return chosen(found, [self.instance])[0]
+        else:
+            found = describer.inventory(progress)
+        sure = engine.basis.calibration is not None
+        wanted = [_plain(one, sure) for one in found if self.level in (None, LEVELS[one.level])]
+        asked = {"asked": len(describer.words[0].phrases), "left_out": len(describer.left_out)}
+        return place | asked | {"inventory" if self._everything else "levels": wanted}
 
 
-def _asked(describer: Describer) -> dict[str, Any]:
-    return {"asked": len(describer.words[0].phrases), "left_out": len(describer.left_out)}
-
-
-def _share(softmax: float, sure: bool) -> dict[str, Any]:
-    """A share of the softmax over a vocabulary, and whether that is a probability too."""
-    return {"softmax": softmax, "probability": softmax if sure else None}
-
-
-def _word(word: Word | None, sure: bool) -> dict[str, Any] | None:
-    return None if word is None else {"phrase": word.phrase, **_share(word.probability, sure)}
-
-
-def _level(words: Words, sure: bool) -> dict[str, Any]:
-    return {
-        "level": LEVELS[words.level],
-        "words": [_word(word, sure) for word in words.words],
-        "other": words.other,
-        "known": words.known,
-        "colour": _word(words.colour, sure),
-        "material": _word(words.material, sure),
-    }
-
-
-def _spot(spot: Spot, sure: bool) -> dict[str, Any]:
-    return {
-        "centre": spot.centre.tolist(),
-        "box": spot.box.tolist(),
-        "gaussians": len(spot.rows),
-        "share": spot.share,
-        "colour": _word(spot.colour, sure),
-        "material": _word(spot.material, sure),
-    }
-
-
-def _entry(entry: Entry, sure: bool) -> dict[str, Any]:
-    return {
-        "phrase": entry.phrase,
-        "also": list(entry.also),
-        "level": LEVELS[entry.level],
-        **_share(entry.probability, sure),
-        "score": entry.score,
-        "share": entry.share,
-        "spots": [_spot(spot, sure) for spot in entry.spots],
-    }
+def _plain(value: Any, sure: bool) -> Any:
+    """Words, spots and entries, ready for JSON. A share of the softmax over a vocabulary is a probability too
+    where that is `sure`."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, tuple):
+        return [_plain(item, sure) for item in value]
+    if not is_dataclass(value):
+        return value
+    made: dict[str, Any] = {}
+    for name in (field.name for field in fields(value)):
+        held = getattr(value, name)
+        if name == "level":
+            made[name] = LEVELS[held]
+        elif name == "rows":
+            made["gaussians"] = len(held)
+        elif name == "probability":
+            made |= {"softmax": held, "probability": held if sure else None}
+        else:
+            made[name] = _plain(held, sure)
+    return made
 
 
 def _looks(described: dict[str, Any]) -> str:
@@ -475,3 +476,104 @@ def _print_words(levels: list[dict[str, Any]]) -> None:
         said = ", ".join(word["phrase"] + _percent(word) for word in level["words"])
         looks = _looks(level)
         print(f"{level['level']:<8} {said}" + (f"; looks {looks}" if looks else ""))
+
+
+# Scenes, instances and JSON, as all three print them.
+
+
+@dataclass(frozen=True)
+class Unit:
+    """The unit that lengths are printed and given in."""
+
+    name: str  # "m" or "units"
+    length: float  # world units -> this
+
+    @property
+    def metres(self) -> float | None:
+        """Metres per world unit, where they are known."""
+        return self.length if self.name == "m" else None
+
+    def format(self, values: Array, between: str = " ") -> str:
+        """World units as text, in this unit, without it."""
+        return between.join(f"{self.length * value:.3f}" for value in values)
+
+
+def _unit(scene: Scene, metres_per_unit: float | None = None) -> Unit:
+    """Metres by `metres_per_unit`, else by the scene's own, else world units. InputError unless above 0."""
+    if metres_per_unit is not None and not 0 < metres_per_unit < float("inf"):
+        raise InputError(f"--scale {metres_per_unit:g}: must be above 0, metres per unit")
+    metres = metres_per_unit or scene.metres_per_unit
+    return Unit("units", 1.0) if metres is None else Unit("m", metres)
+
+
+def _table(instances: Sequence[Instance], unit: Unit) -> list[str]:
+    """Aligned lines under a heading, one for each instance; none without instances."""
+    if not instances:
+        return []
+    rows = [("", "score", "share", "Gaussians", f"centre, {unit.name}", f"size, {unit.name}")]
+    rows += [
+        (
+            str(number),
+            f"{instance.score:.3f}",
+            f"{100 * instance.share:.0f} %",
+            f"{instance.count}",
+            unit.format(instance.centre),
+            unit.format(instance.size, " x "),
+        )
+        for number, instance in enumerate(instances, 1)
+    ]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  " + "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows
+    ]
+
+
+def _listed(instances: Sequence[Instance]) -> dict[str, Any]:
+    return {"instances": [_instance(instance, number) for number, instance in enumerate(instances, 1)]}
+
+
+def _instance(instance: Instance, number: int) -> dict[str, Any]:
+    """An instance, ready for JSON, lengths in world units."""
+    box = instance.oriented
+    return {
+        "number": number,
+        "score": instance.score,
+        "mean": instance.mean,
+        "share": instance.share,
+        "gaussians": instance.count,
+        "centre": instance.centre.tolist(),
+        "size": instance.size.tolist(),
+        "box": instance.box.tolist(),
+        "oriented_box": {
+            "centre": box.centre.tolist(),
+            "rotation": box.axes.tolist(),
+            "half_extents": box.half_extents.tolist(),
+        },
+    }
+
+
+def _chosen(found: Sequence[Instance], numbers: Sequence[int]) -> Sequence[Instance]:
+    """The instances of these numbers, the best is 1; all without numbers. Raises InputError for another."""
+    if not found:
+        raise InputError("what was found lies nowhere on a surface: nothing to select")
+    for number in numbers:
+        if not 1 <= number <= len(found):
+            raise InputError(f"--instance {number}: there are {len(found)}, numbered from 1")
+    return [found[number - 1] for number in numbers] or found
+
+
+def _searchable(path: Path) -> Scene:
+    """The scene of a file; InputError where it has no language field."""
+    scene = load_scene(path)
+    if scene.language is None:
+        raise InputError(f"{path}: {no_field(scene)}")
+    return scene
+
+
+def _basis(engine: QueryEngine) -> dict[str, Any]:
+    return {"encoder": engine.basis.encoder, "calibration": engine.basis.calibration}
+
+
+def _print_json(content: Any) -> None:
+    json.dump(content, sys.stdout, indent=1)
+    print()

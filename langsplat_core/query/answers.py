@@ -1,12 +1,13 @@
-"""Where a relevancy map is cut, so that what lies above is the answer's mask.
+"""From the relevancies of a phrase to its answer: the regions of the surface that are it, or its peak alone.
 
-Absolute relevancy says little across encoders and phrases (a cosine margin of 0.1 is 0.73), so every rule
-here is relative to something measured: the floor, the scene's median, or the map's own range.
+Absolute relevancy says little across encoders and phrases (a cosine margin of 0.1 is 0.73). So whether a
+phrase is found is judged by what everyday phrases fit in the same scene, and how far it reaches by its best
+region.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -15,254 +16,13 @@ from scipy.sparse import csr_matrix
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.grammar import Named, named
+from langsplat_core.query.instances import axis_aligned_box
+from langsplat_core.query.lookup import codewords
 from langsplat_core.query.surface import SMALLEST, Regions, Surface
 from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField, Odds
-from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, Scale, relevancy_of
+from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, Scale
 
-CutRule = Literal["floor", "median", "range"]
-CUT_RULES: tuple[CutRule, ...] = get_args(CutRule)
-SPAN = 0.02  # the least distance between the lower end and the peak that is divided
-RANGE_SHARE = 0.7  # of the map's range: LangSplat's code maps [0, 1] to [-1, 1] and cuts at 0.4
-
-
-def cut_level(rule: CutRule, values: Array, peak: float, median: float) -> float:
-    """The relevancy above which `values` belong to the answer.
-
-    values: the map that is cut, any shape, in [0, 1], read by "range" alone; peak: the smoothed peak of the
-    whole scene at the chosen level; median: of the scene's Gaussians at that level. Rules:
-
-    * "floor": half way between the floor, no better than the canonical phrases, and the peak;
-    * "median": half way between the scene's median and the peak, since what is typical of the scene is not
-      what was asked for, wherever the encoder puts it;
-    * "range": at 0.7 of the map's range, as the public code of LangSplat does; it always finds something.
-    """
-    if rule == "range":
-        low, high = (float(values.min()), float(values.max())) if np.size(values) else (0.0, 1.0)
-        return low + RANGE_SHARE * (high - low)
-    low = FLOOR if rule == "floor" else median
-    return low + 0.5 * max(peak - low, SPAN)
-
-
-# Where a phrase is: the strongest place among the Gaussians, its extent, and its pixel in a view.
-
-PLATEAU = 1e-3  # of relevancy: what is this close to the peak is as high
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """A connected set of Gaussians that answer a phrase."""
-
-    position: Array  # (3,) world units, around the middle of what is as high as the peak
-    box: Array  # (2, 3) lower and upper corner, world units, between 2 % and 98 % of the members
-    count: int  # Gaussians in it
-
-
-def locate(surface: Surface, smoothed: Array, threshold: float) -> Place | None:
-    """The connected part above `threshold` that holds the peak of `smoothed` (M,); None where all is 0."""
-    if len(smoothed) == 0:
-        return None
-    peak = int(smoothed.argmax())
-    if smoothed[peak] <= 0:
-        return None
-    inside = smoothed > threshold
-    inside[peak] = True
-    members = surface.connected(inside, peak)
-    # All of a thing may mean the very same: then its middle is the place, not whichever comes first.
-    highest = members[smoothed[members] >= smoothed[peak] - PLATEAU]
-    centre = surface.positions[highest].mean(0)
-    middle = highest[((surface.positions[highest] - centre) ** 2).sum(1).argmin()]
-    near = surface.neighbours[middle]
-    weights = surface.weights[near] * smoothed[near]
-    position = (surface.positions[near] * weights[:, None]).sum(0) / weights.sum()
-    box = np.quantile(surface.positions[members], [0.02, 0.98], axis=0)
-    return Place(position, box, len(members))
-
-
-def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
-    """Peak (column, row, value) of a relevancy map (H, W) after a mean filter of `window` px (paper: 20).
-
-    The window never exceeds the picture; borders repeat the edge pixels.
-    """
-    window = max(1, min(window, *relevancy.shape))
-    smooth = uniform_filter(np.asarray(relevancy, np.float64), size=window, mode="nearest")
-    row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
-    return int(column), int(row), float(smooth[row, column])
-
-
-# What everyday phrases fit in a scene, where most of them are not: what exceeds that is found.
-#
-# Fits are those of `semantics.relevancy.Scale`. The more places a scene has, the better the best of them
-# fits a phrase by chance; so "found" is said by the best fits of everyday phrases in the scene itself.
-
-SAMPLED = 96  # everyday phrases that are looked up in a scene without codewords, where each costs a query
-# Spreads above the median best fit of everyday phrases from which a phrase is found, among whole things and
-# at the finer levels, by what it names: where things like it are, and elsewhere, where more is asked for. One
-# absent phrase in twenty exceeds it (rooms 201 to 203, the bundled encoder and CLIP's geometry with six sets
-# of vectors). Some everyday phrases are there, which raises their median; that is in these numbers.
-FOUND: Mapping[Named | Literal["inside"], tuple[float, float]] = {
-    "thing": (1.35, 2.6),
-    "part": (2.55, 1.3),
-    "part of a thing": (2.55, 1.3),
-    "inside": (np.inf, 1.8),  # a part, among what is on a thing that is there
-}
-LOW = 0.16  # quantile one standard deviation below the median; what is there lies above, and widens nothing
-
-
-@dataclass(frozen=True)
-class Bar:
-    """What the best fit of phrases is by chance."""
-
-    median: float
-    spread: float
-
-    def excess(self, fit: float, spreads: float) -> float:
-        """By how many spreads `fit` exceeds what is so many above the median."""
-        return (fit - self.median) / max(self.spread, NARROWEST) - spreads
-
-
-Bars = tuple[Bar, Bar, Bar, Bar]  # of each level, and of the better one of the finer two
-
-
-@dataclass(frozen=True, eq=False)
-class Chance:
-    """Fits of V everyday phrases at all regions of a scene."""
-
-    fits: tuple[Array, Array, Array]  # (R, V) float32 of each level
-
-    def bars(self, rows: tuple[Array, Array, Array] | None = None) -> Bars:
-        """Of the scene, or of some regions `rows` of each level alone."""
-        chosen = (
-            self.fits if rows is None else [fits[some] for fits, some in zip(self.fits, rows, strict=True)]
-        )
-        subpart, part, whole = (fits.max(0, initial=-np.inf) for fits in chosen)
-        return _bar(subpart), _bar(part), _bar(whole), _bar(np.maximum(subpart, part))
-
-
-def _bar(best: Array) -> Bar:
-    if len(best) == 0 or not np.isfinite(best).all():
-        return Bar(np.inf, 1.0)
-    low, median = np.quantile(best, [LOW, 0.5])
-    return Bar(float(median), float(median - low))
-
-
-def excess(fits: Fits, bars: Bars, named: Named | Literal["inside"], level: LevelChoice = "auto") -> float:
-    """By how many spreads the best fits of a phrase exceed those from which it is found; it is from 0 on. At
-    one `level`, or, where that is free, at any."""
-    whole, finer = FOUND[named]
-    if level != "auto":
-        index = LEVELS.index(level)
-        return bars[index].excess(fits[index], min(whole, finer))
-    return max(bars[2].excess(fits[2], whole), bars[3].excess(max(fits[:2]), finer))
-
-
-def chance_in(
-    field: LanguageField, surface: Surface, regions: Regions, scale: Scale, lookup: Iterator[Array]
-) -> Chance:
-    """Of a scene. lookup: relevancies (3, N) of everyday phrases, which are looked at where there are no
-    codewords to compare instead."""
-    if field.codec.space == "index":
-        return _by_codewords(field, surface, regions, scale)
-    columns = [[scale.fit(means) for means in regions.means(values)] for values in lookup]
-    subpart, part, whole = (
-        _solid(np.stack(fits, 1).astype(np.float32), regions.sizes[level])
-        for level, fits in enumerate(zip(*columns, strict=True))
-    )
-    return Chance((subpart, part, whole))
-
-
-def _by_codewords(field: LanguageField, surface: Surface, regions: Regions, scale: Scale) -> Chance:
-    assert scale.everyday is not None
-    count = field.codec.index_size
-    vectors = field.codec.decode(np.arange(count, dtype=np.uint16)[:, None])
-    zero, rate = scale.of(vectors @ scale.texts.T)
-    relevancy = relevancy_of(vectors @ scale.everyday.T, zero[:, None], rate[:, None])
-    fits = []
-    for level, known in enumerate(field.known):
-        has = known[surface.rows]
-        places = regions.of[level][has], field.latents[level, surface.rows[has], 0].astype(np.int64)
-        shape = (len(regions.totals[level]), count)
-        shares = csr_matrix((surface.weights[has], places), shape=shape)
-        means = (shares @ relevancy) / regions.totals[level][:, None]
-        fits.append(_solid(scale.fit(means).astype(np.float32), regions.sizes[level]))
-    return Chance((fits[0], fits[1], fits[2]))
-
-
-def _solid(fits: Array, sizes: Array) -> Array:
-    """Crumbs do not count where there are others, as in `extent`."""
-    solid = sizes >= SMALLEST
-    return np.where(solid[:, None], fits, -np.inf) if solid.any() else fits
-
-
-# How far an answer reaches: its level, the regions that are it, and how good the best one is.
-#
-# Everything is judged by the fit of a region, in spreads of what phrases fit by chance (`chance`), so that
-# one rule serves all encoders. The numbers were chosen on rooms 201 to 203, with the bundled encoder and
-# with the geometry of CLIP, never on rooms that measure.
-
-# Spreads that each level is given before the best is chosen, by what a phrase names. A thing is one whole,
-# whatever some part of it looks like; a part is rather too fine than too coarse.
-ADVANTAGE: Mapping[Named, tuple[float, float, float]] = {
-    "thing": (0.0, 0.0, 0.5),
-    "part": (0.0, 0.0, 0.25),
-    "part of a thing": (0.0, 0.0, -0.25),
-}
-REACH = 0.4  # of the best fit: what fits less by no more than this, and by `NEAREST` to `FARTHEST`, is it too
-NEAREST, FARTHEST = 0.15, 1.0  # spreads
-
-
-@dataclass(frozen=True, eq=False)
-class Extent:
-    """What of a surface answers a phrase: some of the R regions of a level."""
-
-    level: int  # index into LEVELS
-    fits: Fits  # of the best region of each level
-    peaks: tuple[float, float, float]  # relevancy of the best region of each level
-    even: Array  # (R,) float32 relevancy, the same all over a region
-    inside: Array  # (R,) bool
-
-
-def find_extent(
-    relevancy: Array,
-    regions: Regions,
-    scale: Scale,
-    level: LevelChoice = "auto",
-    named: Named = "thing",
-) -> Extent:
-    """From the (3, N) relevancy of a phrase. level: "auto", which depends on what is `named`, or the one that
-    is wanted."""
-    means = regions.means(relevancy)
-    peaks = [_best(values, sizes) for values, sizes in zip(means, regions.sizes, strict=True)]
-    best = scale.fit(np.array(peaks))
-    chosen = _level(best, named) if level == "auto" else LEVELS.index(level)
-    return Extent(
-        level=chosen,
-        fits=(float(best[0]), float(best[1]), float(best[2])),
-        peaks=(peaks[0], peaks[1], peaks[2]),
-        even=means[chosen].astype(np.float32),
-        inside=scale.fit(means[chosen]) >= lowest(float(best[chosen])),
-    )
-
-
-def lowest(best: float, share: float = 1.0) -> float:
-    """The fit from which a region belongs to an answer whose best region has the fit `best`; share: of the
-    way that such an answer reaches."""
-    return best - share * float(np.clip(REACH * best, NEAREST, FARTHEST))
-
-
-def _best(means: Array, sizes: Array) -> float:
-    """The best region's relevancy; crumbs that no neighbour took do not count where there are others."""
-    solid = means[sizes >= SMALLEST]
-    return float((solid if len(solid) else means).max(initial=0))
-
-
-def _level(best: Array, named: Named) -> int:
-    """The best after its advantage; of equal ones the coarsest."""
-    given = best + ADVANTAGE[named]
-    return int(np.flatnonzero(given == given.max())[-1])
-
-
-# From relevancies to an answer: by regions of the surface, or by the peak alone, as published.
-
+Triple = tuple[float, float, float]  # one number a level
 AnswerRule = Literal["regions", "peak"]
 Verdict = Literal["found", "weak match", "not here"]
 WEAK = 0.5  # probability from which what is not found is at least a weak match
@@ -275,7 +35,7 @@ class QueryResult:
 
     phrase: str
     level: int  # index into LEVELS
-    scores: tuple[float, float, float]  # best relevancy per level: of a region, or of a neighbourhood
+    scores: Triple  # best relevancy per level: of a region, or of a neighbourhood
     relevancy: Array  # (3, N) float32 in [0, 1] per level and Gaussian
     even: Array  # (N,) float32 relevancy at the level, the same all over a region
     peak: float  # score of the chosen level
@@ -297,7 +57,7 @@ class QueryResult:
 
     @property
     def verdict(self) -> Verdict:
-        """What to say about it."""
+        """The verdict for people."""
         if self.found:
             return "found"
         if self.probability is not None:
@@ -321,6 +81,182 @@ def recut(result: QueryResult, cut: float) -> QueryResult:
     return replace(result, own_cut=cut, members=result.even >= np.float32(cut))
 
 
+def triple(values: Iterable[float]) -> Triple:
+    """Three values as plain numbers."""
+    subpart, part, whole = values
+    return float(subpart), float(part), float(whole)
+
+
+# Chance: the fits of everyday phrases in a scene, most of which name nothing there. What exceeds it is found.
+#
+# Fits are those of `semantics.relevancy.Scale`. The more places a scene has, the better the best of them
+# fits a phrase by chance; so "found" is said by the best fits of everyday phrases in the scene itself.
+
+SAMPLED = 96  # everyday phrases that are looked up in a scene without codewords, where each costs a query
+# Spreads above the median best fit of everyday phrases from which a phrase is found, among whole things and
+# at the finer levels, by what it names: where things like it are, and elsewhere, where more is asked for. One
+# absent phrase in twenty exceeds it (rooms 201 to 203, the bundled encoder and CLIP's geometry with six sets
+# of vectors). Some everyday phrases are there, which raises their median; that is in these numbers.
+FOUND: Mapping[Named | Literal["inside"], tuple[float, float]] = {
+    "thing": (1.35, 2.6),
+    "part": (2.55, 1.3),
+    "part of a thing": (2.55, 1.3),
+    "inside": (np.inf, 1.8),  # a part, among what is on a thing that is there
+}
+LOW = 0.16  # quantile one standard deviation below the median; what is there lies above, and widens nothing
+
+
+@dataclass(frozen=True)
+class Bar:
+    """The best fit of phrases by chance: its median and spread."""
+
+    median: float
+    spread: float
+
+    def excess(self, fit: float, spreads: float) -> float:
+        """Spreads by which `fit` exceeds what is so many above the median."""
+        return (fit - self.median) / max(self.spread, NARROWEST) - spreads
+
+
+Bars = tuple[Bar, Bar, Bar, Bar]  # of each level, and of the better one of the finer two
+
+
+@dataclass(frozen=True, eq=False)
+class Chance:
+    """Fits of V everyday phrases at all regions of a scene."""
+
+    fits: tuple[Array, Array, Array]  # (R, V) float32 of each level
+
+    def bars(self, rows: tuple[Array, Array, Array] | None = None) -> Bars:
+        """The bars of the scene, or of some regions `rows` of each level alone."""
+        chosen = [f if rows is None else f[rows[level]] for level, f in enumerate(self.fits)]
+        subpart, part, whole = (fits.max(0, initial=-np.inf) for fits in chosen)
+        return _bar(subpart), _bar(part), _bar(whole), _bar(np.maximum(subpart, part))
+
+
+def _bar(best: Array) -> Bar:
+    if len(best) == 0 or not np.isfinite(best).all():
+        return Bar(np.inf, 1.0)
+    low, median = np.quantile(best, [LOW, 0.5])
+    return Bar(float(median), float(median - low))
+
+
+def excess(fits: Fits, bars: Bars, named: Named | Literal["inside"], level: LevelChoice = "auto") -> float:
+    """Spreads by which the best fits of a phrase exceed those from which it is found; it is from 0 on. At one
+    `level`, or, where that is free, at any."""
+    whole, finer = FOUND[named]
+    if level != "auto":
+        index = LEVELS.index(level)
+        return bars[index].excess(fits[index], min(whole, finer))
+    return max(bars[2].excess(fits[2], whole), bars[3].excess(max(fits[:2]), finer))
+
+
+def chance_in(
+    field: LanguageField, surface: Surface, regions: Regions, scale: Scale, lookup: Iterator[Array]
+) -> Chance:
+    """The fits of everyday phrases in a scene. lookup: their relevancies (3, N), which are looked at where
+    there are no codewords to compare instead."""
+    if field.codec.space == "index":
+        return _by_codewords(field, surface, regions, scale)
+    columns = [[scale.fit(means) for means in regions.means(values)] for values in lookup]
+    subpart, part, whole = (
+        _solid(np.stack(fits, 1).astype(np.float32), regions.sizes[level])
+        for level, fits in enumerate(zip(*columns, strict=True))
+    )
+    return Chance((subpart, part, whole))
+
+
+def _by_codewords(field: LanguageField, surface: Surface, regions: Regions, scale: Scale) -> Chance:
+    assert scale.everyday is not None
+    relevancy = codewords(field.codec, scale).relevancies(scale.everyday)
+    fits = []
+    for level, known in enumerate(field.known):
+        has = known[surface.rows]
+        places = regions.of[level][has], field.latents[level, surface.rows[has], 0].astype(np.int64)
+        shape = (len(regions.totals[level]), len(relevancy))
+        shares = csr_matrix((surface.weights[has], places), shape=shape)
+        means = (shares @ relevancy) / regions.totals[level][:, None]
+        fits.append(_solid(scale.fit(means).astype(np.float32), regions.sizes[level]))
+    return Chance((fits[0], fits[1], fits[2]))
+
+
+def _solid(fits: Array, sizes: Array) -> Array:
+    """Crumbs do not count where there are others, as in `extent`."""
+    solid = sizes >= SMALLEST
+    return np.where(solid[:, None], fits, -np.inf) if solid.any() else fits
+
+
+# Extent: the level of an answer, the regions that are it, and how good the best one is.
+#
+# Everything is judged by the fit of a region, in spreads of what phrases fit by chance (`chance`), so that
+# one rule serves all encoders. The numbers were chosen on rooms 201 to 203, with the bundled encoder and
+# with the geometry of CLIP, never on rooms that measure.
+
+# Spreads that each level is given before the best is chosen, by what a phrase names. A thing is one whole,
+# whatever some part of it looks like; a part is rather too fine than too coarse.
+ADVANTAGE: Mapping[Named, tuple[float, float, float]] = {
+    "thing": (0.0, 0.0, 0.5),
+    "part": (0.0, 0.0, 0.25),
+    "part of a thing": (0.0, 0.0, -0.25),
+}
+REACH = 0.4  # of the best fit: what fits less by no more than this, and by `NEAREST` to `FARTHEST`, is it too
+NEAREST, FARTHEST = 0.15, 1.0  # spreads
+
+
+@dataclass(frozen=True, eq=False)
+class Extent:
+    """The part of a surface that answers a phrase: some of the R regions of a level."""
+
+    level: int  # index into LEVELS
+    fits: Fits  # of the best region of each level
+    peaks: Triple  # relevancy of the best region of each level
+    even: Array  # (R,) float32 relevancy, the same all over a region
+    inside: Array  # (R,) bool
+
+
+def find_extent(
+    relevancy: Array,
+    regions: Regions,
+    scale: Scale,
+    level: LevelChoice = "auto",
+    named: Named = "thing",
+) -> Extent:
+    """The extent by the (3, N) relevancy of a phrase. level: "auto", which depends on what is `named`, or the
+    one that is wanted."""
+    means = regions.means(relevancy)
+    peaks = [_best(values, sizes) for values, sizes in zip(means, regions.sizes, strict=True)]
+    best = scale.fit(np.array(peaks))
+    chosen = _level(best, named) if level == "auto" else LEVELS.index(level)
+    return Extent(
+        level=chosen,
+        fits=triple(best),
+        peaks=triple(peaks),
+        even=means[chosen].astype(np.float32),
+        inside=scale.fit(means[chosen]) >= lowest(float(best[chosen])),
+    )
+
+
+def lowest(best: float, share: float = 1.0) -> float:
+    """The fit from which a region belongs to an answer whose best region has the fit `best`; share: of the
+    way that such an answer reaches."""
+    return best - share * float(np.clip(REACH * best, NEAREST, FARTHEST))
+
+
+def _best(means: Array, sizes: Array) -> float:
+    """The best region's relevancy; crumbs that no neighbour took do not count where there are others."""
+    solid = means[sizes >= SMALLEST]
+    return float((solid if len(solid) else means).max(initial=0))
+
+
+def _level(best: Array, named: Named) -> int:
+    """The best after its advantage; of equal ones the coarsest."""
+    given = best + ADVANTAGE[named]
+    return int(np.flatnonzero(given == given.max())[-1])
+
+
+# The answer by regions.
+
+
 def by_regions(
     phrase: str,
     relevancy: Array,
@@ -331,7 +267,7 @@ def by_regions(
     calibration: Calibration | None,
     level: LevelChoice,
 ) -> QueryResult:
-    """Whole regions that fit nearly as well as the best one (`extent`)."""
+    """The answer of whole regions that fit nearly as well as the best one (`find_extent`)."""
     extent = find_extent(relevancy, regions, scale, level, named(phrase))
     even = regions.spread(extent.level, extent.even, relevancy[extent.level])
     peak = extent.peaks[extent.level]
@@ -345,7 +281,8 @@ def by_regions(
         probability = odds.probability(extent.fits)
         found = fits and probability >= odds.found
     solid = np.where(extent.even > np.float32(peak), 0, extent.even)  # what is above the best is a crumb
-    place = locate(surface, solid[regions.of[extent.level]], np.nextafter(np.float32(lowest), np.float32(0)))
+    reached = np.nextafter(np.float32(lowest), np.float32(0))
+    place, box = locate(surface, solid[regions.of[extent.level]], reached)
     return QueryResult(
         phrase=phrase,
         level=extent.level,
@@ -358,39 +295,80 @@ def by_regions(
         excess=above,
         found=found,
         members=regions.spread(extent.level, extent.inside, np.zeros(relevancy.shape[1], bool)),
-        place=None if place is None else place.position,
-        box=None if place is None else place.box,
+        place=place,
+        box=box,
     )
+
+
+def _odds(phrase: str, calibration: Calibration | None) -> Odds | None:
+    """The odds for a phrase: a part asked for alone answers at the finer levels, where fits are others."""
+    if calibration is None:
+        return None
+    return calibration.thing if named(phrase) == "thing" else calibration.part
+
+
+# The answer as published, by the peak alone.
+
+SPAN = 0.02  # the least distance between the floor and the peak that is divided
 
 
 def by_peak(
     phrase: str, relevancy: Array, surface: Surface, scale: Scale, found: float, level: LevelChoice
 ) -> QueryResult:
-    """The level with the highest smoothed peak, cut half way between the floor and that peak; relevancy is as
-    published."""
-    smoothed = surface.smooth(relevancy)
-    scores = [float(values.max()) if len(values) else 0.0 for values in smoothed]
+    """The answer as published: the level with the highest smoothed peak, cut half way between the floor and
+    that peak."""
+    smoothed = np.stack([surface.smooth(values) for values in relevancy])
+    scores = triple(smoothed.max(1, initial=0))
     chosen = int(np.argmax(scores)) if level == "auto" else LEVELS.index(level)
-    peak, best = scores[chosen], scale.fit(np.array(scores))
-    place = locate(surface, smoothed[chosen], max(FLOOR + 0.5 * (peak - FLOOR), FLOOR))
+    peak = scores[chosen]
+    place, box = locate(surface, smoothed[chosen], max(FLOOR + 0.5 * (peak - FLOOR), FLOOR))
     return QueryResult(
         phrase=phrase,
         level=chosen,
-        scores=(scores[0], scores[1], scores[2]),
+        scores=scores,
         relevancy=relevancy,
         even=relevancy[chosen],
         peak=peak,
-        fits=(float(best[0]), float(best[1]), float(best[2])),
+        fits=triple(scale.fit(np.array(scores))),
         probability=None,
         found=peak >= FLOOR and max(scores) >= found,
-        members=relevancy[chosen] > cut_level("floor", relevancy[chosen], peak, FLOOR),
-        place=None if place is None else place.position,
-        box=None if place is None else place.box,
+        members=relevancy[chosen] > FLOOR + 0.5 * max(peak - FLOOR, SPAN),
+        place=place,
+        box=box,
     )
 
 
-def _odds(phrase: str, calibration: Calibration | None) -> Odds | None:
-    """A part asked for alone answers at the finer levels, where its fits are others than a thing's."""
-    if calibration is None:
-        return None
-    return calibration.thing if named(phrase) == "thing" else calibration.part
+# Places: the strongest among the Gaussians, and the pixel of the peak in a view.
+
+PLATEAU = 1e-3  # of relevancy: what is this close to the peak is as high
+
+
+def locate(surface: Surface, smoothed: Array, threshold: float) -> tuple[Array, Array] | tuple[None, None]:
+    """Place and box, world units, of the connected part above `threshold` that holds the peak of `smoothed`
+    (M,): (3,) around the middle of what is as high as the peak, and (2, 3) lower and upper corner between 2 %
+    and 98 % of its Gaussians. None where all is 0."""
+    if smoothed.max(initial=0) <= 0:
+        return None, None
+    peak = int(smoothed.argmax())
+    inside = smoothed > threshold
+    inside[peak] = True
+    members = surface.connected(inside, peak)
+    # All of a thing may mean the very same: then its middle is the place, not whichever comes first.
+    highest = members[smoothed[members] >= smoothed[peak] - PLATEAU]
+    centre = surface.positions[highest].mean(0)
+    middle = highest[((surface.positions[highest] - centre) ** 2).sum(1).argmin()]
+    near = surface.neighbours[middle]
+    weights = surface.weights[near] * smoothed[near]
+    position = (surface.positions[near] * weights[:, None]).sum(0) / weights.sum()
+    return position, axis_aligned_box(surface.positions[members])
+
+
+def peak_pixel(relevancy: Array, window: int) -> tuple[int, int, float]:
+    """Peak (column, row, value) of a relevancy map (H, W) after a mean filter of `window` px (paper: 20).
+
+    The window never exceeds the image; borders repeat the edge pixels.
+    """
+    window = max(1, min(window, *relevancy.shape))
+    smooth = uniform_filter(np.asarray(relevancy, np.float64), size=window, mode="nearest")
+    row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
+    return int(column), int(row), float(smooth[row, column])

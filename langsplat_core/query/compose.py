@@ -1,11 +1,11 @@
-"""Single things among the Gaussians that answer a phrase, and how they stand to each other.
+"""Phrases with structure: each phrase of the tree is asked for itself, and the answers are combined.
 
-Lengths are compared with the things' own sizes, so that a scene needs no scale.
+How things stand to each other is measured in their own sizes, so that a scene needs no scale.
 """
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -15,7 +15,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import QueryResult, excess, locate, lowest
+from langsplat_core.query.answers import QueryResult, excess, locate, lowest, triple
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import (
     Atom,
@@ -32,10 +32,9 @@ from langsplat_core.query.grammar import (
     children,
     named,
     parse,
-    reading,
+    unparse,
 )
-from langsplat_core.query.instances import connected_parts
-from langsplat_core.query.selection import difference, intersection, union
+from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.surface import Surface
 from langsplat_core.scene import LEVELS, NO_THING, Camera
 from langsplat_core.scene.language import phrase_key, tidy
@@ -55,7 +54,7 @@ ASIDE = 0.25  # of the mean size: what is closer than this sideways or in depth 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """The place that one thing takes, in axes of which the last is up."""
+    """The points of one thing, in axes of which the last is up."""
 
     points: Array  # (P, 3) world units
     low: Array  # (3,) 2 % quantiles
@@ -73,7 +72,7 @@ class Body:
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Of its points."""
+        """Search tree of its points."""
         return cKDTree(self.points)
 
     @cached_property
@@ -83,14 +82,19 @@ class Body:
 
 
 @dataclass(frozen=True, eq=False)
-class Viewer:
-    """From where left, right, near, far, behind and in front are said."""
+class Viewpoint:
+    """The camera from which left, right, near, far, behind and in front are said."""
 
-    matrix: Array  # (4, 4) from the axes of extents to the camera's
+    matrix: Array  # (4, 4) from the axes of bodies to the camera's
 
-    def seen(self, extent: Body) -> tuple[float, float]:
+    def centre(self, body: Body) -> Array:
+        """(3,) of a body, in the camera's axes."""
+        seen: Array = self.matrix[:3, :3] @ body.centre + self.matrix[:3, 3]
+        return seen
+
+    def seen(self, body: Body) -> tuple[float, float]:
         """Tangent of the angle to the right of the viewing direction, and depth; NaN for what is behind."""
-        x, _, z = self.matrix[:3, :3] @ extent.centre + self.matrix[:3, 3]
+        x, _, z = self.centre(body)
         return (float(x / z), float(z)) if z > 0 else (float("nan"), float("nan"))
 
 
@@ -101,17 +105,17 @@ def upright(up: Array) -> Array:
     return np.stack([first, np.cross(up, first), up])
 
 
-def viewer(camera: Camera, frame: Array) -> Viewer:
+def viewpoint(camera: Camera, frame: Array) -> Viewpoint:
     """`camera` as seen in the axes of `frame` (3, 3), see `upright`."""
     turned = np.eye(4)
     turned[:3, :3] = frame.T
-    return Viewer(camera.world_to_camera @ turned)
+    return Viewpoint(camera.world_to_camera @ turned)
 
 
 def body(positions: Array, frame: Array) -> Body:
-    """(P, 3) world points of one thing, P >= 1 -> its extent in the axes of `frame`."""
+    """(P, 3) world points of one thing, P >= 1 -> its body in the axes of `frame`."""
     points = positions[:: max(1, -(-len(positions) // SAMPLE))] @ frame.T
-    low, high = np.quantile(points, [0.02, 0.98], axis=0)
+    low, high = axis_aligned_box(points)
     return Body(points, low, high)
 
 
@@ -124,7 +128,7 @@ def separate(surface: Surface, inside: Array, things: Array | None = None) -> li
     """
     numbers = np.flatnonzero(inside)
     owner = np.full(len(numbers), NO_THING) if things is None else things[surface.rows[numbers]]
-    parts = connected_parts(surface, numbers[owner == NO_THING]).each()
+    parts = surface.parts(numbers[owner == NO_THING]).each()
     parts += [numbers[owner == one] for one in np.unique(owner[owner != NO_THING])]
     parts.sort(key=len, reverse=True)
     return [part for part in parts if len(part) >= max(FEWEST, SPECK * len(parts[0]))]
@@ -135,9 +139,9 @@ def gap(one: Body, other: Body) -> float:
     return float(other.tree.query(one.points)[0].min())
 
 
-def stands(kind: Side, what: Body, anchor: Body, seen_by: Viewer | None) -> bool:
-    """Whether `what` stands so to `anchor`. "left of", "right of", "behind" and "in front of" are said by a
-    viewer, who is then not None."""
+def stands(kind: Side, what: Body, anchor: Body, seen_by: Viewpoint | None) -> bool:
+    """True if `what` stands so to `anchor`. "left of", "right of", "behind" and "in front of" are said from a
+    viewpoint, which is then not None."""
     match kind:
         case "on":
             return _on(what, anchor)
@@ -165,7 +169,7 @@ def _on(what: Body, anchor: Body) -> bool:
 
 
 def _over(what: Body, anchor: Body) -> bool:
-    """Whether the middle of `what`, seen from above, lies within `anchor`."""
+    """True if the middle of `what`, seen from above, lies within `anchor`."""
     return bool(((what.centre >= anchor.low) & (what.centre <= anchor.high))[:2].all())
 
 
@@ -182,7 +186,7 @@ def _above(what: Body, anchor: Body) -> bool:
     return bool(overlap and what.centre[2] > anchor.high[2] and what.low[2] > anchor.centre[2])
 
 
-def _beside(kind: Side, what: Body, anchor: Body, seen_by: Viewer) -> bool:
+def _beside(kind: Side, what: Body, anchor: Body, seen_by: Viewpoint) -> bool:
     (x, z), (anchor_x, anchor_z) = seen_by.seen(what), seen_by.seen(anchor)
     apart = ASIDE * (what.size + anchor.size) / 2
     aside = (x - anchor_x) * anchor_z  # world units at the anchor's depth
@@ -194,15 +198,14 @@ def _beside(kind: Side, what: Body, anchor: Body, seen_by: Viewer) -> bool:
     return in_line and (z - anchor_z > apart if kind == "behind" else anchor_z - z > apart)
 
 
-def most(kind: Extreme, things: list[Body], anchors: list[Body], seen_by: Viewer | None) -> int:
+def most(kind: Extreme, things: list[Body], anchors: list[Body], seen_by: Viewpoint | None) -> int:
     """Number of the one of `things` (at least one) that is most so. "nearest" and "farthest" are measured
-    from any of `anchors`, and without one from the viewer, as "leftmost" and "rightmost" are; who is then not
-    None."""
+    from any of `anchors`, and without one from the viewpoint, as "leftmost" and "rightmost" are."""
     sign = -1 if kind in ("smallest", "nearest", "lowest", "leftmost") else 1
     return int(np.nanargmax([sign * _measure(kind, thing, anchors, seen_by) for thing in things]))
 
 
-def _measure(kind: Extreme, thing: Body, anchors: list[Body], seen_by: Viewer | None) -> float:
+def _measure(kind: Extreme, thing: Body, anchors: list[Body], seen_by: Viewpoint | None) -> float:
     if kind in ("biggest", "smallest"):
         return thing.size
     if kind in ("highest", "lowest"):
@@ -211,47 +214,17 @@ def _measure(kind: Extreme, thing: Body, anchors: list[Body], seen_by: Viewer | 
         return min(gap(thing, anchor) for anchor in anchors)
     assert seen_by is not None
     if kind in ("nearest", "farthest"):
-        return float(np.linalg.norm(seen_by.matrix[:3, :3] @ thing.centre + seen_by.matrix[:3, 3]))
+        return float(np.linalg.norm(seen_by.centre(thing)))
     aside = seen_by.seen(thing)[0]
     return (np.inf if kind == "leftmost" else -np.inf) if np.isnan(aside) else aside
-
-
-# The answer to several phrases at once, as one selection.
-
-Combination = Literal["union", "intersection", "difference"]
-_SELECT = {"union": union, "intersection": intersection, "difference": difference}
-
-
-@dataclass(frozen=True, eq=False)
-class Combined:
-    """What several answers make together."""
-
-    members: Array  # (N,) bool
-    relevancy: Array  # (N,) in [0, 1]: the largest of a union, the least of an intersection, else the first's
-
-
-def combine(results: Sequence[QueryResult], how: Combination) -> Combined:
-    """One or more answers in one. Raises InputError where a phrase was not found, or nothing is left."""
-    for result in results:
-        if not result.found or not result.members.any():
-            raise InputError(
-                f"'{result.phrase}' was not found (score {result.peak:.3f}): nothing to select; ask in other "
-                "words, or at another --level"
-            )
-    members = _SELECT[how]([result.members for result in results])
-    if not members.any():
-        phrases = ", ".join(f"'{result.phrase}'" for result in results)
-        raise InputError(f"the {how} of {phrases} is empty: nothing to select; try another --combine")
-    values = [result.relevancy[result.level] for result in results]
-    if how == "union":
-        return Combined(members, reduce(np.maximum, values))
-    return Combined(members, reduce(np.minimum, values) if how == "intersection" else values[0])
 
 
 # Answers to single phrases, combined among the Gaussians into one of the same form.
 #
 # The relevancy of a combined answer is zero wherever it does not hold, and the same at every level where it
 # has parts of several; its peak is that of its weakest necessary part.
+
+Combination = Literal["union", "intersection", "difference"]
 
 WHOLE = LEVELS.index("whole")
 SHARE = 0.6  # of the way from what is typical of a thing's least fitting surface to the part's peak on it
@@ -262,40 +235,29 @@ HALF = 0.5  # of the peak: what is less is no longer the place
 
 
 def grown(surface: Surface, members: Array) -> Array:
-    """(N,) bool, and what is next to it on the surface."""
+    """`members` (N,) and what is next to them on the surface."""
     inside = np.flatnonzero(members[surface.rows])
     result = members.copy()
     result[surface.rows[surface.links[inside].indices]] = True
     return result
 
 
-def owners(surface: Surface, count: int, things: list[Array]) -> Array:
-    """(N,) number of the thing (of `things`, as surface numbers) that each of `count` Gaussians belongs to;
-    -1 for what belongs to none, as the faint Gaussians do that are not of the surface."""
-    labels = np.full(count, -1)
-    for number, thing in enumerate(things):
-        labels[surface.rows[thing]] = number
-    return labels
-
-
 def cut_inside(
     engine: QueryEngine, asked: list[QueryResult], thing: QueryResult, there: Array, level: LevelChoice
 ) -> QueryResult:
-    """What `asked` says of a part, cut anew among the Gaussians of its thing. there: (N,) bool."""
+    """The answers of a part in one, cut anew among the Gaussians of its thing. there: (N,) bool."""
     surface, known = engine.surface, engine.field.known
     relevancy = np.asarray(np.mean([result.relevancy for result in asked], axis=0, dtype=np.float32))
-    even = np.where(there, engine.evened(relevancy), 0)
+    even = np.where(there, engine.regions.even(relevancy), 0)
     relevancy = np.where(there, relevancy, 0)
-    numbers = np.flatnonzero(there[surface.rows])
-    peaks = peaks_among(even[:, surface.rows[numbers]])
+    peaks = triple(even[:, surface.rows[there[surface.rows]]].max(1, initial=0))
     own = int(np.argmax(peaks[:WHOLE])) if max(peaks[:WHOLE]) > 0 else WHOLE
     chosen = own if level == "auto" else LEVELS.index(level)
     peak, inside = peaks[chosen], there & known[chosen]
     own_surface = thing.members & known[chosen]  # without what it touches, which may be anything
     low = float(np.quantile(even[chosen][own_surface], LEAST)) if own_surface.any() else peak
     members = inside & (even[chosen] > low + SHARE * max(peak - low, SPAN))
-    subpart, part, whole = engine.scale.fit(np.array(peaks)).tolist()
-    fits, probability = (subpart, part, whole), thing.probability
+    fits, probability = triple(engine.scale.fit(np.array(peaks))), thing.probability
     right, above = True, None
     if engine.calibration is not None and probability is not None:
         odds = engine.calibration.inside
@@ -320,13 +282,7 @@ def cut_inside(
     )
 
 
-def peaks_among(relevancy: Array) -> tuple[float, float, float]:
-    """The highest of (3, K) relevancies per level; 0 for none."""
-    subpart, part, whole = relevancy.max(axis=1, initial=0)
-    return float(subpart), float(part), float(whole)
-
-
-def joined(answers: list[QueryResult], all_needed: bool) -> QueryResult:
+def joined(answers: Sequence[QueryResult], all_needed: bool) -> QueryResult:
     """The union of answers, found if all are, or any is; what is not found of alternatives does not count."""
     counting = answers if all_needed else [answer for answer in answers if answer.found] or answers
     score = min if all_needed else max
@@ -351,8 +307,8 @@ def without(what: QueryResult, unwanted: QueryResult) -> QueryResult:
 
 
 def surest(engine: QueryEngine, answer: QueryResult) -> QueryResult:
-    """Those members alone that fit nearly as well as the best one does. A green mug may be in the answer to
-    "red mug", for want of a better one; it is not what "not red mug" means."""
+    """`answer` with those members alone that fit nearly as well as the best one does. A green mug may be in
+    the answer to "red mug", for want of a better one; it is not what "not red mug" means."""
     fits = engine.scale.fit(answer.even)
     best = float(fits[answer.members].max(initial=-np.inf))
     return replace(answer, members=answer.members & (fits >= lowest(best, SURE)))
@@ -370,7 +326,7 @@ def _of_any(members: Array, probability: float | None) -> float | None:
 
 
 def restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryResult:
-    """`answer` where `keep` (N,) holds alone; nothing is found without `needed`."""
+    """`answer` where `keep` (N,) holds; nothing is found without `needed`."""
     members = answer.members & keep
     return replace(
         answer,
@@ -384,17 +340,35 @@ def restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryRe
     )
 
 
+def combine(answers: Sequence[QueryResult], how: Combination) -> QueryResult:
+    """One or more answers in one, as "and", "without" and what is in all of them: the same members, without a
+    place. Raises InputError where one was not found, or nothing is left."""
+    for answer in answers:
+        if not answer.found or not answer.members.any():
+            raise InputError(
+                f"'{answer.phrase}' was not found (score {answer.peak:.3f}): nothing to select; ask in other "
+                "words, or at another --level"
+            )
+    result, *others = answers
+    if how == "union":
+        return joined(answers, all_needed=True) if others else result
+    for other in others:
+        result = without(result, other) if how == "difference" else restricted(result, other.members, other)
+    if not result.members.any():
+        phrases = ", ".join(f"'{answer.phrase}'" for answer in answers)
+        raise InputError(f"the {how} of {phrases} is empty: nothing to select; try another --combine")
+    return result
+
+
 def placed(surface: Surface, answer: QueryResult) -> QueryResult:
     """`answer` with the place of its strongest connected members."""
-    values = np.where(answer.members, answer.relevancy[answer.level], 0)
-    smoothed = surface.smooth(np.tile(values.astype(np.float32), (len(LEVELS), 1)))[0]
-    place = locate(surface, smoothed, HALF * float(smoothed.max(initial=0)))
-    found = (None, None) if place is None else (place.position, place.box)
-    return replace(answer, place=found[0], box=found[1])
+    values = np.where(answer.members, answer.relevancy[answer.level], 0).astype(np.float32)
+    smoothed = surface.smooth(values)
+    place, box = locate(surface, smoothed, HALF * float(smoothed.max(initial=0)))
+    return replace(answer, place=place, box=box)
 
 
-# Answers to phrases with structure: each phrase in the tree is asked for itself at its fitting level, and
-# the answers are combined among the Gaussians (`query.combine`).
+# Answers to whole trees: each phrase is asked at its fitting level.
 
 SAME = 0.5  # of a thing's Gaussians: what shares so many with another is the same, and not related to it
 SAID_BY_VIEWER = ("left of", "right of", "behind", "in front of", "leftmost", "rightmost")
@@ -402,16 +376,15 @@ SAID_BY_VIEWER = ("left of", "right of", "behind", "in front of", "leftmost", "r
 
 @dataclass(frozen=True, eq=False)
 class ComposedResult:
-    """The answer to a phrase and how the phrase was understood."""
+    """The answer to a phrase, and the tree as which it was read."""
 
     answer: QueryResult  # in the form of a simple one
     tree: Tree
-    parts: tuple[QueryResult, ...]  # what was asked, phrase by phrase
 
     @property
     def reading(self) -> str:
-        """Such as "handle  inside  red mug"."""
-        return reading(self.tree)
+        """The tree as text, such as "handle  inside  red mug"."""
+        return unparse(self.tree)
 
 
 def run_phrase(
@@ -443,9 +416,8 @@ def run_phrase(
             tree = Atom(tidy(text))
         else:
             answer = replace(found, phrase=tidy(text))
-            return ComposedResult(placed(engine.surface, answer), tree, tuple(asking.asked.values()))
-    answer = engine.run(tree.text, level, progress)
-    return ComposedResult(answer, tree, (answer,))
+            return ComposedResult(placed(engine.surface, answer), tree)
+    return ComposedResult(engine.run(tree.text, level, progress), tree)
 
 
 def check_phrase(
@@ -479,15 +451,15 @@ def _check_viewpoint(tree: Tree, viewpoint: Camera | None) -> None:
 class _Asking:
     """The phrases of one tree, each asked once."""
 
-    def __init__(self, engine: QueryEngine, viewpoint: Camera | None, progress: Progress) -> None:
+    def __init__(self, engine: QueryEngine, camera: Camera | None, progress: Progress) -> None:
         self.engine, self._progress = engine, progress
         self.surface = engine.surface
-        self.asked: dict[tuple[str, LevelChoice], QueryResult] = {}
+        self._asked: dict[tuple[str, LevelChoice], QueryResult] = {}
         self._frame = upright(engine.scene.up())
-        self._viewer = None if viewpoint is None else viewer(viewpoint, self._frame)
+        self._viewpoint = None if camera is None else viewpoint(camera, self._frame)
 
     def answer(self, tree: Tree, level: LevelChoice = "auto") -> QueryResult:
-        """What a tree means; without a place, which only the last answer needs."""
+        """The answer to a tree; without a place, which only the last answer needs."""
         match tree:
             case Atom(text):
                 return self._thing(text, level)
@@ -507,12 +479,12 @@ class _Asking:
 
     def _ask(self, text: str, level: LevelChoice) -> QueryResult:
         key = (phrase_key(text), level)
-        if key not in self.asked:
-            self.asked[key] = self.engine.run(text, level, self._progress)
-        return self.asked[key]
+        if key not in self._asked:
+            self._asked[key] = self.engine.run(text, level, self._progress)
+        return self._asked[key]
 
     def _thing(self, text: str, level: LevelChoice) -> QueryResult:
-        """A thing is looked for among wholes, unless it is a part, or fits none of them."""
+        """The answer to a phrase; a thing is looked for among wholes, unless it is a part, or fits none."""
         if level != "auto" or named(text) != "thing":
             return self._ask(text, level)
         whole = self._ask(text, "whole")
@@ -542,19 +514,21 @@ class _Asking:
         if isinstance(tree, Superlative):
             every = [thing for _, thing in things]
             others = [other for _, other in anchors]
-            right = {most(tree.kind, every, others, self._viewer)} if every else set()
+            right = {most(tree.kind, every, others, self._viewpoint)} if every else set()
         else:
             right = {
                 row
                 for row, (mine, thing) in enumerate(things)
                 if any(
-                    stands(tree.kind, thing, other, self._viewer)
+                    stands(tree.kind, thing, other, self._viewpoint)
                     for theirs, other in anchors
                     if np.isin(mine, theirs).mean() < SAME
                 )
             }
-        labels = owners(self.surface, len(what.members), [numbers for numbers, _ in things])
-        return restricted(what, np.isin(labels, list(right)), anchor or what)
+        keep = np.zeros(len(what.members), bool)
+        for row in right:
+            keep[self.surface.rows[things[row][0]]] = True
+        return restricted(what, keep, anchor or what)
 
     def _bodies(self, answer: QueryResult) -> list[tuple[Array, Body]]:
         """Every single thing of an answer, as surface numbers and as the place it takes."""

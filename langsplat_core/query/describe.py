@@ -15,6 +15,7 @@ word of the vocabulary fits.
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import get_args
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.instances import connected_parts
+from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.surface import surface_areas
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import pixel_weights
@@ -69,7 +70,7 @@ class WordScores:
         return found
 
     def take(self, chosen: Array) -> "WordScores":
-        """Those phrases for which `chosen` (V,) bool is True; the canonical ones stay."""
+        """The phrases for which `chosen` (V,) bool is True; the canonical ones stay."""
         rows = np.append(chosen, np.ones(len(self.vectors) - len(chosen), bool))
         phrases = tuple(phrase for phrase, kept in zip(self.phrases, chosen, strict=True) if kept)
         return replace(self, phrases=phrases, vectors=self.vectors[rows], hubs=self.hubs[rows])
@@ -126,11 +127,8 @@ def build_words(field: LanguageField, phrases: tuple[str, ...], vectors: Array) 
 def build_attributes(field: LanguageField, phrases: tuple[str, ...], vectors: Array) -> WordScores:
     """Words of which a thing has one, such as colours: V phrases and their (V, D) unit vectors. Few and all
     of one kind, they are no hubs."""
-    none, scale = (
-        np.zeros(len(vectors), np.float32),
-        ATTRIBUTE_SCALE / _spread(field, vectors, meanings(field)),
-    )
-    return WordScores(phrases, vectors.astype(np.float32), none, scale)
+    scale = ATTRIBUTE_SCALE / _spread(field, vectors, meanings(field))
+    return WordScores(phrases, vectors.astype(np.float32), np.zeros(len(vectors), np.float32), scale)
 
 
 def _spread(field: LanguageField, vectors: Array, bank: Array) -> float:
@@ -169,7 +167,7 @@ def certain(words: WordScores, codec: Codec, latents: Array, weights: Array) -> 
     return Word(words.phrases[best], float(shares[best])) if shares[best] >= CERTAIN else None
 
 
-# The inventory of a scene: what is in it, where, how sure.
+# The inventory of a scene: every word that is true in it, where, how sure.
 #
 # Every meaning of the scene has its best word, and so every Gaussian. Words that cover enough of the surface
 # are candidates; those that claim the same meanings are one thing by two names ("mug" and "cup"); and what is
@@ -182,13 +180,7 @@ SAME = 0.5  # overlap of claims from which two words name the same thing
 LIKELY = 0.5  # probability from which a word is listed
 RUNNERS_UP = 5  # words per meaning that may be names for it
 MOST = 200  # candidates per level, the largest first
-
-LEVEL_NAMES: tuple[LevelChoice, ...] = (
-    "subpart",
-    "part",
-    "whole",
-)  # `LEVELS`, as `QueryEngine.run` takes them
-Attributes = tuple[WordScores | None, WordScores | None]  # colours, materials
+ATTRIBUTES: tuple[Bundled, ...] = ("colours", "materials")
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,35 +229,6 @@ class _Claim:
     phrases: tuple[str, ...]  # the most claimed first
     rows: Array  # (M,) int64 numbers of the Gaussians for which one of them is the best
     probability: float
-
-
-def take_inventory(
-    engine: QueryEngine,
-    words: Sequence[WordScores],
-    attributes: Attributes,
-    areas: Array,
-    progress: Progress = silent,
-) -> list[Entry]:
-    """Every word that is true in the scene, whole things first, then by surface. A word is listed once, at
-    the coarsest level where it is claimed and found.
-
-    words: of each level; areas: (N,) as of `surface_areas`.
-    """
-    field = engine.field
-    held = field_meanings(field)
-    entries: list[Entry] = []
-    named: set[str] = set()
-    for level in reversed(range(len(LEVELS))):
-        claims = list(_claims(field, held, words[level], level, areas))
-        for done, claim in enumerate(claims):
-            progress(f"checking words: {LEVELS[level]}", done / len(claims))
-            if named.isdisjoint(claim.phrases):
-                entry = _verified(engine, words[level], attributes, areas, claim)
-                if entry is not None:
-                    entries.append(entry)
-                    named.update(claim.phrases)
-        progress(f"checking words: {LEVELS[level]}", 1.0)
-    return entries
 
 
 def field_meanings(field: LanguageField) -> Meanings:
@@ -331,63 +294,12 @@ def same_things(names: Array, surface: Array) -> list[list[int]]:
     return groups
 
 
-def _verified(
-    engine: QueryEngine, words: WordScores, attributes: Attributes, areas: Array, claim: _Claim
-) -> Entry | None:
-    """The claim as an entry under the first of its words that a query finds there; None if it finds none."""
-    level: LevelChoice = LEVEL_NAMES[claim.level]
-    for phrase in claim.phrases:
-        result = engine.run(phrase, level, vector=words.vector(phrase))
-        agreed = claim.rows[result.relevancy[claim.level, claim.rows] > FLOOR]
-        if not result.found or 2 * areas[agreed].sum() < areas[claim.rows].sum():
-            continue
-        spots = _spots(engine, attributes, areas, claim.level, agreed)
-        if spots:
-            others = tuple(other for other in claim.phrases if other != phrase)
-            share = float(sum(spot.share for spot in spots))
-            return Entry(phrase, others, claim.level, claim.probability, result.peak, share, spots)
-    return None
-
-
-def _spots(
-    engine: QueryEngine, attributes: Attributes, areas: Array, level: int, rows: Array
-) -> tuple[Spot, ...]:
-    """The connected places of Gaussians `rows` (M,), the largest first, without splinters."""
-    total = float(areas.sum())
-    surface = engine.surface
-    numbers = np.flatnonzero(np.isin(surface.rows, rows))
-    found = [surface.rows[part] for part in connected_parts(surface, numbers).each()]
-    parts = sorted(found, key=lambda part: -areas[part].sum())
-    least = LEAST_SPOT * areas[parts[0]].sum() if parts else 0.0
-    kept = [part for part in parts if len(part) >= LEAST_COUNT and areas[part].sum() >= least]
-    return tuple(_spot(engine, attributes, areas, level, part, total) for part in kept)
-
-
-def _spot(
-    engine: QueryEngine, attributes: Attributes, areas: Array, level: int, rows: Array, total: float
-) -> Spot:
-    field, weights = engine.field, np.maximum(areas[rows], 1e-300)
-    positions = engine.scene.gaussians.means[rows].astype(np.float64)
-    latents = field.latents[level, rows]
-    colour, material = (
-        None if known is None else certain(known, field.codec, latents, weights) for known in attributes
-    )
-    return Spot(
-        centre=weights @ positions / weights.sum(),
-        box=np.quantile(positions, [0.02, 0.98], axis=0),
-        rows=rows,
-        share=float(weights.sum()) / total,
-        colour=colour,
-        material=material,
-    )
-
-
-# What is here? Words for Gaussians, for a pixel, and for a whole scene.
+# Words for Gaussians, for a pixel, and for a whole scene.
 
 
 @dataclass(frozen=True)
 class Words:
-    """What a place is, at one level."""
+    """The words for a place, at one level."""
 
     level: int  # index into LEVELS
     words: tuple[Word, ...]  # the most probable first; none where nothing is known
@@ -428,10 +340,9 @@ class Describer:
         whole = np.isin(known, things)
         every = build_words(field, known, vectors)
         self.words: tuple[WordScores, WordScores, WordScores] = (every, every, every.take(whole))
-        self._colours = self._attributes("colours", progress)
-        self._materials = self._attributes("materials", progress)
+        self._attributes = [self._attribute(name, progress) for name in ATTRIBUTES]
 
-    def _attributes(self, name: Bundled, progress: Progress) -> WordScores | None:
+    def _attribute(self, name: Bundled, progress: Progress) -> WordScores | None:
         known, vectors = self.engine.known_vectors(bundled_vocabulary(name), progress)
         return build_attributes(self.engine.field, known, vectors) if known else None
 
@@ -465,26 +376,83 @@ class Describer:
     def at_pixel(
         self, rasterizer: LiftingRasterizer, camera: Camera, pixel: tuple[int, int], top: int = 5
     ) -> Levels:
-        """Words for what `camera` sees at `pixel` (column, row): every Gaussian's words count by its blending
-        weight there. A pixel that is mostly empty has no words.
+        """Words for what `camera` sees at `pixel` (column, row), see `look_at_pixel`. A pixel that is mostly
+        empty has none.
 
-        Raises InputError for a pixel outside the picture.
+        Raises InputError for a pixel outside the image.
         """
         column, row = pixel
         if not (0 <= column < camera.width and 0 <= row < camera.height):
             raise InputError(
-                f"pixel {column} {row}: the picture has columns 0 to {camera.width - 1} and rows 0 to "
+                f"pixel {column} {row}: the image has columns 0 to {camera.width - 1} and rows 0 to "
                 f"{camera.height - 1}"
             )
-        scene = self.engine.scene
-        rows, weights = pixel_weights(rasterizer, scene.gaussians, camera, pixel, scene.raster_settings())
-        if weights.sum() <= PictureConfig().alpha_gate:
-            rows, weights = rows[:0], weights[:0]
-        return self.at_gaussians(rows, weights, top)
+        found = look_at_pixel(rasterizer, self, camera, pixel, top=top)
+        return self.at_gaussians(np.zeros(0, np.int64)) if found is None else found.words
 
     def inventory(self, progress: Progress = silent) -> list[Entry]:
-        """What is in the scene, see `query.inventory`."""
-        return take_inventory(self.engine, self.words, (self._colours, self._materials), self.areas, progress)
+        """Every word that is true in the scene, whole things first, then by surface. A word is listed once,
+        at the coarsest level where it is claimed and found."""
+        held = field_meanings(self.engine.field)
+        entries: list[Entry] = []
+        named: set[str] = set()
+        for level in reversed(range(len(LEVELS))):
+            claims = list(_claims(self.engine.field, held, self.words[level], level, self.areas))
+            for done, claim in enumerate(claims):
+                progress(f"checking words: {LEVELS[level]}", done / len(claims))
+                if named.isdisjoint(claim.phrases):
+                    entry = self._verified(claim)
+                    if entry is not None:
+                        entries.append(entry)
+                        named.update(claim.phrases)
+            progress(f"checking words: {LEVELS[level]}", 1.0)
+        return entries
+
+    def _verified(self, claim: _Claim) -> Entry | None:
+        """The claim as an entry under the first of its words that a query finds there, if any."""
+        areas, level = self.areas, claim.level
+        for phrase in claim.phrases:
+            vector = self.words[level].vector(phrase)
+            result = self.engine.run(phrase, get_args(LevelChoice)[1 + level], vector=vector)  # after "auto"
+            agreed = claim.rows[result.relevancy[level, claim.rows] > FLOOR]
+            if not result.found or 2 * areas[agreed].sum() < areas[claim.rows].sum():
+                continue
+            spots = tuple(self._spot(level, part) for part in self._solid(agreed))
+            if spots:
+                others = tuple(other for other in claim.phrases if other != phrase)
+                share = float(sum(spot.share for spot in spots))
+                return Entry(phrase, others, level, claim.probability, result.peak, share, spots)
+        return None
+
+    def _solid(self, rows: Array) -> list[Array]:
+        """The connected parts of Gaussians `rows` (M,), the largest first, without splinters."""
+        surface, areas = self.engine.surface, self.areas
+        numbers = np.flatnonzero(np.isin(surface.rows, rows))
+        found = [surface.rows[part] for part in surface.parts(numbers).each()]
+        parts = sorted(found, key=lambda part: -areas[part].sum())
+        least = LEAST_SPOT * areas[parts[0]].sum() if parts else 0.0
+        return [part for part in parts if len(part) >= LEAST_COUNT and areas[part].sum() >= least]
+
+    def _spot(self, level: int, rows: Array) -> Spot:
+        weights = np.maximum(self.areas[rows], 1e-300)
+        positions = self.engine.scene.gaussians.means[rows].astype(np.float64)
+        colour, material = self._looks(self.engine.field.latents[level, rows], weights)
+        return Spot(
+            centre=weights @ positions / weights.sum(),
+            box=axis_aligned_box(positions),
+            rows=rows,
+            share=float(weights.sum()) / float(self.areas.sum()),
+            colour=colour,
+            material=material,
+        )
+
+    def _looks(self, latents: Array, weights: Array) -> tuple[Word | None, Word | None]:
+        """Colour and material of (M, d) latents with a meaning, weighted by (M,)."""
+        codec = self.engine.field.codec
+        colour, material = (
+            None if words is None else certain(words, codec, latents, weights) for words in self._attributes
+        )
+        return colour, material
 
     def _at_level(self, level: int, rows: Array, weights: Array, top: int) -> Words:
         field = self.engine.field
@@ -496,21 +464,12 @@ class Describer:
         names = self.words[level]
         shares = names.mixture(field.codec, latents, weights)
         best = np.argsort(-shares[: len(names.phrases)], kind="stable")[: max(top, 0)]
-        colour, material = (
-            None if words is None else certain(words, field.codec, latents, weights)
-            for words in (self._colours, self._materials)
-        )
-        return Words(
-            level=level,
-            words=tuple(Word(names.phrases[i], float(shares[i])) for i in best),
-            other=float(shares[len(names.phrases) :].sum()),
-            known=seen / total,
-            colour=colour,
-            material=material,
-        )
+        words = tuple(Word(names.phrases[i], float(shares[i])) for i in best)
+        other = float(shares[len(names.phrases) :].sum())
+        return Words(level, words, other, seen / total, *self._looks(latents, weights))
 
 
-# What lies under one pixel: where it is, what it is called, and how relevant it is to what was asked.
+# The surface under one pixel: where it is, what it is called, and how relevant it is to what was asked.
 
 
 @dataclass(frozen=True, eq=False)
@@ -532,7 +491,7 @@ def look_at_pixel(
     top: int = 3,
     settings: RasterSettings | None = None,
 ) -> Pointed | None:
-    """What `camera` sees at `pixel` (column, row) of its picture; None where that is mostly empty.
+    """The surface that `camera` sees at `pixel` (column, row) of its image; None where that is mostly empty.
 
     Every Gaussian counts by its blending weight there; the surface is at the median of their depths, as the
     rasterizers have it. `settings` of image formation: by default the scene's own.
@@ -558,7 +517,7 @@ def look_at_pixel(
     )
 
 
-# What can be asked of a scene: examples that it answers, and phrases that begin like what is being typed.
+# Suggestions of what to ask: examples that a scene answers, and phrases that begin like what is being typed.
 
 EXAMPLES = 6
 TRIES = 4  # candidates that are asked for each example wanted

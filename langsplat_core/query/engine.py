@@ -1,4 +1,4 @@
-"""Answering phrases on a scene: encode, look up, read (`answers`)."""
+"""Phrases asked of a scene: encoded, looked up at every Gaussian, and read (`answers`)."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -9,7 +9,6 @@ from typing import Protocol
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.compiled import plain
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.io.language import SUFFIX
@@ -40,7 +39,7 @@ NO_FIELD = "this scene has no language field: it can be looked at, not searched;
 
 
 def no_field(scene: Scene) -> str:
-    """Why a scene without a language field has none."""
+    """The reason why a scene has no language field."""
     unread = [reason for reason in scene.unread if SUFFIX in reason]
     return f"it can be looked at, not searched: {unread[0]}" if unread else NO_FIELD
 
@@ -60,7 +59,7 @@ class TextEncoder(Protocol):
 
 @dataclass(frozen=True)
 class Basis:
-    """What the answers in a scene stand on, for people."""
+    """The encoder and calibration that the answers in a scene stand on, for people."""
 
     encoder: str  # as the scene names it
     calibration: str | None  # where percentages were seen to hold; None: there are none
@@ -87,8 +86,8 @@ class QueryEngine:
         rule: AnswerRule = "regions",
     ) -> None:
         """load_encoder: usually `semantics.encoders.load_text_encoder`; without one only the scene's own
-        phrasebook can be asked. encoder_id: in place of the encoder that the scene names. exact: decode at
-        every Gaussian instead of looking up, 2 KB each, to measure the table by. rule: see `answers`;
+        phrasebook can be asked. encoder_id: in place of the encoder that the scene names. exact: compare
+        every latent instead of looking it up in a table, to measure the table by. rule: see `answers`;
         "regions" becomes "peak" where neither scene nor encoder has everyday phrases to compare with."""
         self.scene = scene
         self.exact = exact
@@ -123,14 +122,14 @@ class QueryEngine:
 
     @property
     def calibration(self) -> Calibration | None:
-        """By which a probability is said; None where the encoder has none, and with other canonical phrases
+        """The calibration of probabilities; None where the encoder has none, and with other canonical phrases
         than those it was fitted with."""
         usual = self._canonical is None and self.rule == "regions"
         return self.field.reading.calibration if usual else None
 
     @property
     def basis(self) -> Basis:
-        """What answers stand on, by what is known so far: nothing is loaded for it."""
+        """The basis of answers, by what is known so far: nothing is loaded for it."""
         field = self.field
         everyday = None if self._rule == "peak" else self.__dict__.get("_everyday", _enough(field.everyday))
         name, calibration = field.encoder_id, None
@@ -158,12 +157,8 @@ class QueryEngine:
         """The scene's own everyday phrases, else the encoder's; None where the rule needs none."""
         if self._rule == "peak":
             return None
-        stored = self.field.everyday
-        if stored is None:
-            return self._encoded_everyday()
-        return _enough(stored)
-
-    def _encoded_everyday(self) -> Array | None:
+        if self.field.everyday is not None:
+            return _enough(self.field.everyday)
         try:
             encoder = self.load_encoder()
             self._check_encoder(encoder)
@@ -184,11 +179,6 @@ class QueryEngine:
         for made in ("_lookup", "chance", "_bars"):
             self.__dict__.pop(made, None)
 
-    @property
-    def encoder(self) -> TextEncoder:
-        """The text encoder, see `load_encoder`."""
-        return self.load_encoder()
-
     def load_encoder(self, progress: Progress = silent) -> TextEncoder:
         """The text encoder, loaded at the first call, which imports torch: seconds.
 
@@ -207,7 +197,7 @@ class QueryEngine:
 
     @cached_property
     def surface(self) -> Surface:
-        """What the scene's Gaussians lie on; built when first needed, a tenth of a second at 80k."""
+        """The surface of the scene's Gaussians; built when first needed, a tenth of a second at 80k."""
         return build_surface(self.scene.gaussians)
 
     @cached_property
@@ -221,7 +211,7 @@ class QueryEngine:
 
     @cached_property
     def chance(self) -> Chance | None:
-        """What everyday phrases fit in the scene; None where there are none."""
+        """The fits of everyday phrases in the scene; None where there are none."""
         everyday = self.scale.everyday
         if everyday is None:
             return None
@@ -233,7 +223,7 @@ class QueryEngine:
         return None if self.chance is None else self.chance.bars()
 
     def chance_among(self, members: Array) -> Bars:
-        """What the best fits of everyday phrases are at the regions of some Gaussians, (N,) bool."""
+        """The best fits of everyday phrases at the regions of some Gaussians, (N,) bool."""
         assert self.chance is not None
         everywhere = self.regions.everywhere[:, members]
         subpart, part, whole = (np.unique(row[row >= 0]) for row in everywhere)
@@ -244,7 +234,7 @@ class QueryEngine:
         `load_encoder` raises it."""
         if phrase_key(phrase) in self.field.phrasebook:
             return ()
-        return self.encoder.unknown_words(phrase_key(phrase))
+        return self.load_encoder().unknown_words(phrase_key(phrase))
 
     def text_vector(self, phrase: str, progress: Progress = silent) -> Array:
         """(D,) unit vector of a phrase: from the scene's phrasebook, else from the encoder.
@@ -257,51 +247,59 @@ class QueryEngine:
 
     def text_vectors(self, phrases: Sequence[str], progress: Progress = silent) -> Array:
         """(Q, D) unit vectors of phrases, encoded together. Raises as `text_vector`."""
-        book, keys = self.field.phrasebook, [phrase_key(phrase) for phrase in phrases]
-        fresh = [key for key in dict.fromkeys(keys) if key not in book and key not in self._encoded]
+        keys = list(map(phrase_key, phrases))
+        fresh = self._fresh(keys)
         for key in fresh:
             check_names(key.split())
         if fresh:
             encoder = self.load_encoder(progress)
             with self._turn:
                 _check_words(encoder, fresh)
-                for start in range(0, len(fresh), BATCH):
-                    batch = fresh[start : start + BATCH]
-                    self._encoded.update(zip(batch, self._encode(encoder, batch), strict=True))
-        return np.stack([book[key] if key in book else self._encoded[key] for key in keys])
+                self._encode(encoder, fresh)
+        return self._vectors(keys)
 
     def known_vectors(
         self, phrases: Iterable[str], progress: Progress = silent
     ) -> tuple[tuple[str, ...], Array]:
-        """Those of `phrases` whose words the encoder was taught, each once as `phrase_key` has it, and their
+        """The `phrases` whose words the encoder was taught, each once as `phrase_key` has it, and their
         (V, D) unit vectors: from the phrasebook, else encoded together. Raises EncoderError for an encoder
         that is not the scene's, or one that cannot be loaded."""
-        book, keys = self.field.phrasebook, tuple(dict.fromkeys(map(phrase_key, phrases)))
-        fresh = [key for key in keys if key not in book and not only(STOP_WORDS, key.split())]
-        known = dict(book)
+        keys = tuple(dict.fromkeys(map(phrase_key, phrases)))
+        fresh = [key for key in self._fresh(keys) if not only(STOP_WORDS, key.split())]
         if fresh:
             encoder = self.load_encoder(progress)
             progress("loading the text encoder", 1.0)
-            fresh = [key for key in fresh if not encoder.unknown_words(key)]
-        for start in range(0, len(fresh), BATCH):
-            batch = fresh[start : start + BATCH]
-            known.update(zip(batch, self._encode(encoder, batch), strict=True))
-            progress("reading the vocabulary", (start + len(batch)) / len(fresh))
-        found = tuple(key for key in keys if key in known)
-        nothing = np.zeros((0, self.field.codec.vector_dim), np.float32)
-        return found, np.stack([known[key] for key in found]) if found else nothing
+            self._encode(encoder, [key for key in fresh if not encoder.unknown_words(key)], progress)
+        unknown = set(self._fresh(keys))
+        known = tuple(key for key in keys if key not in unknown)
+        return known, self._vectors(known)
 
-    def _encode(self, encoder: TextEncoder, keys: list[str]) -> Array:
-        """(M, D) of phrases that `encoder` knows; EncoderError where it is not the scene's."""
-        with self._turn:
-            vectors = np.asarray(encoder.encode_texts(keys), np.float32)
-        if vectors.shape[1:] != (self.field.codec.vector_dim,):
-            raise EncoderError(
-                f"the encoder gives {vectors.shape[1]} numbers, the scene was made with "
-                f"{self.field.codec.vector_dim} by {self.field.encoder_id}; give that one with --encoder"
-            )
-        self._check_encoder(encoder)
-        return vectors
+    def _fresh(self, keys: Iterable[str]) -> list[str]:
+        """The phrases that are neither in the phrasebook nor encoded yet, each once."""
+        book = self.field.phrasebook
+        return [key for key in dict.fromkeys(keys) if key not in book and key not in self._encoded]
+
+    def _vectors(self, keys: Sequence[str]) -> Array:
+        """(Q, D) of phrases of which none is fresh."""
+        book = self.field.phrasebook
+        vectors = [book[key] if key in book else self._encoded[key] for key in keys]
+        return np.stack(vectors) if vectors else np.zeros((0, self.field.codec.vector_dim), np.float32)
+
+    def _encode(self, encoder: TextEncoder, keys: Sequence[str], progress: Progress = silent) -> None:
+        """Keep the vectors of phrases that `encoder` knows; EncoderError where it is not the scene's."""
+        for start in range(0, len(keys), BATCH):
+            batch = list(keys[start : start + BATCH])
+            with self._turn:
+                vectors = np.asarray(encoder.encode_texts(batch), np.float32)
+                if vectors.shape[1:] != (self.field.codec.vector_dim,):
+                    raise EncoderError(
+                        f"the encoder gives {vectors.shape[1]} numbers, the scene was made with "
+                        f"{self.field.codec.vector_dim} by {self.field.encoder_id}; give that one with "
+                        "--encoder"
+                    )
+                self._check_encoder(encoder)
+            self._encoded.update(zip(batch, vectors, strict=True))
+            progress("reading the vocabulary", (start + len(batch)) / len(keys))
 
     def _check_encoder(self, encoder: TextEncoder) -> None:
         """EncoderError unless `encoder` turns the canonical phrases into the vectors that the scene has for
@@ -333,7 +331,7 @@ class QueryEngine:
         progress: Progress = silent,
         vector: Array | None = None,
     ) -> QueryResult:
-        """Answer `phrase`. The level is chosen once for the scene, on raw relevancy, so that the picture
+        """Answer `phrase`. The level is chosen once for the scene, on raw relevancy, so that the image
         does not flicker between levels as the camera moves. vector: (D,) unit, the phrase's own, where it is
         at hand. Raises as `text_vector` does."""
         if vector is None:
@@ -344,10 +342,10 @@ class QueryEngine:
     def run_many(
         self, phrases: Sequence[str], level: LevelChoice = "auto", progress: Progress = silent
     ) -> list[QueryResult]:
-        """What `run` answers to each of `phrases`, which are encoded and compared with the scene's meanings
+        """The answers of `run` to each of `phrases`, which are encoded and compared with the scene's meanings
         together. An answer keeps 17 bytes per Gaussian. Raises as `text_vector` does, before any is asked."""
         results: list[QueryResult] = []
-        vectors = self.text_vectors(phrases, progress) if phrases else np.zeros((0, 0))
+        vectors = self.text_vectors(phrases, progress)
         for start in range(0, len(phrases), BATCH):
             part = slice(start, start + BATCH)
             for phrase, relevancy in zip(phrases[part], self._relevancies(vectors[part]), strict=True):
@@ -362,12 +360,6 @@ class QueryEngine:
         return by_regions(
             phrase, relevancy, self.surface, self.regions, self.scale, self._bars, self.calibration, level
         )
-
-    def evened(self, relevancy: Array) -> Array:
-        """(3, N) relevancy -> the same, of every region its mean; of what is off the surface its own."""
-        regions, own = self.regions, plain(relevancy)
-        means = [values.astype(np.float32) for values in regions.means(own)]
-        return np.stack([regions.spread(level, row, own[level]) for level, row in enumerate(means)])
 
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
         """The things among the members of an answer, best first, or only so many of them."""

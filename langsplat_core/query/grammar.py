@@ -1,4 +1,4 @@
-"""What a phrase with structure says, as a tree of the phrases in it, and its reading for people."""
+"""Phrases with structure, read as a tree of the phrases in them."""
 
 import re
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ class Inside:
 
 @dataclass(frozen=True)
 class Relation:
-    """Those of `what` that stand so to one of `anchor`."""
+    """The ones of `what` that stand so to one of `anchor`."""
 
     kind: Side
     what: "Tree"
@@ -54,7 +54,7 @@ class Union:
 
 @dataclass(frozen=True)
 class Without:
-    """What is `what` and not `unwanted`."""
+    """Everything that is `what` and not `unwanted`."""
 
     what: "Tree"
     unwanted: "Tree"
@@ -79,8 +79,8 @@ def atoms(tree: Tree) -> tuple[Atom, ...]:
     return tuple(atom for child in children(tree) for atom in atoms(child))
 
 
-def reading(tree: Tree) -> str:  # noqa: PLR0911  one row of a table each
-    """How a tree was understood, such as "handle  inside  red mug"; groups in a group stand in brackets."""
+def unparse(tree: Tree) -> str:  # noqa: PLR0911  one row of a table each
+    """A tree as text, such as "handle  inside  red mug"; groups in a group stand in brackets."""
     match tree:
         case Atom(text):
             return text
@@ -100,11 +100,11 @@ def reading(tree: Tree) -> str:  # noqa: PLR0911  one row of a table each
 
 
 def _nested(tree: Tree) -> str:
-    return tree.text if isinstance(tree, Atom) else f"({reading(tree)})"
+    return tree.text if isinstance(tree, Atom) else f"({unparse(tree)})"
 
 
 def children(tree: Tree) -> tuple[Tree, ...]:
-    """What a tree is made of."""
+    """The trees that a tree is made of."""
     match tree:
         case Both(items) | Union(items):
             return items
@@ -116,7 +116,7 @@ def children(tree: Tree) -> tuple[Tree, ...]:
             return ()
 
 
-# The plain word lists by which the grammar of phrases tells a part from a thing; see `query.grammar`.
+# The word lists by which a part is told from a thing.
 
 Named = Literal["thing", "part", "part of a thing"]
 
@@ -182,13 +182,13 @@ def forms(word: str) -> tuple[str, ...]:
 
 
 def is_part(word: str) -> bool:
-    """Whether a noun, in either number, is a part of things."""
+    """True of a noun, in either number, that is a part of things."""
     return any(form in PARTS for form in forms(word))
 
 
 def named(phrase: str) -> Named:
-    """What a phrase without structure names: "red mug" a thing, "red handle" and "keyboard" a part, "mug
-    handle" a part of a thing."""
+    """Kind of what a phrase without structure names: "red mug" a thing, "red handle" and "keyboard" a part,
+    "mug handle" a part of a thing."""
     *before, last = phrase.split() or [""]
     if not is_part(last):
         return "thing"
@@ -196,12 +196,12 @@ def named(phrase: str) -> Named:
 
 
 def is_measure(word: str) -> bool:
-    """Whether a noun, in either number, holds or counts what follows "of"."""
+    """True of a noun, in either number, that holds or counts what follows "of"."""
     return any(form in MEASURES for form in forms(word))
 
 
 def only(words: frozenset[str], tokens: Sequence[str]) -> bool:
-    """Whether all `tokens` are among `words`, whatever their case; true of none."""
+    """True if all `tokens` are among `words`, whatever their case; so also of no tokens."""
     return all(token.lower() in words for token in tokens)
 
 
@@ -231,8 +231,7 @@ def check_names(words: Sequence[str]) -> None:
 # Y), not "children's book" (Y owns X), not "red handle" (Y only describes). "Y without X", X a part word,
 # leaves out the X inside Y. Words that only describe are no thing, so that "red and blue ball" stays whole.
 # Wherever a side of a construction would name nothing, the grammar finds nothing there, and the words are
-# asked as one phrase. A line of several queries is separated by `scene.phrases.split_phrases`. Word lists
-# are in `query.vocabulary`.
+# asked as one phrase. A line of several queries is separated by `split_phrases`.
 
 MAX_CHARACTERS = 400
 MAX_ATOMS = 12  # each is asked for itself
@@ -356,7 +355,7 @@ def _split(tokens: list[str], marks: tuple[str, ...]) -> list[list[str]]:
 
 
 def _names(tokens: list[str]) -> bool:
-    """Whether the words name a thing: more than stop words and descriptions."""
+    """True of words that name a thing: more than stop words and descriptions."""
     words = [token for token in tokens if token != ","]
     return not only(_EMPTY, words) or (bool(words) and words[-1].lower() in ALSO_NOUNS)
 
@@ -417,6 +416,6 @@ def _thing(tokens: list[str]) -> Tree:
 
 
 def _without_articles(tokens: list[str]) -> list[str]:
-    """Without the articles at the beginning, unless there is nothing else."""
+    """The tokens without articles at the beginning, unless there is nothing else."""
     first = next((at for at, token in enumerate(tokens) if token.lower() not in ARTICLES), 0)
     return tokens[first:]

@@ -1,4 +1,4 @@
-"""Boxes around points: along the world's axes, and along the points' own."""
+"""Instances of an answer: its Gaussians, taken apart where the surface is, with boxes, scores and hulls."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from langsplat_core.arrays import Array, sigmoid
-from langsplat_core.compiled import kernel, plain
+from langsplat_core.compiled import plain
 from langsplat_core.errors import InputError
 from langsplat_core.query.surface import Surface
 from langsplat_core.scene import Gaussians
@@ -47,7 +47,7 @@ def axis_aligned_box(points: Array) -> Array:
 
 
 def oriented_box(points: Array) -> OrientedBox:
-    """Around (M, 3) points, M >= 1, between the `INNER` quantiles along each of its axes.
+    """Box around (M, 3) points, M >= 1, between the `INNER` quantiles along each of its axes.
 
     The axes begin as the principal ones of the points that are no strays, and are then turned about one
     another to the least area of the box's faces: principal axes alone say nothing about how a square, a cube
@@ -106,8 +106,6 @@ def _right_handed(axes: Array) -> Array:
     return axes * signs
 
 
-# The instances of an answer: its Gaussians, taken apart where the surface is, with place, size and score.
-#
 # Two members belong to one instance when a walk over linked members of the surface leads from one to the
 # other. What is too faint to be on the surface belongs where the surface Gaussian nearest to it belongs.
 
@@ -116,7 +114,6 @@ CRUMB_SHARE = 0.01  # of the largest instance's extent on the surface
 EQUAL_SCORES = 1e-3  # of relevancy: instances this close are as good, and the larger comes first
 BOXED = 2048  # members, at most, that a box is taken from
 _FLAT = -100.0  # logarithm of a scale, instead of -infinity
-_OUTSIDE, _WAITING = -1, -2  # labels that are no part
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,19 +149,6 @@ class Instance:
         return size
 
 
-@dataclass(frozen=True, eq=False)
-class Parts:
-    """The C connected parts of some members of a surface, with the members part by part."""
-
-    order: Array  # (K,) int32 numbers on the surface
-    starts: Array  # (C,) int32 where each part begins in `order`
-    labels: Array  # (M,) int32 part of every Gaussian of the surface; -1 for those that are no members
-
-    def each(self) -> list[Array]:
-        """The numbers of every part, ascending."""
-        return [np.sort(part) for part in np.split(self.order, self.starts[1:])] if len(self.starts) else []
-
-
 def find_instances(
     surface: Surface, gaussians: Gaussians, members: Array, relevancy: Array, at_most: int | None = None
 ) -> tuple[Instance, ...]:
@@ -181,11 +165,9 @@ def find_instances(
     visible = surface.rows[numbers] == rows
     if not visible.any():
         return ()
-    parts = connected_parts(surface, numbers[visible])
+    parts = surface.parts(numbers[visible])
     values = plain(relevancy)
-    smoothed = np.empty(len(parts.order), np.float32)
-    _smooth_some(parts.order, surface.neighbours, surface.rows, surface.weights, values, smoothed)
-    scores = np.maximum.reduceat(smoothed, parts.starts)
+    scores = np.maximum.reduceat(surface.smooth(values, parts.order), parts.starts)
     labels = parts.labels[numbers]  # -1: faint ones beside something else
     sizes = _extent(gaussians, every)
     extents = np.bincount(labels + 1, sizes[near], len(parts.starts) + 1)[1:]
@@ -196,16 +178,6 @@ def find_instances(
         share = extents[part] / max(sizes.sum(), 1e-300)
         found.append(_instance(surface, own, rows[labels == part], values, float(scores[part]), share))
     return tuple(found)
-
-
-def connected_parts(surface: Surface, numbers: Array) -> Parts:
-    """Of some Gaussians of the surface, given by their numbers (K,), in [0, M), each once."""
-    labels = np.full(len(surface.rows), _OUTSIDE, np.int32)
-    labels[numbers] = _WAITING
-    order, starts = np.empty(len(numbers), np.int32), np.empty(len(numbers), np.int32)
-    links = surface.links
-    count = _label(links.indptr, links.indices, numbers, labels, order, starts)
-    return Parts(order, starts[:count].copy(), labels)
 
 
 def _ranked(scores: Array, extents: Array, counts: Array) -> Array:
@@ -241,44 +213,6 @@ def _extent(gaussians: Gaussians, rows: Array) -> Array:
     return opacity * np.exp(x + y + z - np.minimum(np.minimum(x, y), z))
 
 
-@kernel
-def _label(indptr: Array, indices: Array, numbers: Array, labels: Array, order: Array, starts: Array) -> int:
-    """Number the parts of `numbers`, which are `_WAITING` in `labels`, breadth first; how many parts."""
-    parts = found = done = 0
-    for seed in numbers:
-        if labels[seed] != _WAITING:
-            continue
-        starts[parts] = found
-        labels[seed] = parts
-        order[found] = seed
-        found += 1
-        while done < found:
-            here = order[done]
-            done += 1
-            for entry in range(indptr[here], indptr[here + 1]):
-                there = indices[entry]
-                if labels[there] == _WAITING:
-                    labels[there] = parts
-                    order[found] = there
-                    found += 1
-        parts += 1
-    return parts
-
-
-@kernel
-def _smooth_some(
-    chosen: Array, neighbours: Array, rows: Array, weights: Array, values: Array, smoothed: Array
-) -> None:
-    """What `Surface.smooth` gives for `chosen` numbers and one level."""
-    for i in range(len(chosen)):
-        value = total = np.float32(0)
-        for k in range(neighbours.shape[1]):
-            j = neighbours[chosen[i], k]
-            value += weights[j] * values[rows[j]]
-            total += weights[j]
-        smoothed[i] = value / total
-
-
 # The convex hull of an instance, as a closed mesh.
 
 FEW = 8  # Gaussians in the box: of so few none is a stray
@@ -296,12 +230,12 @@ class Mesh:
 
 
 def hulls(things: Sequence[Instance], gaussians: Gaussians, colours: Array, name: str) -> tuple[Mesh, ...]:
-    """One around each, named `name` and its number from 1 on. Arguments and errors as of `hull`."""
+    """One hull around each, named `name` and its number from 1 on. Arguments and errors as of `hull`."""
     return tuple(hull(thing, gaussians, colours, f"{name} {k}") for k, thing in enumerate(things, 1))
 
 
 def hull(instance: Instance, gaussians: Gaussians, colours: Array, name: str) -> Mesh:
-    """Around the instance's Gaussians that lie in its oriented box: strays would stretch it.
+    """Hull around the instance's Gaussians that lie in its oriented box: strays would stretch it.
 
     colours: (N, 3) of the scene's Gaussians, in [0, 1]; the mesh has the mean of its own. Raises InputError
     where all lie at one point.

@@ -1,9 +1,9 @@
-"""A phrase as a small table: relevancy over the sphere of latents.
+"""Relevancy of phrases at every Gaussian, by what the scene's codec allows, and at every pixel.
 
-With d = 3 and unit latents, the relevancy of one phrase is a function on the sphere. The decoder is run
-once per scene at the nodes of an octahedral grid that its latents lie between; after that a phrase costs one
-matrix-vector product, and every Gaussian looks its value up by bilinear interpolation at a place computed
-once.
+A codebook gives an exact answer for a fetch. Of unit latents of three numbers, the relevancy of a phrase is
+a function on the sphere: the decoder is run once per scene at the nodes of an octahedral grid that its
+latents lie between; after that a phrase costs one matrix-vector product, and every Gaussian a bilinear
+interpolation at a place computed once. What is left is compared latent by latent, exactly.
 """
 
 from collections.abc import Iterator
@@ -23,24 +23,59 @@ from langsplat_core.scene.codec import meaningful
 from langsplat_core.semantics.relevancy import Scale, latent_relevancy, relevancy_of
 
 RESOLUTION = 256  # nodes per side; error against exact decoding falls with its square
+TOGETHER = 16  # phrases compared with every latent at a time: 12 bytes each per Gaussian
+CHUNK = 16_384  # latents that are compared with texts at a time
 
 
-def octahedral_to_sphere(uv: Array) -> Array:
-    """(..., 2) in [0, 1]^2 -> (..., 3) unit vectors; the square's border is the lower hemisphere's pole."""
-    xy = 2 * np.asarray(uv, np.float64) - 1
-    z = 1 - np.abs(xy).sum(-1)
-    folded = (1 - np.abs(xy[..., ::-1])) * np.where(xy >= 0, 1, -1)
-    xy = np.where((z < 0)[..., None], folded, xy)
-    vectors = np.concatenate([xy, z[..., None]], -1)
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+class Lookup(Protocol):
+    """Everything about a language field that does not depend on the phrase."""
+
+    def relevancies(self, phrases: Array) -> Iterator[Array]:
+        """(Q, D) unit phrase vectors -> of each in turn (3 N,) float32 relevancy; 0 where a Gaussian has no
+        meaning. What can be computed for all phrases together is."""
 
 
-def sphere_to_octahedral(vectors: Array) -> Array:
-    """(..., 3) non-zero vectors -> (..., 2) in [0, 1]^2; inverse of `octahedral_to_sphere`."""
-    scaled = vectors / np.abs(vectors).sum(-1, keepdims=True)
-    xy, z = scaled[..., :2], scaled[..., 2]
-    folded = (1 - np.abs(xy[..., ::-1])) * np.where(xy >= 0, 1, -1)
-    return (np.where((z < 0)[..., None], folded, xy) + 1) / 2
+def build_lookup(field: LanguageField, scale: Scale, exact: bool = False) -> Lookup:
+    """The fastest lookup for `field`; with `exact` none that interpolates, to measure a table by."""
+    if field.codec.space == "index":
+        return CodeLookup(field, scale)
+    if not exact and field.codec.latent_dim == 3 and field.codec.space == "sphere":
+        latents = np.where(field.known[..., None], field.latents, 0)
+        return build_table(field.codec, latents.reshape(-1, 3), scale)
+    return LatentLookup(field, scale)
+
+
+class Vectors:
+    """K unit vectors of meanings, with the zero and rate of relevancy at each."""
+
+    def __init__(self, vectors: Array, scale: Scale) -> None:
+        self.vectors = vectors  # (K, D) float32
+        self._zero, self._rate = scale.of(vectors @ scale.texts.T)
+
+    def relevancies(self, phrases: Array) -> Array:
+        """(Q, D) unit phrase vectors -> (K, Q) in (0, 1)."""
+        return relevancy_of(self.vectors @ phrases.T, self._zero[:, None], self._rate[:, None])
+
+
+def codewords(codec: Codec, scale: Scale) -> Vectors:
+    """All K codewords of a codebook."""
+    return Vectors(codec.decode(np.arange(codec.index_size, dtype=np.uint16)[:, None]), scale)
+
+
+class CodeLookup:
+    """K relevancies of codewords, and a fetch per Gaussian: exact."""
+
+    def __init__(self, field: LanguageField, scale: Scale) -> None:
+        self._codewords = codewords(field.codec, scale)
+        codes = np.where(field.known, field.latents[..., 0], field.codec.index_size)
+        self._codes = codes.astype(np.uint16).reshape(-1)
+
+    def relevancies(self, phrases: Array) -> Iterator[Array]:
+        """See `Lookup`."""
+        for row in self._codewords.relevancies(phrases).T:
+            found = np.empty(len(self._codes), np.float32)
+            shared_workers().run(_fetch, len(found), plain(np.append(row, 0)), self._codes, found)
+            yield found
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,35 +83,24 @@ class SphereTable:
     """Decoded vectors at the U nodes of R x R that are needed, and where M latents lie between them."""
 
     used: Array  # (U,) int64 index of each node in the grid, row-major
-    vectors: Array  # (U, D) float32 decoded unit vectors
-    zero: Array  # (U,) cosine of relevancy 0.5, see `chance.Scale`
-    rate: Array  # (U,)
+    nodes: Vectors  # of what they decode to
     corner: Array  # (M,) int32 index of the lower left node; -1 for a latent without meaning
     fraction: Array  # (M, 2) float32 position inside the cell, in [0, 1]
     resolution: int
 
     def relevancies(self, phrases: Array) -> Iterator[Array]:
-        """(Q, D) unit phrase vectors -> of each in turn (M,) float32 relevancy; 0 where the latent has no
-        meaning."""
-        values = relevancy_of(self.vectors @ phrases.T, self.zero[:, None], self.rate[:, None])
-        nodes = np.zeros(self.resolution**2, np.float32)
-        for row in values.T:
-            nodes[self.used] = row
+        """See `Lookup`."""
+        grid = np.zeros(self.resolution**2, np.float32)
+        for row in self.nodes.relevancies(phrases).T:
+            grid[self.used] = row
             found = np.empty(len(self.corner), np.float32)
-            arguments = nodes, self.corner, self.fraction, self.resolution, found
+            arguments = grid, self.corner, self.fraction, self.resolution, found
             shared_workers().run(_interpolate, len(found), *arguments)
             yield found
 
 
-def suits_table(codec: Codec) -> bool:
-    """Whether the codec's latents lie on a sphere."""
-    return codec.latent_dim == 3 and codec.space == "sphere"
-
-
 def build_table(codec: Codec, latents: Array, scale: Scale, resolution: int = RESOLUTION) -> SphereTable:
-    """Tabulate `codec` for (M, 3) latents; those of no length have no meaning."""
-    if not suits_table(codec):
-        raise ValueError(f"a sphere table needs unit latents of 3 numbers; {codec.kind} has others")
+    """Tabulate a `codec` of unit latents for (M, 3) latents; those of no length have no meaning."""
     known = meaningful(codec, latents)
     safe = np.where(known[:, None], latents, (0.0, 0.0, 1.0)).astype(np.float64)
     position = sphere_to_octahedral(safe) * (resolution - 1)
@@ -87,17 +111,73 @@ def build_table(codec: Codec, latents: Array, scale: Scale, resolution: int = RE
         needed[corner[known] + step] = True
     used = np.flatnonzero(needed)
     grid = np.stack([used % resolution, used // resolution], 1) / (resolution - 1)
-    vectors = codec.decode(octahedral_to_sphere(grid).astype(np.float32))
-    zero, rate = scale.of(vectors @ scale.texts.T)
     return SphereTable(
         used=used,
-        vectors=vectors,
-        zero=zero,
-        rate=rate,
+        nodes=Vectors(codec.decode(octahedral_to_sphere(grid).astype(np.float32)), scale),
         corner=np.where(known, corner, -1).astype(np.int32),
         fraction=(position - cell).astype(np.float32),
         resolution=resolution,
     )
+
+
+def octahedral_to_sphere(uv: Array) -> Array:
+    """(..., 2) in [0, 1]^2 -> (..., 3) unit vectors; the square's border is the lower hemisphere's pole."""
+    xy = 2 * np.asarray(uv, np.float64) - 1
+    z = 1 - np.abs(xy).sum(-1)
+    vectors = np.concatenate([_folded(xy, z), z[..., None]], -1)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def sphere_to_octahedral(vectors: Array) -> Array:
+    """(..., 3) non-zero vectors -> (..., 2) in [0, 1]^2; inverse of `octahedral_to_sphere`."""
+    scaled = vectors / np.abs(vectors).sum(-1, keepdims=True)
+    return (_folded(scaled[..., :2], scaled[..., 2]) + 1) / 2
+
+
+def _folded(xy: Array, z: Array) -> Array:
+    """The square's corners turned out where z < 0, or back in."""
+    return np.where((z < 0)[..., None], (1 - np.abs(xy[..., ::-1])) * np.where(xy >= 0, 1, -1), xy)
+
+
+@dataclass(frozen=True, eq=False)
+class LatentLookup:
+    """Every latent compared, in bounded memory: exact."""
+
+    field: LanguageField
+    scale: Scale
+
+    @cached_property
+    def _read(self) -> tuple[Array, Array, Array]:
+        """Rows of (3 N,) with a meaning, and the (M,) zero and rate of each."""
+        field = self.field
+        rows = np.flatnonzero(field.known)
+        latents = field.latents.reshape(-1, field.latents.shape[-1])
+        zero, rate = np.empty(len(rows), np.float32), np.empty(len(rows), np.float32)
+        for start in range(0, len(rows), CHUNK):
+            part = slice(start, start + CHUNK)
+            cosines = field.codec.similarities(latents[rows[part]], self.scale.texts)
+            zero[part], rate[part] = self.scale.of(cosines)
+        return rows, zero, rate
+
+    def relevancies(self, phrases: Array) -> Iterator[Array]:
+        """See `Lookup`."""
+        field, (rows, zero, rate) = self.field, self._read
+        latents = field.latents.reshape(-1, field.latents.shape[-1])
+        for first in range(0, len(phrases), TOGETHER):
+            some = phrases[first : first + TOGETHER]
+            values = np.zeros((len(some), len(latents)), np.float32)
+            for start in range(0, len(rows), CHUNK):
+                part = slice(start, start + CHUNK)
+                cosines = field.codec.similarities(latents[rows[part]], some)
+                values[:, rows[part]] = relevancy_of(cosines, zero[part, None], rate[part, None]).T
+            yield from values
+
+
+@kernel
+def _fetch(first: int, last: int, values: Array, codes: Array, found: Array) -> None:
+    """Rows [first, last) of `found` (3 N,)."""
+    for i in range(first, last):
+        found[i] = values[codes[i]]
 
 
 @kernel
@@ -116,135 +196,9 @@ def _interpolate(
         found[i] = low * (one - v) + high * v
 
 
-# How the relevancy of one phrase is found at every Gaussian, by what the scene's codec allows.
-#
-# A codebook gives an exact answer for a fetch; a sphere of three numbers has a table over it; what is left is
-# compared latent by latent.
-
-TOGETHER = 16  # phrases compared with every latent at a time: 12 bytes each per Gaussian
-CHUNK = 16_384  # latents that are compared with texts, or decoded vectors held, at a time
-
-
-class Lookup(Protocol):
-    """Everything about a language field that does not depend on the phrase."""
-
-    def relevancies(self, phrases: Array) -> Iterator[Array]:
-        """(Q, D) unit phrase vectors -> of each in turn (3 N,) float32 relevancy; 0 where a Gaussian has no
-        meaning. What can be computed for all phrases together is."""
-
-
-def build_lookup(field: LanguageField, scale: Scale, exact: bool = False) -> Lookup:
-    """The fastest lookup for `field`; with `exact` none that interpolates, to measure a table by."""
-    if field.codec.space == "index":
-        return CodeLookup(field, scale)
-    if exact:
-        return DecodedLookup(field, scale)
-    if suits_table(field.codec):
-        return build_table(field.codec, known_latents(field), scale)
-    return LatentLookup(field, scale)
-
-
-def known_latents(field: LanguageField) -> Array:
-    """(3 N, d) latents, zero where a Gaussian has no meaning."""
-    latents = np.where(field.known[..., None], field.latents, 0)
-    return latents.reshape(-1, field.latents.shape[-1])
-
-
-class CodeLookup:
-    """K relevancies of codewords, and a fetch per Gaussian: exact."""
-
-    def __init__(self, field: LanguageField, scale: Scale) -> None:
-        count = field.codec.index_size
-        self._vectors = field.codec.decode(np.arange(count, dtype=np.uint16)[:, None])
-        self._zero, self._rate = scale.of(self._vectors @ scale.texts.T)
-        self._codes = np.where(field.known, field.latents[..., 0], count).astype(np.uint16).reshape(-1)
-
-    def relevancies(self, phrases: Array) -> Iterator[Array]:
-        """See `Lookup`."""
-        values = relevancy_of(self._vectors @ phrases.T, self._zero[:, None], self._rate[:, None])
-        for row in values.T:
-            found = np.empty(len(self._codes), np.float32)
-            shared_workers().run(_fetch, len(found), plain(np.append(row, 0)), self._codes, found)
-            yield found
-
-
-@dataclass(frozen=True, eq=False)
-class LatentLookup:
-    """Every latent compared, in bounded memory."""
-
-    field: LanguageField
-    scale: Scale
-
-    @cached_property
-    def _read(self) -> tuple[Array, Array, Array]:
-        """Rows of (3 N,) with a meaning, and the (M,) zero and rate of each."""
-        field = self.field
-        rows = np.flatnonzero(field.known)
-        latents = field.latents.reshape(-1, field.latents.shape[-1])
-        zero, rate = np.empty(len(rows), np.float32), np.empty(len(rows), np.float32)
-        for start in range(0, len(rows), CHUNK):
-            part = slice(start, start + CHUNK)
-            zero[part], rate[part] = self.scale.of(
-                field.codec.similarities(latents[rows[part]], self.scale.texts)
-            )
-        return rows, zero, rate
-
-    def relevancies(self, phrases: Array) -> Iterator[Array]:
-        """See `Lookup`."""
-        field, (rows, zero, rate) = self.field, self._read
-        latents = field.latents.reshape(-1, field.latents.shape[-1])
-        for first in range(0, len(phrases), TOGETHER):
-            some = phrases[first : first + TOGETHER]
-            values = np.zeros((len(some), len(latents)), np.float32)
-            for start in range(0, len(rows), CHUNK):
-                part = slice(start, start + CHUNK)
-                cosines = field.codec.similarities(latents[rows[part]], some)
-                values[:, rows[part]] = relevancy_of(cosines, zero[part, None], rate[part, None]).T
-            yield from values
-
-
-@dataclass(frozen=True, eq=False)
-class DecodedLookup:
-    """Every latent decoded once, 2 KB each at D = 512."""
-
-    field: LanguageField
-    scale: Scale
-
-    @cached_property
-    def _decoded(self) -> tuple[Array, Array, Array, Array]:
-        """Rows of (3 N,) with a meaning, their (M, D) vectors, and the (M,) zero and rate of each."""
-        field = self.field
-        rows = np.flatnonzero(field.known)
-        latents = field.latents.reshape(-1, field.latents.shape[-1])
-        vectors = np.empty((len(rows), field.codec.vector_dim), np.float32)
-        zero, rate = np.empty(len(rows), np.float32), np.empty(len(rows), np.float32)
-        for start in range(0, len(rows), CHUNK):
-            part = slice(start, start + CHUNK)
-            vectors[part] = field.codec.decode(latents[rows[part]])
-            zero[part], rate[part] = self.scale.of(vectors[part] @ self.scale.texts.T)
-        return rows, vectors, zero, rate
-
-    def relevancies(self, phrases: Array) -> Iterator[Array]:
-        """See `Lookup`."""
-        rows, vectors, zero, rate = self._decoded
-        for phrase in phrases:
-            values = np.zeros(self.field.confidence.size, np.float32)
-            values[rows] = relevancy_of(vectors @ phrase, zero, rate)
-            yield values
-
-
-@kernel
-def _fetch(first: int, last: int, values: Array, codes: Array, found: Array) -> None:
-    """Rows [first, last) of `found` (3 N,)."""
-    for i in range(first, last):
-        found[i] = values[codes[i]]
-
-
-# Relevancy of pixels, in both orders.
-#
-# `decode-first` (ours): relevancy is looked up per Gaussian and splatted, one linear channel per phrase.
-# `paper` (LangSplat section 3.4): latents are splatted, every pixel's blend is decoded, then compared.
-# Both are gated by alpha, because an uncovered pixel's zero latent decodes to a confident something.
+# Relevancy of pixels: per Gaussian and splatted, one linear channel per phrase (ours); or of latents that are
+# splatted and decoded (the paper's order, section 3.4). Both are gated by alpha, because an uncovered pixel's
+# zero latent decodes to a confident something.
 
 
 def splatted_relevancy(view: View, relevancy: Array, alpha_gate: float) -> Array:

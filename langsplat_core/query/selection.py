@@ -1,10 +1,9 @@
-"""Selections of Gaussians, (N,) bool arrays, and what can be made of them.
+"""Selections of Gaussians, (N,) bool arrays: by place, along the surface, and drawn on an image.
 
 Growing and shrinking walk along the surface and never jump to a thing behind or above. Gaussians too faint to
 be on it go where the one goes that they are nearest to (`Surface.anchors`); those near none never change.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +13,6 @@ from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import InputError
-from langsplat_core.query.instances import OrientedBox
 from langsplat_core.query.surface import Regions, Surface
 from langsplat_core.scene import Camera
 
@@ -24,27 +22,6 @@ def of_rows(rows: Array, count: int) -> Array:
     selected = np.zeros(count, bool)
     selected[rows] = True
     return selected
-
-
-def union(selections: Sequence[Array]) -> Array:
-    """What is in any of them, one or more."""
-    return np.logical_or.reduce(selections)
-
-
-def intersection(selections: Sequence[Array]) -> Array:
-    """What is in all of them, one or more."""
-    return np.logical_and.reduce(selections)
-
-
-def difference(selections: Sequence[Array]) -> Array:
-    """What is in the first and in none of the others."""
-    first, *others = selections
-    return first & ~union(others) if others else first.copy()
-
-
-def invert(selected: Array) -> Array:
-    """What is not selected."""
-    return ~selected
 
 
 def in_sphere(means: Array, centre: Array, radius: float) -> Array:
@@ -62,12 +39,6 @@ def in_box(means: Array, low: Array, high: Array) -> Array:
     return inside
 
 
-def in_oriented_box(means: Array, box: OrientedBox) -> Array:
-    """(N, 3) -> (N,) bool: inside `box`, faces included."""
-    with np.errstate(invalid="ignore"):
-        return box.contains(np.asarray(means, np.float64))
-
-
 def at_point(surface: Surface, regions: Regions, level: int, point: Array) -> Array:
     """(N,) bool: the whole region, at a level (index into LEVELS), of what lies nearest to `point` (3,),
     world units, with the faint ones beside it. Nothing where the scene has no surface."""
@@ -78,22 +49,10 @@ def at_point(surface: Surface, regions: Regions, level: int, point: Array) -> Ar
     return same
 
 
-def grow_steps(surface: Surface, selected: Array, steps: int = 1) -> Array:
-    """And all that `steps` links along the surface lead to."""
-    _check("number of steps", steps)
-    reached: Array = selected[surface.rows]
-    for _ in range(steps):
-        linked: Array = surface.links @ reached
-        wider = reached | linked
-        if np.array_equal(wider, reached):
-            break
-        reached = wider
-    return _spread(surface, selected, reached)
-
-
 def grow(surface: Surface, selected: Array, distance: float) -> Array:
-    """And all that lies within `distance` along the surface, world units, from its nearest selected point."""
-    _check("distance", distance)
+    """`selected` and all that lies within `distance` of it along the surface, world units."""
+    if not 0 <= distance < float("inf"):
+        raise InputError(f"a distance of {distance:g} cannot be walked along the surface; give 0 or more")
     reached = selected[surface.rows]
     if not reached.any() or reached.all():
         return _spread(surface, selected, reached)
@@ -103,14 +62,9 @@ def grow(surface: Surface, selected: Array, distance: float) -> Array:
     return _spread(surface, selected, np.isfinite(lengths))
 
 
-def shrink_steps(surface: Surface, selected: Array, steps: int = 1) -> Array:
-    """Without what is at most `steps` links from what is not selected. Where the surface itself ends,
-    nothing is lost."""
-    return ~grow_steps(surface, ~selected, steps)
-
-
 def shrink(surface: Surface, selected: Array, distance: float) -> Array:
-    """Without what lies within `distance` of what is not selected, along the surface, world units."""
+    """`selected` without what lies within `distance` of the rest along the surface, world units. Where the
+    surface itself ends, nothing is lost."""
     return ~grow(surface, ~selected, distance)
 
 
@@ -131,12 +85,7 @@ def _lengths(surface: Surface) -> csr_matrix:
     return csr_matrix((np.maximum(gaps, 1e-12), links.indices, links.indptr), shape=links.shape)
 
 
-def _check(name: str, value: float) -> None:
-    if not 0 <= value < float("inf"):
-        raise InputError(f"a {name} of {value:g} cannot be walked along the surface; give 0 or more")
-
-
-# Selections drawn on a picture: the Gaussians whose centres a camera sees inside an outline or a stroke.
+# Selections drawn on an image: the Gaussians whose centres a camera sees inside an outline or a stroke.
 #
 # Places are pixels of the camera, x to the right and y down, the centre of the first pixel at (0.5, 0.5).
 # What lies on or behind the camera's plane, or has no finite place, is never inside.
@@ -146,7 +95,7 @@ BEHIND = 0.03  # of the surface's depth: a centre no farther behind it is on the
 
 @dataclass(frozen=True, eq=False)
 class Projected:
-    """Where N centres lie in one picture."""
+    """The places of N centres in one image."""
 
     pixels: Array  # (N, 2) float64
     depths: Array  # (N,) float64 camera z, world units; -1 where there is no place
@@ -204,7 +153,9 @@ def in_stroke(seen: Projected, path: Array, radius: float) -> Array:
     path = np.asarray(path, np.float64)
     check_array("path", path, ("K", 2))
     inside = np.zeros(len(seen.depths), bool)
-    near = np.flatnonzero(_in_reach(seen, path, radius))
+    if len(path) == 0:
+        return inside
+    near = np.flatnonzero(in_rectangle(seen, path.min(0) - radius, path.max(0) + radius))
     if len(near) == 0:
         return inside
     pixels = seen.pixels[near]
@@ -221,18 +172,12 @@ def in_stroke(seen: Projected, path: Array, radius: float) -> Array:
     return inside
 
 
-def _in_reach(seen: Projected, path: Array, radius: float) -> Array:
-    if len(path) == 0:
-        return np.zeros(len(seen.depths), bool)
-    return in_rectangle(seen, path.min(0) - radius, path.max(0) + radius)
-
-
 def on_surface(seen: Projected, depths: Array, size: tuple[int, int], behind: float = BEHIND) -> Array:
-    """(N,) bool: in the picture and not hidden there: the depth of the centre is at most that of the surface
+    """(N,) bool: in the image and not hidden there: the depth of the centre is at most that of the surface
     in its pixel and `behind` of it more. Where nothing is drawn, nothing hides.
 
     depths: (H, W) camera z of the surface, world units, 0 where nothing is drawn; it may be coarser or finer
-    than the `size` (width, height) of the picture that the centres were projected into.
+    than the `size` (width, height) of the image that the centres were projected into.
     """
     check_array("depths", depths, ("H", "W"))
     height, width = depths.shape

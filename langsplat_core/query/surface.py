@@ -16,6 +16,22 @@ FAINTEST = 1e-3  # weight of a Gaussian whose opacity is less, so that no mean d
 REACH = 4.0  # times the median distance of a Gaussian's neighbours: what is farther is another surface
 
 
+_OUTSIDE, _WAITING = -1, -2  # labels that are no part
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """The C connected parts of some members of a surface, with the members part by part."""
+
+    order: Array  # (K,) int32 numbers on the surface
+    starts: Array  # (C,) int32 where each part begins in `order`
+    labels: Array  # (M,) int32 part of every Gaussian of the surface; -1 for those that are no members
+
+    def each(self) -> list[Array]:
+        """The numbers of every part, ascending."""
+        return [np.sort(part) for part in np.split(self.order, self.starts[1:])] if len(self.starts) else []
+
+
 @dataclass(frozen=True, eq=False)
 class Surface:
     """The M Gaussians that count, each with its k nearest, itself first; near ones have near numbers."""
@@ -27,28 +43,37 @@ class Surface:
     links: csr_matrix  # (M, M) who is next to whom on one surface; symmetric
     anchors: Array  # (N,) int32 number of every Gaussian, if it is too faint of the nearest; -1: none is near
 
-    def smooth(self, values: Array) -> Array:
-        """(3, N) values of all Gaussians -> (3, M) float32 opacity-weighted means over each neighbourhood.
+    def smooth(self, values: Array, numbers: Array | None = None) -> Array:
+        """(N,) float32 values of all Gaussians -> (K,) float32 opacity-weighted means over the neighbourhoods
+        of `numbers` (K,), by default of all M.
 
-        The 3D counterpart of the mean filter that the paper applies to a relevancy map before it
-        takes the peak (section 4.1, "implementation details"): one stray Gaussian decides nothing.
+        The 3D counterpart of the mean filter that the paper applies to a relevancy map before it takes the
+        peak (section 4.1, "implementation details"): one stray Gaussian decides nothing.
         """
-        count, workers = len(self.rows), shared_workers()
-        packed = np.empty((count, len(LEVELS) + 1), np.float32)
-        workers.run(_pack, count, plain(values), self.rows, self.weights, packed)
-        smoothed = np.empty((len(LEVELS), count), np.float32)
-        workers.run(_smooth, count, packed, self.neighbours, smoothed)
+        chosen = np.arange(len(self.rows)) if numbers is None else numbers
+        smoothed = np.empty(len(chosen), np.float32)
+        arguments = chosen, self.neighbours, self.rows, self.weights, plain(values), smoothed
+        shared_workers().run(_smooth, len(chosen), *arguments)
         return smoothed
+
+    def parts(self, numbers: Array) -> Parts:
+        """The connected parts of the Gaussians `numbers` (K,), in [0, M), each once."""
+        labels = np.full(len(self.rows), _OUTSIDE, np.int32)
+        labels[numbers] = _WAITING
+        order, starts = np.empty(len(numbers), np.int32), np.empty(len(numbers), np.int32)
+        count, _ = _label(self.links.indptr, self.links.indices, numbers, labels, order, starts)
+        return Parts(order, starts[:count].copy(), labels)
 
     def connected(self, inside: Array, seed: int) -> Array:
         """(M,) bool, and a member of it -> numbers of all that are linked to that member through members."""
-        reached = np.empty(int(inside.sum()), np.int32)
-        count = _walk(self.links.indptr, self.links.indices, inside.copy(), seed, reached)
-        return reached[:count]
+        labels = np.where(inside, np.int32(_WAITING), np.int32(_OUTSIDE))
+        order, starts = np.empty(int(inside.sum()), np.int32), np.empty(1, np.int32)
+        _, count = _label(self.links.indptr, self.links.indices, np.array([seed]), labels, order, starts)
+        return order[:count]
 
 
 def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
-    """Of all valid Gaussians with at least `min_opacity` (of all valid ones if none has)."""
+    """Surface of all valid Gaussians with at least `min_opacity` (of all valid ones if none has)."""
     valid = gaussians.valid()
     opacity = np.where(valid, sigmoid(gaussians.opacity_logits.astype(np.float64)), 0)
     rows = np.flatnonzero(opacity >= min_opacity)
@@ -56,7 +81,8 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
         rows = np.flatnonzero(valid)
     k = min(NEIGHBOURS, len(rows))
     if k == 0:
-        return _empty(len(gaussians))
+        nothing = np.zeros((0, 1), np.int32), np.zeros(0, np.float32), csr_matrix((0, 0), dtype=bool)
+        return Surface(rows, np.zeros((0, 3)), *nothing, np.full(len(gaussians), -1, np.int32))
     rows = rows[cKDTree(gaussians.means[rows].astype(np.float64)).indices]  # leaf by leaf: near ones meet
     positions = gaussians.means[rows].astype(np.float64)
     tree = cKDTree(positions)
@@ -84,18 +110,6 @@ def surface_areas(gaussians: Gaussians) -> Array:
     return np.minimum(areas, np.quantile(areas, 0.99)) if len(areas) else areas
 
 
-def _empty(count: int) -> Surface:
-    """Of `count` Gaussians none of which is valid."""
-    return Surface(
-        rows=np.zeros(0, np.int64),
-        positions=np.zeros((0, 3)),
-        neighbours=np.zeros((0, 1), np.int32),
-        weights=np.zeros(0, np.float32),
-        links=csr_matrix((0, 0), dtype=bool),
-        anchors=np.full(count, -1, np.int32),
-    )
-
-
 def _links(neighbours: Array, distances: Array, reach: Array) -> csr_matrix:
     near = distances <= reach[:, None]
     count = len(neighbours)
@@ -105,48 +119,51 @@ def _links(neighbours: Array, distances: Array, reach: Array) -> csr_matrix:
 
 
 @kernel
-def _pack(first: int, last: int, values: Array, rows: Array, weights: Array, packed: Array) -> None:
-    """Weighted values and weight side by side (M, 4): a neighbour costs one access to memory, not four."""
+def _smooth(
+    first: int,
+    last: int,
+    chosen: Array,
+    neighbours: Array,
+    rows: Array,
+    weights: Array,
+    values: Array,
+    smoothed: Array,
+) -> None:
+    """Elements [first, last) of `smoothed` (K,)."""
     for i in range(first, last):
-        row, weight = rows[i], weights[i]
-        packed[i, 0] = weight * values[0, row]
-        packed[i, 1] = weight * values[1, row]
-        packed[i, 2] = weight * values[2, row]
-        packed[i, 3] = weight
-
-
-@kernel
-def _smooth(first: int, last: int, packed: Array, neighbours: Array, smoothed: Array) -> None:
-    """Rows [first, last) of `smoothed` (3, M) from what `_pack` made of everyone."""
-    for i in range(first, last):
-        subpart = part = whole = total = np.float32(0)
+        value = total = np.float32(0)
         for k in range(neighbours.shape[1]):
-            j = neighbours[i, k]
-            subpart += packed[j, 0]
-            part += packed[j, 1]
-            whole += packed[j, 2]
-            total += packed[j, 3]
-        smoothed[0, i] = subpart / total
-        smoothed[1, i] = part / total
-        smoothed[2, i] = whole / total
+            j = neighbours[chosen[i], k]
+            value += weights[j] * values[rows[j]]
+            total += weights[j]
+        smoothed[i] = value / total
 
 
 @kernel
-def _walk(indptr: Array, indices: Array, waiting: Array, seed: int, reached: Array) -> int:
-    """Breadth first from `seed` over members that are `waiting`; who was reached, and how many."""
-    reached[0] = seed
-    waiting[seed] = False
-    done, found = 0, 1
-    while done < found:
-        here = reached[done]
-        done += 1
-        for entry in range(indptr[here], indptr[here + 1]):
-            there = indices[entry]
-            if waiting[there]:
-                waiting[there] = False
-                reached[found] = there
-                found += 1
-    return found
+def _label(
+    indptr: Array, indices: Array, seeds: Array, labels: Array, order: Array, starts: Array
+) -> tuple[int, int]:
+    """Number the parts that `seeds` are in, breadth first over what is `_WAITING` in `labels`; how many parts
+    there are, and Gaussians in them."""
+    parts = found = done = 0
+    for seed in seeds:
+        if labels[seed] != _WAITING:
+            continue
+        starts[parts] = found
+        labels[seed] = parts
+        order[found] = seed
+        found += 1
+        while done < found:
+            here = order[done]
+            done += 1
+            for entry in range(indptr[here], indptr[here + 1]):
+                there = indices[entry]
+                if labels[there] == _WAITING:
+                    labels[there] = parts
+                    order[found] = there
+                    found += 1
+        parts += 1
+    return parts, found
 
 
 # Regions: patches of the surface that mean the same, at each level.
@@ -197,9 +214,15 @@ class Regions:
         shared_workers().run(_spread, len(others), self.everywhere[level], values, others, spread)
         return spread
 
+    def even(self, values: Array) -> Array:
+        """(3, N) float32 values -> the same, of every region its mean; of what is off the surface its own."""
+        own = plain(values)
+        means = [row.astype(np.float32) for row in self.means(own)]
+        return np.stack([self.spread(level, row, own[level]) for level, row in enumerate(means)])
+
 
 def build_regions(surface: Surface, field: LanguageField) -> Regions:
-    """Of a scene's surface; once for a scene."""
+    """Regions of a scene's surface, by what its field means there; once for a scene."""
     links = surface.links.tocoo()
     once = links.row < links.col
     ends = links.row[once].astype(np.int32), links.col[once].astype(np.int32)
@@ -217,7 +240,7 @@ def build_regions(surface: Surface, field: LanguageField) -> Regions:
 
 
 def regions_from(surface: Surface, of: Array) -> Regions:
-    """From the (3, M) int32 number of each Gaussian's region at each level, counted from 0."""
+    """Regions by the (3, M) int32 number of each Gaussian's region at each level, counted from 0."""
     everywhere = np.full((len(LEVELS), len(surface.anchors)), -1, np.int32)
     near = surface.anchors >= 0
     everywhere[:, near] = of[:, surface.anchors[near]]

@@ -19,7 +19,7 @@ from langsplat_core.bench.measure import markdown
 from langsplat_core.evaluation.scoring import intersection_over_union
 from langsplat_core.progress import Progress, TerminalProgress, silent
 from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.compose import Body, Viewer, body, most, run_phrase, stands, upright, viewer
+from langsplat_core.query.compose import Body, Viewpoint, body, most, run_phrase, stands, upright, viewpoint
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import EXTREMES, SIDES, atoms, parse
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
@@ -103,7 +103,7 @@ def things_in(world: World, frame: Array, seed: int = 0) -> Things:
     return Things(words, extents)
 
 
-def cases(truth: Truth, things: Things, seen_by: Viewer, seed: int) -> list[Case]:
+def cases(truth: Truth, things: Things, seen_by: Viewpoint, seed: int) -> list[Case]:
     """At most `MOST_CASES` of every construction but of parts, of which there are all."""
     rng = np.random.default_rng((seed, 7))
     found: dict[str, list[Case]] = {name: [] for name in CONSTRUCTIONS}
@@ -158,7 +158,7 @@ def _kinds(things: Things) -> list[str]:
     return sorted({kind for word in things.words.values() for kind in CATEGORIES.get(word, ())})
 
 
-def _relations(things: Things, seen_by: Viewer) -> Iterator[Case]:
+def _relations(things: Things, seen_by: Viewpoint) -> Iterator[Case]:
     """Of a kind of which some stand so and others do not; and of single things, of which none does."""
     objects = sorted(set(things.words.values()) - set(SHELL))
     for side, anchor in product(SIDES, objects):
@@ -178,7 +178,7 @@ def _relations(things: Things, seen_by: Viewer) -> Iterator[Case]:
                 yield Case(side, text, text, right)
 
 
-def _extremes(things: Things, seen_by: Viewer) -> Iterator[Case]:
+def _extremes(things: Things, seen_by: Viewpoint) -> Iterator[Case]:
     for kind, word in product(EXTREMES, _kinds(things)):
         numbers = things.called(word)
         if len(numbers) >= FEWEST:
@@ -222,7 +222,7 @@ def measure_phrases(room: Room, field: LanguageField, progress: Progress = silen
     things = things_in(photographed_room(room.seed, room.tier), frame, room.seed)
     asked = [
         case
-        for case in cases(room.truth, things, viewer(held_out[0], frame), room.seed)
+        for case in cases(room.truth, things, viewpoint(held_out[0], frame), room.seed)
         if not any(engine.unknown_words(atom.text) for atom in atoms(parse(case.text)))
     ]
     ways: dict[str, Callable[[Case], Judged]] = {

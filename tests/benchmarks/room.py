@@ -45,7 +45,7 @@ from langsplat_core.pipeline.language import Views, language_field
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import trained_gaussians
 from langsplat_core.progress import Progress
-from langsplat_core.query.answers import AnswerRule, CutRule
+from langsplat_core.query.answers import AnswerRule
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
@@ -67,6 +67,7 @@ from tests.benchmarks.oracles import (
 )
 from tests.benchmarks.scoring import (
     Asked,
+    CutRule,
     Judge,
     MaskRule,
     Measured,
@@ -99,7 +100,7 @@ class RoomSettings:
     with the geometry of CLIP, OWN being the cosine of an image with its words (0.22 to 0.32)."""
     text_vectors: Path | None = None  # .npy of real text vectors for clip-geometry, names in a .txt beside it
     cut: CutRule | Literal["regions"] = "regions"
-    """How an answer becomes a mask: whole regions, or a rule of `query.answers.cut_level` for the map."""
+    """How an answer becomes a mask: whole regions, or a rule of `scoring.cut_level` for the map."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ overlap directly among the Gaussians; and rejection: how many absent objects are
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_core.evaluation.scoring import intersection_over_union, majority
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import CutRule, QueryResult, cut_level, peak_pixel
+from langsplat_core.query.answers import SPAN, QueryResult, peak_pixel
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.surface import Regions
@@ -35,6 +35,29 @@ CHANNELS = 32  # phrases that are splatted at a time
 TOGETHER = 64  # phrases that are asked at a time
 TIMED = 15  # phrases that are asked alone
 HALF = 0.5  # of what a pixel shows: from there it belongs to an answer's Gaussians
+
+
+CutRule = Literal["floor", "median", "range"]
+CUT_RULES: tuple[CutRule, ...] = get_args(CutRule)
+RANGE_SHARE = 0.7  # of the map's range: LangSplat's code maps [0, 1] to [-1, 1] and cuts at 0.4
+
+
+def cut_level(rule: CutRule, values: Array, peak: float, median: float) -> float:
+    """The relevancy above which `values` belong to the answer.
+
+    values: the map that is cut, any shape, in [0, 1], read by "range" alone; peak: the smoothed peak of the
+    whole scene at the chosen level; median: of the scene's Gaussians at that level. Rules:
+
+    * "floor": half way between the floor, no better than the canonical phrases, and the peak;
+    * "median": half way between the scene's median and the peak, since what is typical of the scene is not
+      what was asked for, wherever the encoder puts it;
+    * "range": at 0.7 of the map's range, as the public code of LangSplat does; it always finds something.
+    """
+    if rule == "range":
+        low, high = (float(values.min()), float(values.max())) if np.size(values) else (0.0, 1.0)
+        return low + RANGE_SHARE * (high - low)
+    low = FLOOR if rule == "floor" else median
+    return low + 0.5 * max(peak - low, SPAN)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import pytest
 
 from assets.making.truth import Region, Truth, read_truth
 from assets.making.world import World, build_room
-from langsplat_core.query.compose import upright, viewer
+from langsplat_core.query.compose import upright, viewpoint
 from langsplat_core.query.describe import Entry, Spot
 from langsplat_core.query.grammar import Atom, parse
 from langsplat_core.scene import look_at
@@ -39,7 +39,7 @@ def room(tmp_path_factory) -> tuple[World, Truth]:
 def found(room) -> list[Case]:
     world, truth = room
     camera = look_at(np.array([0.0, -2.0, 1.0]), np.zeros(3), UP, (160, 120))
-    return cases(truth, things_in(world, FRAME), viewer(camera, FRAME), 0)
+    return cases(truth, things_in(world, FRAME), viewpoint(camera, FRAME), 0)
 
 
 def test_things_are_where_the_room_has_them(room):

@@ -10,7 +10,6 @@ from assets.making.truth import Phrase, Region, Truth
 from langsplat_core.arrays import unit
 from langsplat_core.errors import InputError
 from langsplat_core.progress import silent
-from langsplat_core.query.answers import CUT_RULES, cut_level
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
@@ -37,9 +36,11 @@ from tests.benchmarks.patches import (
     pictures,
 )
 from tests.benchmarks.scoring import (
+    CUT_RULES,
     Answer,
     Asked,
     ask,
+    cut_level,
     evaluate_direct,
     found_rate,
     relevancy_maps,

@@ -39,8 +39,8 @@ WEAK, ABSENT = replace(FOUND, verdict="weak match"), replace(FOUND, verdict="not
 
 def channels(display: Display = "rgb", value: float = 0.9, alpha: float = 1.0) -> Channels:
     """A grey image; `value` is that of the further channel."""
-    count = {"latent": 3, "relevancy": 1, "segmentation": 1, "depth": 1}.get(display)
-    extra = None if count is None else np.full((4, 5, count), value * alpha)
+    count = 3 if display == "latent" else 1
+    extra = None if DISPLAYS[display].channel is None else np.full((4, 5, count), value * alpha)
     return Channels(np.full((4, 5, 3), 0.5 * alpha), np.full((4, 5), alpha), extra)
 
 

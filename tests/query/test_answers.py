@@ -1,15 +1,40 @@
 """Answers by regions and by the peak, and what is said about them."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 
-from langsplat_core.arrays import sigmoid
-from langsplat_core.query.answers import QueryResult, by_peak, by_regions, chance_in
+from langsplat_core.arrays import Array, sigmoid
+from langsplat_core.query import answers as chance_module
+from langsplat_core.query.answers import (
+    ADVANTAGE,
+    FARTHEST,
+    FOUND,
+    NEAREST,
+    REACH,
+    Bar,
+    Chance,
+    QueryResult,
+    by_peak,
+    by_regions,
+    chance_in,
+    excess,
+    find_extent,
+    lowest,
+)
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.grammar import Named
 from langsplat_core.query.lookup import build_lookup
-from langsplat_core.query.surface import SMALLEST, Surface, build_regions, build_surface
+from langsplat_core.query.surface import (
+    SMALLEST,
+    Regions,
+    Surface,
+    build_regions,
+    build_surface,
+    regions_from,
+)
 from langsplat_core.scene import LEVELS, Calibration, Gaussians, LanguageField, Odds, Reading, Scene
 from langsplat_core.semantics.relevancy import FLOOR, Scale
 from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, blob_scene, blobs, language
@@ -200,21 +225,185 @@ def test_no_meaning_anywhere(rule):
     assert rule == "peak" or result.probability < 1e-3
 
 
-def test_evened_relevancy_is_that_of_its_region():
-    gaussians, field = random_gaussians(300), random_field(300, "autoencoder")
-    gaussians.opacity_logits[:20] = -9  # faint: what is next to them, or if nothing is near, their own
-    gaussians.means[:5] += 500
-    engine = QueryEngine(Scene(gaussians, field))
-    relevancy = engine.relevancy(engine.text_vector("red mug"))
-    evened = engine.evened(relevancy)
-    assert evened.shape == (3, 300)
-    np.testing.assert_array_equal(evened[:, :5], relevancy[:, :5])
-    surface, regions = engine.surface, engine.regions
-    means = regions.means(relevancy)
-    for level in range(3):
-        want = means[level].astype(np.float32)[regions.of[level]]
-        np.testing.assert_array_equal(evened[level, surface.rows], want)
-        near = np.flatnonzero(surface.anchors >= 0)
-        np.testing.assert_array_equal(evened[level, near], want[surface.anchors[near]])
-        result = engine.run("red mug", LEVELS[level])
-        np.testing.assert_allclose(result.even, evened[level], atol=1e-6)
+# What everyday phrases fit in a scene, and what is found because it fits more.
+
+BARS = (Bar(0.0, 1.0), Bar(0.5, 1.0), Bar(-1.0, 2.0), Bar(0.6, 0.5))
+
+
+def engine_of(kind: str) -> QueryEngine:
+    return QueryEngine(Scene(random_gaussians(400), random_field(400, kind)))
+
+
+def test_by_codewords_is_as_by_looking_up(monkeypatch):
+    monkeypatch.setattr(chance_module, "SAMPLED", 60)
+    engine = engine_of("codebook")
+    field, everyday = engine.field, engine.field.everyday
+    fits = engine.chance.fits
+    for number, vector in enumerate(everyday):
+        means = engine.regions.means(engine.relevancy(vector))
+        for level in range(len(LEVELS)):
+            solid = engine.regions.sizes[level] >= SMALLEST
+            want = engine.scale.fit(means[level])
+            np.testing.assert_allclose(fits[level][solid, number], want[solid], atol=1e-4)
+            assert np.isneginf(fits[level][~solid, number]).all() or not solid.any()
+    scene = (field, engine.surface, engine.regions, engine.scale)
+    assert chance_in(*scene, iter(())).bars() == engine.chance.bars()
+
+
+@pytest.mark.parametrize("kind", ["autoencoder", "linear"])
+def test_without_codewords_everyday_phrases_are_looked_up(kind):
+    engine = engine_of(kind)
+    bars = engine.chance.bars()
+    assert all(np.isfinite([bar.median, bar.spread]).all() and bar.spread > 0 for bar in bars)
+    best = [engine.run("x", level, vector=engine.field.everyday[7]).fits for level in LEVELS]
+    column = [fits[:, 7].max() for fits in engine.chance.fits]  # all 60 phrases are looked at
+    np.testing.assert_allclose(best[0], column, atol=1e-4)
+
+
+def test_bars_are_quantiles_of_the_best_and_those_of_some_regions_are_lower():
+    rng = np.random.default_rng(0)
+    fits = tuple(rng.normal(size=(9, 101)) for _ in LEVELS)
+    made = Chance(fits)
+    for bar, level in zip(made.bars()[:3], fits, strict=True):
+        low, median = np.quantile(level.max(0), [0.16, 0.5])
+        assert (bar.median, bar.spread) == (pytest.approx(median), pytest.approx(median - low))
+    finer = np.maximum(fits[0].max(0), fits[1].max(0))
+    assert made.bars()[3].median == pytest.approx(np.median(finer))
+    some = made.bars((np.array([2]), np.array([0, 1]), np.array([], int)))
+    assert some[0].median < made.bars()[0].median
+    assert not np.isfinite(some[2].median)  # nothing is found where there is nothing
+
+
+@pytest.mark.parametrize("named", FOUND)
+@pytest.mark.parametrize("level", ["auto", *LEVELS])
+def test_excess_is_counted_from_the_bars(named, level):
+    rng = np.random.default_rng(1)
+    whole, finer = FOUND[named]
+    for fits in rng.normal(scale=4, size=(50, 3)).tolist():
+        if level == "auto":
+            by_whole = (fits[2] - BARS[2].median) / BARS[2].spread - whole
+            want = max(by_whole, (max(fits[:2]) - BARS[3].median) / BARS[3].spread - finer)
+        else:
+            bar, fit = BARS[LEVELS.index(level)], fits[LEVELS.index(level)]
+            want = (fit - bar.median) / bar.spread - min(whole, finer)
+        assert excess(tuple(fits), BARS, named, level) == pytest.approx(want)
+    assert np.isfinite(Bar(0.3, 0.0).excess(0.3, 1.0))  # without width
+
+
+def test_the_scene_needs_everyday_phrases_else_the_peak_answers():
+    field = replace(language(), everyday=None, reading=Reading(found=0.6))
+    scene = replace(blob_scene(), language=field)
+    engine = QueryEngine(scene, lambda _: FakeEncoder())  # which knows too few of them
+    assert (engine.rule, engine.chance, engine.calibration) == ("peak", None, None)
+    result = engine.run("mug")
+    assert (result.found, result.excess, result.probability) == (True, None, None)
+    few = replace(field, everyday=np.ones((3, 8), np.float32))
+    assert QueryEngine(replace(scene, language=few), lambda _: FakeEncoder()).rule == "peak"
+
+
+# How far an answer reaches, against the rule written out region by region.
+
+SCALE = Scale(np.eye(2, dtype=np.float32), np.eye(2, dtype=np.float32), 10.0)
+N = 300
+
+
+@pytest.fixture(scope="module")
+def surface() -> Surface:
+    return build_surface(random_gaussians(N), min_opacity=0.0)
+
+
+def regions_of(surface: Surface, sizes: tuple[int, ...]) -> Regions:
+    """Of one partition at all levels; `sizes` add up to the Gaussians of the surface."""
+    of = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
+    return regions_from(surface, np.stack([of] * 3))
+
+
+def spread_out(surface: Surface, regions: Regions, fits) -> Array:
+    """(3, N) relevancy that has the given fits, of each level and region."""
+    relevancy = np.zeros((3, len(surface.anchors)), np.float32)
+    for level, row in enumerate(fits):
+        relevancy[level, surface.rows] = sigmoid(np.asarray(row, np.float64))[regions.of[level]]
+    return relevancy
+
+
+def plain_extent(fits, sizes, level: str, named: Named) -> tuple[int, list[bool]]:
+    """The level and the regions that answer."""
+    solid = [n for n, size in enumerate(sizes) if size >= SMALLEST] or list(range(len(sizes)))
+    best = [max(row[n] for n in solid) for row in fits]
+    given = [value + more for value, more in zip(best, ADVANTAGE[named], strict=True)]
+    chosen = given.index(max(given)) if level == "auto" else LEVELS.index(level)
+    limit = best[chosen] - min(max(REACH * best[chosen], NEAREST), FARTHEST)
+    return chosen, [value >= limit for value in fits[chosen]]
+
+
+@pytest.mark.parametrize(("level", "named"), [*product(["auto"], ADVANTAGE), *product(LEVELS, ["part"])])
+@pytest.mark.parametrize("middle", [-2.0, 0.0, 1.0])
+def test_the_extent_is_that_of_the_plain_rule(surface, level, named, middle):
+    rng = np.random.default_rng(0)
+    count = len(surface.rows)
+    for _ in range(30):
+        sizes = (*rng.integers(3, 30, 9).tolist(),)
+        sizes = (*sizes, count - sum(sizes))
+        fits = middle + rng.normal(size=(3, len(sizes)))
+        regions = regions_of(surface, sizes)
+        got = find_extent(spread_out(surface, regions, fits), regions, SCALE, level, named)
+        chosen, answering = plain_extent(fits, sizes, level, named)
+        assert got.level == chosen
+        np.testing.assert_array_equal(got.inside, answering)
+        solid = np.array(sizes) >= SMALLEST
+        np.testing.assert_allclose(got.fits, fits[:, solid].max(1), atol=1e-5)
+        np.testing.assert_allclose(got.peaks, sigmoid(fits[:, solid].max(1)), atol=1e-6)
+        np.testing.assert_allclose(got.even, sigmoid(fits[chosen]), atol=1e-6)
+        assert got.even.dtype == np.float32
+        assert got.inside.any()
+
+
+@pytest.mark.parametrize(
+    ("best", "named", "level"),
+    [
+        ((2.0, 2.0, 2.0), "thing", 2),
+        ((2.0, 2.0, 1.6), "thing", 2),
+        ((2.0, 1.0, 1.4), "thing", 0),
+        ((-5.0, -3.0, -3.4), "thing", 2),
+        ((2.0, 2.0, 1.8), "part", 2),
+        ((2.1, 2.0, 1.8), "part", 0),
+        ((2.0, 2.1, 2.2), "part of a thing", 1),
+        ((2.0, 1.6, 2.2), "part of a thing", 0),
+        ((-5.0, -3.0, -2.0), "part of a thing", 2),
+    ],
+)
+def test_the_level_is_the_best_one_after_what_speaks_for_it(surface, best, named, level):
+    regions = regions_of(surface, (100, len(surface.rows) - 100))
+    fits = [(value, value - 4) for value in best]
+    assert find_extent(spread_out(surface, regions, fits), regions, SCALE, named=named).level == level
+
+
+def test_crumbs_set_no_scale_unless_there_is_nothing_else(surface):
+    count = len(surface.rows)
+    regions = regions_of(surface, (SMALLEST - 1, 50, count - 50 - SMALLEST + 1))
+    fits = [(0.9, 0.2, -0.4)] * 3
+    got = find_extent(spread_out(surface, regions, fits), regions, SCALE)
+    assert got.fits == pytest.approx((0.2,) * 3, abs=1e-5)
+    small = build_surface(random_gaussians(4), min_opacity=0.0)
+    crumbs = regions_of(small, (1, len(small.rows) - 1))
+    got = find_extent(spread_out(small, crumbs, [(0.9, 0.2)] * 3), crumbs, SCALE)
+    assert got.fits == pytest.approx((0.9,) * 3, abs=1e-4)
+
+
+def test_where_everything_is_as_bad_all_of_it_answers_and_nothing_is_not_a_number(surface):
+    regions = regions_of(surface, (100, len(surface.rows) - 100))
+    for value in (0.0, 0.5, 1.0):
+        relevancy = np.full((3, N), value, np.float32)
+        got = find_extent(relevancy, regions, SCALE)
+        assert (got.level, got.inside.all()) == (2, True)
+        assert np.isfinite([*got.fits, *got.peaks]).all()
+        assert (got.even == np.float32(value)).all()
+
+
+def test_the_reach_is_below_the_best_and_rises_with_it():
+    best = np.linspace(-5, 5, 2001)
+    for share in (0.5, 1.0):
+        ends = np.array([lowest(value, share) for value in best.tolist()])
+        assert (ends < best).all()
+        assert (np.diff(ends) > 0).all()
+        assert np.diff(ends).max() < 2 * (best[1] - best[0])  # no jump

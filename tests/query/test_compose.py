@@ -1,13 +1,28 @@
 """Phrases with structure on a laid table, where every Gaussian's meaning is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.query.compose import grown, peaks_among, run_phrase
+from langsplat_core.query.compose import (
+    Body,
+    body,
+    combine,
+    gap,
+    most,
+    run_phrase,
+    separate,
+    stands,
+    upright,
+    viewpoint,
+)
 from langsplat_core.query.engine import QueryEngine
-from tests.support.laid_table import PlainEncoder, front_camera, laid_table, meaning
+from langsplat_core.query.surface import build_surface
+from langsplat_core.scene import NO_THING, look_at
+from tests.support.laid_table import UP, PlainEncoder, front_camera, laid_table, meaning
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +100,6 @@ def test_the_reading_and_its_phrases_are_shown(table):
     result = run_phrase(table[0], "handle of the red mug")
     assert result.reading == "handle  inside  red mug"
     assert result.answer.phrase == "handle of the red mug"
-    assert {part.phrase for part in result.parts} == {"handle", "red mug", "red mug handle"}
 
 
 def test_alternatives_are_whichever_is_there(table):
@@ -112,17 +126,125 @@ def test_a_part_is_cut_inside_at_the_level_that_is_asked_for(table):
     assert run_phrase(engine, "handle of the red mug", "whole").answer.level == 2
 
 
-def test_growing_adds_what_is_linked(table):
-    engine, blocks = table
-    surface, book = engine.surface, blocks["book"]
-    inside = book[surface.rows]
-    want = book.copy()
-    want[surface.rows[inside | (surface.links.astype(float) @ inside > 0)]] = True
-    np.testing.assert_array_equal(grown(surface, book), want)
-    assert want.sum() > book.sum()
+# How boxes of points stand to each other, and which things there are.
+
+FRAME = upright(UP)
+EYE = viewpoint(look_at(np.array([0.0, -8, 1]), np.zeros(3), UP, (160, 120)), FRAME)
 
 
-def test_peaks_are_of_every_level():
-    values = np.array([[0.1, 0.3], [0.2, 0.1], [0.0, 0.0]], np.float32)
-    assert peaks_among(values) == pytest.approx((0.3, 0.2, 0.0))
-    assert peaks_among(values[:, :0]) == (0, 0, 0)
+def box(centre: tuple[float, float, float], half: tuple[float, float, float], hollow: bool = False) -> Body:
+    """2000 points in a box, or of an open vessel: its floor and sides."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (2000, 3))
+    if hollow:
+        points = points[(np.abs(points[:, :2]).max(1) > 0.9) | (points[:, 2] < -0.9)]
+    return body(points * half + np.array(centre), FRAME)
+
+
+TABLE = box((0, 0, -0.05), (1, 1, 0.05))
+BOWL = box((0.5, 0, 0.2), (0.3, 0.3, 0.2), hollow=True)
+CUP = box((-0.5, 0, 0.1), (0.1, 0.1, 0.1))
+FRUIT = box((0.5, 0, 0.2), (0.1, 0.1, 0.1))
+DOME = body(CUP.points @ FRAME * (1, 1, 0.3), FRAME)  # flat, on the table
+LAMP = box((-0.5, 0, 2.0), (0.35, 0.35, 0.2))
+WALL = box((0, 2.05, 1), (3, 0.05, 2))
+PICTURE = box((0, 1.98, 1.5), (0.4, 0.02, 0.3))
+TRUE = {
+    "on": [(CUP, TABLE), (BOWL, TABLE), (PICTURE, WALL)],
+    "in": [(FRUIT, BOWL)],
+    "near": [(FRUIT, BOWL), (CUP, TABLE)],
+    "above": [(LAMP, TABLE), (LAMP, CUP)],
+    "below": [(TABLE, LAMP), (CUP, LAMP)],
+    "left of": [(CUP, BOWL)],
+    "right of": [(BOWL, CUP)],
+    "behind": [(PICTURE, TABLE)],
+    "in front of": [(TABLE, PICTURE)],
+}
+FALSE = {
+    "on": [(TABLE, CUP), (LAMP, TABLE), (CUP, BOWL), (CUP, WALL)],
+    "in": [(CUP, BOWL), (BOWL, FRUIT), (CUP, TABLE), (DOME, TABLE)],
+    "near": [(CUP, BOWL), (LAMP, CUP)],
+    "above": [(TABLE, LAMP), (LAMP, BOWL)],
+    "below": [(LAMP, TABLE)],
+    "left of": [(BOWL, CUP), (FRUIT, BOWL)],
+    "right of": [(CUP, BOWL)],
+    "behind": [(TABLE, PICTURE), (CUP, BOWL)],
+    "in front of": [(PICTURE, TABLE)],
+}
+
+
+@pytest.mark.parametrize("kind", TRUE)
+def test_how_things_stand(kind):
+    assert all(stands(kind, what, anchor, EYE) for what, anchor in TRUE[kind])
+    assert not any(stands(kind, what, anchor, EYE) for what, anchor in FALSE[kind])
+
+
+@pytest.mark.parametrize("turn", [0, 90, 211])
+def test_what_is_upright_does_not_depend_on_the_world(turn):
+    """The same things under another up direction stand the same."""
+    angle = np.radians(turn)
+    rotation = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+
+    def turned(one: Body) -> Body:
+        return body((one.points @ FRAME) @ rotation.T, upright(rotation @ UP))
+
+    for kind in ("on", "in", "near", "above", "below"):
+        assert all(stands(kind, turned(what), turned(anchor), None) for what, anchor in TRUE[kind])
+        assert not any(stands(kind, turned(what), turned(anchor), None) for what, anchor in FALSE[kind])
+
+
+def test_the_most_extreme_thing():
+    things = [CUP, BOWL, LAMP]
+    want = {"biggest": 2, "smallest": 0, "highest": 2, "lowest": 0, "rightmost": 1, "farthest": 2}
+    assert {kind: most(kind, things, [], EYE) for kind in want} == want
+    assert most("nearest", things, [FRUIT], None) == 1
+
+
+def test_a_gap_is_the_least_distance():
+    distances = np.linalg.norm(CUP.points[:, None] - BOWL.points, axis=-1)
+    assert gap(CUP, BOWL) == pytest.approx(distances.min())
+
+
+def test_single_things_are_connected_and_no_specks():
+    scene, blocks = laid_table()
+    surface = build_surface(scene.gaussians)
+    inside: Array = (blocks["far mug"] | blocks["book"])[surface.rows]
+    speck = np.flatnonzero(blocks["table"][surface.rows])[:3]
+    inside[speck] = True
+    parts = separate(surface, inside)
+    assert [len(part) for part in parts] == [blocks["far mug"].sum()]  # the book has less than a tenth of it
+    assert separate(surface, np.zeros(len(surface.rows), bool)) == []
+
+
+def test_what_is_known_of_things_tells_apart_what_touches_and_keeps_together_what_is_hidden():
+    """A mug and the table under it are one connected surface, and two things; of what is of no thing, the
+    surface decides."""
+    scene, blocks = laid_table()
+    surface = build_surface(scene.gaussians)
+    mugs = blocks["far mug"] | blocks["red mug"]
+    inside: Array = (mugs | blocks["table"])[surface.rows]
+    things = np.full(len(scene.gaussians), NO_THING, np.uint16)
+    things[mugs] = 3  # as if one thing, half hidden by what stands before it
+    counts = sorted(len(part) for part in separate(surface, inside, things))
+    assert counts == sorted([int(mugs.sum()), int(blocks["table"].sum())])
+    apart = separate(surface, mugs[surface.rows], np.full(len(things), NO_THING, np.uint16))
+    assert [list(part) for part in apart] == [list(part) for part in separate(surface, mugs[surface.rows])]
+    assert len(apart) == 2
+
+
+@pytest.mark.parametrize("how", ["union", "intersection", "difference"])
+def test_answers_are_combined_as_their_members_are(table, how):
+    engine, _ = table
+    mug, red = engine.run("mug", "whole"), engine.run("red mug", "whole")
+    want = {
+        "union": mug.members | red.members,
+        "intersection": mug.members & red.members,
+        "difference": mug.members & ~red.members,
+    }[how]
+    np.testing.assert_array_equal(combine([mug, red], how).members, want)
+    assert combine([mug], how) is mug
+    if how == "union":
+        same = run_phrase(engine, "mug and red mug", "whole").answer
+        np.testing.assert_array_equal(same.members, want)
+    with pytest.raises(InputError, match="'plant' was not found"):
+        combine([mug, replace(red, phrase="plant", found=False)], how)

@@ -5,16 +5,41 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.query import describe
-from langsplat_core.query.describe import Describer, field_meanings, same_things
+from langsplat_core.query.describe import (
+    NEAREST,
+    Describer,
+    WordScores,
+    build_attributes,
+    build_words,
+    certain,
+    completions,
+    corrected,
+    hubs,
+    look_at_pixel,
+    meanings,
+    same_things,
+    suggest,
+)
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.instances import connected_parts
 from langsplat_core.query.surface import surface_areas
 from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_core.scene import Gaussians, Scene
-from tests.support.blob_words import NAMES, named_field, named_scene
-from tests.support.fakes import CENTRES, PER_BLOB, WORDS, FakeEncoder, axis, blob_scene
+from langsplat_core.scene import Gaussians, LanguageField, LinearCodec, Scene
+from langsplat_core.scene.codec import CodebookCodec
+from tests.support.fakes import (
+    CENTRES,
+    NAMES,
+    PER_BLOB,
+    WORDS,
+    FakeEncoder,
+    axis,
+    blob_scene,
+    language,
+    named_field,
+    named_scene,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -68,31 +93,50 @@ def test_gaussians_without_a_surface_still_mean_something():
 
 
 @pytest.mark.parametrize("codebook", [True, False])
-def test_a_pixel_blends_probabilities_by_the_rows_of_w(codebook):
-    """Against float64: the reference's weights at the pixel, and every Gaussian's own words."""
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_a_pixel_is_what_the_rows_of_w_say(codebook, backend):
+    """Against float64: the reference's weights at the pixel, and every Gaussian's own words and relevancy.
+    The surface is at the median of their depths."""
     scene = named_scene(codebook)
     asked, camera = describer(scene), scene.cameras[1]
+    engine, names = asked.engine, asked.words[2]
+    results = [engine.run(word) for word in WORDS]
+    relevancy = np.stack([result.relevancy[result.level] for result in results], 1)
+    own = names.probabilities(engine.field.codec, engine.field.latents[2]).astype(np.float64)
     view = load_lifting_rasterizer("reference").view(scene.gaussians, camera)
-    for centre in [*CENTRES, (CENTRES[0] + CENTRES[1]) / 2 + (-0.15, 0, 0)]:
-        (column, row), _ = camera.project(centre[None])[0].astype(int)[0], None
+    depths = camera.project(scene.gaussians.means.astype(np.float64))[1]
+    for thing, centre in enumerate([*CENTRES, (CENTRES[0] + CENTRES[1]) / 2 + (-0.15, 0, 0)]):
+        column, row = camera.project(centre[None])[0][0].astype(int).tolist()
         image = np.zeros((camera.height, camera.width, 1))
         image[row, column] = 1
         weights = view.gather(image)[:, 0]
         if weights.sum() <= 0.3:
             continue
-        words = asked.words[2]
-        own = words.probabilities(asked.engine.field.codec, asked.engine.field.latents[2]).astype(np.float64)
+        rasterizer = load_lifting_rasterizer(backend)
+        found = look_at_pixel(rasterizer, asked, camera, (column, row), results, top=4)
+        assert asked.at_pixel(rasterizer, camera, (column, row), top=4) == found.words
         want = weights @ own / weights.sum()
-        got = asked.at_pixel(load_lifting_rasterizer("cpu"), camera, (int(column), int(row)), top=4)[2]
-        for word in got.words:
-            expected = want[words.phrases.index(word.phrase)]
-            assert word.probability == pytest.approx(expected, abs=1e-4)
+        for word in found.words[2].words:
+            assert word.probability == pytest.approx(want[names.phrases.index(word.phrase)], abs=1e-4)
+        np.testing.assert_allclose(found.relevancy, weights @ relevancy / weights.sum(), atol=2e-4)
+        back, depth = camera.project(found.position[None])
+        np.testing.assert_allclose(back[0], (column + 0.5, row + 0.5), atol=1e-6)
+        assert found.depth == pytest.approx(depth[0])
+        if thing < len(WORDS):
+            assert found.words[2].words[0].phrase == WORDS[thing]
+            assert np.linalg.norm(found.position - centre) < 0.6  # on the blob, towards the eye
+        if backend == "reference":
+            in_front = weights[depths < found.depth - 1e-9].sum()
+            there = weights[np.abs(depths - found.depth) < 1e-6].sum()
+            assert in_front < weights.sum() / 2 <= in_front + there
 
 
 def test_a_pixel_that_shows_nothing_has_no_words():
-    scene = named_scene()
-    levels = describer(scene).at_pixel(load_lifting_rasterizer("cpu"), scene.cameras[1], (0, 0))
+    scene, rasterizer = named_scene(), load_lifting_rasterizer("cpu")
+    asked = describer(scene)
+    levels = asked.at_pixel(rasterizer, scene.cameras[1], (0, 0))
     assert [words.words for words in levels] == [(), (), ()]
+    assert look_at_pixel(rasterizer, asked, scene.cameras[1], (0, 0)) is None
 
 
 @pytest.mark.parametrize("codebook", [True, False])
@@ -155,7 +199,7 @@ def test_places_that_are_not_there():
     asked = describer(named_scene())
     with pytest.raises(InputError, match="Gaussian 360: the scene has Gaussians 0 to 359"):
         asked.at_gaussians(np.array([0, 360]))
-    with pytest.raises(InputError, match="pixel 160 3: the picture has columns 0 to 159 and rows 0 to 119"):
+    with pytest.raises(InputError, match="pixel 160 3: the image has columns 0 to 159 and rows 0 to 119"):
         asked.at_pixel(load_lifting_rasterizer("cpu"), named_scene().cameras[0], (160, 3))
 
 
@@ -183,18 +227,183 @@ def test_surface_of_gaussians():
     assert len(surface_areas(shape.take(np.zeros(0, int)))) == 0
 
 
-def test_meanings_of_fields_without_codewords_are_the_gaussians_own():
-    made = named_field(codebook=False)
-    held = field_meanings(made)
-    assert (held.of[0] == -1).all()
-    np.testing.assert_array_equal(held.latents[held.of[2]], made.latents[2])
+# Words of meanings, against a plain float64 reference.
+
+D, K, N, V = 24, 40, 90, 17
 
 
-def test_parts_of_nothing_and_of_two_blobs():
-    surface = QueryEngine(named_scene()).surface
-    assert connected_parts(surface, np.zeros(0, int)).each() == []
-    rows = np.concatenate([np.arange(PER_BLOB), np.arange(2 * PER_BLOB, 3 * PER_BLOB)])  # two that are apart
-    numbers = np.flatnonzero(np.isin(surface.rows, rows))
-    found = connected_parts(surface, numbers).each()
-    parts = [surface.rows[part] for part in found if len(part) > 1]
-    assert {frozenset((part // PER_BLOB).tolist()) for part in parts} == {frozenset({0}), frozenset({2})}
+def field(kind: str) -> LanguageField:
+    """Random meanings, by a codebook or by a linear codec; every seventh Gaussian has none."""
+    rng = np.random.default_rng(4)
+    confidence = np.ones((3, N), np.float32)
+    confidence[:, ::7] = 0
+    canonical = unit(rng.normal(size=(4, D))).astype(np.float32)
+    if kind == "codebook":
+        codec = CodebookCodec(unit(rng.normal(size=(K, D))).astype(np.float32), np.zeros((K, 3), np.float32))
+        latents = rng.integers(0, K, (3, N, 1)).astype(np.uint16)
+    else:
+        codec = LinearCodec(np.linalg.qr(rng.normal(size=(D, 6)))[0].T.astype(np.float32).copy())
+        latents = rng.normal(size=(3, N, 6)).astype(np.float32)
+    return LanguageField(latents, confidence, codec, canonical, "none")
+
+
+def phrases() -> tuple[tuple[str, ...], Array]:
+    vectors = unit(np.random.default_rng(5).normal(size=(V, D))).astype(np.float32)
+    return tuple(f"word {number}" for number in range(V)), vectors
+
+
+def plain_probabilities(made: LanguageField, vectors: Array, latents: Array, bank: Array) -> Array:
+    """The formula of the module, one meaning and one word after the other, in float64."""
+    every = [vector.astype(np.float64) for vector in (*vectors, *made.canonical)]
+    hub = []
+    for word in every:
+        cosines = sorted((float(word @ meaning) for meaning in bank.astype(np.float64)), reverse=True)
+        hub.append(np.mean(cosines[:NEAREST]))
+    spreads = [np.std([float(word @ meaning) for word in every[: len(vectors)]]) for meaning in bank]
+    rows, scale = [], describe.WORD_SCALE / np.median(spreads)
+    for vector in made.codec.decode(latents).astype(np.float64):
+        fits = np.array([scale * (vector @ word - own / 2) for word, own in zip(every, hub, strict=True)])
+        shares = np.exp(fits - fits.max())
+        rows.append(shares / shares.sum())
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("kind", ["codebook", "linear"])
+def test_probabilities_and_mixtures_are_those_of_the_formula(kind, monkeypatch):
+    monkeypatch.setattr(describe, "CELLS", 7 * (V + 4))  # several blocks
+    made = field(kind)
+    names, vectors = phrases()
+    words = build_words(made, names, vectors)
+    latents = made.latents[made.known][:60]
+    want = plain_probabilities(made, vectors, latents, meanings(made))
+    np.testing.assert_allclose(words.probabilities(made.codec, latents), want, atol=2e-5)
+    weights = np.random.default_rng(6).uniform(size=len(latents))
+    mixture = words.mixture(made.codec, latents, weights)
+    np.testing.assert_allclose(mixture, weights @ want / weights.sum(), atol=2e-5)
+    best, shares = words.best(made.codec, latents, 3)
+    order = np.argsort(-want[:, :V], axis=1)[:, :3]
+    assert (best == order).mean() > 0.99  # equal but for rounding
+    np.testing.assert_allclose(shares, np.take_along_axis(want, order, 1), atol=2e-5)
+
+
+def test_the_bank_holds_every_meaning_that_some_gaussian_has_once():
+    made = field("codebook")
+    used = np.unique(made.latents[made.known])
+    assert 0 < len(used) <= K
+    np.testing.assert_array_equal(meanings(made), made.codec.vectors[used])
+    assert len(meanings(field("linear"))) == field("linear").known.sum()
+
+
+def test_hubs_of_few_or_no_meanings():
+    vectors = np.eye(D, dtype=np.float32)[:2]
+    np.testing.assert_allclose(hubs(vectors, np.eye(D, dtype=np.float32)[:4]), [0.25, 0.25])
+    np.testing.assert_array_equal(hubs(vectors, np.zeros((0, D), np.float32)), [0, 0])
+
+
+def test_a_word_that_is_near_everything_is_not_the_answer_everywhere():
+    """Forty things around a common direction: "hub" is closest to most of them by the plain cosine."""
+    rng = np.random.default_rng(0)
+    centre = unit(np.ones(64))
+    things = unit(centre + 0.7 * unit(rng.normal(size=(40, 64)))).astype(np.float32)
+    names = unit(things + 0.85 * unit(rng.normal(size=(40, 64)))).astype(np.float32)
+    codec = CodebookCodec(things, np.zeros((40, 3), np.float32))
+    codes = np.tile(np.arange(40, dtype=np.uint16)[:, None], (3, 1, 1))
+    far = np.tile(unit(rng.normal(size=64)).astype(np.float32), (4, 1))
+    made = LanguageField(codes, np.ones((3, 40), np.float32), codec, far, "none")
+    vectors = np.concatenate([names, centre[None].astype(np.float32)])
+    labels = (*(f"thing {number}" for number in range(40)), "hub")
+    latents = codes[0]
+    right = (build_words(made, labels, vectors).best(codec, latents, 1)[0][:, 0] == np.arange(40)).mean()
+    plain = (build_attributes(made, labels, vectors).best(codec, latents, 1)[0][:, 0] == np.arange(40)).mean()
+    assert plain < 0.2
+    assert right > 0.8
+
+
+def test_very_different_cosines_do_not_overflow():
+    made = field("codebook")
+    names, vectors = phrases()
+    words = WordScores(names, vectors, np.zeros(V, np.float32), 1e6)
+    found = words.probabilities(made.codec, made.latents[0])
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(found.sum(1), 1, atol=1e-5)
+
+
+def test_the_canonical_phrases_take_what_no_word_fits():
+    made = field("codebook")
+    names, vectors = phrases()
+    latents = made.latents[made.known][:1]
+    like = made.codec.decode(latents)
+    nothing = LanguageField(made.latents, made.confidence, made.codec, np.repeat(like, 4, 0), "none")
+    assert build_words(nothing, names, vectors).mixture(made.codec, latents, np.ones(1))[V:].sum() > 0.9
+
+
+def test_an_attribute_is_said_where_it_is_certain():
+    made = field("codebook")
+    latents = np.array([[3], [3], [8]], np.uint16)
+    own = made.codec.vectors[[3, 8]]
+    colours = build_attributes(made, ("red", "blue"), own)
+    said = certain(colours, made.codec, latents, np.ones(3))
+    assert said is not None
+    assert said.phrase == "red"
+    assert 0.5 <= said.probability < 0.7
+    alike = build_attributes(made, ("a", "b", "c"), np.repeat(own[:1], 3, 0))
+    assert certain(alike, made.codec, latents, np.ones(3)) is None
+
+
+def test_words_that_are_taken_keep_their_numbers():
+    made = field("codebook")
+    names, vectors = phrases()
+    words = build_words(made, names, vectors)
+    few = words.take(np.arange(V) % 2 == 0)
+    assert few.phrases == names[::2]
+    assert len(few.vectors) == len(few.phrases) + 4
+    np.testing.assert_array_equal(few.vector("word 2"), words.vector("word 2"))
+    nothing = words.take(np.zeros(V, bool))
+    assert nothing.best(made.codec, made.latents[0], 5)[0].shape == (N, 0)
+
+
+# Examples of what a scene answers, and completions of what is typed.
+
+PHRASES = ("teddy bear", "tea pot", "red mug", "teapot", "mug")
+
+
+def test_every_example_is_found_in_the_scene():
+    engine = QueryEngine(blob_scene(), lambda _: FakeEncoder())
+    found = suggest(engine)
+    assert {"mug", "book", "plant"} >= set(found.examples)
+    assert found.examples
+    assert all(engine.run(phrase).found for phrase in found.examples)
+    assert set(found.examples) <= set(found.phrases)
+    assert len(suggest(engine, at_most=1).examples) == 1
+
+
+def test_without_an_encoder_the_phrasebook_is_asked():
+    nothing = (-axis(0) - axis(1) - axis(2)) / np.float32(np.sqrt(3))
+    book = {"mug": axis(0), "unicorn": nothing, "of": axis(1)}
+    scene = replace(blob_scene(), language=replace(language(), phrasebook=book))
+    found = suggest(QueryEngine(scene))
+    assert found.examples == ("mug",)
+    assert found.phrases == ("mug", "unicorn", "of")
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ("te", ["teddy bear", "tea pot", "teapot"]),
+        ("TEA ", []),
+        ("tea p", ["tea pot"]),
+        ("red te", ["red teddy", "red tea", "red teapot"]),
+        ("blue mu", ["blue mug"]),
+        ("mug", []),
+        ("", []),
+        ("zebra", []),
+    ],
+)
+def test_what_is_typed_is_completed(typed, offered):
+    assert completions(typed, PHRASES) == offered
+    assert completions(typed, PHRASES, at_most=1) == offered[:1]
+
+
+def test_a_correction_replaces_the_unknown_words_alone():
+    assert corrected("the Red mugg", {"mugg": ("mug", "muff")}) == "the red mug"
+    assert corrected("red mugg", {"mugg": ()}) is None

@@ -1,144 +1,50 @@
 """Relevancy, the sphere table, levels, places and pixels."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from langsplat_core.arrays import unit
+from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.query.answers import locate, peak_pixel
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.lookup import (
-    build_table,
-    decoded_relevancy,
-    octahedral_to_sphere,
-    sphere_to_octahedral,
-    splatted_relevancy,
-    suits_table,
-)
 from langsplat_core.query.surface import build_surface
-from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.scene import LanguageField, LinearCodec, Scene
-from langsplat_core.semantics.relevancy import FLOOR, Scale, latent_relevancy, relevancy
-from tests.support.fakes import WORDS, FakeEncoder, blob_scene
-from tests.support.two_blobs import D, random_codec, two_blob_scene
+from langsplat_core.scene import (
+    CANONICAL_PHRASES,
+    Calibration,
+    LanguageField,
+    Odds,
+    Reading,
+    Scene,
+)
+from langsplat_core.semantics.encoder import OPEN_MODEL
+from langsplat_core.semantics.encoders import DEMO
+from langsplat_core.semantics.relevancy import FLOOR
+from langsplat_core.semantics.vocabulary import FEWEST
+from tests.support.fakes import DIM, WORDS, FakeEncoder, axis, blob_scene, named_scene
+from tests.support.file_samples import random_field
+from tests.support.scenes import random_gaussians
+from tests.support.two_blobs import D, two_blob_scene
 
 
-def test_relevancy_is_the_minimum_of_pairwise_softmaxes():
-    rng = np.random.default_rng(1)
-    vectors, phrases, canonical = (unit(rng.normal(size=(n, D))) for n in (50, 3, 4))
-    got = relevancy(vectors, phrases, canonical)
-    for i, vector in enumerate(vectors):
-        for j, phrase in enumerate(phrases):
-            pairs = [np.exp(10 * np.array([vector @ phrase, vector @ c])) for c in canonical]
-            assert got[i, j] == pytest.approx(min(p[0] / p.sum() for p in pairs), abs=1e-12)
-
-
-def test_latents_of_length_zero_mean_nothing():
-    rng = np.random.default_rng(2)
-    codec = random_codec(rng)
-    phrase, canonical = unit(rng.normal(size=(1, D))), unit(rng.normal(size=(4, D)))
-    values = latent_relevancy(codec, np.zeros((4, 3), np.float32), phrase, canonical)
-    assert (values == 0).all()
-
-
-def test_blended_latents_keep_the_meaning_of_their_direction():
-    rng = np.random.default_rng(3)
-    codec = random_codec(rng)
-    latents = unit(rng.normal(size=(20, 3))).astype(np.float32)
-    phrase, canonical = unit(rng.normal(size=(1, D))), unit(rng.normal(size=(4, D)))
-    full = latent_relevancy(codec, latents, phrase, canonical)
-    faint = latent_relevancy(codec, 0.02 * latents, phrase, canonical)
-    np.testing.assert_allclose(faint, full, atol=1e-5)
-
-
-def test_linear_codec_needs_no_decoding():
-    rng = np.random.default_rng(4)
-    basis = np.linalg.qr(rng.normal(size=(D, 6)))[0].T.astype(np.float32)
-    codec = LinearCodec(np.ascontiguousarray(basis))
-    latents = rng.normal(size=(30, 6)).astype(np.float32)
-    phrase, canonical = unit(rng.normal(size=(2, D))), unit(rng.normal(size=(4, D)))
-    want = relevancy(codec.decode(latents), phrase, canonical)
-    np.testing.assert_allclose(latent_relevancy(codec, latents, phrase, canonical), want, atol=1e-5)
-
-
-def test_octahedral_map_is_a_bijection_of_the_sphere():
-    rng = np.random.default_rng(5)
-    vectors = unit(rng.normal(size=(1000, 3)))
-    vectors = np.concatenate([vectors, np.eye(3), -np.eye(3)])
-    np.testing.assert_allclose(octahedral_to_sphere(sphere_to_octahedral(vectors)), vectors, atol=1e-12)
-    uv = sphere_to_octahedral(vectors)
-    assert uv.min() >= 0
-    assert uv.max() <= 1
-
-
-def test_table_agrees_with_exact_decoding_and_improves_with_resolution():
-    rng = np.random.default_rng(6)
-    codec = random_codec(rng)
-    latents = unit(rng.normal(size=(4000, 3))).astype(np.float32)
-    latents[:6] = np.concatenate([np.eye(3), -np.eye(3)])  # the fold's corners and edges
-    phrases, canonical = unit(rng.normal(size=(5, D))), unit(rng.normal(size=(4, D)))
-    exact = latent_relevancy(codec, latents, phrases, canonical)
-    errors = {}
-    for resolution in (48, 192):
-        table = build_table(codec, latents, Scale(canonical, None, 10.0), resolution=resolution)
-        got = np.stack(list(table.relevancies(phrases)), 1)
-        errors[resolution] = np.abs(got - exact)
-    assert errors[192].mean() < 3e-4
-    assert errors[192].max() < 0.02  # at creases of the ReLU decoder
-    assert errors[192].mean() < errors[48].mean() / 6  # bilinear: second order where smooth
-
-
-def test_a_table_decodes_only_what_latents_lie_between():
-    rng = np.random.default_rng(8)
-    codec, canonical = random_codec(rng), unit(rng.normal(size=(4, D)))
-    latents = np.repeat(unit(rng.normal(size=(5, 3))), 40, axis=0).astype(np.float32)
-    latents[:40] = 0  # no meaning
-    table = build_table(codec, latents, Scale(canonical, None, 10.0), resolution=64)
-    assert len(table.used) == len(table.vectors) <= 4 * 4
-    phrases = unit(rng.normal(size=(2, D)))
-    got = np.stack(list(table.relevancies(phrases)), 1)
-    np.testing.assert_allclose(got, latent_relevancy(codec, latents, phrases, canonical), atol=0.02)
-    assert (got[:40] == 0).all()
-    nothing = build_table(codec, np.zeros((7, 3), np.float32), Scale(canonical, None, 10.0))
-    assert (next(nothing.relevancies(phrases)) == 0).all()
-
-
-def test_a_table_needs_a_sphere():
-    rng = np.random.default_rng(7)
-    canonical = unit(rng.normal(size=(4, D))).astype(np.float32)
-    flat = LinearCodec(np.eye(D, dtype=np.float32)[:3])  # 3 numbers, but of any length
-    for codec in (random_codec(rng, d=4), flat):
-        assert not suits_table(codec)
-        with pytest.raises(ValueError, match="sphere"):
-            build_table(codec, np.ones((2, codec.latent_dim), np.float32), canonical)
-
-
-def test_the_floor_is_where_phrase_and_canonical_phrases_are_as_close():
-    vectors = np.eye(D)[:1]
-    assert relevancy(vectors, vectors, np.repeat(vectors, 4, 0)).tolist() == [[FLOOR]]
-
-
-def test_engine_finds_the_blob_and_its_place():
+def test_what_is_there_is_found_at_its_place_and_nothing_else_is():
     scene, left, _ = two_blob_scene()
-    result = QueryEngine(scene).run("left")
-    assert result.found
+    engine = QueryEngine(scene)
+    result, absent = engine.run("left"), engine.run("Nowhere")
+    assert (result.found, absent.found) == (True, False)
     assert result.level in (1, 2)  # nothing was observed at the subpart level
     assert result.scores[0] == 0
-    assert result.place is not None
     assert np.linalg.norm(result.place - left.mean(0)) < 0.25
-    assert result.box is not None
-    assert (result.box[1] < 0.5).any()  # the box does not reach the other blob
-    assert result.box[1][0] < 0
+    assert result.box[1][0] < 0  # the box does not reach the other blob
     assert (result.relevancy[2][:60] > 0.99).all()
-    assert (result.relevancy[2][60:] <= 0.5 + 1e-6).all()
-
-
-def test_engine_says_when_nothing_is_there():
-    scene, *_ = two_blob_scene()
-    result = QueryEngine(scene).run("Nowhere")
-    assert not result.found
-    assert result.peak <= 0.5 + 1e-6
+    assert (result.relevancy[2][60:] <= FLOOR + 1e-6).all()
+    assert absent.peak <= FLOOR + 1e-6
+    assert result.heat_range == (FLOOR, result.peak)
+    assert absent.heat_range == (FLOOR, pytest.approx(FLOOR + 0.1))  # never over less than a tenth
+    empty = QueryEngine(scene.take(np.zeros(0, int))).run("left")
+    assert (empty.found, empty.place) == (False, None)
 
 
 def test_engine_errors_say_what_to_do():
@@ -195,21 +101,6 @@ def test_marks_around_a_phrase_change_nothing(phrase):
     assert engine.run(phrase).phrase.lower() == "mug"
 
 
-def test_a_phrase_is_encoded_once():
-    encoded = []
-
-    class Counting(FakeEncoder):
-        def encode_texts(self, texts):
-            encoded.extend(texts)
-            return super().encode_texts(texts)
-
-    engine = QueryEngine(blob_scene(), lambda _: Counting())
-    check_phrase(engine, "mug or book")
-    run_phrase(engine, "book or mug")
-    engine.run("Mug", "part")
-    assert sorted(word for word in encoded if word in WORDS) == ["book", "mug"]
-
-
 def test_a_check_raises_what_asking_would():
     engine = QueryEngine(blob_scene(phrasebook=True))
     check_phrase(engine, "Book")
@@ -243,66 +134,19 @@ def test_the_encoder_is_loaded_once_by_the_first_phrase_that_needs_it(encoder_id
     assert engine.run(" Plant ", progress=lambda label, _: told.append(label)).phrase == "Plant"
     engine.run("mug", progress=lambda label, _: told.append(label))
     assert engine.unknown_words("red mug") == ("red",)
-    assert engine.load_encoder() is engine.encoder
     assert loaded == [asked_for]
     assert told[1:] == ["loading the text encoder", "searching 'Plant'", "searching 'mug'"]
-
-
-def test_heat_goes_from_the_floor_to_the_peak_but_never_over_less_than_a_tenth():
-    scene, *_ = two_blob_scene()
-    found, absent = QueryEngine(scene).run("left"), QueryEngine(scene).run("nowhere")
-    assert found.heat_range == (FLOOR, found.peak)
-    assert absent.heat_range == (FLOOR, pytest.approx(FLOOR + 0.1))
-
-
-def test_an_empty_scene_can_be_asked():
-    scene, *_ = two_blob_scene()
-    assert scene.language is not None
-    empty = Scene(
-        scene.gaussians.take(np.zeros(0, int)),
-        LanguageField(
-            scene.language.latents[:, :0],
-            scene.language.confidence[:, :0],
-            scene.language.codec,
-            scene.language.canonical,
-            "none",
-            scene.language.phrasebook,
-        ),
-    )
-    result = QueryEngine(empty).run("left")
-    assert not result.found
-    assert result.place is None
 
 
 def test_a_stray_gaussian_decides_nothing():
     scene, *_ = two_blob_scene()
     neighbourhood = build_surface(scene.gaussians)
-    values = np.zeros((3, 120))
-    values[2, :60] = 0.8
-    values[2, 90] = 1.0  # one wrong Gaussian in the other blob
-    smoothed = neighbourhood.smooth(values)[2]
-    place = locate(neighbourhood, smoothed, 0.5)
-    assert place is not None
-    assert place.position[0] < 0
-
-
-def test_both_orders_agree_inside_one_object_and_are_gated_outside():
-    scene, *_ = two_blob_scene()
-    assert scene.language is not None
-    view = ReferenceRasterizer().view(scene.gaussians, scene.cameras[0])
-    engine = QueryEngine(scene, rule="peak")
-    phrase = engine.text_vector("left")
-    ours = splatted_relevancy(view, engine.relevancy(phrase)[2][:, None], 0.3)[..., 0]
-    paper = decoded_relevancy(view, scene.language, 2, phrase[None], 0.3)[..., 0]
-    _, alpha = view.splat(np.ones((120, 1)))
-    assert (ours[alpha <= 0.3] == 0).all()
-    assert (paper[alpha <= 0.3] == 0).all()
-    covered = alpha > 0.5
-    np.testing.assert_allclose(ours[covered], paper[covered], atol=1e-3)  # the blobs do not overlap
-    column, row, score = peak_pixel(ours, 5)
-    assert column < 32
-    assert score > 0.9
-    assert alpha[row, column] > 0.3
+    values = np.zeros(120, np.float32)
+    values[:60] = 0.8
+    values[90] = 1.0  # one wrong Gaussian in the other blob
+    smoothed = neighbourhood.smooth(values)
+    place, _ = locate(neighbourhood, smoothed, 0.5)
+    assert place[0] < 0
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (30, 40)])
@@ -312,3 +156,135 @@ def test_peak_pixel_of_any_size(shape):
     column, row, _ = peak_pixel(image, 20)
     assert 0 <= column < shape[1]
     assert 0 <= row < shape[0]
+
+
+@pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
+@pytest.mark.parametrize("rule", ["regions", "peak"])
+@pytest.mark.parametrize("exact", [False, True])
+def test_many_phrases_together_are_answered_as_one_by_one(kind, rule, exact):
+    field = random_field(400, kind)
+    vectors = unit(np.random.default_rng(8).normal(size=(20, field.codec.vector_dim))).astype(np.float32)
+    book = {f"phrase {number}": vector for number, vector in enumerate(vectors)}
+    asked = LanguageField(field.latents, field.confidence, field.codec, field.canonical, "none", book)
+    engine = QueryEngine(Scene(random_gaussians(400), asked), exact=exact, rule=rule)
+    many = engine.run_many([*book, "Phrase 3"])
+    assert [result.phrase for result in many] == [*book, "Phrase 3"]
+    for phrase, together in zip([*book, "phrase 3"], many, strict=True):
+        alone = engine.run(phrase)
+        assert (together.level, together.found) == (alone.level, alone.found)
+        np.testing.assert_allclose(together.relevancy, alone.relevancy, atol=1e-6)
+        np.testing.assert_allclose(together.even, alone.even, atol=1e-6)
+        np.testing.assert_allclose(together.scores, alone.scores, atol=1e-6)
+        differ = together.members != alone.members  # at most where rounding decides
+        np.testing.assert_allclose(alone.even[differ], min(alone.cut, together.cut), atol=1e-5)
+
+
+def test_many_phrases_are_encoded_in_one_batch_or_not_at_all():
+    class Counting(FakeEncoder):
+        def encode_texts(self, texts):
+            batches.append(texts)
+            return super().encode_texts(texts)
+
+    batches: list[list[str]] = []
+    engine = QueryEngine(blob_scene(), lambda _: Counting())
+    assert engine.run_many([]) == []
+    with pytest.raises(EncoderError, match="'flurb'"):
+        engine.run_many(["mug", "flurb"])
+    with pytest.raises(InputError, match="empty"):
+        engine.run_many(["mug", " "])
+    assert batches == []
+    check_phrase(engine, "mug or book")
+    assert len(engine.run_many(["mug", "book", "Mug"])) == 3
+    run_phrase(engine, "book or mug")
+    # Each phrase once, and the canonical ones that prove the encoder.
+    assert batches == [["mug", "book"], list(CANONICAL_PHRASES)]
+
+
+# What an answer is said to stand on.
+
+CALIBRATED = Reading(calibration=Calibration(*[Odds(0, 1, 1)] * 3))
+FAR = np.where(
+    np.arange(DIM) < len(WORDS), 0.5, 1
+)  # from what is in the scene, so that that is found clearly
+EVERYDAY = unit((FAR * np.random.default_rng(4).normal(size=(FEWEST, DIM))).astype(np.float32))
+
+
+def scene_of(encoder: str, reading: Reading, *, everyday: bool = True) -> Scene:
+    scene = named_scene()
+    assert scene.language is not None
+    vectors = EVERYDAY if everyday else None
+    return replace(
+        scene, language=replace(scene.language, encoder_id=encoder, reading=reading, everyday=vectors)
+    )
+
+
+def test_too_few_everyday_phrases_count_as_none():
+    few = scene_of("lab/clip", Reading())
+    assert few.language is not None
+    few = replace(few, language=replace(few.language, everyday=EVERYDAY[:-1]))
+    assert QueryEngine(few).basis == QueryEngine(scene_of("lab/clip", Reading(), everyday=False)).basis
+
+
+@pytest.mark.parametrize("encoder", [DEMO, "lab/clip"])
+@pytest.mark.parametrize("reading", [CALIBRATED, Reading()])
+@pytest.mark.parametrize("everyday", [True, False])
+def test_a_calibration_is_named_exactly_where_probabilities_are_said(encoder, reading, everyday):
+    engine = QueryEngine(scene_of(encoder, reading, everyday=everyday))
+    before = engine.basis  # known before anything is asked, without loading an encoder
+    answer = engine.run("mug")
+    assert engine.basis == before
+    assert (before.calibration is not None) == (answer.probability is not None)
+    assert before.encoder == encoder
+    assert before.guesses == (encoder == DEMO and reading == Reading())
+    assert (OPEN_MODEL in before.long) == before.guesses
+    engine.compare_with(["plant"])
+    assert engine.run("mug").probability is None
+    assert engine.basis.calibration is None
+
+
+def test_ways_to_an_answer_are_told_apart():
+    demo, clip = scene_of(DEMO, CALIBRATED), scene_of("lab/clip", Reading())
+    guessed, published = scene_of(DEMO, Reading()), scene_of("lab/clip", Reading(), everyday=False)
+    said = [QueryEngine(scene).basis for scene in (demo, clip, guessed, published)]
+    assert len({basis.short for basis in said}) == len({basis.long for basis in said}) == 4
+    assert "lab/clip" in said[1].short
+
+
+class Speaker(FakeEncoder):
+    """Knows every word; what is in no scene has a vector of its own."""
+
+    def encode_texts(self, texts: list[str]) -> Array:
+        drawn = [np.random.default_rng(list(text.encode())).normal(size=DIM) for text in texts]
+        own = [axis(3) if text in CANONICAL_PHRASES else row for text, row in zip(texts, drawn, strict=True)]
+        return unit(np.array(own, np.float32))
+
+    def unknown_words(self, text: str) -> tuple[str, ...]:
+        return ()
+
+
+def test_everyday_phrases_of_the_encoder_count_once_they_are_there():
+    engine = QueryEngine(scene_of("lab/clip", Reading(), everyday=False), lambda _: Speaker())
+    published = engine.basis
+    assert engine.run("mug").excess is not None
+    assert engine.basis.short != published.short
+
+
+def test_without_a_calibration_combined_answers_have_no_probability_and_the_weakest_excess():
+    scene = scene_of("lab/clip", Reading())
+    assert scene.language is not None
+    book = scene.language.phrasebook | {"handle": axis(3)}
+    engine = QueryEngine(replace(scene, language=replace(scene.language, phrasebook=book)))
+    parts = [engine.run(text) for text in ("mug", "wall")]
+    both = run_phrase(engine, "mug and wall").answer
+    assert both.excess == min(part.excess for part in parts) < parts[0].excess
+    either = run_phrase(engine, "mug or wall").answer
+    assert either.excess == parts[0].excess
+    assert run_phrase(engine, "mug near the wall").answer.excess == parts[1].excess
+    assert [part.found for part in (*parts, both, either)] == [True, False, False, True]
+    inside = run_phrase(engine, "handle of the wall").answer
+    assert inside.excess == parts[1].excess < run_phrase(engine, "handle of the mug").answer.excess
+    none = run_phrase(engine, "mug, not mug").answer
+    assert not none.members.any()
+    for answer in (both, either, inside, none):
+        assert answer.probability is None
+    assert (inside.verdict, none.verdict) == ("not here", "not here")

@@ -16,8 +16,9 @@ from langsplat_core.query.grammar import (
     Union,
     Without,
     atoms,
+    named,
     parse,
-    reading,
+    unparse,
 )
 from langsplat_core.scene.language import split_phrases
 
@@ -101,46 +102,17 @@ def test_a_text_without_end_is_refused():
 
 
 def test_readings_show_the_structure():
-    assert reading(parse("red mug handle")) == "handle  inside  red mug"
-    assert reading(parse("biggest mug on the table")) == "biggest  (mug  on  table)"
-    assert reading(parse("mug nearest to the book")) == "nearest  mug  from  book"
-    assert reading(parse("mug or cup, not red cup")) == "(mug  or  cup)  without  red cup"
+    assert unparse(parse("red mug handle")) == "handle  inside  red mug"
+    assert unparse(parse("biggest mug on the table")) == "biggest  (mug  on  table)"
+    assert unparse(parse("mug nearest to the book")) == "nearest  mug  from  book"
+    assert unparse(parse("mug or cup, not red cup")) == "(mug  or  cup)  without  red cup"
 
 
 WORDS = st.sampled_from(
-    [
-        "mug",
-        "red",
-        "handle",
-        "of",
-        "the",
-        "and",
-        "or",
-        "not",
-        "without",
-        "but",
-        ",",
-        "'",
-        "'s",
-        "on",
-        "in",
-        "left",
-        "to",
-        "biggest",
-        "nearest",
-        "from",
-        "a",
-        "orange,",
-        "&",
-        "on;",
-        "mug's",
-        "dogs'",
-        "near",
-        "as",
-        "well",
-        "top",
-    ]
-)
+    ["mug", "red", "handle", "of", "the", "and", "or", "not", "without", "but", ",", "'", "'s", "on", "in",
+     "left", "to", "biggest", "nearest", "from", "a", "orange,", "&", "on;", "mug's", "dogs'", "near", "as",
+     "well", "top"]
+)  # fmt: skip
 
 
 @settings(max_examples=400)
@@ -152,4 +124,16 @@ def test_every_text_is_read_or_refused(text):
             tree = parse(query)
         except InputError:
             continue
-        assert all(atom.text.strip() and atom.text in reading(tree) for atom in atoms(tree))
+        assert all(atom.text.strip() and atom.text in unparse(tree) for atom in atoms(tree))
+
+
+NAMED = {
+    "thing": ("", "mug", "red mug", "handle of", "handle mug"),
+    "part": ("handle", "Handles", "the red handle"),
+    "part of a thing": ("mug handle", "the red mug handles", "lamp shade"),
+}
+
+
+@pytest.mark.parametrize("what", NAMED)
+def test_a_part_word_at_the_end_names_a_part_and_a_thing_before_it_whose(what):
+    assert {named(phrase) for phrase in NAMED[what]} == {what}

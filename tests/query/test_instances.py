@@ -5,14 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull
 
-from langsplat_core.arrays import Array, logit, sigmoid
+from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid
+from langsplat_core.errors import InputError
 from langsplat_core.query.instances import (
     BOXED,
     CRUMB_COUNT,
     EQUAL_SCORES,
-    connected_parts,
+    INNER,
+    Instance,
+    Mesh,
+    OrientedBox,
+    axis_aligned_box,
     find_instances,
+    hull,
+    hulls,
+    oriented_box,
 )
 from langsplat_core.query.surface import Surface, build_surface
 from langsplat_core.scene import Gaussians
@@ -49,7 +58,7 @@ def smoothed(surface: Surface, values: Array) -> Array:
 def test_parts_are_the_connected_components():
     surface = build_surface(random_gaussians(500))
     numbers = np.flatnonzero(np.random.default_rng(0).uniform(size=len(surface.rows)) < 0.08)
-    parts = connected_parts(surface, numbers)
+    parts = surface.parts(numbers)
     count, labels = connected_components(surface.links[numbers][:, numbers], directed=False)
     assert len(parts.starts) == count > 3
     own = parts.labels[numbers]
@@ -59,6 +68,7 @@ def test_parts_are_the_connected_components():
     grouped = np.split(parts.order, parts.starts[1:])
     assert all(set(parts.labels[group]) == {part} for part, group in enumerate(grouped))
     assert (np.delete(parts.labels, numbers) < 0).all()
+    assert surface.parts(numbers[:0]).each() == []
 
 
 def test_every_ball_is_an_instance_with_the_figures_of_a_plain_account():
@@ -157,3 +167,147 @@ def test_boxes_of_many_points_are_taken_from_some_of_them(measured):
     error = np.abs(found.box - np.quantile(surface.positions, [0.02, 0.98], axis=0)).max() / 0.2
     measured("boxes of a fifth of the points", "error of a side, share of it", error)
     assert error < 0.01
+
+
+# Boxes around points whose box is known.
+
+INSIDE = INNER[1] - INNER[0]  # of a side, where points are spread evenly over it
+
+
+def turned(seed: int) -> Array:
+    return rotation_matrices(np.random.default_rng(seed).normal(size=(1, 4)))[0]
+
+
+def filled(sides: tuple[float, float, float], count: int = 2000, seed: int = 0) -> Array:
+    return np.random.default_rng(seed).uniform(-0.5, 0.5, size=(count, 3)) * sides
+
+
+def check(box: OrientedBox) -> None:
+    np.testing.assert_allclose(box.axes.T @ box.axes, np.eye(3), atol=1e-12)
+    assert np.linalg.det(box.axes) == pytest.approx(1)
+    assert (np.diff(box.half_extents) <= 0).all()
+    assert (box.half_extents >= 0).all()
+    assert np.isfinite(box.centre).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("sides", [(3, 2, 1), (1, 1, 0.3), (2, 0.5, 0.5), (1, 1, 1), (4, 3, 0)])
+def test_a_turned_box_is_found_again(sides, seed, measured):
+    rotation, shift = turned(seed), np.array([5.0, -2, 9])
+    box = oriented_box(filled(sides, seed=seed) @ rotation.T + shift)
+    check(box)
+    np.testing.assert_allclose(box.centre, shift, atol=0.03 * max(sides))
+    found = 2 * box.half_extents
+    error = np.abs(found - INSIDE * np.array(sides)).max() / max(sides)
+    measured(f"oriented box of {sides}", "error of a side, share of the longest", error)
+    assert error < 0.08
+
+
+def test_strays_do_not_count():
+    points = filled((3, 2, 1))
+    before = oriented_box(points)
+    points[:20] = np.random.default_rng(1).normal(scale=50, size=(20, 3))
+    after = oriented_box(points)
+    np.testing.assert_allclose(after.half_extents, before.half_extents, rtol=0.1)
+    box = axis_aligned_box(points)
+    assert (np.abs(box) < 1.6).all()
+
+
+def test_no_more_than_the_quantiles_lie_outside():
+    points = filled((1, 2, 3)) @ turned(2).T
+    box = oriented_box(points)
+    low, high = axis_aligned_box(points)
+    per_axis = 1 - INSIDE
+    assert 1 - 3 * per_axis - 0.01 <= box.contains(points).mean() < 1
+    assert ((points >= low) & (points <= high)).all(1).mean() >= 1 - 3 * per_axis - 0.01
+    assert box.contains(box.corners).all()
+    np.testing.assert_allclose(
+        np.sort(box.corners @ box.axes, axis=0)[-1] - box.centre @ box.axes, box.half_extents
+    )
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.zeros((1, 3)),
+        np.full((7, 3), 4.0),
+        np.array([[0.0, 0, 0], [1, 2, 3]]),
+        np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]),
+        np.linspace(0, 1, 50)[:, None] * [1.0, 1, 0],
+        filled((2, 1, 0)),
+        filled((1, 1, 1)) * 1e-20,
+        filled((1, 1, 1)) * 1e20,
+        filled((1, 1, 1)).astype(np.float32),
+    ],
+    ids=["one", "coincident", "two", "three", "line", "plane", "tiny", "huge", "float32"],
+)
+def test_degenerate_points(points):
+    check(oriented_box(points))
+    assert np.isfinite(axis_aligned_box(points)).all()
+
+
+def test_a_line_has_a_length():
+    box = oriented_box(np.linspace(0, 1, 101)[:, None] * [3.0, 4, 0])
+    np.testing.assert_allclose(2 * box.half_extents, [5 * INSIDE, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(np.abs(box.axes[:, 0]), [0.6, 0.8, 0], atol=1e-9)
+
+
+# Hulls: closed, turned outwards, around the thing and not its strays.
+
+
+def thing(points: Array) -> tuple[Instance, Gaussians]:
+    n = len(points)
+    gaussians = Gaussians(
+        means=points,
+        log_scales=np.full((n, 3), -4.0),
+        quats_wxyz=np.tile([1.0, 0, 0, 0], (n, 1)),
+        opacity_logits=np.full(n, 3.0),
+        sh=np.zeros((n, 1, 3)),
+    )
+    positions = gaussians.means.astype(np.float64)
+    return Instance(np.arange(n), 0.9, 0.9, positions.mean(0), positions, 1.0), gaussians
+
+
+def colours(n: int) -> Array:
+    return np.tile([0.2, 0.4, 0.6], (n, 1))
+
+
+def volume(mesh: Mesh) -> float:
+    """Positive where the triangles are turned outwards; a closed mesh is needed."""
+    a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
+    return float((np.cross(a, b) * c).sum() / 6)
+
+
+def check_closed(mesh: Mesh) -> None:
+    edges = [(int(t[k]), int(t[(k + 1) % 3])) for t in mesh.triangles for k in range(3)]
+    assert len(set(edges)) == len(edges)
+    assert {(b, a) for a, b in edges} == set(edges)
+
+
+def test_the_hull_of_a_cloud_is_its_convex_hull_within_the_box():
+    points = np.random.default_rng(0).uniform(size=(3000, 3)) * [3, 2, 1]
+    points[:5] += 100  # strays
+    instance, gaussians = thing(points)
+    mesh = hull(instance, gaussians, colours(3000), "cloud")
+    check_closed(mesh)
+    inside = instance.oriented.contains(gaussians.means.astype(np.float64))
+    assert volume(mesh) == pytest.approx(ConvexHull(gaussians.means[inside]).volume, rel=1e-6)
+    assert 0.85 * 6 * (INNER[1] - INNER[0]) ** 3 < volume(mesh) < 6
+    np.testing.assert_allclose(mesh.colour, [0.2, 0.4, 0.6])
+    assert (np.abs((mesh.vertices - instance.oriented.centre) @ instance.oriented.axes) < 1.6).all()
+
+
+@pytest.mark.parametrize("flat", [[1, 1, 0], [1, 0, 0]], ids=["sheet", "line"])
+def test_sheets_and_lines_are_given_a_thickness(flat):
+    instance, gaussians = thing(np.random.default_rng(0).uniform(size=(200, 3)) * flat)
+    meshes = hulls([instance, replace(instance)], gaussians, colours(200), "red mug")
+    assert [mesh.name for mesh in meshes] == ["red mug 1", "red mug 2"]
+    check_closed(meshes[0])
+    assert volume(meshes[0]) > 0
+
+
+def test_four_points_are_enough_and_one_is_not():
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    assert volume(hull(*thing(points), colours(4), "four")) == pytest.approx(1 / 6)
+    with pytest.raises(InputError, match="mug 1 is a single point"):
+        hull(*thing(np.ones((5, 3))), colours(5), "mug 1")

@@ -1,5 +1,6 @@
-"""A scene of three blobs with known meanings, and a text encoder that knows their names."""
+"""A scene of three blobs with known meanings, a text encoder that knows their names, and phrases for it."""
 
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -18,7 +19,16 @@ from langsplat_core.scene import (
     Scene,
     look_at,
 )
-from tests.support.everyday import everyday_about
+from langsplat_core.scene.codec import CodebookCodec
+
+COUNT = 64
+
+
+def everyday_about(canonical: Array, spread: float = 0.2, seed: int = 8) -> Array:
+    """(64, D) float32 unit vectors around a (D,) canonical phrase: nothing in particular fits them."""
+    noise = np.random.default_rng(seed).normal(scale=spread, size=(COUNT, len(canonical)))
+    return unit(canonical + noise).astype(np.float32)
+
 
 WORDS = ("mug", "book", "plant")  # each an axis of the vector space; the fourth is the canonical phrases'
 CENTRES = np.array([[-1.2, 0.0, 0.0], [0.0, 0.0, 0.0], [1.2, 0.0, 0.0]])
@@ -100,3 +110,21 @@ def calibrated_for(phrase: str, logit_of_whole: float) -> Calibration:
     """With which `phrase`, asked of the blobs, has a probability of sigmoid(logit_of_whole)."""
     fits = QueryEngine(blob_scene(), lambda _: FakeEncoder()).run(phrase).fits
     return Calibration(*[Odds(logit_of_whole - 8 * fits[2], whole=8.0, finer=0.0)] * 3)
+
+
+NAMES = (*WORDS, "wall")  # "wall" is nowhere in the scene
+BOOK = {**{word: axis(number) for number, word in enumerate(WORDS)}, "wall": axis(6)}
+
+
+def named_field(codebook: bool = True) -> LanguageField:
+    """Each blob means its word at level "whole"; `NAMES` are in the phrasebook, so no encoder is needed."""
+    made = replace(language(), phrasebook=BOOK)
+    if not codebook:
+        return made
+    codec = CodebookCodec(np.eye(4, DIM, dtype=np.float32), np.zeros((4, 3), np.float32))
+    codes = made.codec.decode(made.latents.reshape(-1, 4)) @ codec.vectors.T
+    return replace(made, codec=codec, latents=codes.argmax(1).astype(np.uint16).reshape(3, -1, 1))
+
+
+def named_scene(codebook: bool = True, path: Path | None = None) -> Scene:
+    return Scene(blobs(), named_field(codebook), cameras(), path)

@@ -16,7 +16,7 @@ from langsplat_core.scene import (
     Scene,
     look_at,
 )
-from tests.support.everyday import everyday_about
+from tests.support.fakes import everyday_about
 
 DIM = 8
 AXES = ("mug", "handle", "book", "table", "red", "blue", "anything", "white")  # the seventh is canonical

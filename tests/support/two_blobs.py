@@ -12,7 +12,7 @@ from langsplat_core.scene import (
     Scene,
     look_at,
 )
-from tests.support.everyday import everyday_about
+from tests.support.fakes import everyday_about
 
 D = 16
 

@@ -88,6 +88,16 @@ def settle(viewer: Viewer, seconds: float = 120.0) -> None:
     viewpoint.tick(viewer, 0.0)
 
 
+def recorded(viewer: Viewer, seconds: float = 60.0) -> None:
+    """Until the recorder has nothing left to do."""
+    end = time.monotonic() + seconds
+    while viewer.recorder.current is not None:
+        assert time.monotonic() < end, "never finished"
+        viewer.take_results()
+        time.sleep(0.002)
+    viewer.take_results()
+
+
 def arrive(viewer: Viewer) -> None:
     """Let a gliding camera arrive."""
     viewpoint.tick(viewer, viewer.clock + 2 * GLIDE_SECONDS)

@@ -36,7 +36,7 @@ from langsplat_viewer.state import (
 )
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
-from tests.support.windowless import FakeRenderer, errors, rest, settle
+from tests.support.windowless import FakeRenderer, errors, recorded, rest, settle
 
 SIZE = (120, 90)
 
@@ -632,12 +632,6 @@ def test_a_search_is_measured(opened):
     assert [title for title, _ in opened.state.timing.medians()] == ["Search"]
 
 
-def wait(viewer) -> None:
-    viewer.worker, viewer.recorder = viewer.recorder, viewer.worker
-    settle(viewer)
-    viewer.worker, viewer.recorder = viewer.recorder, viewer.worker
-
-
 @pytest.mark.parametrize("look", ["plain", "heat", "wipe", "levels", "changed"])
 def test_what_is_shown_is_that_of_the_reference(drawn, look):
     """Whatever is chosen in the window: queries, split, marks, cuts, splats."""
@@ -654,7 +648,7 @@ def test_what_is_shown_is_that_of_the_reference(drawn, look):
         settings.set_clip(drawn, Clip(1.0, 5.2))
         settings.set_colour_map(drawn, "viridis")
     viewpoint.compare_with_reference(drawn)
-    wait(drawn)
+    recorded(drawn)
     found = drawn.state.timing.comparison
     assert errors(drawn) == []
     assert LONGEST_SIDE - 3 < max(found.size) <= LONGEST_SIDE
@@ -672,7 +666,7 @@ def test_what_is_wrong_is_told(drawn, monkeypatch):
     capture = drawn.surface.capture
     monkeypatch.setattr(drawn.surface, "capture", lambda state: 255 - capture(state))
     viewpoint.compare_with_reference(drawn)
-    wait(drawn)
+    recorded(drawn)
     found = drawn.state.timing.comparison
     assert found.largest == 255
     assert found.mean == pytest.approx(np.abs(255 - 2 * right).mean(), abs=1)
@@ -680,7 +674,7 @@ def test_what_is_wrong_is_told(drawn, monkeypatch):
 
 def test_the_picture_on_screen_is_drawn_again_after_it(drawn):
     viewpoint.compare_with_reference(drawn)
-    wait(drawn)
+    recorded(drawn)
     rest(drawn.surface, drawn.state, 2.0)
     assert drawn.surface.textures[0].size == (400, 300)
     depths = drawn.surface.depths()
@@ -697,5 +691,5 @@ def test_a_comparison_is_one_at_a_time_and_can_be_left(drawn):
     viewpoint.compare_with_reference(drawn)
     assert "wait for it or cancel it" in errors(drawn)[-1]
     viewpoint.stop_comparing(drawn)
-    wait(drawn)
+    recorded(drawn)
     assert drawn.state.timing.comparison is None

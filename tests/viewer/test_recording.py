@@ -1,7 +1,6 @@
 """Camera paths, films, saved images and commands, as actions of the window."""
 
 import shlex
-import time
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from langsplat_viewer.rendering.renderer import render_image
 from langsplat_viewer.rendering.request import Splats
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
-from tests.support.windowless import arrive, errors, settle
+from tests.support.windowless import arrive, errors, recorded, settle
 
 
 def turn(viewer: Viewer, yaw: float) -> None:
@@ -36,16 +35,6 @@ def record_three(viewer: Viewer) -> list:
         filming.add_keyframe(viewer)
         turn(viewer, 0.3)
     return views
-
-
-def drawn(viewer: Viewer, seconds: float = 60.0) -> None:
-    """Until the recorder has nothing left to do."""
-    end = time.monotonic() + seconds
-    while viewer.recorder.current is not None:
-        assert time.monotonic() < end, "never finished"
-        viewer.take_results()
-        time.sleep(0.002)
-    viewer.take_results()
 
 
 def times(viewer: Viewer) -> list[float]:
@@ -194,7 +183,7 @@ def test_a_film_is_made_beside_the_window(opened, folder):
     filming.set_film_fps(opened, 1.0)
     filming.save_film(opened, folder)
     queries.ask(opened, "mug")  # the other worker answers meanwhile
-    drawn(opened)
+    recorded(opened)
     assert "blobs-film-001/: 32x24, 5 pictures" in " ".join(m.text for m in opened.state.messages)
     seen = sorted((folder / "blobs-film-001").glob("*.png"))
     assert len(seen) == 5
@@ -208,7 +197,7 @@ def test_a_film_can_be_stopped(opened, folder):
     filming.set_film_size(opened, 320, 240)
     filming.save_film(opened, folder)
     filming.cancel_film(opened)
-    drawn(opened)
+    recorded(opened)
     opened.recorder.close(10.0)
     assert len(list(folder.glob("blobs-film-001/*.png"))) < 121
     assert not list(folder.glob("**/.*"))
@@ -217,7 +206,7 @@ def test_a_film_can_be_stopped(opened, folder):
 def test_a_picture_of_any_size(opened, folder):
     filming.set_film_size(opened, 97, 41)
     filming.save_sized_picture(opened, folder)
-    drawn(opened)
+    recorded(opened)
     assert Image.open(folder / "blobs-97x41-001.png").size == (97, 41)
 
 

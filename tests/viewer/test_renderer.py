@@ -64,9 +64,9 @@ def random_channels(seed: int, display: str, queries: int) -> Channels:
     """Alpha from 0 to 1 with many pixels about the gate, colours beyond 1, depths beyond the range."""
     rng = np.random.default_rng(seed)
     alpha = np.clip(rng.normal(0.4, 0.35, size=(40, 50)), 0, 1).astype(np.float32)
-    count = {"latent": 3, "relevancy": queries, "segmentation": queries, "depth": 1}.get(display)
+    count = {"latent": 3, "relevancy": queries, "segmentation": queries}.get(display, 1)
     rgb = rng.uniform(size=(40, 50, 3)).astype(np.float32) * alpha[..., None] * 1.3
-    if count is None:
+    if DISPLAYS[display].channel is None:
         return Channels(rgb, alpha)
     low, high = (0.5, 4.0) if display == "depth" else (0.0, 1.0)
     return Channels(rgb, alpha, rng.uniform(low, high, (40, 50, count)).astype(np.float32) * alpha[..., None])

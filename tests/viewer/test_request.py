@@ -1,6 +1,5 @@
 """Render requests: what they depend on, their panes, the edited scene; and that every image is one."""
 
-import time
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 
@@ -43,7 +42,7 @@ from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene, cameras
 from tests.support.scenes import random_gaussians
 from tests.support.selected import blob
-from tests.support.windowless import errors, rest, settle
+from tests.support.windowless import errors, recorded, rest, settle
 
 SCENE = blob_scene()
 NOTHING = np.zeros(360, bool)
@@ -78,16 +77,6 @@ def edit_everything(viewer: Viewer, mode: str) -> None:
     settings.set_display(viewer, "relevancy", 1)
     split = Split(mode, second="segmentation", second_level=0, at=0.4)
     state.settings = replace(state.settings, split=split)
-
-
-def recorded(viewer: Viewer) -> None:
-    """Until the recorder has nothing left to do."""
-    end = time.monotonic() + 60
-    while viewer.recorder.current is not None:
-        assert time.monotonic() < end
-        viewer.take_results()
-        time.sleep(0.002)
-    viewer.take_results()
 
 
 def image(path: Path) -> np.ndarray:
