@@ -181,14 +181,15 @@ def test_a_film_is_made_beside_the_window(opened, folder):
     record_three(opened)
     filming.set_film_size(opened, 32, 24)
     filming.set_film_fps(opened, 1.0)
+    request = opened.state.request((32, 24))
     filming.save_film(opened, folder)
-    queries.ask(opened, "mug")  # the other worker answers meanwhile
+    queries.ask(opened, "mug")  # the other worker answers meanwhile, and changes what is shown
     recorded(opened)
     assert "blobs-film-001/: 32x24, 5 pictures" in " ".join(m.text for m in opened.state.messages)
     seen = sorted((folder / "blobs-film-001").glob("*.png"))
     assert len(seen) == 5
     camera = opened.state.record.keyframes[1].pose.camera(32, 24)
-    expected = render_image(opened.state.request((32, 24)).seen_by(camera), "cpu")
+    expected = render_image(request.seen_by(camera), "cpu")
     np.testing.assert_array_equal(np.asarray(Image.open(seen[2])), expected)
 
 

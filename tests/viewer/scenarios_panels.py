@@ -1,4 +1,4 @@
-"""Scenarios of `window_driver` about files: those that change while they are shown."""
+"""Scenarios of `window_driver` in the panels: files, training, layout, recording, bookmarks."""
 
 import json
 import sys
@@ -13,15 +13,15 @@ from imgui_bundle import imgui  # isort: skip
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.pipeline.report import REPORT
 from langsplat_viewer import viewer as training
-from langsplat_viewer.actions import opening, settings, viewpoint
+from langsplat_viewer.actions import filming, opening, settings, viewpoint
+from langsplat_viewer.files.flights import read_flight
+from langsplat_viewer.panels.layout import PANELS
 from langsplat_viewer.panels.style import scene_area
 from tests.support.fakes import CENTRES, blob_scene
 
 
 def reload_what_changed(s: Any) -> None:
     """A bar appears by itself, its button reads the file again, camera and queries stay."""
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
     s.search("mug")
     s.drag((600, 300), (656, 279))
     s.settle()
@@ -44,8 +44,6 @@ def reload_what_changed(s: Any) -> None:
 
 def fade_in_a_photograph(s: Any) -> None:
     """The slider lays it over the picture where the camera saw it; elsewhere there is none."""
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
     viewer, folder = s.window.viewer, s.folder / "elsewhere"
     folder.mkdir()
     colours = np.full((240, 320, 3), (250, 120, 10), np.uint8)
@@ -87,8 +85,6 @@ def fade_in_a_photograph(s: Any) -> None:
 
 def switch_between_scenes(s: Any) -> None:
     """Dropped together; the list in the panel shows one after the other, as it was left."""
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
     s.window.drop([str(s.folder / name) for name in ("blobs.ply", "plain.ply")])
     s.ctx.yield_(2)
     s.settle()
@@ -125,8 +121,6 @@ time.sleep(60)
 
 def watch_a_training(s: Any) -> None:
     """The panel plots what the process says of its loss."""
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
     viewer, photographs = s.window.viewer, s.folder / "photos"
     photographs.mkdir()
     for number in range(3):
@@ -157,8 +151,6 @@ DOUBTS = [
 
 def read_what_speaks_against(s: Any) -> None:
     """A training that ends with doubts: the panels Train and Scene have them, for that scene alone."""
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
     viewer, photographs = s.window.viewer, s.folder / "photos"
     photographs.mkdir()
     (photographs / "0.jpg").write_bytes(b"")
@@ -195,10 +187,137 @@ def digit_key(digit: int) -> imgui.Key:
 
 
 Scenario = tuple[Callable[[Any], None], str, dict[str, Any]]
-SCENARIOS: dict[str, Scenario] = {
+FILES: dict[str, Scenario] = {
     "reload_what_changed": (reload_what_changed, "blobs.ply", {}),
     "fade_in_a_photograph": (fade_in_a_photograph, "blobs.ply", {}),
     "switch_between_scenes": (switch_between_scenes, "blobs.ply", {}),
     "watch_a_training": (watch_a_training, "blobs.ply", {}),
     "read_what_speaks_against": (read_what_speaks_against, "blobs.ply", {}),
+}
+
+
+# Scenarios of `window_driver` about where things lie: large letters, long words.
+
+LONG = "mugg or boook or plent or mugg or boook or plent or mugg or boook or plent or mugg"
+
+
+def large_letters(s: Any) -> None:
+    """At twice the size, in a small window: the column grows, and no widget of any panel is cut off."""
+    for phrase in ("mug or plant", LONG):
+        s.search(phrase)
+    assert s.state.queries[-1].meant  # a long one, and so is the button for it
+    narrow = scene_area().left
+    settings.set_ui_scale(s.window.viewer, 2.0)
+    s.settle()
+    assert 1.3 * narrow < scene_area().left <= 0.41 * 1280
+    for panel in PANELS:
+        settings.open_panel(s.window.viewer, panel.title)
+        s.settle()
+        assert seen_items(s, panel.title), panel.title
+        assert cut_off(s, panel.title) == [], panel.title
+    settings.show_help(s.window.viewer, True)
+    s.settle()
+    keys = s.ctx.window_info("//Keys").window
+    assert 0 <= keys.pos.x <= keys.pos.x + keys.size.x <= 1280
+    assert 0 <= keys.pos.y <= keys.pos.y + keys.size.y <= 720
+    s.shot("large letters")
+    settings.escape(s.window.viewer)
+    settings.set_ui_scale(s.window.viewer, 1.0)
+    s.settle()
+    assert abs(scene_area().left - narrow) < 0.15 * narrow
+
+
+def seen_items(s: Any, title: str) -> list[Any]:
+    """The widgets of a panel."""
+    found = imgui.test_engine.TestItemList()
+    s.ctx.gather_items(found, f"//{title}")
+    return [found.get_by_index(place) for place in range(found.get_size())]
+
+
+def cut_off(s: Any, title: str) -> list[tuple[float, float]]:
+    """Right ends of the widgets that reach beyond their window, and where that ends."""
+    ends = [(item.rect_full.max.x, item.window.inner_rect.max.x) for item in seen_items(s, title)]
+    return [(right, end) for right, end in ends if right > end + 1]
+
+
+LAYOUT: dict[str, tuple[Callable[[Any], None], str, dict[str, Any]]] = {
+    "large_letters": (large_letters, "blobs.ply", {"size": (1280, 720)}),
+}
+
+
+# Scenarios of `window_driver`: the panel "Record", bookmarks, sides.
+
+
+def record_and_play(s) -> None:
+    """Keyframes by a key, played in the window, saved as a path and as a film."""
+    record = s.state.record
+    settings.open_panel(s.window.viewer, "Record")
+    s.ctx.yield_(4)
+    for end in ((656, 300), (700, 320)):
+        s.ctx.key_press(imgui.Key.k)
+        s.drag((600, 300), end)
+        s.settle()
+    s.ctx.item_click("//**/Add keyframe")
+    s.ctx.yield_(2)
+    assert [key.seconds for key in record.keyframes] == [0, 2, 4]
+    last = s.state.view
+    s.ctx.item_click("//**/Clear")
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
+    s.ctx.yield_(2)
+    assert len(record.keyframes) == 3
+
+    filming.set_path_seconds(s.window.viewer, 1.0)
+    start = s.shot("start")
+    s.ctx.item_click("//**/Play##path")
+    s.wait(lambda: 0.2 < record.at < 1.0)
+    moving = s.state.view
+    s.wait(lambda: record.began is None)
+    assert record.at == 1.0
+    np.testing.assert_allclose(s.state.view.eye, last.eye, atol=1e-6)
+    assert np.abs(moving.eye - last.eye).max() > 1e-3
+    s.ctx.key_press(imgui.Key.mod_shift | imgui.Key.k)  # from the start again
+    s.wait(lambda: 0 < record.at < 0.9)
+    s.drag((600, 300), (620, 310))  # the hand is stronger
+    s.settle()
+    assert record.began is None
+    assert np.abs(s.shot("elsewhere") - start)[100:500, 400:].max() > 30
+
+    s.ctx.item_click("//**/Save path")
+    s.ctx.yield_(2)
+    assert len(read_flight(s.folder / "blobs-001.path.json").keyframes) == 3
+    filming.set_film_size(s.window.viewer, 32, 24)
+    filming.set_film_fps(s.window.viewer, 4.0)
+    filming.type_film(s.window.viewer, "film")
+    s.ctx.item_click("//Record/Save film")
+    s.wait(lambda: s.window.viewer.recorder.current is None)
+    s.ctx.yield_(3)
+    assert len(list((s.folder / "film").glob("frame-*.png"))) == 5
+
+
+def mark_and_return(s) -> None:
+    """A bookmark by its key, the sides by theirs, the command on the clipboard."""
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.b)
+    s.ctx.yield_(2)
+    start = s.state.view
+    s.ctx.key_press(imgui.Key.keypad7)
+    s.settle()
+    np.testing.assert_allclose(s.state.view.rotation[2], -start.up, atol=1e-6)
+    settings.open_panel(s.window.viewer, "Bookmarks")
+    s.ctx.yield_(4)
+    s.ctx.item_click("//**/view 1##bookmark")
+    s.settle()
+    np.testing.assert_allclose(s.state.view.rotation, start.rotation, atol=1e-6)
+    s.ctx.item_click("//**/##bookmark")
+    s.ctx.key_chars_append_enter("by the key of k")
+    s.ctx.yield_(2)
+    assert [mark.name for mark in s.state.bookmarks] == ["view 1", "by the key of k"]
+    assert s.state.record.keyframes == ()
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.c)
+    s.ctx.yield_(3)
+    assert imgui.get_clipboard_text().startswith("langsplat-viewer ")
+
+
+RECORD = {
+    "record_and_play": (record_and_play, "blobs.ply", {}),
+    "mark_and_return": (mark_and_return, "blobs.ply", {}),
 }

@@ -1,4 +1,4 @@
-"""Scenarios of `window_driver` about seeing: several pictures, what is drawn over them, measuring."""
+"""Scenarios of `window_driver` over the scene: several panes, overlays, measuring, selecting."""
 
 from collections.abc import Callable
 from itertools import combinations
@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from imgui_bundle import imgui  # isort: skip
+from imgui_bundle import hello_imgui, imgui  # isort: skip
+from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
+import glfw  # isort: skip
+from langsplat_core.io.scenes import load_scene
 from langsplat_viewer import canvas
 from langsplat_viewer.actions import queries, selecting, settings, viewpoint
 from langsplat_viewer.camera.overlays import Label, visible_faces
@@ -16,19 +19,15 @@ from langsplat_viewer.panels import overlays
 from langsplat_viewer.panels.overlays import EDGE
 from langsplat_viewer.panels.style import Area, scene_area
 from langsplat_viewer.rendering.renderer import ArrayChannels
+from langsplat_viewer.rendering.request import TINT
 from tests.support.fakes import CENTRES
+from tests.support.selected import marked
 
 MUG, BOOK, PLANT = CENTRES
 
 
-def begin(s: Any) -> None:
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
-
-
 def split_the_view(s: Any) -> None:
     """The line is dragged without the camera; nothing is drawn for it, and nothing at rest."""
-    begin(s)
     rgb = s.shot("rgb")
     s.ctx.key_press(imgui.Key.v)
     s.settle()
@@ -76,7 +75,6 @@ def click(s: Any, place: tuple[float, float]) -> None:
 
 def draw_over_the_scene(s: Any) -> None:
     """The cube turns the view, a click on a camera stands there, two clicks measure."""
-    begin(s)
     s.menu("View", "Show or hide the view cube")
     s.menu("View", "Show or hide the training cameras")
     s.settle()
@@ -125,7 +123,6 @@ def draw_over_the_scene(s: Any) -> None:
 
 def cut_by_depth(s: Any) -> None:
     """The sliders of the panel leave out what is nearer or farther; undone at their ends."""
-    begin(s)
     settings.open_panel(s.window.viewer, "Camera")
     s.ctx.yield_(3)
     viewpoint.look_from(s.window.viewer, "left")
@@ -145,7 +142,6 @@ def cut_by_depth(s: Any) -> None:
 
 def time_and_compare(s: Any) -> None:
     """The panel tells medians while it is seen, and the error of what is shown."""
-    begin(s)
     settings.open_panel(s.window.viewer, "Timing")
     s.ctx.yield_(3)
     for key in (imgui.Key["_2"], imgui.Key["_1"]):
@@ -195,7 +191,6 @@ def rasterize_elsewhere(s: Any) -> None:
 
     ArrayChannels.render = gated
     canvas.MOVING_BUDGET = 0.0  # everything is slow
-    begin(s)
     s.drag((600, 300), (656, 279))
     s.wait(lambda: s.window.viewer.surface.waits)
     assert s.state.stats.scale < 1
@@ -259,7 +254,6 @@ def measure_and_select(s: Any) -> None:
 def look_without_perspective(s: Any) -> None:
     """A key takes perspective away until it is pressed again; axes, wheel, tools and the click on a camera
     work as ever, and the picture says what it is."""
-    begin(s)
     deep, view = s.shot("deep"), s.state.view
     s.ctx.key_press(imgui.Key.o)
     s.settle()
@@ -305,7 +299,6 @@ def look_without_perspective(s: Any) -> None:
 
 def name_what_is_close(s: Any) -> None:
     """Things in one line of sight have their names one above the other."""
-    begin(s)
     settings.show_overlay(s.window.viewer, "things", True)
     for word in ("mug", "book", "plant"):
         s.search(word)
@@ -328,7 +321,7 @@ def name_what_is_close(s: Any) -> None:
     s.shot("names")
 
 
-SCENARIOS: dict[str, Scenario] = {
+SEEING: dict[str, Scenario] = {
     "name_what_is_close": (name_what_is_close, "blobs.ply", {}),
     "look_without_perspective": (look_without_perspective, "blobs.ply", {}),
     "split_the_view": (split_the_view, "blobs.ply", {}),
@@ -336,4 +329,146 @@ SCENARIOS: dict[str, Scenario] = {
     "time_and_compare": (time_and_compare, "blobs.ply", {}),
     "rasterize_elsewhere": (rasterize_elsewhere, "blobs.ply", {"backend": "cpu"}),
     "draw_over_the_scene": (draw_over_the_scene, "blobs.ply", {}),
+}
+
+
+# Selecting in the real window; played by `window_driver`.
+
+
+def around(s: Any, centre: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Two corners around a blob, as it is seen now."""
+    x, y = on_screen(s, centre)
+    right, _ = on_screen(s, centre + 0.6 * s.state.view.rotation[0])
+    half = right - x
+    return (x - half, y - half), (x + half, y + half)
+
+
+def looks_selected(colour: np.ndarray) -> bool:
+    """Whether a colour of the picture, 0 to 255, has the tint."""
+    return bool(np.abs(colour - 255 * TINT).max() < 0.55 * 255 and colour[2] > colour[1] + 60)
+
+
+def press(s: Any, item: str) -> None:
+    s.ctx.item_click(item)
+    s.settle()
+
+
+def select_with_the_mouse(s: Any) -> None:
+    """A rectangle, keys and buttons; everything is undone; what is left is saved."""
+    s.ctx.key_press(imgui.Key.period)  # the camera in front: no blob hides another
+    s.settle()
+    plain = s.shot("plain")
+    s.menu("Window", "Select")
+    s.settle()
+    press(s, "//**/Rectangle##tool")
+    s.drag(*around(s, PLANT))
+    s.settle()
+    seen = s.state.selection.marks.selected
+    assert 10 < seen.sum() < 110  # the front of it
+    press(s, "//**/Only what is visible")
+    before = s.state.view
+    s.drag(*around(s, PLANT))
+    s.settle()
+    assert s.state.view is before  # the drag turned nothing
+    assert marked(s.window.viewer) == ("plant", "", "")
+    chosen = s.shot("chosen")
+    assert looks_selected(s.at(chosen, PLANT))
+    np.testing.assert_allclose(s.at(chosen, BOOK), s.at(plain, BOOK), atol=6)
+
+    s.ctx.key_down(imgui.Key.mod_shift)
+    s.drag(*around(s, BOOK))
+    s.ctx.yield_(2)
+    s.ctx.key_up(imgui.Key.mod_shift)
+    s.settle()
+    assert marked(s.window.viewer)[0] == "book plant"
+
+    hide_and_undo(s, plain)
+    save_the_rest(s)
+    s.ctx.key_press(imgui.Key.escape)
+    s.ctx.yield_(3)
+    assert s.state.selection.tool is None
+    s.drag((600, 300), (656, 279))
+    s.settle()
+    assert not np.array_equal(before.rotation, s.state.view.rotation)  # the drag turns again
+
+
+def hide_and_undo(s: Any, plain: np.ndarray) -> None:
+    s.ctx.key_press(imgui.Key.h)
+    s.settle()
+    assert marked(s.window.viewer) == ("", "book plant", "")
+    hidden = s.shot("hidden")
+    assert s.at(hidden, PLANT).max() < 30
+    assert s.at(plain, PLANT).max() > 90
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
+    s.settle()
+    assert marked(s.window.viewer) == ("book plant", "", "")
+
+
+def save_the_rest(s: Any) -> None:
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.i)
+    s.settle()
+    assert marked(s.window.viewer)[0] == "mug"
+    s.menu("Select", "Save the selection")
+    s.settle()
+    written = load_scene(s.folder / "blobs-selection-001.ply")
+    assert len(written.gaussians) == len(written.language) == s.state.selection.marks.selected.sum()
+
+
+def outline_and_rest(s: Any) -> None:
+    """An outline is drawn while the button is held, Esc gives it up, and nothing is drawn again at rest."""
+    s.menu("Select", "Select: lasso")
+    s.settle()
+    s.ctx.mouse_teleport_to_pos((500, 200))
+    s.ctx.mouse_down(0)
+    for place in ((700, 200), (700, 400), (520, 390)):
+        s.ctx.mouse_teleport_to_pos(place)
+        s.ctx.yield_(2)
+    assert len(s.state.selection.stroke.path) == 4
+    line = s.shot("lasso")[196:205, 600]
+    assert line.min(1).max() > 100  # a light line on black
+    s.ctx.key_press(imgui.Key.escape)
+    s.ctx.mouse_up(0)
+    s.settle()
+    assert (s.state.selection.stroke, s.state.selection.tool) == (None, "lasso")
+    assert marked(s.window.viewer)[0] == ""
+    drawn = s.renderer.count
+    s.ctx.yield_(20)
+    assert s.renderer.count == drawn
+
+
+def ask_before_leaving(s: Any) -> None:
+    """What was deleted and not saved is asked about before another scene opens or the window closes."""
+    s.search("mug")
+    s.menu("Select", "Select what the search found")
+    s.ctx.key_press(imgui.Key.delete)
+    s.settle()
+    assert marked(s.window.viewer) == ("", "", "mug")
+    s.window.drop([str(s.folder / "plain.ply")])
+    s.ctx.yield_(4)
+    s.shot("question")
+    press(s, "//**/Cancel")
+    assert s.state.path.name == "blobs.ply"
+
+    s.menu("File", "Quit")
+    assert not hello_imgui.get_runner_params().app_shall_exit
+    press(s, "//**/Cancel")
+    assert not s.state.selection.may_close
+    glfw.set_window_should_close(glfw_window_hello_imgui(), True)  # its cross was clicked
+    s.wait(lambda: s.state.selection.leaving is not None)
+    press(s, "//**/Cancel")
+    assert marked(s.window.viewer) == ("", "", "mug")
+
+    s.window.drop([str(s.folder / "plain.ply")])
+    s.ctx.yield_(4)
+    press(s, "//**/Not saved/Save")
+    s.wait(lambda: s.state.path.name == "plain.ply")
+    s.settle()
+    assert len(load_scene(s.folder / "blobs-edited-001.ply").gaussians) < 360
+    assert len(load_scene(s.folder / "blobs.ply").gaussians) == 360  # as it was
+
+
+SELECTING: dict[str, tuple[Any, str, dict[str, Any]]] = {
+    "select_with_the_mouse": (select_with_the_mouse, "blobs.ply", {}),
+    "outline_and_rest": (outline_and_rest, "blobs.ply", {}),
+    "ask_before_leaving": (ask_before_leaving, "blobs.ply", {}),
 }
