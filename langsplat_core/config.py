@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
 
 import tyro
 
@@ -22,7 +22,7 @@ from langsplat_core.errors import InputError
 
 @dataclass(frozen=True)
 class Range:
-    """Where a number must lie; both ends count, but for `low` where `above` says so. Always finite."""
+    """Range of a number; both ends count, but for `low` where `above` says so. Always finite."""
 
     low: float
     high: float
@@ -30,7 +30,7 @@ class Range:
     some: bool = False  # of a field with several numbers: there must be at least one
 
     def holds(self, value: float) -> bool:
-        """Whether `value` lies in the range; NaN lies in none."""
+        """True where `value` lies in the range; NaN lies in none."""
         return (self.low < value if self.above else self.low <= value) and value <= self.high
 
     def __str__(self) -> str:
@@ -60,7 +60,7 @@ def check_settings(settings: object, option: str = "--") -> None:
 
 
 def numeric_settings(settings: object, option: str = "--") -> Iterator[Setting]:
-    """All fields of a dataclass that hold numbers, and those of dataclasses in it, in their order."""
+    """Fields of a dataclass that hold numbers, and those of dataclasses in it, in their order."""
     for name, value, hint in named_values(settings, option):
         kinds = set(_kinds(hint))
         if kinds & {int, float}:
@@ -81,7 +81,7 @@ def named_values(settings: object, option: str = "--") -> Iterator[tuple[str, An
 
 
 def annotations(hint: Any) -> Iterator[Any]:
-    """What `Annotated` says beside the type, also inside of unions, tuples and further `Annotated`."""
+    """Parts of `Annotated` beside the type, also inside of unions, tuples and further `Annotated`."""
     if get_origin(hint) is Annotated:
         yield from hint.__metadata__
     if get_origin(hint) is not typing.Literal:
@@ -103,12 +103,12 @@ def _kinds(hint: Any) -> Iterator[type]:
 
 
 def _is_flat(hint: Any) -> bool:
-    """Whether a dataclass's fields are options without its own name: ``tyro.conf.arg(name="")``."""
+    """True where a dataclass's fields are options without its own name: ``tyro.conf.arg(name="")``."""
     return any(getattr(part, "name", None) == "" for part in annotations(hint))
 
 
 def _problem(setting: Setting) -> str | None:
-    """What is wrong with a setting's value; None where nothing is."""
+    """Fault of a setting's value; None where there is none."""
     bound, numbers = setting.range, list(_flat(setting.value))
     if bound is None:
         return None
@@ -236,7 +236,7 @@ class RadianceConfig:
 
 @dataclass(frozen=True)
 class MaskConfig:
-    """Where masks come from and which are kept (paper section 3.1 and the method's public code)."""
+    """Source of masks, and which are kept (paper section 3.1 and the method's public code)."""
 
     source: Literal["auto", "sam", "graph"] = "auto"  # auto: sam when `sam` names weights, else graph
     # hub id, folder or file of SAM, SAM 2 or SAM-HQ weights, e.g. facebook/sam-vit-huge
@@ -265,20 +265,60 @@ class ClipConfig:
     device: Literal["auto", "cpu", "cuda"] = "auto"  # where it runs
 
 
-@dataclass(frozen=True)
-class CodecConfig:
-    """How a Gaussian keeps a CLIP vector: by the number of a codeword, or as latents (paper section 3.2)."""
+_KIND = tyro.conf.arg(
+    metavar="{codebook,autoencoder,linear}",
+    help="how a Gaussian keeps a CLIP vector, with settings of its own",
+)
+LatentDim = Annotated[int, Range(1, 4_096)]
 
-    kind: Literal["codebook", "autoencoder", "linear"] = "codebook"  # how vectors are kept
-    # codewords of a codebook; 0: as many as `max_relevancy_error` asks for
-    size: Annotated[int, Range(0, 65_535)] = 0
+
+@dataclass(frozen=True)
+class CodebookConfig:
+    """A Gaussian keeps the number of a codeword."""
+
+    kind: Annotated[Literal["codebook"], _KIND] = "codebook"
+    size: Annotated[int, Range(0, 65_535)] = 0  # codewords; 0: as many as `max_relevancy_error` asks for
     # mean over the scene's vectors and a few hundred phrases
     max_relevancy_error: Annotated[Share, tyro.conf.arg(aliases=["--max-relevancy-error"])] = 0.006
-    latent_dim: Annotated[int, Range(1, 4_096)] = 3  # numbers that the other kinds keep
-    steps: Count = 4_000  # of the autoencoder's training, as are the following
+    seed: Seed = 0  # of random numbers
+
+    @property
+    def seconds(self) -> float:
+        """That the fit is expected to take on two cores."""
+        return 3 + 0.02 * min(self.size or 2_500, 4_096)
+
+
+@dataclass(frozen=True)
+class AutoencoderConfig:
+    """A Gaussian keeps latents of the paper's autoencoder (section 3.2)."""
+
+    kind: Annotated[Literal["autoencoder"], _KIND] = "autoencoder"
+    latent_dim: LatentDim = 3  # numbers per Gaussian and level
+    steps: Count = 4_000  # of training
     batch: SeveralCount = 256  # vectors per step
     lr: Rate = 3e-3  # 7e-4 in the public code: with as many steps a quarter more error
     seed: Seed = 0  # of random numbers
+
+    @property
+    def seconds(self) -> float:
+        return 3 + 0.013 * self.steps
+
+
+@dataclass(frozen=True)
+class LinearConfig:
+    """A Gaussian keeps coordinates in a linear basis of the scene's vectors."""
+
+    kind: Annotated[Literal["linear"], _KIND] = "linear"
+    latent_dim: LatentDim = 3  # numbers per Gaussian and level
+    seed: Seed = 0  # of the vectors that are sampled
+    seconds: ClassVar[float] = 3.0
+
+
+# The kinds of codecs. On the command line `--codec.kind` chooses one, whose settings are then options.
+CodecConfig = tyro.conf.AvoidSubcommands[CodebookConfig | AutoencoderConfig | LinearConfig]
+CODEC_CONFIGS: Mapping[str, type[CodebookConfig | AutoencoderConfig | LinearConfig]] = MappingProxyType(
+    {settings.kind: settings for settings in (CodebookConfig, AutoencoderConfig, LinearConfig)}
+)
 
 
 @dataclass(frozen=True)
@@ -288,7 +328,6 @@ class LiftConfig:
     # median, mean: of the CLIP vectors of the masks a Gaussian belongs to, then encoded;
     # one-pass: the paper's latents, averaged as W^T H / W^T 1; gradient: trained by Adam, as in the paper
     mode: Literal["median", "mean", "one-pass", "gradient"] = "median"
-    chunk: Count = 32  # mask channels per gather pass, where a backend cannot lift label maps at once
     backend: Literal["auto", "cpu", "cuda"] = "auto"  # what lifts
     steps: Count = 30_000  # of mode gradient, as are the following
     lr: Rate = 2.5e-3  # learning rate
@@ -304,7 +343,7 @@ class TrainConfig:
     radiance: RadianceConfig = field(default_factory=RadianceConfig)
     masks: MaskConfig = field(default_factory=MaskConfig)
     clip: ClipConfig = field(default_factory=ClipConfig)
-    codec: CodecConfig = field(default_factory=CodecConfig)
+    codec: CodecConfig = field(default_factory=CodebookConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     phrases: tuple[str, ...] = ()  # stored encoded in the scene: they can be asked without any encoder
 
@@ -314,7 +353,7 @@ class TrainConfig:
 PAPER = TrainConfig(
     radiance=RadianceConfig(coarse_fraction=0.0),
     masks=MaskConfig(source="sam", sam="facebook/sam-vit-huge", crop_layers=1),
-    codec=CodecConfig(kind="autoencoder", steps=10_000, batch=64, lr=7e-4),
+    codec=AutoencoderConfig(steps=10_000, batch=64, lr=7e-4),
     lift=LiftConfig(mode="gradient", start="zeros-as-published"),
 )
 TrainProfile = Literal["default", "paper"]
@@ -335,7 +374,7 @@ def with_preset(config: TrainConfig, preset: TrainPreset) -> TrainConfig:
         radiance=replace(
             config.radiance, steps=steps, max_gaussians=most, sh_degree=1, opacity_decay=OPACITY_DECAY
         ),
-        codec=replace(config.codec, size=size),
+        codec=replace(config.codec, size=size) if config.codec.kind == "codebook" else config.codec,
     )
 
 

@@ -5,6 +5,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.io.langsplat_files import write_autoencoder, write_checkpoint, write_features
 from langsplat_core.io.language import write_language
 from langsplat_core.io.ply import write_ply
-from langsplat_core.io.scenes import save_scene
+from langsplat_core.io.scenes import WRITABLE, save_scene
 from langsplat_core.io.shapes import write_points
 from langsplat_core.pipeline.stages import kept, kept_array
 from langsplat_core.scene import Scene
@@ -78,10 +79,12 @@ def stage(folder: Path) -> None:
     kept(folder / "codec.npz", lambda: noise, lambda made: made, dict)
 
 
+def save_scene_as(suffix: str, folder: Path) -> None:
+    save_scene(folder / f"s{suffix}", SCENE)
+
+
 WRITERS: dict[str, Write] = {
-    "scene .ply": lambda folder: save_scene(folder / "s.ply", SCENE),
-    "scene .spz": lambda folder: save_scene(folder / "s.spz", SCENE),
-    "scene .splat": lambda folder: save_scene(folder / "s.splat", SCENE),
+    **{f"scene {suffix}": partial(save_scene_as, suffix) for suffix in WRITABLE},
     "Gaussians": lambda folder: write_ply(folder / "s.ply", GAUSSIANS),
     "sidecar": lambda folder: write_language(folder / "s.safetensors", FIELD, GAUSSIANS.means),
     "cameras": lambda folder: write_cameras(folder / "cameras.json", SCENE.cameras),
@@ -89,7 +92,9 @@ WRITERS: dict[str, Write] = {
     "their checkpoint": lambda folder: write_checkpoint(
         folder / "c.pth", GAUSSIANS, np.ones((40, 3), np.float32)
     ),
-    "their autoencoder": lambda folder: write_autoencoder(folder / "a.pth", random_codec("autoencoder")),  # type: ignore[arg-type]
+    "their autoencoder": lambda folder: write_autoencoder(
+        folder / "a.pth", *random_codec("autoencoder").networks
+    ),  # type: ignore[misc]
     "their features": lambda folder: write_features(
         folder, "a", np.ones((2, 64), np.float32), np.zeros((4, 8, 8), np.int32)
     ),

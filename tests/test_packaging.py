@@ -1,6 +1,7 @@
 """What a desktop is told of the viewer, and what the one-folder build is made of."""
 
 import importlib.util
+import subprocess
 import sys
 from configparser import ConfigParser
 from pathlib import Path
@@ -26,7 +27,8 @@ def desktop_entry() -> dict[str, str]:
 
 
 def mime_globs() -> dict[str, list[str]]:
-    root = ElementTree.parse(DESKTOP / "langsplat-viewer.xml").getroot()
+    made = subprocess.run([sys.executable, DESKTOP / "mime_types.py"], capture_output=True, check=True)
+    root = ElementTree.fromstring(made.stdout)
     types = root.findall(f"{NAMESPACE}mime-type")
     return {
         kind.attrib["type"]: [g.attrib["pattern"] for g in kind.findall(f"{NAMESPACE}glob")] for kind in types

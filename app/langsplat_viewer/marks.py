@@ -20,7 +20,6 @@ from langsplat_core.query.selection import (
     project,
 )
 from langsplat_core.scene import Camera
-from langsplat_viewer.camera.controls import eye_depth
 
 # The scene itself is never changed: deleting marks, and what is marked is left out of pictures and of what is
 # saved. So everything can be undone, and an answer's numbers per Gaussian keep their places.
@@ -256,9 +255,6 @@ def caught(drawn: Drawn, means: Array, depths: Array | None = None) -> Array:
         inside = in_stroke(seen, pixels, drawn.brush * camera.height)
     if depths is None:
         return inside
-    plane = eye_depth(camera)  # what counts as hidden is a share of the depth from the eye
-    seen = replace(seen, depths=seen.depths - plane)
-    depths = np.where(depths > 0, depths - plane, 0)
     return inside & on_surface(seen, depths, (camera.width, camera.height))
 
 

@@ -5,16 +5,18 @@ from importlib.resources import files
 import numpy as np
 
 from langsplat_core import load_rasterizer, load_scene
+from langsplat_core.raster import View
 
 
-class DiscView:
+class DiscView(View):
     def __init__(self, gaussians, camera, settings):
         centres, self.depths = camera.project(gaussians.means)  # pixels, world units
         variances = (np.exp(gaussians.log_scales).mean(1) * camera.fx / self.depths) ** 2 + settings.dilation
         pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1) + 0.5
         squared = ((pixels - centres[:, None, None]) ** 2).sum(-1) / variances[:, None, None]  # (N, H, W)
         opacities = (self.depths > settings.near) / (1 + np.exp(-gaussians.opacity_logits))
-        self.dropped, order = 0, np.argsort(self.depths)  # rows that cannot be drawn; front to back
+        self.camera, self.count, self.dropped = camera, len(gaussians), 0  # rows that cannot be drawn
+        order = np.argsort(self.depths)  # front to back
         alphas = np.minimum(opacities[:, None, None] * np.exp(-0.5 * squared), settings.alpha_max)[order]
         light = np.cumprod(1 - alphas, 0) / (1 - alphas)  # that reaches each
         self.weights = (alphas * light)[np.argsort(order)]  # the matrix W of `langsplat_core.raster.protocol`

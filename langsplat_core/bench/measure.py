@@ -20,7 +20,7 @@ import scipy.sparse
 from langsplat_core.arrays import Array
 from langsplat_core.bench.memory import peak_memory, restart_peak
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster.protocol import FreezableView, LabelView, Rasterizer
+from langsplat_core.raster.protocol import LiftingView, Rasterizer
 from langsplat_core.raster.reference import Footprints, ReferenceView, project, rim
 from langsplat_core.scene import Camera, Gaussians, look_at
 
@@ -188,9 +188,9 @@ def operations(
             None if exact is None else lambda: _gradient_error(view, case, values, exact.masked(image), exact)
         )
         yield Operation("backward", lambda: view.backward(values, image), wrong)
-    if isinstance(view, LabelView):
+    if isinstance(view, LiftingView):
         yield _labels(view, case.camera, exact)
-    if isinstance(view, FreezableView):
+    if isinstance(view, LiftingView) and view.frozen() is not view:
         yield Operation("freeze", view.frozen)
         yield from _linear(view.frozen(), values, image, exact, "frozen ")
 
@@ -213,7 +213,7 @@ def _linear(
         )
 
 
-def _labels(view: LabelView, camera: Camera, exact: "ReferenceWindows | None") -> Operation:
+def _labels(view: LiftingView, camera: Camera, exact: "ReferenceWindows | None") -> Operation:
     """Label maps of three levels (`GRIDS`), as many regions as a segmenter finds."""
     maps, count = label_maps(camera)
 

@@ -18,14 +18,14 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.bench import QueryBenchConfig
 from langsplat_core.bench.measure import markdown
-from langsplat_core.config import PictureConfig
+from langsplat_core.config import AutoencoderConfig, PictureConfig
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import QueryEngine, TextEncoder
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.protocol import View
-from langsplat_core.scene import LEVELS, Camera, CodebookCodec, Codec, LanguageField, Scene
+from langsplat_core.scene import LEVELS, Camera, Codec, LanguageField, Scene
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
 from langsplat_core.semantics.vocabulary import everyday_phrases
 from langsplat_core.training.language.codec_fit import train_autoencoder
@@ -84,7 +84,7 @@ def measure_queries(
     scene: Scene, encoder: TextEncoder, config: QueryBenchConfig, progress: Progress = silent
 ) -> QueryReport:
     """`scene` must have a codebook and a camera; InputError otherwise. The paper's order takes minutes."""
-    if scene.language is None or not isinstance(scene.language.codec, CodebookCodec) or not scene.cameras:
+    if scene.language is None or scene.language.codec.blends or not scene.cameras:
         raise InputError("bench query needs a scene with a codebook and training cameras")
     if config.count:
         scene = repeated(scene, config.count)
@@ -96,9 +96,9 @@ def measure_queries(
     surface, regions = _seconds(lambda: engine.surface), _seconds(lambda: engine.regions)
     alone, together = _batched(engine, words[: config.together], progress)
     texts = words[: config.phrases]
-    codewords = field.codec.decode(np.arange(field.codec.index_size, dtype=np.uint16)[:, None])
+    codewords = field.codec.decode(np.arange(field.codec.size, dtype=np.uint16)[:, None])
     asked = _Asked(texts, engine.text_vectors(texts), field.latents[..., 0], field.known, codewords)
-    fitted = train_autoencoder(codewords, steps=config.codec_steps, progress=progress)
+    fitted = train_autoencoder(codewords, AutoencoderConfig(steps=config.codec_steps), progress)
     encoded = with_codec(field, fitted)
     by_table = QueryEngine(replace(scene, language=encoded), lambda _: encoder)
     camera = scene.cameras[0].resized(*config.size)
@@ -125,7 +125,7 @@ def repeated(scene: Scene, count: int, seed: int = 0) -> Scene:
 
 def with_codec(field: LanguageField, codec: Codec) -> LanguageField:
     """`field`, which has a codebook, with its codewords encoded by another codec."""
-    codewords = field.codec.decode(np.arange(field.codec.index_size, dtype=np.uint16)[:, None])
+    codewords = field.codec.decode(np.arange(field.codec.size, dtype=np.uint16)[:, None])
     latents = codec.encode(codewords)[field.latents[..., 0]]
     return replace(field, latents=np.where(field.known[..., None], latents, 0), codec=codec)
 

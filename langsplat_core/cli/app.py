@@ -11,7 +11,7 @@ from typing import Annotated, Any, Union
 
 import tyro
 
-from langsplat_core.cli.run import Command, main, parsed
+from langsplat_core.cli.run import Command, main, parsed, with_codec
 from langsplat_core.errors import InputError
 
 FLAGS = ("-q", "--quiet", "-v", "--verbose")  # may precede a command
@@ -66,7 +66,7 @@ def parse(args: list[str]) -> Command:
     elif args and args[0] in GROUPS:
         commands = [_group(args[0], args[1:2])]
     elif args and args[0] in COMMANDS:
-        commands = [_subcommand(args[0], load_command(COMMANDS[args[0]]))]
+        commands = [_subcommand(args[0], with_codec(load_command(COMMANDS[args[0]]), args))]
     else:
         commands = [_subcommand(name, load_command(where)) for name, where in COMMANDS.items()]
         commands += [_group(name, ()) for name in GROUPS]

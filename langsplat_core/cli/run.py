@@ -16,8 +16,8 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, make_dataclass
-from itertools import dropwhile, takewhile
+from dataclasses import MISSING, dataclass, fields, make_dataclass
+from itertools import dropwhile, pairwise, takewhile
 from types import FrameType
 from typing import Annotated, Any, Protocol
 
@@ -25,6 +25,7 @@ import tyro
 
 from langsplat_core import __version__
 from langsplat_core.cli.checks import check_arguments
+from langsplat_core.config import CODEC_CONFIGS, CodecConfig
 from langsplat_core.errors import InputError, LangSplatError, optional_imports, printable_line
 from langsplat_core.io.files import NO_ROOM, shown
 from langsplat_core.progress import Terminated
@@ -73,6 +74,36 @@ class Command(Protocol):
 
     def run(self) -> None:
         """Do it; raise LangSplatError for what a user can mend."""
+
+
+def named(args: Sequence[str], option: str) -> str:
+    """What `args` give for an option, the last time they do; "" where they do not."""
+    values = [
+        after if word == option else word.partition("=")[2]
+        for word, after in pairwise([*args, ""])
+        if word.partition("=")[0] == option
+    ]
+    return values[-1] if values else ""
+
+
+def codec_settings(args: Sequence[str], default: CodecConfig) -> CodecConfig:
+    """The default settings of the codec that `args` choose by `--codec.kind`; `default` itself where it is of
+    that kind or none is chosen. InputError for an unknown kind."""
+    kind = named(args, "--codec.kind") or default.kind
+    if kind not in CODEC_CONFIGS:
+        raise InputError(f"--codec.kind {kind}: choose one of {', '.join(CODEC_CONFIGS)}")
+    return default if kind == default.kind else CODEC_CONFIGS[kind]()
+
+
+def with_codec(command: type[Command], args: Sequence[str]) -> type[Command]:
+    """`command` with the settings of the codec that `args` choose, where it has a field `codec`."""
+    entry: Any = next((entry for entry in fields(command) if entry.name == "codec"), None)  # type: ignore[arg-type]
+    if entry is None:
+        return command
+    default = entry.default_factory() if entry.default is MISSING else entry.default
+    chosen = ("codec", CodecConfig, codec_settings(args, default))
+    names = {"__doc__": command.__doc__}
+    return make_dataclass(command.__name__, [chosen], bases=(command,), frozen=True, namespace=names)
 
 
 def one_line(box: str) -> str:

@@ -1,4 +1,4 @@
-"""`langsplat inspect` and `langsplat doctor`: what a scene holds, what this machine can do."""
+"""`langsplat inspect`, `doctor`, `convert`, `compact` and `scale`: commands on scene files."""
 
 import ctypes.util
 import importlib.metadata
@@ -17,7 +17,7 @@ from rich.text import Text
 
 from langsplat_core import __version__
 from langsplat_core.cli.checks import OutFile, OutputConsole
-from langsplat_core.config import CodecConfig, CompactConfig, Positive, Range
+from langsplat_core.config import CodebookConfig, CodecConfig, CompactConfig, Positive, Range
 from langsplat_core.errors import EXTRAS, BackendError, InputError, LangSplatError, remedy
 from langsplat_core.io.files import check_output_folder
 from langsplat_core.io.language import rematch_language
@@ -80,10 +80,7 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
         ("duplicates", f"{a.duplicates}"),
         ("bounds (1-99 %)", f"{low}  to  {high}"),
         ("opacity", ", ".join([f"{_percent(hidden)} never drawn", *below])),
-        (
-            "anisotropy",
-            f"median {median}, 99 % {most}, largest {largest}; {a.needles} > {NEEDLE:g}",
-        ),
+        ("anisotropy", f"median {median}, 99 % {most}, largest {largest}; {a.needles} > {NEEDLE:g}"),
         (
             "SH degree",
             f"{a.sh_degree}; energy by degree {' + '.join(f'{100 * e:.3g} %' for e in a.sh_energy)}",
@@ -99,10 +96,7 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
     observed = ", ".join(f"{name} {_percent(share)}" for name, share in field.observed.items())
     return [
         *lines,
-        (
-            "language field",
-            f"codec {field.codec} of {field.size}; {field.bytes / 1e6:.2f} MB in memory",
-        ),
+        ("language field", f"codec {field.codec} of {field.size}; {field.bytes / 1e6:.2f} MB in memory"),
         ("text encoder", f"{field.encoder}, {field.vector_dim} numbers"),
         ("phrasebook", f"{field.phrases} phrases"),
         ("observed", observed),
@@ -134,7 +128,7 @@ class Doctor:
 
 
 def _opengl() -> str:
-    """What draws without a window, or why it cannot and what to do."""
+    """Name of the OpenGL that draws without a window, or why there is none and what to do."""
     from langsplat_core.raster.opengl.scene_textures import create_egl_context
 
     try:
@@ -149,7 +143,7 @@ def _opengl() -> str:
 
 
 def _encoder() -> str:
-    """Whether the bundled encoder works, and what real photographs want."""
+    """State of the bundled encoder, and what real photographs want."""
     try:
         encoder = load_text_encoder("demo")
         encoder.encode_texts(["red mug"])
@@ -165,8 +159,6 @@ def _version(package: str) -> str:
         return f"missing: {remedy(package)}" if package in EXTRAS else "missing"
 
 
-# `langsplat convert`: one scene file to another, and to and from what other methods keep.
-
 CHECKPOINTS = (".pth", ".pt", ".ckpt", ".npz", ".npy", ".faiss")  # no scene has such a name
 Target = Literal["scene", "langsplat", "occam", "features"]
 LevelName = Literal["subpart", "part", "whole"]
@@ -181,8 +173,7 @@ class Convert:
     checkpoints."""
 
     source: tyro.conf.Positional[Path]
-    """Scene to read: .ply, compressed .ply, .spz, .splat, .ksplat, SOG folder, meta.json or .sog; or the
-    first of the files that another method has of one scene."""
+    """Scene to read, of any format; or the first of the files that another method has of one scene."""
     rest: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[MORE...] OUT")]]
     """The other method's further files, in any order, and last the scene to write: .ply, .spz or .splat; with
     --to the folder."""
@@ -200,17 +191,17 @@ class Convert:
     """Levels of the checkpoints with features, in their order, where files and folders do not tell."""
     phrases: tuple[str, ...] = ()
     """Stored encoded in a scene made of checkpoints: they can be asked without any encoder."""
-    codec: CodecConfig = field(default_factory=CodecConfig)
+    codec: CodecConfig = CodebookConfig()  # noqa: RUF009  (frozen)
     """How the Gaussians of checkpoints with whole vectors keep them."""
 
     @property
     def sources(self) -> tuple[Path, ...]:
-        """All that is read."""
+        """Files that are read."""
         return (self.source, *self.rest[:-1])
 
     @property
     def out(self) -> Path:
-        """What is written."""
+        """File or folder that is written."""
         return self.rest[-1]
 
     def run(self) -> None:
@@ -300,8 +291,6 @@ class Convert:
         print(f"{self.out}: masks and vectors of {count} photographs")
 
 
-# `langsplat compact`: a scene with no more Gaussians than it needs.
-
 if TYPE_CHECKING:
     from langsplat_core.compaction.compact import CompactReport
 
@@ -385,8 +374,6 @@ def _notes(report: "CompactReport") -> list[str]:
     return lines
 
 
-# `langsplat scale`: how long a scene's world unit is.
-
 Coordinate = Annotated[float, Range(-1e12, 1e12)]
 Span = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
 
@@ -422,7 +409,8 @@ class Scale:
 
 
 def metres_per_unit(metres: float, between: Span) -> float:
-    """From a length in metres and two points in world units. InputError unless both lengths are positive."""
+    """Metres per unit of a length in metres between two points. InputError unless both lengths are
+    positive."""
     units = math.dist(between[:3], between[3:])
     if not (0 < metres < math.inf and 0 < units < math.inf):
         raise InputError(

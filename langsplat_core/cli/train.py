@@ -6,15 +6,14 @@ import logging
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
 from langsplat_core.cli.checks import OutFile, OutFolder
-from langsplat_core.cli.run import one_line
+from langsplat_core.cli.run import codec_settings, named, one_line
 from langsplat_core.config import (
     TRAIN_PROFILES,
     TrainConfig,
@@ -93,8 +92,9 @@ class Train:
 
 def train_command(args: Sequence[str]) -> type[Train]:
     """`Train` with the settings of the profile and preset that `args` name as defaults."""
-    profile, preset = _named(args, "--profile"), _named(args, "--preset")
+    profile, preset = named(args, "--profile"), named(args, "--preset")
     config = next((TRAIN_PROFILES[name] for name in TRAIN_PROFILES if name == profile), TrainConfig())
+    config = replace(config, codec=codec_settings(args, config.codec))
     for known in get_args(TrainPreset):
         if known == preset:
             config = with_preset(config, known)
@@ -110,7 +110,7 @@ def train_command(args: Sequence[str]) -> type[Train]:
 def with_file(args: Sequence[str]) -> list[str]:
     """The words of `langsplat train ...`, those of the file that --config names before all others, so that
     options beside it win. InputError that names file and key for what is no option, or not of its kind."""
-    name = _named(args, "--config")
+    name = named(args, "--config")
     if not name:
         return list(args)
     complaint = io.StringIO()
@@ -141,13 +141,3 @@ def _words(table: Mapping[str, Any], before: str = "") -> Iterator[str]:
             yield from (f"--{before}{key}", *values)
         else:
             yield f"--{before}{key}={value}"
-
-
-def _named(args: Sequence[str], option: str) -> str:
-    """What `args` give for an option, the last time they do; "" where they do not."""
-    values = [
-        after if word == option else word.partition("=")[2]
-        for word, after in pairwise([*args, ""])
-        if word.partition("=")[0] == option
-    ]
-    return values[-1] if values else ""

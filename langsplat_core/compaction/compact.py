@@ -25,7 +25,7 @@ from langsplat_core.compaction.views import (
     worst_loss,
 )
 from langsplat_core.config import CompactConfig, PictureConfig, check_settings
-from langsplat_core.display.displays import gated_mean, latent_colours
+from langsplat_core.display.displays import gated_mean
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.io.summary import disk_bytes
@@ -187,9 +187,8 @@ def language_change(
 
 
 def _channels(field: LanguageField, results: Sequence[QueryResult]) -> Array:
-    """(N, 3 c + 3 Q) float32: the latents of every level (the colours of codewords, whose numbers cannot be
-    blended), then the relevancies of every phrase."""
-    latents = latent_colours(field) if field.codec.space == "index" else field.latents
+    """(N, 3 c + 3 Q) float32: the latents of every level as what can be blended, then all relevancies."""
+    latents = [field.codec.blendable(level) for level in field.latents]
     parts = [*latents, *(result.relevancy.T for result in results)]
     return np.concatenate(parts, axis=1).astype(np.float32)
 

@@ -19,7 +19,6 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import ColourMap, Display, PictureConfig
 from langsplat_core.io.hostile import opened
 from langsplat_core.scene import LanguageField
-from langsplat_core.scene.codec import CodebookCodec, principal_colours
 
 # Turbo colour map: polynomial fit published by A. Mikhailov, Google (2019), coefficients by channel.
 _TURBO_COEFFICIENTS = np.array(
@@ -175,11 +174,8 @@ def latent_colours(field: LanguageField) -> Array:
     if made is not None:
         return made
     seen = field.known
-    if isinstance(field.codec, CodebookCodec):
-        colours = field.codec.colours[field.latents[..., 0]]
-    else:
-        flat = field.latents.reshape(-1, field.latents.shape[2])
-        colours = principal_colours(flat, seen.reshape(-1).astype(np.float64)).reshape(*seen.shape, 3)
+    flat = field.latents.reshape(-1, field.latents.shape[2])
+    colours = field.codec.colours(flat, seen.reshape(-1).astype(np.float64)).reshape(*seen.shape, 3)
     _LATENT[field] = np.where(seen[..., None], colours, np.float32(0.5)).astype(np.float32)
     return _LATENT[field]
 

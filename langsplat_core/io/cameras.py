@@ -33,7 +33,7 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".h
 
 
 def read_cameras(path: Path | str) -> tuple[Camera, ...]:
-    """The cameras in the file, in its order. Raises InputError and FormatError."""
+    """Return the cameras in the file, in its order. Raises InputError and FormatError."""
     path = Path(path)
     entries = read_json_file(path, SIZE_LIMIT)
     if not isinstance(entries, list):
@@ -42,7 +42,7 @@ def read_cameras(path: Path | str) -> tuple[Camera, ...]:
 
 
 def write_cameras(path: Path | str, cameras: tuple[Camera, ...]) -> None:
-    """Write `cameras`, atomically."""
+    """Write `cameras` in INRIA's form, atomically."""
     entries = [
         {
             "id": index,
@@ -98,7 +98,7 @@ def _camera(entry: Any, what: str) -> Camera:
 
 
 def is_rotation(matrix: Array) -> bool:
-    """Whether a finite (3, 3) matrix is a rotation, to `ROTATION_TOLERANCE`."""
+    """Return whether a finite (3, 3) matrix is a rotation, to `ROTATION_TOLERANCE`."""
     if np.abs(matrix).max() > 2:  # products of larger ones could overflow
         return False
     unlike = np.abs(matrix @ matrix.T - np.eye(3)).max()

@@ -50,7 +50,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 
 
 def _no_room(error: Exception, temporary: Path) -> OSError | None:
-    """What the system says where `error`, of whoever writes `temporary`, comes from a full or broken disk.
+    """Return the system's own error where `error`, raised while writing `temporary`, comes from a full disk.
 
     Libraries say so in their own words and classes, or give no cause at all: then the system is asked again.
     """

@@ -1,4 +1,8 @@
-"""A scene of another method, put together from the files that people have of it."""
+"""A scene of another method, put together from the files that people have of it.
+
+Nothing in a file is ever executed, and what a file is tells what it holds. docs/files.md says what to give of
+each method and what becomes of it.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -14,7 +18,6 @@ from langsplat_core.io.cameras import read_cameras
 from langsplat_core.io.foreign_language import (
     DR_SPLAT,
     FEATURE_3DGS,
-    FVDB,
     LANGSPLAT,
     OCCAM,
     OPEN_GAUSSIAN,
@@ -24,8 +27,7 @@ from langsplat_core.io.foreign_language import (
     Carrier,
     Centroids,
     Clusters,
-    Leaves,
-    Meaning,
+    Features,
     Part,
     ProductCodes,
     Rearranged,
@@ -35,7 +37,6 @@ from langsplat_core.io.foreign_language import (
     read_part,
 )
 from langsplat_core.io.hostile import exists
-from langsplat_core.io.langsplat_files import write_autoencoder, write_checkpoint
 from langsplat_core.scene import LEVELS, AutoencoderCodec, Scene
 
 WIDEST_LATENT = 16  # numbers per Gaussian up to which they are an autoencoder's; 1, 2, 3 and 8 were published
@@ -50,28 +51,28 @@ class ForeignScene:
 
     method: str
     scene: Scene  # without a language field
-    levels: tuple[Meaning | None, ...] = (None, None, None)  # of subpart, part and whole, each for all N
+    levels: tuple[Features | None, ...] = (None, None, None)  # of subpart, part and whole, each for all N
     paths: tuple[Path | None, ...] = (None, None, None)  # the files that these come from
-    codec: AutoencoderCodec | None = None  # that the meanings are latents of; None where they are vectors
+    codec: AutoencoderCodec | None = None  # that the features are latents of; None where they are vectors
     notes: tuple[str, ...] = field(default=())  # what was taken for granted, for people
 
     @property
     def dim(self) -> int:
-        """D, of the vectors; 0 where nothing has a meaning."""
+        """D, of the vectors; 0 where there are no features."""
         if self.codec is not None:
             return self.codec.vector_dim
-        return next((meaning.dim for meaning in self.levels if meaning is not None), 0)
+        return next((features.dim for features in self.levels if features is not None), 0)
 
     def rows(self, level: int, indices: Array) -> Array:
-        """(n, D or d) float32 vectors or latents of any length at `level`; zero for no meaning.
+        """(n, D or d) float32 vectors or latents of any length at `level`; zero for no features.
 
         Raises FormatError where one is not finite.
         """
-        meaning = self.levels[level]
-        if meaning is None:
-            raise ValueError(f"no meanings of level {LEVELS[level]}")
+        features = self.levels[level]
+        if features is None:
+            raise ValueError(f"no features of level {LEVELS[level]}")
         with np.errstate(invalid="ignore", over="ignore"):
-            rows = meaning.rows(indices)
+            rows = features.rows(indices)
         faulty = np.flatnonzero(~np.isfinite(rows).all(1))
         if len(faulty):
             raise FormatError(
@@ -89,20 +90,20 @@ def read_foreign(paths: Sequence[Path], levels: Sequence[str] = ()) -> ForeignSc
     """
     parts = [read_part(path) for path in paths]
     carriers = [part for part in parts if isinstance(part, Carrier)]
-    plain = _only([carrier for carrier in carriers if not carrier.tells], "scenes without features")
+    plain = _only([carrier for carrier in carriers if not carrier.has_features], "scenes without features")
     clusters = _only([part for part in parts if isinstance(part, Clusters)], "files of clusters")
     centroids = _only([part for part in parts if isinstance(part, Centroids)], "quantisers")
     autoencoder = _only([part for part in parts if isinstance(part, Autoencoder)], "autoencoders")
-    tellers = [_named(carrier, autoencoder) for carrier in carriers if carrier.tells]
-    methods = {teller.method for teller in tellers}
+    featured = [_named(carrier, autoencoder) for carrier in carriers if carrier.has_features]
+    methods = {carrier.method for carrier in featured}
     if len(methods) > 1:
-        listed = ", ".join(f"{teller.path} is of {teller.method}" for teller in tellers)
+        listed = ", ".join(f"{carrier.path} is of {carrier.method}" for carrier in featured)
         raise InputError(f"{listed}; give the files of one method")
     if clusters is not None and methods <= {OPEN_GAUSSIAN}:
-        return _of_clusters(_only([*tellers, *([plain] if plain else [])], "scenes"), clusters)
-    if not tellers:
+        return _of_clusters(_only([*featured, *([plain] if plain else [])], "scenes"), clusters)
+    if not featured:
         return _without_language(plain, [part for part in parts if part is not plain])
-    return _of_levels(plain, tellers, levels, centroids, autoencoder)
+    return _of_levels(plain, featured, levels, centroids, autoencoder)
 
 
 def _only(found: list[P], what: str) -> P | None:
@@ -112,10 +113,10 @@ def _only(found: list[P], what: str) -> P | None:
 
 
 def _named(carrier: Carrier, autoencoder: Autoencoder | None) -> Carrier:
-    """With the method of float features known: they are latents or vectors."""
-    if carrier.method != UNNAMED or carrier.meaning is None:
+    """Return the carrier with the method of its float features: they are latents or vectors."""
+    if carrier.method != UNNAMED or carrier.features is None:
         return carrier
-    width = carrier.meaning.dim
+    width = carrier.features.dim
     if autoencoder is None and width <= WIDEST_LATENT:
         raise InputError(
             f"{carrier.path}: {width} numbers per Gaussian, latents of LangSplat's autoencoder; "
@@ -141,7 +142,7 @@ def _without_language(plain: Carrier | None, others: list[Part]) -> ForeignScene
 def _of_clusters(carrier: Carrier | None, clusters: Clusters) -> ForeignScene:
     """OpenGaussian: one level, which is taken for the whole."""
     leaves = clusters.leaves
-    if carrier is None or carrier.gaussians is None:
+    if carrier is None:
         raise InputError(f"{clusters.path}: has no Gaussians; name the scene's checkpoint or PLY too")
     if len(leaves) != len(carrier.gaussians):
         raise FormatError(
@@ -158,63 +159,60 @@ def _of_clusters(carrier: Carrier | None, clusters: Clusters) -> ForeignScene:
 
 def _of_levels(
     plain: Carrier | None,
-    tellers: list[Carrier],
+    featured: list[Carrier],
     asked: Sequence[str],
     centroids: Centroids | None,
     autoencoder: Autoencoder | None,
 ) -> ForeignScene:
-    method = tellers[0].method
-    if len(tellers) > len(LEVELS):
-        raise InputError(f"{tellers[-1].path}: a fourth checkpoint with features; there are three levels")
+    method = featured[0].method
+    if len(featured) > len(LEVELS):
+        raise InputError(f"{featured[-1].path}: a fourth checkpoint with features; there are three levels")
     if method == OPEN_GAUSSIAN:
         raise InputError(
-            f"{tellers[0].path}: of OpenGaussian; name its cluster_lang.npz too, it has the meanings"
+            f"{featured[0].path}: of OpenGaussian; its features are in cluster_lang.npz, name it too"
         )
-    numbers, how = _numbers(tellers, asked)
-    carrier = _geometry(plain, tellers)
-    assert carrier.gaussians is not None
-    levels: list[Meaning | None] = [None] * len(LEVELS)
+    numbers, how = _numbers(featured, asked)
+    base = _geometry(plain, featured)
+    levels: list[Features | None] = [None] * len(LEVELS)
     paths: list[Path | None] = [None] * len(LEVELS)
     pruned = 0
-    for number, teller in zip(numbers, tellers, strict=True):
-        meaning = _meaning(teller, centroids)
-        rows = partners(carrier.gaussians.means, teller, method in PRUNED)
+    for number, carrier in zip(numbers, featured, strict=True):
+        features = _features(carrier, centroids)
+        rows = partners(base.gaussians.means, carrier, method in PRUNED)
         pruned += rows is not None
-        levels[number] = meaning if rows is None else Rearranged(meaning, rows)
-        paths[number] = teller.path
+        levels[number] = features if rows is None else Rearranged(features, rows)
+        paths[number] = carrier.path
     return ForeignScene(
         method,
-        _scene(carrier),
+        _scene(base),
         tuple(levels),
         tuple(paths),
         autoencoder.codec if autoencoder is not None and method == LANGSPLAT else None,
-        _notes(numbers, tellers, how, pruned),
+        _notes(numbers, featured, how, pruned),
     )
 
 
-def _numbers(tellers: list[Carrier], asked: Sequence[str]) -> tuple[list[int], str]:
-    """As `levels_of`."""
-    method = tellers[0].method
+def _numbers(featured: list[Carrier], asked: Sequence[str]) -> tuple[list[int], str]:
+    """Return the level of each checkpoint, and by what it was told, as `levels_of` does."""
+    method = featured[0].method
     if method not in ONE_LEVEL or asked:
-        return levels_of(tellers, asked)
-    _only(tellers, f"scenes of {method}, which knows no levels")
+        return levels_of(featured, asked)
+    _only(featured, f"scenes of {method}, which knows no levels")
     return [len(LEVELS) - 1], f"{method} knows none, whole is filled"
 
 
-def _geometry(plain: Carrier | None, tellers: list[Carrier]) -> Carrier:
-    """Whose Gaussians the scene has: those without features; else those of the checkpoints."""
-    carriers = [plain] if plain else [teller for teller in tellers if teller.gaussians is not None]
-    if not carriers:
-        raise InputError(f"{tellers[0].path}: of {FVDB}, which keeps no Gaussians; name the scene's PLY too")
+def _geometry(plain: Carrier | None, featured: list[Carrier]) -> Carrier:
+    """Return the carrier of the scene's Gaussians: the one without features, else the first checkpoint."""
+    carriers = [plain] if plain else featured
     if carriers[0].method not in PRUNED:
         return carriers[0]
     return replace(carriers[0], gaussians=all_gaussians(carriers))
 
 
-def _meaning(carrier: Carrier, centroids: Centroids | None) -> Meaning:
+def _features(carrier: Carrier, centroids: Centroids | None) -> Features:
     if carrier.codes is None:
-        assert carrier.meaning is not None  # a carrier that tells has one or the other
-        return carrier.meaning
+        assert carrier.features is not None  # a carrier with features has one or the other
+        return carrier.features
     if centroids is None:
         raise InputError(
             f"{carrier.path}: quantised codes of {DR_SPLAT}; name its pq_index.faiss too, "
@@ -228,20 +226,23 @@ def _meaning(carrier: Carrier, centroids: Centroids | None) -> Meaning:
     return ProductCodes(carrier.codes, centroids.values)
 
 
-def _notes(numbers: list[int], tellers: list[Carrier], how: str, pruned: int) -> tuple[str, ...]:
-    named = [f"{LEVELS[number]} from {teller.path}" for number, teller in zip(numbers, tellers, strict=True)]
+def _notes(numbers: list[int], featured: list[Carrier], how: str, pruned: int) -> tuple[str, ...]:
+    named = [
+        f"{LEVELS[number]} from {carrier.path}" for number, carrier in zip(numbers, featured, strict=True)
+    ]
     notes = [f"levels ({how}): {', '.join(named)}"]
     empty = [name for number, name in enumerate(LEVELS) if number not in numbers]
     if empty:
-        notes.append(f"without meanings: {', '.join(empty)}")
+        notes.append(f"without features: {', '.join(empty)}")
     if pruned:
-        notes.append(f"{pruned} of the checkpoints lack some Gaussians, which mean nothing at their levels")
+        notes.append(
+            f"{pruned} of the checkpoints lack some Gaussians, which have no features at their levels"
+        )
     return tuple(notes)
 
 
 def _scene(carrier: Carrier) -> Scene:
-    """Its Gaussians, and the cameras that 3D Gaussian Splatting puts into the model's folder."""
-    assert carrier.gaussians is not None
+    """The carrier's Gaussians, and the cameras that 3D Gaussian Splatting puts into the model's folder."""
     folder = carrier.path.resolve().parent
     model = folder.parent.parent if carrier.path.name == "point_cloud.ply" else folder
     cameras = [path for path in (carrier.path.with_suffix(CAMERAS), model / "cameras.json") if exists(path)]
@@ -251,11 +252,3 @@ def _scene(carrier: Carrier) -> Scene:
         antialiased=carrier.antialiased,
         extras=carrier.extras,
     )
-
-
-# Checkpoints of other methods: read as plain data, and written where another method's tools are to go on.
-#
-# Nothing in a file is ever executed, and what a file is tells what it holds. See docs/files.md for what to
-# give of each method and what becomes of it.
-
-__all__ = ["ForeignScene", "Leaves", "read_foreign", "write_autoencoder", "write_checkpoint"]

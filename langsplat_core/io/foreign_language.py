@@ -1,14 +1,14 @@
-"""What the Gaussians of a foreign checkpoint mean, each method's own way, read a block at a time.
+"""Language features of other methods' checkpoints: the files that carry them, and the vectors that they stand
+for, read a block at a time.
 
-A `Meaning` is the vectors of N Gaussians at one level. Methods keep 512 numbers per Gaussian, or something
+`Features` are the vectors of N Gaussians at one level. Methods keep 512 numbers per Gaussian, or something
 smaller that stands for them; either way no (N, 512) array is made here.
 """
 
 import re
 import struct
-import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,7 +17,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.hostile import MAGIC as NPY
-from langsplat_core.io.hostile import open_for_reading, read_npy, read_npz
+from langsplat_core.io.hostile import open_for_reading, opened_archive, read_npy, read_npz
 from langsplat_core.io.langsplat_files import (
     GEOMETRY,
     autoencoder_from,
@@ -28,22 +28,21 @@ from langsplat_core.io.langsplat_files import (
 from langsplat_core.io.ply import read_ply_scene
 from langsplat_core.io.unpickling import load_torch, plain_array, plain_mapping
 from langsplat_core.scene import LEVELS, AutoencoderCodec, Gaussians
+from langsplat_core.scene.gaussians import join_gaussians
 
-NO_CODE = 255  # in every place of a product code: no meaning
+NO_CODE = 255  # in every place of a product code: no features
+TOPK = 4  # codewords of a Gaussian in LangSplatV2
 
 
-class Meaning(Protocol):
+class Features(Protocol):
     """The vectors of N Gaussians."""
-
-    def __len__(self) -> int:
-        """N"""
 
     @property
     def dim(self) -> int:
         """Numbers per vector."""
 
     def rows(self, indices: Array) -> Array:
-        """(n,) whole numbers below N -> (n, dim) float32 vectors of any length; zero for no meaning."""
+        """(n,) whole numbers below N -> (n, dim) float32 vectors of any length; zero for no features."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +50,6 @@ class Vectors:
     """A vector for each: Occam's LGS, Feature-3DGS; or a latent for each: LangSplat."""
 
     values: Array  # (N, D) floats of any length
-
-    def __len__(self) -> int:
-        return len(self.values)
 
     @property
     def dim(self) -> int:
@@ -67,16 +63,12 @@ class Vectors:
 class SparseCodes:
     """LangSplatV2: a Gaussian is a mixture of the few codewords that its logits name.
 
-    The weights are the largest `topk` of a softmax, scaled to the sum 1. Logits that are all equal were
+    The weights are the largest `TOPK` of a softmax, scaled to the sum 1. Logits that are all equal were
     never trained, and stand for nothing.
     """
 
     logits: Array  # (N, L K) floats, for L layers of codewords one after the other
     codewords: Array  # (L, K, D) float32; the layers' mixtures are added
-    topk: int = 4
-
-    def __len__(self) -> int:
-        return len(self.logits)
 
     @property
     def dim(self) -> int:
@@ -87,7 +79,7 @@ class SparseCodes:
         logits = np.asarray(self.logits[indices], np.float32)
         mixed = np.zeros((len(logits), dim), np.float32)
         for layer in range(layers):
-            weights = _largest_of_softmax(logits[:, layer * size : (layer + 1) * size], self.topk)
+            weights = _largest_of_softmax(logits[:, layer * size : (layer + 1) * size], TOPK)
             mixed += weights @ self.codewords[layer]
         return np.where(np.ptp(logits, axis=1, keepdims=True) != 0, mixed, np.float32(0))
 
@@ -108,11 +100,8 @@ def _largest_of_softmax(logits: Array, count: int) -> Array:
 class ProductCodes:
     """Dr. Splat: a byte for each of M parts of the vector names one of 256 centroids of that part."""
 
-    codes: Array  # (N, M) uint8; a row of NO_CODE has no meaning
+    codes: Array  # (N, M) uint8; a row of NO_CODE has no features
     centroids: Array  # (M, 256, D / M) float32
-
-    def __len__(self) -> int:
-        return len(self.codes)
 
     @property
     def dim(self) -> int:
@@ -129,8 +118,8 @@ class ProductCodes:
 class Leaves:
     """OpenGaussian: a Gaussian belongs to one cluster, and the clusters have vectors."""
 
-    index: Array  # (N,) int64 rows of `vectors`; anything beyond them has no meaning
-    vectors: Array  # (K, D) float32 of any length; zero for a cluster without a meaning
+    index: Array  # (N,) int64 rows of `vectors`; anything beyond them has no features
+    vectors: Array  # (K, D) float32 of any length; zero for a cluster without any
 
     def __len__(self) -> int:
         return len(self.index)
@@ -147,23 +136,20 @@ class Leaves:
 
 @dataclass(frozen=True, eq=False)
 class Rearranged:
-    """A meaning carried over to other Gaussians."""
+    """Features carried over to other Gaussians."""
 
-    meaning: Meaning
-    partner: Array  # (N,) int64 row of `meaning`; -1 for none
-
-    def __len__(self) -> int:
-        return len(self.partner)
+    features: Features
+    partner: Array  # (N,) int64 row of `features`; -1 for none
 
     @property
     def dim(self) -> int:
-        return self.meaning.dim
+        return self.features.dim
 
     def rows(self, indices: Array) -> Array:
         partner = self.partner[indices]
         out = np.zeros((len(partner), self.dim), np.float32)
         found = partner >= 0
-        out[found] = self.meaning.rows(partner[found])
+        out[found] = self.features.rows(partner[found])
         return out
 
 
@@ -178,7 +164,7 @@ class Rearranged:
 #     uint64 x 3      D, M parts, bits per part
 #     uint64          float32 numbers that follow: the centroids (M, 2^bits, D / M)
 #
-# The same centroids are also taken as a .npy, .npz or torch file with one array of that shape.
+# The same centroids are also taken as a .npy file of that shape.
 
 MAGIC = b"IxPq"
 CENTROIDS = 256  # of a part: what a byte can name
@@ -186,13 +172,12 @@ _INDEX = struct.Struct("<iqqq?i")
 _QUANTISER = struct.Struct("<QQQQ")
 
 
-def is_centroids(array: Array) -> bool:
-    """Whether these may be the (M, 256, D / M) centroids of a product quantiser."""
-    return array.ndim == 3 and array.shape[1] == CENTROIDS and array.dtype.kind == "f"
-
-
 def checked_centroids(array: Array, path: Path) -> Array:
-    """(M, 256, D / M) float32. Raises FormatError for numbers that are not finite."""
+    """(M, 256, D / M) float32. Raises FormatError for another shape and numbers that are not finite."""
+    if array.ndim != 3 or array.shape[1] != CENTROIDS or array.dtype.kind != "f":
+        raise FormatError(
+            f"{path}: holds {array.dtype} {array.shape}; expected the (M, 256, D / M) centroids of Dr. Splat"
+        )
     if not np.isfinite(array).all():
         raise FormatError(f"{path}: the quantiser's centroids are not finite")
     return np.ascontiguousarray(array, np.float32)
@@ -228,14 +213,13 @@ def read_faiss(path: Path) -> Array:
 
 # One file of what people give to an import, recognised by what it holds, never by its name or length.
 #
-# A `Carrier` has Gaussians, meanings of one level, or both. What a method keeps beside its checkpoints, an
+# A `Carrier` has Gaussians, features of one level, or both. What a method keeps beside its checkpoints, an
 # autoencoder, a quantiser or the vectors of clusters, is of no use alone.
 
 PLAIN, UNNAMED = "3D Gaussian Splatting", "LangSplat or Occam's LGS"
 LANGSPLAT, OCCAM, V2 = "LangSplat", "Occam's LGS", "LangSplatV2"
 DR_SPLAT, FEATURE_3DGS, OPEN_GAUSSIAN = "Dr. Splat", "Feature-3DGS", "OpenGaussian"
-FVDB, FVDB_MAGIC = "fVDB's LangSplatV2", "LangSplatV2Checkpoint"
-INSTANCE = 6  # numbers per Gaussian that OpenGaussian tells instances by, twice; they mean nothing alone
+INSTANCE = 6  # numbers per Gaussian that OpenGaussian tells instances by, twice; they tell nothing alone
 PICKLE = b"\x80"  # how files of torch began before they were archives
 SEMANTIC = re.compile(r"semantic_\d+")
 
@@ -246,22 +230,21 @@ class Carrier:
 
     path: Path
     method: str
-    gaussians: Gaussians | None = None  # None where a method keeps them in another file
-    meaning: Vectors | SparseCodes | None = None
+    gaussians: Gaussians
+    features: Vectors | SparseCodes | None = None
     codes: Array | None = None  # (N, M) uint8 of Dr. Splat: they need a quantiser
-    level: int | None = None  # as the file says: 0 default, 1 subpart, 2 part, 3 whole
     extras: Mapping[str, Array] = field(default_factory=dict)  # of a PLY, as `Scene.extras`
     antialiased: bool = False
 
     @property
-    def tells(self) -> bool:
-        """Whether there is more in it than Gaussians."""
+    def has_features(self) -> bool:
+        """Return whether the file carries more than Gaussians."""
         return self.method != PLAIN
 
 
 @dataclass(frozen=True, eq=False)
 class Centroids:
-    """A product quantiser."""
+    """The centroids of a product quantiser, as Dr. Splat keeps them beside its checkpoints."""
 
     path: Path
     values: Array  # (M, 256, D / M) float32
@@ -287,19 +270,19 @@ Part = Carrier | Centroids | Clusters | Autoencoder
 
 
 def read_part(path: Path) -> Part:
-    """What `path` holds. Raises InputError where it cannot be opened, FormatError where it is nothing known
-    or damaged."""
+    """Read a file of any method, told by its content. Raises InputError where it cannot be opened,
+    FormatError where it is nothing known or damaged."""
     file, _ = open_for_reading(path)
     with file:
         start = file.read(8)
     if start.startswith((b"ply\n", b"ply\r")):
         return _from_ply(path)
     if start.startswith(NPY):
-        return _centroids({"": read_npy(path)}, path)
+        return Centroids(path, checked_centroids(read_npy(path), path))
     if start.startswith((b"Ix", b"Iw")):  # as all kinds of faiss's indexes do
         return Centroids(path, read_faiss(path))
     if start.startswith(b"PK") and _is_npz(path):
-        return _from_npz(read_npz(path), path)
+        return _clusters(read_npz(path), path)
     if not start.startswith((b"PK", PICKLE)):
         raise FormatError(f"{path}: neither a PLY nor a file of torch, NumPy or faiss; name checkpoints")
     return _from_torch(load_torch(path), path)
@@ -307,9 +290,9 @@ def read_part(path: Path) -> Part:
 
 def _is_npz(path: Path) -> bool:
     try:
-        with zipfile.ZipFile(path) as archive:
-            return all(name.endswith(".npy") for name in archive.namelist())
-    except (zipfile.BadZipFile, OSError, ValueError):
+        with opened_archive(path, "archive") as archive:
+            return all(name.endswith(".npy") for name in archive.names)
+    except FormatError:  # torch finds more in a damaged archive than zipfile does
         return False
 
 
@@ -323,16 +306,16 @@ def _from_ply(path: Path) -> Carrier:
     if set(ordered) != set(names):
         raise FormatError(f"{path}: {len(names)} properties semantic_*, not counted from 0 without gaps")
     vectors = np.stack([scene.extras[name].astype(np.float32) for name in ordered], axis=1)
-    return Carrier(path, FEATURE_3DGS, scene.gaussians, Vectors(vectors), None, None, rest, scene.antialiased)
+    return Carrier(path, FEATURE_3DGS, scene.gaussians, Vectors(vectors), None, rest, scene.antialiased)
 
 
-def _from_npz(arrays: dict[str, Array], path: Path) -> Part:
-    if {"leaf_feat", "leaf_ind"} <= set(arrays):
-        return Clusters(path, _leaves(arrays, path))
-    return _centroids(arrays, path)
-
-
-def _leaves(arrays: dict[str, Array], path: Path) -> Leaves:
+def _clusters(arrays: dict[str, Array], path: Path) -> Clusters:
+    """OpenGaussian's vectors of clusters, and the cluster of each Gaussian."""
+    if not {"leaf_feat", "leaf_ind"} <= set(arrays):
+        shapes = ", ".join(str(array.shape) for array in list(arrays.values())[:6])
+        raise FormatError(
+            f"{path}: holds arrays {shapes or 'of no kind'}; expected leaf_feat and leaf_ind of OpenGaussian"
+        )
     vectors, index = arrays["leaf_feat"], arrays["leaf_ind"]
     if vectors.ndim != 2 or vectors.dtype.kind != "f" or index.ndim != 1 or index.dtype.kind not in "iu":
         raise FormatError(
@@ -342,18 +325,8 @@ def _leaves(arrays: dict[str, Array], path: Path) -> Leaves:
     counts = arrays.get("occu_count", np.ones(len(vectors)))
     if counts.shape != (len(vectors),):
         raise FormatError(f"{path}: occu_count has the shape {counts.shape}, leaf_feat {vectors.shape}")
-    return Leaves(index.astype(np.int64), np.where(counts[:, None] > 0, vectors, 0).astype(np.float32))
-
-
-def _centroids(arrays: dict[str, Array], path: Path) -> Centroids:
-    found = [array for array in arrays.values() if is_centroids(array)]
-    if len(found) != 1:
-        shapes = ", ".join(str(array.shape) for array in list(arrays.values())[:6])
-        raise FormatError(
-            f"{path}: holds arrays {shapes or 'of no kind'}; expected leaf_feat and leaf_ind of "
-            "OpenGaussian, or the (M, 256, D / M) centroids of Dr. Splat's quantiser"
-        )
-    return Centroids(path, checked_centroids(found[0], path))
+    known = np.where(counts[:, None] > 0, vectors, 0).astype(np.float32)
+    return Clusters(path, Leaves(index.astype(np.int64), known))
 
 
 def _from_torch(content: Any, path: Path) -> Part:
@@ -362,14 +335,10 @@ def _from_torch(content: Any, path: Path) -> Part:
         return _from_tuple(elements, path)
     mapping = plain_mapping(content)
     named = {"": content} if mapping is None else mapping
-    if named.get("magic") == FVDB_MAGIC:
-        return _from_fvdb(named, path)
     if is_autoencoder(named):
         return Autoencoder(path, autoencoder_from(named, path))
     arrays = {str(name): plain_array(value, path) for name, value in named.items()}
     found = {name: array for name, array in arrays.items() if array is not None}
-    if any(is_centroids(array) for array in found.values()):
-        return _centroids(found, path)
     if any(array.ndim == 4 for array in found.values()):
         raise FormatError(
             f"{path}: a convolutional decoder, as of Feature-3DGS with its speed-up; it decodes pictures, "
@@ -380,14 +349,14 @@ def _from_torch(content: Any, path: Path) -> Part:
 
 def _from_tuple(elements: tuple[Any, ...], path: Path) -> Carrier:
     gaussians = gaussians_of(elements, path)
-    method, meaning, codes = _language(elements, len(gaussians), path)
-    return Carrier(path, method, gaussians, meaning, codes)
+    method, features, codes = _language(elements, len(gaussians), path)
+    return Carrier(path, method, gaussians, features, codes)
 
 
 def _language(
     elements: tuple[Any, ...], count: int, path: Path
 ) -> tuple[str, Vectors | SparseCodes | None, Array | None]:
-    """Method, meaning and codes of what follows the geometry."""
+    """Method, features and codes of what follows the geometry."""
     first = plain_array(elements[GEOMETRY], path)
     second = plain_array(elements[GEOMETRY + 1], path) if len(elements) > GEOMETRY + 1 else None
     if first is None or first.ndim != 2:  # (N,) radii of plain 3D Gaussian Splatting
@@ -403,7 +372,7 @@ def _language(
             f"{path}: features of the type {first.dtype}; expected floats, or bytes of a quantiser"
         )
     if second is not None and second.ndim == 3:
-        return V2, _sparse(first, second, 4, path), None
+        return V2, _sparse(first, second, path), None
     if second is not None and first.shape == second.shape == (count, INSTANCE):
         return OPEN_GAUSSIAN, None, None
     return UNNAMED, Vectors(first), None
@@ -417,39 +386,14 @@ def _wide(array: Array | None, count: int) -> Array | None:
     return flat if flat.ndim == 2 and flat.shape[1] > 1 else None
 
 
-def _sparse(logits: Array, codewords: Array, topk: int, path: Path) -> SparseCodes:
+def _sparse(logits: Array, codewords: Array, path: Path) -> SparseCodes:
     layers, size, _ = codewords.shape
     if logits.ndim != 2 or logits.shape[1] != layers * size or not np.isfinite(codewords).all():
         raise FormatError(
             f"{path}: logits {logits.shape} for codewords {codewords.shape}; expected (N, L K) and finite "
             "(L, K, D)"
         )
-    return SparseCodes(logits, np.asarray(codewords, np.float32), topk)
-
-
-def _from_fvdb(content: Mapping[str, Any], path: Path) -> Carrier:
-    config = _mapping(content, "config")
-    model = _mapping(content, "model")
-    state = _mapping(model, "model_state") or model
-    arrays = [array for value in state.values() if (array := plain_array(value, path)) is not None]
-    codewords = [array for array in arrays if array.ndim == 3 and array.dtype.kind == "f"]
-    wanted = {array.shape[0] * array.shape[1] for array in codewords}
-    logits = [array for array in arrays if array.ndim == 2 and array.shape[1] in wanted]
-    if len(codewords) != 1 or len(logits) != 1:
-        raise FormatError(
-            f"{path}: {len(logits)} tensors of logits and {len(codewords)} of codewords; expected one of "
-            "each, (N, L K) and (L, K, D)"
-        )
-    topk = _mapping(config, "model").get("topk", 4)
-    level = config.get("feature_level")
-    if not isinstance(topk, int) or topk < 1:
-        raise FormatError(f"{path}: config.model.topk is not a whole number, 1 or more")
-    meaning = _sparse(logits[0], codewords[0], topk, path)
-    return Carrier(path, FVDB, None, meaning, None, level if isinstance(level, int) else None)
-
-
-def _mapping(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    return plain_mapping(content.get(name)) or {}
+    return SparseCodes(logits, np.asarray(codewords, np.float32))
 
 
 # Which of the three levels a checkpoint is of, and how its Gaussians go with those of the others.
@@ -462,19 +406,17 @@ LEAST_SHARED = 0.5  # of the Gaussians of a pruned checkpoint; with fewer in com
 def levels_of(carriers: Sequence[Carrier], asked: Sequence[str]) -> tuple[list[int], str]:
     """0, 1 or 2 for each checkpoint, and by what they were told apart.
 
-    As `asked` (names of levels, in the order of the checkpoints); else as the files say, or their names or
-    those of their folders; else three in their order, and one alone is the whole. Raises InputError where
+    As `asked` (names of levels, in the order of the checkpoints); else as their names say or those of their
+    folders; else three in their order, and one alone is the whole. Raises InputError where
     that leaves a doubt.
     """
     if asked:
         return _as_asked(carriers, asked), "as asked"
-    said = [carrier.level for carrier in carriers]
-    told = any(number is not None for number in said)
-    numbers = said if told else [_numbered(carrier.path) for carrier in carriers]
-    chosen = [number - 1 for number in numbers if number]  # 0 is SAM's default masks, all levels in one
+    numbers = [_numbered(carrier.path) for carrier in carriers]
+    chosen = [number - 1 for number in numbers if number is not None]
     if len(set(chosen)) == len(carriers):
-        return chosen, "as the files say" if told else "by the names of files and folders"
-    if not told and len(carriers) == len(LEVELS) and len(set(numbers)) == 1:
+        return chosen, "by the names of files and folders"
+    if len(carriers) == len(LEVELS) and len(set(numbers)) == 1:
         return list(range(len(LEVELS))), "by their order"
     if numbers == [None]:
         return [len(LEVELS) - 1], "one alone is taken for the whole"
@@ -494,7 +436,7 @@ def _as_asked(carriers: Sequence[Carrier], asked: Sequence[str]) -> list[int]:
 
 
 def _numbered(path: Path) -> int | None:
-    """The number at the end of a file's name, or of its folder's."""
+    """Return the number at the end of a file's name, or of its folder's."""
     for name in (path.stem, path.resolve().parent.name):
         found = _NUMBER.search(name)
         if found:
@@ -503,22 +445,16 @@ def _numbered(path: Path) -> int | None:
 
 
 def all_gaussians(carriers: Sequence[Carrier]) -> Gaussians:
-    """Of checkpoints that lack different ones: those of the first, then what each further one has beside
-    them. Raises FormatError where they are not of one scene."""
-    found: Gaussians | None = None
-    for carrier in carriers:
+    """Return the Gaussians of checkpoints that lack different ones: those of the first, then what each
+    further one has beside them. Raises FormatError where they are not of one scene."""
+    found = carriers[0].gaussians
+    for carrier in carriers[1:]:
         theirs = carrier.gaussians
-        if found is None or theirs is None:
-            found = theirs if found is None else found
-            continue
         if found.sh.shape[1] != theirs.sh.shape[1]:
             raise FormatError(f"{carrier.path}: SH degree {theirs.sh_degree}, others have {found.sh_degree}")
         row = _row_of(theirs.means, found.means)
         _require_shared(row, min(len(found), len(theirs)), carrier)
-        new = theirs.take(row < 0)
-        arrays = [(getattr(found, item.name), getattr(new, item.name)) for item in fields(Gaussians)]
-        found = Gaussians(*map(np.concatenate, arrays))
-    assert found is not None
+        found = join_gaussians([found, theirs.take(row < 0)])
     return found
 
 
@@ -526,14 +462,9 @@ def partners(means: Array, carrier: Carrier, may_lack: bool) -> Array | None:
     """(N,) row of the `carrier`'s Gaussian at each of (N, 3) `means`, -1 where it has none; None where they
     are the same Gaussians. Raises FormatError where they are not of one scene.
 
-    A checkpoint without Gaussians of its own has as many features. One that `may_lack` some has them removed:
-    Gaussians at the same position, bit for bit, are the same.
+    A checkpoint that `may_lack` some Gaussians has removed them: those at the same position, bit for bit, are
+    the same.
     """
-    if carrier.gaussians is None:
-        count = 0 if carrier.meaning is None else len(carrier.meaning)
-        if count != len(means):
-            raise FormatError(f"{carrier.path}: features of {count} Gaussians, the scene has {len(means)}")
-        return None
     theirs = carrier.gaussians.means
     if np.array_equal(means, theirs, equal_nan=True):
         return None

@@ -23,8 +23,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError, LangSplatError, printable_line, quoted
 from langsplat_core.io.files import atomic_path
 
-# Files of plain NumPy arrays of numbers or texts, .npy and .npz, read without pickles and without belief in
-# their headers; and .npy written.
+# ---- .npy and .npz: plain numbers or texts, read without pickles and without belief in their headers ----
 
 MAGIC = b"\x93NUMPY"
 HEADER_LIMIT = 10_000  # bytes; NumPy writes 118
@@ -93,12 +92,12 @@ def _parse(file: BinaryIO, size: int, name: str) -> Array:
 
 
 def _is_text(data: Array) -> bool:
-    """Whether every code point of a text array exists; NumPy raises SystemError over one that does not."""
+    """Return whether every code point of a text array exists; NumPy raises SystemError over others."""
     codes = data.view(data.dtype.byteorder.replace("|", "=") + "u4")
     return bool(((codes < 0xD800) | (codes > 0xDFFF) & (codes <= 0x10FFFF)).all())
 
 
-# Opening a file for reading, with every way it can fail as one line for the user.
+# ---- opening a file and JSON, with every way it can fail as one line for the user ----
 
 
 def open_for_reading(path: Path) -> tuple[BinaryIO, int]:
@@ -149,7 +148,7 @@ def parse_json(text: bytes, path: Path) -> Any:
         raise FormatError(f"{path}: not readable as JSON ({str(error)[:80]})") from None
 
 
-# Zip archives without belief in their directories.
+# ---- zip archives, without belief in their directories ----
 #
 # `zipfile` lets through what its decompressors and its own parsing meet in damaged archives (LZMAError,
 # IndexError, struct.error, NotImplementedError, zlib.error ...), so every exception here means an unreadable
@@ -166,7 +165,7 @@ class Archive:
 
     @property
     def names(self) -> list[str]:
-        """Of all members, in the directory's order."""
+        """Names of all members, in the directory's order."""
         return self._archive.namelist()
 
     def read(self, name: str, limit: int) -> bytes:
@@ -204,7 +203,7 @@ def opened_archive(path: Path, kind: str) -> Iterator[Archive]:
             raise FormatError(f"{path}: not a readable {kind} ({what})") from None
 
 
-# Opening picture files: the one place of the project that hands a file to Pillow.
+# ---- pictures: the one place of the project that hands a file to Pillow ----
 #
 # The kind is told by the content, and only the kinds below are tried: others (EPS, WMF, FITS ...) make
 # Pillow start other programs or allocate what a header of a few bytes asks for. The size that the header
@@ -215,10 +214,7 @@ def opened_archive(path: Path, kind: str) -> Iterator[Archive]:
 
 KINDS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # always; AVIF and HEIF where Pillow has a codec
 # HEIF is named where it cannot be read, too: the message then says why such photographs are left out
-PHOTO_SUFFIXES = (
-    *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif"),
-    *(".heic", ".heif"),
-)
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif", ".heic", ".heif")
 MOST_PIXELS = 178_000_000  # of any picture: 0.7 GB once decoded. The largest cameras make 151 million
 # Declared pixels beyond these need a file of a fitting size: photographs keep 2 to 100 pixels a byte, what is
 # made to exhaust memory a million. The decoders of WebP and AVIF hold two more copies of the picture.

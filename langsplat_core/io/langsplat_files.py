@@ -1,4 +1,7 @@
-"""The exchange format of the original LangSplat: the masks and CLIP vectors of one photograph.
+"""Files of the original LangSplat and of Gaussian Splatting in torch: features of photographs, the
+autoencoder, and checkpoints of Gaussian models.
+
+The masks and CLIP vectors of one photograph:
 
     <stem>_f.npy   float32 (M, D)      one CLIP vector per mask; D = 512, or 3 after its autoencoder
     <stem>_s.npy   integer (4, H, W)   row of `_f` per pixel, -1 where there is no mask; maps in order
@@ -21,6 +24,7 @@ from langsplat_core.io.hostile import read_npy, write_npy
 from langsplat_core.io.ply import REST_COUNTS
 from langsplat_core.io.unpickling import plain_array
 from langsplat_core.scene import AutoencoderCodec, Gaussians
+from langsplat_core.scene.codec import Layers
 
 MAP_COUNT = 4
 NO_MASK = -1
@@ -65,7 +69,7 @@ def _paths(folder: Path | str, stem: str) -> tuple[Path, Path]:
     return Path(folder) / f"{stem}_f.npy", Path(folder) / f"{stem}_s.npy"
 
 
-# LangSplat's autoencoder, `best_ckpt.pth`: a dictionary of weights by the number of a layer in its network.
+# ---- LangSplat's autoencoder, `best_ckpt.pth`: weights by the number of a layer in its network ----
 #
 #     encoder.{0,3,6,9,12}.{weight,bias}                        linear layers 512-256-128-64-32-3
 #     encoder.{1,4,7,10}.{weight,bias,running_mean,running_var} batch normalisation behind all but the last,
@@ -82,7 +86,7 @@ Layer = dict[str, Array]
 
 
 def is_autoencoder(content: Mapping[Any, Any]) -> bool:
-    """Whether these are weights of an encoder and a decoder."""
+    """Return whether these are weights of an encoder and a decoder."""
     parts = {found[1] for name in content if isinstance(name, str) and (found := _NAME.fullmatch(name))}
     return parts == {"encoder", "decoder"}
 
@@ -128,11 +132,11 @@ def _folded(layers: list[Layer]) -> tuple[tuple[Array, Array], ...]:
     return tuple((weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in folded)
 
 
-def autoencoder_weights(codec: AutoencoderCodec) -> dict[str, Array]:
+def autoencoder_weights(encoder: Layers, decoder: Layers) -> dict[str, Array]:
     """The dictionary of a codec; its batch normalisations change nothing, because theirs are folded in."""
     named: dict[str, Array] = {}
-    last = len(codec.encoder) - 1
-    for number, (weight, bias) in enumerate(codec.encoder):
+    last = len(encoder) - 1
+    for number, (weight, bias) in enumerate(encoder):
         named |= {f"encoder.{3 * number}.weight": weight, f"encoder.{3 * number}.bias": bias}
         if number < last:
             ones, zeros = np.ones(len(bias), np.float32), np.zeros(len(bias), np.float32)
@@ -142,12 +146,12 @@ def autoencoder_weights(codec: AutoencoderCodec) -> dict[str, Array]:
                 "num_batches_tracked": np.array(0, np.int64),
             }
             named |= {f"encoder.{3 * number + 1}.{name}": array for name, array in neutral.items()}
-    for number, (weight, bias) in enumerate(codec.decoder):
+    for number, (weight, bias) in enumerate(decoder):
         named |= {f"decoder.{2 * number}.weight": weight, f"decoder.{2 * number}.bias": bias}
     return named
 
 
-# The tuple of a Gaussian model, as 3D Gaussian Splatting saves it and others extend it.
+# ---- the tuple of a Gaussian model, as 3D Gaussian Splatting saves it and others extend it ----
 #
 #     index  element                                        shape
 #     0      active SH degree                               whole number
@@ -205,8 +209,8 @@ def _element(
     return np.asarray(array, np.float32)
 
 
-# Checkpoints as LangSplat and Occam's LGS read them: (tuple of a Gaussian model, iteration), see
-# `gaussian_tuple`; element 7 holds the features, and what an optimiser would need is empty.
+# Checkpoints as LangSplat and Occam's LGS read them: element 7 holds the features, and what an optimiser
+# would need is empty.
 
 ITERATION = 30_000
 
@@ -237,9 +241,9 @@ def write_checkpoint(path: Path, gaussians: Gaussians, features: Array) -> None:
     _save((elements, ITERATION), path)
 
 
-def write_autoencoder(path: Path, codec: AutoencoderCodec) -> None:
+def write_autoencoder(path: Path, encoder: Layers, decoder: Layers) -> None:
     """`best_ckpt.pth` of a codec, atomically."""
-    _save({name: _tensor(array) for name, array in autoencoder_weights(codec).items()}, path)
+    _save({name: _tensor(array) for name, array in autoencoder_weights(encoder, decoder).items()}, path)
 
 
 def _tensor(array: Array) -> Any:

@@ -1,4 +1,47 @@
-"""The tensors of a language sidecar, read and checked; the layout stands in `language`."""
+"""The language field of a scene: `scene.langsplat.safetensors` beside `scene.ply`.
+
+A safetensors file (an 8-byte length, a JSON header, raw little-endian tensors: nothing in it is ever
+executed). Version 2, for N Gaussians, CLIP vectors of D numbers and P phrases:
+
+    tensor           type     shape      meaning
+    codes            uint16   (3, N)     number of the codeword at subpart, part, whole: of a codebook
+    latents          float    (3, N, d)  instead, of another codec; zero where never observed
+    confidence       float    (3, N)     total blending weight of the observations, >= 0; 0 for no meaning
+    things           uint16   (N,)       number of the thing a Gaussian belongs to, 65535 for none; absent
+                                         where it is not known
+    positions        uint64   (N,)       of the Gaussians that the field belongs to, see `pack_positions`
+    corners          float32  (2, 3)     of the box of these positions
+    canonical        float    (4, D)     unit text vectors of "object", "things", "stuff", "texture"
+    everyday         float    (V, D)     unit text vectors of phrases most of which name nothing in the scene;
+                                         absent where the encoder knows too few
+    phrasebook       float    (P, D)     unit text vectors of `phrases`; absent when P = 0
+    codec.*          float               of a codebook vectors (K, D) and colours (K, 3); basis (d, D) of a
+                                         linear codec; of an autoencoder
+                                         {encoder,decoder}.{layer}.{weight,bias}
+
+    metadata         value
+    format           "langsplat"
+    version          "2"
+    encoder          hub id or folder of the text encoder
+    levels           "subpart,part,whole"
+    codec            "codebook", "autoencoder" or "linear"
+    d                latent dimension, decimal
+    gaussians        N, decimal
+    means_blake2b    BLAKE2b-128 of the means of the PLY, as float32 little endian, hexadecimal
+    phrases          JSON list of the P phrases
+    temperature      of the softmax that reads this encoder's cosines, decimal
+    found            relevancy from which a phrase counts as present, decimal
+    odds             JSON: a list of numbers for each of the three `Odds` of `scene.Calibration`; absent where
+                     the encoder has none ("calibration" of older files is of another scale, and is not read)
+
+"float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
+like the one in memory. With a codebook as `langsplat train` makes it that is 22 bytes per Gaussian, 6 of
+them codes.
+
+The PLY stays a plain file that other programs edit; the checksum notices it, and the positions let
+`rematch_language` carry the field over to an edited PLY. Version 1 is read too: everything float32, `means`
+(N, 3) in place of positions and corners, no temperature and no found.
+"""
 
 import hashlib
 import json
@@ -15,7 +58,6 @@ from langsplat_core.arrays import Array, check_array
 from langsplat_core.errors import FormatError, printable_line, quoted
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading, parse_json
-from langsplat_core.io.ply import pack_positions, step, unpack_positions
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     LEVELS,
@@ -26,7 +68,6 @@ from langsplat_core.scene import (
     Reading,
     codec_from_tensors,
 )
-from langsplat_core.scene.codec import KINDS
 
 FORMAT, VERSION = "langsplat", "2"
 CODEC = "codec."
@@ -44,7 +85,7 @@ _WHOLE = {"codes": "U16", "things": "U16", "positions": "U64"}  # tensors that h
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """What a sidecar holds."""
+    """Content of a sidecar."""
 
     field: LanguageField
     means: Array  # (N, 3) positions of the Gaussians it was made for, world units; NaN for those not finite
@@ -92,18 +133,18 @@ def _check_metadata(metadata: dict[str, str], path: Path) -> None:
 
 
 def _assemble(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> Stored:
-    kind = KINDS.get(metadata["codec"])
-    latents_name = "codes" if kind is not None and kind.space == "index" else "latents"
     places = ("means",) if metadata["version"] == "1" else ("positions", "corners")
-    for name in (latents_name, "confidence", "canonical", *places):
+    for name in ("confidence", "canonical", *places):
         if name not in tensors:
             raise FormatError(f"{path}: tensor {name!r} is missing")
     for name, tensor in tensors.items():
         if name != "means" and not np.isfinite(tensor).all():
             raise FormatError(f"{path}: tensor {quoted(name)} holds numbers that are not finite")
     try:
-        field = _field(tensors, metadata, latents_name, path)
+        field = _field(tensors, metadata, path)
         means, precision = _means(tensors, len(field))
+    except KeyError as missing:
+        raise FormatError(f"{path}: tensor {missing} is missing") from None
     except (ValueError, TypeError, IndexError) as error:
         raise FormatError(f"{path}: {error}") from None
     if (metadata["d"], metadata["gaussians"]) != (str(field.codec.latent_dim), str(len(field))):
@@ -113,15 +154,9 @@ def _assemble(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -
     return Stored(field, means, precision, metadata["means_blake2b"])
 
 
-def _field(
-    tensors: dict[str, Array], metadata: dict[str, str], latents_name: str, path: Path
-) -> LanguageField:
+def _field(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> LanguageField:
     weights = {name.removeprefix(CODEC): t for name, t in tensors.items() if name.startswith(CODEC)}
     codec = codec_from_tensors(metadata["codec"], weights)
-    latents = tensors[latents_name]
-    if latents_name == "codes":
-        check_array("codes", latents, (len(LEVELS), "N"))
-        latents = latents[..., None]
     phrases = _phrases(metadata, path)
     vectors = tensors.get("phrasebook", np.zeros((0, codec.vector_dim), np.float32))
     check_array("phrasebook", vectors, (len(phrases), codec.vector_dim))
@@ -131,7 +166,7 @@ def _field(
         calibration = _calibration(metadata, path)
         reading = Reading(float(metadata["temperature"]), float(metadata["found"]), calibration)
     return LanguageField(
-        latents,
+        codec.from_file(tensors),
         tensors["confidence"],
         codec,
         tensors["canonical"],
@@ -164,7 +199,7 @@ def _means(tensors: dict[str, Array], count: int) -> tuple[Array, float]:
     check_array("positions", tensors["positions"], (count,))
     check_array("corners", tensors["corners"], (2, 3))
     corners = tensors["corners"]
-    return unpack_positions(tensors["positions"], corners), step(corners)
+    return unpack_positions(tensors["positions"], corners), position_step(corners)
 
 
 def _phrases(metadata: dict[str, str], path: Path) -> list[str]:
@@ -192,45 +227,12 @@ def save_tensors(path: Path, tensors: dict[str, Array], metadata: dict[str, str]
             file.write(text.ljust(size))
 
 
-# The language field of a scene: `scene.langsplat.safetensors` beside `scene.ply`.
-#
-# A safetensors file (an 8-byte length, a JSON header, raw little-endian tensors: nothing in it is ever
-# executed). Version 2, for N Gaussians, CLIP vectors of D numbers and P phrases:
-#
-# tensor           type     shape      meaning codes            uint16   (3, N)     number of the codeword
-# at subpart, part, whole: of a codebook latents          float    (3, N, d)  instead, of another codec;
-# zero where never observed confidence       float    (3, N)     total blending weight of the observations,
-# >= 0; 0 for no meaning things           uint16   (N,)       number of the thing a Gaussian belongs to,
-# 65535 for none; absent where it is not known positions        uint64   (N,)       of the Gaussians that
-# the field belongs to, see `packed_positions` corners          float32  (2, 3)     of the box of these
-# positions canonical        float    (4, D)     unit text vectors of "object", "things", "stuff", "texture"
-# everyday         float    (V, D)     unit text vectors of phrases most of which name nothing in the scene;
-# absent where the encoder knows too few phrasebook       float    (P, D)     unit text vectors of
-# `phrases`; absent when P = 0 codec.*          float               of a codebook vectors (K, D) and colours
-# (K, 3); basis (d, D) of a linear codec; of an autoencoder {encoder,decoder}.{layer}.{weight,bias}
-#
-# metadata         value format           "langsplat" version          "2" encoder          hub id or folder
-# of the text encoder levels           "subpart,part,whole" codec            "codebook", "autoencoder" or
-# "linear" d                latent dimension, decimal gaussians        N, decimal means_blake2b
-# BLAKE2b-128 of the means of the PLY, as float32 little endian, hexadecimal phrases          JSON list of
-# the P phrases temperature      of the softmax that reads this encoder's cosines, decimal found
-# relevancy from which a phrase counts as present, decimal odds             JSON: a list of numbers for each
-# of the three `Odds` of `scene.Calibration`; absent where the encoder has none ("calibration" of older
-# files is of another scale, and is not read)
-#
-# "float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
-# like the one in memory. With a codebook as `langsplat train` makes it that is 22 bytes per Gaussian, 6 of
-# them codes.
-#
-# The PLY stays a plain file that other programs edit; the checksum notices it, and the positions let
-# `rematch_language` carry the field over to an edited PLY. Version 1 is read too: everything float32, `means`
-# (N, 3) in place of positions and corners, no temperature and no found.
-
 SUFFIX = ".langsplat.safetensors"
 
 
 def means_checksum(means: Array) -> str:
-    """Of (N, 3) float32 positions; every bit counts, so that any edit or reordering is noticed."""
+    """Return the BLAKE2b-128 of (N, 3) float32 positions; every bit counts, so that any edit or reordering is
+    noticed."""
     data = np.ascontiguousarray(means, dtype="<f4")
     return hashlib.blake2b(data.tobytes(), digest_size=16).hexdigest()
 
@@ -239,19 +241,16 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
     """Write `field` for the Gaussians at `means` (N, 3), atomically."""
     check_array("means", means, (len(field), 3), dtype=np.float32)
     positions, corners = pack_positions(means)
-    indexed = field.codec.space == "index"
     floats = {
         "confidence": field.confidence,
         "canonical": field.canonical,
-        **({} if indexed else {"latents": field.latents}),
+        **field.codec.to_file(field.latents),
         **({} if field.everyday is None else {"everyday": field.everyday}),
         **({"phrasebook": np.stack(list(field.phrasebook.values()))} if field.phrasebook else {}),
         **{CODEC + name: tensor for name, tensor in field.codec.tensors().items()},
     }
     tensors = {name: _narrow(tensor) for name, tensor in floats.items()}
     tensors |= {"positions": positions, "corners": corners}
-    if indexed:
-        tensors["codes"] = field.latents[..., 0]
     if field.things is not None:
         tensors["things"] = field.things
     metadata = {
@@ -275,7 +274,9 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
 
 
 def _narrow(tensor: Array) -> Array:
-    """As float16 where that loses nothing."""
+    """Floats as float16 where that loses nothing."""
+    if tensor.dtype != np.float32:
+        return tensor
     with np.errstate(over="ignore"):
         half = tensor.astype(np.float16)
     return half if np.array_equal(half.astype(np.float32), tensor) else tensor
@@ -335,3 +336,46 @@ def _median_spacing(tree: Any) -> float:
     sample = tree.data[:: max(1, len(tree.data) // 10_000)]
     distances = tree.query(sample, k=2)[0][:, 1]  # infinite where there is no second point
     return float(np.median(np.where(np.isfinite(distances), distances, 0)))
+
+
+# ---- positions in 8 bytes: 21 bits an axis, between the corners of their box ----
+#
+# They tell which Gaussian was which after a PLY was edited; a 2 millionth of the box is closer than that
+# needs, also where a few floaters make the box a thousand times larger than what is looked at.
+
+_BITS = 21
+_NOWHERE = np.uint64(2**64 - 1)  # of a position that is not finite
+_STEPS = 2**_BITS - 1
+
+
+def pack_positions(means: Array) -> tuple[Array, Array]:
+    """(N, 3) float32 -> (N,) uint64 and (2, 3) float32 lower and upper corner of what is finite."""
+    finite = np.isfinite(means).all(1)
+    if not finite.any():
+        return np.full(len(means), _NOWHERE), np.zeros((2, 3), np.float32)
+    corners = np.stack([means[finite].min(0), means[finite].max(0)]).astype(np.float32)
+    low, span = _box(corners)
+    steps = np.rint((means[finite].astype(np.float64) - low) / span * _STEPS).astype(np.uint64)
+    packed = np.full(len(means), _NOWHERE)
+    packed[finite] = steps[:, 0] | steps[:, 1] << np.uint64(_BITS) | steps[:, 2] << np.uint64(2 * _BITS)
+    return packed, corners
+
+
+def unpack_positions(packed: Array, corners: Array) -> Array:
+    """The inverse, (N, 3) float64 to half a `position_step` on each axis; NaN for what was not finite."""
+    low, span = _box(corners)
+    axes = [(packed >> np.uint64(shift)) & np.uint64(_STEPS) for shift in (0, _BITS, 2 * _BITS)]
+    means = np.stack(axes, 1).astype(np.float64) / _STEPS * span + low
+    means[packed == _NOWHERE] = np.nan
+    return means
+
+
+def position_step(corners: Array) -> float:
+    """Largest distance between two neighbouring packed numbers, in the units of the positions."""
+    return float(_box(corners)[1].max() / _STEPS)
+
+
+def _box(corners: Array) -> tuple[Array, Array]:
+    """Lower corner and extent, float64; an axis without extent gets 1."""
+    low, high = corners.astype(np.float64)
+    return low, np.where(high > low, high - low, 1.0)

@@ -1,9 +1,20 @@
-"""How long a scene's world unit is: a comment in the header of its PLY.
+"""3D Gaussian scenes as PLY: INRIA's layout in all its variants, written in its plain form, and SuperSplat's
+compressed PLY.
 
-    comment metres_per_unit 0.25
+One element `vertex`, one row per Gaussian. As written: binary little endian, float32, in order
+``x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3``. Opacities are logits, scales natural
+logarithms, rotations quaternions w x y z. There are 0, 9, 24 or 45 `f_rest` (SH degree 0 to 3), channel
+after channel: all coefficients of red, then of green, then of blue. Normals are zeros that nobody reads.
 
-Other programs pass over it. Of several the last one counts, and one that is not a positive number is none. A
-scene in another format has no scale.
+As read: the properties in any order and of any scalar type, any byte order, ascii, LF or CR LF in the
+header, without normals, with further elements (ignored) and properties (kept as `Scene.extras`). Rows are
+kept as they are, NaN included. Of comments in the header two kinds mean something; of several of a kind the
+last one counts:
+
+    metres_per_unit 0.25        length of the world's unit; no positive number: unknown
+    SplatRenderMode: mip        trained with Mip-Splatting's compensation: Brush, splat-transform, gsplat
+    antialiased 1               the same: Postshot
+    train_flags antialiasing    the same: proposed for the INRIA code
 """
 
 import math
@@ -26,89 +37,10 @@ from langsplat_core.io.ply_table import (
     fill_columns,
     is_name,
     iterate_rows,
+    read_columns,
     read_ply_header,
 )
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
-
-KEY = "metres_per_unit"
-
-
-def metres_comment(metres_per_unit: float) -> str:
-    """The comment that says so."""
-    return f"{KEY} {float(metres_per_unit)!r}"
-
-
-def metres_by_comments(comments: tuple[str, ...]) -> float | None:
-    """Metres per world unit, > 0 and finite, as the header's comments say; None where they do not."""
-    found = None
-    for comment in comments:
-        match comment.replace(":", " ").split():
-            case [key, value] if key == KEY:
-                found = _positive(value)
-    return found
-
-
-def write_metres(path: Path | str, metres_per_unit: float) -> None:
-    """Say in the header of the PLY `path` how long its unit is; all else stays as it is, byte for byte.
-
-    Raises InputError for another kind of file and a length that is not positive, FormatError for a header
-    that breaks the rules.
-    """
-    path = Path(path)
-    if path.suffix.lower() != ".ply":
-        raise InputError(f"{path}: only a .ply keeps a scale; make one with 'langsplat convert'")
-    if not 0 < metres_per_unit < math.inf:
-        raise InputError(f"{metres_per_unit:g} metres per unit: must be above 0 and finite")
-    file, _ = open_for_reading(path)
-    with atomic_path(path) as temporary, file, temporary.open("wb") as out:
-        size = read_ply_header(file, path).size
-        file.seek(0)
-        *lines, last = file.read(size).splitlines(keepends=True)
-        end = b"\r\n" if last.endswith(b"\r\n") else b"\n"
-        out.writelines(line for line in lines if not _is_ours(line))
-        out.write(b"comment " + metres_comment(metres_per_unit).encode() + end + last)
-        shutil.copyfileobj(file, out)
-
-
-def _is_ours(line: bytes) -> bool:
-    return line.replace(b":", b" ").split()[:2] == [b"comment", KEY.encode()]
-
-
-def _positive(text: str) -> float | None:
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if 0 < value < math.inf else None
-
-
-# How a PLY says that its Gaussians were trained with Mip-Splatting's compensation.
-#
-# The PLY standard has no place for it, so programs write header comments. Known ones, in any case; of several
-# the last one counts, and a value that is none of these says no:
-#
-#     SplatRenderMode: mip        Brush, PlayCanvas' splat-transform, gsplat; otherwise default or 2dgs
-#     antialiased 1               Postshot; otherwise 0
-#     train_flags antialiasing    proposed for the INRIA code
-
-COMMENT = "SplatRenderMode: mip"  # the commonest spelling, which `save_scene` writes
-
-
-def antialiased_by_comments(comments: tuple[str, ...]) -> bool:
-    """Whether the header's comments say so."""
-    said = False
-    for comment in comments:
-        match comment.lower().replace(":", " ").split():
-            case ["splatrendermode", mode, *_]:
-                said = mode == "mip"
-            case ["antialiased", value]:
-                said = value == "1"
-            case ["train_flags", *flags]:
-                said = "antialiasing" in flags
-    return said
-
-
-# The columns of the INRIA 3DGS layout, which PLY and compressed PLY share.
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")  # zeros that nobody reads
@@ -117,233 +49,9 @@ SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 SH_C0 = 0.5 / np.sqrt(np.pi)  # the constant spherical harmonic: colour = 0.5 + SH_C0 * f_dc
 REST_COUNTS = {3 * (count - 1): degree for degree, count in SH_COUNTS.items()}  # f_rest_* -> SH degree
-
-
-def sh_from_channel_major(base: Array, rest: Array) -> Array:
-    """(N, 3) base colours and (N, 3 (K - 1)) channel-major coefficients -> (N, K, 3)."""
-    by_channel = rest.reshape(len(rest), 3, rest.shape[1] // 3)
-    return np.concatenate([base[:, None], by_channel.transpose(0, 2, 1)], axis=1)
-
-
-def sh_to_channel_major(sh: Array) -> Array:
-    """(N, K, 3) -> (N, 3 (K - 1)): the `f_rest_*` columns."""
-    return sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), 3 * (sh.shape[1] - 1))
-
-
-def check_gaussian_properties(vertex: PlyElement, path: Path) -> tuple[str, ...]:
-    """Require the scalar properties of a Gaussian; returns the names of its `f_rest_*` in order."""
-    names = {prop.name for prop in vertex.properties}
-    needed = (*POSITION, *BASE_COLOUR, "opacity", *SCALE, *ROTATION)
-    missing = [name for name in needed if name not in names]
-    if not names & set(needed[3:]):
-        raise FormatError(
-            f"{path}: a mesh or point cloud, not a 3D Gaussian scene: its vertices have no f_dc, opacity, "
-            "scale and rot; train one with 'langsplat train'"
-        )
-    if missing:
-        raise FormatError(f"{path}: property {missing[0]!r} is missing; every Gaussian needs it")
-    rest_count = sum(name.startswith("f_rest_") for name in names)
-    if rest_count not in REST_COUNTS:
-        raise FormatError(
-            f"{path}: {rest_count} properties f_rest_*; expected 0, 9, 24 or 45 (SH degree 0-3)"
-        )
-    rest = tuple(f"f_rest_{index}" for index in range(rest_count))
-    absent = [name for name in rest if name not in names]
-    if absent:
-        raise FormatError(f"{path}: property {absent[0]!r} is missing among {rest_count} f_rest_*")
-    lists = [prop.name for prop in vertex.properties if prop.count_code]
-    if lists:
-        raise FormatError(f"{path}: property {lists[0]!r} of vertex is a list; expected one number")
-    return rest
-
-
-# Positions in 8 bytes: 21 bits an axis, between the corners of their box.
-#
-# They tell which Gaussian was which after a PLY was edited; a 2 millionth of the box is closer than that
-# needs, also where a few floaters make the box a thousand times larger than what is looked at.
-
-BITS = 21
-NOWHERE = np.uint64(2**64 - 1)  # of a position that is not finite
-_STEPS = 2**BITS - 1
-
-
-def pack_positions(means: Array) -> tuple[Array, Array]:
-    """(N, 3) float32 -> (N,) uint64 and (2, 3) float32 lower and upper corner of what is finite."""
-    finite = np.isfinite(means).all(1)
-    if not finite.any():
-        return np.full(len(means), NOWHERE), np.zeros((2, 3), np.float32)
-    corners = np.stack([means[finite].min(0), means[finite].max(0)]).astype(np.float32)
-    low, span = _box(corners)
-    steps = np.rint((means[finite].astype(np.float64) - low) / span * _STEPS).astype(np.uint64)
-    packed = np.full(len(means), NOWHERE)
-    packed[finite] = steps[:, 0] | steps[:, 1] << np.uint64(BITS) | steps[:, 2] << np.uint64(2 * BITS)
-    return packed, corners
-
-
-def unpack_positions(packed: Array, corners: Array) -> Array:
-    """The inverse, (N, 3) float64 to half a `step` on each axis; NaN for what was not finite."""
-    low, span = _box(corners)
-    axes = [(packed >> np.uint64(shift)) & np.uint64(_STEPS) for shift in (0, BITS, 2 * BITS)]
-    means = np.stack(axes, 1).astype(np.float64) / _STEPS * span + low
-    means[packed == NOWHERE] = np.nan
-    return means
-
-
-def step(corners: Array) -> float:
-    """Largest distance between two neighbouring packed numbers, in the units of the positions."""
-    return float(_box(corners)[1].max() / _STEPS)
-
-
-def _box(corners: Array) -> tuple[Array, Array]:
-    """Lower corner and extent, float64; an axis without extent gets 1."""
-    low, high = corners.astype(np.float64)
-    return low, np.where(high > low, high - low, 1.0)
-
-
-# Reading the compressed PLY of SuperSplat and splat-transform.
-#
-# Three elements. `chunk`: for every 256 Gaussians the least and greatest position, logarithm of scale and,
-# in files of 18 columns, base colour. `vertex`: four uint32 per Gaussian,
-#
-#     packed_position   x 11 bits, y 10, z 11, from the top, as fractions between the chunk's bounds
-#     packed_scale      likewise, of the scales' logarithms
-#     packed_rotation   2 bits: which of w x y z is largest and left out (it is positive); then the other
-#                       three in 10 bits each, as fractions of [-sqrt(1/2), sqrt(1/2)]
-#     packed_color      red, green, blue, opacity in 8 bits each; the opacity is not a logit here
-#
-# `sh`, optional: `f_rest_*` in 8 bits each over [-4, 4], channel after channel. Opacities of 0 and 1 become
-# logits of -infinity and +infinity.
-#
-# Source of the layout: the public writer in PlayCanvas' splat-transform; the code here is our own.
-
-CHUNK_SIZE = 256
-POSITION_BOUNDS = ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z")
-SCALE_BOUNDS = ("min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z")
-COLOUR_BOUNDS = ("min_r", "min_g", "min_b", "max_r", "max_g", "max_b")
-PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-
-# Code c stands for the middle of its 1/256 interval, but the two ends are exact (-4 and 4).
-_SH_VALUES = ((np.arange(256) + 0.5) / 256 - 0.5) * 8
-_SH_VALUES[[0, 255]] = -4, 4
-
-
-def is_compressed(header: PlyHeader) -> bool:
-    """Whether the header announces packed Gaussians."""
-    vertex = header.element("vertex")
-    return (
-        header.element("chunk") is not None
-        and vertex is not None
-        and any(prop.name in PACKED for prop in vertex.properties)
-    )
-
-
-def read_compressed(file: BinaryIO, file_size: int, header: PlyHeader, path: Path) -> Gaussians:
-    """Decode a file for which `is_compressed` holds. Raises FormatError."""
-    chunk, vertex = header.element("chunk"), header.element("vertex")
-    assert chunk is not None  # is_compressed
-    assert vertex is not None
-    has_colours = any(prop.name == COLOUR_BOUNDS[0] for prop in chunk.properties)
-    bound_names = POSITION_BOUNDS + SCALE_BOUNDS + (COLOUR_BOUNDS if has_colours else ())
-    if chunk.count * CHUNK_SIZE < vertex.count:
-        raise FormatError(
-            f"{path}: {chunk.count} chunks for {vertex.count} Gaussians; expected one for every {CHUNK_SIZE}"
-        )
-    bounds = _read_columns(file, file_size, header, chunk, bound_names, path).astype(np.float64)
-    packed = _read_columns(file, file_size, header, vertex, PACKED, path)
-    if not ((packed >= 0) & (packed < 2**32)).all():  # NaN compares False
-        raise FormatError(f"{path}: packed numbers beyond 32 bits; expected uint")
-    packed = packed.astype(np.uint32)
-    position, rotation, scale, colour = packed.T
-    of_chunk = np.arange(vertex.count) // CHUNK_SIZE
-    rgba = np.stack([colour >> shift & 255 for shift in (24, 16, 8, 0)], axis=1) / 255
-    with np.errstate(invalid="ignore", over="ignore"):  # infinite bounds make rows that are dropped later
-        rgb = _between(bounds[:, 12:18], of_chunk, rgba[:, :3]) if has_colours else rgba[:, :3]
-        return Gaussians(
-            means=_between(bounds[:, 0:6], of_chunk, _fractions_11_10_11(position)),
-            log_scales=_between(bounds[:, 6:12], of_chunk, _fractions_11_10_11(scale)),
-            quats_wxyz=_quaternions(rotation),
-            opacity_logits=logit(rgba[:, 3]),
-            sh=sh_from_channel_major((rgb - 0.5) / SH_C0, _read_rest(file, file_size, header, vertex, path)),
-        )
-
-
-def _read_columns(
-    file: BinaryIO, file_size: int, header: PlyHeader, element: PlyElement, names: tuple[str, ...], path: Path
-) -> Array:
-    """(rows, names) as float64, which holds every uint32 exactly."""
-    properties = {prop.name: prop for prop in element.properties}
-    for name in names:
-        if name not in properties or properties[name].count_code:
-            raise FormatError(f"{path}: compressed PLY without the number {name!r} in element {element.name}")
-    if element.has_lists:
-        raise FormatError(f"{path}: compressed PLY with a list in element {element.name}")
-    file.seek(header.size)
-    chunks = iterate_rows(file, file_size, header, element, path)
-    out = np.empty((element.count, len(names)))
-    with np.errstate(invalid="ignore"):  # a signalling NaN becomes an ordinary one
-        for start, rows in chunks:
-            for column, name in enumerate(names):
-                out[start : start + len(rows), column] = rows[name]
-    return out
-
-
-def _read_rest(file: BinaryIO, file_size: int, header: PlyHeader, vertex: PlyElement, path: Path) -> Array:
-    """(N, 3 (K - 1)) channel-major coefficients; K = 1 without the element `sh`."""
-    element = header.element("sh")
-    if element is None or not element.properties:
-        return np.zeros((vertex.count, 0))
-    if element.count != vertex.count or len(element.properties) not in REST_COUNTS:
-        raise FormatError(
-            f"{path}: element sh has {element.count} rows of {len(element.properties)}; expected "
-            f"{vertex.count} rows of 9, 24 or 45"
-        )
-    names = tuple(f"f_rest_{index}" for index in range(len(element.properties)))
-    codes = _read_columns(file, file_size, header, element, names, path)
-    if not ((codes >= 0) & (codes <= 255)).all():
-        raise FormatError(f"{path}: element sh holds values beyond 0..255; expected uchar")
-    return _SH_VALUES[codes.astype(np.uint8)]
-
-
-def _between(bounds: Array, of_chunk: Array, fractions: Array) -> Array:
-    """(chunks, 6) least and greatest, (N,) chunk of each row, (N, 3) fractions -> (N, 3) values."""
-    least, greatest = bounds[of_chunk, :3], bounds[of_chunk, 3:]
-    return least * (1 - fractions) + greatest * fractions
-
-
-def _fractions_11_10_11(packed: Array) -> Array:
-    """(N,) uint32 -> (N, 3) in [0, 1]."""
-    return np.stack([(packed >> 21) / 2047, (packed >> 11 & 1023) / 1023, (packed & 2047) / 2047], axis=1)
-
-
-def _quaternions(packed: Array) -> Array:
-    """(N,) uint32 -> (N, 4) unit quaternions w x y z."""
-    three = np.stack([packed >> shift & 1023 for shift in (20, 10, 0)], axis=1) / 1023
-    return smallest_three((three - 0.5) * np.sqrt(2), packed >> 30)
-
-
-def smallest_three(three: Array, largest: Array) -> Array:
-    """(N, 3) components other than the largest, (N,) index of the largest -> (N, 4) unit quaternions."""
-    out = np.empty((len(three), 4))
-    rows = np.arange(len(three))[:, None]
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-    out[rows, others[largest]] = three
-    out[rows[:, 0], largest] = np.sqrt(np.maximum(0, 1 - (three**2).sum(1)))
-    return out
-
-
-# The INRIA 3D Gaussian Splatting PLY, read in all its variants and written in its plain form.
-#
-# Layout: one element `vertex`, one row per Gaussian. As written: binary little endian, float32, in order
-# ``x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3``. Opacities are logits, scales natural
-# logarithms, rotations quaternions w x y z. There are 0, 9, 24 or 45 `f_rest` (SH degree 0 to 3), channel
-# after channel: all coefficients of red, then of green, then of blue. Normals are zeros that nobody reads.
-#
-# As read: the properties in any order and of any scalar type, any byte order, ascii, LF or CR LF in the
-# header, without normals, with further elements (ignored) and properties (kept by `read_ply_scene`), and
-# the compressed variant of `compressed_ply`. Rows are kept as they are, NaN included. Header comments may
-# say that the Gaussians are to be drawn antialiased (`antialiasing`), and how long a unit is (`metres`).
-
 LAYOUT = "the layout"  # NumPy field of all its columns together; no PLY property has a name with a blank
+METRES = "metres_per_unit"
+COMMENT = "SplatRenderMode: mip"  # the commonest spelling, which `save_scene` writes
 
 
 def read_ply(path: Path | str) -> Gaussians:
@@ -457,3 +165,218 @@ def _rows(part: Gaussians) -> Array:
         part.quats_wxyz,
     ]
     return np.concatenate(table, axis=1)
+
+
+def sh_from_channel_major(base: Array, rest: Array) -> Array:
+    """(N, 3) base colours and (N, 3 (K - 1)) channel-major coefficients -> (N, K, 3)."""
+    by_channel = rest.reshape(len(rest), 3, rest.shape[1] // 3)
+    return np.concatenate([base[:, None], by_channel.transpose(0, 2, 1)], axis=1)
+
+
+def sh_to_channel_major(sh: Array) -> Array:
+    """(N, K, 3) -> (N, 3 (K - 1)): the `f_rest_*` columns."""
+    return sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), 3 * (sh.shape[1] - 1))
+
+
+def check_gaussian_properties(vertex: PlyElement, path: Path) -> tuple[str, ...]:
+    """Require the scalar properties of a Gaussian; returns the names of its `f_rest_*` in order."""
+    names = {prop.name for prop in vertex.properties}
+    needed = (*POSITION, *BASE_COLOUR, "opacity", *SCALE, *ROTATION)
+    missing = [name for name in needed if name not in names]
+    if not names & set(needed[3:]):
+        raise FormatError(
+            f"{path}: a mesh or point cloud, not a 3D Gaussian scene: its vertices have no f_dc, opacity, "
+            "scale and rot; train one with 'langsplat train'"
+        )
+    if missing:
+        raise FormatError(f"{path}: property {missing[0]!r} is missing; every Gaussian needs it")
+    rest_count = sum(name.startswith("f_rest_") for name in names)
+    if rest_count not in REST_COUNTS:
+        raise FormatError(
+            f"{path}: {rest_count} properties f_rest_*; expected 0, 9, 24 or 45 (SH degree 0-3)"
+        )
+    rest = tuple(f"f_rest_{index}" for index in range(rest_count))
+    absent = [name for name in rest if name not in names]
+    if absent:
+        raise FormatError(f"{path}: property {absent[0]!r} is missing among {rest_count} f_rest_*")
+    lists = [prop.name for prop in vertex.properties if prop.count_code]
+    if lists:
+        raise FormatError(f"{path}: property {lists[0]!r} of vertex is a list; expected one number")
+    return rest
+
+
+# ---- comments ----
+
+
+def antialiased_by_comments(comments: tuple[str, ...]) -> bool:
+    """Return whether a header's comments say that its scene was trained with Mip-Splatting's compensation."""
+    said = False
+    for comment in comments:
+        match comment.lower().replace(":", " ").split():
+            case ["splatrendermode", mode, *_]:
+                said = mode == "mip"
+            case ["antialiased", value]:
+                said = value == "1"
+            case ["train_flags", *flags]:
+                said = "antialiasing" in flags
+    return said
+
+
+def metres_comment(metres_per_unit: float) -> str:
+    """The comment that says so."""
+    return f"{METRES} {float(metres_per_unit)!r}"
+
+
+def metres_by_comments(comments: tuple[str, ...]) -> float | None:
+    """Metres per world unit, > 0 and finite, as the header's comments say; None where they do not."""
+    found = None
+    for comment in comments:
+        match comment.replace(":", " ").split():
+            case [key, value] if key == METRES:
+                found = _positive(value)
+    return found
+
+
+def write_metres(path: Path | str, metres_per_unit: float) -> None:
+    """Say in the header of the PLY `path` how long its unit is; all else stays as it is, byte for byte.
+
+    Raises InputError for another kind of file and a length that is not positive, FormatError for a header
+    that breaks the rules.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".ply":
+        raise InputError(f"{path}: only a .ply keeps a scale; make one with 'langsplat convert'")
+    if not 0 < metres_per_unit < math.inf:
+        raise InputError(f"{metres_per_unit:g} metres per unit: must be above 0 and finite")
+    file, _ = open_for_reading(path)
+    with atomic_path(path) as temporary, file, temporary.open("wb") as out:
+        size = read_ply_header(file, path).size
+        file.seek(0)
+        *lines, last = file.read(size).splitlines(keepends=True)
+        end = b"\r\n" if last.endswith(b"\r\n") else b"\n"
+        out.writelines(line for line in lines if not _is_ours(line))
+        out.write(b"comment " + metres_comment(metres_per_unit).encode() + end + last)
+        shutil.copyfileobj(file, out)
+
+
+def _is_ours(line: bytes) -> bool:
+    return line.replace(b":", b" ").split()[:2] == [b"comment", METRES.encode()]
+
+
+def _positive(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if 0 < value < math.inf else None
+
+
+# ---- the compressed PLY of SuperSplat and splat-transform ----
+#
+# Three elements. `chunk`: for every 256 Gaussians the least and greatest position, logarithm of scale and,
+# in files of 18 columns, base colour. `vertex`: four uint32 per Gaussian,
+#
+#     packed_position   x 11 bits, y 10, z 11, from the top, as fractions between the chunk's bounds
+#     packed_scale      likewise, of the scales' logarithms
+#     packed_rotation   2 bits: which of w x y z is largest and left out (it is positive); then the other
+#                       three in 10 bits each, as fractions of [-sqrt(1/2), sqrt(1/2)]
+#     packed_color      red, green, blue, opacity in 8 bits each; the opacity is not a logit here
+#
+# `sh`, optional: `f_rest_*` in 8 bits each over [-4, 4], channel after channel. Opacities of 0 and 1 become
+# logits of -infinity and +infinity.
+#
+# Source of the layout: the public writer in PlayCanvas' splat-transform; the code here is our own.
+
+CHUNK_SIZE = 256
+POSITION_BOUNDS = ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z")
+SCALE_BOUNDS = ("min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z")
+COLOUR_BOUNDS = ("min_r", "min_g", "min_b", "max_r", "max_g", "max_b")
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+
+# Code c stands for the middle of its 1/256 interval, but the two ends are exact (-4 and 4).
+_SH_VALUES = ((np.arange(256) + 0.5) / 256 - 0.5) * 8
+_SH_VALUES[[0, 255]] = -4, 4
+
+
+def is_compressed(header: PlyHeader) -> bool:
+    """Return whether the header announces packed Gaussians."""
+    vertex = header.element("vertex")
+    return (
+        header.element("chunk") is not None
+        and vertex is not None
+        and any(prop.name in PACKED for prop in vertex.properties)
+    )
+
+
+def read_compressed(file: BinaryIO, file_size: int, header: PlyHeader, path: Path) -> Gaussians:
+    """Decode a file for which `is_compressed` holds. Raises FormatError."""
+    chunk, vertex = header.element("chunk"), header.element("vertex")
+    assert chunk is not None  # is_compressed
+    assert vertex is not None
+    has_colours = any(prop.name == COLOUR_BOUNDS[0] for prop in chunk.properties)
+    bound_names = POSITION_BOUNDS + SCALE_BOUNDS + (COLOUR_BOUNDS if has_colours else ())
+    if chunk.count * CHUNK_SIZE < vertex.count:
+        raise FormatError(
+            f"{path}: {chunk.count} chunks for {vertex.count} Gaussians; expected one for every {CHUNK_SIZE}"
+        )
+    bounds = read_columns(file, file_size, header, chunk, bound_names, path)
+    packed = read_columns(file, file_size, header, vertex, PACKED, path)
+    if not ((packed >= 0) & (packed < 2**32)).all():  # NaN compares False
+        raise FormatError(f"{path}: packed numbers beyond 32 bits; expected uint")
+    packed = packed.astype(np.uint32)
+    position, rotation, scale, colour = packed.T
+    of_chunk = np.arange(vertex.count) // CHUNK_SIZE
+    rgba = np.stack([colour >> shift & 255 for shift in (24, 16, 8, 0)], axis=1) / 255
+    with np.errstate(invalid="ignore", over="ignore"):  # infinite bounds make rows that are dropped later
+        rgb = _between(bounds[:, 12:18], of_chunk, rgba[:, :3]) if has_colours else rgba[:, :3]
+        return Gaussians(
+            means=_between(bounds[:, 0:6], of_chunk, _fractions_11_10_11(position)),
+            log_scales=_between(bounds[:, 6:12], of_chunk, _fractions_11_10_11(scale)),
+            quats_wxyz=_quaternions(rotation),
+            opacity_logits=logit(rgba[:, 3]),
+            sh=sh_from_channel_major((rgb - 0.5) / SH_C0, _read_rest(file, file_size, header, vertex, path)),
+        )
+
+
+def _read_rest(file: BinaryIO, file_size: int, header: PlyHeader, vertex: PlyElement, path: Path) -> Array:
+    """(N, 3 (K - 1)) channel-major coefficients; K = 1 without the element `sh`."""
+    element = header.element("sh")
+    if element is None or not element.properties:
+        return np.zeros((vertex.count, 0))
+    if element.count != vertex.count or len(element.properties) not in REST_COUNTS:
+        raise FormatError(
+            f"{path}: element sh has {element.count} rows of {len(element.properties)}; expected "
+            f"{vertex.count} rows of 9, 24 or 45"
+        )
+    names = tuple(f"f_rest_{index}" for index in range(len(element.properties)))
+    codes = read_columns(file, file_size, header, element, names, path)
+    if not ((codes >= 0) & (codes <= 255)).all():
+        raise FormatError(f"{path}: element sh holds values beyond 0..255; expected uchar")
+    return _SH_VALUES[codes.astype(np.uint8)]
+
+
+def _between(bounds: Array, of_chunk: Array, fractions: Array) -> Array:
+    """(chunks, 6) least and greatest, (N,) chunk of each row, (N, 3) fractions -> (N, 3) values."""
+    least, greatest = bounds[of_chunk, :3], bounds[of_chunk, 3:]
+    return least * (1 - fractions) + greatest * fractions
+
+
+def _fractions_11_10_11(packed: Array) -> Array:
+    """(N,) uint32 -> (N, 3) in [0, 1]."""
+    return np.stack([(packed >> 21) / 2047, (packed >> 11 & 1023) / 1023, (packed & 2047) / 2047], axis=1)
+
+
+def _quaternions(packed: Array) -> Array:
+    """(N,) uint32 -> (N, 4) unit quaternions w x y z."""
+    three = np.stack([packed >> shift & 1023 for shift in (20, 10, 0)], axis=1) / 1023
+    return smallest_three((three - 0.5) * np.sqrt(2), packed >> 30)
+
+
+def smallest_three(three: Array, largest: Array) -> Array:
+    """(N, 3) components other than the largest, (N,) index of the largest -> (N, 4) unit quaternions."""
+    out = np.empty((len(three), 4))
+    rows = np.arange(len(three))[:, None]
+    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+    out[rows, others[largest]] = three
+    out[rows[:, 0], largest] = np.sqrt(np.maximum(0, 1 - (three**2).sum(1)))
+    return out

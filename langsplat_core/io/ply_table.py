@@ -1,7 +1,7 @@
-"""The header of a PLY file: what its elements and properties are and where the body begins."""
+"""Tables of a PLY file: its header, the rows of an element in any encoding, clouds of coloured points."""
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
@@ -59,13 +59,13 @@ class PlyElement:
         return sum(np.dtype(prop.count_code or prop.code).itemsize for prop in self.properties)
 
     def dtype(self, byte_order: str) -> np.dtype:
-        """Of a row without lists in a binary file."""
+        """Type of a row without lists in a binary file."""
         return np.dtype([(prop.name, byte_order + prop.code) for prop in self.properties])
 
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """A parsed header."""
+    """Header of a PLY file: byte order, elements, comments."""
 
     byte_order: str  # "<", ">" or "" for ascii
     elements: tuple[PlyElement, ...]
@@ -122,7 +122,7 @@ def _parse(lines: list[str], size: int, path: Path) -> PlyHeader:
 
 
 def is_name(word: str) -> bool:
-    """Whether an element or property may be called so: names are shown in messages, in one line."""
+    """Return whether an element or property may be called so: names are shown in messages, in one line."""
     return word.isprintable() and word.split() == [word] and len(word) <= NAME_LIMIT
 
 
@@ -162,7 +162,7 @@ def _require_unique(names: list[str], what: str, path: Path) -> None:
         seen.add(name)
 
 
-# The rows of one PLY element as chunks of a structured array, whatever the file's encoding.
+# ---- rows ----
 #
 # Every size is checked against the file before anything is allocated, so a header that claims 10^12 rows
 # costs nothing.
@@ -192,6 +192,26 @@ def iterate_rows(
             file.seek(element.count * element.least_row_size, 1)
     rows = _ascii_rows if not header.byte_order else _binary_rows
     return rows(file, wanted, header.byte_order, path)
+
+
+def read_columns(
+    file: BinaryIO, file_size: int, header: PlyHeader, element: PlyElement, names: Sequence[str], path: Path
+) -> Array:
+    """(rows, names) float64, which holds every type of a PLY exactly. Raises FormatError for an element
+    without these numbers, or with lists, and as `iterate_rows`."""
+    numbers = {prop.name for prop in element.properties if not prop.count_code}
+    absent = [name for name in names if name not in numbers]
+    if absent or element.has_lists:
+        lacks = f"has no number {absent[0]!r}" if absent else "holds lists"
+        raise FormatError(f"{path}: element {element.name} {lacks}; expected one number for each property")
+    file.seek(header.size)
+    chunks = iterate_rows(file, file_size, header, element, path)
+    table = np.empty((element.count, len(names)))
+    with np.errstate(invalid="ignore"):  # a signalling NaN becomes an ordinary one
+        for start, rows in chunks:
+            for column, name in enumerate(names):
+                table[start : start + len(rows), column] = rows[name]
+    return table
 
 
 def fill_columns(
@@ -321,7 +341,7 @@ def _skip_lists(file: BinaryIO, element: PlyElement, byte_order: str, path: Path
             file.seek(step, 1)
 
 
-# Coloured points in a PLY, as structure from motion and scanners write them.
+# ---- coloured points, as structure from motion and scanners write them ----
 
 AXES = ("x", "y", "z")
 CHANNELS = ("red", "green", "blue")
@@ -342,30 +362,11 @@ def read_cloud(path: Path) -> tuple[Array, Array]:
         if vertex is None:
             raise FormatError(f"{path}: has no element 'vertex', so it is no point cloud")
         kinds = {prop.name: prop.code[0] for prop in vertex.properties if not prop.count_code}
-        missing = [axis for axis in AXES if axis not in kinds]
-        if missing or vertex.has_lists:
-            raise FormatError(
-                f"{path}: its points have no number {missing[0]!r}"
-                if missing
-                else f"{path}: its points hold lists, so it is no point cloud"
-            )
         coloured = all(channel in kinds for channel in CHANNELS)
-        wanted = AXES + CHANNELS * coloured
-        rows = iterate_rows(file, size, header, vertex, path)  # has checked the count against the size
-        table = _columns(rows, vertex, wanted)
+        table = read_columns(file, size, header, vertex, AXES + CHANNELS * coloured, path)
     points = table[:, :3]
     scale = 255 if coloured and kinds["red"] == "f" else 1
     shades = table[:, 3:] if coloured else np.full(points.shape, GREY)
     # clipped first, so that nothing overflows; NaN becomes black
     colours = np.rint(np.clip(np.nan_to_num(shades), 0, 255 / scale) * scale).astype(np.uint8)
     return points, colours
-
-
-def _columns(rows: Iterator[tuple[int, Array]], element: PlyElement, names: tuple[str, ...]) -> Array:
-    """(rows, names) float64."""
-    table = np.empty((element.count, len(names)))
-    with np.errstate(invalid="ignore"):  # a signalling NaN becomes an ordinary one
-        for start, part in rows:
-            for column, name in enumerate(names):
-                table[start : start + len(part), column] = part[name]
-    return table

@@ -1,5 +1,5 @@
-"""Scenes on disk: one table of formats, which the loader, `langsplat convert`, the file browser, the desktop
-entry and the tests of damaged files all read; a scene's companions.
+"""Scenes on disk: `FORMATS`, the one table that the loader, `langsplat convert`, the file browser, the
+desktop entry and the tests of round trips and damaged files read; and a scene's companions.
 
 A scene is `scene.ply` with, beside it, `scene.langsplat.safetensors` and `scene.cameras.json`, either of
 which may be absent. The same companions are looked for beside a compressed PLY, a SOG folder or a .sog. Those
@@ -38,13 +38,17 @@ LOOKED_AT = 4096  # rows of a large scene, evenly taken, that tell whether most 
 class SceneFormat:
     """A format of scenes: one row of `FORMATS`."""
 
-    suffix: str  # of its files, lower case
+    suffix: str  # of its files, lower case; its name for people too
     read: Callable[[Path], Scene]
     write: Callable[[Path, Scene], None] | None = None  # None: read only
-    exact: bool = False  # positions are read as they were written
+    loses: tuple[str, ...] = ()  # what a written file cannot hold, in words of `LOSSES`
     own_companions: bool = False  # companions keep the suffix: `a.spz.langsplat.safetensors`
     folder_file: str = ""  # a folder with this file in it is a scene too, and so is the file
     mime: str = "model/x-gaussian-splat"
+
+
+# Parts of a scene that a format may be unable to hold; without "precision" numbers are rounded
+LOSSES = ("precision", "view dependence", "antialiasing", "metres per unit", "extra properties")
 
 
 def _write_ply(path: Path, scene: Scene) -> None:
@@ -55,17 +59,19 @@ def _write_ply(path: Path, scene: Scene) -> None:
 
 
 FORMATS = (
-    SceneFormat(".ply", read_ply_scene, _write_ply, exact=True, mime="model/x-ply"),  # plain and compressed
+    SceneFormat(".ply", read_ply_scene, _write_ply, mime="model/x-ply"),  # plain and compressed
     SceneFormat(
         ".spz",
         read_spz_scene,
         lambda path, scene: write_spz(path, scene.gaussians, scene.antialiased),
+        loses=("precision", "metres per unit", "extra properties"),
         own_companions=True,
     ),
     SceneFormat(
         ".splat",
         lambda path: Scene(read_splat(path)),
         lambda path, scene: write_splat(path, scene.gaussians),
+        loses=LOSSES,
         own_companions=True,
     ),
     SceneFormat(".ksplat", lambda path: Scene(read_ksplat(path)), own_companions=True),
@@ -79,7 +85,7 @@ SUPPORTED = ", ".join(
 
 
 def format_of(path: Path) -> SceneFormat | None:
-    """The format that `path` is named as, or, for a folder, has the file of; None for no scene."""
+    """Return the format that `path` is named as, or, for a folder, has the file of; None for no scene."""
     folder = os.path.isdir(path)  # which a name too long is not
     for row in FORMATS:
         if not folder and path.suffix.lower() == row.suffix:
@@ -90,7 +96,7 @@ def format_of(path: Path) -> SceneFormat | None:
 
 
 def load_gaussians(path: Path | str) -> Gaussians:
-    """The Gaussians of a scene in any supported format, without its companions.
+    """Return the Gaussians of a scene in any supported format, without its companions.
 
     Raises InputError for what cannot be opened or is of no supported kind, FormatError for what breaks
     the rules of its format.
@@ -99,7 +105,7 @@ def load_gaussians(path: Path | str) -> Gaussians:
 
 
 def load_scene(path: Path | str) -> Scene:
-    """A scene with its language field and cameras, where they lie beside it.
+    """Return a scene with its language field and cameras, where they lie beside it.
 
     Cameras are `<scene>.cameras.json`, or for a PLY in the folder structure of the INRIA code
     (`model/point_cloud/iteration_N/point_cloud.ply`) `model/cameras.json`. A companion that is unusable or
@@ -117,7 +123,7 @@ def load_scene(path: Path | str) -> Scene:
 
 
 def load_without_language(path: Path | str) -> Scene:
-    """As `load_scene`, but without the language field, which is not even looked at."""
+    """Return a scene as `load_scene` does, but without the language field, which is not even looked at."""
     path = Path(path)
     scene, cameras = replace(_read_scene(path), path=path), _cameras_path(path)
     if not exists(cameras):
@@ -130,7 +136,7 @@ def load_without_language(path: Path | str) -> Scene:
 
 
 def _read_scene(path: Path) -> Scene:
-    """What the scene's own file holds; a warning where most of it cannot be drawn."""
+    """Read the scene's own file; warn where most of it cannot be drawn."""
     scene = _read_by_kind(path)
     count = len(scene.gaussians)
     log.debug("%s: %d Gaussians", path, count)
@@ -172,14 +178,13 @@ def _writable(path: Path) -> SceneFormat:
 
 
 def save_scene(path: Path | str, scene: Scene) -> None:
-    """Write `scene` as .ply, .spz or .splat, by its name, with its companions; those it lacks are removed.
+    """Write `scene` in the format of its name, with its companions; those it lacks are removed.
 
-    Only the PLY keeps everything. .spz rounds it, without extras and scale; .splat moreover has neither view
-    dependence nor the mark of antialiasing. All keep the rows' order. All files are first written whole under
-    temporary names. Then the old companions are removed, the scene's file renamed into place, and last the
-    new companions. Interrupted anywhere, there is the old scene or the new one, perhaps without companions,
-    but never a scene beside companions of another. A scene with companions that could not be read is not
-    written: that would remove them. Raises InputError then, and as `check_writable`.
+    Only the PLY keeps everything: see `SceneFormat.loses`. All formats keep the rows' order. All files are
+    first written whole under temporary names. Then the old companions are removed, the scene's file renamed
+    into place, and last the new companions. Interrupted anywhere, there is the old scene or the new one,
+    perhaps without companions, but never a scene beside companions of another. A scene with companions that
+    could not be read is not written: that would remove them. Raises InputError then, and as `check_writable`.
     """
     path = Path(path)
     if scene.unread:
@@ -198,15 +203,16 @@ def save_scene(path: Path | str, scene: Scene) -> None:
         row.write(new_file, scene)
         if scene.language is not None and new_sidecar is not None:
             # The sidecar belongs to the positions as a reader finds them, rounded in some formats.
-            means = scene.gaussians.means if row.exact else load_gaussians(new_file).means
+            rounded = "precision" in row.loses
+            means = load_gaussians(new_file).means if rounded else scene.gaussians.means
             write_language(new_sidecar, scene.language, means)
         for companion in (sidecar, cameras):
             companion.unlink(missing_ok=True)
 
 
 def companion_path(scene: Path | str, suffix: str) -> Path:
-    """Where the file of a scene that ends in `suffix` lies: `a/b.ply` or .sog -> `a/b<suffix>`; a SOG folder
-    `a/b` (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder; `a/b.spz`, .splat or .ksplat ->
+    """Return where the companion of a scene that ends in `suffix` lies: `a/b.ply` or .sog -> `a/b<suffix>`; a
+    SOG folder `a/b` (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder; `a/b.spz`, .splat or .ksplat ->
     `a/b.spz<suffix>` and so on."""
     scene = Path(scene)
     if any(row.folder_file and scene.name == row.folder_file for row in FORMATS):
@@ -219,8 +225,8 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
 
 
 def scene_files(path: Path | str) -> tuple[Path, ...]:
-    """The files that `load_scene` reads, the scene's own first (of a SOG folder its meta.json, then images),
-    then language field and cameras, whether these are there or not."""
+    """Return the files that `load_scene` reads, the scene's own first (of a SOG folder its meta.json, then
+    images), then language field and cameras, whether these are there or not."""
     path = Path(path)
     own: tuple[Path, ...] = (path,)
     if os.path.isdir(path) or path.name == META_NAME:  # which a name too long is not

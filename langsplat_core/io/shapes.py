@@ -1,4 +1,4 @@
-"""What other programs open of a scene without knowing Gaussians: coloured points, and meshes."""
+"""Coloured points and meshes, which other programs open without knowing Gaussians."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

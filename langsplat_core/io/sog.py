@@ -41,13 +41,9 @@ SLACK_PIXELS = 65536
 Fetch = Callable[[str, int], bytes]  # (file name, most bytes) -> content
 
 
-def read_sog(path: Path | str) -> Gaussians:
-    """The Gaussians of a SOG folder, its `meta.json`, or a `.sog` file. Raises as `read_sog_scene` does."""
-    return read_sog_scene(path).gaussians
-
-
 def read_sog_scene(path: Path | str) -> Scene:
-    """The Gaussians, as `read_sog` gives them, and whether they are to be drawn antialiased.
+    """Return the Gaussians of a SOG folder, its `meta.json` or a `.sog` file, and whether they are to be
+    drawn antialiased.
 
     Raises InputError when a file cannot be opened and FormatError when it breaks a rule of the format.
     """

@@ -1,4 +1,6 @@
-"""The .splat file of antimatter15's viewer: 32 bytes per Gaussian and nothing else.
+"""The records of two web viewers: antimatter15's .splat, read and written, and mkkellogg's .ksplat, read.
+
+A .splat is 32 bytes per Gaussian and nothing else:
 
     position   3 float32, world units, axes as in the PLY
     scale      3 float32, world units (not logarithms)
@@ -10,6 +12,7 @@ by size times opacity, so that a viewer can show the first part; here the order 
 language field goes by rows. Source of the layout: antimatter15/splat; the code here is our own.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -21,6 +24,7 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import open_for_reading
 from langsplat_core.io.ply import SH_C0
 from langsplat_core.scene import SH_COUNTS, Gaussians
+from langsplat_core.scene.gaussians import join_gaussians
 
 HUGE = 1e12  # world units that no Gaussian of a real scene has
 _RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
@@ -90,7 +94,7 @@ def to_bytes(values: Array) -> Array:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-# Reading the .ksplat file of mkkellogg's GaussianSplats3D, compression levels 0, 1 and 2.
+# ---- the .ksplat file of mkkellogg's GaussianSplats3D, compression levels 0, 1 and 2 ----
 #
 # A main header, a number of section headers (`_MAIN` and `_SECTION` give the fields that matter here), then
 # the sections one after the other, everything little endian. A section holds the sizes of its partly filled
@@ -251,15 +255,8 @@ def _by_degree(rest: Array) -> list[Array]:
 
 def _joined(parts: list[Gaussians]) -> Gaussians:
     columns = max((part.sh.shape[1] for part in parts), default=1)
-    padded = [np.pad(part.sh, ((0, 0), (0, columns - part.sh.shape[1]), (0, 0))) for part in parts]
-    if not parts:
-        return Gaussians(
-            np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 1, 3))
-        )
-    return Gaussians(
-        np.concatenate([part.means for part in parts]),
-        np.concatenate([part.log_scales for part in parts]),
-        np.concatenate([part.quats_wxyz for part in parts]),
-        np.concatenate([part.opacity_logits for part in parts]),
-        np.concatenate(padded),
+    none = Gaussians(
+        np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, columns, 3))
     )
+    padded = [np.pad(part.sh, ((0, 0), (0, columns - part.sh.shape[1]), (0, 0))) for part in parts]
+    return join_gaussians([none, *(replace(part, sh=sh) for part, sh in zip(parts, padded, strict=True))])

@@ -1,4 +1,4 @@
-"""The container of .spz files (Niantic): from the file to one block of bytes per attribute, and back.
+"""The .spz file of Niantic: its container, one block of bytes per attribute, and quantised Gaussians in it.
 
 Versions 1 to 3 are one gzip stream (a few tools write it without gzip) of a 16-byte header and the blocks
 in the order of `widths`. Version 4 is a header of 32 bytes, extension records up to the byte that the
@@ -138,7 +138,7 @@ def _read_to_the_end(file: BinaryIO, limit: int, path: Path) -> None:
 
 
 def _read_streams(file: BinaryIO, file_size: int, path: Path) -> Packed:
-    """Version 4."""
+    """Read version 4: a table of sizes, then one Zstandard frame per block."""
     start = file.read(HEADER_SIZE_4)
     header = _header(start, path)
     if len(start) < HEADER_SIZE_4:
@@ -185,8 +185,8 @@ def _unpacked(data: bytes, size: int, path: Path) -> bytes:
 
 
 def _axes(records: bytes, path: Path) -> int:
-    """What the extension records say about the axes. Records of other layouts, which older programs wrote,
-    end the search."""
+    """Return the axes that the extension records name, 1 to 8. Records of other layouts, which older programs
+    wrote, end the search."""
     at = 0
     while at + 8 <= len(records):
         kind, length = struct.unpack_from("<II", records, at)
@@ -210,7 +210,7 @@ def write_packed(path: Path | str, packed: Packed) -> None:
         temporary.write_bytes(gzip.compress(content, mtime=0))  # mtime: the same scene, the same bytes
 
 
-# The .spz file of Niantic: quantised Gaussians, about ten times smaller than the PLY.
+# ---- quantised Gaussians, about ten times smaller than the PLY ----
 #
 #     positions   three 24-bit fixed-point numbers; the header says how many bits are behind the point
 #                 (version 1: three float16)
@@ -296,7 +296,7 @@ def write_spz(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
 
 
 def _fractional_bits(drawn: Gaussians, path: Path) -> int:
-    """As many as other writers use, more for a small scene, fewer for a large one."""
+    """Bits behind the point: as many as other writers use, more for a small scene, fewer for a large one."""
     if len(drawn) == 0:
         return FRACTIONAL_BITS
     reach = max(float(np.abs(drawn.means).max()), 1e-30)
@@ -363,7 +363,7 @@ def _signs_to_rdf(axes: int) -> Array:
 
 
 def _quaternion_signs(signs: Array) -> Array:
-    """Of w x y z: mirroring an axis turns the two rotations about the others round."""
+    """(4,) signs of w x y z: mirroring an axis turns the two rotations about the others round."""
     return np.array([1, signs[1] * signs[2], signs[0] * signs[2], signs[0] * signs[1]])
 
 

@@ -1,4 +1,4 @@
-"""What a scene consists of, in numbers: the health of its rows and where its bytes go."""
+"""Summary of a scene in numbers: the health of its rows and where its bytes go."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -86,7 +86,7 @@ def summarise(scene: Scene) -> SceneSummary:
 
 
 def memory_bytes(scene: Scene) -> int:
-    """Of the arrays that grow with the number of Gaussians."""
+    """Bytes in memory of the arrays that grow with the number of Gaussians."""
     arrays = [getattr(scene.gaussians, field.name) for field in fields(scene.gaussians)]
     arrays += list(scene.extras.values())
     if scene.language is not None:
@@ -103,7 +103,7 @@ def disk_bytes(scene: Path) -> int:
 
 
 def duplicates(gaussians: Gaussians) -> int:
-    """How many rows could go because an earlier one equals them bit for bit."""
+    """Number of rows that could go because an earlier one equals them bit for bit."""
     if len(gaussians) == 0:
         return 0
     columns = [getattr(gaussians, field.name).reshape(len(gaussians), -1) for field in fields(gaussians)]
@@ -139,7 +139,7 @@ def _sh_energy(gaussians: Gaussians) -> tuple[float, ...]:
 
 
 def _arrays(field: LanguageField) -> list[Array]:
-    """Those with a row for each Gaussian."""
+    """Arrays with a row for each Gaussian."""
     return [array for array in (field.latents, field.confidence, field.things) if array is not None]
 
 
@@ -150,7 +150,7 @@ def _language(field: LanguageField) -> LanguageSummary:
     }
     return LanguageSummary(
         codec=field.codec.kind,
-        size=field.codec.index_size or field.codec.latent_dim,
+        size=field.codec.size,
         encoder=field.encoder_id,
         vector_dim=field.codec.vector_dim,
         phrases=len(field.phrasebook),

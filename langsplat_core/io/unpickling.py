@@ -17,7 +17,7 @@ from typing import IO, Any
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import FormatError, optional_imports
+from langsplat_core.errors import FormatError, optional_imports, quoted
 from langsplat_core.io.hostile import open_for_reading
 
 DEEPEST = 100  # tuples in tuples; Python's hash goes down them on the machine's stack, which ends at 100 000
@@ -94,7 +94,8 @@ _NAMED = {
 
 @optional_imports()
 def load_torch(path: Path) -> Any:
-    """What a file of `torch.save` holds; tensors are on the CPU and, where the file allows, read when used.
+    """Return the content of a file of `torch.save`; tensors are on the CPU and, where the file allows, read
+    when used.
 
     Tensors, containers, and NumPy's numbers and arrays, which training code leaves among them; `plain_array`
     and `plain_mapping` say what they are. Raises InputError where the file cannot be opened; FormatError
@@ -116,7 +117,7 @@ def load_torch(path: Path) -> Any:
 
 
 def _look_through(path: Path) -> bool:
-    """Whether a file is an archive. Raises FormatError for what its pickles may not hold."""
+    """Return whether a file is an archive. Raises FormatError for what its pickles may not hold."""
     from torch._C import PyTorchFileReader
 
     with open_for_reading(path)[0] as file:
@@ -141,8 +142,8 @@ def _check_pickle(stream: IO[bytes]) -> None:
             continue
         if opcode.name == "GLOBAL" and (name := str(argument).replace(" ", ".", 1)) not in _NAMED:
             raise FormatError(
-                f"needs {name[:60]!r}; only tensors, arrays and numbers are read, as all else could run code "
-                "of whoever made the file; save it again as plain tensors"
+                f"needs {quoted(name)}; only tensors, arrays and numbers are read, as all else could run "
+                "code of whoever made the file; save it again as plain tensors"
             )
         taken: list[int] = []
         if pickletools.markobject in opcode.stack_before:

@@ -6,10 +6,14 @@ import numpy as np
 
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import InputError
-from langsplat_core.io.foreign import write_autoencoder, write_checkpoint
-from langsplat_core.io.langsplat_files import read_features, write_features
+from langsplat_core.io.langsplat_files import (
+    read_features,
+    write_autoencoder,
+    write_checkpoint,
+    write_features,
+)
 from langsplat_core.progress import Progress, silent
-from langsplat_core.scene import LEVELS, AutoencoderCodec, LanguageField, Scene
+from langsplat_core.scene import LEVELS, LanguageField, Scene
 from langsplat_core.semantics.store import SUFFIX, FeatureStore, ImageFeatures
 
 LANGSPLAT_LATENT = 3  # numbers per Gaussian that its rasterizer is compiled for
@@ -25,9 +29,9 @@ def export_langsplat(scene: Scene, folder: Path, name: str) -> list[Path]:
     """
     language = _language(scene)
     codec = language.codec
-    if not isinstance(codec, AutoencoderCodec) or codec.latent_dim != LANGSPLAT_LATENT:
+    if codec.networks is None or codec.latent_dim != LANGSPLAT_LATENT:
         raise InputError(
-            f"{scene.path}: its codec, {codec.kind} of {codec.index_size or codec.latent_dim}, is not "
+            f"{scene.path}: its codec, {codec.kind} of {codec.size}, is not "
             "LangSplat's autoencoder of 3 numbers; write vectors by --to occam, or train with "
             "--codec.kind autoencoder"
         )
@@ -35,7 +39,7 @@ def export_langsplat(scene: Scene, folder: Path, name: str) -> list[Path]:
     written = [folder / f"{name}_{level + 1}" / "chkpnt30000.pth" for level in range(len(LEVELS))]
     for level, path in enumerate(written):
         write_checkpoint(path, scene.gaussians, latents[level])
-    write_autoencoder(folder / "best_ckpt.pth", codec)
+    write_autoencoder(folder / "best_ckpt.pth", *codec.networks)
     return [*written, folder / "best_ckpt.pth"]
 
 

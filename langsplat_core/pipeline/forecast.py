@@ -61,7 +61,7 @@ def plan(
     gaussians = config.radiance.max_gaussians
     # A step costs what it draws, and what it keeps: 0.02 s at 0.1 megapixels, 0.1 s at 100 000 Gaussians.
     step = 0.2 * megapixels + 1e-6 * min(gaussians, 300_000)
-    codec = 3 + 0.02 * min(config.codec.size or 2500, 4096)
+    codec = config.codec.seconds
     lifting = photographs * (0.2 + 0.5 * megapixels) + 1e-4 * gaussians * min(photographs, 100) / 50
     if config.lift.mode == "gradient":
         lifting += 0.02 * config.lift.steps

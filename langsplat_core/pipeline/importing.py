@@ -11,20 +11,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.config import CodecConfig, check_settings
+from langsplat_core.config import CodebookConfig, CodecConfig, check_settings
 from langsplat_core.errors import InputError
-from langsplat_core.io.foreign import ForeignScene, Leaves
+from langsplat_core.io.foreign import ForeignScene
+from langsplat_core.io.foreign_language import Leaves
 from langsplat_core.pipeline.language import encoded_phrases
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     LEVELS,
-    CodebookCodec,
     Codec,
     LanguageField,
     Scene,
 )
-from langsplat_core.scene.codec import LARGEST, SHORTEST, latent_dtype
+from langsplat_core.scene.codec import LARGEST, SHORTEST
 from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.vocabulary import everyday_vectors
@@ -32,10 +32,9 @@ from langsplat_core.training.language.codec_fit import (
     CodecReport,
     Vocabulary,
     codec_report,
-    codeword_colours,
     everyday_vocabulary,
+    exact_codec,
     fit_codec,
-    rounded,
 )
 
 FITTED, JUDGED = 12_000, 2_000  # Gaussians of each level that a codec is fitted to, and judged on
@@ -68,7 +67,7 @@ def import_scene(
     Raises EncoderError where the encoder cannot be loaded, InputError where its vectors have another length
     or no Gaussian has a meaning, FormatError for features that are not finite.
     """
-    config = config or CodecConfig()
+    config = config or CodebookConfig()
     check_settings(config, "--codec.")
     if foreign.dim == 0:
         return foreign.scene, ImportReport(foreign.method, "", 0, (0.0, 0.0, 0.0), None, foreign.notes)
@@ -92,7 +91,7 @@ def import_scene(
         everyday=everyday_vectors(encoder),
     )
     subpart, part, whole = confidence.mean(1).tolist() if confidence.size else (0.0, 0.0, 0.0)
-    size = codec.index_size or codec.latent_dim
+    size = codec.size
     report = ImportReport(foreign.method, codec.kind, size, (subpart, part, whole), loss, foreign.notes)
     return replace(foreign.scene, language=field), report
 
@@ -109,22 +108,22 @@ def _codec(
         return foreign.codec, None
     clusters = foreign.levels[-1]
     small = isinstance(clusters, Leaves) and len(clusters.vectors) <= LARGEST
-    if isinstance(clusters, Leaves) and small and config.kind == "codebook":
-        return _codebook_of(clusters, config), None
+    exact = _cluster_codec(clusters, config) if isinstance(clusters, Leaves) and small else None
+    if exact is not None:
+        return exact, None
     fitted, judged = _samples(foreign, config.seed)
     codec = fit_codec(fitted, config, vocabulary, progress)
     return codec, codec_report(codec, judged if len(judged) else fitted, vocabulary)
 
 
-def _codebook_of(clusters: Leaves, config: CodecConfig) -> CodebookCodec:
-    """A codeword for every cluster with a meaning that Gaussians belong to, in the clusters' order."""
+def _cluster_codec(clusters: Leaves, config: CodecConfig) -> Codec | None:
+    """The codec of the vectors of all clusters with a meaning that Gaussians belong to, in their order; None
+    for a kind that keeps no vectors as they are."""
     counts = np.bincount(clusters.index[_named(clusters)], minlength=len(clusters.vectors))
     used = np.flatnonzero((counts > 0) & _has_meaning(clusters.vectors))
     if len(used) == 0:
         raise InputError("no cluster that Gaussians belong to has a meaning; there is nothing to search")
-    codewords = rounded(unit(clusters.vectors[used]))
-    colours = codeword_colours(codewords, counts[used].astype(np.float64), config)
-    return CodebookCodec(codewords, rounded(colours))
+    return exact_codec(unit(clusters.vectors[used]), counts[used].astype(np.float64), config)
 
 
 def _named(clusters: Leaves) -> Array:
@@ -164,7 +163,7 @@ def _unit_rows(foreign: ForeignScene, level: int, rows: Array) -> tuple[Array, A
 def _latents(foreign: ForeignScene, codec: Codec, progress: Progress) -> tuple[Array, Array]:
     """(3, N, d) of the codec's type, and (3, N) float32: 1 where a Gaussian has a meaning."""
     count = len(foreign.scene.gaussians)
-    latents = np.zeros((len(LEVELS), count, codec.latent_dim), latent_dtype(codec))
+    latents = np.zeros((len(LEVELS), count, codec.latent_dim), codec.dtype)
     confidence = np.zeros((len(LEVELS), count), np.float32)
     told = _told(foreign)
     for done, (level, rows) in enumerate(_blocks(told, count)):

@@ -1,6 +1,6 @@
-"""From masks with vectors to a language field: memberships, groups of masks, codec, latents.
+"""From masks with vectors to a language field: mask_weights, groups of masks, codec, latents.
 
-Each is kept in the work folder. Memberships are kept view by view and latents block by block, so that an
+Each is kept in the work folder. MaskWeights are kept view by view and latents block by block, so that an
 interrupted run, or one that is shared by several processes, repeats little, and so that what is held in
 memory depends on a block of Gaussians and not on all of them times all photographs.
 """
@@ -39,7 +39,7 @@ from langsplat_core.scene import (
     LanguageField,
     codec_from_tensors,
 )
-from langsplat_core.scene.codec import latent_dtype
+from langsplat_core.scene.codec import KINDS
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.encoder import Encoder, PhraseEncoder
 from langsplat_core.semantics.store import ImageFeatures
@@ -59,7 +59,7 @@ from langsplat_core.training.language.lift import (
 )
 from langsplat_core.training.language.mask_weights import (
     MaskGroups,
-    Memberships,
+    MaskWeights,
     find_things,
     group_masks,
     view_pairs,
@@ -104,10 +104,10 @@ def language_field(
 
 
 def check_lift(config: TrainConfig) -> None:
-    """Raises InputError for a codebook whose numbers the lifting would average."""
-    if config.codec.kind == "codebook" and config.lift.mode in LATENT_LIFTS:
+    """Raises InputError for a codec of latents that cannot be averaged with a lifting that does."""
+    if config.lift.mode in LATENT_LIFTS and not KINDS[config.codec.kind].blends:
         raise InputError(
-            f"--lift.mode {config.lift.mode} averages latents, and a codebook's are numbers of codewords; "
+            f"--lift.mode {config.lift.mode}: a {config.codec.kind} has no latents that can be averaged; "
             "add --codec.kind autoencoder"
         )
 
@@ -142,15 +142,15 @@ class _Stages:
             self._vectors.append(features.vectors)
             digests.append(features_digest([features]))
         self._inputs = (gaussians_digest(gaussians), digests)
-        self._made: tuple[Memberships, MaskGroups] | None = None
+        self._made: tuple[MaskWeights, MaskGroups] | None = None
 
     def codec(self) -> tuple[Codec, CodecReport]:
-        """Fitted to lifted vectors and, unless it is a codebook, to the masks' own; to these alone where
-        latents are averaged themselves."""
+        """Fitted to lifted vectors and, where that helps, to the masks' own; to these alone where latents are
+        averaged themselves."""
         fitted_to = "masks" if self._lift.mode in LATENT_LIFTS else self._lift.mode
         path = self._work / f"{stage_key('codec', 2, *self._inputs, fitted_to, self._config.codec)}.npz"
         if self._lift.mode not in LATENT_LIFTS and not path.exists():
-            self._memberships()  # everyone's work, unlike the fit
+            self._mask_weights()  # everyone's work, unlike the fit
         return self._crew.once(lambda: kept(path, self._fit, _pack_codec, _unpack_codec))
 
     def latents(self, codec: Codec) -> Latents:
@@ -167,18 +167,18 @@ class _Stages:
 
     def things(self) -> Array | None:
         """Which thing each Gaussian belongs to; None where latents are averaged themselves, which needs no
-        memberships."""
+        mask_weights."""
         if self._lift.mode in LATENT_LIFTS:
             return None
         path = self._work / f"{stage_key('things', 1, *self._inputs)}.npy"
         if not path.exists():
-            self._memberships()  # everyone's work
+            self._mask_weights()  # everyone's work
         self._crew.once(lambda: kept_array(path, self._find_things))
         return np.array(open_array(path))
 
     def _find_things(self) -> Array:
         self._progress("finding things", 0.5)
-        return find_things(self._memberships()[0], [len(vectors) for vectors in self._vectors])
+        return find_things(self._mask_weights()[0], [len(vectors) for vectors in self._vectors])
 
     def _fit(self) -> tuple[Codec, CodecReport]:
         config, vocabulary = self._config.codec, everyday_vocabulary(self._encoder, self._config.phrases)
@@ -187,30 +187,29 @@ class _Stages:
             codec = fit_codec(masks, config, vocabulary, self._progress)
             return codec, codec_report(codec, masks, vocabulary)
         fitted, judged = self._lifted_samples()
-        data = fitted if config.kind == "codebook" and len(fitted) else np.concatenate([masks, fitted])
-        codec = fit_codec(data, config, vocabulary, self._progress)
+        codec = fit_codec(fitted, config, vocabulary, self._progress, further=masks)
         return codec, codec_report(codec, judged if len(judged) else masks, vocabulary)
 
     def _lifted_samples(self) -> tuple[Array, Array]:
         """(M, D) float32 vectors of Gaussians that a codec is fitted to, and of others that judge it."""
-        memberships, groups = self._memberships()
+        mask_weights, groups = self._mask_weights()
         order = np.random.default_rng(self._config.codec.seed).permutation(len(self._gaussians))
         samples = []
         for rows in (order[:FITTED], order[FITTED : FITTED + JUDGED]):
-            lifted = lift_sample(memberships, groups, np.sort(rows), self._robust, self._progress)
+            lifted = lift_sample(mask_weights, groups, np.sort(rows), self._robust, self._progress)
             samples.append(lifted.vectors[lifted.confidence > 0])
         return samples[0], samples[1]
 
     def _lift_blocks(self, codec: Codec, folder: Path) -> None:
         """This process's share of the blocks of Gaussians, each in a file."""
-        memberships, groups = self._memberships()
+        mask_weights, groups = self._mask_weights()
 
         def lift(number: int) -> Latents:
-            return _encoded(codec, lift_block(memberships, groups, number, self._robust))
+            return _encoded(codec, lift_block(mask_weights, groups, number, self._robust))
 
-        for number in self._crew.share(range(len(memberships.blocks))):
+        for number in self._crew.share(range(len(mask_weights.blocks))):
             kept(_numbered(folder, number), partial(lift, number), _pack, _unpack)
-            self._progress("averaging mask vectors", (number + 1) / len(memberships.blocks))
+            self._progress("averaging mask vectors", (number + 1) / len(mask_weights.blocks))
 
     def _all_latents(self, codec: Codec, folder: Path) -> Latents:
         if self._lift.mode in LATENT_LIFTS:
@@ -218,14 +217,14 @@ class _Stages:
             scene = (self._rasterizer(), self._gaussians, self._views, codec)
             return lift(*scene, config=self._config.lift, progress=self._progress)
         shape = (len(LEVELS), len(self._gaussians), codec.latent_dim)
-        latents, confidence = np.zeros(shape, latent_dtype(codec)), np.zeros(shape[:2], np.float32)
-        for number, (first, last) in enumerate(self._memberships()[0].blocks):
+        latents, confidence = np.zeros(shape, codec.dtype), np.zeros(shape[:2], np.float32)
+        for number, (first, last) in enumerate(self._mask_weights()[0].blocks):
             latents[:, first:last], confidence[:, first:last] = _unpack(
                 read_arrays(_numbered(folder, number))
             )
         return latents, confidence
 
-    def _memberships(self) -> tuple[Memberships, MaskGroups]:
+    def _mask_weights(self) -> tuple[MaskWeights, MaskGroups]:
         """Pairs of every view, in files that are read where they are needed, and the groups of the masks."""
         if self._made is None:
             folder = self._work / stage_key("memberships", 2, *self._inputs)
@@ -237,7 +236,7 @@ class _Stages:
             self._crew.meet()
             pairs = [open_array(path) for path in files]
             groups = self._crew.once(lambda: self._groups(folder / "groups.npz"))
-            self._made = Memberships(pairs, len(self._gaussians)), groups
+            self._made = MaskWeights(pairs, len(self._gaussians)), groups
         return self._made
 
     def _groups(self, path: Path) -> MaskGroups:
@@ -245,7 +244,7 @@ class _Stages:
 
     def _pairs(self, rasterizer: LiftingRasterizer, index: int) -> Array:
         camera, features = self._views[index]
-        return view_pairs(rasterizer, self._gaussians, camera, features, self._config.lift.chunk)
+        return view_pairs(rasterizer, self._gaussians, camera, features)
 
     def _rasterizer(self) -> LiftingRasterizer:
         return load_lifting_rasterizer(self._config.lift.backend)
@@ -259,7 +258,7 @@ def _what_matters(config: LiftConfig) -> LiftConfig:
     """The settings that change the result: not the backend and the batches, which change who computes."""
     if config.mode != "gradient":
         return LiftConfig(mode=config.mode)
-    return replace(config, backend="auto", chunk=LiftConfig.chunk)
+    return replace(config, backend="auto")
 
 
 def _one_pass(

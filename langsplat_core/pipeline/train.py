@@ -159,7 +159,7 @@ def _train(
             encoder=encoder.id,
             mask_count=sum(len(item.vectors) for item in features),
             codec=language.codec.kind,
-            codec_size=language.codec.index_size or language.codec.latent_dim,
+            codec_size=language.codec.size,
             codec_cosine=loss.cosine,
             relevancy_error=loss.error_mean,
             relevancy_error_p99=loss.error_p99,

@@ -5,7 +5,7 @@ phrase is found is judged by what everyday phrases fit in the same scene, and ho
 region.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -17,10 +17,9 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.grammar import Named, named
 from langsplat_core.query.instances import axis_aligned_box
-from langsplat_core.query.lookup import codewords
 from langsplat_core.query.surface import SMALLEST, Regions, Surface
 from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField, Odds
-from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, Scale
+from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, Scale, relevancy_of
 
 Triple = tuple[float, float, float]  # one number a level
 AnswerRule = Literal["regions", "peak"]
@@ -92,7 +91,7 @@ def triple(values: Iterable[float]) -> Triple:
 # Fits are those of `semantics.relevancy.Scale`. The more places a scene has, the better the best of them
 # fits a phrase by chance; so "found" is said by the best fits of everyday phrases in the scene itself.
 
-SAMPLED = 96  # everyday phrases that are looked up in a scene without codewords, where each costs a query
+CHUNK = 16_384  # latents compared with everyday phrases at a time
 # Spreads above the median best fit of everyday phrases from which a phrase is found, among whole things and
 # at the finer levels, by what it names: where things like it are, and elsewhere, where more is asked for. One
 # absent phrase in twenty exceeds it (rooms 201 to 203, the bundled encoder and CLIP's geometry with six sets
@@ -151,31 +150,23 @@ def excess(fits: Fits, bars: Bars, named: Named | Literal["inside"], level: Leve
     return max(bars[2].excess(fits[2], whole), bars[3].excess(max(fits[:2]), finer))
 
 
-def chance_in(
-    field: LanguageField, surface: Surface, regions: Regions, scale: Scale, lookup: Iterator[Array]
-) -> Chance:
-    """The fits of everyday phrases in a scene. lookup: their relevancies (3, N), which are looked at where
-    there are no codewords to compare instead."""
-    if field.codec.space == "index":
-        return _by_codewords(field, surface, regions, scale)
-    columns = [[scale.fit(means) for means in regions.means(values)] for values in lookup]
-    subpart, part, whole = (
-        _solid(np.stack(fits, 1).astype(np.float32), regions.sizes[level])
-        for level, fits in enumerate(zip(*columns, strict=True))
-    )
-    return Chance((subpart, part, whole))
-
-
-def _by_codewords(field: LanguageField, surface: Surface, regions: Regions, scale: Scale) -> Chance:
+def chance_in(field: LanguageField, surface: Surface, regions: Regions, scale: Scale) -> Chance:
+    """The fits of everyday phrases in a scene."""
     assert scale.everyday is not None
-    relevancy = codewords(field.codec, scale).relevancies(scale.everyday)
     fits = []
     for level, known in enumerate(field.known):
         has = known[surface.rows]
-        places = regions.of[level][has], field.latents[level, surface.rows[has], 0].astype(np.int64)
-        shape = (len(regions.totals[level]), len(relevancy))
-        shares = csr_matrix((surface.weights[has], places), shape=shape)
-        means = (shares @ relevancy) / regions.totals[level][:, None]
+        latents, of = field.codec.unique(field.latents[level, surface.rows[has]])
+        shape = (len(regions.totals[level]), len(latents))
+        shares = csr_matrix((surface.weights[has], (regions.of[level][has], of)), shape=shape).tocsc()
+        means = np.zeros((shape[0], len(scale.everyday)))
+        for start in range(0, len(latents), CHUNK):
+            part = slice(start, start + CHUNK)
+            cosines = field.codec.cosines(latents[part], scale.texts)
+            zero, rate = scale.of(cosines)
+            everyday = cosines[:, len(scale.canonical) :]
+            means += shares[:, part] @ relevancy_of(everyday, zero[:, None], rate[:, None])
+        means /= regions.totals[level][:, None]
         fits.append(_solid(scale.fit(means).astype(np.float32), regions.sizes[level]))
     return Chance((fits[0], fits[1], fits[2]))
 

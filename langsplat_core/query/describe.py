@@ -77,11 +77,7 @@ class WordScores:
 
     def probabilities(self, codec: Codec, latents: Array) -> Array:
         """(M, d) latents with a meaning -> (M, V + C) float32, each row adding up to 1."""
-        if codec.space == "index":
-            cosines = codec.decode(latents) @ self.vectors.T
-        else:
-            cosines = codec.similarities(latents, self.vectors)
-        logits = np.float32(self.scale) * (cosines - self.hubs / 2)
+        logits = np.float32(self.scale) * (codec.cosines(latents, self.vectors) - self.hubs / 2)
         shares = np.exp(logits - logits.max(1, keepdims=True))
         result: Array = shares / shares.sum(1, keepdims=True)
         return result
@@ -89,12 +85,11 @@ class WordScores:
     def mixture(self, codec: Codec, latents: Array, weights: Array) -> Array:
         """(M, d) latents with a meaning and (M,) weights >= 0, not all zero -> (V + C,) float64: the mean of
         their probabilities. Answers are blended, never meanings: between two things lies a third."""
-        if codec.space == "index":
-            codes, inverse = np.unique(latents[:, 0], return_inverse=True)
-            latents, weights = codes[:, None], np.bincount(inverse, weights, minlength=len(codes))
+        latents, of = codec.unique(latents)
+        weights = np.bincount(of, weights, minlength=len(latents))
         total = np.zeros(len(self.vectors))
         for part in self._blocks(len(latents)):
-            total += weights[part].astype(np.float64) @ self.probabilities(codec, latents[part])
+            total += weights[part] @ self.probabilities(codec, latents[part])
         return total / total.sum()
 
     def best(self, codec: Codec, latents: Array, count: int) -> tuple[Array, Array]:
@@ -141,11 +136,8 @@ def _spread(field: LanguageField, vectors: Array, bank: Array) -> float:
 def meanings(field: LanguageField) -> Array:
     """(B, D) float32 unit vectors of what the scene's Gaussians mean: every codeword that one of them has, or
     those of evenly spread Gaussians where there are no codewords."""
-    latents = field.latents[field.known]
-    if field.codec.space == "index":
-        latents, most = np.unique(latents)[:, None], BANK
-    else:
-        most = SAMPLES
+    latents, _ = field.codec.unique(field.latents[field.known])
+    most = SAMPLES if field.codec.blends else BANK  # latents that are no numbers are all distinct meanings
     chosen = np.unique(np.linspace(0, len(latents) - 1, min(most, len(latents))).astype(np.int64))
     return field.codec.decode(latents[chosen])
 
@@ -232,14 +224,11 @@ class _Claim:
 
 
 def field_meanings(field: LanguageField) -> Meanings:
-    """Codewords, or the meaning of every Gaussian by itself where a codec has none."""
-    if field.codec.space == "index":
-        codes = np.arange(field.codec.index_size, dtype=np.uint16)[:, None]
-        return Meanings(codes, np.where(field.known, field.latents[..., 0].astype(np.int64), -1))
+    """The distinct latents of the field's Gaussians."""
     known = field.known
     of = np.full(known.shape, -1, np.int64)
-    of[known] = np.arange(int(known.sum()))
-    return Meanings(field.latents[known], of)
+    latents, of[known] = field.codec.unique(field.latents[known])
+    return Meanings(latents, of)
 
 
 def _claims(

@@ -14,7 +14,6 @@ from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.io.language import SUFFIX
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import (
-    SAMPLED,
     AnswerRule,
     Bars,
     Chance,
@@ -212,11 +211,9 @@ class QueryEngine:
     @cached_property
     def chance(self) -> Chance | None:
         """The fits of everyday phrases in the scene; None where there are none."""
-        everyday = self.scale.everyday
-        if everyday is None:
+        if self.scale.everyday is None:
             return None
-        some = everyday[np.unique(np.linspace(0, len(everyday) - 1, SAMPLED).astype(np.int64))]
-        return chance_in(self.field, self.surface, self.regions, self.scale, self._relevancies(some))
+        return chance_in(self.field, self.surface, self.regions, self.scale)
 
     @cached_property
     def _bars(self) -> Bars | None:

@@ -1,29 +1,27 @@
 """Relevancy of phrases at every Gaussian, by what the scene's codec allows, and at every pixel.
 
-A codebook gives an exact answer for a fetch. Of unit latents of three numbers, the relevancy of a phrase is
-a function on the sphere: the decoder is run once per scene at the nodes of an octahedral grid that its
-latents lie between; after that a phrase costs one matrix-vector product, and every Gaussian a bilinear
-interpolation at a place computed once. What is left is compared latent by latent, exactly.
+Each distinct latent is compared, exactly; those of a codebook are few, and every Gaussian costs a fetch. Of
+unit latents of three numbers, the relevancy of a phrase is a function on the sphere: the decoder is run once
+per scene at the nodes of an octahedral grid that its latents lie between; after that a phrase costs one
+matrix-vector product, and every Gaussian a bilinear interpolation at a place computed once.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.compiled import kernel, plain, shared_workers
+from langsplat_core.compiled import kernel, shared_workers
 from langsplat_core.display.displays import gated_mean
 from langsplat_core.errors import InputError
 from langsplat_core.raster.protocol import View
 from langsplat_core.scene import Codec, LanguageField
-from langsplat_core.scene.codec import meaningful
 from langsplat_core.semantics.relevancy import Scale, latent_relevancy, relevancy_of
 
 RESOLUTION = 256  # nodes per side; error against exact decoding falls with its square
-TOGETHER = 16  # phrases compared with every latent at a time: 12 bytes each per Gaussian
+TOGETHER = 16  # phrases compared with every latent at a time: 4 bytes each per latent
 CHUNK = 16_384  # latents that are compared with texts at a time
 
 
@@ -37,9 +35,7 @@ class Lookup(Protocol):
 
 def build_lookup(field: LanguageField, scale: Scale, exact: bool = False) -> Lookup:
     """The fastest lookup for `field`; with `exact` none that interpolates, to measure a table by."""
-    if field.codec.space == "index":
-        return CodeLookup(field, scale)
-    if not exact and field.codec.latent_dim == 3 and field.codec.space == "sphere":
+    if field.codec.spherical and not exact:
         latents = np.where(field.known[..., None], field.latents, 0)
         return build_table(field.codec, latents.reshape(-1, 3), scale)
     return LatentLookup(field, scale)
@@ -55,27 +51,6 @@ class Vectors:
     def relevancies(self, phrases: Array) -> Array:
         """(Q, D) unit phrase vectors -> (K, Q) in (0, 1)."""
         return relevancy_of(self.vectors @ phrases.T, self._zero[:, None], self._rate[:, None])
-
-
-def codewords(codec: Codec, scale: Scale) -> Vectors:
-    """All K codewords of a codebook."""
-    return Vectors(codec.decode(np.arange(codec.index_size, dtype=np.uint16)[:, None]), scale)
-
-
-class CodeLookup:
-    """K relevancies of codewords, and a fetch per Gaussian: exact."""
-
-    def __init__(self, field: LanguageField, scale: Scale) -> None:
-        self._codewords = codewords(field.codec, scale)
-        codes = np.where(field.known, field.latents[..., 0], field.codec.index_size)
-        self._codes = codes.astype(np.uint16).reshape(-1)
-
-    def relevancies(self, phrases: Array) -> Iterator[Array]:
-        """See `Lookup`."""
-        for row in self._codewords.relevancies(phrases).T:
-            found = np.empty(len(self._codes), np.float32)
-            shared_workers().run(_fetch, len(found), plain(np.append(row, 0)), self._codes, found)
-            yield found
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +76,7 @@ class SphereTable:
 
 def build_table(codec: Codec, latents: Array, scale: Scale, resolution: int = RESOLUTION) -> SphereTable:
     """Tabulate a `codec` of unit latents for (M, 3) latents; those of no length have no meaning."""
-    known = meaningful(codec, latents)
+    known = codec.known(latents)
     safe = np.where(known[:, None], latents, (0.0, 0.0, 1.0)).astype(np.float64)
     position = sphere_to_octahedral(safe) * (resolution - 1)
     cell = np.clip(np.floor(position), 0, resolution - 2).astype(np.int64)
@@ -139,38 +114,37 @@ def _folded(xy: Array, z: Array) -> Array:
     return np.where((z < 0)[..., None], (1 - np.abs(xy[..., ::-1])) * np.where(xy >= 0, 1, -1), xy)
 
 
-@dataclass(frozen=True, eq=False)
 class LatentLookup:
-    """Every latent compared, in bounded memory: exact."""
+    """Every distinct latent compared, and a fetch per Gaussian: exact, in bounded memory."""
 
-    field: LanguageField
-    scale: Scale
-
-    @cached_property
-    def _read(self) -> tuple[Array, Array, Array]:
-        """Rows of (3 N,) with a meaning, and the (M,) zero and rate of each."""
-        field = self.field
-        rows = np.flatnonzero(field.known)
-        latents = field.latents.reshape(-1, field.latents.shape[-1])
-        zero, rate = np.empty(len(rows), np.float32), np.empty(len(rows), np.float32)
-        for start in range(0, len(rows), CHUNK):
-            part = slice(start, start + CHUNK)
-            cosines = field.codec.similarities(latents[rows[part]], self.scale.texts)
-            zero[part], rate[part] = self.scale.of(cosines)
-        return rows, zero, rate
+    def __init__(self, field: LanguageField, scale: Scale) -> None:
+        self._codec = field.codec
+        self._latents, of = field.codec.unique(field.latents.reshape(-1, field.latents.shape[-1]))
+        count = len(self._latents)
+        kind = np.uint16 if count <= np.iinfo(np.uint16).max else np.uint32
+        self._of = np.where(field.known.reshape(-1), of, count).astype(kind)
+        self._zero, self._rate = np.empty(count, np.float32), np.empty(count, np.float32)
+        for part in self._parts():
+            cosines = self._codec.cosines(self._latents[part], scale.texts)
+            self._zero[part], self._rate[part] = scale.of(cosines)
 
     def relevancies(self, phrases: Array) -> Iterator[Array]:
         """See `Lookup`."""
-        field, (rows, zero, rate) = self.field, self._read
-        latents = field.latents.reshape(-1, field.latents.shape[-1])
         for first in range(0, len(phrases), TOGETHER):
             some = phrases[first : first + TOGETHER]
-            values = np.zeros((len(some), len(latents)), np.float32)
-            for start in range(0, len(rows), CHUNK):
-                part = slice(start, start + CHUNK)
-                cosines = field.codec.similarities(latents[rows[part]], some)
-                values[:, rows[part]] = relevancy_of(cosines, zero[part, None], rate[part, None]).T
-            yield from values
+            values = np.zeros((len(some), len(self._latents) + 1), np.float32)  # the last: no meaning
+            for part in self._parts():
+                cosines = self._codec.cosines(self._latents[part], some)
+                zero, rate = self._zero[part, None], self._rate[part, None]
+                values[:, :-1][:, part] = relevancy_of(cosines, zero, rate).T
+            for row in values:
+                found = np.empty(len(self._of), np.float32)
+                shared_workers().run(_fetch, len(found), row, self._of, found)
+                yield found
+
+    def _parts(self) -> Iterator[slice]:
+        for start in range(0, len(self._latents), CHUNK):
+            yield slice(start, min(start + CHUNK, len(self._latents)))
 
 
 @kernel
@@ -214,9 +188,9 @@ def decoded_relevancy(
 
     Raises InputError for a codebook, whose numbers cannot be blended.
     """
-    if field.codec.space == "index":
+    if not field.codec.blends:
         raise InputError(
-            "the paper's order blends latents, and this scene has a codebook; train one with "
+            f"the paper's order blends latents, and this scene has a {field.codec.kind}; train one with "
             "`--codec.kind autoencoder`"
         )
     blended, alpha = view.splat(field.latents[level])

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from langsplat_core.arrays import Array, sigmoid, unit
+from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.compiled import kernel, plain, shared_workers
 from langsplat_core.scene import LEVELS, NO_THING, Gaussians, LanguageField
 
@@ -179,7 +179,6 @@ SCALE = 6.8  # of the criterion, in typical steps times Gaussians: larger prefer
 SMALLEST = 10  # Gaussians; smaller patches join the neighbour that means the most similar
 BORDER = 0.6  # added to the step between two things, in typical steps
 UNKNOWN = 2.0  # step between a Gaussian with a meaning and one without: as much as between opposites
-CHUNK = 65_536  # links whose ends are compared at a time
 PIECES = 4  # that a level is summed in, so that more than three cores have work
 STEPS = 65_535 / (UNKNOWN + 2 * BORDER)  # of 1 - cosine that are told apart: 16 bits sort in linear time
 
@@ -255,38 +254,15 @@ def _steps(field: LanguageField, level: int, rows: Array, ends: tuple[Array, Arr
     """(E,) 1 - cosine between what the two ends of each link mean, in [0, 2]."""
     known, latents = field.known[level][rows], field.latents[level][rows]
     a, b = ends
-    if field.codec.space == "index":
-        directions = field.codec.decode(np.arange(field.codec.index_size, dtype=np.uint16)[:, None])
-        steps = _apart(directions, latents[a, 0], latents[b, 0])
-    else:
-        steps = _apart(unit(latents.astype(np.float32)), a, b)
+    steps = field.codec.distances(latents, a, b)
     both, neither = known[a] & known[b], ~known[a] & ~known[b]
     return np.asarray(np.where(both, steps, np.where(neither, 0.0, UNKNOWN)).clip(0, UNKNOWN))
 
 
 def _typical_step(field: LanguageField, level: int, rows: Array) -> float:
-    """The mean of 1 - cosine between two Gaussians drawn by chance: what is far in this encoder's space. It
-    is 1 minus the squared length of their mean vector."""
+    """The mean of 1 - cosine between two Gaussians drawn by chance: what is far in this encoder's space."""
     latents = field.latents[level][rows[field.known[level][rows]]]
-    if len(latents) == 0:
-        return 1.0
-    if field.codec.space == "index":
-        counts = np.bincount(latents[:, 0], minlength=field.codec.index_size)
-        mean = counts @ field.codec.decode(np.arange(len(counts), dtype=np.uint16)[:, None]) / len(latents)
-    else:
-        mean = unit(latents.astype(np.float32)).mean(0, dtype=np.float64)
-    return max(1 - float(mean @ mean), 0.0)
-
-
-def _apart(directions: Array, first: Array, second: Array) -> Array:
-    """(E,) 1 - cosine of pairs among (K, D) unit vectors, from a table of all where that is smaller."""
-    if len(directions) ** 2 <= len(first):
-        return np.asarray((1 - directions @ directions.T)[first, second])
-    steps = np.empty(len(first), np.float32)
-    for start in range(0, len(first), CHUNK):  # the vectors may be as long as the encoder's
-        part = slice(start, start + CHUNK)
-        steps[part] = 1 - np.einsum("ed,ed->e", directions[first[part]], directions[second[part]])
-    return steps
+    return field.codec.spread(latents) if len(latents) else 1.0
 
 
 def _along_things(steps: Array, things: Array, ends: tuple[Array, Array], border: float) -> Array:

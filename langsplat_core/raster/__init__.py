@@ -7,21 +7,12 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
 from langsplat_core.errors import BackendError, InputError, optional_imports
-from langsplat_core.raster.protocol import (
-    FreezableView,
-    LiftingRasterizer,
-    LiftingView,
-    MedianDepth,
-    Rasterizer,
-    View,
-)
+from langsplat_core.raster.protocol import LiftingRasterizer, LiftingView, Rasterizer, View
 
 __all__ = [
     "BACKENDS",
-    "FreezableView",
     "LiftingRasterizer",
     "LiftingView",
-    "MedianDepth",
     "Rasterizer",
     "View",
     "load_lifting_rasterizer",
@@ -84,7 +75,7 @@ def load_lifting_rasterizer(backend: str = "auto") -> LiftingRasterizer:
 
 
 def _cuda_may_work() -> bool:
-    """Whether it is worth importing gsplat, which takes seconds: it is there, and so is a CUDA device."""
+    """True where gsplat, which takes seconds to import, and a CUDA device are there."""
     if find_spec("gsplat") is None or find_spec("torch") is None:
         return False
     from torch import cuda

@@ -18,7 +18,7 @@ from torch import Tensor
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
-from langsplat_core.raster.protocol import farthest
+from langsplat_core.raster.protocol import LiftingView, farthest
 from langsplat_core.scene import Camera, Gaussians, look_at
 
 DEVICE = "cuda"
@@ -46,12 +46,12 @@ class Drawn:
 
 
 def has_device() -> bool:
-    """Whether torch finds the device that gsplat draws on."""
+    """True where torch finds the device that gsplat draws on."""
     return torch.cuda.is_available()
 
 
 def drawn_settings(settings: RasterSettings) -> RasterSettings:
-    """What the installed gsplat draws with where `settings` are asked for: its cap of alpha is its own."""
+    """Settings that the installed gsplat draws with in place of `settings`: its cap of alpha is its own."""
     release = tuple(int(part) for part in version("gsplat").split(".")[:2])
     return replace(settings, alpha_max=0.999 if release < (1, 6) else 0.99)
 
@@ -108,6 +108,7 @@ def draw(
         sh_degree=sh_degree,
         packed=False,
         rasterize_mode="antialiased" if settings.antialiased else "classic",
+        camera_model="ortho" if camera.orthographic else "pinhole",
     )
     means_px = extra["means2d"]
     if means_px.requires_grad:
@@ -121,14 +122,14 @@ def to_device(array: Array) -> Tensor:
     return torch.tensor(np.asarray(array), dtype=torch.float32, device=DEVICE)
 
 
-class GsplatView:
+class GsplatView(LiftingView):
     """Valid Gaussians on the device; gsplat projects them anew in every call."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> None:
         valid = gaussians.valid()
         self.camera, self._settings = camera, settings
         self.dropped = int((~valid).sum())
-        self._count, self._rows = len(gaussians), np.flatnonzero(valid)
+        self.count, self._rows = len(gaussians), np.flatnonzero(valid)
         kept = gaussians.take(self._rows)
         # Relative to the camera in float64 first: float32 has no digits left far from the origin.
         means = kept.means.astype(np.float64) - camera.position
@@ -144,7 +145,7 @@ class GsplatView:
 
     def splat(self, values: Array) -> tuple[Array, Array]:
         """See `View.splat`; float32."""
-        channels = check_array("values", values, (self._count, "C"))["C"]
+        channels = check_array("values", values, (self.count, "C"))["C"]
         if len(self._rows) == 0:
             shape = (self.camera.height, self.camera.width)
             return np.zeros((*shape, channels), np.float32), np.zeros(shape, np.float32)
@@ -155,20 +156,16 @@ class GsplatView:
     def gather(self, image: Array) -> Array:
         """See `LiftingView.gather`: the derivative of <splat(values), image> by values; float32."""
         channels = check_array("image", image, (self.camera.height, self.camera.width, "C"))["C"]
-        gathered = np.zeros((self._count, channels), np.float32)
+        gathered = np.zeros((self.count, channels), np.float32)
         if len(self._rows) > 0:
             values = torch.zeros(len(self._rows), channels, device=DEVICE, requires_grad=True)
             (grad,) = torch.autograd.grad(self._draw(values)[0], values, to_device(image))
             gathered[self._rows] = grad.cpu().numpy()
         return gathered
 
-    def contributions(self) -> Array:
-        """See `LiftingView.contributions`; float32."""
-        return self.gather(np.ones((self.camera.height, self.camera.width, 1), np.float32))[:, 0]
-
     def depth(self) -> Array:
         """See `View.depth`; float32."""
-        both = np.ones((self._count, 2), np.float32)
+        both = np.ones((self.count, 2), np.float32)
         both[self._rows, 0] = self._depths
         sums, weights = np.moveaxis(self.splat(both)[0], -1, 0)
         return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), 0)

@@ -1,25 +1,133 @@
-"""Pictures that this machine's memory cannot hold are refused before anything is allocated for them."""
+"""Rasterizers: a linear operator per view, and nothing more.
+
+With geometry frozen, a rendered image is ``F = W x``: `x` holds one vector per Gaussian and `W` the blending
+weights alpha_i T_i of the view. A backend projects a view once and then offers `splat` (``W x``) and, where
+it can lift, `gather` (``W^T y``, the exact adjoint).
+"""
 
 import math
 import os
+from abc import ABC, abstractmethod
 from functools import cache
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar
 
+import numpy as np
 from scipy import sparse
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import InputError
 from langsplat_core.scene import Camera, Gaussians
 
-# Of a picture of colours with alpha while it is drawn and turned into display values, float32 and uint8.
+# Of an image of colours with alpha while it is drawn and turned into display values, float32 and uint8.
 BYTES_PER_PIXEL = 40
+LABELS_AT_ONCE = 32  # that a plain gather lifts
 _LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 
 
+class View(ABC):
+    """N Gaussians as one camera of H x W pixels sees them."""
+
+    camera: Camera
+    count: int  # N
+    dropped: int  # rows that were invalid (see `Gaussians.valid`) and therefore not drawn
+
+    @abstractmethod
+    def splat(self, values: Array) -> tuple[Array, Array]:
+        """(N, C) values -> (H, W, C) image ``W x`` without background, and (H, W) alpha = row sums of W."""
+
+    @abstractmethod
+    def depth(self) -> Array:
+        """(H, W) alpha-weighted mean depth along camera z, world units; 0 where nothing is drawn."""
+
+    def median_depth(self) -> Array:
+        """(H, W) camera z, world units, of the Gaussian at which the transmittance falls to 0.5 or below; 0
+        where it never does. A backend that cannot tell gives the mean depth there."""
+        _, alpha = self.splat(np.empty((self.count, 0), np.float32))
+        return np.where(alpha >= 0.5, self.depth(), 0)
+
+
+class LiftingView(View):
+    """A view whose backend also has the adjoint."""
+
+    @abstractmethod
+    def gather(self, image: Array) -> Array:
+        """(H, W, C) image -> (N, C) values ``W^T y``."""
+
+    def contributions(self) -> Array:
+        """(N,) blending weight of each Gaussian summed over the image, in pixels: ``W^T 1``."""
+        return self.gather(np.ones((self.camera.height, self.camera.width, 1), np.float32))[:, 0]
+
+    def gather_labels(self, maps: Array, count: int, least: float = 0.0) -> sparse.csr_matrix:
+        """(L, H, W) int32 labels below `count`, -1 for none -> (N, count) float32 ``W^T onehot``, in pixels.
+
+        A pixel counts once for every label that it has in any map. Entries of at most `least` are left out.
+        """
+        self.check_labels(maps, count)
+        columns = [sparse.csr_matrix((self.count, 0), dtype=np.float32)]
+        for start in range(0, count, LABELS_AT_ONCE):
+            size = min(LABELS_AT_ONCE, count - start)
+            image = np.zeros((self.camera.height * self.camera.width, size), np.float32)
+            for labels in maps.reshape(len(maps), -1):
+                inside = np.flatnonzero((labels >= start) & (labels < start + size))
+                image[inside, labels[inside] - start] = 1
+            weights = self.gather(image.reshape(self.camera.height, self.camera.width, size))
+            columns.append(sparse.csr_matrix(np.where(weights > least, weights, 0).astype(np.float32)))
+        return sparse.hstack(columns, format="csr")
+
+    def check_labels(self, maps: Array, count: int) -> None:
+        """ValueError for maps that `gather_labels` cannot take."""
+        check_array("maps", maps, ("L", self.camera.height, self.camera.width))
+        if maps.max(initial=-1) >= count or maps.min(initial=-1) < -1:
+            raise ValueError(f"maps: labels {maps.min()} to {maps.max()}, expected -1 to {count - 1}")
+
+    def frozen(self) -> "LiftingView":
+        """The same view with W kept, in fewer digits: `splat` and `gather` get cheaper, from some calls on.
+        The view itself where nothing is gained."""
+        return self
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of what `frozen` keeps."""
+        return 0
+
+
+V = TypeVar("V", bound=View, covariant=True)
+
+
+class Backend(Protocol[V]):
+    """A rasterizer with views of type V; stateless apart from device resources."""
+
+    name: str
+
+    def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> V:
+        """Project `gaussians` into `camera` once, for any number of calls."""
+
+
+Rasterizer = Backend[View]
+LiftingRasterizer = Backend[LiftingView]
+
+
+def farthest(settings: RasterSettings) -> float:
+    """The largest camera z at which Gaussians are drawn, world units."""
+    return math.inf if settings.far is None else settings.far
+
+
+def tangent_limits(camera: Camera, settings: RasterSettings) -> tuple[float, float, float, float]:
+    """Limits of |x/z| and |y/z| at which the Jacobian is taken: left, top, right, bottom of the axis."""
+    margin_x = (settings.fov_clamp - 1) * 0.5 * camera.width / camera.fx
+    margin_y = (settings.fov_clamp - 1) * 0.5 * camera.height / camera.fy
+    return (
+        camera.cx / camera.fx + margin_x,
+        camera.cy / camera.fy + margin_y,
+        (camera.width - camera.cx) / camera.fx + margin_x,
+        (camera.height - camera.cy) / camera.fy + margin_y,
+    )
+
+
 def check_picture(camera: Camera) -> None:
-    """InputError where a picture of the camera's size needs more than all of this machine's memory."""
+    """InputError where an image of the camera's size needs more than all of this machine's memory."""
     needed = camera.width * camera.height * BYTES_PER_PIXEL
     if needed > memory_bytes():
         raise InputError(
@@ -30,7 +138,7 @@ def check_picture(camera: Camera) -> None:
 
 @cache
 def memory_bytes() -> float:
-    """What a process here may use at most: the machine's memory, or its container's share; infinite where the
+    """Most that a process here may use: the machine's memory, or its container's share; infinite where the
     system does not say."""
     found = [float("inf")]
     if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):
@@ -41,91 +149,3 @@ def memory_bytes() -> float:
         except (OSError, ValueError):  # not there, or "max"
             continue
     return min(found)
-
-
-# What every rasterizer is: a linear operator per view, and nothing more.
-#
-# With geometry frozen, a rendered image is ``F = W x``: `x` holds one vector per Gaussian and `W` the
-# blending weights alpha_i T_i of the view. A backend projects a view once and then offers `splat`
-# (``W x``) and, where it can lift, `gather` (``W^T y``, the exact adjoint).
-
-
-def farthest(settings: RasterSettings) -> float:
-    """The largest camera z at which Gaussians are drawn, world units."""
-    return math.inf if settings.far is None else settings.far
-
-
-class View(Protocol):
-    """N Gaussians as one camera of H x W pixels sees them."""
-
-    @property
-    def dropped(self) -> int:
-        """How many rows were invalid (see `Gaussians.valid`) and therefore not drawn."""
-
-    def splat(self, values: Array) -> tuple[Array, Array]:
-        """(N, C) values -> (H, W, C) image ``W x`` without background, and (H, W) alpha = row sums of W."""
-
-    def depth(self) -> Array:
-        """(H, W) alpha-weighted mean depth along camera z, world units; 0 where nothing is drawn."""
-
-
-@runtime_checkable
-class MedianDepth(Protocol):
-    """A view that also knows where half of the light is stopped."""
-
-    def median_depth(self) -> Array:
-        """(H, W) camera z, world units, of the Gaussian at which the transmittance falls to 0.5 or below; 0
-        where it never does."""
-
-
-class LiftingView(View, Protocol):
-    """A view whose backend also has the adjoint."""
-
-    def gather(self, image: Array) -> Array:
-        """(H, W, C) image -> (N, C) values ``W^T y``."""
-
-    def contributions(self) -> Array:
-        """(N,) blending weight of each Gaussian summed over the picture, in pixels: ``W^T 1``."""
-
-
-@runtime_checkable
-class LabelView(Protocol):
-    """A view that lifts label maps in one walk, however many labels there are."""
-
-    def gather_labels(self, maps: Array, count: int, least: float = 0.0) -> sparse.csr_matrix:
-        """(L, H, W) int32 labels below `count`, -1 for none -> (N, count) float32 ``W^T onehot``, in pixels.
-
-        A pixel counts once for every label that it has in any map. Entries of at most `least` are left out.
-        """
-
-
-@runtime_checkable
-class FreezableView(Protocol):
-    """A lifting view that can keep W itself."""
-
-    def frozen(self) -> "FrozenView":
-        """The same view with W kept in fewer digits: `splat` and `gather` get cheaper, from some calls on."""
-
-
-class FrozenView(LiftingView, Protocol):
-    """A view whose W is kept."""
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of what is kept."""
-
-
-class Rasterizer(Protocol):
-    """A backend; stateless apart from device resources."""
-
-    name: str
-
-    def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> View:
-        """Project `gaussians` into `camera` once, for any number of `splat` calls."""
-
-
-class LiftingRasterizer(Rasterizer, Protocol):
-    """A backend whose views can gather."""
-
-    def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> LiftingView:
-        """As in `Rasterizer`."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array, rotation_matrices, sigmoid, unit
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster.protocol import farthest
+from langsplat_core.raster.protocol import LiftingView, farthest, tangent_limits
 from langsplat_core.scene import Camera, Gaussians
 
 C0 = 0.28209479177387814  # 1 / (2 sqrt(pi))
@@ -61,7 +61,8 @@ def colours(sh: Array, means: Array, camera_position: Array) -> Array:
 #
 # Image formation, from top to bottom (constants in `config.RasterSettings`):
 #
-# 1. Camera space: p = R x + t; Gaussians with p.z <= near or p.z > far are not drawn. 2. Footprint: the
+# 1. Camera space: p = R x + t; Gaussians with p.z <= near or p.z > far are not drawn. 2. Footprint (of an
+# orthographic camera, whose map is linear, J is diag(fx, fy) without a third column): the
 # perspective map is linearised at p, with p.x/p.z and p.y/p.z clamped to 1.3 times the half field of view
 # on each side of the principal point. With A = J R rotation diag(scales) (2x3) the 2D covariance is A A^T +
 # 0.3 I, positive definite by construction. 3. alpha(u) = min(0.99, opacity * exp(-1/2 (u-m)^T cov^-1
@@ -94,17 +95,16 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INR
 
     # Clamp where the Jacobian is taken, not where the mean goes (EWA splatting's linearisation
     # explodes far outside the field of view).
-    margin_x = (settings.fov_clamp - 1) * 0.5 * camera.width / camera.fx
-    margin_y = (settings.fov_clamp - 1) * 0.5 * camera.height / camera.fy
-    left, right = camera.cx / camera.fx + margin_x, (camera.width - camera.cx) / camera.fx + margin_x
-    top, bottom = camera.cy / camera.fy + margin_y, (camera.height - camera.cy) / camera.fy + margin_y
+    left, top, right, bottom = tangent_limits(camera, settings)
     tx = np.clip(x / z, -left, right) * z
     ty = np.clip(y / z, -top, bottom) * z
-    zero = np.zeros_like(z)
+    zero, over, bent = np.zeros_like(z), z, 1.0
+    if camera.orthographic:
+        over, bent = np.ones_like(z), 0.0
     jacobian = np.stack(
         [
-            np.stack([camera.fx / z, zero, -camera.fx * tx / z**2], -1),
-            np.stack([zero, camera.fy / z, -camera.fy * ty / z**2], -1),
+            np.stack([camera.fx / over, zero, -bent * camera.fx * tx / z**2], -1),
+            np.stack([zero, camera.fy / over, -bent * camera.fy * ty / z**2], -1),
         ],
         -2,
     )
@@ -126,7 +126,7 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INR
     opacities = np.where(drawn & (opacities >= settings.alpha_min), opacities, 0)
     reach = np.sqrt(2 * np.log(np.maximum(opacities / settings.alpha_min, 1)))  # in standard deviations
     return Footprints(
-        means_px=np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1),
+        means_px=np.stack([camera.fx * x / over + camera.cx, camera.fy * y / over + camera.cy], -1),
         depths=z,
         conics=np.stack([yy / det, -xy / det, xx / det], -1),
         extents_px=np.stack([reach * np.sqrt(xx), reach * np.sqrt(yy)], -1),
@@ -160,14 +160,14 @@ def rim(f: Footprints, settings: RasterSettings, relative: float) -> Array:
     return f.extents_px * np.sqrt(1 + 2.1 * relative / squared)[:, None] + 1e-3
 
 
-class ReferenceView:
+class ReferenceView(LiftingView):
     """Blending weights of one view, recomputed Gaussian by Gaussian in every call."""
 
     def __init__(
         self, footprints: Footprints, camera: Camera, settings: RasterSettings, dropped: int
     ) -> None:
         self.camera, self.settings, self.footprints = camera, settings, footprints
-        self.dropped = dropped
+        self.count, self.dropped = len(footprints.depths), dropped
         self.order = np.argsort(footprints.depths, kind="stable")
         self.windows = self._windows()
 
@@ -247,17 +247,13 @@ class ReferenceView:
             values[step.index] = np.tensordot(step.weights, image[step.window], 2)
         return values
 
-    def contributions(self) -> Array:
-        """See `LiftingView.contributions`; float64."""
-        return self.gather(np.ones((self.camera.height, self.camera.width, 1)))[:, 0]
-
     def depth(self) -> Array:
         """See `View.depth`; float64."""
         total, alpha = self.splat(self.footprints.depths[:, None])
         return np.where(alpha > 0, total[..., 0] / np.where(alpha > 0, alpha, 1), 0)
 
     def median_depth(self) -> Array:
-        """See `MedianDepth.median_depth`; float64."""
+        """See `View.median_depth`; float64."""
         median = np.zeros((self.camera.height, self.camera.width))
         for step in self.steps():
             passed = (step.weights > 0) & (step.after <= 0.5)

@@ -51,18 +51,21 @@ def _may_reach(
 ) -> Array:
     """(N,) bool, True for every Gaussian whose footprint may cover the pixel, and for few others.
 
-    The footprint's covariance is J R S S R^T J^T + dilation, J the Jacobian (EWA splatting), so its largest
-    eigenvalue is at most |J|^2 s_max^2 + dilation with |J|^2 <= (f/z)^2 (1 + (x/z)^2 + (y/z)^2); beyond
-    sqrt(2 ln(1 / alpha_min)) deviations alpha is below the cut-off, whatever the opacity. J is taken at
-    a clamped x/z and y/z, which only makes it smaller.
+    The footprint's covariance is J R S S^T R^T J^T + dilation, J the Jacobian (EWA), so its largest
+    eigenvalue is at most |J|^2 s_max^2 + dilation with |J|^2 <= (f/z)^2 (1 + (x/z)^2 + (y/z)^2), and f^2 of
+    an orthographic camera; beyond sqrt(2 ln(1 / alpha_min)) deviations alpha is below the cut-off, whatever
+    the opacity. J is taken at a clamped x/z and y/z, which only makes it smaller.
     """
     x, y, z = np.ascontiguousarray(_in_camera(gaussians, camera).T)
     scale_x, scale_y, scale_z = gaussians.log_scales.T
     with np.errstate(all="ignore"):  # invalid rows are dropped by the view
-        x, y = x / z, y / z
-        focal = np.float32(max(camera.fx, camera.fy)) / z
-        largest = np.exp(np.maximum(np.maximum(scale_x, scale_y), scale_z))
-        variance = (focal * largest) ** 2 * (1 + x * x + y * y) + np.float32(settings.dilation)
+        largest = np.float32(max(camera.fx, camera.fy)) * np.exp(
+            np.maximum(np.maximum(scale_x, scale_y), scale_z)
+        )
+        if not camera.orthographic:
+            x, y = x / z, y / z
+            largest *= np.sqrt(1 + x * x + y * y) / z
+        variance = largest**2 + np.float32(settings.dilation)
         reach = np.sqrt(np.float32(2 * np.log(1 / settings.alpha_min)) * variance) + 1
         away = np.maximum(
             np.abs(camera.fx * x + np.float32(camera.cx - pixel[0] - 0.5)),
@@ -83,7 +86,7 @@ def _in_camera(gaussians: Gaussians, camera: Camera) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """What one camera sees of a scene; every channel is premultiplied by alpha, without background."""
+    """A scene as one camera sees it; every channel is premultiplied by alpha, without background."""
 
     colours: Array  # (H, W, 3) display colours >= 0, not clamped above
     alpha: Array  # (H, W) in [0, 1]
@@ -121,4 +124,7 @@ def colours_seen(gaussians: Gaussians, camera: Camera) -> Array:
     """(N, 3) float32 display colours >= 0 of the Gaussians as seen from the camera; invalid rows are 0."""
     from langsplat_core.raster.cpu.projection import colours  # numba: a second that OpenGL need not wait for
 
+    if camera.orthographic:
+        sights = np.broadcast_to(camera.rotation[2].astype(np.float32), gaussians.means.shape)
+        return colours(gaussians.sh, sights, np.zeros(3))
     return colours(gaussians.sh, gaussians.means, camera.position)

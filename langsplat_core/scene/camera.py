@@ -1,7 +1,7 @@
 """Intrinsics: the inner geometry of a pinhole camera, on a pixel grid of a certain size."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,26 +44,28 @@ class Intrinsics:
         return math.degrees(2 * math.atan(0.5 * min(self.width, self.height) / min(self.fx, self.fy)))
 
 
-# The pinhole camera, in OpenCV's frame: x right, y down, z forward.
+# Pinhole and orthographic cameras, in OpenCV's frame: x right, y down, z forward.
 
 FARTHEST = 1e9  # world units along an axis, of cameras in files: there, float32 positions are 64 units apart
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera without distortion.
+    """A pinhole camera without distortion, or an orthographic one.
 
-    Pixel (0, 0) is the top left one and its centre lies at (0.5, 0.5).
+    Pixel (0, 0) is the top left one and its centre lies at (0.5, 0.5). An orthographic camera looks along its
+    z axis everywhere; its focal lengths are pixels per world unit, and what lies behind it is not drawn.
     """
 
     width: int  # pixels, >= 1
     height: int  # pixels, >= 1
-    fx: float  # pixels, > 0
-    fy: float  # pixels, > 0
+    fx: float  # pixels, > 0; orthographic: pixels per world unit
+    fy: float
     cx: float  # pixels, principal point measured from the left edge
     cy: float  # pixels, principal point measured from the top edge
     world_to_camera: Array  # (4, 4) float64, rigid
     name: str = ""  # file stem of the photograph it belongs to, if any
+    orthographic: bool = False
 
     def __post_init__(self) -> None:
         matrix = np.ascontiguousarray(self.world_to_camera, dtype=np.float64)
@@ -78,7 +80,7 @@ class Camera:
 
     @property
     def position(self) -> Array:
-        """(3,) centre of projection in world units."""
+        """(3,) centre of projection, or the point of the principal pixel in the plane z = 0; world units."""
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
 
     @property
@@ -93,9 +95,8 @@ class Camera:
 
     def with_intrinsics(self, intrinsics: Intrinsics) -> "Camera":
         """Another camera in the same pose; its size must be whole pixels."""
-        size = (int(intrinsics.width), int(intrinsics.height))
-        inner = (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy)
-        return Camera(*size, *inner, self.world_to_camera, self.name)
+        inner = {name: getattr(intrinsics, name) for name in ("fx", "fy", "cx", "cy")}
+        return replace(self, width=int(intrinsics.width), height=int(intrinsics.height), **inner)
 
     def resized(self, width: int, height: int) -> "Camera":
         """The same view on another pixel grid."""
@@ -105,14 +106,14 @@ class Camera:
         """(N, 3) world points -> (N, 2) pixel positions and (N,) depths along z (may be <= 0)."""
         in_camera = points_world @ self.rotation.T + self.world_to_camera[:3, 3]
         depth = in_camera[:, 2]
-        safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
-        pixels = in_camera[:, :2] / safe[:, None] * (self.fx, self.fy) + (self.cx, self.cy)
-        return pixels, depth
+        safe = 1.0 if self.orthographic else np.where(np.abs(depth) < 1e-12, 1e-12, depth)[:, None]
+        return in_camera[:, :2] / safe * (self.fx, self.fy) + (self.cx, self.cy), depth
 
     def unproject(self, pixel_xy: tuple[float, float], depth: float) -> Array:
         """World point (3,) at a pixel position and a depth along the camera's z axis."""
         x, y = pixel_xy
-        in_camera = np.array([(x - self.cx) / self.fx * depth, (y - self.cy) / self.fy * depth, depth])
+        scale = 1.0 if self.orthographic else depth
+        in_camera = np.array([(x - self.cx) / self.fx * scale, (y - self.cy) / self.fy * scale, depth])
         return self.rotation.T @ (in_camera - self.world_to_camera[:3, 3])
 
 

@@ -1,10 +1,15 @@
-"""What every codec offers: two maps between CLIP vectors (D numbers) and latents (d numbers), in plain
-NumPy."""
+"""Codecs: how a Gaussian keeps a CLIP vector.
 
+A codec maps unit vectors of D numbers to latents of d numbers and back, in plain NumPy, so that a scene can
+be opened and searched without torch; codecs are fitted in `training.language.codec_fit`. Callers ask a codec
+for what they need (`cosines`, `distances`, `unique`) and never which kind it is.
+"""
+
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, Literal, Protocol, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -12,79 +17,138 @@ from langsplat_core.arrays import Array, check_array, unit
 from langsplat_core.errors import quoted
 
 SHORTEST = 1e-6  # a latent of numbers shorter than this has no meaning
+LARGEST = 65_535  # codewords: indices are 16 bits, and one number stays free for "no meaning"
+ROWS = 16_384  # vectors compared with all codewords at a time
+PAIRS = 65_536  # pairs of latents compared at a time
 
-# sphere: latents have length 1; flat: any vector is one; in both, a blend lies between what was blended.
-# index: a latent is one whole number that names a meaning, and numbers between two names mean nothing.
-LatentSpace = Literal["sphere", "flat", "index"]
+Layers = tuple[tuple[Array, Array], ...]  # ((out, in) weight, (out,) bias) from input to output
 
 
-class Codec(Protocol):
-    """What every codec offers; `kind` names it in the scene file."""
+class Codec(ABC):
+    """Latents of numbers, of which a blend lies between what was blended; other codecs override more."""
 
-    kind: ClassVar[str]
-    space: ClassVar[LatentSpace]
+    kind: ClassVar[str]  # its name in the scene file
+    dtype: ClassVar[type[np.generic]] = np.float32  # of latents
+    blends: ClassVar[bool] = True  # a weighted mean of latents is a latent
 
     @property
+    @abstractmethod
     def latent_dim(self) -> int:
         """d"""
 
     @property
+    @abstractmethod
     def vector_dim(self) -> int:
         """D"""
 
     @property
-    def index_size(self) -> int:
-        """Meanings that an index may name, counted from 0; 0 where latents are numbers."""
+    def size(self) -> int:
+        """The number that a report gives beside the kind: numbers per latent, or codewords."""
+        return self.latent_dim
 
+    @property
+    def spherical(self) -> bool:
+        """True where latents are unit vectors of 3 numbers, over which cosines with a text are smooth."""
+        return False
+
+    @property
+    def networks(self) -> tuple[Layers, Layers] | None:
+        """Encoder and decoder where these are linear layers with ReLU between them."""
+        return None
+
+    @abstractmethod
     def encode(self, vectors: Array) -> Array:
-        """(M, D) unit CLIP vectors -> (M, d) latents, float32 or, of an index, uint16."""
+        """(M, D) unit CLIP vectors -> (M, d) latents of the codec's type."""
 
+    @abstractmethod
     def decode(self, latents: Array) -> Array:
         """(M, d) latents -> (M, D) float32 unit vectors."""
 
-    def similarities(self, latents: Array, vectors: Array) -> Array:
-        """(M, d) latents of any length, (Q, D) unit vectors -> (M, Q) float32 cosines of what the latents
-        stand for. A blended latent is shorter than its kind but keeps its direction; zero gives zeros."""
+    @abstractmethod
+    def cosines(self, latents: Array, vectors: Array) -> Array:
+        """(M, d) latents of any length, (Q, D) unit vectors -> (M, Q) float32 cosines of the decoded latents
+        with the vectors. A blended latent is shorter than 1 but keeps its direction; zero gives zeros."""
 
+    @abstractmethod
     def tensors(self) -> dict[str, Array]:
         """Named weights, as written to the scene file."""
 
     @classmethod
+    @abstractmethod
     def from_tensors(cls, tensors: dict[str, Array]) -> Self:
         """The inverse of `tensors`; ValueError if they do not belong together."""
 
+    def to_file(self, latents: Array) -> dict[str, Array]:
+        """(3, N, d) latents as the named tensor of the scene file."""
+        return {"latents": latents}
 
-def latent_dtype(codec: type[Codec] | Codec) -> type[np.generic]:
-    """Of the latents of `codec`."""
-    return np.uint16 if codec.space == "index" else np.float32
+    @classmethod
+    def from_file(cls, tensors: Mapping[str, Array]) -> Array:
+        """The inverse of `to_file`; KeyError for a tensor that is missing."""
+        return tensors["latents"]
+
+    def check(self, latents: Array) -> None:  # noqa: B027  any numbers will do
+        """ValueError for (M, d) latents that no vector has."""
+
+    def known(self, latents: Array) -> Array:
+        """(M, d) latents -> (M,) bool, False for one without a meaning: a vector of zeros."""
+        known: Array = np.linalg.norm(latents, axis=1) > SHORTEST
+        return known
+
+    def unique(self, latents: Array) -> tuple[Array, Array]:
+        """(M, d) latents -> (U, d) distinct ones and the (M,) int64 index of each latent among them. Where
+        latents hardly ever repeat, these are the latents themselves."""
+        return latents, np.arange(len(latents))
+
+    def directions(self, latents: Array) -> Array:
+        """(M, d) latents -> (M, c) float32 unit vectors whose cosines are those of what the latents mean, or
+        close to them; zero for a latent without a meaning."""
+        return _directions(latents)[0]
+
+    def distances(self, latents: Array, first: Array, second: Array) -> Array:
+        """(M, d) latents -> (E,) 1 - cosine between the latents at the (E,) indices `first` and `second`."""
+        distinct, of = self.unique(latents)
+        directions, first, second = self.directions(distinct), of[first], of[second]
+        if len(directions) ** 2 <= len(first):
+            return np.asarray((1 - directions @ directions.T)[first, second])
+        found = np.empty(len(first), np.float32)
+        for start in range(0, len(first), PAIRS):  # the vectors may be as long as the encoder's
+            part = slice(start, start + PAIRS)
+            found[part] = 1 - np.einsum("ed,ed->e", directions[first[part]], directions[second[part]])
+        return found
+
+    def spread(self, latents: Array) -> float:
+        """The mean distance between two of (M, d) latents, M >= 1: 1 minus the squared length of their mean
+        direction."""
+        distinct, of = self.unique(latents)
+        mean = np.bincount(of, minlength=len(distinct)) @ self.directions(distinct) / len(latents)
+        return max(1 - float(mean @ mean), 0.0)
+
+    def blendable(self, latents: Array) -> Array:
+        """(M, d) latents -> (M, c) float32 numbers of which a blend lies between what was blended."""
+        return latents.astype(np.float32)
+
+    def colours(self, latents: Array, weights: Array) -> Array:
+        """(M, d) latents -> (M, 3) float32 colours in [0, 1]; near meanings have near ones.
+
+        weights: (M,) >= 0, how often each occurs.
+        """
+        return principal_colours(latents, weights)
 
 
-def meaningful(codec: Codec, latents: Array) -> Array:
-    """(M, d) latents -> (M,) whether each stands for anything: a zero vector of numbers does not."""
-    if codec.space == "index":
-        return np.ones(len(latents), bool)
-    known: Array = np.linalg.norm(latents, axis=1) > SHORTEST
-    return known
-
-
-def directions(latents: Array) -> tuple[Array, Array]:
-    """(M, d) float32 latents scaled to length 1, and (M,) whether they have a direction."""
+def _directions(latents: Array) -> tuple[Array, Array]:
+    """(M, d) latents scaled to length 1, float32, and (M,) bool, False for those without a direction."""
     length = np.linalg.norm(latents, axis=1)
     known = length > SHORTEST
     return (latents / np.where(known, length, 1)[:, None]).astype(np.float32), known
 
 
-# An orthonormal basis: decoding is one matrix product, and a cosine needs not even that.
-
-
 @dataclass(frozen=True, eq=False)
-class LinearCodec:
-    """Orthonormal rows spanning the scene's CLIP vectors."""
+class LinearCodec(Codec):
+    """An orthonormal basis of the scene's CLIP vectors: decoding is one matrix product."""
 
     basis: Array  # (d, D) float32, orthonormal rows
     kind: ClassVar[str] = "linear"
-    index_size: ClassVar[int] = 0
-    space: ClassVar[LatentSpace] = "flat"
 
     def __post_init__(self) -> None:
         check_array("codec basis", self.basis, ("d", "D"), dtype=np.float32)
@@ -103,9 +167,9 @@ class LinearCodec:
     def decode(self, latents: Array) -> Array:
         return unit(np.asarray(latents, np.float32) @ self.basis)
 
-    def similarities(self, latents: Array, vectors: Array) -> Array:
+    def cosines(self, latents: Array, vectors: Array) -> Array:
         # cos(B^T l, q) = l.(B q) / |l| for orthonormal rows of B: the big vectors never appear.
-        towards, known = directions(latents)
+        towards, known = _directions(latents)
         return np.where(known[:, None], towards @ (vectors @ self.basis.T).T, 0).astype(np.float32)
 
     def tensors(self) -> dict[str, Array]:
@@ -118,21 +182,14 @@ class LinearCodec:
         return cls(tensors["basis"])
 
 
-# The scene-wise autoencoder of LangSplat (section 3.2 of the paper), batch normalisation already folded into
-# the linear layers; latents have length 1.
-
-Layers = tuple[tuple[Array, Array], ...]  # ((out, in) weight, (out,) bias) from input to output
-
-
 @dataclass(frozen=True, eq=False)
-class AutoencoderCodec:
-    """Multi-layer perceptrons in both directions, with ReLU between layers and unit-length outputs."""
+class AutoencoderCodec(Codec):
+    """The scene-wise autoencoder of LangSplat (section 3.2 of the paper): linear layers with ReLU between
+    them, batch normalisation folded in; latents have length 1."""
 
     encoder: Layers
     decoder: Layers
     kind: ClassVar[str] = "autoencoder"
-    index_size: ClassVar[int] = 0
-    space: ClassVar[LatentSpace] = "sphere"
 
     def __post_init__(self) -> None:
         for name, layers in (("encoder", self.encoder), ("decoder", self.decoder)):
@@ -152,14 +209,22 @@ class AutoencoderCodec:
     def vector_dim(self) -> int:
         return int(self.encoder[0][0].shape[1])
 
+    @property
+    def spherical(self) -> bool:
+        return self.latent_dim == 3
+
+    @property
+    def networks(self) -> tuple[Layers, Layers]:
+        return self.encoder, self.decoder
+
     def encode(self, vectors: Array) -> Array:
         return unit(_run(self.encoder, np.asarray(vectors, np.float32)))
 
     def decode(self, latents: Array) -> Array:
         return unit(_run(self.decoder, np.asarray(latents, np.float32)))
 
-    def similarities(self, latents: Array, vectors: Array) -> Array:
-        towards, known = directions(latents)
+    def cosines(self, latents: Array, vectors: Array) -> Array:
+        towards, known = _directions(latents)
         return np.where(known[:, None], self.decode(towards) @ vectors.T, 0).astype(np.float32)
 
     def tensors(self) -> dict[str, Array]:
@@ -175,7 +240,7 @@ class AutoencoderCodec:
         return cls(_layers(tensors, "encoder"), _layers(tensors, "decoder"))
 
 
-def _run(layers: tuple[tuple[Array, Array], ...], x: Array) -> Array:
+def _run(layers: Layers, x: Array) -> Array:
     """Linear layers with ReLU between them; weights are (out, in)."""
     for index, (weight, bias) in enumerate(layers):
         x = x @ weight.T + bias
@@ -195,33 +260,32 @@ def _layers(tensors: dict[str, Array], part: str) -> Layers:
     return layers
 
 
-# A scene's own codebook: K unit vectors in CLIP space, and a latent is the number of one of them.
-#
-# A scene means a countable number of things. A phrase costs one (K, D) product and a fetch per Gaussian, and
-# what is fetched is an exact cosine with a vector of CLIP's own space: nothing is decoded.
-
-LARGEST = 65_535  # codewords: indices are 16 bits, and one number stays free for "no meaning"
-ROWS = 16_384  # vectors compared with all codewords at a time
-
-
 @dataclass(frozen=True, eq=False)
-class CodebookCodec:
-    """Codewords, and a colour for each by which people tell them apart."""
+class CodebookCodec(Codec):
+    """K unit vectors in CLIP space; a latent is the number of one of them, and blended numbers mean nothing.
+
+    A scene means a countable number of things. A phrase costs one (K, D) product and a fetch per Gaussian,
+    and what is fetched is an exact cosine with a vector of CLIP's own space.
+    """
 
     vectors: Array  # (K, D) float32 unit vectors, 1 <= K <= LARGEST
-    colours: Array  # (K, 3) float32 in [0, 1]; near codewords have near colours
+    palette: Array  # (K, 3) float32 in [0, 1]; near codewords have near colours
     kind: ClassVar[str] = "codebook"
-    space: ClassVar[LatentSpace] = "index"
-    latent_dim: ClassVar[int] = 1
+    dtype: ClassVar[type[np.generic]] = np.uint16
+    blends: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         dims = check_array("codec vectors", self.vectors, ("K", "D"), dtype=np.float32)
-        check_array("codec colours", self.colours, ("K", 3), dims, dtype=np.float32)
+        check_array("codec colours", self.palette, ("K", 3), dims, dtype=np.float32)
         if not 1 <= dims["K"] <= LARGEST:
             raise ValueError(f"codec vectors: {dims['K']} codewords; from 1 to {LARGEST} can be numbered")
 
     @property
-    def index_size(self) -> int:
+    def latent_dim(self) -> int:
+        return 1
+
+    @property
+    def size(self) -> int:
         return len(self.vectors)
 
     @property
@@ -238,12 +302,45 @@ class CodebookCodec:
     def decode(self, latents: Array) -> Array:
         return self.vectors[latents[:, 0]]
 
-    def similarities(self, latents: Array, vectors: Array) -> Array:
-        cosines: Array = (self.vectors @ vectors.T).astype(np.float32)[latents[:, 0]]
-        return cosines
+    def cosines(self, latents: Array, vectors: Array) -> Array:
+        if 2 * len(latents) < len(self.vectors):
+            few: Array = self.decode(latents) @ vectors.T
+            return few.astype(np.float32)
+        every: Array = (self.vectors @ vectors.T).astype(np.float32)
+        return every[latents[:, 0]]
+
+    def to_file(self, latents: Array) -> dict[str, Array]:
+        return {"codes": latents[..., 0]}
+
+    @classmethod
+    def from_file(cls, tensors: Mapping[str, Array]) -> Array:
+        return tensors["codes"][..., None]
+
+    def check(self, latents: Array) -> None:
+        if latents.max(initial=0) >= len(self.vectors):
+            raise ValueError(
+                f"latents: {latents.max()} is not the number of one of {len(self.vectors)} codewords"
+            )
+
+    def known(self, latents: Array) -> Array:
+        return np.ones(len(latents), bool)
+
+    def unique(self, latents: Array) -> tuple[Array, Array]:
+        used = np.bincount(latents[:, 0], minlength=1) > 0
+        numbers = np.cumsum(used) - 1
+        return np.flatnonzero(used).astype(np.uint16)[:, None], numbers[latents[:, 0]]
+
+    def directions(self, latents: Array) -> Array:
+        return self.decode(latents)
+
+    def blendable(self, latents: Array) -> Array:
+        return self.palette[latents[:, 0]]
+
+    def colours(self, latents: Array, weights: Array) -> Array:
+        return self.palette[latents[:, 0]]
 
     def tensors(self) -> dict[str, Array]:
-        return {"vectors": self.vectors, "colours": self.colours}
+        return {"vectors": self.vectors, "colours": self.palette}
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, Array]) -> "CodebookCodec":
@@ -292,25 +389,6 @@ def _quantiles(values: Array, weights: Array) -> tuple[float, float]:
     low, high = np.searchsorted(below, np.array([0.02, 0.98]) * below[-1]).clip(max=len(order) - 1)
     return float(values[order[low]]), float(values[order[high]])
 
-
-# Codecs: how a Gaussian keeps a CLIP vector.
-#
-# Fitting lives in `training.language`; here are the weights and the maps, so that a scene can be opened and
-# queried without torch. A new kind is one file and one row of `KINDS`.
-
-__all__ = [
-    "KINDS",
-    "SHORTEST",
-    "AutoencoderCodec",
-    "CodebookCodec",
-    "Codec",
-    "LatentSpace",
-    "LinearCodec",
-    "codec_from_tensors",
-    "latent_dtype",
-    "meaningful",
-    "principal_colours",
-]
 
 KINDS: Mapping[str, type[Codec]] = MappingProxyType(
     {codec.kind: codec for codec in (CodebookCodec, AutoencoderCodec, LinearCodec)}

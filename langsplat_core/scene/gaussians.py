@@ -1,6 +1,6 @@
 """The Gaussians of a scene, stored as the INRIA PLY stores them: raw, not activated."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -74,7 +74,7 @@ class Gaussians:
         return counts
 
     def _requirements(self) -> tuple[tuple[str, Any], ...]:
-        """What a row must fulfil to be drawn: name of the fault, (N,) True where there is none."""
+        """Requirements of a row that is drawn: name of the fault, (N,) True where there is none."""
         with np.errstate(over="ignore", invalid="ignore"):
             length_squared = (self.quats_wxyz.astype(np.float64) ** 2).sum(1)
             sound_colour = (np.abs(self.sh) <= LARGEST_COEFFICIENT).all((1, 2))
@@ -117,7 +117,7 @@ class Merged:
 
 
 class _Part(NamedTuple):
-    """What becomes of some groups."""
+    """Merged Gaussians of some groups."""
 
     gaussians: Gaussians
     sources: Array  # (m, GROUP) rows of the original; only the first counts where its weight is 1
@@ -206,3 +206,9 @@ def _ellipsoids(covariances: Array) -> tuple[Array, Array, Array]:
     quats = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1) if len(axes) else np.zeros((0, 4))
     scales = np.sqrt(np.maximum(variances, _TINY))
     return np.minimum(np.log(scales), 80.0), quats, _area(scales)
+
+
+def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
+    """Return the rows of at least one part, of the same SH degree, one after the other."""
+    names = [field.name for field in fields(Gaussians)]
+    return Gaussians(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))

@@ -1,5 +1,4 @@
-"""How phrases are written: the one place that says which marks of a text count, where one phrase ends and the
-next begins, and when two of them are the same.
+"""Phrases as they are written, calibration of an encoder, and the language field of a scene.
 
 Quotes and punctuation around words are marks of writing and no part of a phrase: an encoder that met them
 would answer another question, and the demo encoder's tokenizer would end the phrase there.
@@ -13,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array, sigmoid
-from langsplat_core.scene.codec import Codec, latent_dtype, meaningful
+from langsplat_core.scene.codec import Codec
 
 _SEPARATE = re.compile(r"[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)", re.IGNORECASE)
 _APOSTROPHES = str.maketrans(dict.fromkeys("’‘ʼ′＇´`", "'"))
@@ -32,7 +31,7 @@ def tidy(text: str) -> str:
 
 
 def phrase_key(text: str) -> str:
-    """What a phrase is looked up and encoded by: its words, in lower case as CLIP's tokenizers have them."""
+    """Key by which a phrase is looked up and encoded: its words, in lower case as of CLIP's tokenizers."""
     return " ".join(token for token in tokens(text) if token != ",").lower()
 
 
@@ -148,11 +147,8 @@ class LanguageField:
 
     def __post_init__(self) -> None:
         d, big = self.codec.latent_dim, self.codec.vector_dim
-        dims = check_array("latents", self.latents, (len(LEVELS), "N", d), dtype=latent_dtype(self.codec))
-        if self.codec.index_size and self.latents.max(initial=0) >= self.codec.index_size:
-            raise ValueError(
-                f"latents: {self.latents.max()} is not the number of one of {self.codec.index_size} codewords"
-            )
+        dims = check_array("latents", self.latents, (len(LEVELS), "N", d), dtype=self.codec.dtype)
+        self.codec.check(self.latents.reshape(-1, d))
         check_array("confidence", self.confidence, (len(LEVELS), "N"), dims, dtype=np.float32)
         check_array("canonical", self.canonical, ("C", big), dtype=np.float32)
         if len(self.canonical) == 0:
@@ -172,7 +168,7 @@ class LanguageField:
     @property
     def known(self) -> Array:
         """(3, N) whether a Gaussian has a meaning at a level."""
-        flat = meaningful(self.codec, self.latents.reshape(-1, self.latents.shape[2]))
+        flat = self.codec.known(self.latents.reshape(-1, self.latents.shape[2]))
         known: Array = (self.confidence > 0) & flat.reshape(self.confidence.shape)
         return known
 

@@ -15,7 +15,7 @@ from langsplat_core.scene.language import LanguageField
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What `load_scene` returns and every renderer and query takes."""
+    """Gaussians with all that is known of them: `load_scene` returns one, renderers and queries take one."""
 
     gaussians: Gaussians
     language: LanguageField | None = None

@@ -20,7 +20,6 @@ import numpy as np
 
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.scene import Codec, Reading
-from langsplat_core.scene.codec import meaningful
 
 FLOOR = 0.5  # no closer to the phrase than to the closest of "object", "things", "stuff", "texture"
 MIN_HEAT_SPAN = 0.1  # a peak closer than this to the floor is not stretched to full heat
@@ -53,11 +52,11 @@ def latent_relevancy(
     """(M, d) latents of any length, (Q, D), (C, D) -> (M, Q) relevancy of what they stand for, exact, in
     bounded memory. A latent without meaning gets relevancy 0."""
     out = np.zeros((len(latents), len(phrases)), np.float32)
-    known = np.flatnonzero(meaningful(codec, latents))
+    known = np.flatnonzero(codec.known(latents))
     texts = np.concatenate([phrases, canonical])
     for start in range(0, len(known), CHUNK):
         rows = known[start : start + CHUNK]
-        cosines = codec.similarities(latents[rows], texts)
+        cosines = codec.cosines(latents[rows], texts)
         nearest = cosines[:, len(phrases) :].max(1, keepdims=True)
         out[rows] = from_cosines(cosines[:, : len(phrases)], nearest, temperature)
     return out

@@ -56,7 +56,7 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.encoders import load_encoder
 from langsplat_core.semantics.sam import grid_points, load_segmenter
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.mask_weights import find_memberships
+from langsplat_core.training.language.mask_weights import find_mask_weights
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 from tests.support.full_size import MODELS, PHOTOGRAPH
 
@@ -109,7 +109,7 @@ TINY = Plan(
     crops=1,
     batches=1,
     million=500,
-    tests=("tests/raster/test_one_pixel.py", "-k", "reference"),
+    tests=("tests/raster/test_render.py", "-k", "reference"),
 )
 PLANS = {"full": FULL, "tiny": TINY}
 
@@ -403,7 +403,7 @@ def masked_views(scene: Scene, plan: Plan) -> list[tuple[Camera, ImageFeatures]]
     return views
 
 
-# Memberships of masks, W^T onehot(mask), through gsplat's gradients and through the CPU's walk.
+# Mask weights, W^T onehot(mask), through gsplat's gradients and through the CPU's walk.
 
 
 def measure_lifting(plan: Plan) -> Iterator[str]:
@@ -416,9 +416,9 @@ def measure_lifting(plan: Plan) -> Iterator[str]:
     found, rows = {}, []
     for name in ("cpu", "cuda"):
         rasterizer = load_lifting_rasterizer(name)
-        find_memberships(rasterizer, scene.gaussians, views[:1])
+        find_mask_weights(rasterizer, scene.gaussians, views[:1])
         start = time.perf_counter()
-        members = find_memberships(rasterizer, scene.gaussians, views, settings=gsplat.drawn_settings(INRIA))
+        members = find_mask_weights(rasterizer, scene.gaussians, views, settings=gsplat.drawn_settings(INRIA))
         rows.append((name, time.perf_counter() - start, sum(len(pairs) for pairs in members.pairs)))
         found[name] = members.pairs
     yield table(("backend", "seconds", "pairs of Gaussian and mask"), rows)

@@ -1,8 +1,9 @@
 """`python -m tests.benchmarks rooms|verdicts|phrases|lifting|scale`: one report each."""
 
 import sys
+from typing import Union
 
-from langsplat_core.cli.run import Command, main, parsed
+from langsplat_core.cli.run import Command, main, parsed, with_codec
 from tests.benchmarks.lifting import Lifting
 from tests.benchmarks.phrases import Phrases
 from tests.benchmarks.rooms import Rooms
@@ -15,7 +16,8 @@ PROGRAM = "python -m tests.benchmarks"
 def parse(args: list[str]) -> Command:
     """The report that the words of a command line name; SystemExit as tyro raises it."""
     about = "Measure this project where the truth is known, and at large sizes."
-    command: Command = parsed(PROGRAM, Rooms | Verdicts | Phrases | Lifting | Scale, args, about)
+    reports = tuple(with_codec(report, args) for report in (Rooms, Verdicts, Phrases, Lifting, Scale))
+    command: Command = parsed(PROGRAM, Union[(*reports,)], args, about)
     return command
 
 

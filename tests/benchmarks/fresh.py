@@ -81,11 +81,11 @@ def _read_by_plyfile(path: Path) -> list[Array]:
 def lift(count: int, views: int, picture: tuple[int, int]) -> dict[str, Any]:
     """Seconds, bytes and relevancy error of lifting random masks onto random Gaussians."""
     from langsplat_core.bench.measure import random_scene
-    from langsplat_core.config import CodecConfig, TrainConfig
+    from langsplat_core.config import CodebookConfig, TrainConfig
     from langsplat_core.pipeline.language import language_field
     from langsplat_core.progress import silent
 
-    config = TrainConfig(codec=CodecConfig(size=1_024))
+    config = TrainConfig(codec=CodebookConfig(size=1_024))
     gaussians = random_scene(count)
     with tempfile.TemporaryDirectory(prefix="langsplat_lift_") as folder:
         start = time.perf_counter()

@@ -14,7 +14,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.bench.measure import markdown
-from langsplat_core.config import CodecConfig, Count, LevelChoice, LiftConfig
+from langsplat_core.config import CodebookConfig, Count, LevelChoice, LiftConfig, LinearConfig
 from langsplat_core.errors import InputError
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import QueryEngine
@@ -99,10 +99,10 @@ def methods(command: Lifting, masks: MaskOrigin, dim: int) -> list[Variant]:
         replace(paper, name="one-pass latents, answers blended", query="blend answers"),
         replace(ours, name="ours, mean and autoencoder d = 3", codec=latent, lift=LiftConfig(mode="mean")),
         replace(ours, name="ours, autoencoder d = 3", codec=latent),
-        replace(ours, name="ours, 64 linear numbers", codec=CodecConfig(kind="linear", latent_dim=64)),
+        replace(ours, name="ours, 64 linear numbers", codec=LinearConfig(latent_dim=64)),
     ]
     made += [
-        replace(ours, name=f"ours, codebook of {size}", codec=CodecConfig(size=size))
+        replace(ours, name=f"ours, codebook of {size}", codec=CodebookConfig(size=size))
         for size in (256, 1_024, 4_096)
     ]
     made.append(replace(ours, name=f"ours, all {dim} numbers", codec=ceiling(dim)))

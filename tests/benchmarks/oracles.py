@@ -14,7 +14,7 @@ from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import LEVELS, Camera, Gaussians
 from langsplat_core.semantics.masks import LevelMasks
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.mask_weights import MaskGroups, find_memberships
+from langsplat_core.training.language.mask_weights import MaskGroups, find_mask_weights
 
 SIDES = (1 / 16, 1 / 8, 1 / 4)  # of the picture's height, at the levels subpart, part, whole
 
@@ -82,7 +82,7 @@ def true_labels(
         rows, numbers = _as_rows(ids)
         described.append((camera, ImageFeatures(rows, np.zeros((len(numbers), 1), np.float32))))
         columns.append(numbers)
-    members = find_memberships(rasterizer, gaussians, described, progress=progress)
+    members = find_mask_weights(rasterizer, gaussians, described, progress=progress)
     known, group = np.unique(np.concatenate(columns), return_inverse=True)
     edges = np.cumsum([len(numbers) for numbers in columns])[:-1]
     groups = MaskGroups(tuple(np.split(group.astype(np.int32), edges)), np.zeros((len(known), 1), np.float32))

@@ -22,12 +22,15 @@ from assets.making.truth import Truth, TruthMasks, read_truth
 from langsplat_core.arrays import Array
 from langsplat_core.cli.checks import OutFolder
 from langsplat_core.config import (
+    AutoencoderConfig,
     ClipConfig,
+    CodebookConfig,
     CodecConfig,
     Count,
     DatasetConfig,
     LevelChoice,
     LiftConfig,
+    LinearConfig,
     MaskConfig,
     PictureConfig,
     RadianceConfig,
@@ -110,20 +113,20 @@ class Variant:
     name: str
     masks: MaskOrigin
     vectors: Literal["image", "text"] = "image"  # text: of every region's true words
-    codec: CodecConfig = CodecConfig()  # noqa: RUF009 (frozen)
+    codec: CodecConfig = CodebookConfig()  # noqa: RUF009 (frozen)
     lift: LiftConfig = LiftConfig()  # noqa: RUF009
     query: Literal["blend answers", "paper"] = "blend answers"  # paper: blend latents, then decode
     level: LevelChoice = "auto"  # that is asked
 
 
-def autoencoder(d: int = 3, steps: int = 4_000) -> CodecConfig:
+def autoencoder(d: int = 3, steps: int = 4_000) -> AutoencoderConfig:
     """The paper's codec."""
-    return CodecConfig(kind="autoencoder", latent_dim=d, steps=steps)
+    return AutoencoderConfig(latent_dim=d, steps=steps)
 
 
 def ceiling(dim: int) -> CodecConfig:
     """A codec that loses nothing: all `dim` numbers."""
-    return CodecConfig(kind="linear", latent_dim=dim)
+    return LinearConfig(latent_dim=dim)
 
 
 def weights_digest(model: str) -> str:

@@ -11,7 +11,7 @@ from assets.making.config import TIERS, Tier
 from assets.making.objects import EVERYTHING
 from assets.making.truth import PHRASE_KINDS, read_truth
 from langsplat_core.bench.measure import markdown
-from langsplat_core.config import CodecConfig, Count, DatasetConfig, LiftConfig
+from langsplat_core.config import CodebookConfig, CodecConfig, Count, DatasetConfig, LiftConfig
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import load_scene
@@ -56,7 +56,7 @@ class Rooms(InRooms):
     seeds: Seeds = (101,)
     """One room of every tier each; never the bundled scene's."""
     masks: MaskOrigin = "truth"  # where outlines come from
-    codec: CodecConfig = field(default_factory=CodecConfig)
+    codec: CodecConfig = field(default_factory=CodebookConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     ceiling: bool = False  # also keep all of the encoder's numbers, by which a codec is judged
     budget: bool = False  # also swap one stage at a time for one that makes no mistake

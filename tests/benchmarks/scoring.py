@@ -352,7 +352,7 @@ def measured(
 
 def codec_name(codec: Codec) -> str:
     """Such as "codebook 512" or "autoencoder 3"."""
-    return f"{codec.kind} {codec.index_size or codec.latent_dim}"
+    return f"{codec.kind} {codec.size}"
 
 
 def separation(present: Array, absent: Array) -> float:

@@ -151,7 +151,7 @@ def test_truth_masks_are_the_truth(run, capture):
         ("phrases --seeds", "give at least one number"),
         ("rooms --tiers", "at least one of --tiers"),
         ("rooms --views 5", "--views 5: must be 8 to"),
-        ("rooms --codec.batch 1", "--codec.batch 1"),
+        ("rooms --codec.kind autoencoder --codec.batch 1", "--codec.batch 1"),
         ("rooms --scene a.ply", "belong together"),
         ("rooms --paper-order", "needs --scene"),
         ("rooms --encoder clip-geometry:0.9", "no vectors have these cosines"),

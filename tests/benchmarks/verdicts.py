@@ -23,7 +23,7 @@ from assets.making.vocabulary import part_words
 from langsplat_core.arrays import Array
 from langsplat_core.bench.measure import markdown
 from langsplat_core.cli.checks import OutFile
-from langsplat_core.config import CodecConfig
+from langsplat_core.config import CodebookConfig, CodecConfig
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.progress import TerminalProgress
@@ -52,7 +52,7 @@ class Verdicts(InRooms):
     rates, the ROC curve's area, and how well the probabilities are calibrated."""
 
     masks: MaskOrigin = "truth"  # where outlines come from
-    codec: CodecConfig = field(default_factory=CodecConfig)
+    codec: CodecConfig = field(default_factory=CodebookConfig)
     fit: OutFile | None = None
     """Fit the encoder's calibration to these rooms and write it into this reading.json; measure elsewhere."""
 

@@ -15,15 +15,7 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.foreign import ForeignScene, read_foreign
 from langsplat_core.io.ply import write_ply
 from langsplat_core.scene import Gaussians
-from tests.support.foreign_files import (
-    autoencoder,
-    faiss_index,
-    geometry,
-    save_fvdb,
-    save_model,
-    tensor,
-    training_state,
-)
+from tests.support.foreign_files import autoencoder, faiss_index, geometry, save_model, tensor, training_state
 from tests.support.same import assert_same
 from tests.support.scenes import random_gaussians
 
@@ -99,7 +91,7 @@ def test_levels_may_be_missing_and_are_told_apart(tmp_path):
     np.testing.assert_array_equal(rows(got, 0), LATENTS[0])
     np.testing.assert_array_equal(rows(got, 2), LATENTS[2])
     assert got.levels[1] is None
-    assert "without meanings: part" in got.notes
+    assert "without features: part" in got.notes
     nameless = [save_model(tmp_path / f"{name}.pth", G, tensor(LATENTS[i])) for i, name in enumerate("xyz")]
     assert "by their order" in read_foreign([*nameless, ae]).notes[0]
     assert "one alone is taken for the whole" in read_foreign([nameless[0], ae]).notes[0]
@@ -136,27 +128,6 @@ def test_langsplat_v2(tmp_path):
     want[5] = 0
     np.testing.assert_allclose(rows(got, 1), want, atol=1e-5)
     assert got.levels[0] is got.levels[2] is None
-
-
-def test_fvdb(tmp_path):
-    logits = rng.normal(size=(N, 2 * 16)).astype(np.float32)
-    codebooks = rng.normal(size=(2, 16, D)).astype(np.float32)
-    write_ply(tmp_path / "scene.ply", G)
-    path = save_fvdb(tmp_path / "any.pt", logits, codebooks, level=1, topk=3)
-    got = read_foreign([path, tmp_path / "scene.ply"])
-    np.testing.assert_allclose(rows(got, 0), mixture(logits, codebooks, 3), atol=1e-5)
-    assert_same(got.scene.gaussians, G)
-    with pytest.raises(InputError, match="keeps no Gaussians; name the scene's PLY"):
-        read_foreign([path])
-    write_ply(tmp_path / "other.ply", random_gaussians(N + 1))
-    with pytest.raises(FormatError, match="features of 20 Gaussians, the scene has 21"):
-        read_foreign([path, tmp_path / "other.ply"])
-    default = save_fvdb(tmp_path / "default.pt", logits, codebooks, level=0)
-    with pytest.raises(InputError, match="of which levels"):
-        read_foreign([default, tmp_path / "scene.ply"])
-    torch.save({"magic": "LangSplatV2Checkpoint", "model": {"a": torch.zeros(3)}}, tmp_path / "no.pt")
-    with pytest.raises(FormatError, match="0 tensors of logits"):
-        read_foreign([tmp_path / "no.pt", tmp_path / "scene.ply"])
 
 
 def occam(folder: Path, kept: tuple[Array, ...]) -> list[Path]:
@@ -210,10 +181,7 @@ def test_dr_splat(tmp_path):
         got = read_foreign([path, tmp_path / "pq_index.faiss"])
         np.testing.assert_array_equal(rows(got, 0), want)
     np.save(tmp_path / "a.npy", CENTROIDS)
-    np.savez(tmp_path / "a.npz", centroids=CENTROIDS)
-    torch.save(torch.from_numpy(CENTROIDS), tmp_path / "a.pt")
-    for name in ("a.npy", "a.npz", "a.pt"):
-        np.testing.assert_array_equal(rows(read_foreign([tmp_path / name, path]), 0), want)
+    np.testing.assert_array_equal(rows(read_foreign([tmp_path / "a.npy", path]), 0), want)
     with pytest.raises(InputError, match=r"name its pq_index\.faiss"):
         read_foreign([path])
     np.save(tmp_path / "a.npy", CENTROIDS[:3])
@@ -240,7 +208,7 @@ def test_open_gaussian(tmp_path, as_ply):
         write_ply(path, G, extras=dict(zip(names, instance.T, strict=True)))
     else:
         path = save_model(tmp_path / "chkpnt90000.pth", G, tensor(instance), tensor(instance))
-        with pytest.raises(InputError, match=r"name its cluster_lang\.npz"):
+        with pytest.raises(InputError, match=r"cluster_lang\.npz, name it too"):
             read_foreign([path])
     got = read_foreign([path, tmp_path / "cluster_lang.npz"])
     assert got.method == "OpenGaussian"
@@ -404,36 +372,3 @@ def test_damaged_quantisers(tmp_path):
         refused([path, checkpoint], message)
     np.savez(tmp_path / "x.npz", a=np.zeros((3, 4)))
     refused([tmp_path / "x.npz", checkpoint], r"holds arrays \(3, 4\)")
-
-
-SAMPLES = {
-    "checkpoint": lambda folder: save_model(folder / "c.pth", G.take(ALL[:4]), tensor(VECTORS[0][:4])),
-    "autoencoder": lambda folder: best_ckpt(folder, encoder=(8, 3), decoder=(5,)),
-}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", SAMPLES)
-def test_damage_anywhere_is_one_line(tmp_path, kind):
-    path = SAMPLES[kind](tmp_path)
-    plain = save_model(tmp_path / "plain_1.pth", G.take(ALL[:4]), tensor(LATENTS[0][:4]))
-    given = [path] if kind == "checkpoint" else [path, plain]
-    good, messages = path.read_bytes(), []
-    generator = np.random.default_rng(0)
-    for round_ in range(150):
-        data = bytearray(good)
-        place = int(generator.integers(len(data)))
-        match round_ % 3:
-            case 0:
-                data = data[:place]
-            case 1:
-                data[place : place + 4] = generator.bytes(4)
-            case _:
-                del data[place : place + int(generator.integers(1, 9))]
-        path.write_bytes(bytes(data))
-        try:
-            read_foreign(given)
-        except InputError as error:
-            messages.append(str(error))
-    assert len(messages) > 40
-    assert all("\n" not in message and str(tmp_path) in message for message in messages)

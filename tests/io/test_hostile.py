@@ -1,4 +1,4 @@
-"""Archives that lie or use what nobody needs: one error each."""
+"""Archives, arrays, pictures and clouds of points that are malformed, and files made to exhaust memory."""
 
 import gzip
 import io
@@ -32,17 +32,8 @@ from langsplat_core.io.language import read_language, write_language
 from langsplat_core.io.ply import read_ply
 from langsplat_core.io.ply_table import GREY, read_cloud
 from langsplat_core.io.scenes import load_gaussians
-from langsplat_core.io.sog import read_sog
-from langsplat_core.io.splat import read_ksplat
 from langsplat_core.io.spz import read_spz_scene
-from tests.support.file_samples import (
-    ksplat_bytes,
-    plain_ply,
-    random_field,
-    sog_files,
-    spz_bytes,
-    write_folder,
-)
+from tests.support.file_samples import plain_ply, random_field, sog_files, spz_bytes, write_folder
 from tests.support.scenes import random_gaussians
 
 
@@ -59,11 +50,6 @@ def read(folder: Path, data: bytes, name: str = "a", limit: int = 10_000) -> byt
         return archive.read(name, limit)
 
 
-@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
-def test_members_are_read(tmp_path: Path, method: int) -> None:
-    assert read(tmp_path, packed(method)) == b"content" * 100
-
-
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
 def test_other_methods_are_refused_before_they_run(tmp_path: Path, method: int) -> None:
     with pytest.raises(FormatError, match=f"packed by method {method}; pack the archive again with deflate"):
@@ -74,19 +60,6 @@ def test_what_unfolds_beyond_the_limit_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="has more than 699 bytes"):
         read(tmp_path, packed(zipfile.ZIP_DEFLATED), limit=699)
     assert len(read(tmp_path, packed(zipfile.ZIP_DEFLATED), limit=700)) == 700
-
-
-def test_every_changed_byte_is_one_error_or_none(tmp_path: Path) -> None:
-    """zipfile raises IndexError, struct.error, zlib.error, NotImplementedError ... over these."""
-    good, messages = packed(zipfile.ZIP_DEFLATED), []
-    for place in range(len(good)):
-        for value in (0, 255, good[place] ^ 1):
-            try:
-                read(tmp_path, good[:place] + bytes([value]) + good[place + 1 :])
-            except FormatError as error:
-                messages.append(str(error))
-    assert len(messages) > len(good)
-    assert all(message.isprintable() for message in messages)
 
 
 def test_an_array_of_text_that_is_none(tmp_path: Path) -> None:
@@ -140,7 +113,7 @@ def test_integers_beyond_any_float(tmp_path: Path) -> None:
     [
         ("element vertex", "element corner", "no element 'vertex'"),
         ("property double y", "property double q", "no number 'y'"),
-        ("property double z", "property list uchar int l\nproperty double z", "hold lists"),
+        ("property double z", "property list uchar int l\nproperty double z", "holds lists"),
         ("element vertex 1", "element vertex 1000000000000", "truncated"),
     ],
 )
@@ -270,29 +243,6 @@ def test_whatever_a_decoder_raises_is_one_error(tmp_path: Path, error: type[Exce
     assert caught.value.reason == "damaged: inside Pillow"
 
 
-def test_what_the_reader_itself_refuses_is_kept() -> None:
-    with pytest.raises(FormatError, match="too small"), opened(saved("PNG")):
-        raise FormatError("too small")
-
-
-def test_damaged_tiff_says_nothing_on_the_standard_error(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], recwarn: pytest.WarningsRecorder
-) -> None:
-    """libtiff's own messages, Pillow's loggers and its warnings about tags."""
-    good = saved("TIFF", compression="tiff_lzw")
-    rng = np.random.default_rng(0)
-    refused = 0
-    for place in range(8, len(good), 31):
-        (tmp_path / "a.tif").write_bytes(good[:place] + rng.bytes(3) + good[place + 3 :])
-        try:
-            read_photo(tmp_path / "a.tif", upright=True)
-        except PictureError:
-            refused += 1
-    assert refused > 3
-    assert capfd.readouterr().err == ""
-    assert not recwarn.list
-
-
 def test_warnings_are_back_when_the_last_picture_is_closed() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -334,7 +284,7 @@ def test_images_that_unfold_to_gigabytes(tmp_path, bounded, name, width):
     files = sog_files(SCENE)
     files[name] = webp_that_claims(width, 16384)
     with pytest.raises(FormatError, match=name):
-        read_sog(write_folder(tmp_path / "a", files))
+        load_gaussians(write_folder(tmp_path / "a", files))
 
 
 def test_a_count_that_the_images_would_have_to_be_bombs_for(tmp_path, bounded):
@@ -345,7 +295,7 @@ def test_a_count_that_the_images_would_have_to_be_bombs_for(tmp_path, bounded):
         files[name] = webp_that_claims(16384, 16384)
     files["meta.json"] = json.dumps(meta).encode()
     with pytest.raises(FormatError, match="too few for 268435456 Gaussians"):
-        read_sog(write_folder(tmp_path / "a", files))
+        load_gaussians(write_folder(tmp_path / "a", files))
 
 
 @pytest.mark.long
@@ -361,7 +311,7 @@ def test_an_archive_that_unfolds_to_gigabytes(tmp_path, bounded):
                 member.write(bytes(1 << 20))
     assert path.stat().st_size < 1 << 20
     with pytest.raises(FormatError, match=r"'quats\.webp' inside has more than"):
-        read_sog(path)
+        load_gaussians(path)
 
 
 def test_a_meta_of_gigabytes(tmp_path, bounded):
@@ -370,7 +320,7 @@ def test_a_meta_of_gigabytes(tmp_path, bounded):
     with (folder / "meta.json").open("wb") as file:
         file.truncate(3 << 30)  # a hole: takes no room on the disk
     with pytest.raises(FormatError, match=r"meta\.json: 3221225472 bytes; expected at most"):
-        read_sog(folder)
+        load_gaussians(folder)
     with pytest.raises(FormatError, match="never exceeds"):
         read_cameras(folder / "meta.json")
 
@@ -427,16 +377,6 @@ def test_spz_4_streams_that_unfold_to_gigabytes(tmp_path, bounded):
         read_spz_scene(path)
 
 
-@pytest.mark.parametrize("at", [4, 16, 4096, 4100, 4108, 4132])
-@pytest.mark.parametrize("count", [10**6, 2**31, 2**32 - 1])
-def test_ksplat_counts_of_what_is_not_there(tmp_path, bounded, at, count):
-    content = bytearray(ksplat_bytes([SCENE], 1))
-    struct.pack_into("<I", content, at, count)
-    (tmp_path / "a.ksplat").write_bytes(content)
-    with pytest.raises(FormatError):
-        read_ksplat(tmp_path / "a.ksplat")
-
-
 @pytest.mark.parametrize("name", ["a.ksplat", "a.spz"])
 def test_files_of_a_terabyte_of_nothing(tmp_path, bounded, name):
     with (tmp_path / name).open("wb") as file:
@@ -450,13 +390,6 @@ def ply_with(line: str, body: bytes = b"") -> bytes:
     old = f"element vertex {len(SCENE)}".encode()
     assert old in sample
     return sample.replace(old, line.encode()) + body
-
-
-@pytest.mark.parametrize("count", [21, 10**6, 10**12, 2**63, 2**64 - 1, 10**19])
-def test_vertices_that_are_not_there(tmp_path, bounded, count):
-    (tmp_path / "a.ply").write_bytes(ply_with(f"element vertex {count}"))
-    with pytest.raises(FormatError, match=f"truncated: {count} rows of element vertex"):
-        read_ply(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize(

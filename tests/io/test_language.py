@@ -1,101 +1,142 @@
-"""The language sidecar: written and read back, refused when broken, matched with an edited scene."""
+"""The language sidecar: written and read back, refused when malformed, matched with an edited scene."""
 
 import json
 import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.io import language
-from langsplat_core.io.language import read_language, rematch_language, write_language
-from langsplat_core.io.ply import pack_positions, step, unpack_positions
+from langsplat_core.io.language import (
+    means_checksum,
+    pack_positions,
+    position_step,
+    read_language,
+    rematch_language,
+    unpack_positions,
+    write_language,
+)
 from langsplat_core.scene import NO_THING, Calibration, CodebookCodec, LanguageField, Odds, Reading
 from tests.support.file_samples import random_field
 from tests.support.same import assert_same_field
 from tests.support.scenes import random_gaussians
 
 N = 60
+CALIBRATION = Calibration(Odds(-0.25, 18.548, 2.7, 0.62), Odds(0.5, 2.25, 15.5), Odds(0.75, -0.5, 9.25, 0.5))
+
+
+def full_field(kind: str = "autoencoder", calibration: Calibration | None = CALIBRATION) -> LanguageField:
+    things = (np.arange(N) // 7).astype(np.uint16)
+    things[::5] = NO_THING
+    return replace(random_field(N, kind), things=things, reading=Reading(11.7, 0.73, calibration))
 
 
 @pytest.fixture
-def means():
+def means() -> Array:
     return random_gaussians(N).means
 
 
 @pytest.fixture
-def sidecar(tmp_path, means):
+def sidecar(tmp_path: Path, means: Array) -> Path:
     path = tmp_path / "scene.langsplat.safetensors"
-    write_language(path, random_field(N), means)
+    write_language(path, full_field(), means)
     return path
 
 
-def edit(path: Path, change) -> None:
-    """Rewrite a safetensors file; `change` gets (header, data) and returns the new pair."""
+def header_of(path: Path) -> dict[str, Any]:
     raw = path.read_bytes()
-    size = struct.unpack("<Q", raw[:8])[0]
-    header, data = change(json.loads(raw[8 : 8 + size]), raw[8 + size :])
+    return json.loads(raw[8 : 8 + struct.unpack("<Q", raw[:8])[0]])
+
+
+def change_header(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Rewrite the header alone: it need not go with the data any more."""
+    header, data = header_of(path), path.read_bytes()
+    change(header)
     text = json.dumps(header).encode()
-    path.write_bytes(struct.pack("<Q", len(text)) + text + data)
+    path.write_bytes(struct.pack("<Q", len(text)) + text + data[8 + struct.unpack("<Q", data[:8])[0] :])
 
 
-def edit_metadata(path: Path, **entries: str | None) -> None:
-    def change(header, data):
-        for key, value in entries.items():
-            header["__metadata__"].pop(key)
-            if value is not None:
-                header["__metadata__"][key] = value
-        return header, data
-
-    edit(path, change)
+def change(path: Path, **tensors: Array | None) -> None:
+    """Write the file again with other tensors; None for one that is to go."""
+    found = load_file(path) | tensors
+    found = {name: tensor for name, tensor in found.items() if tensor is not None}
+    save_file(found, path, header_of(path)["__metadata__"])
 
 
-def edit_tensor(path: Path, name: str, **entries) -> None:
-    edit(path, lambda header, data: (header | {name: header[name] | entries}, data))
+Spoil = Callable[[Path], object]
 
 
-def rename_tensor(path: Path, old: str, new: str) -> None:
-    edit(path, lambda header, data: ({new if k == old else k: v for k, v in header.items()}, data))
+def says(**entries: str | None) -> Spoil:
+    """Other metadata; None for an entry that is to go."""
+
+    def edit(header: dict[str, Any]) -> None:
+        metadata = header["__metadata__"] | entries
+        header["__metadata__"] = {key: value for key, value in metadata.items() if value is not None}
+
+    return lambda path: change_header(path, edit)
+
+
+def declares(name: str, **entries: Any) -> Spoil:
+    """Another type or shape of a tensor."""
+    return lambda path: change_header(path, lambda header: header[name].update(entries))
+
+
+def holds(**tensors: Array | None) -> Spoil:
+    return lambda path: change(path, **tensors)
+
+
+def spoilt(name: str, value: float) -> Spoil:
+    def put(path: Path) -> None:
+        tensor = load_file(path)[name].copy()
+        tensor[0, 0] = value
+        change(path, **{name: tensor})
+
+    return put
+
+
+def odds(numbers: str) -> Spoil:
+    return says(odds=f"[[{numbers}], [{numbers}], [{numbers}]]")
 
 
 @pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
 @pytest.mark.parametrize("phrases", [(), ("red mug",), ("tür", 'a "quoted", {braced}\nphrase', "猫")])
-def test_what_is_written_is_read_back(tmp_path, means, kind, phrases):
+@pytest.mark.parametrize("full", [False, True])
+def test_what_is_written_is_read_back(tmp_path, means, kind, phrases, full):
     want = random_field(N, kind, phrases)
+    if full:
+        want = replace(full_field(kind), phrasebook=want.phrasebook)
     path = tmp_path / "a.langsplat.safetensors"
     write_language(path, want, means)
     assert_same_field(read_language(path, means), want)
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_scene_without_gaussians(tmp_path):
-    path = tmp_path / "a.langsplat.safetensors"
-    write_language(path, random_field(0), np.zeros((0, 3), np.float32))
-    assert len(read_language(path, np.zeros((0, 3), np.float32))) == 0
+    write_language(path, want.take(np.zeros(0, int)), means[:0])
+    assert len(read_language(path, means[:0])) == 0
 
 
 def test_the_layout_is_the_documented_one(sidecar, means):
-    raw = sidecar.read_bytes()
-    size = struct.unpack("<Q", raw[:8])[0]
-    header = json.loads(raw[8 : 8 + size])
+    header = header_of(sidecar)
     metadata = header.pop("__metadata__")
-    shapes = {name: tuple(entry["shape"]) for name, entry in header.items()}
-    kinds = {name: entry["dtype"] for name, entry in header.items()}
-    assert (kinds.pop("positions"), kinds.pop("everyday")) == ("U64", "F16")
-    assert set(kinds.values()) == {"F32"}
-    assert shapes["latents"] == (3, N, 3)
-    assert shapes["confidence"] == (3, N)
-    assert shapes["positions"] == (N,)
-    assert shapes["corners"] == (2, 3)
-    assert shapes["canonical"] == (4, 16)
-    assert (shapes["phrasebook"], shapes["everyday"]) == ((2, 16), (60, 16))
-    assert shapes["codec.encoder.0.weight"] == (8, 16)
+    layout = {name: (entry["dtype"], entry["shape"]) for name, entry in header.items()}
+    for name, kind, shape in (
+        ("latents", "F32", [3, N, 3]),
+        ("confidence", "F32", [3, N]),
+        ("things", "U16", [N]),
+        ("positions", "U64", [N]),
+        ("corners", "F32", [2, 3]),
+        ("canonical", "F32", [4, 16]),
+        ("everyday", "F16", [60, 16]),
+        ("phrasebook", "F32", [2, 16]),
+        ("codec.encoder.0.weight", "F32", [8, 16]),
+    ):
+        assert layout[name] == (kind, shape)
+    numbers = [[-0.25, 18.548, 2.7, 0.62], [0.5, 2.25, 15.5, 0.75], [0.75, -0.5, 9.25, 0.5]]
+    assert json.loads(metadata.pop("odds")) == numbers
     assert metadata == {
         "format": "langsplat",
         "version": "2",
@@ -104,11 +145,99 @@ def test_the_layout_is_the_documented_one(sidecar, means):
         "codec": "autoencoder",
         "d": "3",
         "gaussians": str(N),
-        "means_blake2b": language.means_checksum(means),
+        "means_blake2b": means_checksum(means),
         "phrases": '["red mug", "tür"]',
-        "temperature": "10.0",
-        "found": "0.6",
+        "temperature": "11.7",
+        "found": "0.73",
     }
+
+
+LISTS = "not 3 lists of four numbers"
+MALFORMED: dict[str, tuple[Spoil, str]] = {
+    "another program's": (says(format="gguf"), "not a language field"),
+    "no format": (says(format=None), "not a language field"),
+    "no metadata": (lambda p: change_header(p, lambda h: h.pop("__metadata__")), "not a language field"),
+    "a newer version": (says(version="3"), "version '3'; this program reads 1 and 2, update"),
+    "no checksum": (says(means_blake2b=None), "the header has no 'means_blake2b'"),
+    "levels in another order": (says(levels="whole,part,subpart"), "levels 'whole,part"),
+    "an unknown codec": (says(codec="vq"), "unknown codec kind 'vq'"),
+    "the other codec": (says(codec="linear"), "linear codec without its basis"),
+    "a wrong d": (says(d="4"), "the header's d or number of Gaussians"),
+    "a wrong count": (says(gaussians="61"), "the header's d or number of Gaussians"),
+    "phrases that are no list": (says(phrases='{"a": 1}'), "not a list of texts"),
+    "phrases that are no texts": (says(phrases="[1, 2]"), "not a list of texts"),
+    "phrases that are no JSON": (says(phrases="[1,"), "not readable as JSON"),
+    "one phrase twice": (says(phrases='["a", "a"]'), "one phrase twice"),
+    "a phrase without a vector": (says(phrases='["a","b","c"]'), r"phrasebook: .*\(3, 16\)"),
+    "a temperature that is no number": (says(temperature="hot"), "could not convert"),
+    "a temperature of nothing": (says(temperature="0"), "temperature 0.0 and found"),
+    "a verdict that is none": (says(found="nan"), "found nan"),
+    "odds that are no JSON": (says(odds="[0.0, 1.0,"), "not readable as JSON"),
+    "odds nested without end": (says(odds="[" * 100_000), "not readable as JSON"),
+    **{f"odds {text[:40]}": (says(odds=text), LISTS) for text in
+       ('{"constant": 1.0}', "1.0", "null", '["0.0", "1.0", "2.0", "0.7"]', "[true, true, true, true]",
+        "[[0.0, 1.0, 2.0, 0.7], [0.0, 1.0, 2.0, 0.7]]", "[1" + "0" * 500 + ", 1.0, 2.0, 0.7]")},
+    "odds that are NaN": (odds("NaN, 1.0, 2.0, 0.7"), "expected finite numbers"),
+    "infinite odds": (odds("0.0, Infinity, 2.0, 0.7"), "expected finite numbers"),
+    "falling odds": (odds("0.0, -3.0, 2.0, 0.7"), "rising with fits"),
+    "found by less than even": (odds("0.0, 3.0, 2.0, 0.3"), r"found in \[0.5, 1\]"),
+    "no latents": (holds(latents=None), "tensor 'latents' is missing"),
+    "no positions": (holds(corners=None), "tensor 'corners' is missing"),
+    "a codec in parts": (holds(**{"codec.encoder.0.bias": None}), "without encoder.0.bias"),
+    "latents of another shape": (declares("latents", shape=[N, 3, 3]), "latents: expected shape"),
+    "flat latents": (declares("latents", shape=[3 * N * 3]), "latents: expected shape"),
+    "too few positions": (declares("positions", shape=[N // 2, 2]), "positions: expected shape"),
+    "flat weights": (declares("codec.encoder.0.weight", shape=[128]), "safetensors: "),
+    "latents of integers": (declares("latents", dtype="I32"), "'latents' is I32; expected F32 or F16"),
+    "latents of bfloat16": (declares("latents", dtype="BF16", shape=[3, N, 6]), "BF16; expected F32 or F16"),
+    "a shape beyond the data": (declares("latents", shape=[3, 10**12, 3]), "not a whole safetens"),
+    "latents that are NaN": (spoilt("latents", np.nan), "tensor 'latents' holds"),
+    "an infinite canonical phrase": (spoilt("canonical", np.inf), "tensor 'canonical' holds"),
+    "negative confidence": (spoilt("confidence", -1), "tensor 'confidence' holds"),
+    "everyday phrases of integers": (holds(everyday=np.zeros((60, 16), np.int32)), "'everyday' is I32"),
+    "short everyday phrases": (holds(everyday=np.zeros((60, 3), np.float32)), "everyday: expected shape"),
+    "things of floats": (holds(things=np.zeros(N, np.float32)), "'things' is F32; expected U16"),
+    "things of bytes": (holds(things=np.zeros(N, np.uint8)), "'things' is U8; expected U16"),
+    **{f"things of {shape}": (holds(things=np.zeros(shape, np.uint16)), "things: expected shape") for shape in
+       ((N - 1,), (N + 1,), (3, N), ())},
+    "not safetensors": (lambda p: p.write_bytes(b"\x80\x04pickle"), "not a whole safetensors file"),
+    "empty": (lambda p: p.write_bytes(b""), "not a whole safetensors file"),
+    "truncated": (lambda p: p.write_bytes(p.read_bytes()[:-1]), "not a whole safetensors file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", MALFORMED)
+def test_every_broken_rule_has_its_message(sidecar, means, case):
+    spoil, message = MALFORMED[case]
+    spoil(sidecar)
+    for read in (read_language, rematch_language):
+        with pytest.raises(FormatError, match=message) as caught:
+            read(sidecar, means)
+        assert str(caught.value).startswith(str(sidecar))
+        assert "\n" not in str(caught.value)
+
+
+def test_a_field_without_things_and_odds_is_what_files_held_before(sidecar, means):
+    change(sidecar, things=None, everyday=None)
+    says(odds=None, calibration="[-0.25, 18.5, 2.75, 0.625]")(sidecar)  # of another scale: not read
+    field = read_language(sidecar, means)
+    assert (field.things, field.everyday, field.reading) == (None, None, Reading(11.7, 0.73))
+    assert rematch_language(sidecar, means[:9]).things is None
+
+
+def test_rematch_after_removing_reordering_and_adding(sidecar, means):
+    field = full_field()
+    keep = np.random.default_rng(3).permutation(N)[:40]
+    assert_same_field(rematch_language(sidecar, means[keep]), field.take(keep))
+    far = np.array([[50, 0, 0], [np.nan, 0, 0]], np.float32)
+    rounded = means + np.random.default_rng(4).uniform(-1e-4, 1e-4, means.shape).astype(np.float32)
+    got = rematch_language(sidecar, np.concatenate([rounded, far]))
+    assert_same_field(got.take(np.arange(N)), field)
+    assert not got.latents[:, N:].any()
+    assert not got.confidence[:, N:].any()
+    assert got.things.tolist()[N:] == [NO_THING] * 2
+    nobody = rematch_language(sidecar, np.zeros((0, 3), np.float32))
+    assert (nobody.things.shape, nobody.things.dtype) == ((0,), np.uint16)
 
 
 def test_a_field_of_other_gaussians_is_refused_with_the_way_to_mend_it(sidecar, means):
@@ -122,113 +251,11 @@ def test_a_field_of_other_gaussians_is_refused_with_the_way_to_mend_it(sidecar, 
             read_language(sidecar, other)
 
 
-BROKEN = {
-    "another program's": (lambda p: edit_metadata(p, format="gguf"), "not a language field"),
-    "no format": (lambda p: edit_metadata(p, format=None), "not a language field"),
-    "no metadata": (
-        lambda p: edit(p, lambda h, d: ({k: v for k, v in h.items() if k != "__metadata__"}, d)),
-        "not a language field",
-    ),
-    "a newer version": (
-        lambda p: edit_metadata(p, version="3"),
-        "version '3'; this program reads 1 and 2, update",
-    ),
-    "no checksum": (lambda p: edit_metadata(p, means_blake2b=None), "the header has no 'means_blake2b'"),
-    "a wrong checksum": (lambda p: edit_metadata(p, means_blake2b="00"), "at other positions"),
-    "levels in another order": (
-        lambda p: edit_metadata(p, levels="whole,part,subpart"),
-        "levels 'whole,part",
-    ),
-    "an unknown codec": (lambda p: edit_metadata(p, codec="vq"), "unknown codec kind 'vq'"),
-    "the other codec": (lambda p: edit_metadata(p, codec="linear"), "linear codec without its basis"),
-    "a wrong d": (lambda p: edit_metadata(p, d="4"), "the header's d or number of Gaussians"),
-    "a wrong count": (lambda p: edit_metadata(p, gaussians="61"), "the header's d or number of Gaussians"),
-    "phrases that are no list": (lambda p: edit_metadata(p, phrases='{"a": 1}'), "not a list of texts"),
-    "phrases that are no texts": (lambda p: edit_metadata(p, phrases="[1, 2]"), "not a list of texts"),
-    "phrases that are no JSON": (lambda p: edit_metadata(p, phrases="[1,"), "not readable as JSON"),
-    "one phrase twice": (lambda p: edit_metadata(p, phrases='["a", "a"]'), "one phrase twice"),
-    "a phrase without a vector": (
-        lambda p: edit_metadata(p, phrases='["a","b","c"]'),
-        r"phrasebook: .*\(3, 16\)",
-    ),
-    "no latents": (lambda p: rename_tensor(p, "latents", "old"), "tensor 'latents' is missing"),
-    "no positions": (lambda p: rename_tensor(p, "corners", "old"), "tensor 'corners' is missing"),
-    "a temperature that is no number": (lambda p: edit_metadata(p, temperature="hot"), "could not convert"),
-    "a temperature of nothing": (lambda p: edit_metadata(p, temperature="0"), "temperature 0.0 and found"),
-    "a verdict that is none": (lambda p: edit_metadata(p, found="nan"), "found nan"),
-    "a codec in parts": (lambda p: rename_tensor(p, "codec.encoder.0.bias", "x"), "without encoder.0.bias"),
-    "latents of another shape": (
-        lambda p: edit_tensor(p, "latents", shape=[N, 3, 3]),
-        "latents: expected shape",
-    ),
-    "flat latents": (lambda p: edit_tensor(p, "latents", shape=[3 * N * 3]), "latents: expected shape"),
-    "too few positions": (
-        lambda p: edit_tensor(p, "positions", shape=[N // 2, 2]),
-        "positions: expected shape",
-    ),
-    "flat weights": (lambda p: edit_tensor(p, "codec.encoder.0.weight", shape=[128]), "safetensors: "),
-    "latents of integers": (
-        lambda p: edit_tensor(p, "latents", dtype="I32"),
-        "'latents' is I32; expected F32 or F16",
-    ),
-    "latents of bfloat16": (
-        lambda p: edit_tensor(p, "latents", dtype="BF16", shape=[3, N, 6]),
-        "'latents' is BF16; expected F32 or F16",
-    ),
-    "a shape beyond the data": (
-        lambda p: edit_tensor(p, "latents", shape=[3, 10**12, 3]),
-        "not a whole safetens",
-    ),
-    "not safetensors": (lambda p: p.write_bytes(b"\x80\x04pickle"), "not a whole safetensors file"),
-    "empty": (lambda p: p.write_bytes(b""), "not a whole safetensors file"),
-    "truncated": (lambda p: p.write_bytes(p.read_bytes()[:-1]), "not a whole safetensors file"),
-}
-
-
-@pytest.mark.parametrize("case", BROKEN)
-def test_every_broken_rule_has_its_message(sidecar, means, case):
-    spoil, message = BROKEN[case]
-    spoil(sidecar)
-    with pytest.raises(FormatError, match=message) as caught:
-        read_language(sidecar, means)
-    assert str(caught.value).startswith(str(sidecar))
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(("name", "value"), [("latents", np.nan), ("canonical", np.inf), ("confidence", -1)])
-def test_numbers_that_mean_nothing(tmp_path, means, name, value):
-    field = random_field(N)
-    getattr(field, name)[0, 0] = value
-    write_language(tmp_path / "a.safetensors", field, means)
-    with pytest.raises(FormatError, match=f"tensor '{name}' holds"):
-        read_language(tmp_path / "a.safetensors", means)
-
-
 def test_paths_that_cannot_be_read(tmp_path, means):
     with pytest.raises(InputError, match="no such file"):
         read_language(tmp_path / "a.safetensors", means)
     with pytest.raises(InputError, match="is a folder"):
         read_language(tmp_path, means)
-
-
-def test_rematch_after_removing_and_reordering(sidecar, means):
-    field = random_field(N)
-    keep = np.random.default_rng(3).permutation(N)[:40]
-    got = rematch_language(sidecar, means[keep])
-    assert_same_field(
-        got, replace(field, latents=field.latents[:, keep], confidence=field.confidence[:, keep])
-    )
-
-
-def test_rematch_leaves_what_has_no_partner_without_meaning(sidecar, means):
-    field = random_field(N)
-    far = np.array([[50, 0, 0], [np.nan, 0, 0]], np.float32)
-    rounded = means + np.random.default_rng(4).uniform(-1e-4, 1e-4, means.shape).astype(np.float32)
-    got = rematch_language(sidecar, np.concatenate([rounded, far]))
-    np.testing.assert_array_equal(got.latents[:, :N], field.latents)
-    np.testing.assert_array_equal(got.confidence[:, :N], field.confidence)
-    assert not got.latents[:, N:].any()
-    assert not got.confidence[:, N:].any()
 
 
 def test_rematch_within_a_given_distance(sidecar, means):
@@ -252,7 +279,7 @@ def test_a_codebook_is_stored_in_small_numbers_where_that_loses_nothing(tmp_path
     path = tmp_path / "a.langsplat.safetensors"
     write_language(path, field, means)
     header = header_of(path)
-    kinds = {name: (entry["dtype"], entry["shape"]) for name, entry in header.items()}
+    kinds = {name: (entry.get("dtype"), entry.get("shape")) for name, entry in header.items()}
     assert kinds["codes"] == ("U16", [3, N])
     assert kinds["codec.vectors"] == ("F16", [11, 16])
     assert kinds["confidence"] == ("F16", [3, N])
@@ -264,7 +291,7 @@ def test_a_codebook_is_stored_in_small_numbers_where_that_loses_nothing(tmp_path
 def test_a_code_without_a_codeword_is_refused(tmp_path, means):
     path = tmp_path / "a.langsplat.safetensors"
     write_language(path, random_field(N, "codebook"), means)
-    rename_tensor(path, "codec.vectors", "codec.all_vectors")
+    change(path, **{"codec.vectors": None})
     with pytest.raises(FormatError, match="codebook codec without its vectors"):
         read_language(path, means)
     field = random_field(N, "codebook")
@@ -279,7 +306,7 @@ def test_version_1_still_opens(tmp_path, means):
     field = replace(random_field(N), everyday=None)
     path = tmp_path / "a.langsplat.safetensors"
     write_language(path, field, means)
-    metadata = header_of(path, metadata=True)
+    metadata = header_of(path)["__metadata__"]
     for name in ("temperature", "found"):
         metadata.pop(name)
     tensors = load_file(path)
@@ -288,14 +315,6 @@ def test_version_1_still_opens(tmp_path, means):
     save_file(tensors | {"means": means}, path, metadata | {"version": "1"})
     assert_same_field(read_language(path, means), field)
     assert_same_field(rematch_language(path, means), field)
-
-
-def test_the_reading_of_an_encoder_is_kept(tmp_path, means):
-    field = replace(random_field(N), reading=Reading(11.7, 0.55))
-    path = tmp_path / "a.langsplat.safetensors"
-    write_language(path, field, means)
-    assert read_language(path, means).reading == field.reading
-    assert rematch_language(path, means[:9]).reading == field.reading
 
 
 def test_packed_positions_are_as_near_as_they_say():
@@ -307,21 +326,14 @@ def test_packed_positions_are_as_near_as_they_say():
     got = unpack_positions(packed, corners)
     finite = np.isfinite(means).all(1)
     assert np.isnan(got[7]).all()
-    assert np.abs(got[finite] - means[finite]).max() <= 0.51 * step(corners)
-    assert step(corners) < 0.002
+    assert np.abs(got[finite] - means[finite]).max() <= 0.51 * position_step(corners)
+    assert position_step(corners) < 0.002
     empty, nowhere = pack_positions(np.full((2, 3), np.inf, np.float32))
     assert np.isnan(unpack_positions(empty, nowhere)).all()
 
 
 def rounded(tensor: np.ndarray) -> np.ndarray:
     return tensor.astype(np.float16).astype(np.float32)
-
-
-def header_of(path: Path, metadata: bool = False) -> dict:
-    raw = path.read_bytes()
-    header = json.loads(raw[8 : 8 + struct.unpack("<Q", raw[:8])[0]])
-    own = header.pop("__metadata__")
-    return own if metadata else header
 
 
 def test_the_same_field_makes_the_same_bytes(tmp_path, means):
@@ -331,149 +343,3 @@ def test_the_same_field_makes_the_same_bytes(tmp_path, means):
         write_language(path, random_field(N), means)
         written.add(path.read_bytes())
     assert len(written) == 1
-
-
-# Things and the calibration in the language sidecar.
-
-CALIBRATION = Calibration(Odds(-0.25, 18.548, 2.7, 0.62), Odds(0.5, 2.25, 15.5), Odds(0.75, -0.5, 9.25, 0.5))
-Change = Callable[[dict[str, Array], dict[str, str]], None]
-
-
-def full_field(kind: str = "codebook") -> LanguageField:
-    things = (np.arange(N) // 7).astype(np.uint16)
-    things[::5] = NO_THING
-    return replace(random_field(N, kind), things=things, reading=Reading(11.7, 0.73, CALIBRATION))
-
-
-@pytest.fixture
-def stored_sidecar(tmp_path, means) -> Path:
-    path = tmp_path / "scene.langsplat.safetensors"
-    write_language(path, full_field(), means)
-    return path
-
-
-def change(path: Path, how: Change) -> None:
-    """Write the file again with other tensors and metadata."""
-    with safe_open(path, framework="numpy") as file:
-        metadata = dict(file.metadata())
-    tensors = load_file(path)
-    how(tensors, metadata)
-    save_file(tensors, path, metadata)
-
-
-@pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
-@pytest.mark.parametrize("things", [False, True])
-@pytest.mark.parametrize("calibration", [None, CALIBRATION, Calibration(*[Odds(0, 1, 0, 1)] * 3)])
-def test_a_stored_sidecar_is_read_back(tmp_path, means, kind, things, calibration):
-    want = replace(full_field(kind), reading=Reading(11.7, 0.73, calibration))
-    if not things:
-        want = replace(want, things=None)
-    path = tmp_path / "a.langsplat.safetensors"
-    write_language(path, want, means)
-    assert_same_field(read_language(path, means), want)
-
-
-def test_the_stored_layout_is_the_documented_one(stored_sidecar, tmp_path, means):
-    with safe_open(stored_sidecar, framework="numpy") as file:
-        stored, metadata = file.get_slice("things"), file.metadata()
-        assert (stored.get_dtype(), stored.get_shape()) == ("U16", [N])
-    assert json.loads(metadata["odds"]) == [
-        [-0.25, 18.548, 2.7, 0.62],
-        [0.5, 2.25, 15.5, 0.75],
-        [0.75, -0.5, 9.25, 0.5],
-    ]
-    write_language(tmp_path / "a.safetensors", random_field(N), means)
-    with safe_open(tmp_path / "a.safetensors", framework="numpy") as file:
-        assert "things" not in file.keys()  # noqa: SIM118 (not a dictionary)
-        assert "odds" not in file.metadata()
-
-
-def test_a_field_without_either_is_what_files_held_before(stored_sidecar, means):
-    def older(tensors: dict[str, Array], metadata: dict[str, str]) -> None:
-        del tensors["things"], tensors["everyday"], metadata["odds"]
-        metadata["calibration"] = "[-0.25, 18.5, 2.75, 0.625]"  # of another scale: not read
-
-    change(stored_sidecar, older)
-    field = read_language(stored_sidecar, means)
-    assert (field.things, field.everyday, field.reading) == (None, None, Reading(11.7, 0.73))
-
-
-def stating(text: str) -> Change:
-    return lambda tensors, metadata: metadata.update(odds=text)
-
-
-def thrice(numbers: str) -> str:
-    return f"[[{numbers}], [{numbers}], [{numbers}]]"
-
-
-def holding(things: Array) -> Change:
-    return lambda tensors, metadata: tensors.update(things=things)
-
-
-DAMAGED = {
-    "no JSON": (stating("[0.0, 1.0,"), "not readable as JSON"),
-    "no list": (stating('{"constant": 1.0}'), "not 3 lists of four numbers"),
-    "a number": (stating("1.0"), "not 3 lists of four numbers"),
-    "nothing": (stating("null"), "not 3 lists of four numbers"),
-    "too short": (stating("[0.0, 1.0, 2.0]"), "not 3 lists of four numbers"),
-    "too long": (stating("[0.0, 1.0, 2.0, 0.7, 0.7]"), "not 3 lists of four numbers"),
-    "texts": (stating('["0.0", "1.0", "2.0", "0.7"]'), "not 3 lists of four numbers"),
-    "truths": (stating("[true, true, true, true]"), "not 3 lists of four numbers"),
-    "two lists": (stating("[[0.0, 1.0, 2.0, 0.7], [0.0, 1.0, 2.0, 0.7]]"), "not 3 lists of four numbers"),
-    "lists of four": (stating("[[0.0, 1.0, 2.0, 0.7], [0.0, 1.0, 2.0, 0.7], [0.0]]"), "not 3 lists"),
-    "a falling one": (
-        stating("[[0.0, 1.0, 2.0, 0.7], [0.0, 1.0, 2.0, 0.7], [0.0, -3.0, 2.0, 0.7]]"),
-        "rising with fits",
-    ),
-    "lists": (stating("[[0.0], [1.0], [2.0], [0.7]]"), "not 3 lists of four numbers"),
-    "an endless number": (stating("[1" + "0" * 500 + ", 1.0, 2.0, 0.7]"), "not 3 lists of four numbers"),
-    "nested without end": (stating("[" * 100_000), "not readable as JSON"),
-    "NaN": (stating(thrice("NaN, 1.0, 2.0, 0.7")), "expected finite numbers"),
-    "infinite": (stating(thrice("0.0, Infinity, 2.0, 0.7")), "expected finite numbers"),
-    "falling": (stating(thrice("0.0, -3.0, 2.0, 0.7")), "rising with fits"),
-    "found by less than even": (stating(thrice("0.0, 3.0, 2.0, 0.3")), r"found in \[0.5, 1\]"),
-    "everyday phrases of whole numbers": (
-        lambda tensors, _: tensors.update(everyday=np.zeros((60, 16), np.int32)),
-        "'everyday' is I32",
-    ),
-    "everyday phrases of another length": (
-        lambda tensors, _: tensors.update(everyday=np.zeros((60, 3), np.float32)),
-        "everyday: expected shape",
-    ),
-    "things of floats": (holding(np.zeros(N, np.float32)), "'things' is F32; expected U16"),
-    "things of 32 bits": (holding(np.zeros(N, np.int32)), "'things' is I32; expected U16"),
-    "things of bytes": (holding(np.zeros(N, np.uint8)), "'things' is U8; expected U16"),
-    "too few things": (holding(np.zeros(N - 1, np.uint16)), "things: expected shape"),
-    "too many things": (holding(np.zeros(N + 1, np.uint16)), "things: expected shape"),
-    "things of each level": (holding(np.zeros((3, N), np.uint16)), "things: expected shape"),
-    "one thing": (holding(np.array(4, np.uint16)), "things: expected shape"),
-}
-
-
-@pytest.mark.parametrize("case", DAMAGED)
-def test_damage_is_one_line(stored_sidecar, means, case):
-    how, message = DAMAGED[case]
-    change(stored_sidecar, how)
-    for read in (read_language, rematch_language):
-        with pytest.raises(FormatError, match=message) as caught:
-            read(stored_sidecar, means)
-        assert str(caught.value).startswith(str(stored_sidecar))
-        assert "\n" not in str(caught.value)
-
-
-def test_rematching_carries_things_and_the_calibration(stored_sidecar, means):
-    field = full_field()
-    keep = np.random.default_rng(3).permutation(N)[:40]
-    got = rematch_language(stored_sidecar, means[keep])
-    assert_same_field(got, field.take(keep))
-    far = np.array([[50, 0, 0], [np.nan, 0, 0]], np.float32)
-    got = rematch_language(stored_sidecar, np.concatenate([means, far]))
-    np.testing.assert_array_equal(got.things[:N], field.things)
-    assert got.things[N:].tolist() == [NO_THING] * 2
-    nobody = rematch_language(stored_sidecar, np.zeros((0, 3), np.float32))
-    assert (nobody.things.shape, nobody.things.dtype) == ((0,), np.uint16)
-
-
-def test_rematching_invents_no_things(tmp_path, means):
-    write_language(tmp_path / "a.safetensors", random_field(N), means)
-    assert rematch_language(tmp_path / "a.safetensors", means[:9]).things is None

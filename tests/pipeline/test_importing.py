@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from langsplat_core.arrays import Array, unit
-from langsplat_core.config import CodecConfig
+from langsplat_core.config import CodebookConfig, LinearConfig
 from langsplat_core.errors import EncoderError, FormatError, InputError
 from langsplat_core.io.foreign import read_foreign
 from langsplat_core.io.langsplat_files import read_features, write_features
@@ -94,7 +94,7 @@ def test_many_meanings_are_kept_within_the_stated_error(tmp_path, clip):
     g = random_gaussians(n)
     vectors = unit(MEANINGS[rng.integers(0, 7, n)] + rng.normal(scale=0.02, size=(n, D))).astype(np.float32)
     path = save_model(tmp_path / "a_3.pth", g, tensor(vectors))
-    config = CodecConfig(max_relevancy_error=0.02)
+    config = CodebookConfig(max_relevancy_error=0.02)
     scene, report = import_scene(read_foreign([path]), clip, (), config)
     assert scene.language is not None
     assert report.loss is not None
@@ -104,7 +104,7 @@ def test_many_meanings_are_kept_within_the_stated_error(tmp_path, clip):
     assert 7 < report.codec_size <= n // 4
     assert np.abs(got - want).mean() <= 1.1 * report.loss.error_mean  # most of these were fitted to
     assert report.loss.error_mean <= 1.2 * config.max_relevancy_error
-    linear, _ = import_scene(read_foreign([path]), clip, (), CodecConfig(kind="linear", latent_dim=D))
+    linear, _ = import_scene(read_foreign([path]), clip, (), LinearConfig(latent_dim=D))
     assert linear.language is not None
     np.testing.assert_allclose(decoded(linear.language, 2), vectors, atol=1e-5)
 

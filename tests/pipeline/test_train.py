@@ -13,9 +13,11 @@ from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.config import (
     PAPER,
+    AutoencoderConfig,
     ClipConfig,
-    CodecConfig,
+    CodebookConfig,
     LiftConfig,
+    LinearConfig,
     RadianceConfig,
     TrainConfig,
     with_preset,
@@ -151,10 +153,10 @@ def test_a_setting_repeats_only_what_depends_on_it(room, tmp_path):
     out, work = tmp_path / "scene.ply", tmp_path / "scene.work"
     train_scene(room, out, tiny_settings(room))
     before = kept_results(work)
-    train_scene(room, out, replace(tiny_settings(room), codec=CodecConfig(size=9)))
+    train_scene(room, out, replace(tiny_settings(room), codec=CodebookConfig(size=9)))
     added = {Path(name).name.partition("-")[0] for name in set(kept_results(work)) - set(before)}
     assert added == {"codec", "latents"}
-    other_machine = replace(tiny_settings(room), lift=LiftConfig(backend="cpu", chunk=7))
+    other_machine = replace(tiny_settings(room), lift=LiftConfig(backend="cpu"))
     train_scene(room, out, other_machine)
     assert len(kept_results(work)) == len(before) + 2  # who computes, and in which batches, changes nothing
 
@@ -165,7 +167,7 @@ def test_more_steps_of_lifting_do_not_fit_the_codec_again(room, tmp_path):
         config = replace(
             tiny_settings(room),
             lift=LiftConfig(mode="gradient", steps=steps),
-            codec=CodecConfig(kind="autoencoder", steps=30),
+            codec=AutoencoderConfig(steps=30),
         )
         train_scene(room, tmp_path / "scene.ply", config)
     assert (len(list(work.glob("codec-*.npz"))), len(list(work.glob("latents-*.npz")))) == (1, 2)
@@ -188,11 +190,11 @@ def test_a_damaged_result_is_one_line(room, tmp_path, name):
 
 @pytest.mark.parametrize("mode", ["mean", "one-pass", "gradient"])
 def test_other_liftings(room, tmp_path, mode):
-    linear = CodecConfig(kind="linear", latent_dim=8)
+    linear = LinearConfig(latent_dim=8)
     config = replace(tiny_settings(room), lift=LiftConfig(mode=mode, steps=30), codec=linear)
     if mode != "mean":
         with pytest.raises(InputError, match=r"add --codec\.kind autoencoder"):
-            train_scene(room, tmp_path / "scene.ply", replace(config, codec=CodecConfig()))
+            train_scene(room, tmp_path / "scene.ply", replace(config, codec=CodebookConfig()))
     train_scene(room, tmp_path / "scene.ply", config)
     field = load_scene(tmp_path / "scene.ply").language
     assert field is not None
@@ -331,7 +333,7 @@ def test_a_trained_scene_is_given_a_meaning(room, tmp_path):
     assert not list((tmp_path / "again.work").glob("radiance*"))
     field = load_scene(again).language
     assert field is not None
-    assert field.codec.index_size == 9
+    assert field.codec.size == 9
     assert run("train", room, "--out", again, "--gaussians", tmp_path / "missing.ply", *options) == 2
     write_metres(first, 0.25)  # as `langsplat scale` measured it; the photographs say 0.5
     assert run("train", room, "--out", again, "--gaussians", first, *options) == 0
@@ -340,7 +342,7 @@ def test_a_trained_scene_is_given_a_meaning(room, tmp_path):
 
 def test_profiles_are_defaults_that_options_override():
     plain = parse(["train", "photos", "--out", "s.ply", "--max-relevancy-error", "0.01"])
-    assert plain.config == replace(TrainConfig(), codec=CodecConfig(max_relevancy_error=0.01))
+    assert plain.config == replace(TrainConfig(), codec=CodebookConfig(max_relevancy_error=0.01))
     words = ["train", "photos", "--out", "s.ply", "--profile", "paper"]
     assert parse(words).config == PAPER
     assert (PAPER.codec.kind, PAPER.codec.latent_dim, PAPER.lift.steps) == ("autoencoder", 3, 30_000)

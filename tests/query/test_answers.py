@@ -26,7 +26,6 @@ from langsplat_core.query.answers import (
 )
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Named
-from langsplat_core.query.lookup import build_lookup
 from langsplat_core.query.surface import (
     SMALLEST,
     Regions,
@@ -58,9 +57,7 @@ def asked(
     if rule == "peak":
         return by_peak(phrase, relevancy, surface, scale, field.reading.found, level)
     regions, calibration = build_regions(surface, field), field.reading.calibration
-    others = build_lookup(field, scale).relevancies(field.everyday[:9])
-    others = (values.reshape(relevancy.shape) for values in others)
-    bars = chance_in(field, surface, regions, scale, others).bars()
+    bars = chance_in(field, surface, regions, replace(scale, everyday=field.everyday[:9])).bars()
     return by_regions(phrase, relevancy, surface, regions, scale, bars, calibration, level)
 
 
@@ -227,6 +224,7 @@ def test_no_meaning_anywhere(rule):
 
 # What everyday phrases fit in a scene, and what is found because it fits more.
 
+TOLERANCE = {"codebook": 1e-4, "linear": 1e-4, "autoencoder": 5e-3}  # of the table that finds relevancies
 BARS = (Bar(0.0, 1.0), Bar(0.5, 1.0), Bar(-1.0, 2.0), Bar(0.6, 0.5))
 
 
@@ -234,30 +232,18 @@ def engine_of(kind: str) -> QueryEngine:
     return QueryEngine(Scene(random_gaussians(400), random_field(400, kind)))
 
 
-def test_by_codewords_is_as_by_looking_up(monkeypatch):
-    monkeypatch.setattr(chance_module, "SAMPLED", 60)
-    engine = engine_of("codebook")
-    field, everyday = engine.field, engine.field.everyday
+@pytest.mark.parametrize("kind", ["codebook", "autoencoder", "linear"])
+def test_fits_by_chance_are_those_of_looking_everyday_phrases_up(kind, monkeypatch):
+    monkeypatch.setattr(chance_module, "CHUNK", 7)  # several
+    engine = engine_of(kind)
     fits = engine.chance.fits
-    for number, vector in enumerate(everyday):
+    for number, vector in enumerate(engine.field.everyday):
         means = engine.regions.means(engine.relevancy(vector))
         for level in range(len(LEVELS)):
             solid = engine.regions.sizes[level] >= SMALLEST
             want = engine.scale.fit(means[level])
-            np.testing.assert_allclose(fits[level][solid, number], want[solid], atol=1e-4)
+            np.testing.assert_allclose(fits[level][solid, number], want[solid], atol=TOLERANCE[kind])
             assert np.isneginf(fits[level][~solid, number]).all() or not solid.any()
-    scene = (field, engine.surface, engine.regions, engine.scale)
-    assert chance_in(*scene, iter(())).bars() == engine.chance.bars()
-
-
-@pytest.mark.parametrize("kind", ["autoencoder", "linear"])
-def test_without_codewords_everyday_phrases_are_looked_up(kind):
-    engine = engine_of(kind)
-    bars = engine.chance.bars()
-    assert all(np.isfinite([bar.median, bar.spread]).all() and bar.spread > 0 for bar in bars)
-    best = [engine.run("x", level, vector=engine.field.everyday[7]).fits for level in LEVELS]
-    column = [fits[:, 7].max() for fits in engine.chance.fits]  # all 60 phrases are looked at
-    np.testing.assert_allclose(best[0], column, atol=1e-4)
 
 
 def test_bars_are_quantiles_of_the_best_and_those_of_some_regions_are_lower():

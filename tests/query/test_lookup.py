@@ -90,7 +90,7 @@ def test_margins_of_another_size_change_nothing():
         common[:, axis] = math.sqrt(1 - share)
         return np.concatenate([math.sqrt(share) * vectors, common], 1).astype(np.float32)
 
-    codec = CodebookCodec(beside(field.codec.vectors, 0), field.codec.colours)
+    codec = CodebookCodec(beside(field.codec.vectors, 0), field.codec.palette)
     canonical, everyday = beside(field.canonical, 1), beside(field.everyday, 1)
     narrow = replace(field, codec=codec, canonical=canonical, everyday=everyday, phrasebook={})
     phrase = unit(np.random.default_rng(3).normal(size=dim))[None].astype(np.float32)

@@ -114,10 +114,7 @@ def plain_step(field: LanguageField, level: int, a: int, b: int) -> float:
     known = field.known[level]
     if not (known[a] and known[b]):
         return UNKNOWN if known[a] or known[b] else 0.0
-    vectors = field.latents[level][[a, b]]
-    if field.codec.space == "index":
-        vectors = field.codec.decode(vectors)
-    one, other = np.asarray(vectors, np.float64)
+    one, other = field.codec.directions(field.latents[level][[a, b]]).astype(np.float64)
     return float(1 - one @ other / (np.linalg.norm(one) * np.linalg.norm(other)))
 
 
@@ -125,7 +122,7 @@ def plain_typical_step(surface: Surface, field: LanguageField, level: int) -> fl
     """Mean over all pairs of Gaussians with a meaning, each with itself included."""
     rows = [row for row in surface.rows if field.known[level][row]]
     latents = field.latents[level][rows]
-    vectors = field.codec.decode(latents) if field.codec.space == "index" else unit(latents)
+    vectors = field.codec.directions(latents)
     vectors = vectors.astype(np.float64)
     return float(np.mean(1 - vectors @ vectors.T))
 

@@ -172,14 +172,10 @@ def check_random_scenes(seeds: range, backend: Backend, measured: Measure) -> No
     assert flips <= FLIPS * pixels
 
 
-def test_random_scenes(fast_backend: Backend, measured: Measure) -> None:
-    check_random_scenes(range(200 if fast_backend.name == "cpu" else 40), fast_backend, measured)
-
-
-@pytest.mark.slow
-def test_more_random_scenes(fast_backend: Backend, measured: Measure) -> None:
-    seeds = range(200, 1200) if fast_backend.name == "cpu" else range(40, 200)
-    check_random_scenes(seeds, fast_backend, measured)
+@pytest.mark.parametrize("start", [0, pytest.param(200, marks=pytest.mark.slow)])
+def test_random_scenes(fast_backend: Backend, measured: Measure, start: int) -> None:
+    count = (1_000 if start else 200) if fast_backend.name == "cpu" else (160 if start else 40)
+    check_random_scenes(range(start, start + count), fast_backend, measured)
 
 
 def corner_case(width: int, height: int) -> tuple[Gaussians, Camera, Camera]:

@@ -15,13 +15,14 @@ from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError
 from langsplat_core.raster import gsplat, load_lifting_rasterizer, load_rasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.training.language.mask_weights import find_memberships
+from langsplat_core.scene import Camera
+from langsplat_core.training.language.mask_weights import find_mask_weights
 from langsplat_core.training.radiance.differentiable import CpuRenderer, CudaRenderer, DifferentiableRenderer
 from langsplat_core.training.radiance.state import PARAMETERS, start
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 from tests.support import gsplat_twin as twin
 from tests.support.lifting import make_views
-from tests.support.scenes import random_camera, random_gaussians
+from tests.support.scenes import random_camera, random_gaussians, without_perspective
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("gsplat_twin")]
 
@@ -30,8 +31,10 @@ SETTINGS = [INRIA, GSPLAT, replace(INRIA, antialiased=True), replace(INRIA, far=
 
 @pytest.mark.parametrize("settings", SETTINGS)
 @pytest.mark.parametrize("channels", [1, 3, 6, 35])  # as they are, padded, and in two chunks
-def test_a_picture_is_the_references(settings: RasterSettings, channels: int) -> None:
+@pytest.mark.parametrize("orthographic", [False, True])
+def test_a_picture_is_the_references(settings: RasterSettings, channels: int, orthographic: bool) -> None:
     gaussians, camera = random_gaussians(60, channels), random_camera(channels, 41, 30)
+    camera = without_perspective(camera) if orthographic else camera
     values = np.random.default_rng(0).random((60, channels))
     view = load_rasterizer("cuda").view(gaussians, camera, settings)
     image, alpha = view.splat(values)
@@ -61,7 +64,7 @@ def test_masks_lift_as_on_the_cpu() -> None:
     gaussians, views = random_gaussians(25, 3), make_views()
     settings = gsplat.drawn_settings(INRIA)
     found = [
-        find_memberships(load_lifting_rasterizer(name), gaussians, views, 3, settings)
+        find_mask_weights(load_lifting_rasterizer(name), gaussians, views, settings)
         for name in ("cpu", "cuda")
     ]
     for cpu, cuda in zip(found[0].pairs, found[1].pairs, strict=True):
@@ -70,10 +73,11 @@ def test_masks_lift_as_on_the_cpu() -> None:
         np.testing.assert_allclose(cpu["weight"], cuda["weight"], rtol=1e-4, atol=1e-5)
 
 
-def gradients(renderer: DifferentiableRenderer, degree: int, image_grad: Array) -> dict[str, Array]:
+def gradients(
+    renderer: DifferentiableRenderer, degree: int, image_grad: Array, camera: Camera
+) -> dict[str, Array]:
     """Of <picture, image_grad> + the sum of alpha, by every parameter and by the projected means."""
     state = start(random_gaussians(60, 5, degree), 0, renderer.device)
-    camera = random_camera(5, 41, 30)
     drawn = renderer.render(state.values, camera, degree)
     (drawn.image * torch.tensor(image_grad)).sum().add(drawn.alpha.sum()).backward()
     found: dict[str, Any] = {name: state.values[name].grad for name in PARAMETERS}
@@ -81,16 +85,18 @@ def gradients(renderer: DifferentiableRenderer, degree: int, image_grad: Array) 
     return {name: value.numpy() for name, value in found.items() if value is not None}
 
 
-@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize(("degree", "orthographic"), [(0, False), (1, False), (3, False), (0, True)])
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_gradients_are_the_cpus(degree: int, antialiased: bool) -> None:
+def test_gradients_are_the_cpus(degree: int, orthographic: bool, antialiased: bool) -> None:
     """Those through the directions of view too; a picture in which nothing lies at a cut-off."""
     settings = replace(gsplat.drawn_settings(INRIA), antialiased=antialiased)
-    reference = ReferenceRasterizer().view(random_gaussians(60, 5), random_camera(5, 41, 30), settings)
+    camera = random_camera(5, 41, 30)
+    camera = without_perspective(camera) if orthographic else camera
+    reference = ReferenceRasterizer().view(random_gaussians(60, 5), camera, settings)
     image_grad = np.random.default_rng(1).normal(size=(30, 41, 3)).astype(np.float32)
     assert reference.cut_off_band(1e-4).mean() < 0.05
-    cpu = gradients(CpuRenderer(settings), degree, image_grad)
-    cuda = gradients(CudaRenderer(settings), degree, image_grad)
+    cpu = gradients(CpuRenderer(settings), degree, image_grad, camera)
+    cuda = gradients(CudaRenderer(settings), degree, image_grad, camera)
     assert cpu.keys() == cuda.keys()
     np.testing.assert_array_equal(cuda.pop("visible")[cpu.pop("visible")], True)
     for name, want in cpu.items():
@@ -129,11 +135,3 @@ def test_a_kernel_that_fails_is_one_line(monkeypatch: pytest.MonkeyPatch) -> Non
     with pytest.raises(BackendError, match=r"Error building extension 'gsplat_cuda'\); install") as caught:
         gsplat.require_device()
     assert "\n" not in str(caught.value)
-
-
-def test_no_kernel_takes_what_the_real_ones_refuse() -> None:
-    with pytest.raises(RuntimeError, match="contiguous: False"):
-        twin.intersect_offset(torch.zeros(4, 2, dtype=torch.int64)[:, 0], 1, 1, 1)
-    kept = gsplat.DeviceGaussians(*(torch.ones(1, n).double() for n in (3, 3, 4)), torch.ones(1).double())
-    with pytest.raises(RuntimeError, match=r"torch\.float64"):
-        gsplat.draw(kept, torch.ones(1, 1), random_camera(0, 16, 16), INRIA)

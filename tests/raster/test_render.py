@@ -1,18 +1,23 @@
 """The front door: one call from a scene and a camera to a picture."""
 
 import doctest
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import langsplat_core
 from langsplat_core import Scene, render
-from langsplat_core.config import GSPLAT
+from langsplat_core.config import GSPLAT, INRIA
 from langsplat_core.errors import BackendError, InputError
-from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer, reference
+from langsplat_core.io.cameras import read_cameras, write_cameras
+from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer, protocol, reference
 from langsplat_core.raster import render as front_door
-from langsplat_core.raster.render import splat_colours
-from tests.support.scenes import random_camera, random_gaussians, random_values
+from langsplat_core.raster.render import pixel_weights, splat_colours
+from langsplat_core.scene import look_at
+from tests.support.scenes import random_camera, random_gaussians, random_values, without_perspective
 
 G, CAMERA = random_gaussians(80, 4, sh_degree=2), random_camera(2)
 
@@ -67,3 +72,74 @@ def test_every_public_name_is_there():
         assert getattr(langsplat_core, name).__doc__
     with pytest.raises(AttributeError, match="nothing_like_it"):
         getattr(langsplat_core, "nothing_like_it")  # noqa: B009  the module's own __getattr__ is meant
+
+
+# A camera may ask for any number of pixels: what memory cannot hold is refused before it is allocated.
+
+
+def test_a_camera_file_of_65536_x_65536(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(protocol, "memory_bytes", lambda: 64e9)
+    write_cameras(tmp_path / "view.json", (replace(random_camera(2), width=65_536, height=65_536),))
+    (camera,) = read_cameras(tmp_path / "view.json")
+    tracemalloc.start()
+    with pytest.raises(InputError, match=r"65536x65536 pixels needs 172 GB .* has 64; choose a smaller size"):
+        render(Scene(G), camera)
+    assert tracemalloc.get_traced_memory()[1] < 1e9  # modules that are imported meanwhile, no pictures
+    tracemalloc.stop()
+
+
+def test_what_memory_holds_is_drawn() -> None:
+    assert render(Scene(G), random_camera(2)).alpha.max() > 0
+    assert 1e8 < protocol.memory_bytes() < 1e15
+
+
+# The Gaussians of one pixel are those that the whole view blends there.
+
+SIZE = (64, 48)
+PIXELS = [(0, 0), (63, 47), (32, 24), (20, 40), (50, 5)]
+
+
+def view_from(distance: float):
+    return look_at(np.array([0.2, -0.3, -distance]), np.zeros(3), np.array([0.0, -1, 0]), SIZE)
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+@pytest.mark.parametrize("distance", [3.0, 0.8])  # outside, and amid them: some behind, some at the edge
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_the_row_of_w(backend, distance, orthographic):
+    gaussians = random_gaussians(400, 3, scale_range=(0.005, 0.5))
+    camera, rasterizer = view_from(distance), load_lifting_rasterizer(backend)
+    camera = without_perspective(camera) if orthographic else camera
+    truth = load_lifting_rasterizer("reference").view(gaussians, camera)
+    for column, row in PIXELS:
+        image = np.zeros((SIZE[1], SIZE[0], 1))
+        image[row, column] = 1
+        want = truth.gather(image)[:, 0]
+        rows, weights = pixel_weights(rasterizer, gaussians, camera, (column, row))
+        got = np.zeros(len(gaussians))
+        got[rows] = weights
+        assert (weights > 0).all()
+        np.testing.assert_allclose(got, want, atol=2e-5)
+
+
+def test_few_are_projected_and_invalid_ones_are_not():
+    gaussians = random_gaussians(2000, 4, scale_range=(0.005, 0.02))
+    broken = replace(gaussians, means=np.where(np.arange(2000)[:, None] == 5, np.nan, gaussians.means))
+    seen = []
+
+    class Recorder:
+        name = "recorder"
+
+        def view(self, some, camera, settings=INRIA):
+            seen.append(len(some))
+            return load_lifting_rasterizer("cpu").view(some, camera, settings)
+
+    rows, _ = pixel_weights(Recorder(), broken, view_from(3.0), (32, 24))
+    assert 5 not in rows
+    assert seen[0] < 200
+
+
+def test_an_empty_scene():
+    none = random_gaussians(3, 0).take(np.zeros(3, bool))
+    rows, weights = pixel_weights(load_lifting_rasterizer("cpu"), none, view_from(3.0), (1, 1))
+    assert len(rows) == len(weights) == 0

@@ -1,12 +1,21 @@
-"""A scene far from the origin still has a camera that frames it."""
+"""Scenes: framing, merged Gaussians, phrases, calibration."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
-from langsplat_core.scene import Scene
-from tests.support.scenes import random_gaussians
+from langsplat_core.arrays import logit, psnr, sigmoid
+from langsplat_core.bench.query import repeated
+from langsplat_core.progress import Cancelled
+from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.scene import NO_THING, Gaussians, Odds, Scene
+from langsplat_core.scene.gaussians import GROUP, merged
+from langsplat_core.scene.language import phrase_key, split_phrases, tidy, tokens
+from tests.support.file_samples import random_field
+from tests.support.scenes import covariances, random_camera, random_gaussians
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e4, 1e15, 3e38])
@@ -17,3 +26,211 @@ def test_a_camera_frames_any_scene(offset: float) -> None:
     camera = scene.framing_camera((64, 48))
     assert np.isfinite(camera.world_to_camera).all()
     np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-6)
+
+
+# Fewer Gaussians that look much the same.
+
+
+def test_copies_become_one():
+    """Exactly: same place, same shape, the opacity of all four one behind the other."""
+    one = random_gaussians(1, sh_degree=1, scale_range=(0.1, 0.4))
+    four = one.take(np.zeros(GROUP, int))
+    four = replace(four, opacity_logits=logit(np.full(GROUP, 0.3)))
+    found = merged(four)
+    assert len(found.gaussians) == 1
+    np.testing.assert_allclose(found.gaussians.means, one.means, rtol=1e-6)
+    np.testing.assert_allclose(found.gaussians.sh, one.sh, rtol=1e-6)
+    np.testing.assert_allclose(covariances(found.gaussians), covariances(one), rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(sigmoid(found.gaussians.opacity_logits), 1 - 0.7**GROUP, rtol=1e-6)
+    np.testing.assert_allclose(found.weights.toarray(), 1 / GROUP)
+
+
+def test_a_row_of_neighbours_becomes_a_longer_one():
+    """Mean and covariance are those of the mixture."""
+    means = np.zeros((GROUP, 3))
+    means[:, 0] = (-0.12, -0.04, 0.04, 0.12)
+    row = Gaussians(
+        means, np.log(np.full((GROUP, 3), 0.2)), np.tile([1.0, 0, 0, 0], (GROUP, 1)), np.zeros(GROUP),
+        np.zeros((GROUP, 1, 3)),
+    )  # fmt: skip
+    found = merged(row).gaussians
+    assert len(found) == 1
+    np.testing.assert_allclose(found.means, 0, atol=1e-7)
+    expected = np.diag([0.04 + np.mean(means[:, 0] ** 2), 0.04, 0.04])
+    np.testing.assert_allclose(covariances(found)[0], expected, atol=1e-7)
+
+
+def test_what_lies_apart_is_left_as_it_is():
+    apart = random_gaussians(81, scale_range=(1e-3, 2e-3))
+    found = merged(apart)
+    rows = found.weights.indices.reshape(-1, GROUP)[:, 0]
+    assert sorted(rows) == list(range(81))
+    for name in ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh"):
+        np.testing.assert_array_equal(getattr(found.gaussians, name), getattr(apart, name)[rows])
+
+
+@pytest.fixture(scope="module")
+def dense() -> Gaussians:
+    small = random_gaussians(200, 1, sh_degree=1, scale_range=(0.05, 0.2))
+    return repeated(Scene(small), 1600).gaussians
+
+
+def test_a_dense_scene_shrinks_and_looks_alike(dense):
+    found = merged(dense)
+    assert 1600 / GROUP <= len(found.gaussians) < 800
+    assert found.gaussians.valid().all()
+    values = sigmoid(3 * dense.means)  # as colours are, much the same nearby
+    camera = random_camera(2)
+    want, want_alpha = ReferenceRasterizer().view(dense, camera).splat(values)
+    image, alpha = ReferenceRasterizer().view(found.gaussians, camera).splat(found.values(values))
+    assert psnr(image, want) > 27  # measured 29.1
+    assert psnr(alpha, want_alpha) > 23  # measured 24.0: the ball's rim is much of so small a picture
+    assert found.values(None) is None
+
+
+def test_every_row_counts_once(dense):
+    weights = merged(dense).weights
+    assert weights.shape[1] == 1600
+    np.testing.assert_allclose(weights.sum(1), 1, rtol=1e-6)
+    entries = weights.tocoo()
+    used = entries.col[entries.data > 0]
+    assert len(used) == len(set(used.tolist())) == 1600
+
+
+def test_blocks_do_not_show(dense, monkeypatch):
+    whole = merged(dense)
+    monkeypatch.setattr("langsplat_core.scene.gaussians.BLOCK", 37)
+    blocks = merged(dense)
+    order = np.lexsort(whole.gaussians.means.T), np.lexsort(blocks.gaussians.means.T)
+    for name in ("means", "log_scales", "sh"):
+        np.testing.assert_array_equal(
+            getattr(whole.gaussians, name)[order[0]], getattr(blocks.gaussians, name)[order[1]]
+        )
+
+
+def test_what_cannot_be_drawn_is_left_out():
+    broken = random_gaussians(11)
+    broken.means[3] = np.nan
+    broken.quats_wxyz[7] = 0
+    found = merged(broken)
+    assert found.gaussians.valid().all()
+    assert not set(found.weights.indices.tolist()) & {3, 7}
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 4, 5])
+def test_any_number_of_gaussians(count):
+    found = merged(random_gaussians(count))
+    assert len(found.gaussians) == found.weights.shape[0] <= count
+    assert found.values(np.ones((count, 2))).shape == (len(found.gaussians), 2)
+    np.testing.assert_allclose(found.values(np.ones((count, 2))), 1, rtol=1e-6)
+
+
+def test_extremes_stay_drawable():
+    """Flat axes, points, the largest scales and full opacity."""
+    hard = random_gaussians(16)
+    hard.log_scales[:4, 0] = -np.inf
+    hard.log_scales[4:8] = -np.inf
+    hard.means[:12] = 0.5
+    hard.log_scales[8:12] = 80
+    hard.opacity_logits[:] = np.tile([np.inf, -np.inf, 90, 0], 4)
+    with np.errstate(all="raise", under="ignore"):
+        found = merged(hard)
+    assert found.gaussians.valid().all()
+
+
+def test_it_stops_when_told_to(dense):
+    def stop(label: str, fraction: float) -> None:
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        merged(dense, stop)
+
+
+# Phrases as they are written.
+
+KEYS = {
+    "red mug": ("red mug", '"red mug"', "'Red  Mug'", "“red mug”", "«red mug»", "(red) mug.", "red mug!?",
+                " - red mug … ", "red mug\u200b", "red, mug,", "*red* _mug_"),
+    "the dogs' t-shirt & the child's cup": ("The dogs' T-shirt & the child’s cup",),
+    "杯子": ("杯子。",),
+    "☕": ("☕",),
+    "": ("", " \n\t", "'?!'", "...", "\x00", ",;,", "\u200b"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("key", "text"), [(key, text) for key, texts in KEYS.items() for text in texts])
+def test_quotes_and_punctuation_are_no_part_of_a_phrase(key, text):
+    assert phrase_key(text) == key
+    assert bool(tidy(text)) == bool(tokens(text)) == bool(split_phrases(text)) == bool(key)
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ('  "PLANT  pot" ', ["PLANT pot"]),
+        ("mug , not 'red mug'!", ["mug, not red mug"]),
+        (" , mug ,", ["mug"]),
+        ("duck, penguin", ["duck", "penguin"]),
+        (
+            '"mug", red book; plate, not red plate,, the cup, but not my cup',
+            ["mug", "red book", "plate, not red plate", "the cup, but not my cup"],
+        ),
+    ],
+)
+def test_phrases_in_a_line_are_separated_and_keep_capitals_and_commas(text, shown):
+    assert split_phrases(text) == shown
+    if len(shown) == 1:
+        assert tidy(text) == shown[0]
+
+
+@settings(max_examples=300)
+@given(st.text(max_size=40))
+@example(")\u0301")  # a mark over nothing
+def test_a_tidy_phrase_stays_as_it_is(text):
+    assert tidy(tidy(text)) == tidy(text)
+    assert phrase_key(tidy(text)) == phrase_key(text)
+
+
+# How cosines are read, and which thing a Gaussian belongs to.
+
+N = 20
+
+
+def test_a_probability_is_the_logistic_of_whole_and_the_better_finer_margin():
+    odds = Odds(-1.0, 18.0, 3.0)
+    for fits in ((0.1, -0.2, 0.3), (-0.2, 0.1, 0.3), (-5.0, -4.0, -9.0)):
+        logit = -1 + 18 * fits[2] + 3 * max(fits[:2])
+        assert odds.probability(fits) == pytest.approx(1 / (1 + np.exp(-logit)))
+    far = odds.probability((-999.0, -999.0, -999.0)), odds.probability((999.0, 999.0, 999.0))
+    assert 0 <= far[0] < 1e-9 < 1 - 1e-9 < far[1] <= 1
+    assert type(far[0]) is float
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [(np.nan, 1, 0, 0.7), (0, np.inf, 0, 0.7), (0, 1, -np.inf, 0.7), (0, 0, 0, 0.7), (0, 1, -1, 0.7),
+     (0, -2, 1, 0.7), (0, 1, 1, 0.49), (0, 1, 1, 1.01), (0, 1, 1, np.nan)],
+)  # fmt: skip
+def test_odds_rise_with_fits(numbers):
+    with pytest.raises(ValueError, match="expected finite numbers, rising with fits"):
+        Odds(*numbers)
+
+
+@pytest.mark.parametrize(
+    "things",
+    [np.zeros(N - 1, np.uint16), np.zeros((N, 1), np.uint16), np.zeros(N, np.int32), np.zeros(N), [0] * N],
+)
+def test_things_are_a_number_of_16_bits_each(things):
+    with pytest.raises((ValueError, TypeError), match="things"):
+        replace(random_field(N), things=things)
+
+
+def test_taking_rows_takes_their_things():
+    field = replace(random_field(N), things=np.arange(N, dtype=np.uint16))
+    field.things[3] = NO_THING
+    mask = np.arange(N) % 2 == 1
+    for rows in (np.array([5, 3, 3, 0]), mask, np.zeros(0, int)):
+        taken = field.take(rows)
+        np.testing.assert_array_equal(taken.things, field.things[rows])
+        assert (len(taken), taken.things.dtype) == (len(field.things[rows]), np.uint16)
+    assert random_field(N).take(mask).things is None

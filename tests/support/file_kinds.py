@@ -14,6 +14,7 @@ from langsplat_core.datasets.capture import Capture, read_photo
 from langsplat_core.datasets.colmap import load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.io.cameras import read_cameras, write_cameras
+from langsplat_core.io.foreign import read_foreign
 from langsplat_core.io.hostile import picture_size
 from langsplat_core.io.language import read_language, write_language
 from langsplat_core.io.scenes import load_scene
@@ -23,6 +24,7 @@ from tests.support.file_samples import (
     ascii_ply,
     compressed_ply,
     ksplat_bytes,
+    mixed_ply,
     plain_ply,
     random_field,
     sog_files,
@@ -30,7 +32,7 @@ from tests.support.file_samples import (
     spz_bytes,
     zipped,
 )
-from tests.support.mutation import Mutation, in_gzip, in_png, in_zip, mutant
+from tests.support.mutation import Mutation, in_gzip, in_ply_header, in_png, in_zip, mutant
 from tests.support.scenes import random_camera, random_gaussians
 from tests.support.small_datasets import write_colmap, write_nerfstudio
 
@@ -194,12 +196,8 @@ def pictures(kind: str) -> Callable[[Path], list[bytes]]:
         modes: dict[str, list[tuple[Image.Image, dict[str, object]]]] = {
             "PNG": [(noise.convert(mode), {}) for mode in ("RGB", "RGBA", "P", "L", "LA", "1")]
             + [(deep, {}), (noise, {"save_all": True, "append_images": [noise.convert("RGB")]})],
-            "JPEG": [
-                (noise, {}),
-                (noise, {"progressive": True}),
-                (noise.convert("L"), {}),
-                (noise.convert("CMYK"), {}),
-            ],
+            "JPEG": [(noise, {}), (noise, {"progressive": True})]
+            + [(noise.convert(mode), {}) for mode in ("L", "CMYK")],
             "WEBP": [(noise, {}), (noise, {"lossless": True}), (noise.convert("RGBA"), {"lossless": True})]
             + [(noise, {"save_all": True, "append_images": [noise.rotate(90)]})],
             "TIFF": [
@@ -238,9 +236,42 @@ def _scenes(file: str, *samples: bytes, damage: Mutation = mutant) -> FileKind:
     return FileKind(file, lambda _: [*samples], scene_share, damage)
 
 
+def checkpoints(folder: Path) -> list[bytes]:
+    """Of Occam's LGS, and without features."""
+    from tests.support.foreign_files import save_model, tensor  # imports torch
+
+    vectors = np.random.default_rng(0).normal(size=(20, 24)).astype(np.float32)
+    paths = [save_model(folder / "made", SCENE, tensor(vectors)), save_model(folder / "plain", SCENE)]
+    return [path.read_bytes() for path in paths]
+
+
+def autoencoders(folder: Path) -> list[bytes]:
+    """Of LangSplat; the checkpoint that goes with it lies beside."""
+    import torch
+
+    from tests.support.foreign_files import autoencoder, save_model, tensor
+
+    save_model(folder / "latents_1.pth", SCENE, tensor(np.ones((20, 3), np.float32)))
+    torch.save(autoencoder(24, (8, 3), (5,)).state_dict(), folder / "made")
+    return [(folder / "made").read_bytes()]
+
+
+def imported(path: Path) -> float:
+    beside = path.with_name("latents_1.pth")
+    scene = read_foreign([path, *[beside] * beside.exists()])
+    for level in (level for level in range(3) if scene.levels[level] is not None):
+        scene.rows(level, np.arange(len(scene.scene.gaussians)))
+    return 1.0
+
+
 KINDS = {
-    "INRIA PLY": _scenes("a.ply", plain_ply(SCENE), plain_ply(PLAIN), ascii_ply(random_gaussians(5))),
-    "compressed PLY": _scenes("a.ply", compressed_ply(SCENE), compressed_ply(PLAIN, colours=False)),
+    "INRIA PLY": _scenes(
+        *("a.ply", plain_ply(SCENE), plain_ply(PLAIN), mixed_ply(SCENE), ascii_ply(random_gaussians(5))),
+        damage=in_ply_header,
+    ),
+    "compressed PLY": _scenes(
+        "a.ply", compressed_ply(SCENE), compressed_ply(PLAIN, colours=False), damage=in_ply_header
+    ),
     "SOG": _scenes("a.sog", zipped(sog_files(SCENE)), zipped(sog_files(PLAIN)), damage=in_zip),
     **{
         f"SPZ {v}": _scenes("a.spz", spz_bytes(SCENE, v), spz_bytes(PLAIN, v), damage=in_gzip)
@@ -255,13 +286,15 @@ KINDS = {
     ),
     "cameras.json": FileKind("a.cameras.json", camera_files, camera_list),
     "transforms.json": FileKind("transforms.json", transforms, beside_transforms),
-    "point-cloud PLY": FileKind("cloud.ply", cloud_folder, beside_transforms),
+    "point-cloud PLY": FileKind("cloud.ply", cloud_folder, beside_transforms, in_ply_header),
     **{
         f"COLMAP {part}.{form}": colmap(f"{part}.{form}")
         for form in ("bin", "txt")
         for part in ("cameras", "images", "points3D")
     },
     ".features.npz": FileKind("a.features.npz", feature_files, stored_features, in_zip),
+    "checkpoint": FileKind("a.pth", checkpoints, imported),
+    "autoencoder": FileKind("a.pth", autoencoders, imported),
     "PNG": _photographs("PNG", in_png),
     **{kind: _photographs(kind) for kind in ("JPEG", "WEBP", "TIFF", "BMP", "AVIF")},
 }

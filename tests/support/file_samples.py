@@ -97,6 +97,19 @@ def ascii_ply(g: Gaussians) -> bytes:
     return ply_bytes(header, "\n".join(lines).encode())
 
 
+def mixed_ply(g: Gaussians) -> bytes:
+    """Big endian doubles, an extra property in front and one of another type behind, a further element."""
+    names = inria_names(g.sh_degree, normals=False)
+    table = vertex_table(g, ["segment", *names], ">f8")
+    mixed = np.zeros(len(g), [*table.dtype.descr, ("id", ">u2")])
+    for name in table.dtype.names:
+        mixed[name] = table[name]
+    header = ["format binary_big_endian 1.0", "comment antialiased 1", f"element vertex {len(g)}"]
+    header += [f"property double {name}" for name in table.dtype.names]
+    header += ["property ushort id", "element camera 1", "property float focal"]
+    return ply_bytes(header, mixed.tobytes() + b"\0\0\0\1")
+
+
 def _fields(values: Array, bits: tuple[int, ...]) -> Array:
     """(N, len(bits)) fractions in [0, 1] -> (N,) uint32, the first field on top."""
     packed = np.zeros(len(values), np.uint32)
@@ -259,8 +272,8 @@ def random_field(
 ) -> LanguageField:
     rng = np.random.default_rng(seed)
     codec = random_codec(kind, seed=seed)
-    if codec.index_size:
-        latents = rng.integers(codec.index_size, size=(3, n, 1)).astype(np.uint16)
+    if not codec.blends:
+        latents = rng.integers(codec.size, size=(3, n, 1)).astype(np.uint16)
     else:
         latents = unit(rng.normal(size=(3, n, codec.latent_dim))).astype(np.float32)
     latents[:, ::7] = 0  # never observed

@@ -94,23 +94,3 @@ def faiss_index(centroids: Array, kind: bytes = b"IxPq", metric: int = 1, bits: 
     out += struct.pack("<f", 0.5) if metric > 1 else b""
     out += struct.pack("<QQQQ", dim, parts, bits, centroids.size) + centroids.astype("<f4").tobytes()
     return out + struct.pack("<Q", 3 * parts) + bytes(3 * parts) + struct.pack("<i?i", 0, False, 0)
-
-
-def save_fvdb(path: Path, logits: Array, codebooks: Array, level: int, topk: int = 4) -> Path:
-    """The dictionary of fVDB's port."""
-    config = {"vq_layer_num": codebooks.shape[0], "codebook_size": codebooks.shape[1], "topk": topk}
-    content = {
-        "magic": "LangSplatV2Checkpoint",
-        "version": "1.0.0",
-        "step": 100,
-        "config": {"feature_level": level, "learning_rate": 0.0025, "model": config},
-        "sfm_scene": {"points": np.zeros((5, 3)), "names": ["a.png"]},
-        "gs_model_path": "scene.ply",
-        "model": {
-            "model_state": {"logits": tensor(logits).data, "codebooks": tensor(codebooks).data},
-            "config": config,
-        },
-        "optimizer": {"state": {}, "param_groups": []},
-    }
-    torch.save(content, path)
-    return path

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from langsplat_core.raster import gsplat
 
-PINHOLE = 0  # pybind exports the values of this enumeration beside it
+PINHOLE, ORTHO = 0, 1  # pybind exports the values of this enumeration beside it
 CameraModelType = ModuleType("CameraModelType")
 ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN = 1 / 255, 0.999, 1e-4
 WIDEST = 3.33  # standard deviations
@@ -76,6 +76,7 @@ def _project(
     Ks: Tensor,
     size: tuple[int, int],
     eps2d: float,
+    camera_model: int,
 ) -> tuple[Tensor, ...]:
     """Centres in camera space, pixels, blurred 2D covariances (N, 2, 2), det before / after the blur."""
     turn, shift = viewmats[0, :3, :3], viewmats[0, :3, 3]
@@ -85,9 +86,11 @@ def _project(
     covariances = turn @ (spread @ spread.transpose(1, 2)) @ turn.T
     extent = torch.tensor(size, dtype=torch.float32)
     margin = 0.3 * (0.5 * extent / focal)
-    over_z = 1 / points[:, 2]
+    over_z = 1 / points[:, 2] if camera_model == PINHOLE else torch.ones_like(points[:, 2])
     slopes = points[:, :2] * over_z[:, None]
     kept = slopes.clamp(-(centre / focal + margin), (extent - centre) / focal + margin) * points[:, 2:]
+    if camera_model == ORTHO:
+        kept = torch.zeros_like(kept)  # its Jacobian has no third column
     zero = torch.zeros_like(over_z)
     jacobian = torch.stack(
         [
@@ -118,9 +121,9 @@ def projection_ewa_3dgs_fused_fwd(  # noqa: PLR0913  gsplat's signature
     count = len(means)
     assert (means.shape, viewmats.shape, Ks.shape) == ((count, 3), (1, 4, 4), (1, 3, 3))
     assert covars is None
-    assert camera_model == PINHOLE
+    assert camera_model in (PINHOLE, ORTHO)
     points, pixels, blurred, ratio = _project(
-        means, quats, scales, viewmats, Ks, (image_width, image_height), eps2d
+        means, quats, scales, viewmats, Ks, (image_width, image_height), eps2d, camera_model
     )
     compensations = ratio.clamp(min=0).sqrt()
     reach = torch.full((count,), WIDEST)
@@ -152,12 +155,14 @@ def projection_ewa_3dgs_fused_bwd(  # noqa: PLR0913  gsplat's signature
     _check(means, quats, scales, viewmats, Ks, conics, compensations)
     _check(v_means2d, v_depths, v_conics, v_compensations)
     assert covars is None
-    assert camera_model == PINHOLE
+    assert camera_model in (PINHOLE, ORTHO)
     assert not viewmats_requires_grad
     rows = (radii[0] > 0).all(1).nonzero()[:, 0]
     leaves = [leaf[rows].clone().requires_grad_() for leaf in (means, quats, scales)]
     with torch.enable_grad():
-        points, pixels, blurred, ratio = _project(*leaves, viewmats, Ks, (image_width, image_height), eps2d)
+        points, pixels, blurred, ratio = _project(
+            *leaves, viewmats, Ks, (image_width, image_height), eps2d, camera_model
+        )
         outputs = [pixels, points[:, 2], _conics(blurred)]
         grads = [v_means2d[0, rows], v_depths[0, rows], v_conics[0, rows]]
         if v_compensations is not None:

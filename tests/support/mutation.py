@@ -23,65 +23,14 @@ import numpy as np
 from langsplat_core.errors import InputError, printable_line
 
 HEADER = 600  # bytes at the beginning in which half of the mutations fall
-INTEGERS = (
-    0,
-    1,
-    -1,
-    127,
-    128,
-    255,
-    256,
-    2**15,
-    2**16 - 1,
-    2**24,
-    2**31 - 1,
-    2**31,
-    2**32 - 1,
-    2**53,
-    2**63 - 1,
-)
+INTEGERS = (0, 1, -1, *(2**k + d for k in (7, 8, 15, 16, 24, 31, 32, 53, 63) for d in (-1, 0)))
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-45, 1e-38, 1e9, 1e20, 3.4e38, float("inf"), float("-inf"), float("nan"))
 TOKENS = (
-    *(
-        b"0",
-        b"-1",
-        b"1",
-        b"256",
-        b"65536",
-        b"4294967296",
-        b"18446744073709551616",
-        b"9" * 30,
-        b"1" + b"0" * 400,
-    ),
-    *(
-        b"9" * 5000,
-        b"1e308",
-        b"1e999",
-        b"-1e999",
-        b"1e-320",
-        b"nan",
-        b"NaN",
-        b"inf",
-        b"-Infinity",
-        b"0x10",
-        b"1_0",
-    ),
-    *(
-        b"null",
-        b"true",
-        b"[]",
-        b"{}",
-        b'""',
-        b'"a"',
-        b"[[[[",
-        b"\x00",
-        b"\x1b[2J",
-        b"\xff\xfe",
-        b"\n",
-        b"\r",
-        b"#",
-    ),
-    *("٣".encode(), "\u2028".encode(), b"\\ud800", b"../../x", b"/dev/zero", b"%s%n", b"a" * 5000),
+    *b"0 -1 1 256 65536 4294967296 18446744073709551616 0x10 1_0".split(),
+    *b"1e308 1e999 -1e999 1e-320 nan NaN inf -Infinity".split(),
+    *b'null true [] {} "" "a" [[[[ \\ud800 ../../x /dev/zero %s%n #'.split(),
+    *(b"9" * 30, b"1" + b"0" * 400, b"9" * 5000, b"a" * 5000, b"\x00", b"\x1b[2J", b"\xff\xfe", b"\n", b"\r"),
+    *("٣".encode(), "\u2028".encode()),
 )
 _WORD = re.compile(rb"[^\s,:\[\]{}\"]+")
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
@@ -264,6 +213,64 @@ def in_png(data: bytes, others: Sequence[bytes], rng: np.random.Generator) -> by
         for name, content in chunks
     )
     return data[:8] + body
+
+
+# Lines of the header of a PLY, from which a mutation takes others.
+PLY_LINES = b"""ply
+element face 3
+element face 0
+element a 999999999999
+element vertex 3
+property list uchar int v
+property list char int v
+property list uint double w
+property list float int v
+property double q
+property uchar q
+property float x
+property float f_rest_0
+property float f_rest_45
+property float packed_color
+property char \xff\xfe
+property
+element
+comment SplatRenderMode: mip
+obj_info \x00
+format ascii 1.0
+format binary_big_endian 1.0
+end_header
+
+\x00""".split(b"\n")
+PLY_WORDS = (
+    *b"char uchar short ushort int uint float double int8 float64".split(),
+    *b"ascii binary_little_endian binary_big_endian chunk sh vertex".split(),
+    *b"x opacity rot_3 f_dc_0 min_x packed_position f_rest_9 f_rest_-1".split(),
+    *(str(n).encode() for n in (-1, 0, 1, 2, 19, 21, 255, 256, 257, 2**31, 2**32, 2**63, 2**64, 10**12)),
+)
+
+
+@_half
+def in_ply_header(data: bytes, _: Sequence[bytes], rng: np.random.Generator) -> bytes:
+    """One to three lines removed, doubled, swapped, added, or saying something else."""
+    header, _, body = data.partition(b"end_header\n")
+    lines = header.splitlines()
+    for _ in range(int(rng.integers(1, 4))):
+        place, other = (int(i) for i in rng.integers(1, len(lines), size=2))
+        match int(rng.integers(0, 6)):
+            case 0 if len(lines) > 3:
+                del lines[place]
+            case 1:
+                lines.insert(other, lines[place])
+            case 2:
+                lines[place], lines[other] = lines[other], lines[place]
+            case 3:
+                lines.insert(place, PLY_LINES[int(rng.integers(len(PLY_LINES)))])
+            case _:
+                words = lines[place].split(b" ")
+                words[int(rng.integers(len(words)))] = PLY_WORDS[int(rng.integers(len(PLY_WORDS)))]
+                lines[place] = b" ".join(words)
+    newline = b"\r\n" if rng.random() < 0.1 else b"\n"
+    return newline.join([*lines, b"end_header"]) + newline + body
 
 
 # What a reader may do with a damaged file: load it, or refuse it in one short printable line. Everything

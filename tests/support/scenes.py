@@ -1,5 +1,7 @@
 """Tiny seeded scenes that many tests share."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from langsplat_core.arrays import Array, logit, rotation_matrices
@@ -62,6 +64,11 @@ def random_camera(
     )
 
 
+def without_perspective(camera: Camera, distance: float = 3.0) -> Camera:
+    """The orthographic camera that sees what is `distance` world units away as large."""
+    return replace(camera, fx=camera.fx / distance, fy=camera.fy / distance, orthographic=True)
+
+
 def covariances(g: Gaussians) -> Array:
     """(N, 3, 3) in world units, float64."""
     axes = rotation_matrices(g.quats_wxyz.astype(float)) * np.exp(g.log_scales.astype(float))[:, None]
@@ -75,13 +82,7 @@ def random_values(n: int, channels: int, seed: int = 0) -> Array:
 
 def shifted(gaussians: Gaussians, camera: Camera, offset: Array) -> tuple[Gaussians, Camera]:
     """The same picture with the world's origin moved by `offset` (3,), up to rounding of the means."""
-    moved = Gaussians(
-        gaussians.means.astype(np.float64) + offset,
-        gaussians.log_scales,
-        gaussians.quats_wxyz,
-        gaussians.opacity_logits,
-        gaussians.sh,
-    )
+    moved = replace(gaussians, means=gaussians.means.astype(np.float64) + offset)
     matrix = camera.world_to_camera.copy()
     matrix[:3, 3] -= camera.rotation @ np.asarray(offset, np.float64)
-    return moved, Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, matrix)
+    return moved, replace(camera, world_to_camera=matrix)

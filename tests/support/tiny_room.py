@@ -10,7 +10,7 @@ from PIL import Image
 
 from langsplat_core.config import (
     ClipConfig,
-    CodecConfig,
+    CodebookConfig,
     DatasetConfig,
     MaskConfig,
     RadianceConfig,
@@ -58,7 +58,7 @@ def tiny_settings(room: Path) -> TrainConfig:
         radiance=RadianceConfig(steps=20, sh_degree=0, checkpoint_every=5),
         masks=MaskConfig(source="graph"),
         clip=ClipConfig(model=str(room / "encoder"), device="cpu"),
-        codec=CodecConfig(steps=30),
+        codec=CodebookConfig(),
         phrases=("red mug",),
     )
 

@@ -34,9 +34,12 @@ def project(
     )
     tx = torch.clamp(x / z, -camera.cx / camera.fx - grow_x, (camera.width - camera.cx) / camera.fx + grow_x)
     ty = torch.clamp(y / z, -camera.cy / camera.fy - grow_y, (camera.height - camera.cy) / camera.fy + grow_y)
+    over = torch.ones_like(z) if camera.orthographic else z
+    if camera.orthographic:
+        tx, ty = torch.zeros_like(z), torch.zeros_like(z)
     nought = torch.zeros_like(z)
     jacobian = torch.stack(
-        [camera.fx / z, nought, -camera.fx * tx / z, nought, camera.fy / z, -camera.fy * ty / z], -1
+        [camera.fx / over, nought, -camera.fx * tx / z, nought, camera.fy / over, -camera.fy * ty / z], -1
     ).reshape(-1, 2, 3)
     w, i, j, k = torch.nn.functional.normalize(leaves["quats_wxyz"], dim=1).T
     turn = torch.stack(
@@ -54,7 +57,7 @@ def project(
     if settings.antialiased:
         ratio = torch.linalg.det(sharp) / torch.linalg.det(covariance)
         opacity = opacity * torch.sqrt(torch.clamp(ratio, min=0.005**2))
-    means_px = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
+    means_px = torch.stack([camera.fx * x / over + camera.cx, camera.fy * y / over + camera.cy], -1)
     return means_px, covariance, opacity, z
 
 

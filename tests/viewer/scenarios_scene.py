@@ -257,7 +257,7 @@ def look_without_perspective(s: Any) -> None:
     deep, view = s.shot("deep"), s.state.view
     s.ctx.key_press(imgui.Key.o)
     s.settle()
-    assert s.state.view.back > 0
+    assert s.state.view.orthographic
     flat, area = s.shot("flat"), scene_area()
     for thing in CENTRES:
         assert s.at(flat, thing).argmax() == s.at(deep, thing).argmax()
@@ -278,7 +278,7 @@ def look_without_perspective(s: Any) -> None:
     s.menu("View", "Show or hide the training cameras")
     s.ctx.key_press(imgui.Key.home)
     s.settle()
-    assert s.state.view.back > 0
+    assert s.state.view.orthographic
     settings.open_panel(s.window.viewer, "Camera")
     s.ctx.yield_(4)
     s.ctx.item_click("//Camera/###orthographic")
@@ -288,13 +288,13 @@ def look_without_perspective(s: Any) -> None:
     )
     s.ctx.key_press(imgui.Key.keypad5)
     s.ctx.yield_(2)
-    assert s.state.view.back > 0
+    assert s.state.view.orthographic
     viewpoint.zoom_by(s.window.viewer, 4.0)  # until all cameras are in the picture
     s.settle()
     s.shot("cameras")
     click(s, on_screen(s, s.state.scene.cameras[2].position))
     s.settle()
-    assert (s.state.camera_index, s.state.view.back) == (2, 0.0)
+    assert (s.state.camera_index, s.state.view.orthographic) == (2, False)
 
 
 def name_what_is_close(s: Any) -> None:

@@ -38,7 +38,7 @@ def test_there_and_back_is_the_same_view(opened):
     (command,) = (command for command in COMMANDS if command.act is viewpoint.toggle_orthographic)
     assert command.keys == ("O", "Keypad5")
     command.act(opened)
-    assert opened.state.view.back > 90 * before.distance
+    assert opened.state.view.orthographic
     command.act(opened)
     assert_allclose(
         opened.state.view.camera(*SIZE).world_to_camera, before.camera(*SIZE).world_to_camera, atol=0
@@ -70,7 +70,7 @@ def test_moving_keeps_it(flat, go):
     go(flat)
     arrive(flat)
     assert flat.state.view is not before
-    assert flat.state.view.back == before.back
+    assert flat.state.view.orthographic
 
 
 def test_the_opening_view_of_a_scene_without_cameras_holds_all_of_it(viewer):
@@ -84,14 +84,14 @@ def test_the_opening_view_of_a_scene_without_cameras_holds_all_of_it(viewer):
     sample = viewer.state.extent.sample
     places = pixels(viewer, sample.points)
     inside = (places >= 0).all(1) & (places <= SIZE).all(1)
-    assert viewer.state.view.back > 0
+    assert viewer.state.view.orthographic
     assert sample.weights[inside].sum() > 0.98 * sample.weights.sum()
 
 
 def test_a_training_camera_is_seen_with_perspective(flat):
     viewpoint.go_to_camera(flat, 1)
     arrive(flat)
-    assert flat.state.view.back == 0
+    assert flat.state.view.orthographic is False
     assert standing_at(flat.state) is not None
     viewpoint.toggle_orthographic(flat)
     assert standing_at(flat.state) is None  # its photograph would not fit
@@ -118,7 +118,7 @@ def test_a_glide_under_way_goes_on(opened):
     arrive(opened)
     wanted = from_side(opened.state.view, "top")
     assert_allclose(opened.state.view.rotation, wanted.rotation, atol=1e-9)
-    assert opened.state.view.back > 0
+    assert opened.state.view.orthographic
 
 
 def test_keyframes_and_bookmarks_bring_their_own(flat, tmp_path):
@@ -132,17 +132,17 @@ def test_keyframes_and_bookmarks_bring_their_own(flat, tmp_path):
     filming.add_keyframe(flat)
     viewpoint.add_bookmark(flat, "deep")
     kept = flat.shelf.read(flat.state.path)
-    for name, back, go in (
-        ("flat", marked.back, lambda: viewpoint.go_to_bookmark(flat, kept[0])),
-        ("deep", 0.0, lambda: viewpoint.go_to_bookmark(flat, kept[1])),
-        ("first key", marked.back, lambda: filming.choose_keyframe(flat, flat.state.record.keyframes[0])),
-        ("second key", 0.0, lambda: filming.choose_keyframe(flat, flat.state.record.keyframes[1])),
-        ("played", marked.back, lambda: viewpoint.scrub(flat, 1.0)),
+    for name, orthographic, go in (
+        ("flat", True, lambda: viewpoint.go_to_bookmark(flat, kept[0])),
+        ("deep", False, lambda: viewpoint.go_to_bookmark(flat, kept[1])),
+        ("first key", True, lambda: filming.choose_keyframe(flat, flat.state.record.keyframes[0])),
+        ("second key", False, lambda: filming.choose_keyframe(flat, flat.state.record.keyframes[1])),
+        ("played", True, lambda: viewpoint.scrub(flat, 1.0)),
     ):
         go()
         arrive(flat)
-        assert flat.state.view.back == back, name
-        if back and name != "played":
+        assert flat.state.view.orthographic == orthographic, name
+        if orthographic and name != "played":
             assert_allclose(flat.state.view.target, marked.target, atol=1e-9)
             assert flat.state.view.span == pytest.approx(marked.span)
 

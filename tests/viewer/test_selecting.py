@@ -258,11 +258,10 @@ def test_what_lies_behind_something_is_left_out_unless_all_is_wanted(front, monk
     assert 20 < in_front.sum() < 100
 
 
-def test_in_parallel_projection_strokes_meet_the_same(front, monkeypatch):
+def test_without_perspective_strokes_meet_the_same(front, monkeypatch):
     """Depths count from the eye: what hides, and what is cut away."""
     viewpoint.toggle_orthographic(front)
-    back = front.state.view.back
-    monkeypatch.setattr(FakeSurface, "depths", lambda self: np.full((30, 40), back + 4.95))
+    monkeypatch.setattr(FakeSurface, "depths", lambda self: np.full((30, 40), 4.95))
     z = front.state.scene.gaussians.means[:, 2]
     selecting.use_tool(front, "lasso")
     draw(front, around(front, CENTRES[0], 0.7))

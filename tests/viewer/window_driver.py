@@ -312,7 +312,7 @@ def from_the_command_line(s: Session) -> None:
     expected = s.state.scene.cameras[2]
     np.testing.assert_allclose(s.state.view.eye, expected.position, atol=1e-9)
     np.testing.assert_allclose(s.state.view.rotation, expected.rotation, atol=1e-9)
-    assert s.state.view.back > 0
+    assert s.state.view.orthographic
     assert abs(s.state.view.span - 4.0) < 1e-9
 
 

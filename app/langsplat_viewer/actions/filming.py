@@ -18,7 +18,7 @@ from langsplat_core.scene import LEVELS
 from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.actions.viewpoint import glide_to, leave_path, path_seconds
-from langsplat_viewer.camera.controls import from_camera, in_perspective
+from langsplat_viewer.camera.controls import from_camera, with_projection
 from langsplat_viewer.camera.flight import (
     LONGEST,
     SAME_TIME,
@@ -278,7 +278,7 @@ def copy_command(viewer: Viewer, folder: Path) -> str:
             return ""
         camera = str(saved.absolute())
     words = ["langsplat-viewer", str(state.path.absolute()), "--headless", "--camera", camera]
-    if state.view.back:
+    if state.view.orthographic:
         words += ["--orthographic", repr(float(state.view.span_in(*state.size)))]
     words += ["--size", "{}x{}".format(*state.size), *_display_words(state), *_look_words(state)]
     if viewer.services.encoder_id:
@@ -299,7 +299,7 @@ def _training_camera(state: ViewerState) -> str | None:
     """The number of the training camera whose view it is, exactly, with perspective or without."""
     if state.view is None or state.scene is None or state.extent is None:
         return None
-    here = in_perspective(state.view).camera(*state.size)
+    here = with_projection(state.view, orthographic=False).camera(*state.size)
     for number, own in enumerate(state.scene.cameras):
         there = from_camera(own, state.extent).camera(*state.size)
         same = np.allclose(there.world_to_camera, here.world_to_camera, rtol=0, atol=1e-9)

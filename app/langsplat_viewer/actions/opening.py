@@ -284,7 +284,7 @@ def standing_at(state: ViewerState) -> Camera | None:
     if (
         scene is None
         or view is None
-        or view.back
+        or view.orthographic
         or state.extent is None
         or index is None
         or state.glide is not None

@@ -23,7 +23,6 @@ from langsplat_core.query.selection import at_point, grow, of_rows, shrink
 from langsplat_core.scene import LEVELS, Scene
 from langsplat_viewer import marks
 from langsplat_viewer.actions.history import remember
-from langsplat_viewer.camera.controls import eye_depth
 from langsplat_viewer.marks import Drawn, Leaving, Marks, Mode, Stroke, Tool
 from langsplat_viewer.output.saving import free_name
 from langsplat_viewer.rendering.depth import UNCLIPPED
@@ -366,7 +365,7 @@ def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
         return
     wanted = state.selection.only_visible and drawn.tool in marks.ON_SCREEN and viewer.surface is not None
     depths = viewer.surface.depths() if wanted and viewer.surface is not None else None
-    means, clip = state.scene.gaussians.means, state.settings.clip.beyond(eye_depth(drawn.camera))
+    means, clip = state.scene.gaussians.means, state.settings.clip
     found = marks.caught(drawn, means, depths)
     if clip != UNCLIPPED and drawn.tool in marks.ON_SCREEN:  # what is not drawn lies under no outline
         found &= clip.keeps(means @ drawn.camera.rotation[2] + drawn.camera.world_to_camera[2, 3])

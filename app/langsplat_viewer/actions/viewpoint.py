@@ -24,10 +24,9 @@ from langsplat_viewer.camera.controls import (
     from_camera,
     from_side,
     holding_distance,
-    in_parallel,
-    in_perspective,
     orbit,
     spanning,
+    with_projection,
     zoom,
 )
 from langsplat_viewer.camera.flight import pose_at, pose_of, view_of
@@ -185,8 +184,8 @@ def reset_view(viewer: Viewer) -> None:
     view, extent = opening_view(viewer), viewer.state.extent
     if view is None or extent is None:
         return
-    if viewer.state.view is not None and viewer.state.view.back:
-        view = in_parallel(view, extent)
+    if viewer.state.view is not None and viewer.state.view.orthographic:
+        view = with_projection(view, orthographic=True)
         if _opens_framed(viewer):
             view = frame_all(view, extent, viewer.state.size)
     glide_to(viewer, view)
@@ -214,11 +213,11 @@ def set_orthographic(viewer: Viewer, orthographic: bool) -> None:
     """Look without perspective, or with it again; a glide under way goes on."""
     state = viewer.state
     view, extent, glide = state.view, state.extent, state.glide
-    if view is None or extent is None or bool(view.back) == orthographic:
+    if view is None or extent is None or view.orthographic == orthographic:
         return
 
     def turned(view: OrbitCamera) -> OrbitCamera:
-        return in_parallel(view, extent) if orthographic else in_perspective(view)
+        return with_projection(view, orthographic)
 
     move(viewer, turned)
     state.glide = None if glide is None else replace(glide, end=turned(glide.end))
@@ -226,14 +225,14 @@ def set_orthographic(viewer: Viewer, orthographic: bool) -> None:
 
 def toggle_orthographic(viewer: Viewer) -> None:
     """Look without perspective, or with it again."""
-    set_orthographic(viewer, viewer.state.view is not None and not viewer.state.view.back)
+    set_orthographic(viewer, viewer.state.view is not None and not viewer.state.view.orthographic)
 
 
 def open_orthographic(viewer: Viewer, span: float) -> None:
     """Look without perspective, `span` world units across the shorter side of the uncropped picture."""
     extent = viewer.state.extent
     if extent is not None:
-        move(viewer, lambda view: spanning(view, span, extent))
+        move(viewer, lambda view: spanning(view, span))
 
 
 def set_walking(viewer: Viewer, walks: bool) -> None:
@@ -302,8 +301,8 @@ def focus_pixel(viewer: Viewer, u: float, v: float) -> None:
         viewer.state.say("nothing under the cursor to turn around")
         return
     view = viewer.state.view
-    # The eye stays, but in parallel projection the size of things does.
-    depth = None if view.back else float((point - view.eye) @ view.rotation[2])
+    # The eye stays, but without perspective the size of things does.
+    depth = None if view.orthographic else float((point - view.eye) @ view.rotation[2])
     glide_to(viewer, focus(view, point, depth))
 
 

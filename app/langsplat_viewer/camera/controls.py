@@ -1,7 +1,4 @@
-"""Parallel projection by a pinhole camera that stands far behind the eye: rasterizers need not know of it.
-
-The farther it stands, the more parallel its rays, and the more of a float32 its depths take. Plain maths.
-"""
+"""The camera that the user moves, and what it needs to know about a scene. Plain maths."""
 
 import math
 from dataclasses import dataclass, replace
@@ -12,31 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.scene import Camera, Gaussians, Intrinsics, Scene, look_at
-
-
-@dataclass(frozen=True, eq=False)
-class FarCamera(Camera):
-    """Stands behind the eye, with a lens so narrow that what is as far as the target keeps its size. It has
-    before it what lies behind the eye; `image_formation` leaves that out."""
-
-    back: float = 0.0  # from it to the plane of the eye, world units
-    distance: float = 1.0  # from there to the target, world units
-
-    def with_intrinsics(self, intrinsics: Intrinsics) -> "FarCamera":
-        """See `Camera`."""
-        near = super().with_intrinsics(intrinsics)
-        inner = (near.width, near.height, near.fx, near.fy, near.cx, near.cy)
-        return FarCamera(*inner, self.world_to_camera, self.name, back=self.back, distance=self.distance)
-
-    @property
-    def near_intrinsics(self) -> Intrinsics:
-        """Of a camera at the eye that sees the target as large."""
-        return narrowed(self.intrinsics, self.distance / (self.distance + self.back))
-
-
-def eye_depth(camera: Camera) -> float:
-    """Camera z of the plane through the eye, world units; 0 in perspective."""
-    return camera.back if isinstance(camera, FarCamera) else 0.0
 
 
 def narrowed(inner: Intrinsics, factor: float) -> Intrinsics:
@@ -149,8 +121,7 @@ MAX_ELEVATION = math.radians(88)  # nearer to the pole a small drag would spin t
 DEFAULT_FOV = 50.0  # degrees, of the picture's shorter side
 FOV_RANGE = (10.0, 120.0)  # degrees
 FARTHEST = 12.0  # of the distance from the middle that holds the scene: it is still a spot that can be seen
-BACK = 25.0  # of `Extent.farthest`: so far behind the eye stands the camera of a parallel projection
-NARROW = 1e4  # how much longer the lens is by which a scene is framed in parallel projection
+NARROW = 1e4  # how much longer the lens is by which a scene is framed without perspective
 SURROUNDINGS = 1.8  # how much more than a thing itself a view of it shows
 
 
@@ -173,13 +144,11 @@ class OrbitCamera:
     distance: float  # world units from the eye to the target, > 0
     up: Array  # (3,) unit, the world's up: the axis that a sideways drag turns about
     intrinsics: Intrinsics  # of a picture that any window shows whole, uncropped
-    back: float = (
-        0.0  # world units that the camera stands behind the eye, see `in_parallel`; 0: in perspective
-    )
+    orthographic: bool = False  # without perspective: everything has the size that it has at the target
 
     @property
     def eye(self) -> Array:
-        """(3,) centre of projection, world units."""
+        """(3,) where the camera stands, world units."""
         return self.target - self.distance * self.rotation[2]
 
     def camera(self, width: int, height: int) -> Camera:
@@ -188,12 +157,10 @@ class OrbitCamera:
         matrix[:3, :3] = self.rotation
         matrix[:3, 3] = -self.rotation @ self.eye
         inner = self.intrinsics.fitted(width, height)
-        if not self.back:
-            return Camera(width, height, inner.fx, inner.fy, inner.cx, inner.cy, matrix)
-        matrix[2, 3] += self.back
-        inner = narrowed(inner, (self.distance + self.back) / self.distance)
+        if self.orthographic:
+            inner = narrowed(inner, 1 / self.distance)
         pinhole = (width, height, inner.fx, inner.fy, inner.cx, inner.cy, matrix)
-        return FarCamera(*pinhole, back=self.back, distance=self.distance)
+        return Camera(*pinhole, orthographic=self.orthographic)
 
     @property
     def span(self) -> float:
@@ -256,11 +223,11 @@ def zoom(
     view: OrbitCamera, factor: float, min_distance: float, max_distance: float = math.inf
 ) -> OrbitCamera:
     """Multiply the distance by `factor`; at `min_distance` the target is pushed on, so it never sticks, and
-    at `max_distance` the way back ends (a view from farther away stays where it is). In parallel projection
+    at `max_distance` the way back ends (a view from farther away stays where it is). Without perspective
     pushing on would make nothing larger."""
     wanted = view.distance * factor
     distance = min(max(wanted, min_distance), max(max_distance, view.distance))
-    push = distance - wanted if factor < 1 and not view.back else 0.0
+    push = distance - wanted if factor < 1 and not view.orthographic else 0.0
     return replace(view, distance=distance, target=view.target + push * view.rotation[2])
 
 
@@ -367,46 +334,40 @@ def extent_of(scene: Scene) -> Extent:
 
 
 def from_camera(camera: Camera, extent: Extent) -> OrbitCamera:
-    """The exact view of `camera`, turning around the depth at which it sees the scene's middle; of a far one
-    around what it was made for."""
-    forward = camera.rotation[2]
-    if isinstance(camera, FarCamera):
-        target = camera.position + (camera.back + camera.distance) * forward
-        lens = camera.near_intrinsics
-        return OrbitCamera(camera.rotation, target, camera.distance, extent.up, lens, camera.back)
+    """The exact view of `camera`, turning around the depth at which it sees the scene's middle; of an
+    orthographic one, around that at which a lens of the default angle shows as much."""
+    forward, inner = camera.rotation[2], camera.intrinsics
+    if camera.orthographic:
+        distance = symmetric_intrinsics().fitted(camera.width, camera.height).fx / camera.fx
+        target, inner = camera.position + distance * forward, narrowed(inner, distance)
+        return OrbitCamera(camera.rotation, target, distance, extent.up, inner, orthographic=True)
     distance = max(float((extent.centre - camera.position) @ forward), 0.3 * extent.radius)
     target = camera.position + distance * forward
-    return OrbitCamera(camera.rotation, target, distance, extent.up, camera.intrinsics)
+    return OrbitCamera(camera.rotation, target, distance, extent.up, inner)
 
 
-def in_parallel(view: OrbitCamera, extent: Extent) -> OrbitCamera:
-    """The same view without perspective: what is as far as the target keeps its size. What lies behind the
-    eye stays out of the picture."""
-    return replace(view, back=BACK * extent.farthest)
+def with_projection(view: OrbitCamera, orthographic: bool) -> OrbitCamera:
+    """The same view with or without perspective: what is as far as the target keeps its size."""
+    return replace(view, orthographic=orthographic)
 
 
-def in_perspective(view: OrbitCamera) -> OrbitCamera:
-    """The same view with perspective."""
-    return replace(view, back=0.0)
-
-
-def spanning(view: OrbitCamera, span: float, extent: Extent) -> OrbitCamera:
-    """From the same eye in parallel projection, `span` world units across the uncropped picture's shorter
-    side."""
+def spanning(view: OrbitCamera, span: float) -> OrbitCamera:
+    """The orthographic view from the same eye, `span` world units across the shorter side of the uncropped
+    picture."""
     distance = view.distance * span / view.span
-    return in_parallel(focus(view, view.eye + distance * view.rotation[2], distance), extent)
+    return with_projection(focus(view, view.eye + distance * view.rotation[2], distance), orthographic=True)
 
 
 def frame_all(view: OrbitCamera, extent: Extent, size: tuple[int, int]) -> OrbitCamera:
     """Stand back, or come nearer, until a window of `size` pixels holds the scene; the direction is kept."""
-    narrow = NARROW if view.back else 1.0
+    narrow = NARROW if view.orthographic else 1.0
     eye = framing_eye(extent.sample, view.rotation, narrowed(view.intrinsics.fitted(*size), narrow))
     forward = view.rotation[2]
     if eye is None:
         return focus(view, extent.centre, 2.6 * extent.radius)
     depth = max(median_depth(extent.sample, eye, forward), 1e-3 * extent.radius)
     target, distance = eye + depth * forward, depth / narrow
-    if view.back:  # however flat the scene looks from here, nothing of it is behind the eye
+    if view.orthographic:  # however flat the scene looks from here, nothing of it is behind the eye
         distance = max(distance, -nearest_depth(extent.sample, target, forward))
     return replace(view, target=target, distance=distance)
 

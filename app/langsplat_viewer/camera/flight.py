@@ -34,9 +34,7 @@ class Pose:
     position: Array  # (3,) world units
     rotation: Array  # (3, 3) world to camera, rows are right, down and forward
     fov_degrees: float  # across the picture's shorter side, within `FOV_LIMITS`
-    span: float | None = (
-        None  # world units across that side in parallel projection, > 0; None: in perspective
-    )
+    span: float | None = None  # world units across that side without perspective, > 0; None: in perspective
 
     def camera(self, width: int, height: int) -> Camera:
         """The pinhole camera of a picture of `width` x `height` pixels, its principal point in the centre;
@@ -129,7 +127,7 @@ def turntable(view: OrbitCamera, seconds: float) -> Turntable:
 
 def pose_of(view: OrbitCamera) -> Pose:
     """The eye of a view. A principal point that is off the centre moves there."""
-    span = view.span if view.back else None
+    span = view.span if view.orthographic else None
     return Pose(view.eye, view.rotation, view.intrinsics.fov_degrees, span)
 
 
@@ -137,7 +135,7 @@ def view_of(pose: Pose, extent: Extent) -> OrbitCamera:
     """A view from `pose`, turning around the depth at which it sees the scene's middle; without perspective
     around the depth of which perspective would show as much."""
     view = from_camera(pose.camera(1, 1), extent)
-    return view if pose.span is None else spanning(view, pose.span, extent)
+    return view if pose.span is None else spanning(view, pose.span)
 
 
 def camera_of(pose: Pose, extent: Extent, size: tuple[int, int]) -> Camera:

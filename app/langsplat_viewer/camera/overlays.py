@@ -68,22 +68,24 @@ def clip_segments(camera: Camera, segments: Array, least_depth: float) -> tuple[
     """(M, 2, 3) segments between world points -> (K, 2, 2) their visible parts in pixels of `camera`, and the
     (K,) rows they come from, in rising order.
 
-    A segment is cut where its camera z is `least_depth` (world units, > 0) and at the four planes through the
-    eye and the picture's borders. All are linear in camera space, so that nothing is divided before the cut
-    and no coordinate on screen is beyond the picture.
+    A segment is cut where its camera z is `least_depth` (world units, > 0) and at the four planes of the
+    picture's borders. All are linear in camera space, so that nothing is divided before the cut and no
+    coordinate on screen is beyond the picture.
     """
     points = segments.astype(np.float64) @ camera.rotation.T + camera.world_to_camera[:3, 3]
     start, step = points[:, 0], points[:, 1] - points[:, 0]
     planes = np.array(
         [
-            [camera.fx, 0, camera.cx],
-            [-camera.fx, 0, camera.width - camera.cx],
-            [0, camera.fy, camera.cy],
-            [0, -camera.fy, camera.height - camera.cy],
-            [0, 0, 1],
+            [camera.fx, 0, camera.cx, 0],
+            [-camera.fx, 0, camera.width - camera.cx, 0],
+            [0, camera.fy, camera.cy, 0],
+            [0, -camera.fy, camera.height - camera.cy, 0],
+            [0, 0, 1, -least_depth],
         ]
     )
-    offsets = np.array([0, 0, 0, 0, -least_depth])
+    if camera.orthographic:  # the borders' planes are parallel: in place of z stands 1
+        planes[:4] = planes[:4, [0, 1, 3, 2]]
+    planes, offsets = planes[:, :3], planes[:, 3]
     inside, slope = start @ planes.T + offsets, step @ planes.T  # >= 0 is inside
     with np.errstate(divide="ignore", invalid="ignore"):
         crossing = -inside / slope
@@ -92,7 +94,8 @@ def clip_segments(camera: Camera, segments: Array, least_depth: float) -> tuple[
     enters, leaves = np.maximum(enters, 0), np.minimum(leaves, 1)
     rows = np.flatnonzero(enters <= leaves)
     ends = start[rows, None] + np.stack([enters[rows], leaves[rows]], 1)[..., None] * step[rows, None]
-    depth = np.maximum(ends[..., 2:], least_depth)  # rounding must not take an end behind the plane
+    # Rounding must not take an end behind the plane.
+    depth = 1.0 if camera.orthographic else np.maximum(ends[..., 2:], least_depth)
     return ends[..., :2] / depth * (camera.fx, camera.fy) + (camera.cx, camera.cy), rows
 
 

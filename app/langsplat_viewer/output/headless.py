@@ -141,7 +141,7 @@ def turn(prepared: Prepared, options: ViewerOptions) -> Motion:
         if box is None:
             box = np.stack([place, place + 0.1 * extent.radius])
         nearer = min(holding_distance(view, box), float(np.linalg.norm(place - view.eye)))
-        view = focus(view, place, None if view.back else nearer)  # the scale of a parallel one was chosen
+        view = focus(view, place, None if view.orthographic else nearer)  # whose scale was chosen
     assert options.turntable is not None
     return turntable(view, options.turntable)
 
@@ -157,9 +157,8 @@ def first_camera(scene: Scene, choice: str, size: tuple[int, int] | None) -> Cam
 
 
 def without_perspective(scene: Scene, camera: Camera, span: float) -> Camera:
-    """Return the camera in parallel projection, `span` world units across the image's shorter side."""
-    extent = extent_of(scene)
-    return spanning(from_camera(camera, extent), span, extent).camera(camera.width, camera.height)
+    """Return an orthographic camera at the same eye, `span` world units across the image's shorter side."""
+    return spanning(from_camera(camera, extent_of(scene)), span).camera(camera.width, camera.height)
 
 
 def describe(result: QueryResult) -> str:

@@ -9,7 +9,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import LangSplatError
 from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.files import atomic_path
-from langsplat_viewer.camera.controls import in_perspective
+from langsplat_viewer.camera.controls import with_projection
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.viewer import Viewer
 
@@ -56,10 +56,10 @@ def save_view(viewer: Viewer, folder: Path) -> Path | None:
         return None
     path = free_name(folder, f"{state.path.stem if state.path else 'view'}-view", ".json")
     try:
-        write_cameras(path, (in_perspective(state.view).camera(*state.size),))
+        write_cameras(path, (with_projection(state.view, orthographic=False).camera(*state.size),))
     except OSError as error:
         state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
         return None
-    span = f" --orthographic {state.view.span_in(*state.size):.6g}" if state.view.back else ""
+    span = f" --orthographic {state.view.span_in(*state.size):.6g}" if state.view.orthographic else ""
     state.say(f"saved {path}; show it again with --camera {path.name}{span}")
     return path

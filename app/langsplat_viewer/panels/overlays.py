@@ -228,7 +228,7 @@ def draw_lines(viewer: Viewer, area: Area) -> None:
 def _orthographic(viewer: Viewer, area: Area) -> None:
     """Write that the camera is orthographic, and its scale."""
     view, scene = viewer.state.view, viewer.state.scene
-    if view is None or scene is None or not view.back:
+    if view is None or scene is None or not view.orthographic:
         return
     line = imgui.get_text_line_height()
     lines_below = 2 if "grid" in viewer.state.preferences.overlays else 1
@@ -250,8 +250,7 @@ def clicked(area: Area) -> bool:
 def _least_depth(viewer: Viewer) -> float:
     """Camera z from which on lines are drawn: a little before the eye."""
     assert viewer.state.extent is not None
-    assert viewer.state.view is not None
-    return viewer.state.view.back + overlays.LEAST_DEPTH * viewer.state.extent.radius
+    return overlays.LEAST_DEPTH * viewer.state.extent.radius
 
 
 def _lines(area: Area, segments: Array, colour: tuple[float, float, float, float], thick: float) -> None:
@@ -494,7 +493,7 @@ def pointed_figures(hover: Hover) -> list[str]:
         f"{phrase}: {value:.2f}" for phrase, value in zip(hover.phrases, hover.found.relevancy, strict=True)
     ]
     x, y, z = hover.found.position
-    return [*lines, f"at {x:.2f}  {y:.2f}  {z:.2f}, {hover.found.depth - hover.view.back:.2f} away"]
+    return [*lines, f"at {x:.2f}  {y:.2f}  {z:.2f}, {hover.found.depth:.2f} away"]
 
 
 # The view cube; a click on a face turns the view there.

@@ -207,7 +207,7 @@ def draw_camera(viewer: Viewer) -> None:
 def _projection(viewer: Viewer, view: OrbitCamera) -> None:
     """With perspective or without; the field of view is one of perspective."""
     text = with_key("Orthographic", viewpoint.toggle_orthographic)
-    _, orthographic = imgui.checkbox(f"{text}###orthographic", bool(view.back))
+    _, orthographic = imgui.checkbox(f"{text}###orthographic", view.orthographic)
     viewpoint.set_orthographic(viewer, orthographic)
     tip("No perspective: what is parallel looks parallel; the wheel changes the scale")
     before = view.intrinsics.fov_degrees

@@ -7,10 +7,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, logit
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster import View
-from langsplat_core.raster.protocol import MedianDepth
 from langsplat_core.scene import Camera, Gaussians, Scene
-from langsplat_viewer.camera.controls import eye_depth
 
 
 @dataclass(frozen=True)
@@ -20,10 +17,6 @@ class Clip:
 
     near: float = 0.0
     far: float = math.inf
-
-    def beyond(self, plane: float) -> "Clip":
-        """Return the same range in depths of a camera before which the eye's plane lies `plane` away."""
-        return Clip(self.near + plane, self.far + plane)
 
     def keeps(self, depths: Array) -> Array:
         """(N,) bool, of (N,) camera z."""
@@ -46,7 +39,9 @@ _SAMPLE = 20_000  # Gaussians looked at; quantiles need no more
 def near_plane(gaussians: Gaussians, camera: Camera, most: float = INRIA.near) -> float:
     """World units from the camera to the near plane: a share of the depth of what is nearest in the
     picture, so that one can go as near to a thing as it is small; at most `most`, the constant of training,
-    so that the view of a photograph is the one that was trained."""
+    so that the view of a photograph is the one that was trained. Without perspective, that of the eye."""
+    if camera.orthographic:
+        return 0.0
     rows = slice(None, None, max(len(gaussians) // _SAMPLE, 1))
     means = gaussians.means[rows].astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -60,11 +55,9 @@ def near_plane(gaussians: Gaussians, camera: Camera, most: float = INRIA.near) -
 
 
 def image_formation(scene: Scene, camera: Camera, clip: Clip = UNCLIPPED) -> RasterSettings:
-    """The scene's own image formation, with the near plane of `near_plane`, and what `clip` cuts away;
-    without what lies behind the eye of a parallel projection."""
+    """The scene's own image formation, with the near plane of `near_plane`, and what `clip` cuts away."""
     settings = scene.raster_settings()
     near = near_plane(scene.gaussians, camera, settings.near)
-    clip = clip.beyond(eye_depth(camera))
     return replace(settings, near=max(near, clip.near), far=None if math.isinf(clip.far) else clip.far)
 
 
@@ -78,7 +71,7 @@ def depth_range(gaussians: Gaussians, camera: Camera, clip: Clip = UNCLIPPED) ->
     with np.errstate(invalid="ignore", over="ignore"):
         pixels, depths = camera.project(means)
         inside = (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1) & (depths > 0)
-        inside &= clip.beyond(eye_depth(camera)).keeps(depths)
+        inside &= clip.keeps(depths)
     if not inside.any():
         return 0.0, 1.0
     near, far = np.quantile(depths[inside], [0.02, 0.98])
@@ -90,15 +83,6 @@ def camera_depths(gaussians: Gaussians, camera: Camera) -> Array:
     with np.errstate(invalid="ignore", over="ignore"):
         depths = gaussians.means.astype(np.float64) @ camera.rotation[2] + camera.world_to_camera[2, 3]
         return np.nan_to_num(depths.astype(np.float32))[:, None]
-
-
-def surface_depths(view: View, count: int) -> Array:
-    """(H, W) depth of the surface as a view of `count` Gaussians has it: the median where the rasterizer
-    knows it, else the mean; world units, 0 where less than half of the light is stopped."""
-    if isinstance(view, MedianDepth):
-        return view.median_depth()
-    _, alpha = view.splat(np.empty((count, 0), np.float32))
-    return np.where(alpha >= 0.5, view.depth(), 0)
 
 
 def why_undrawable(gaussians: Gaussians) -> str:
@@ -121,7 +105,7 @@ def why_nothing(gaussians: Gaussians, camera: Camera) -> str:
     if reason:
         return reason
     _, depths = camera.project(gaussians.means[gaussians.valid()].astype(np.float64))
-    if (depths <= eye_depth(camera)).all():
+    if (depths <= 0).all():
         return "the whole scene lies behind the camera"
     if (depths <= near_plane(gaussians, camera)).all():
         return "the whole scene lies nearer than the camera can see"

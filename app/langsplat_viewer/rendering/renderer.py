@@ -38,10 +38,9 @@ from langsplat_core.raster.opengl.scene_textures import (
     set_uniforms,
     shader,
 )
-from langsplat_core.raster.protocol import MedianDepth
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Gaussians, Scene
-from langsplat_viewer.rendering.depth import VISIBLE_ALPHA, camera_depths, depth_range, surface_depths
+from langsplat_viewer.rendering.depth import VISIBLE_ALPHA, camera_depths, depth_range
 from langsplat_viewer.rendering.request import Channel, Inputs, Pane, RenderKey, RenderRequest
 
 Backend = Literal["auto", "opengl", "cpu", "cuda"]
@@ -157,7 +156,7 @@ class ArrayChannels:
         the scene is transparent there), world units, 0 where there is nothing, and alpha."""
         view = self.views.of(key)
         _, alpha = view.splat(np.empty((len(key.scene.gaussians), 0), np.float32))
-        median = view.median_depth()[row, column] if isinstance(view, MedianDepth) else 0
+        median = view.median_depth()[row, column]
         return float(median or view.depth()[row, column]), float(alpha[row, column])
 
 
@@ -256,7 +255,7 @@ class GlSource:
         return self._view(key).depth_at(column, row)
 
     def depth_map(self, key: RenderKey) -> Array:
-        return surface_depths(self._view(key), len(key.scene.gaussians))
+        return self._view(key).median_depth()
 
     def forget(self) -> None:
         self._keep([])
@@ -329,7 +328,7 @@ class ArraySource:
         return self._channels.depth_at(key, column, row)
 
     def depth_map(self, key: RenderKey) -> Array:
-        return surface_depths(self._channels.views.of(key), len(key.scene.gaussians))
+        return self._channels.views.of(key).median_depth()
 
     def forget(self) -> None:
         self._channels.views.forget()

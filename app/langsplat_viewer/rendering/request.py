@@ -16,7 +16,6 @@ from langsplat_core.display.displays import DISPLAYS, Answers, DisplayRow, Range
 from langsplat_core.io.ply import SH_C0
 from langsplat_core.scene import LEVELS, SH_COUNTS, Camera, Scene
 from langsplat_core.scene.gaussians import Merged
-from langsplat_viewer.camera.controls import eye_depth
 from langsplat_viewer.marks import Marks
 from langsplat_viewer.rendering.depth import UNCLIPPED, Clip, image_formation
 
@@ -270,7 +269,7 @@ def panes(picture: PictureConfig, level: int, answers: Answers, split: Split) ->
 
 def _pose(camera: Camera) -> tuple[object, ...]:
     """Equal for cameras that see the same."""
-    return eye_depth(camera), camera.intrinsics, camera.world_to_camera.tobytes()
+    return camera.orthographic, camera.intrinsics, camera.world_to_camera.tobytes()
 
 
 # What a renderer makes of a request and keeps for the next one.

@@ -176,7 +176,7 @@ def backward(
 
 
 class ParameterGradients(NamedTuple):
-    """What `to_parameters` fills in, float32; rows that are not drawn are left alone."""
+    """Result of `to_parameters`, float32; rows that are not drawn are left alone."""
 
     means: Array  # (N, 3)
     log_scales: Array  # (N, 3)
@@ -275,6 +275,8 @@ def _point_gradient(point: cp.Point, camera: cp.KernelCamera, du: float, dv: flo
 
     A clamped coordinate is a constant multiple of z in the Jacobian, so it gets no gradient there.
     """
+    if camera.orthographic:
+        return du * camera.fx, dv * camera.fy, 0.0
     x, y, z = point
     r = camera.rotation
     j00 = db[0, 0] * r[0, 0] + db[0, 1] * r[0, 1] + db[0, 2] * r[0, 2]

@@ -1,6 +1,6 @@
 """Blending on the CPU: ``W x``, ``W^T y`` and the depth of half transmittance, tile by tile (see `walk`)."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -27,6 +27,7 @@ from langsplat_core.raster.cpu.tiles import (
     walk,
     write_tile,
 )
+from langsplat_core.raster.protocol import LiftingView
 from langsplat_core.scene import Camera
 
 
@@ -177,7 +178,7 @@ def median_depth(
 # Gaussian's partial sums are added up over its tiles.
 
 
-class Regions(NamedTuple):
+class TileRegions(NamedTuple):
     """The regions that each of T tiles meets."""
 
     firsts: Array  # (T + 1,) int64: tile t has labels[firsts[t] : firsts[t + 1]]
@@ -192,8 +193,8 @@ class LabelSums(NamedTuple):
     sums: Array  # float32
 
 
-class Merged(NamedTuple):
-    """What each Gaussian has, in depth order: from room[rank] on counts[rank] entries."""
+class LabelRows(NamedTuple):
+    """Entries of each Gaussian, in depth order: counts[rank] of them from room[rank] on."""
 
     room: Array  # (M + 1,) int64
     columns: Array  # int32 labels, ascending
@@ -202,7 +203,9 @@ class Merged(NamedTuple):
 
 
 @kernel
-def _meet_regions(first: int, last: int, maps: Array, columns: int, regions: Regions, counts: Array) -> None:
+def _meet_regions(
+    first: int, last: int, maps: Array, columns: int, regions: TileRegions, counts: Array
+) -> None:
     """For tiles [first, last) of (L, H, W) maps: counts[tile] <- how many labels >= 0 they hold; and, where
     there is room in `regions`, which."""
     levels, height, width = maps.shape
@@ -229,7 +232,9 @@ def _meet_regions(first: int, last: int, maps: Array, columns: int, regions: Reg
 
 
 @helper
-def _fill_planes(planes: Array, maps: Array, tile: int, columns: int, regions: Regions, lines: int) -> None:
+def _fill_planes(
+    planes: Array, maps: Array, tile: int, columns: int, regions: TileRegions, lines: int
+) -> None:
     """planes[(row, region, column)] <- 1 where a label of the pixel is that region, else 0."""
     levels, height, width = maps.shape
     x0, y0 = tile % columns * TILE, tile // columns * TILE
@@ -265,7 +270,7 @@ def _gather(
     geometry: Array,
     cutoffs: Cutoffs,
     maps: Array,
-    regions: Regions,
+    regions: TileRegions,
     out: LabelSums,
 ) -> None:
     """(L, H, W) int32 maps -> fills `out.sums`."""
@@ -291,11 +296,11 @@ def _merge(
     last: int,
     tiles: Tiles,
     tile_of: Array,
-    regions: Regions,
+    regions: TileRegions,
     sums: LabelSums,
     least: float,
     total: Array,
-    out: Merged,
+    out: LabelRows,
 ) -> None:
     """For Gaussians [first, last) in depth order: their regions of more weight than `least`.
 
@@ -338,10 +343,10 @@ def gather_labels(
     `run(kernel, *arguments)` runs a kernel over the view's tiles.
     """
     number = len(tiles.starts) - 1
-    met, nothing = np.empty(number, np.int64), Regions(np.zeros(1, np.int64), np.empty(0, np.int32))
+    met, nothing = np.empty(number, np.int64), TileRegions(np.zeros(1, np.int64), np.empty(0, np.int32))
     workers.run(_meet_regions, number, maps, tiles.columns, nothing, met)
     firsts = np.concatenate([[0], np.cumsum(met)])
-    regions = Regions(firsts, np.empty(firsts[-1], np.int32))
+    regions = TileRegions(firsts, np.empty(firsts[-1], np.int32))
     workers.run(_meet_regions, number, maps, tiles.columns, regions, met)
     here, lines = np.diff(tiles.starts), (met + 3) // 4 * 4
     offsets = np.concatenate([[0], np.cumsum(here * lines)])
@@ -350,7 +355,7 @@ def gather_labels(
     tile_of = np.repeat(np.arange(number, dtype=np.int32), here)
     room = _room(tiles, met[tile_of], count)
     columns, values = np.empty(room[-1], np.int32), np.empty(room[-1], np.float32)
-    merged = Merged(room, columns, values, np.zeros(len(room) - 1, np.int64))
+    merged = LabelRows(room, columns, values, np.zeros(len(room) - 1, np.int64))
     ranks = len(merged.counts)
     workers.run(_merge, ranks, tiles, tile_of, regions, sums, least, np.zeros(count), merged)
     return _as_matrix(merged, count)
@@ -363,7 +368,7 @@ def _room(tiles: Tiles, met: Array, count: int) -> Array:
     return np.concatenate([[0], np.cumsum(most)])
 
 
-def _as_matrix(merged: Merged, count: int) -> sparse.csr_matrix:
+def _as_matrix(merged: LabelRows, count: int) -> sparse.csr_matrix:
     """Without the room that was not needed."""
     sizes = np.diff(merged.room)
     place = np.arange(merged.room[-1]) - np.repeat(merged.room[:-1], sizes)
@@ -378,7 +383,7 @@ def _as_matrix(merged: Merged, count: int) -> sparse.csr_matrix:
 _CHANNELS_AT_ONCE = 32  # a tile's state stays in the first level cache
 
 
-class TileOperator(ABC):
+class TileOperator(LiftingView):
     """The linear operator W of a view: M drawn of `count` Gaussians, in depth order, with their tiles."""
 
     def __init__(self, camera: Camera, count: int, order: Array, tiles: Tiles, workers: Workers) -> None:
@@ -386,14 +391,6 @@ class TileOperator(ABC):
         self.order = order  # (M,) int32
         self.tiles, self.workers = tiles, workers
         self.dropped = 0
-
-    @abstractmethod
-    def depth(self) -> Array:
-        """See `View.depth`; float32."""
-
-    @abstractmethod
-    def median_depth(self) -> Array:
-        """See `MedianDepth.median_depth`; float32."""
 
     @abstractmethod
     def _splat_part(self, values: Array, image: Array, alpha: Array) -> None:
@@ -430,10 +427,6 @@ class TileOperator(ABC):
             self.workers.run(sum_partials, len(self.order), self.tiles, self.order, partial, out)
             values[:, start : start + _CHANNELS_AT_ONCE] = out
         return values
-
-    def contributions(self) -> Array:
-        """See `LiftingView.contributions`; float32."""
-        return self.gather(np.ones((self.camera.height, self.camera.width, 1), np.float32))[:, 0]
 
 
 def in_fours(values: Array) -> Array:

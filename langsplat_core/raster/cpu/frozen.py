@@ -61,8 +61,8 @@ def _keep_span(work: Any, mine: Any, s: int, low: int, high: int) -> None:
 def find_spans(
     first: int, last: int, tiles: Tiles, geometry: Array, cutoffs: Cutoffs, spans: Array, alpha: Array
 ) -> None:
-    """Of every intersection the rows that have a weight: (I,) uint16 spans, 0 at first, as `Tiles.rows`; and
-    (H, W, 1) alpha."""
+    """Fill (I,) uint16 spans, 0 at first, as `Tiles.rows`: the rows of every intersection that have a weight;
+    and (H, W, 1) alpha."""
     count = tiles.starts.shape[0] - 1
     height, width, _ = alpha.shape
     seen = np.empty(2, np.int64)
@@ -190,7 +190,7 @@ class FrozenView(TileOperator):
         return self._view.depth()
 
     def median_depth(self) -> Array:
-        """See `MedianDepth.median_depth`; float32."""
+        """See `View.median_depth`; float32."""
         return self._view.median_depth()
 
     def _splat_part(self, values: Array, image: Array, alpha: Array) -> None:

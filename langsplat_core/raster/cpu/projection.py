@@ -19,7 +19,7 @@ import numpy as np
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.compiled import helper, kernel, plain, shared_workers
 from langsplat_core.config import RasterSettings
-from langsplat_core.raster.protocol import farthest
+from langsplat_core.raster.protocol import farthest, tangent_limits
 from langsplat_core.raster.reference import C0, C1, C2, C3
 from langsplat_core.scene import Camera
 from langsplat_core.scene.gaussians import LARGEST_COEFFICIENT
@@ -47,8 +47,8 @@ class Rows(NamedTuple):
     sh_bits: Array  # (N, 3 K) uint32: the SH coefficients' bits, only to see whether they are usable
 
 
-class Footprints(NamedTuple):
-    """What `project` fills in."""
+class Projected(NamedTuple):
+    """Result of `project`."""
 
     geometry: Array  # (N, 8) float64, columns MEAN_X to HALF_HEIGHT; only where DRAWN
     depths: Array  # (N,) float64 camera z; only where DRAWN
@@ -56,7 +56,7 @@ class Footprints(NamedTuple):
 
 
 class KernelCamera(NamedTuple):
-    """What the kernels need to know of a camera and the settings."""
+    """Camera and settings as the kernels take them."""
 
     rotation: Array  # (3, 3) world to camera
     translation: Array  # (3,)
@@ -75,12 +75,11 @@ class KernelCamera(NamedTuple):
     dilation: float
     alpha_min: float
     antialiased: bool
+    orthographic: bool
 
 
 def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
-    """The clamp is 1.3 times the half field of view beyond the image's borders; see `reference.project`."""
-    margin_x = (settings.fov_clamp - 1) * 0.5 * camera.width / camera.fx
-    margin_y = (settings.fov_clamp - 1) * 0.5 * camera.height / camera.fy
+    left, top, right, bottom = tangent_limits(camera, settings)
     return KernelCamera(
         rotation=np.ascontiguousarray(camera.rotation),
         translation=np.ascontiguousarray(camera.world_to_camera[:3, 3]),
@@ -90,15 +89,16 @@ def kernel_camera(camera: Camera, settings: RasterSettings) -> KernelCamera:
         cy=float(camera.cy),
         width=float(camera.width),
         height=float(camera.height),
-        left=camera.cx / camera.fx + margin_x,
-        right=(camera.width - camera.cx) / camera.fx + margin_x,
-        top=camera.cy / camera.fy + margin_y,
-        bottom=(camera.height - camera.cy) / camera.fy + margin_y,
+        left=float(left),
+        right=float(right),
+        top=float(top),
+        bottom=float(bottom),
         near=float(settings.near),
         far=float(farthest(settings)),
         dilation=float(settings.dilation),
         alpha_min=float(settings.alpha_min),
         antialiased=bool(settings.antialiased),
+        orthographic=camera.orthographic,
     )
 
 
@@ -116,6 +116,8 @@ def camera_point(mean: Array, camera: KernelCamera) -> Point:
 @helper
 def _jacobian(x: float, y: float, z: float, camera: KernelCamera) -> tuple[float, float, float, float]:
     """Non-zero entries (0,0), (0,2), (1,1), (1,2) of d(pixel)/d(camera point), taken at the clamped point."""
+    if camera.orthographic:
+        return camera.fx, 0.0, camera.fy, 0.0
     tx = min(max(x / z, -camera.left), camera.right)
     ty = min(max(y / z, -camera.top), camera.bottom)
     return camera.fx / z, -camera.fx * tx / z, camera.fy / z, -camera.fy * ty / z
@@ -202,7 +204,7 @@ def _is_valid(rows: Rows, i: int) -> bool:
 
 
 @kernel
-def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Footprints) -> None:
+def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Projected) -> None:
     """Fill `out` for rows [first, last).
 
     A Gaussian whose alpha = alpha_min contour meets no pixel centre is UNDRAWN.
@@ -224,7 +226,8 @@ def project(first: int, last: int, rows: Rows, camera: KernelCamera, out: Footpr
             if opacity < camera.alpha_min:
                 continue
         reach = np.sqrt(2 * np.log(max(opacity / camera.alpha_min, 1.0)))
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        over = 1.0 if camera.orthographic else z
+        u, v = camera.fx * x / over + camera.cx, camera.fy * y / over + camera.cy
         wide, high = reach * np.sqrt(xx), reach * np.sqrt(yy)
         right, bottom = camera.width - 0.5, camera.height - 0.5  # the last pixel's centre
         if u + wide < 0.5 or u - wide > right or v + high < 0.5 or v - high > bottom:

@@ -51,7 +51,7 @@ class CpuView(TileOperator):
             plain(gaussians.opacity_logits),
             plain(gaussians.sh).reshape(n, gaussians.sh.shape[1] * 3).view(np.uint32),
         )
-        found = projection.Footprints(np.empty((n, projection.COLUMNS)), np.empty(n), np.empty(n, np.uint8))
+        found = projection.Projected(np.empty((n, projection.COLUMNS)), np.empty(n), np.empty(n, np.uint8))
         with lap("projection"):
             workers.run(projection.project, n, self._rows, self._kernel_camera, found)
         with lap("sort"):
@@ -79,10 +79,8 @@ class CpuView(TileOperator):
         self._over_tiles(blend.gather, image, self._cutoffs, partial)
 
     def gather_labels(self, maps: Array, count: int, least: float = 0.0) -> sparse.csr_matrix:
-        """See `LabelView.gather_labels`."""
-        check_array("maps", maps, ("L", self.camera.height, self.camera.width))
-        if maps.max(initial=-1) >= count or maps.min(initial=-1) < -1:
-            raise ValueError(f"maps: labels {maps.min()} to {maps.max()}, expected -1 to {count - 1}")
+        """See `LiftingView.gather_labels`."""
+        self.check_labels(maps, count)
 
         def run(kernel: Callable[..., None], *rest: Any) -> None:
             self._over_tiles(kernel, self._cutoffs, *rest)
@@ -140,7 +138,7 @@ class CpuView(TileOperator):
         self.workers.run(kernel, len(self.tiles.starts) - 1, self.tiles, self._geometry, *arguments)
 
     def median_depth(self) -> Array:
-        """See `MedianDepth.median_depth`; float32."""
+        """See `View.median_depth`; float32."""
         median = np.empty((self.camera.height, self.camera.width, 1), np.float32)
         self._over_tiles(blend.median_depth, self._depths, self._cutoffs, median)
         return median[..., 0]

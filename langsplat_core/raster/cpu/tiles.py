@@ -1,4 +1,4 @@
-"""Which Gaussians touch which tile of 16x16 pixels, front to back: sorting for the CPU backend."""
+"""Tiles of 16x16 pixels and the Gaussians that touch each, front to back: binning for the CPU backend."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -28,7 +28,7 @@ from langsplat_core.raster.opengl.scene_textures import (
     set_uniforms,
     shader,
 )
-from langsplat_core.raster.protocol import farthest
+from langsplat_core.raster.protocol import View, farthest, tangent_limits
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 
 MAX_TARGETS = 4  # colour attachments of one pass, three values each
@@ -164,8 +164,6 @@ class GlRasterizer:
     def _fill(self, scene: SceneTextures, view: "GlView") -> None:
         camera, settings = view.camera, view.settings
         high = camera.position.astype(np.float32)
-        margin_x = (settings.fov_clamp - 1) * 0.5 * camera.width / camera.fx
-        margin_y = (settings.fov_clamp - 1) * 0.5 * camera.height / camera.fy
         set_uniforms(
             self._project,
             {
@@ -174,14 +172,10 @@ class GlRasterizer:
                 "world_to_camera": camera.rotation.T.astype("f4").tobytes(),  # GLSL is column-major
                 "camera_high": tuple(high),
                 "camera_low": tuple(camera.position - high),
+                "orthographic": camera.orthographic,
                 "focal": (camera.fx, camera.fy),
                 "principal": (camera.cx, camera.cy),
-                "tangents": (
-                    camera.cx / camera.fx + margin_x,
-                    camera.cy / camera.fy + margin_y,
-                    (camera.width - camera.cx) / camera.fx + margin_x,
-                    (camera.height - camera.cy) / camera.fy + margin_y,
-                ),
+                "tangents": tangent_limits(camera, settings),
                 "dilation": settings.dilation,
                 "alpha_min": settings.alpha_min,
                 "antialiased": settings.antialiased,
@@ -232,7 +226,7 @@ class GlRasterizer:
         self._project.release()
 
 
-class GlView:
+class GlView(View):
     """See `protocol.View`. Holds no device memory: its rasterizer projects it again when another view
     was drawn in between."""
 
@@ -247,11 +241,8 @@ class GlView:
         self.rasterizer = rasterizer
         self.gaussians, self.camera, self.settings = gaussians, camera, settings
         self.order = order
-
-    @property
-    def dropped(self) -> int:
-        """See `View.dropped`."""
-        return len(self.gaussians) - len(self.rasterizer.scene(self.gaussians).rows)
+        self.count = len(gaussians)
+        self.dropped = self.count - len(rasterizer.scene(gaussians).rows)
 
     def splat(self, values: Array) -> tuple[Array, Array]:
         """See `View.splat`; float32."""
@@ -291,7 +282,7 @@ class GlView:
     def depth_at(self, column: int, row: int) -> tuple[float, float]:
         """Surface depth and alpha of one pixel, from the projection read back.
 
-        The depth is the median (see `MedianDepth`) or, where the transmittance stays above 0.5, the
+        The depth is the median (see `View.median_depth`) or, where the transmittance stays above 0.5, the
         alpha-weighted mean; camera z in world units, 0 where nothing is drawn.
         """
         scene = self.rasterizer.project(self)

@@ -26,7 +26,7 @@ SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swr ", "software", "swi
 
 
 def is_software(ctx: moderngl.Context) -> bool:
-    """Whether the driver draws on the CPU."""
+    """True where the driver draws on the CPU."""
     renderer = ctx.info["GL_RENDERER"].lower()
     return any(name in renderer for name in SOFTWARE_RENDERERS)
 
@@ -173,7 +173,7 @@ class DepthSorter:
         }
 
     def holds(self, count: int) -> bool:
-        """Whether the driver's buffers are large enough for so many points."""
+        """True where the driver's buffers are large enough for so many points."""
         return bool(MEAN_BYTES * count <= self._ctx.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"])
 
     def sort(self, buffers: SortBuffers, plane: Array, near: float, far: float) -> None:
@@ -213,7 +213,7 @@ class DepthSorter:
         self._ctx.memory_barrier()
 
     def is_right(self) -> bool:
-        """Whether a small sort comes out right: drivers are known to get such shaders wrong."""
+        """True where a small sort comes out right: drivers are known to get such shaders wrong."""
         depths = np.random.default_rng(0).integers(-2, 60, _PROBE) * np.pi
         means = np.zeros((_PROBE, 3))
         means[:, 2] = depths
@@ -362,7 +362,7 @@ def front_to_back(depths: Array) -> Array:
 
 
 class DrawOrder(Protocol):
-    """Of the Gaussians ahead of one camera."""
+    """Order in which the Gaussians ahead of one camera are drawn."""
 
     def write(self, scene: SceneTextures) -> None:
         """Make `scene.order` this order."""

@@ -1,19 +1,26 @@
-"""What a codec costs in the only currency that counts: the relevancy of phrases."""
+"""Fitting codecs to the CLIP vectors of one scene, and what they cost: errors of the relevancy of phrases."""
 
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
 
 from langsplat_core.arrays import Array
-from langsplat_core.config import CodecConfig, check_settings
+from langsplat_core.config import (
+    AutoencoderConfig,
+    CodebookConfig,
+    CodecConfig,
+    LinearConfig,
+    check_settings,
+)
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import CANONICAL_PHRASES, AutoencoderCodec, CodebookCodec, Codec, LinearCodec
-from langsplat_core.scene.codec import principal_colours, stretched
+from langsplat_core.scene.codec import KINDS, principal_colours, stretched
 from langsplat_core.semantics.encoder import Encoder, PhraseEncoder
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
 from langsplat_core.semantics.vocabulary import everyday_phrases, everyday_vectors
@@ -35,14 +42,6 @@ class Vocabulary:
         return relevancy_of(vectors @ self.phrases.T, zero[:, None], rate[:, None])
 
 
-@dataclass(frozen=True)
-class RelevancyError:
-    """Absolute differences to the relevancy of the unquantised vectors, over vectors and phrases."""
-
-    mean: float
-    p99: float
-
-
 def everyday_vocabulary(encoder: Encoder | PhraseEncoder, phrases: tuple[str, ...] = ()) -> Vocabulary:
     """`phrases` and everyday ones, as `encoder` writes them."""
     texts = list(dict.fromkeys([*phrases, *everyday_phrases(encoder.unknown_words)]))
@@ -51,33 +50,33 @@ def everyday_vocabulary(encoder: Encoder | PhraseEncoder, phrases: tuple[str, ..
     return Vocabulary(encoder.encode_texts(texts) if texts else canonical, scale)
 
 
-def relevancy_error(made: Array, vectors: Array, vocabulary: Vocabulary) -> RelevancyError:
-    """Of (M, D) `made` in place of (M, D) `vectors`, both float32 unit vectors; 0 where M = 0."""
+def relevancy_error(made: Array, vectors: Array, vocabulary: Vocabulary) -> tuple[float, float]:
+    """Mean and 99 % quantile of the change of relevancy, over vectors and phrases, with (M, D) `made` in
+    place of (M, D) `vectors`, both float32 unit vectors; 0 where M = 0."""
     differences = [
         np.abs(vocabulary.relevancy(made[i : i + CHUNK]) - vocabulary.relevancy(vectors[i : i + CHUNK]))
         for i in range(0, len(vectors), CHUNK)
     ]
     if not differences:
-        return RelevancyError(0.0, 0.0)
+        return 0.0, 0.0
     errors = np.concatenate([part.astype(np.float32).ravel() for part in differences])
-    return RelevancyError(float(errors.mean(dtype=np.float64)), float(np.quantile(errors, 0.99)))
+    return float(errors.mean(dtype=np.float64)), float(np.quantile(errors, 0.99))
 
 
 @dataclass(frozen=True)
 class CodecReport:
-    """What a codec loses of vectors that it was not fitted to."""
+    """Losses of a codec on vectors that it was not fitted to."""
 
     cosine: float  # mean, of a vector with what the codec makes of it
-    error_mean: float  # of relevancy, see `RelevancyError`
+    error_mean: float  # of relevancy, see `relevancy_error`
     error_p99: float
 
 
 def codec_report(codec: Codec, vectors: Array, vocabulary: Vocabulary) -> CodecReport:
-    """Of (M, D) float32 unit vectors."""
+    """Report on (M, D) float32 unit vectors."""
     made = codec.decode(codec.encode(vectors))
-    error = relevancy_error(made, vectors, vocabulary)
     cosine = float((made * vectors).sum(1).mean()) if len(vectors) else 1.0
-    return CodecReport(cosine, error.mean, error.p99)
+    return CodecReport(cosine, *relevancy_error(made, vectors, vocabulary))
 
 
 # The paper's codec: an autoencoder of one scene's CLIP vectors.
@@ -91,13 +90,7 @@ DECODER_WIDTHS = (16, 32, 64, 128, 256, 256)
 
 
 def train_autoencoder(
-    vectors: Array,
-    latent_dim: int = 3,
-    steps: int = CodecConfig.steps,
-    batch: int = CodecConfig.batch,
-    lr: float = CodecConfig.lr,
-    seed: int = 0,
-    progress: Progress = silent,
+    vectors: Array, config: AutoencoderConfig, progress: Progress = silent
 ) -> AutoencoderCodec:
     """The autoencoder of (M, D) unit vectors: Adam with a cosine schedule on random batches; progress shows
     the batch's mean cosine. Deterministic for a given seed on one machine."""
@@ -105,24 +98,21 @@ def train_autoencoder(
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return _train(vectors, latent_dim, (steps, batch, lr, seed), progress)
+        return _train(vectors, config, progress)
     finally:
         torch.set_num_threads(threads)
 
 
-def _train(
-    vectors: Array, latent_dim: int, settings: tuple[int, int, float, int], progress: Progress
-) -> AutoencoderCodec:
-    steps, size, lr, seed = settings
-    torch.manual_seed(seed)
+def _train(vectors: Array, config: AutoencoderConfig, progress: Progress) -> AutoencoderCodec:
+    torch.manual_seed(config.seed)
     data = torch.from_numpy(np.ascontiguousarray(vectors, np.float32))
-    encoder, decoder = networks(data.shape[1], latent_dim)
+    encoder, decoder = networks(data.shape[1], config.latent_dim)
     parameters = [*encoder.parameters(), *decoder.parameters()]
-    optimiser = torch.optim.Adam(parameters, lr=lr, fused=True)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
-    generator = torch.Generator().manual_seed(seed)
-    for step in range(steps):
-        batch = data[torch.randint(len(data), (size,), generator=generator)]
+    optimiser = torch.optim.Adam(parameters, lr=config.lr, fused=True)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.steps)
+    generator = torch.Generator().manual_seed(config.seed)
+    for step in range(config.steps):
+        batch = data[torch.randint(len(data), (config.batch,), generator=generator)]
         latent = nn.functional.normalize(encoder(batch), dim=1, eps=1e-6)
         output = nn.functional.normalize(decoder(latent), dim=1, eps=1e-6)
         cosine = (output * batch).sum(1).mean()
@@ -131,8 +121,8 @@ def _train(
         loss.backward()
         optimiser.step()
         schedule.step()
-        if step % 50 == 0 or step + 1 == steps:
-            progress(f"codec: cosine {cosine.item():.3f}", (step + 1) / steps)
+        if step % 50 == 0 or step + 1 == config.steps:
+            progress(f"codec: cosine {cosine.item():.3f}", (step + 1) / config.steps)
     _settle_statistics(encoder, data)
     return AutoencoderCodec(folded_layers(encoder), folded_layers(decoder))
 
@@ -199,7 +189,7 @@ FEWEST_FOR_COLOURS = 16  # codewords; fewer have their principal axes for colour
 
 
 def fit_codebook(
-    vectors: Array, config: CodecConfig, vocabulary: Vocabulary, progress: Progress = silent
+    vectors: Array, config: CodebookConfig, vocabulary: Vocabulary, progress: Progress = silent
 ) -> CodebookCodec:
     """The codebook of (M, D) float32 unit vectors: of `config.size` codewords, or, where that is 0, the
     smallest that keeps the mean relevancy error on vectors it was not fitted to within
@@ -221,7 +211,13 @@ def fit_codebook(
     progress("colours of the codewords", 0.8)
     nearest, _ = nearest_centres(fitted, codewords)
     usage = np.bincount(nearest, minlength=len(codewords)).astype(np.float64)
-    return CodebookCodec(codewords, rounded(codeword_colours(codewords, usage, config)))
+    return codebook_of(codewords, usage, config)
+
+
+def codebook_of(vectors: Array, usage: Array, config: CodebookConfig) -> CodebookCodec:
+    """The codebook of (K, D) float32 unit vectors that occur (K,) `usage` times, rounded to float16."""
+    codewords = rounded(vectors)
+    return CodebookCodec(codewords, rounded(codeword_colours(codewords, usage, config.seed)))
 
 
 def _smallest(
@@ -237,38 +233,36 @@ def _smallest(
     while True:
         codewords = grow(size, smaller)
         error = codebook_error(codewords, judged, vocabulary)
-        if error.mean <= budget or size == most or len(codewords) < size:
+        if error <= budget or size == most or len(codewords) < size:
             break
         smaller, size = codewords, min(2 * size, most)
-    if error.mean > budget and size == most:
-        log.warning(
-            "codebook: %d codewords still have a mean relevancy error of %.4f", len(codewords), error.mean
-        )
-    if smaller is None or error.mean > budget:
+    if error > budget and size == most:
+        log.warning("codebook: %d codewords still have a mean relevancy error of %.4f", len(codewords), error)
+    if smaller is None or error > budget:
         return codewords
     low, high = len(smaller), len(codewords)
     for _ in range(REFINEMENTS):
         middle = round((low * high) ** 0.5)
         tried = grow(middle, smaller)
-        if codebook_error(tried, judged, vocabulary).mean <= budget:
+        if codebook_error(tried, judged, vocabulary) <= budget:
             codewords, high = tried, middle
         else:
             smaller, low = tried, middle
     return codewords
 
 
-def codebook_error(codewords: Array, vectors: Array, vocabulary: Vocabulary) -> RelevancyError:
-    """Of every vector's nearest codeword in its place."""
+def codebook_error(codewords: Array, vectors: Array, vocabulary: Vocabulary) -> float:
+    """Mean error of relevancy with every vector's nearest codeword in its place."""
     nearest, _ = nearest_centres(vectors, codewords)
-    return relevancy_error(codewords[nearest], vectors, vocabulary)
+    return relevancy_error(codewords[nearest], vectors, vocabulary)[0]
 
 
-def codeword_colours(codewords: Array, usage: Array, config: CodecConfig) -> Array:
+def codeword_colours(codewords: Array, usage: Array, seed: int = 0) -> Array:
     """(K, 3) float32 in [0, 1]: latents of the paper's autoencoder of 3 numbers, fitted to the (K, D)
     codewords, each axis stretched over what (K,) usage says occurs."""
     if len(codewords) < FEWEST_FOR_COLOURS:
         return principal_colours(codewords, usage)
-    codec = train_autoencoder(codewords, 3, COLOUR_STEPS, COLOUR_BATCH, config.lr, config.seed)
+    codec = train_autoencoder(codewords, AutoencoderConfig(steps=COLOUR_STEPS, batch=COLOUR_BATCH, seed=seed))
     return stretched(codec.encode(codewords), usage)
 
 
@@ -281,26 +275,24 @@ def rounded(numbers: Array) -> Array:
 
 
 def fit_codec(
-    vectors: Array, config: CodecConfig, vocabulary: Vocabulary, progress: Progress = silent
+    vectors: Array,
+    config: CodecConfig,
+    vocabulary: Vocabulary,
+    progress: Progress = silent,
+    further: Array | None = None,
 ) -> Codec:
     """(M, D) float32 unit CLIP vectors -> a codec for them; what phrases of the `vocabulary` find is what it
-    may not change. Deterministic for a given seed on one machine. InputError for settings out of range."""
+    may not change. Deterministic for a given seed on one machine. InputError for settings out of range.
+
+    further: (M', D) vectors that are not kept, but help a kind that interpolates between what it has seen.
+    """
     check_settings(config, "--codec.")
+    if further is not None and (KINDS[config.kind].blends or len(vectors) == 0):
+        vectors = np.concatenate([further, vectors])
     return FITTERS[config.kind](vectors, config, vocabulary, progress)
 
 
-def fit_autoencoder(
-    vectors: Array, config: CodecConfig, vocabulary: Vocabulary, progress: Progress = silent
-) -> AutoencoderCodec:
-    """The paper's codec, see `autoencoder_fit`."""
-    return train_autoencoder(
-        vectors, config.latent_dim, config.steps, config.batch, config.lr, config.seed, progress
-    )
-
-
-def fit_linear(
-    vectors: Array, config: CodecConfig, vocabulary: Vocabulary, progress: Progress = silent
-) -> LinearCodec:
+def fit_linear(vectors: Array, config: LinearConfig) -> LinearCodec:
     """The leading right singular vectors, `config.latent_dim` of them: the best basis in the least-squares
     sense (Eckart-Young)."""
     # Through the D x D Gram matrix: D is 512, M may be a million. float64 keeps its squared condition usable.
@@ -309,6 +301,20 @@ def fit_linear(
     return LinearCodec(np.ascontiguousarray(axes[:, ::-1][:, : config.latent_dim].T, np.float32))
 
 
-FITTERS: Mapping[str, Callable[[Array, CodecConfig, Vocabulary, Progress], Codec]] = MappingProxyType(
-    {CodebookCodec.kind: fit_codebook, AutoencoderCodec.kind: fit_autoencoder, LinearCodec.kind: fit_linear}
+def exact_codec(vectors: Array, usage: Array, config: CodecConfig) -> Codec | None:
+    """The codec whose latents stand for just the (K, D) float32 unit vectors, which occur (K,) `usage` times;
+    None for a kind that only comes near to them."""
+    return EXACT[config.kind](vectors, usage, config) if config.kind in EXACT else None
+
+
+# By the kind: the fit, and the codec of given vectors.
+FITTERS: Mapping[str, Callable[[Array, Any, Vocabulary, Progress], Codec]] = MappingProxyType(
+    {
+        "codebook": fit_codebook,
+        "autoencoder": lambda vectors, config, vocabulary, progress: train_autoencoder(
+            vectors, config, progress
+        ),
+        "linear": lambda vectors, config, vocabulary, progress: fit_linear(vectors, config),
+    }
 )
+EXACT: Mapping[str, Callable[[Array, Array, Any], Codec]] = MappingProxyType({"codebook": codebook_of})

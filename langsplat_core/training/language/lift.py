@@ -16,10 +16,10 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.compiled import helper, kernel, plain, shared_workers
 from langsplat_core.config import INRIA, LiftConfig, RasterSettings, check_settings
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster.protocol import FreezableView, LiftingRasterizer, LiftingView
+from langsplat_core.raster.protocol import LiftingRasterizer, LiftingView
 from langsplat_core.scene import LEVELS, Camera, Codec, Gaussians
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language.mask_weights import MaskGroups, Memberships
+from langsplat_core.training.language.mask_weights import MaskGroups, MaskWeights
 
 MEDIAN_STEPS = 8
 FAINT = 2e-3  # share of a Gaussian's weight below which a mask has no say in its median
@@ -27,28 +27,28 @@ FAINT = 2e-3  # share of a Gaussian's weight below which a mask has no say in it
 
 @dataclass(frozen=True, eq=False)
 class Lifted:
-    """What n Gaussians mean at the three levels."""
+    """Vectors of n Gaussians at the three levels."""
 
     vectors: Array  # (3, n, D) float32 unit vectors; zero where unobserved
     confidence: Array  # (3, n) float32 total blending weight, in pixels
 
 
-def lift_block(memberships: Memberships, groups: MaskGroups, number: int, robust: bool) -> Lifted:
-    """Of the Gaussians of one block. `robust` takes the geometric median, else the mean."""
-    return lift_weights(memberships.block(number, groups), groups.vectors, robust)
+def lift_block(mask_weights: MaskWeights, groups: MaskGroups, number: int, robust: bool) -> Lifted:
+    """Lift onto the Gaussians of one block. `robust` takes the geometric median, else the mean."""
+    return lift_weights(mask_weights.block(number, groups), groups.vectors, robust)
 
 
 def lift_sample(
-    memberships: Memberships, groups: MaskGroups, rows: Array, robust: bool, progress: Progress = silent
+    mask_weights: MaskWeights, groups: MaskGroups, rows: Array, robust: bool, progress: Progress = silent
 ) -> Lifted:
-    """Of the Gaussians at `rows`, in rising order."""
+    """Lift onto the Gaussians at `rows`, in rising order."""
     parts = []
-    for number, (first, last) in enumerate(memberships.blocks):
+    for number, (first, last) in enumerate(mask_weights.blocks):
         inside = rows[(rows >= first) & (rows < last)] - first
         if len(inside):
-            weights = memberships.block(number, groups)[inside]
+            weights = mask_weights.block(number, groups)[inside]
             parts.append(lift_weights(weights, groups.vectors, robust))
-        progress("averaging the masks of a sample", last / memberships.count)
+        progress("averaging the masks of a sample", last / mask_weights.count)
     if not parts:
         nothing = np.zeros((len(LEVELS), 0, groups.vectors.shape[1]), np.float32)
         return Lifted(nothing, np.zeros((len(LEVELS), 0), np.float32))
@@ -181,28 +181,6 @@ PUBLISHED_EPSILON = 1e-9  # in x / (|x| + 1e-9)
 KEPT_BYTES = 4e9  # weights of views that are kept; further views are projected again at every step
 
 
-@dataclass
-class AdamState:
-    """Adam (Kingma and Ba 2015) on one array."""
-
-    x: Array  # float32
-    first: Array
-    second: Array
-    steps: int = 0
-
-    @staticmethod
-    def begin(x: Array) -> "AdamState":
-        """Before the first step."""
-        return AdamState(x.astype(np.float32), np.zeros_like(x, np.float32), np.zeros_like(x, np.float32))
-
-    def update(self, gradient: Array, lr: float) -> None:
-        """One step, in place."""
-        self.steps += 1
-        corrected = (lr / (1 - BETAS[0] ** self.steps), 1 / (1 - BETAS[1] ** self.steps))
-        flat = (array.reshape(-1) for array in (self.x, self.first, self.second, plain(gradient)))
-        shared_workers().run(_adam, self.x.size, *flat, *(np.float32(factor) for factor in corrected))
-
-
 @dataclass(frozen=True, eq=False)
 class _Target:
     """One photograph: its camera, and what each pixel ought to show at every level."""
@@ -225,19 +203,24 @@ def lift_by_gradient(
 
     `config` says for how many steps, how fast, from where. Deterministic for a given seed on the CPU.
     """
-    start, confidence = lift_latents(rasterizer, gaussians, views, codec, settings, progress)
+    import torch  # seconds that the other ways of lifting need not wait for
+
+    x, confidence = lift_latents(rasterizer, gaussians, views, codec, settings, progress)
     check_settings(config, "--lift.")
     published = config.start == "zeros-as-published"
-    adam = AdamState.begin(np.zeros_like(start) if published else start)
+    if published:
+        x[:] = 0
+    leaf = torch.from_numpy(x)  # shares its memory
+    adam = torch.optim.Adam([leaf], lr=config.lr, betas=BETAS, eps=EPSILON, fused=True)
     targets = [_target(camera, features, codec) for camera, features in views]
     weights = _Weights(rasterizer, gaussians, [camera for camera, _ in views], settings)
-    for index in _shuffled(len(views), config.steps, config.seed):
-        loss, by_y = loss_and_gradient(weights.of(index), targets[index], blended(adam.x, published))
-        adam.update(by_features(adam.x, by_y) if published else by_y, config.lr)
-        if adam.steps % 20 == 0 or adam.steps == config.steps:
-            progress(f"training language features: loss {loss:.4f}", adam.steps / config.steps)
-    latents = unit(adam.x)
-    return np.where(confidence[..., None] > 0, latents, 0).astype(np.float32), confidence
+    for step, index in enumerate(_shuffled(len(views), config.steps, config.seed), 1):
+        loss, by_y = loss_and_gradient(weights.of(index), targets[index], blended(x, published))
+        leaf.grad = torch.from_numpy(plain(by_features(x, by_y) if published else by_y))
+        adam.step()
+        if step % 20 == 0 or step == config.steps:
+            progress(f"training language features: loss {loss:.4f}", step / config.steps)
+    return np.where(confidence[..., None] > 0, unit(x), 0).astype(np.float32), confidence
 
 
 def blended(x: Array, published: bool) -> Array:
@@ -292,26 +275,6 @@ def _compare(
         losses[row] = total
 
 
-@kernel
-def _adam(
-    first: int,
-    last: int,
-    x: Array,
-    mean: Array,
-    square: Array,
-    gradient: Array,
-    rate: float,
-    correction: float,
-) -> None:
-    """Numbers [first, last). rate: lr / (1 - beta1^t); correction: 1 / (1 - beta2^t)."""
-    old, older = np.float32(BETAS[0]), np.float32(BETAS[1])
-    for i in range(first, last):
-        g = gradient[i]
-        mean[i] = old * mean[i] + (np.float32(1) - old) * g
-        square[i] = older * square[i] + (np.float32(1) - older) * g * g
-        x[i] -= rate * mean[i] / (np.sqrt(square[i] * correction) + np.float32(EPSILON))
-
-
 def _target(camera: Camera, features: ImageFeatures, codec: Codec) -> _Target:
     return _Target(camera, np.asarray(features.labels, np.int32), plain(codec.encode(features.vectors)))
 
@@ -345,9 +308,8 @@ class _Weights:
         if index in self._kept:
             return self._kept[index]
         view = self._rasterizer.view(self._gaussians, self._cameras[index], self._settings)
-        if not isinstance(view, FreezableView) or self._bytes > KEPT_BYTES:
-            return view
-        frozen = view.frozen()
-        self._bytes += frozen.nbytes
-        self._kept[index] = frozen
+        frozen = view.frozen() if self._bytes <= KEPT_BYTES else view
+        if frozen is not view:
+            self._bytes += frozen.nbytes
+            self._kept[index] = frozen
         return frozen

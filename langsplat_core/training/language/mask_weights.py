@@ -1,4 +1,4 @@
-"""Spherical k-means: few unit vectors that many lie close to (Dhillon and Modha 2001)."""
+"""Mask weights, how much of every mask each Gaussian paints; groups of masks; and 3D instances from them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,9 +11,11 @@ from scipy.sparse.csgraph import connected_components
 from langsplat_core.arrays import Array, unit
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.progress import Progress, silent
-from langsplat_core.raster.protocol import LabelView, LiftingRasterizer, LiftingView
+from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import LEVELS, NO_THING, Camera, Gaussians
 from langsplat_core.semantics.store import ImageFeatures
+
+# Spherical k-means: few unit vectors that many lie close to (Dhillon and Modha 2001).
 
 CHUNK = 8_192  # vectors compared with all centres at a time
 HELPING = 8  # one in so many centres is added, or given up, at a time
@@ -154,7 +156,7 @@ def _per_view(groups: Array, counts: list[int]) -> tuple[Array, ...]:
     return tuple(np.split(groups.astype(np.int32), np.cumsum(counts)[:-1]))
 
 
-# Memberships: how much of every mask in every photograph each Gaussian paints, ``W^T onehot(mask)``.
+# Mask weights: how much of every mask in every photograph each Gaussian paints, ``W^T onehot(mask)``.
 #
 # Targets are constant on masks, so this sparse matrix carries vectors of any length from photographs onto
 # Gaussians. It is kept view by view, as pairs sorted by Gaussian, in memory or in files, and read block by
@@ -166,7 +168,7 @@ PAIR = np.dtype([("row", "<u4"), ("mask", "<u2"), ("level", "<u2"), ("weight", "
 
 
 @dataclass(frozen=True, eq=False)
-class Memberships:
+class MaskWeights:
     """How strongly `count` Gaussians belong to the masks of all views."""
 
     pairs: Sequence[Array]  # of each view, of type PAIR, by rising row: Gaussian, mask, its level, pixels
@@ -179,7 +181,7 @@ class Memberships:
 
     @cached_property
     def _edges(self) -> list[Array]:
-        """Of each view, where each block begins in its pairs, and where the last ends."""
+        """Places in each view's pairs at which blocks begin, and the last one ends."""
         firsts = np.arange(0, self.count + BLOCK, BLOCK)
         return [np.searchsorted(view["row"], firsts) for view in self.pairs]
 
@@ -199,20 +201,19 @@ class Memberships:
         return sparse.coo_matrix(entries, shape).tocsr()  # which adds up what falls on one place
 
 
-def find_memberships(
+def find_mask_weights(
     rasterizer: LiftingRasterizer,
     gaussians: Gaussians,
     views: Sequence[tuple[Camera, ImageFeatures]],
-    chunk: int = 32,
     settings: RasterSettings = INRIA,
     progress: Progress = silent,
-) -> Memberships:
-    """Of all views, in memory."""
+) -> MaskWeights:
+    """Mask weights of all views, in memory."""
     pairs = []
     for camera, features in views:
-        pairs.append(view_pairs(rasterizer, gaussians, camera, features, chunk, settings))
+        pairs.append(view_pairs(rasterizer, gaussians, camera, features, settings))
         progress("lifting masks onto the Gaussians", len(pairs) / len(views))
-    return Memberships(pairs, len(gaussians))
+    return MaskWeights(pairs, len(gaussians))
 
 
 def view_pairs(
@@ -220,47 +221,21 @@ def view_pairs(
     gaussians: Gaussians,
     camera: Camera,
     features: ImageFeatures,
-    chunk: int = 32,
     settings: RasterSettings = INRIA,
 ) -> Array:
-    """The pairs of one view, of type PAIR, by rising row.
-
-    Where a backend cannot lift label maps in one walk, `chunk` masks travel through one gather pass.
-    """
+    """The pairs of one view, of type PAIR, by rising row."""
     if len(features.vectors) == 0:
         return np.zeros(0, PAIR)
     if len(features.vectors) > np.iinfo(PAIR["mask"]).max:
         raise ValueError(f"{camera.name}: {len(features.vectors)} masks; at most 65 535 can be numbered")
     view = rasterizer.view(gaussians, camera, settings)
-    weights = _weights_in_masks(view, features, chunk).tocsr()
+    weights = view.gather_labels(features.labels, len(features.vectors), MIN_WEIGHT)
     pairs = np.empty(weights.nnz, PAIR)
     pairs["row"] = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
     pairs["mask"] = weights.indices
     pairs["level"] = _row_levels(features)[weights.indices]
     pairs["weight"] = weights.data
     return pairs
-
-
-def _weights_in_masks(view: LiftingView, features: ImageFeatures, chunk: int) -> sparse.csr_matrix:
-    """(N, M) float32 weight of every Gaussian in the masks of one view, where it exceeds `MIN_WEIGHT`."""
-    count = len(features.vectors)
-    if isinstance(view, LabelView):
-        return view.gather_labels(features.labels, count, MIN_WEIGHT)
-    columns = []
-    for start in range(0, count, chunk):
-        weights = view.gather(_onehot(features.labels, start, min(chunk, count - start)))
-        columns.append(sparse.csr_matrix(np.where(weights > MIN_WEIGHT, weights, 0).astype(np.float32)))
-    return sparse.hstack(columns, format="csr")
-
-
-def _onehot(labels: Array, start: int, size: int) -> Array:
-    """(3, H, W) global row ids -> (H, W, size) float32 indicator of rows start .. start + size."""
-    height, width = labels.shape[1:]
-    image = np.zeros((height * width, size), np.float32)
-    for level in labels.reshape(len(LEVELS), -1):
-        inside = np.flatnonzero((level >= start) & (level < start + size))  # -1, no mask, is never inside
-        image[inside, level[inside] - start] = 1
-    return image.reshape(height, width, size)
 
 
 def _row_levels(features: ImageFeatures) -> Array:
@@ -285,7 +260,7 @@ THING_SAMPLE = (
 )
 
 
-def find_things(members: Memberships, counts: Sequence[int]) -> Array:
+def find_things(mask_weights: MaskWeights, counts: Sequence[int]) -> Array:
     """(N,) uint16 number of the thing that each Gaussian belongs to, at the coarsest level.
 
     NO_THING where no mask of that level shows it, or where a scene has more things than can be numbered.
@@ -293,13 +268,13 @@ def find_things(members: Memberships, counts: Sequence[int]) -> Array:
     counts: number of masks of each view. Things are numbered from the largest, by number of Gaussians.
     """
     level = len(LEVELS) - 1
-    numbers = masks_of_things(members, counts, level)
+    numbers = masks_of_things(mask_weights, counts, level)
     size = int(numbers.max(initial=-1)) + 1
     of_mask = np.split(np.where(numbers >= 0, numbers, size).astype(np.int32), np.cumsum(counts)[:-1])
     groups = MaskGroups(tuple(of_mask), np.zeros((size + 1, 1), np.float32))
-    things = np.full(members.count, size, np.int64)
-    for number, (first, last) in enumerate(members.blocks):
-        weights = members.block(number, groups)[:, level * (size + 1) : (level + 1) * (size + 1)].tocsr()
+    things = np.full(mask_weights.count, size, np.int64)
+    for number, (first, last) in enumerate(mask_weights.blocks):
+        weights = mask_weights.block(number, groups)[:, level * (size + 1) : (level + 1) * (size + 1)].tocsr()
         if weights.nnz:
             known = np.diff(weights.indptr) > 0
             things[first:last] = np.where(known, np.asarray(weights.argmax(axis=1)).ravel(), size)
@@ -309,11 +284,11 @@ def find_things(members: Memberships, counts: Sequence[int]) -> Array:
     return np.asarray(rank[things].astype(np.uint16))
 
 
-def masks_of_things(members: Memberships, counts: Sequence[int], level: int) -> Array:
+def masks_of_things(mask_weights: MaskWeights, counts: Sequence[int], level: int) -> Array:
     """(M,) number of the thing that each mask of all views shows, from 0; -1 for masks of other levels and
     for those that claim nothing."""
     firsts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    claims, views = _claims(members, firsts, level)
+    claims, views = _claims(mask_weights, firsts, level)
     _, found = connected_components(_overlapping(claims, views), directed=False)
     numbers = np.full(int(firsts[-1]), -1)
     at_level = np.flatnonzero(np.diff(claims.tocsc().indptr) > 0)
@@ -321,13 +296,13 @@ def masks_of_things(members: Memberships, counts: Sequence[int], level: int) -> 
     return numbers
 
 
-def _claims(members: Memberships, firsts: Array, level: int) -> tuple[sparse.csr_matrix, Array]:
+def _claims(mask_weights: MaskWeights, firsts: Array, level: int) -> tuple[sparse.csr_matrix, Array]:
     """(n, M) ones where a mask holds more than half of a sampled Gaussian's weight in its view and level."""
-    chosen = np.full(members.count, -1)
-    sample = np.random.default_rng(0).permutation(members.count)[:THING_SAMPLE]
+    chosen = np.full(mask_weights.count, -1)
+    sample = np.random.default_rng(0).permutation(mask_weights.count)[:THING_SAMPLE]
     chosen[np.sort(sample)] = np.arange(len(sample))
     rows, columns = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    for view, pairs in enumerate(members.pairs):
+    for view, pairs in enumerate(mask_weights.pairs):
         here = pairs[(pairs["level"] == level) & (chosen[pairs["row"]] >= 0)]
         row = chosen[here["row"]]
         total = np.bincount(row, here["weight"], len(sample))

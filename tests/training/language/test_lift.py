@@ -6,10 +6,11 @@ from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import unit
 from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.scene import LinearCodec
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language import mask_weights as blocks
-from langsplat_core.training.language.lift import lift_block, lift_sample, lift_weights
-from langsplat_core.training.language.mask_weights import find_memberships, group_masks
+from langsplat_core.training.language.lift import lift_block, lift_latents, lift_sample, lift_weights
+from langsplat_core.training.language.mask_weights import find_mask_weights, group_masks
 from tests.support.lifting import D, dense_weights, make_views
 from tests.support.scenes import random_camera, random_gaussians
 
@@ -21,10 +22,10 @@ def gaussians():
 
 @pytest.fixture(scope="module")
 def lifting(gaussians):
-    """Memberships and ungrouped masks of three views."""
+    """MaskWeights and ungrouped masks of three views."""
     views = make_views()
     groups = group_masks([features.vectors for _, features in views])
-    return find_memberships(ReferenceRasterizer(), gaussians, views), groups
+    return find_mask_weights(ReferenceRasterizer(), gaussians, views), groups
 
 
 def test_mean_and_confidence(gaussians, lifting):
@@ -45,11 +46,11 @@ def test_mean_and_confidence(gaussians, lifting):
 
 
 def test_a_sample_is_some_of_the_rows(lifting, monkeypatch):
-    members, groups = lifting
-    whole = lift_block(members, groups, 0, robust=True)
+    mask_weights, groups = lifting
+    whole = lift_block(mask_weights, groups, 0, robust=True)
     monkeypatch.setattr(blocks, "BLOCK", 8)
     rows = np.array([0, 3, 7, 8, 22])
-    again = type(members)(members.pairs, members.count)
+    again = type(mask_weights)(mask_weights.pairs, mask_weights.count)
     some = lift_sample(again, groups, rows, robust=True)
     np.testing.assert_allclose(some.vectors, whole.vectors[:, rows], atol=1e-6)
     np.testing.assert_allclose(some.confidence, whole.confidence[:, rows], rtol=1e-6)
@@ -83,8 +84,31 @@ def test_median_outvotes_a_wrong_mask_that_the_mean_follows():
 
 def test_no_masks_anywhere(gaussians):
     empty = ImageFeatures(np.full((3, 6, 8), -1, np.int32), np.zeros((0, D), np.float32))
-    members = find_memberships(ReferenceRasterizer(), gaussians, [(random_camera(0, 8, 6), empty)])
-    lifted = lift_block(members, group_masks([empty.vectors]), 0, robust=True)
+    mask_weights = find_mask_weights(ReferenceRasterizer(), gaussians, [(random_camera(0, 8, 6), empty)])
+    lifted = lift_block(mask_weights, group_masks([empty.vectors]), 0, robust=True)
     assert lifted.vectors.shape == (3, 25, D)
     assert not lifted.vectors.any()
     assert not lifted.confidence.any()
+
+
+# The paper's one-pass lifting against dense weights.
+
+
+def test_one_pass_is_the_weighted_mean_of_latents():
+    gaussians = random_gaussians(25, 3)
+    views = make_views()
+    codec = LinearCodec(np.eye(D, dtype=np.float32)[:4])
+    latents, confidence = lift_latents(ReferenceRasterizer(), gaussians, views, codec)
+    total, weight = np.zeros((25, 4)), np.zeros(25)
+    for camera, features in views:
+        weights = dense_weights(gaussians, camera)
+        masked = features.labels[1] >= 0
+        encoded = codec.encode(features.vectors)[features.labels[1][masked]]
+        total += weights[masked].T @ encoded
+        weight += weights[masked].sum(0)
+    np.testing.assert_allclose(confidence[1], weight, rtol=1e-5)
+    np.testing.assert_allclose(latents[1], unit(total / np.maximum(weight, 1e-9)[:, None]), atol=1e-5)
+    assert (latents[0] == 0).all()
+    assert (confidence[0] == 0).all()
+    seen = weight > 0
+    np.testing.assert_allclose(np.linalg.norm(latents[1][seen], axis=1), 1, atol=1e-5)

@@ -9,7 +9,8 @@ uniform sampler2DArray sh;         // coefficients k, channels rgb, packed four 
 uniform mat3 world_to_camera;
 uniform vec3 camera_high;  // camera position rounded to float32 ...
 uniform vec3 camera_low;   // ... and the rest: scenes may lie a million units from the origin
-uniform vec2 focal;        // px
+uniform bool orthographic;
+uniform vec2 focal;        // px; orthographic: px per world unit
 uniform vec2 principal;    // px
 uniform vec4 tangents;     // clamp of x/z and y/z: left, top, right, bottom
 uniform float dilation;    // px^2
@@ -77,9 +78,9 @@ void main() {
     from_camera -= camera_low;
     vec3 p = world_to_camera * from_camera;
     // Gaussians at or behind the near plane are not in the draw list; here they must only stay finite.
-    float z = max(p.z, 1e-12);
+    float z = orthographic ? 1.0 : max(p.z, 1e-12);
     vec2 tangent = p.xy / z;
-    vec2 clamped = clamp(tangent, -tangents.xy, tangents.zw);
+    vec2 clamped = orthographic ? vec2(0.0) : clamp(tangent, -tangents.xy, tangents.zw);
 
     // Rows of A = J W R diag(s); row vector times matrix.
     vec3 a0 = focal.x / z * ((vec3(1.0, 0.0, -clamped.x) * world_to_camera) * axes) * scales;
@@ -109,6 +110,7 @@ void main() {
         opacity *= sqrt(max(det_sharp / det, 0.005 * 0.005));
     placement = vec4(focal * tangent + principal, p.z, opacity >= alpha_min ? opacity : 0.0);
     shape = vec4(along, inversesqrt(variance_along), inversesqrt(variance_across));
-    float far = length(from_camera);
-    colour = vec4(radiance(texel, far > 0.0 ? from_camera / far : vec3(0.0)), 1.0);
+    vec3 sight = orthographic ? vec3(0.0, 0.0, 1.0) * world_to_camera : from_camera;
+    float far = length(sight);
+    colour = vec4(radiance(texel, far > 0.0 ? sight / far : vec3(0.0)), 1.0);
 }

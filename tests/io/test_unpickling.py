@@ -25,7 +25,7 @@ FLOATS = torch.arange(12.0)
 FIT, STORAGE = (4, 3), FLOATS.untyped_storage()
 
 
-class Lie:
+class Crafted:
     """Is pickled as a call, and a state for what the call returns."""
 
     def __init__(self, function: Any, *args: Any, state: Any = None) -> None:
@@ -38,22 +38,24 @@ class Lie:
 multiarray = __import__("numpy._core.multiarray", fromlist=["scalar"])
 
 
-def kind(code: str, state: Any = None) -> Lie:
-    return Lie(np.dtype, code, False, True, state=state)
+def kind(code: str, state: Any = None) -> Crafted:
+    return Crafted(np.dtype, code, False, True, state=state)
 
 
-def scalar(of: Any, data: Any = EIGHT) -> Lie:
-    return Lie(multiarray.scalar, of, data)
+def scalar(of: Any, data: Any = EIGHT) -> Crafted:
+    return Crafted(multiarray.scalar, of, data)
 
 
-def array(*state: Any) -> Lie:
-    return Lie(multiarray._reconstruct, np.ndarray, (0,), b"b", state=state)  # noqa: SLF001  as pickles say
+def array(*state: Any) -> Crafted:
+    return Crafted(multiarray._reconstruct, np.ndarray, (0,), b"b", state=state)  # noqa: SLF001  as pickles say
 
 
-def rebuilt(shape: Any = FIT, stride: Any = (3, 1), offset: int = 0, *more: Any, storage: Any = None) -> Lie:
+def rebuilt(
+    shape: Any = FIT, stride: Any = (3, 1), offset: int = 0, *more: Any, storage: Any = None
+) -> Crafted:
     typed = torch.storage.TypedStorage(wrap_storage=STORAGE, dtype=torch.float32, _internal=True)
     function = torch._utils._rebuild_tensor_v2  # noqa: SLF001
-    return Lie(
+    return Crafted(
         function, typed if storage is None else storage, offset, shape, stride, False, OrderedDict(), *more
     )
 
@@ -94,7 +96,7 @@ NUMBERS = {
     **{name: scalar(kind(*of)) for name, of in KINDS.items()},
     **{f"scalar {code}": scalar(kind(code)) for code in
        ("O", "V8", "M8", "m8", "f16", "c8", "S-8", "i3", "f8,O", "(2,)f8", "S99999999999", "", "٤")},
-    "scalar of a list": scalar(Lie(np.dtype, [("a", "O")], False, True)),
+    "scalar of a list": scalar(Crafted(np.dtype, [("a", "O")], False, True)),
     "scalar of the class": scalar(np.dtype),
     "scalar of a string": scalar("f8"),
     "scalar of nothing": scalar(None),
@@ -118,9 +120,9 @@ ARRAYS = {
     "array of the class": array(1, FIT, np.dtype, False, EIGHT * 12),
     "array of another version": array(2, FIT, F8, False, EIGHT * 12),
     "array in a short state": array(1, FIT),
-    "array in no state": Lie(multiarray._reconstruct, np.ndarray, (0,), b"b"),  # noqa: SLF001
-    "array with attributes": Lie(np.ndarray, FIT, state={"values": 1, "data": EIGHT, "shape": (2**40,)}),
-    "array of a shape": Lie(np.ndarray, (2**40,)),
+    "array in no state": Crafted(multiarray._reconstruct, np.ndarray, (0,), b"b"),  # noqa: SLF001
+    "array with attributes": Crafted(np.ndarray, FIT, state={"values": 1, "data": EIGHT, "shape": (2**40,)}),
+    "array of a shape": Crafted(np.ndarray, (2**40,)),
 }  # fmt: skip
 TENSORS = {
     **{f"offset {offset}": rebuilt(offset=offset) for offset in (1, -1, 12, 2**62, -(2**63), 2**63)},
@@ -134,32 +136,33 @@ TENSORS = {
     "conjugated": rebuilt(FIT, (3, 1), 0, {"conj": True}),
     "of a tensor": rebuilt(storage=FLOATS),
     "of a number": rebuilt(storage=12),
-    "storage of another kind": Lie(torch._utils._rebuild_tensor_v2, torch.zeros(6).double().untyped_storage(),  # noqa: SLF001
-                                   0, FIT, (3, 1), False, OrderedDict()),
-    "set anew": Lie(torch._utils._rebuild_tensor, torch.storage.TypedStorage(  # noqa: SLF001
+    "storage of another kind": Crafted(
+        torch._utils._rebuild_tensor_v2, torch.zeros(6).double().untyped_storage(),  # noqa: SLF001
+        0, FIT, (3, 1), False, OrderedDict()),
+    "set anew": Crafted(torch._utils._rebuild_tensor, torch.storage.TypedStorage(  # noqa: SLF001
         wrap_storage=STORAGE, dtype=torch.float32, _internal=True), 0, FIT, (3, 1),
         state=(FLOATS, 2**40, FIT, (3, 1))),
-    "a parameter of a list": Lie(torch._utils._rebuild_parameter, [1], False, OrderedDict()),  # noqa: SLF001
+    "a parameter of a list": Crafted(torch._utils._rebuild_parameter, [1], False, OrderedDict()),  # noqa: SLF001
 }  # fmt: skip
 
 
-def sparse(layout: torch.layout, *parts: Any) -> Lie:
-    return Lie(torch._utils._rebuild_sparse_tensor, layout, parts)  # noqa: SLF001
+def sparse(layout: torch.layout, *parts: Any) -> Crafted:
+    return Crafted(torch._utils._rebuild_sparse_tensor, layout, parts)  # noqa: SLF001
 
 
 FAR = torch.tensor([[10**12, -5, 3], [7, 10**15, -1]])
 NAMES = {  # of other tensors, and of what makes them, all of which torch alone would call
     "COO": sparse(torch.sparse_coo, FAR, torch.ones(3), FIT),
     "CSR": sparse(torch.sparse_csr, FAR.ravel()[:5], FAR.ravel()[:3], torch.ones(3), FIT),
-    "sparse class": Lie(torch.sparse.FloatTensor, FAR, torch.ones(3), FIT),
-    "quantised": Lie(torch._utils._rebuild_qtensor, FLOATS, 0, FIT, (3, 1), (), False, None),  # noqa: SLF001
-    "nested": Lie(torch._utils._rebuild_nested_tensor, FLOATS, FAR, FAR, FAR[0]),  # noqa: SLF001
+    "sparse class": Crafted(torch.sparse.FloatTensor, FAR, torch.ones(3), FIT),
+    "quantised": Crafted(torch._utils._rebuild_qtensor, FLOATS, 0, FIT, (3, 1), (), False, None),  # noqa: SLF001
+    "nested": Crafted(torch._utils._rebuild_nested_tensor, FLOATS, FAR, FAR, FAR[0]),  # noqa: SLF001
     "meta": torch.ones(FIT, device="meta"),
     "complex": torch.ones(FIT, dtype=torch.complex64),
     "wide": torch.ones(FIT, dtype=torch.uint16),
-    "uninitialised": Lie(torch.FloatTensor, 4, 3),
-    "huge": Lie(bytearray, 2**40),
-    "renamed": Lie(torch._tensor._rebuild_from_type_v2, complex, torch.Tensor, (), {"numel": complex}),  # noqa: SLF001
+    "uninitialised": Crafted(torch.FloatTensor, 4, 3),
+    "huge": Crafted(bytearray, 2**40),
+    "renamed": Crafted(torch._tensor._rebuild_from_type_v2, complex, torch.Tensor, (), {"numel": complex}),  # noqa: SLF001
 }  # fmt: skip
 
 
@@ -219,12 +222,12 @@ def hostile_files() -> dict[str, bytes]:
     legacy = saved(model(), **old)
     tuples = b"\x85" * 300_000  # in one another; a hash goes down all of them
     return {
-        **{name: saved(model(extent=lie)) for name, lie in NUMBERS.items()},
-        **{name: saved(model(means=lie)) for name, lie in ARRAYS.items()},
-        **{name: saved(model(means=lie)) for name, lie in TENSORS.items()},
-        **{f"{name}, old": saved(model(means=lie), **old) for name, lie in [*TENSORS.items()][::4]},
-        **{f"{name} tensor": saved(model(means=lie)) for name, lie in NAMES.items()},
-        **{f"with another {name}": saved(Lie(OrderedDict, state={name: 5})) for name in ("get", "items")},
+        **{name: saved(model(extent=crafted)) for name, crafted in NUMBERS.items()},
+        **{name: saved(model(means=crafted)) for name, crafted in ARRAYS.items()},
+        **{name: saved(model(means=crafted)) for name, crafted in TENSORS.items()},
+        **{f"{name}, old": saved(model(means=crafted), **old) for name, crafted in [*TENSORS.items()][::4]},
+        **{f"{name} tensor": saved(model(means=crafted)) for name, crafted in NAMES.items()},
+        **{f"with another {name}": saved(Crafted(OrderedDict, state={name: 5})) for name in ("get", "items")},
         "type without a call": by_hand(b"cnumpy.core.multiarray\nscalar\ncnumpy\ndtype\n)\x81U\x00\x86R"),
         "key in many tuples": by_hand(b"})" + tuples + b"K\x00s"),
         "key in remembered tuples": by_hand(b"})" + b"\x85q\x000h\x00" * 150_000 + b"K\x00s"),
@@ -252,7 +255,7 @@ def harmless_files() -> dict[str, bytes]:
     }
 
 
-def test_every_lie_is_refused_in_a_line_and_nothing_else(tmp_path):
+def test_every_crafted_file_is_refused_in_a_line_and_nothing_else(tmp_path):
     hostile, damaged, harmless = hostile_files(), mutants(), harmless_files()
     ended = ends(hostile | damaged | harmless, tmp_path)
     assert {name: ended[name] for name in hostile if not refused(ended[name])} == {}

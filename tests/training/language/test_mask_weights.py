@@ -1,21 +1,109 @@
-"""Things from masks, against the rule written out with sets."""
+"""MaskWeights against dense weights, block by block, and groups of masks."""
 
 from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, unit
+from langsplat_core.raster import load_lifting_rasterizer, protocol
+from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import LEVELS, NO_THING
+from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language import mask_weights as blocks
 from langsplat_core.training.language import mask_weights as module
 from langsplat_core.training.language.mask_weights import (
     PAIR,
     SAME,
-    Memberships,
+    MaskWeights,
+    find_mask_weights,
     find_things,
+    group_masks,
     masks_of_things,
+    view_pairs,
 )
+from tests.support.lifting import D, dense_weights, make_views
+from tests.support.scenes import random_camera, random_gaussians
+
+
+@pytest.fixture(scope="module")
+def gaussians():
+    return random_gaussians(25, 3)
+
+
+def ungrouped(views):
+    return group_masks([features.vectors for _, features in views], groups=10_000)
+
+
+@pytest.mark.parametrize(("backend", "together"), [("reference", 3), ("reference", 32), ("cpu", 32)])
+def test_a_mask_weight_is_the_weight_inside_the_mask(gaussians, backend, together, monkeypatch):
+    monkeypatch.setattr(protocol, "LABELS_AT_ONCE", together)
+    views = make_views()
+    mask_weights = find_mask_weights(load_lifting_rasterizer(backend), gaussians, views)
+    got = mask_weights.block(0, ungrouped(views)).toarray()
+    assert got.shape == (25, 3 * 21)
+    for index, (camera, features) in enumerate(views):
+        weights = dense_weights(gaussians, camera)
+        for row in range(7):
+            level = 1 if row < 4 else 2
+            want = weights[features.labels[level] == row].sum(0)
+            want[want <= 1e-3] = 0
+            column = level * 21 + 7 * index + row
+            np.testing.assert_allclose(got[:, column], want, rtol=1e-5, atol=1e-6)
+            got[:, column] = 0
+    assert not got.any()  # nothing at any other level
+
+
+def test_blocks_are_the_rows_of_the_whole(gaussians, monkeypatch):
+    views = make_views()
+    mask_weights = find_mask_weights(ReferenceRasterizer(), gaussians, views)
+    groups = ungrouped(views)
+    whole = mask_weights.block(0, groups).toarray()
+    monkeypatch.setattr(module, "BLOCK", 7)
+    again = find_mask_weights(ReferenceRasterizer(), gaussians, views)
+    assert again.blocks == [(0, 7), (7, 14), (14, 21), (21, 25)]
+    parts = [again.block(number, groups).toarray() for number in range(4)]
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+
+def test_masks_of_one_group_are_one_column(gaussians):
+    views = make_views()
+    mask_weights = find_mask_weights(ReferenceRasterizer(), gaussians, views)
+    groups = group_masks([features.vectors for _, features in views], groups=4)
+    assert groups.vectors.shape == (4, D)
+    apart = mask_weights.block(0, ungrouped(views)).toarray().reshape(25, 3, 21)
+    together = np.zeros((25, 3, 4))
+    for column, group in enumerate(np.concatenate(groups.of_mask)):
+        together[:, :, group] += apart[:, :, column]
+    np.testing.assert_allclose(mask_weights.block(0, groups).toarray(), together.reshape(25, 12), rtol=1e-5)
+
+
+def test_groups_hold_what_says_the_same():
+    rng = np.random.default_rng(0)
+    centres = unit(rng.normal(size=(6, D)))
+    labels = rng.integers(6, size=300)
+    vectors = unit(centres[labels] + 0.02 * rng.normal(size=(300, D))).astype(np.float32)
+    groups = group_masks(np.split(vectors, [100, 100, 250]), groups=6)  # the second view has no masks
+    assert [len(view) for view in groups.of_mask] == [100, 0, 150, 50]
+    found = np.concatenate(groups.of_mask)
+    assert len({(a, b) for a, b in zip(found, labels, strict=True)}) == 6
+    np.testing.assert_allclose((groups.vectors[found] * centres[labels]).sum(1), 1, atol=0.01)
+
+
+def test_a_view_without_masks_has_no_pairs(gaussians):
+    empty = ImageFeatures(np.full((3, 6, 8), -1, np.int32), np.zeros((0, D), np.float32))
+    pairs = view_pairs(ReferenceRasterizer(), gaussians, random_camera(0, 8, 6), empty)
+    assert (len(pairs), pairs.dtype) == (0, PAIR)
+
+
+def test_more_masks_than_can_be_numbered_are_refused(gaussians):
+    labels = np.full((3, 6, 8), -1, np.int32)
+    many = ImageFeatures(labels, np.zeros((70_000, 1), np.float32))
+    with pytest.raises(ValueError, match="70000 masks; at most 65 535"):
+        view_pairs(ReferenceRasterizer(), gaussians, random_camera(0, 8, 6), many)
+
+
+# Things from masks, against the rule written out with sets.
 
 WHOLE = len(LEVELS) - 1
 UNSEEN = -1
@@ -42,7 +130,7 @@ def counts_of(views: Sequence[Array]) -> list[int]:
 
 
 def found(views: Sequence[Array], count: int) -> Array:
-    return find_things(Memberships(list(views), count), counts_of(views))
+    return find_things(MaskWeights(list(views), count), counts_of(views))
 
 
 def random_views(seed: int, count: int = 240, views: int = 8) -> list[Array]:
@@ -98,7 +186,7 @@ def plain_masks_of_things(views: Sequence[Array], level: int) -> list[int]:
 @pytest.mark.parametrize("seed", range(4))
 def test_masks_go_together_by_the_plain_rule(seed, level):
     views = random_views(seed)
-    got = masks_of_things(Memberships(views, 240), counts_of(views), level)
+    got = masks_of_things(MaskWeights(views, 240), counts_of(views), level)
     want = np.array(plain_masks_of_things(views, level))
     assert ((got == -1) == (want == -1)).all()
     pairs = len({*zip(got.tolist(), want.tolist(), strict=True)})
@@ -129,59 +217,64 @@ def test_a_gaussian_belongs_to_the_thing_that_it_paints_most(seed):
     np.testing.assert_array_equal(found(views, 240), things)
 
 
-def test_masks_seen_in_several_views_are_one_thing_numbered_from_the_largest():
-    truth = np.repeat([0, 1, 2], [10, 30, 20])
-    views = [view(np.array(order)[truth]) for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0])]
-    things = found(views, 60)
+ROWS = np.arange(40)
+TRUTH = np.repeat([0, 1, 2], [10, 30, 20])
+APART = [view(np.where(ROWS < 20, 0, UNSEEN)), view(np.where(ROWS >= 20, 0, UNSEEN))]
+HALVES = ROWS // 20
+CASES = {
+    "masks seen in several views are one thing, numbered from the largest": (
+        [view(np.array(order)[TRUTH]) for order in ([0, 1, 2], [2, 0, 1], [1, 2, 0])],
+        np.array([2, 0, 1])[TRUTH],
+    ),
+    "views that never meet say nothing about each other": (APART, HALVES),
+    "a view of both joins them": (
+        [*APART, view(np.where((ROWS >= 10) & (ROWS < 30), 0, UNSEEN))], np.zeros(40)
+    ),
+    "half a thing in the corner of an image is that thing": (
+        [view(np.zeros(40, int)), view(np.where(ROWS < 6, 0, UNSEEN))], np.zeros(40)
+    ),
+    **{
+        f"touching masks do not merge where one spills over by {spilled}": (
+            [view(HALVES), view(HALVES), view((20 + spilled <= ROWS).astype(int))], HALVES
+        )
+        for spilled in (2, 5)
+    },
+    "a mask over two things merges neither": (
+        [view(HALVES), view(1 - HALVES), view(np.zeros(40, int))], HALVES
+    ),
+    "no masks": ([np.zeros(0, PAIR)] * 2, np.full(5, NO_THING)),
+    "views without masks": (
+        [np.zeros(0, PAIR), view(np.zeros(12, int)), np.zeros(0, PAIR), view(np.zeros(12, int))], np.zeros(12)
+    ),
+    "no Gaussians": ([np.zeros(0, PAIR)], np.zeros(0)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_things_of_a_case(name):
+    """Things of one size may be numbered either way."""
+    views, want = CASES[name]
+    things = found(views, len(want))
     assert things.dtype == np.uint16
-    assert things.tolist() == np.array([2, 0, 1])[truth].tolist()
-
-
-def test_views_that_never_meet_say_nothing_about_each_other():
-    rows = np.arange(40)
-    apart = [view(np.where(rows < 20, 0, UNSEEN)), view(np.where(rows >= 20, 0, UNSEEN))]
-    assert found(apart, 40).tolist() == [0] * 20 + [1] * 20
-    between = view(np.where((rows >= 10) & (rows < 30), 0, UNSEEN))
-    assert found([*apart, between], 40).tolist() == [0] * 40  # a view of both joins them
-
-
-def test_half_a_thing_in_the_corner_of_a_picture_is_that_thing():
-    """What the other view does not see counts on neither side."""
-    rows = np.arange(40)
-    cropped = view(np.where(rows < 6, 0, UNSEEN))
-    assert found([view(np.zeros(40, int)), cropped], 40).tolist() == [0] * 40
-
-
-@pytest.mark.parametrize("spilled", [2, 5])
-def test_touching_masks_do_not_merge_where_one_spills_over(spilled):
-    rows = np.arange(40)
-    exact, wide = view(rows // 20), view((rows >= 20 + spilled).astype(int))
-    things = found([exact, exact.copy(), wide], 40)
-    assert len(np.unique(things)) == 2
-    np.testing.assert_array_equal(things == things[0], rows < 20)
-
-
-def test_a_mask_over_two_things_merges_neither():
-    rows = np.arange(40)
-    both = view(np.zeros(40, int))
-    things = found([view(rows // 20), view(1 - rows // 20), both], 40)
-    np.testing.assert_array_equal(things == things[0], rows < 20)
-    assert NO_THING not in things
+    if "two things" in name or "touching" in name or "never meet" in name:
+        things = (things != things[:1]).astype(int)
+    np.testing.assert_array_equal(things, want)
 
 
 def test_masks_of_other_levels_show_no_thing():
     rows = np.arange(20)
     views = [joined(view(np.where(rows < 10, 0, UNSEEN)), view(np.full(20, 1), level=1))] * 2
-    assert masks_of_things(Memberships(views, 20), [2, 2], WHOLE).tolist() == [0, -1, 0, -1]
-    assert masks_of_things(Memberships(views, 20), [2, 2], 1).tolist() == [-1, 0, -1, 0]
-    assert masks_of_things(Memberships(views, 20), [2, 2], 0).tolist() == [-1] * 4
+    for level, want in ((WHOLE, [0, -1, 0, -1]), (1, [-1, 0, -1, 0]), (0, [-1] * 4)):
+        assert masks_of_things(MaskWeights(views, 20), [2, 2], level).tolist() == want
     assert found(views, 20).tolist() == [0] * 10 + [NO_THING] * 10
+    hidden = find_things(MaskWeights([np.zeros(0, PAIR)], 5), [3])  # masks behind everything
+    assert hidden.tolist() == [NO_THING] * 5
 
 
 def test_a_gaussian_that_two_masks_share_evenly_is_claimed_by_neither():
     even = joined(view([0, 0, 0]), view([1, UNSEEN, UNSEEN]))
     assert plain_masks_of_things([even], WHOLE) == [0, -1]
-    assert masks_of_things(Memberships([even], 3), [2], WHOLE).tolist() == [0, -1]
+    assert masks_of_things(MaskWeights([even], 3), [2], WHOLE).tolist() == [0, -1]
     assert found([even], 3).tolist() == [0, 0, 0]
 
 
@@ -209,13 +302,3 @@ def test_blocks_change_nothing(monkeypatch):
     whole = found(views, 240)
     monkeypatch.setattr(blocks, "BLOCK", 37)
     np.testing.assert_array_equal(found(views, 240), whole)
-
-
-def test_views_without_masks():
-    empty = np.zeros(0, PAIR)
-    full = view(np.zeros(12, int))
-    assert found([empty, full, empty, full, empty], 12).tolist() == [0] * 12
-    for views in ([empty], [empty, empty]):
-        assert found(views, 5).tolist() == [NO_THING] * 5
-    assert find_things(Memberships([empty], 5), [3]).tolist() == [NO_THING] * 5  # masks that hide behind
-    assert found([empty], 0).shape == (0,)

@@ -1,4 +1,4 @@
-"""Parallel projection by a camera that stands far away: how parallel, how exact, and what it leaves out."""
+"""Looking without perspective: pixels, depths, framing, and what is left out."""
 
 from dataclasses import replace
 
@@ -8,22 +8,16 @@ from numpy.testing import assert_allclose
 
 from langsplat_core.config import PictureConfig
 from langsplat_core.io.scenes import load_scene
-from langsplat_core.raster.opengl.rasterizer import GlRasterizer
-from langsplat_core.scene import Camera
 from langsplat_viewer.camera.controls import (
-    FARTHEST,
-    FarCamera,
     OrbitCamera,
     between,
     default_view,
     extent_of,
-    eye_depth,
     frame_all,
     from_camera,
     from_side,
-    in_parallel,
-    in_perspective,
     spanning,
+    with_projection,
     zoom,
 )
 from langsplat_viewer.camera.flight import Flight, Keyframe, camera_of, pose_at, pose_of, turntable, view_of
@@ -56,54 +50,18 @@ def exact(view: OrbitCamera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return np.stack(pixels, 1), z
 
 
-def drawn(view: OrbitCamera, points: np.ndarray, extent) -> np.ndarray:
-    """(N,) bool: before the eye, in the picture, and no farther from the target than the scene reaches."""
-    pixels, z = exact(view, points)
-    near = np.abs(z - view.distance) < extent.farthest / FARTHEST
-    return near & (z > 0) & (pixels >= 0).all(1) & (pixels <= SIZE).all(1)
-
-
-@pytest.mark.parametrize("side", SIDES)
-@pytest.mark.parametrize("nearness", [1.0, 0.1])
-def test_gaussians_are_where_an_orthographic_projection_has_them(room, side, nearness, gl, measured):
-    """In float64 how parallel the rays are; and what float32 adds to it on the graphics device."""
-    scene, extent, opening = room
-    view = zoom(from_side(in_parallel(opening, extent), side), nearness, 0.0)
-    camera, means = view.camera(*SIZE), scene.gaussians.means
-    wanted, _ = exact(view, means)
-    inside = drawn(view, means, extent)
-    assert inside.sum() > 300
-    found, _ = camera.project(means.astype(np.float64))
-    error = np.abs(found - wanted)[inside].max()
-    measured("far camera", "error, px of 1280", error)
-    assert error < 0.5 / 300 * SIZE[0]  # a third of a percent of what lies between the middle and the edge
-
-    rasterizer = GlRasterizer(gl, "single")
-    view_of_gl = rasterizer.view(scene.gaussians, camera, image_formation(scene, camera))
-    placed = rasterizer.project(view_of_gl)
-    by_gl = np.frombuffer(placed.placement.read(), "f4").reshape(-1, 4)[: len(means)]
-    order = view_of_gl.order.rows(placed)
-    inside = inside[scene.gaussians.valid()]
-    rounding = np.abs(by_gl[: len(inside), :2] - found[scene.gaussians.valid()])[inside].max()
-    rasterizer.release()
-    measured("far camera", f"float32, px of 1280, nearness {nearness}", rounding)
-    assert rounding < 0.01 / nearness
-    assert len(order) > 500
-
-
-def test_what_float32_keeps_of_depths_orders_a_scene(room):
-    """The graphics device and CUDA hold depths in float32."""
-    scene, extent, opening = room
-    view = in_parallel(opening, extent)
-    _, depths = view.camera(*SIZE).project(scene.gaussians.means.astype(np.float64))
-    lost = np.abs(depths.astype(np.float32) - depths).max()
-    assert lost < 5e-5 * extent.farthest / FARTHEST
+def test_the_camera_is_orthographic():
+    view = with_projection(VIEW, orthographic=True)
+    wanted, depths = exact(view, BLOBS.gaussians.means)
+    found, z = view.camera(*SIZE).project(BLOBS.gaussians.means.astype(np.float64))
+    assert_allclose(found, wanted, atol=1e-9)
+    assert_allclose(z, depths, atol=1e-12)
 
 
 @pytest.mark.parametrize("side", ["front", "top"])
 def test_rasterizers_agree_on_it(room, side):
-    scene, extent, opening = room
-    view = from_side(in_parallel(opening, extent), side)
+    scene, _, opening = room
+    view = from_side(with_projection(opening, orthographic=True), side)
     images = [
         render_image(plain_request(scene, view.camera(320, 180), PictureConfig()), backend).astype(int)
         for backend in ("cpu", "opengl")
@@ -117,7 +75,7 @@ def test_rasterizers_agree_on_it(room, side):
 @pytest.mark.parametrize("backend", ["opengl", "cpu"])
 def test_what_is_clicked_is_where_it_is(gl, backend):
     """By the depth of one pixel, and by that of all of them."""
-    view = in_parallel(VIEW, EXTENT)
+    view = with_projection(VIEW, orthographic=True)
     camera = view.camera(320, 240)
     renderer, request = GlRenderer(gl, backend, "half"), plain_request(BLOBS, camera, PictureConfig())
     for centre in CENTRES:
@@ -132,33 +90,17 @@ def test_what_is_clicked_is_where_it_is(gl, backend):
     renderer.release()
 
 
-def test_lines_of_one_direction_are_parallel_in_the_picture():
-    view = in_parallel(VIEW, EXTENT)
-    rng = np.random.default_rng(0)
-    starts = rng.uniform(-1, 1, (20, 3))
-    ends = starts + [0.8, 0.3, 0.4]
-
-    def spread(view: OrbitCamera) -> float:
-        """Of the directions in the picture, degrees."""
-        camera = view.camera(*SIZE)
-        steps = camera.project(ends)[0] - camera.project(starts)[0]
-        return float(np.ptp(np.degrees(np.arctan2(*steps.T))))
-
-    assert spread(view) < 0.5
-    assert spread(VIEW) > 5
-
-
 def test_the_plane_through_the_target_keeps_its_scale():
-    view = in_parallel(VIEW, EXTENT)
+    view = with_projection(VIEW, orthographic=True)
     across = VIEW.target + 0.3 * VIEW.rotation[0] - 0.7 * VIEW.rotation[1]
     points = np.stack([VIEW.target, across])
     assert_allclose(view.camera(*SIZE).project(points)[0], VIEW.camera(*SIZE).project(points)[0], atol=1e-9)
-    assert in_perspective(view).camera(*SIZE).intrinsics == VIEW.camera(*SIZE).intrinsics
+    assert with_projection(view, orthographic=False).camera(*SIZE).intrinsics == VIEW.camera(*SIZE).intrinsics
     assert view.span == pytest.approx(2 * np.tan(np.radians(VIEW.intrinsics.fov_degrees / 2)) * VIEW.distance)
 
 
 def test_a_span_is_what_the_shorter_side_shows():
-    view = spanning(VIEW, 2.5, EXTENT)
+    view = spanning(VIEW, 2.5)
     assert view.span == pytest.approx(2.5)
     assert_allclose(view.eye, VIEW.eye, atol=1e-12)
     top, foot = view.target - 1.25 * view.rotation[1], view.target + 1.25 * view.rotation[1]
@@ -169,10 +111,10 @@ def test_a_span_is_what_the_shorter_side_shows():
     assert view.span_in(120, 720) == pytest.approx(2.5 * 160 / 120)  # the photograph's whole width is seen
 
 
-def test_a_far_camera_gives_its_view_back_at_any_size():
-    view = spanning(VIEW, 2.5, EXTENT)
+def test_an_orthographic_camera_gives_its_view_back_at_any_size():
+    view = spanning(VIEW, 2.5)
     camera = view.camera(320, 240).resized(640, 480)
-    assert isinstance(camera, FarCamera)
+    assert camera.orthographic
     again = from_camera(camera, EXTENT)
     assert_allclose(again.target, view.target, atol=1e-9)
     assert again.span == pytest.approx(2.5)
@@ -180,7 +122,7 @@ def test_a_far_camera_gives_its_view_back_at_any_size():
 
 
 def test_what_lies_behind_the_eye_is_left_out_and_cuts_count_from_the_eye():
-    view = in_parallel(VIEW, EXTENT)
+    view = with_projection(VIEW, orthographic=True)
     inside = replace(
         view, target=view.target - 0.2 * view.rotation[2], distance=0.2
     )  # the eye among the blobs
@@ -194,14 +136,14 @@ def test_what_lies_behind_the_eye_is_left_out_and_cuts_count_from_the_eye():
         np.testing.assert_array_equal(shown, (z > clip.near) & (z <= clip.far))
         assert 0 < shown.sum() < len(shown)
         low, high = depth_range(BLOBS.gaussians, camera, clip)
-        assert clip.near <= low - eye_depth(camera) < high - eye_depth(camera) <= min(clip.far, 3.0)
+        assert clip.near <= low < high <= min(clip.far, 3.0)
     beyond = replace(inside, target=inside.target + 50 * inside.rotation[2])
     assert "behind the camera" in why_nothing(BLOBS.gaussians, beyond.camera(*SIZE))
 
 
 @pytest.mark.parametrize("side", SIDES)
 def test_framing_holds_the_scene_and_nothing_of_it_is_behind_the_eye(side):
-    view = frame_all(from_side(in_parallel(VIEW, EXTENT), side), EXTENT, SIZE)
+    view = frame_all(from_side(with_projection(VIEW, orthographic=True), side), EXTENT, SIZE)
     pixels, z = exact(view, EXTENT.sample.points)
     inside = (pixels >= 0).all(1) & (pixels <= SIZE).all(1) & (z > 0)
     assert EXTENT.sample.weights[inside].sum() > 0.979 * EXTENT.sample.weights.sum()
@@ -210,7 +152,7 @@ def test_framing_holds_the_scene_and_nothing_of_it_is_behind_the_eye(side):
 
 
 def test_zooming_in_ends_where_nothing_gets_larger():
-    view = in_parallel(VIEW, EXTENT)
+    view = with_projection(VIEW, orthographic=True)
     assert zoom(view, 0.5, 0.1).span == pytest.approx(0.5 * view.span)
     nearest = zoom(replace(view, distance=0.1), 0.5, 0.1)
     assert nearest.distance == 0.1
@@ -218,9 +160,9 @@ def test_zooming_in_ends_where_nothing_gets_larger():
 
 
 def test_a_glide_has_the_projection_of_its_end():
-    flat = in_parallel(VIEW, EXTENT)
-    assert between(VIEW, flat, 0.3).back == flat.back
-    assert between(flat, VIEW, 0.3).back == 0
+    flat = with_projection(VIEW, orthographic=True)
+    assert between(VIEW, flat, 0.3).orthographic
+    assert not between(flat, VIEW, 0.3).orthographic
 
 
 def flight_of(*views: OrbitCamera) -> Flight:
@@ -228,20 +170,20 @@ def flight_of(*views: OrbitCamera) -> Flight:
 
 
 def test_keyframes_keep_projection_and_scale():
-    flat = [spanning(from_side(VIEW, side), span, EXTENT) for side, span in (("front", 1.0), ("top", 4.0))]
+    flat = [spanning(from_side(VIEW, side), span) for side, span in (("front", 1.0), ("top", 4.0))]
     flight = flight_of(*flat, VIEW)
     for at, wanted in enumerate((*flat, VIEW)):
         found = camera_of(pose_at(flight, at), EXTENT, SIZE)
         assert_allclose(found.world_to_camera, wanted.camera(*SIZE).world_to_camera, atol=1e-7)
-        assert type(found) is (FarCamera if wanted.back else Camera)
+        assert found.orthographic == wanted.orthographic
         assert found.fx == pytest.approx(wanted.camera(*SIZE).fx)
     assert pose_at(flight_of(*flat), 0.5).span == pytest.approx(2.0)
     assert pose_at(flight, 1.5).span == pytest.approx(4.0)  # till the next keyframe
     assert pose_at(flight_of(VIEW, VIEW, flat[0]), 0.5).span is None
 
 
-def test_a_turntable_of_a_parallel_view_is_parallel():
-    view = in_parallel(VIEW, EXTENT)
+def test_a_turntable_keeps_the_projection():
+    view = with_projection(VIEW, orthographic=True)
     pose = pose_at(turntable(view, 8.0), 3.0)
     assert view_of(pose, EXTENT).span == pytest.approx(view.span)
     assert_allclose(view_of(pose, EXTENT).target, view.target, atol=1e-9)

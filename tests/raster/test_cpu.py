@@ -1,0 +1,425 @@
+"""The CPU rasterizer against the float64 reference, and laws that need none."""
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy import sparse
+
+from langsplat_core.arrays import Array, logit
+from langsplat_core.config import GSPLAT, INRIA
+from langsplat_core.errors import InputError
+from langsplat_core.raster import BACKENDS, load_rasterizer, reference
+from langsplat_core.raster.cpu.projection import colours, colours_backward
+from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
+from langsplat_core.raster.cpu.tiles import depth_order
+from langsplat_core.raster.protocol import LiftingRasterizer
+from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.scene import Camera, Gaussians
+from tests.support import torch_reference
+from tests.support.close import BAND, assert_adjoint, assert_close_off_cuts, assert_gradient
+from tests.support.scenes import random_camera, random_gaussians, random_values, without_perspective
+
+CPU, REFERENCE = CpuRasterizer(), ReferenceRasterizer()
+PLAIN = Camera(40, 30, 40.0, 40.0, 20.0, 15.0, np.eye(4))  # at the origin, looking along z
+
+
+def assert_same_picture(gaussians, camera, settings=INRIA, channels=3, atol=2e-5):
+    """Splat, alpha, gather, depths of the CPU equal the reference's; returns the CPU's image."""
+    x = random_values(len(gaussians), channels)
+    fast, slow = CPU.view(gaussians, camera, settings), REFERENCE.view(gaussians, camera, settings)
+    band = slow.cut_off_band(BAND)
+    (image, alpha), (want, want_alpha) = fast.splat(x), slow.splat(x)
+    assert image.dtype == alpha.dtype == np.float32
+    assert_close_off_cuts(image, want, band, atol)
+    assert_close_off_cuts(alpha, want_alpha, band, atol)
+    y = np.random.default_rng(1).normal(size=image.shape).astype(np.float32)
+    y[band] = 0  # flipped weights of the band would enter every sum
+    np.testing.assert_allclose(fast.gather(y), slow.gather(y), atol=1e-5 * max(image.size, 100) ** 0.5)
+    assert_adjoint(lambda v: fast.splat(v)[0], fast.gather, x, y)
+    depth = slow.depth()
+    assert_close_off_cuts(fast.depth(), depth, band, atol * max(depth.max(), 1))
+    halves = np.abs(fast.median_depth() - slow.median_depth()) > 1e-5 * max(depth.max(), 1)
+    assert halves.sum() <= 1 + band.sum()  # T of exactly 0.5 is one more step
+    assert fast.dropped == slow.dropped
+    return image
+
+
+@pytest.mark.parametrize("channels", [1, 2, 5, 32, 40])
+@pytest.mark.parametrize("distance", [0.6, 3.0])  # 0.6: in the scene, Gaussians behind, beside and around
+@pytest.mark.parametrize("settings", [INRIA, GSPLAT])
+def test_pictures_are_the_references(channels, distance, settings):
+    gaussians, camera = random_gaussians(150, 8 + channels), random_camera(8, distance=distance)
+    assert assert_same_picture(gaussians, camera, settings, channels).max() > 0.1
+
+
+@pytest.mark.parametrize("channels", [1, 3, 12, 40])
+@pytest.mark.parametrize("size", [(70, 45), (1, 1), (33, 5)])
+def test_a_frozen_view_differs_by_its_rounding_only(channels, size):
+    gaussians, camera = random_gaussians(300, 21), random_camera(21, *size)
+    view = CPU.view(gaussians, camera)
+    frozen = view.frozen()
+    x = random_values(300, channels)
+    (image, alpha), (want, want_alpha) = frozen.splat(x), view.splat(x)
+    np.testing.assert_array_equal(alpha, want_alpha)
+    deepest = 0.5 / 65535 * 300  # every Gaussian rounded the wrong way
+    assert np.abs(image - want).max(initial=0) < min(deepest, 2e-4)
+    y = np.random.default_rng(3).uniform(-1, 1, image.shape).astype(np.float32)
+    assert np.abs(frozen.gather(y) - view.gather(y)).max() < 0.5 / 65535 * size[0] * size[1]
+    assert_adjoint(lambda v: frozen.splat(v)[0], frozen.gather, x, y)
+    np.testing.assert_array_equal(frozen.depth(), view.depth())
+    assert frozen.dropped == view.dropped
+    assert 0 < frozen.nbytes < 40 * len(view.tiles.ranks) * 16 + 16 * size[0] * size[1] + 64
+
+
+def test_a_frozen_view_of_nothing():
+    empty = CPU.view(random_gaussians(0), PLAIN).frozen()
+    assert not empty.splat(np.zeros((0, 3), np.float32))[0].any()
+    assert empty.gather(np.zeros((30, 40, 2), np.float32)).shape == (0, 2)
+
+
+def test_radii_are_positive_exactly_where_something_is_drawn():
+    gaussians, camera = random_gaussians(300, 18, radius=2.0), random_camera(18)
+    view = CPU.view(gaussians, camera)
+    extents = REFERENCE.view(gaussians, camera).footprints.extents_px.max(1)
+    drawn = view.gather(np.ones((camera.height, camera.width, 1)))[:, 0] > 0
+    assert 0 < drawn.sum() < 300
+    assert (view.radii[drawn] > 0).all()
+    assert ((view.radii > 0) & ~drawn).mean() < 0.05  # hidden ones only
+    np.testing.assert_allclose(view.radii[view.radii > 0], extents[view.radii > 0], rtol=1e-5)
+
+
+def test_two_threads_may_render_at_once():
+    gaussians, camera = random_gaussians(300, 25), random_camera(25, 120, 90)
+    x = random_values(300, 3)
+    want = CPU.view(gaussians, camera).splat(x)[0]
+
+    def render(_: int) -> bool:
+        return all(np.array_equal(CPU.view(gaussians, camera).splat(x)[0], want) for _ in range(5))
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(render, range(4)))
+
+
+def test_arrays_of_any_make():
+    """Doubles, strided and read-only arrays (as memory-mapped files give) mean the same."""
+    gaussians, camera = random_gaussians(50, 26), random_camera(26)
+    x = random_values(50, 3)
+    view = CPU.view(gaussians, camera)
+    want, y = view.splat(x)[0], np.ones((45, 70, 2), np.float32)
+    assert np.array_equal(view.splat(np.asfortranarray(x.astype(np.float64)))[0], want)
+    flipped = np.asfortranarray(y.astype(np.float64))
+    assert np.array_equal(view.gather(flipped), view.gather(y))
+    for name in vars(gaussians):
+        getattr(gaussians, name).flags.writeable = False
+    x.flags.writeable = y.flags.writeable = False
+    view = CPU.view(gaussians, camera)
+    assert np.array_equal(view.splat(x)[0], want)
+    assert view.gather(y).any()
+    assert view.backward(x[:, :2], y).means.any()
+    assert colours(gaussians.sh, gaussians.means, camera.position).any()
+
+
+def test_tiles_hold_little_more_than_what_touches_them():
+    """Culling by the ellipse, not by its box: needles across the image are the case that counts."""
+    gaussians, camera = random_gaussians(60, 20, scale_range=(0.001, 0.6)), random_camera(20, 128, 96)
+    f = REFERENCE.view(gaussians, camera).footprints
+    ys, xs = np.mgrid[:96, :128] + 0.5
+    touched = 0
+    for mean, (xx, xy, yy), opacity in zip(f.means_px, f.conics, f.opacities, strict=True):
+        dx, dy = xs - mean[0], ys - mean[1]
+        alpha = opacity * np.exp(-0.5 * (xx * dx * dx + 2 * xy * dx * dy + yy * dy * dy))
+        touched += (alpha.reshape(6, 16, 8, 16).max((1, 3)) >= 1 / 255).sum()
+    kept = len(CPU.view(gaussians, camera).tiles.ranks)
+    assert touched <= kept <= 1.15 * touched
+
+
+def test_depth_order_is_a_stable_sort():
+    rng = np.random.default_rng(21)
+    for depths in (
+        rng.integers(1, 5, 500).astype(float),
+        rng.lognormal(0, 9, 500),
+        np.full(3, 2.0),
+        np.ones(0),
+    ):
+        status = rng.integers(0, 3, len(depths)).astype(np.uint8)
+        drawn = np.flatnonzero(status == 2)
+        want = drawn[np.argsort(depths[drawn], kind="stable")]
+        assert np.array_equal(depth_order(status, depths.view(np.uint64)), want)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_colours_and_their_gradient(degree):
+    gaussians, eye = random_gaussians(200, 22, degree), np.array([0.3, -2.0, 0.5])
+    gaussians = replace(gaussians, sh=2 * gaussians.sh)
+    sh, means = gaussians.sh.astype(np.float64), gaussians.means.astype(np.float64)
+    want = reference.colours(sh, means, eye)
+    np.testing.assert_allclose(colours(gaussians.sh, gaussians.means, eye), want, atol=1e-6)
+    assert (want == 0).any()  # some are clamped
+    grad = np.random.default_rng(0).normal(size=want.shape).astype(np.float32)
+    sh_grad, means_grad = colours_backward(gaussians.sh, gaussians.means, eye, grad)
+
+    def loss(sh, means):
+        return (reference.colours(sh, means, eye) * grad).sum(1)
+
+    step = 1e-6
+    for axis in np.eye(3) * step:
+        want = (loss(sh, means + axis) - loss(sh, means - axis)) / (2 * step)
+        np.testing.assert_allclose(means_grad @ axis / step, want, atol=1e-6)
+    for k in range(sh.shape[1]):
+        for channel in range(3):
+            nudge = np.zeros_like(sh)
+            nudge[:, k, channel] = step
+            want = (loss(sh + nudge, means) - loss(sh - nudge, means)) / (2 * step)
+            np.testing.assert_allclose(sh_grad[:, k, channel], want, atol=1e-6)
+
+
+def test_colours_of_invalid_and_coincident_rows():
+    gaussians = random_gaussians(3, 23, 1)
+    sh, means = gaussians.sh.copy(), gaussians.means.copy()
+    sh[0, 1, 1], means[1] = np.nan, 0
+    got = colours(sh, means, np.zeros(3))
+    np.testing.assert_allclose(got, reference.colours(sh, means, np.zeros(3)), atol=1e-6)
+    sh_grad, means_grad = colours_backward(sh, means, np.zeros(3), np.ones((3, 3)))
+    assert np.isfinite(sh_grad).all()
+    assert np.isfinite(means_grad).all()
+    assert not sh_grad[0, :, 1].any()
+
+
+def test_backends_are_loaded_by_name_and_lazily():
+    assert set(BACKENDS) == {"reference", "cpu", "opengl", "cuda"}
+    assert load_rasterizer("cpu", threads=1).name == "cpu"
+    with pytest.raises(InputError, match="choose one of reference, cpu, opengl, cuda"):
+        load_rasterizer("vulkan")
+    code = (
+        "import sys, langsplat_core.raster; "
+        "print([m for m in ('numba', 'torch', 'moderngl') if m in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
+
+
+def test_no_channels_still_have_an_alpha():
+    view = CPU.view(random_gaussians(30, 24), random_camera(24))
+    image, alpha = view.splat(np.zeros((30, 0), np.float32))
+    assert image.shape == (45, 70, 0)
+    assert np.array_equal(alpha, view.splat(np.ones((30, 1), np.float32))[1])
+    assert view.gather(image).shape == (30, 0)
+
+
+def test_wrong_shapes_are_named():
+    view = CPU.view(random_gaussians(5), PLAIN)
+    with pytest.raises(ValueError, match="values: expected shape"):
+        view.splat(np.zeros((4, 3), np.float32))
+    with pytest.raises(ValueError, match="image: expected shape"):
+        view.gather(np.zeros((40, 30, 3), np.float32))
+    with pytest.raises(ValueError, match="image_grad: expected shape"):
+        view.backward(np.zeros((5, 3), np.float32), np.zeros((30, 40, 2), np.float32))
+    with pytest.raises(ValueError, match="alpha_grad: expected shape"):
+        view.backward(np.zeros((5, 3), np.float32), np.zeros((30, 40, 3)), np.zeros((40, 30)))
+
+
+# Lifting label maps is ``W^T onehot(labels)``, and says so wherever labels lie.
+
+SIZES = [(70, 45), (64, 48), (1, 1), (17, 33)]  # multiples of a tile's side, and not
+
+
+def onehot(maps: Array, count: int) -> Array:
+    """(H, W, count): 1 where a pixel has the label in any map."""
+    return np.stack([(maps == label).any(0) for label in range(count)], -1).astype(np.float64)
+
+
+def dense(gaussians: Gaussians, camera: object, maps: Array, count: int) -> Array:
+    """(N, count) by the float64 reference."""
+    return ReferenceRasterizer().view(gaussians, camera).gather(onehot(maps, count))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("rasterizer", [CPU, ReferenceRasterizer()], ids=["in one walk", "label by label"])
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("count", [1, 5, 90])
+def test_weights_are_those_of_the_reference(
+    size: tuple[int, int], count: int, rasterizer: LiftingRasterizer
+) -> None:
+    gaussians, camera = random_gaussians(60, 3), random_camera(1, *size)
+    rng = np.random.default_rng(count)
+    maps = rng.integers(-1, count, (3, size[1], size[0])).astype(np.int32)
+    got = rasterizer.view(gaussians, camera).gather_labels(maps, count)
+    want = dense(gaussians, camera, maps, count)
+    assert got.shape == want.shape
+    assert got.has_sorted_indices
+    np.testing.assert_allclose(got.toarray(), want, atol=1e-5 * max(want.max(), 1))
+    assert (got.data > 0).all()
+
+
+def test_every_pixel_with_a_label_of_its_own():
+    """The most that a tile can meet: 256 regions a level."""
+    gaussians, camera = random_gaussians(30, 4), random_camera(2, 32, 16)
+    maps = np.arange(2 * 16 * 32, dtype=np.int32).reshape(2, 16, 32)
+    got = CPU.view(gaussians, camera).gather_labels(maps, 1024)
+    np.testing.assert_allclose(got.toarray(), dense(gaussians, camera, maps, 1024), atol=1e-6)
+
+
+def test_no_labels_no_gaussians_and_none_in_sight():
+    gaussians, camera = random_gaussians(20, 5), random_camera(3, 40, 30)
+    nothing = np.full((3, 30, 40), -1, np.int32)
+    assert CPU.view(gaussians, camera).gather_labels(nothing, 4).nnz == 0
+    assert CPU.view(gaussians, camera).gather_labels(nothing, 0).shape == (20, 0)
+    some = np.zeros((1, 30, 40), np.int32)
+    assert CPU.view(gaussians.take(slice(0)), camera).gather_labels(some, 1).shape == (0, 1)
+    behind = Gaussians(
+        gaussians.means + 1e4 * camera.position, *(vars(gaussians)[n] for n in list(vars(gaussians))[1:])
+    )
+    assert CPU.view(behind, camera).gather_labels(some, 1).nnz == 0
+
+
+def test_light_pairs_are_left_out_and_rows_stay_in_place():
+    gaussians, camera = random_gaussians(80, 6), random_camera(4)
+    broken = gaussians.take(np.arange(80))
+    broken.means[7] = np.nan
+    maps = np.random.default_rng(0).integers(-1, 6, (3, 45, 70)).astype(np.int32)
+    whole = CPU.view(broken, camera).gather_labels(maps, 6)
+    assert whole[7].nnz == 0
+    some = CPU.view(broken, camera).gather_labels(maps, 6, 0.5)
+    kept = sparse.csr_matrix(np.where(whole.toarray() > 0.5, whole.toarray(), 0))
+    assert 0 < some.nnz < whole.nnz
+    assert (abs(some - kept) > 0).nnz == 0
+
+
+def test_results_do_not_depend_on_threads():
+    gaussians, camera = random_gaussians(300, 7), random_camera(5, 120, 90)
+    maps = np.random.default_rng(1).integers(-1, 40, (3, 90, 120)).astype(np.int32)
+    one, many = (CpuRasterizer(n).view(gaussians, camera).gather_labels(maps, 40) for n in (1, 4))
+    for name in ("data", "indices", "indptr"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
+
+
+@pytest.mark.parametrize("label", [-2, 3])
+def test_labels_out_of_range_are_refused(label: int) -> None:
+    maps = np.zeros((1, 45, 70), np.int32)
+    maps[0, 3, 3] = label
+    for rasterizer in (CPU, ReferenceRasterizer()):
+        view = rasterizer.view(random_gaussians(3), random_camera())
+        with pytest.raises(ValueError, match="expected -1 to 2"):
+            view.gather_labels(maps, 3)
+        with pytest.raises(ValueError, match="maps: expected shape"):
+            view.gather_labels(maps[:, :5], 3)
+
+
+# Gradients of the CPU rasterizer against autograd of a dense float64 twin, and against differences.
+
+PARAMETERS = ("means", "log_scales", "quats_wxyz", "opacity_logits")
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """torch's threads only wait for each other on tensors this small."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def compare_with_autograd(gaussians, camera, settings=INRIA, channels=3):
+    """1e-3 relative for every entry of every gradient; pixels at a cut-off carry no loss."""
+    x = random_values(len(gaussians), channels, 1)
+    rng = np.random.default_rng(2)
+    image_grad = rng.normal(size=(camera.height, camera.width, channels))
+    alpha_grad = rng.normal(size=(camera.height, camera.width))
+    band = ReferenceRasterizer().view(gaussians, camera, settings).cut_off_band(BAND)
+    assert band.mean() < 0.02
+    image_grad[band], alpha_grad[band] = 0, 0
+    got = CpuRasterizer().view(gaussians, camera, settings).backward(x, image_grad, alpha_grad)
+
+    leaves = torch_reference.parameters(gaussians)
+    values = torch.tensor(x, dtype=torch.float64, requires_grad=True)
+    image, alpha, means_px = torch_reference.render(leaves, values, camera, settings)
+    loss = (image * torch.tensor(image_grad)).sum() + (alpha * torch.tensor(alpha_grad)).sum()
+    loss.backward()
+    for name in PARAMETERS:
+        assert_gradient(name, getattr(got, name), leaves[name].grad.numpy())
+    assert_gradient("values", got.values, values.grad.numpy())
+    assert_gradient("means_px", got.means_px, means_px.grad.numpy())
+    return got
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_autograd(seed):
+    """Every other scene antialiased, every third in the gsplat profile, every fifth mostly opaque."""
+    gaussians = random_gaussians(40, seed, scale_range=(0.003, 0.1) if seed % 2 else (0.02, 0.25))
+    if seed % 5 == 0:
+        gaussians = replace(gaussians, opacity_logits=gaussians.opacity_logits + np.float32(3))
+    settings = replace(GSPLAT if seed % 3 == 0 else INRIA, antialiased=bool(seed % 2))
+    got = compare_with_autograd(gaussians, random_camera(seed, 32, 22), settings)
+    assert (got.opacity_logits != 0).sum() > 15
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_autograd_without_perspective(antialiased):
+    """A Gaussian's depth changes nothing but the order; beside the picture no Jacobian is clamped."""
+    gaussians, camera = random_gaussians(50, 3, radius=2.0), random_camera(3, 40, 27, distance=1.5)
+    camera = without_perspective(camera, 1.5)
+    got = compare_with_autograd(gaussians, camera, replace(INRIA, antialiased=antialiased))
+    np.testing.assert_allclose(got.means @ camera.rotation[2], 0, atol=1e-5 * np.abs(got.means).max())
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("orthographic", [False, True])
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_autograd_itself_against_differences(antialiased, orthographic):
+    """The twin's gradients by torch's own check in float64; cut-offs are moved to where nothing is left."""
+    settings = replace(INRIA, alpha_min=1e-12, transmittance_min=1e-14, antialiased=antialiased)
+    gaussians, camera = random_gaussians(4, 10), random_camera(10, 6, 5)
+    camera = without_perspective(camera) if orthographic else camera
+    gaussians = replace(gaussians, opacity_logits=logit(np.linspace(0.2, 0.8, 4)))
+    leaves = torch_reference.parameters(gaussians)
+    values = torch.tensor(random_values(4, 2), dtype=torch.float64, requires_grad=True)
+
+    def drawn(*inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        named = dict(zip(leaves, inputs[:-1], strict=True))
+        return torch_reference.render(named, inputs[-1], camera, settings)[:2]
+
+    assert torch.autograd.gradcheck(drawn, (*leaves.values(), values), eps=1e-6, atol=1e-7, rtol=1e-5)
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_the_twin_draws_what_the_reference_draws(antialiased, orthographic):
+    """So that its gradients are those of the image formation that is documented."""
+    settings = replace(INRIA, antialiased=antialiased)
+    gaussians, camera, x = random_gaussians(40, 11), random_camera(11, 40, 27), random_values(40, 3)
+    camera = without_perspective(camera) if orthographic else camera
+    want, want_alpha = ReferenceRasterizer().view(gaussians, camera, settings).splat(x)
+    image, alpha, _ = torch_reference.render(
+        torch_reference.parameters(gaussians), torch.tensor(x, dtype=torch.float64), camera, settings
+    )
+    np.testing.assert_allclose(image.detach(), want, atol=1e-12)
+    np.testing.assert_allclose(alpha.detach(), want_alpha, atol=1e-12)
+
+
+def test_autograd_with_clamped_jacobians():
+    """Large Gaussians beside the field of view: the clamped coordinate has no gradient there."""
+    gaussians, camera = random_gaussians(50, 3, radius=2.0), random_camera(3, 40, 27, distance=1.5)
+    in_camera = gaussians.means @ camera.rotation.T + camera.world_to_camera[:3, 3]
+    aside = (np.abs(in_camera[:, 0] / in_camera[:, 2]) > 1.0) & (in_camera[:, 2] > 0.2)
+    got = compare_with_autograd(gaussians, camera)
+    assert (aside & (got.means != 0).any(1)).sum() >= 3
+
+
+def test_autograd_of_opaque_needles_and_discs():
+    gaussians = random_gaussians(50, 5)
+    log_scales, logits = gaussians.log_scales.copy(), gaussians.opacity_logits.copy()
+    log_scales[:20] = np.log([0.6, 1e-5, 1e-5])
+    log_scales[20:30, 0] = -np.inf
+    logits[::3] = 9.0  # alpha is capped in the middle: no gradient there
+    got = compare_with_autograd(
+        replace(gaussians, log_scales=log_scales, opacity_logits=logits), random_camera(5, 40, 27)
+    )
+    assert not got.log_scales[20:30, 0].any()
+
+
+@pytest.mark.parametrize("channels", [1, 5])
+def test_autograd_with_other_channels(channels):
+    compare_with_autograd(random_gaussians(30, 6), random_camera(6, 33, 20), channels=channels)

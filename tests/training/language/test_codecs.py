@@ -1,0 +1,294 @@
+"""Codecs of every kind: what they answer, fitting, storage; k-means, which finds codewords."""
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+
+from langsplat_core.arrays import Array, unit
+from langsplat_core.config import CODEC_CONFIGS, AutoencoderConfig, CodebookConfig, LinearConfig
+from langsplat_core.scene import AutoencoderCodec, Codec, LinearCodec, codec_from_tensors
+from langsplat_core.scene.codec import KINDS
+from langsplat_core.training.language import codec_fit
+from langsplat_core.training.language.codec_fit import (
+    FITTERS,
+    codebook_error,
+    codec_report,
+    exact_codec,
+    fit_codebook,
+    fit_codec,
+    folded_layers,
+    networks,
+    relevancy_error,
+    rounded,
+)
+from langsplat_core.training.language.mask_weights import nearest_centres, spherical_kmeans
+from tests.support.vocabulary import random_vocabulary
+
+pytestmark = pytest.mark.long
+
+D = 48
+WORDS = random_vocabulary(D)
+QUICK = {
+    "codebook": CodebookConfig(size=9),
+    "autoencoder": AutoencoderConfig(latent_dim=4, steps=20),
+    "linear": LinearConfig(latent_dim=4),
+}
+
+
+@pytest.fixture(autouse=True)
+def quick_colours(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """Tests that are not about colours do not wait for them."""
+    if "colours" not in request.node.name:
+        monkeypatch.setattr(codec_fit, "COLOUR_STEPS", 20)
+
+
+def clusters(count: int, each: int, noise: float = 0.02, seed: int = 0) -> tuple[Array, Array]:
+    """Shuffled (M, D) unit vectors around `count` centres, and the centre of each."""
+    rng = np.random.default_rng(seed)
+    labels = rng.permutation(np.repeat(np.arange(count), each))
+    vectors = unit(rng.normal(size=(count, D)))[labels]
+    return unit(vectors + noise * rng.normal(size=vectors.shape)).astype(np.float32), labels
+
+
+@pytest.fixture(params=sorted(KINDS))
+def codec(request: pytest.FixtureRequest) -> Codec:
+    return fit_codec(clusters(12, 10)[0], QUICK[request.param], WORDS)
+
+
+# What every codec answers.
+
+
+def test_a_codec_is_a_kind_its_settings_and_its_fit() -> None:
+    assert set(KINDS) == set(CODEC_CONFIGS) == set(FITTERS)
+    assert all(CODEC_CONFIGS[kind]().kind == KINDS[kind].kind == kind for kind in KINDS)
+
+
+def test_storage_and_latents(codec: Codec) -> None:
+    vectors, _ = clusters(12, 10)
+    latents = codec.encode(vectors)
+    assert (latents.dtype, latents.shape) == (codec.dtype, (120, codec.latent_dim))
+    again = codec_from_tensors(codec.kind, codec.tensors())
+    assert type(again) is type(codec)
+    np.testing.assert_array_equal(again.encode(vectors), latents)
+    np.testing.assert_array_equal(again.decode(latents), codec.decode(latents))
+    field = np.stack([latents] * 3)
+    np.testing.assert_array_equal(codec.from_file(codec.to_file(field)), field)
+    assert codec.known(latents).all()
+    codec.check(latents)
+
+
+def test_cosines_are_those_of_what_is_decoded(codec: Codec) -> None:
+    latents = codec.encode(clusters(12, 10)[0])
+    if codec.blends:
+        latents = 0.3 * latents / np.linalg.norm(latents, axis=1, keepdims=True)  # blended latents are short
+        latents[5] = 0
+        assert codec.known(latents).tolist() == [row != 5 for row in range(120)]
+    texts = unit(np.random.default_rng(2).normal(size=(7, D))).astype(np.float32)
+    want = codec.decode(latents if not codec.blends else latents / 0.3).astype(np.float64) @ texts.T
+    if codec.blends:
+        want[5] = 0
+    for rows in (slice(None), slice(3, 6)):  # many and few
+        got = codec.cosines(latents[rows], texts)
+        assert got.dtype == np.float32
+        np.testing.assert_allclose(got, want[rows], atol=2e-6)
+
+
+def test_distinct_latents_distances_and_colours(codec: Codec) -> None:
+    latents = codec.encode(clusters(12, 10)[0])
+    distinct, of = codec.unique(latents)
+    np.testing.assert_array_equal(distinct[of], latents)
+    if not codec.blends:
+        assert len(distinct) == len(np.unique(latents)) == 9
+    rng = np.random.default_rng(3)
+    directions = codec.directions(latents).astype(np.float64)
+    every = 1 - directions @ directions.T
+    for count in (50, 20_000):  # fewer and more pairs than distinct ones
+        first, second = rng.integers(120, size=(2, count))
+        np.testing.assert_allclose(codec.distances(latents, first, second), every[first, second], atol=1e-6)
+    assert codec.spread(latents) == pytest.approx(every.mean(), abs=1e-6)
+    colours = codec.colours(latents, np.ones(120))
+    assert (colours.dtype, colours.shape) == (np.float32, (120, 3))
+    assert colours.min() >= 0
+    assert colours.max() <= 1
+    assert codec.blendable(latents).dtype == np.float32
+
+
+def test_broken_tensors_are_named() -> None:
+    for kind, missing in (
+        ("linear", "basis"),
+        ("autoencoder", "encoder"),
+        ("codebook", "colours and vectors"),
+    ):
+        with pytest.raises(ValueError, match=missing):
+            codec_from_tensors(kind, {})
+    with pytest.raises(ValueError, match="unknown codec kind"):
+        codec_from_tensors("vq", {})
+    w, b = np.zeros((3, 8), np.float32), np.zeros(3, np.float32)
+    with pytest.raises(ValueError, match="mirror"):
+        AutoencoderCodec(((w, b),), ((np.zeros((9, 3), np.float32), np.zeros(9, np.float32)),))
+    with pytest.raises(ValueError, match="codec encoder"):
+        AutoencoderCodec(((w, np.zeros(4, np.float32)),), ((w.T.copy(), np.zeros(8, np.float32)),))
+
+
+# Fitting.
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_autoencoder_keeps_a_scenes_vectors_apart(d: int) -> None:
+    vectors, labels = clusters(12, 34)
+    made = fit_codec(vectors, AutoencoderConfig(latent_dim=d, steps=700, batch=128, lr=2e-3), WORDS)
+    latents = made.encode(vectors)
+    np.testing.assert_allclose(np.linalg.norm(latents, axis=1), 1, atol=1e-5)
+    assert codec_report(made, vectors, WORDS).cosine > 0.9
+    # what a query needs: the decoded vector is closest to its own cluster
+    centres = unit(np.stack([vectors[labels == c].mean(0) for c in range(12)]))
+    assert ((made.decode(latents) @ centres.T).argmax(1) == labels).mean() > 0.97
+
+
+def test_linear_codec_is_the_best_subspace() -> None:
+    vectors, _ = clusters(12, 34)
+    made = fit_codec(vectors, LinearConfig(latent_dim=6), WORDS)
+    assert isinstance(made, LinearCodec)
+    np.testing.assert_allclose(made.basis @ made.basis.T, np.eye(6), atol=1e-5)
+    singular = np.linalg.svd(vectors.astype(np.float64), compute_uv=False)
+    assert ((vectors @ made.basis.T) ** 2).sum() == pytest.approx((singular[:6] ** 2).sum(), rel=1e-5)
+
+
+def test_folding_batch_normalisation_changes_nothing() -> None:
+    torch.manual_seed(0)
+    encoder, _ = networks(32, 3)
+    data = torch.randn(200, 32)
+    for _ in range(5):
+        encoder(data)
+    encoder.eval()
+    with torch.no_grad():
+        want = encoder(data).numpy()
+    x = data.numpy()
+    layers = folded_layers(encoder)
+    for index, (weight, bias) in enumerate(layers):
+        x = x @ weight.T + bias
+        if index + 1 < len(layers):
+            x = np.maximum(x, 0)
+    np.testing.assert_allclose(x, want, atol=2e-5)
+
+
+def test_further_vectors_help_kinds_that_interpolate_only() -> None:
+    vectors, further = clusters(5, 20)[0], clusters(30, 20, seed=1)[0]
+    linear = LinearConfig(latent_dim=30)
+    alone, helped = (fit_codec(vectors, linear, WORDS, further=more) for more in (None, further))
+    assert codec_report(helped, further, WORDS).cosine > codec_report(alone, further, WORDS).cosine
+    same, book = (fit_codec(vectors, CodebookConfig(size=5), WORDS, further=more) for more in (None, further))
+    np.testing.assert_array_equal(same.decode(np.zeros((1, 1), int)), book.decode(np.zeros((1, 1), int)))
+    assert fit_codec(vectors[:0], CodebookConfig(size=5), WORDS, further=further).size == 5
+
+
+def test_given_vectors_are_kept_by_a_codebook_alone() -> None:
+    vectors = rounded(clusters(20, 1)[0])
+    made = exact_codec(vectors, np.ones(20), CodebookConfig())
+    assert made is not None
+    np.testing.assert_array_equal(made.decode(np.arange(20)[:, None]), vectors)
+    assert exact_codec(vectors, np.ones(20), LinearConfig()) is None
+
+
+def test_the_size_of_a_codebook_is_the_smallest_that_keeps_the_budget() -> None:
+    vectors, _ = clusters(100, 20, noise=0.01)
+    sizes = []
+    for budget in (0.15, 0.06, 0.02):
+        made = fit_codebook(vectors, CodebookConfig(max_relevancy_error=budget), WORDS)
+        sizes.append(made.size)
+        # judged on all vectors, chosen by a fifth of them
+        assert codec_report(made, vectors, WORDS).error_mean < 1.05 * budget
+    assert sizes == sorted(sizes)
+    assert sizes[0] < sizes[-1]
+    half = fit_codebook(vectors, CodebookConfig(size=sizes[1] // 2), WORDS)
+    assert codec_report(half, vectors, WORDS).error_mean > 0.06
+
+
+@pytest.mark.parametrize(("count", "each"), [(9, 100), (1, 1), (2, 1), (7, 1)])
+def test_a_scene_with_few_meanings_gets_few_codewords(count: int, each: int) -> None:
+    vectors, _ = clusters(count, each, noise=0.0)
+    made = fit_codebook(vectors, CodebookConfig(), WORDS)
+    assert 1 <= made.size <= count
+    if each > 1:
+        assert made.size == count
+        assert codec_report(made, vectors, WORDS).error_mean < 1e-3
+
+
+def test_a_budget_that_cannot_be_kept_is_said(caplog: pytest.LogCaptureFixture) -> None:
+    vectors = unit(np.random.default_rng(0).normal(size=(900, D))).astype(np.float32)
+    with caplog.at_level(logging.WARNING, "langsplat"):
+        made = fit_codebook(vectors, CodebookConfig(max_relevancy_error=1e-4), WORDS)
+    assert made.size <= 900 // 4
+    assert "still have a mean relevancy error" in caplog.text
+
+
+def test_codewords_and_colours_are_float16_and_near_ones_have_near_colours() -> None:
+    vectors, _ = clusters(12, 300, noise=0.03)
+    made = fit_codebook(vectors, CodebookConfig(size=60), WORDS)
+    for numbers in (made.vectors, made.palette):
+        np.testing.assert_array_equal(rounded(numbers), numbers)
+    assert np.ptp(made.palette, axis=0).min() > 0.5
+    cosines = made.vectors @ made.vectors.T
+    distance = np.linalg.norm(made.palette[:, None] - made.palette, axis=2)
+    same = ~np.eye(60, dtype=bool) & (cosines > 0.9)
+    assert same.any()
+    assert distance[same].mean() < 0.5 * distance[cosines < 0.5].mean()
+
+
+def test_errors_are_differences_of_relevancy() -> None:
+    vectors, _ = clusters(5, 4)
+    exact = relevancy_error(vectors, vectors, WORDS)
+    assert exact == (0, 0)
+    swapped = vectors[::-1]
+    difference = np.abs(WORDS.relevancy(swapped) - WORDS.relevancy(vectors))
+    mean, p99 = relevancy_error(swapped, vectors, WORDS)
+    assert mean == pytest.approx(difference.mean(), rel=1e-5)
+    assert p99 == pytest.approx(np.quantile(difference, 0.99), rel=1e-4)
+    assert codebook_error(vectors, vectors, WORDS) < 1e-6
+
+
+# Spherical k-means.
+
+
+def apart(vectors: Array, centres: Array) -> float:
+    return float(1 - nearest_centres(vectors, centres)[1].mean())
+
+
+def test_nearest_is_the_largest_cosine() -> None:
+    vectors, _ = clusters(5, 40)
+    centres = unit(np.random.default_rng(1).normal(size=(7, D))).astype(np.float32)
+    nearest, cosines = nearest_centres(vectors, centres)
+    products = vectors.astype(np.float64) @ centres.T
+    np.testing.assert_array_equal(nearest, products.argmax(1))
+    np.testing.assert_allclose(cosines, products.max(1), atol=1e-6)
+
+
+def test_separate_clusters_are_found_the_same_for_the_same_seed() -> None:
+    vectors, labels = clusters(40, 25)
+    centres, again = (spherical_kmeans(vectors, 40, generator=np.random.default_rng(3)) for _ in range(2))
+    np.testing.assert_array_equal(centres, again)
+    np.testing.assert_allclose(np.linalg.norm(centres, axis=1), 1, atol=1e-5)
+    nearest, _ = nearest_centres(vectors, centres)
+    assert len({(a, b) for a, b in zip(nearest, labels, strict=True)}) <= 44  # all but a few in their own
+    assert apart(vectors, centres) < 0.02
+
+
+def test_more_centres_fit_better_and_a_start_is_kept() -> None:
+    vectors, _ = clusters(60, 20, noise=0.1)
+    spreads, start = [], None
+    for count in (5, 10, 20, 40):
+        start = spherical_kmeans(vectors, count, rounds=4, start=start)
+        assert len(start) == count
+        spreads.append(apart(vectors, start))
+    assert spreads == sorted(spreads, reverse=True)
+    assert spreads[-1] < 0.6 * spreads[0]
+
+
+@pytest.mark.parametrize("different", [1, 3])
+def test_fewer_different_vectors_than_centres(different: int) -> None:
+    vectors = np.repeat(np.eye(8, dtype=np.float32)[:different], 50, 0)
+    centres = spherical_kmeans(vectors, 10)
+    assert sorted(centres.argmax(1)) == list(range(different))
+    assert apart(vectors, centres) < 1e-6
