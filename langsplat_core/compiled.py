@@ -1,4 +1,4 @@
-"""How kernels are compiled, where their machine code is kept, and how they run on all cores.
+"""Kernels: compiled by numba, kept on disk, run on all cores.
 
 A kernel works on items [first, last) of something and releases Python's lock; `Workers` cuts the range into
 pieces and hands them to threads. Compared with numba's own parallel loops this compiles twice as fast,
@@ -44,7 +44,7 @@ _IMPORT = re.compile(rf"^\s*from {_PACKAGE.name}([\w.]*) import (\([^)]*\)|.*)$"
 
 
 def helper(function: Callable[..., Any], **options: Any) -> Any:
-    """For functions that kernels call: compiled into them. options: as of `kernel`."""
+    """Compile `function` into the kernels that call it. options: as of `kernel`."""
     return numba.njit(forceinline=True, error_model="numpy", **options)(function)
 
 
@@ -92,7 +92,7 @@ def _say_once(text: str) -> None:
 
 
 def kernel_folder(source: Path) -> Path | None:
-    """Where the machine code of the kernels in `source` is kept: below `$NUMBA_CACHE_DIR` where that is set,
+    """Folder of the machine code of the kernels in `source`: below `$NUMBA_CACHE_DIR` where that is set,
     else beside the package, else in the user's cache folder: the first of these that can be written to. Where
     none can, in a folder of this process alone, which is said once; None where there is not even that."""
     root = _cache_root(numba.config.CACHE_DIR)
@@ -105,7 +105,8 @@ def kernel_folder(source: Path) -> Path | None:
 
 
 def is_compiled(source: Path) -> bool:
-    """Whether an earlier process has left machine code of the kernels in `source` as they are now."""
+    """Return True where an earlier process has left machine code of the kernels in `source` as they are
+    now."""
     folder = kernel_folder(source)
     return folder is not None and any(folder.rglob("*.nbc"))
 
@@ -140,7 +141,7 @@ def _user_cache() -> list[Path]:
 
 
 def _is_writable(folder: Path) -> bool:
-    """Whether files can be made in `folder`, which is made if it is missing."""
+    """Return True where files can be made in `folder`, which is made if it is missing."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -151,7 +152,7 @@ def _is_writable(folder: Path) -> bool:
 
 @cache
 def digest_of_sources(source: Path) -> str:
-    """Of a file and all files of this package that it imports, as they are now."""
+    """Digest of a file and all files of this package that it imports."""
     digest = hashlib.sha256()
     for path in sorted(_with_imports(source)):
         digest.update(path.name.encode() + b"\0" + path.read_bytes())

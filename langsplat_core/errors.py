@@ -23,7 +23,7 @@ def printable_line(text: object, limit: int = LINE_LIMIT) -> str:
 
 
 def quoted(content: object, limit: int = 60) -> str:
-    """What a file holds, quoted as a part of a message: at most `limit` characters with its escapes."""
+    """Content of a file, quoted as a part of a message: at most `limit` characters with its escapes."""
     return printable_line(repr(content), limit)
 
 

@@ -1,13 +1,16 @@
-"""What the steps of a picture take, for those who want to know; nothing is measured for others."""
+"""Progress of long work, and the milliseconds that the steps of a frame take.
+
+Core functions take a `Progress`; the command line and the window supply one each.
+"""
 
 import json
 import logging
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass, field
 from time import perf_counter
-from types import TracebackType
 
 _laps: ContextVar[dict[str, float] | None] = ContextVar("laps", default=None)
 
@@ -25,7 +28,7 @@ def watched() -> Iterator[dict[str, float]]:
 
 @contextmanager
 def lap(name: str, finish: Callable[[], object] = lambda: None) -> Iterator[None]:
-    """One step. `finish` waits for what a device still has to do of it; called only where one watches."""
+    """Measure one step. `finish` waits for the device's share of it; called only inside `watched`."""
     laps = _laps.get()
     if laps is None:
         yield
@@ -36,19 +39,86 @@ def lap(name: str, finish: Callable[[], object] = lambda: None) -> Iterator[None
     laps[name] = laps.get(name, 0.0) + 1e3 * (perf_counter() - began)
 
 
-# How long work reports where it is. Core functions take a `Progress`; the command line and the window
-# supply one each. A `Progress` may raise to interrupt the work (Ctrl-C, the window's cancel button).
-
 log = logging.getLogger("langsplat")
-Progress = Callable[[str, float], None]  # (what is being done, fraction done in [0, 1])
+
+ALL_STAGES = "all stages"  # the stage under which the whole of several is reported
 
 
-def silent(label: str, fraction: float) -> None:
-    """Reports nothing."""
+@dataclass(frozen=True)
+class Report:
+    """The state of a piece of work."""
+
+    stage: str  # constant while it runs
+    fraction: float  # done, in [0, 1]
+    note: str = ""  # the item under way
+    metrics: Mapping[str, float] = field(default_factory=dict)  # such as loss, psnr (dB), seconds_left
+
+    @classmethod
+    def from_json(cls, line: str) -> "Report":
+        """Read a line of `LineProgress`; ValueError for any other."""
+        try:
+            stated = json.loads(line)
+            metrics = {str(name): float(value) for name, value in stated.get("metrics", {}).items()}
+            return cls(str(stated["stage"]), float(stated["fraction"]), str(stated.get("note", "")), metrics)
+        except (TypeError, KeyError, AttributeError):
+            raise ValueError("no line of progress") from None
+
+    @property
+    def details(self) -> str:
+        """The note and the metrics in words: "9 Gaussians, loss 0.0312, about 3 min left"."""
+        return ", ".join(filter(None, [self.note, *(_metric(*item) for item in self.metrics.items())]))
+
+    @property
+    def text(self) -> str:
+        """The stage and its details: "training: 9 Gaussians, loss 0.0312"."""
+        return ": ".join(filter(None, [self.stage, self.details]))
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The callable that work reports to: ``progress("training", 0.5, "room 3", loss=0.01)``."""
+
+    show: Callable[[Report], None]
+    """It may raise to interrupt the work (Ctrl-C, the window's cancel button)."""
+
+    def __call__(self, stage: str, fraction: float, note: str = "", **metrics: float) -> None:
+        self.show(Report(stage, fraction, note, metrics))
+
+    def part(self, index: int, count: int, stage: str = "", note: str = "") -> "Progress":
+        """The progress of item `index` of `count`; `stage` and `note` replace the item's own."""
+
+        def show(report: Report) -> None:
+            fraction = (index + report.fraction) / count
+            self.show(Report(stage or report.stage, fraction, note or report.note, report.metrics))
+
+        return Progress(show)
+
+
+silent = Progress(lambda report: None)
+
+
+def duration(seconds: float) -> str:
+    """Return "40 s", "12 min" or "3 h": as exact as a forecast is."""
+    seconds = coarse(seconds)
+    if seconds <= 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds <= 90 * 60 else f"{seconds / 3600:.0f} h"
+
+
+def coarse(seconds: float) -> float:
+    """Round seconds to tens, minutes or hours; never below ten seconds."""
+    unit = 10 if seconds <= 90 else 60 if seconds <= 90 * 60 else 3600
+    return max(unit * round(seconds / unit), 10)
+
+
+def _metric(name: str, value: float) -> str:
+    if name == "seconds_left":
+        return f"about {duration(value)} left"
+    return f"PSNR {value:.1f} dB" if name == "psnr" else f"{name} {value:.4f}"
 
 
 def is_quiet() -> bool:
-    """Whether only errors are wanted."""
+    """Return True where only errors are wanted."""
     return log.getEffectiveLevel() >= logging.ERROR
 
 
@@ -61,38 +131,40 @@ class Terminated(KeyboardInterrupt):
 
 
 class LineProgress:
-    """A `Progress` for other programs: a line of JSON on stderr for every report that says anything new,
-    ``{"label": "matching photographs", "fraction": 0.25}``; use as a context manager."""
+    """Progress for other programs, a context manager: a line of JSON on stderr for every report that says
+    anything new, ``{"stage": "training", "fraction": 0.2, "note": "step 9", "metrics": {"loss": 0.03}}``.
+    """
 
     def __init__(self) -> None:
-        self._last: tuple[str, float] = ("", -1.0)
+        self._last = ""
 
-    def __enter__(self) -> "LineProgress":
-        return self
+    def __enter__(self) -> Progress:
+        return Progress(self._show)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *ending: object) -> None:
         pass
 
-    def __call__(self, label: str, fraction: float) -> None:
-        report = (label, round(min(max(fraction, 0.0), 1.0), 3))
-        if report != self._last and not is_quiet():
-            self._last = report
-            line = json.dumps({"label": report[0], "fraction": report[1]})
+    def _show(self, report: Report) -> None:
+        metrics = {name: float(f"{value:.4g}") for name, value in report.metrics.items()}
+        fraction = round(min(max(report.fraction, 0.0), 1.0), 3)
+        line = json.dumps(
+            {"stage": report.stage, "fraction": fraction, "note": report.note, "metrics": metrics}
+        )
+        if line != self._last and not is_quiet():
+            self._last = line
             print(line, file=sys.stderr, flush=True)
 
 
 class TerminalProgress:
-    """A `Progress` that draws one bar per label on stderr; use as a context manager."""
+    """Progress as one bar per stage on stderr, a context manager."""
 
     def __init__(self) -> None:
         from rich.console import Console  # a tenth of a second that nothing else needs
-        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
         from rich.progress import Progress as RichBar
 
         self._bar = RichBar(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             TextColumn("{task.percentage:>3.0f}%"),
             TimeElapsedColumn(),
@@ -100,20 +172,17 @@ class TerminalProgress:
             console=Console(file=sys.stderr),
             disable=is_quiet(),
         )
-        self._tasks: dict[str, int] = {}
+        self._tasks: dict[str, TaskID] = {}
 
-    def __enter__(self) -> "TerminalProgress":
-        return self
+    def __enter__(self) -> Progress:
+        return Progress(self._show)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *ending: object) -> None:
         if self._tasks:  # stopping a bar that never began prints an empty line before the error's own
             self._bar.stop()
 
-    def __call__(self, label: str, fraction: float) -> None:
+    def _show(self, report: Report) -> None:
         self._bar.start()
-        stage = label.partition(":")[0]  # text behind a colon may change while a stage runs
-        if stage not in self._tasks:
-            self._tasks[stage] = self._bar.add_task(label, total=1.0)
-        self._bar.update(self._tasks[stage], completed=fraction, description=label)  # type: ignore[arg-type]
+        if report.stage not in self._tasks:
+            self._tasks[report.stage] = self._bar.add_task(report.stage, total=1.0)
+        self._bar.update(self._tasks[report.stage], completed=report.fraction, description=report.text)

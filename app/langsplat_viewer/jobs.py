@@ -11,7 +11,7 @@ from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from langsplat_core.errors import LangSplatError
-from langsplat_core.progress import Cancelled, Progress
+from langsplat_core.progress import Cancelled, Progress, Report
 
 _ARENA_MAX = -8  # M_ARENA_MAX of malloc.h
 
@@ -51,15 +51,15 @@ class Job:
     work: Callable[[Progress], Any]
     wake: Callable[[], None]
     future: Future[Any] = field(default_factory=Future)
-    step: tuple[str, float] = ("", 0.0)  # what it last reported, fraction in [0, 1]
+    reached: Report = field(default=Report("", 0.0))
     stopped: threading.Event = field(default_factory=threading.Event)
     reported: float = 0.0  # when, seconds
 
-    def report(self, label: str, fraction: float) -> None:
-        """The `Progress` given to the work; raises Cancelled once the job is cancelled."""
+    def report(self, report: Report) -> None:
+        """Take a report of the work; raises Cancelled once the job is cancelled."""
         if self.stopped.is_set():
             raise Cancelled
-        self.step = (label, fraction)
+        self.reached = report
         now = time.monotonic()
         if now - self.reported >= REPORT_EVERY:
             self.reported = now
@@ -70,7 +70,7 @@ class Job:
         if not self.future.set_running_or_notify_cancel():
             return
         try:
-            self.future.set_result(self.work(self.report))
+            self.future.set_result(self.work(Progress(self.report)))
         except BaseException as error:  # noqa: BLE001  whatever it is, the window's thread says it
             self.future.set_exception(error)
         self.wake()
@@ -128,8 +128,7 @@ class Worker:
         """Label and fraction of the present job, for the status line; None when idle or only winding up."""
         for job in self._jobs:
             if not job.stopped.is_set():
-                label, fraction = job.step
-                return label or job.label, fraction
+                return job.reached.text or job.label, job.reached.fraction
         return None
 
     @property

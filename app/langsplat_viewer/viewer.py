@@ -1,8 +1,6 @@
 """`langsplat train` as a process of its own: started, listened to, interrupted."""
 
-import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -15,7 +13,7 @@ from typing import IO, Any, Protocol, TypeVar
 from langsplat_core.arrays import Array
 from langsplat_core.config import Display, TrainPreset
 from langsplat_core.errors import printable_line
-from langsplat_core.progress import Progress
+from langsplat_core.progress import ALL_STAGES, Progress, Report
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.scene import Camera, Scene
@@ -29,8 +27,6 @@ from langsplat_viewer.rendering.depth import Clip
 from langsplat_viewer.rendering.request import RenderRequest
 from langsplat_viewer.state import Query, Ruler, ViewerState
 
-ALL = "all stages"  # the label under which the whole is reported
-LOSS = re.compile(r"\bloss (\d+\.\d+)")  # behind a stage's colon
 PREVIEW_EVERY = 100  # steps between the checkpoints that can be looked at
 KEPT = 20  # lines of what it says that are kept
 
@@ -49,33 +45,28 @@ class TrainingRequest:
 class TrainingProgress:
     """Progress of a training run. Written by the listening thread, read by the window's."""
 
-    stages: dict[str, float] = field(default_factory=dict)  # label -> fraction in [0, 1], in their order
+    stages: dict[str, float] = field(default_factory=dict)  # name -> fraction in [0, 1], in their order
     overall: float = 0.0
     left: str = ""  # "about 3 min left"
     losses: list[float] = field(default_factory=list)  # of the Gaussians, as far as they are trained
     said: list[str] = field(default_factory=list)  # lines that are no progress, the latest last
 
-    _heard: str = ""  # the last one, as it was said
-
     def hear(self, line: str) -> None:
         """Take one line of what the process writes."""
         try:
-            report = json.loads(line)
-            label, fraction = str(report["label"]), float(report["fraction"])
-        except (ValueError, TypeError, KeyError):
+            report = Report.from_json(line)
+        except ValueError:
             text = printable_line(line, 300)
             if text:
                 self.said = [*self.said[1 - KEPT :], text]
             return
-        stage, _, detail = label.partition(":")
-        if stage == ALL:
-            self.overall, self.left = fraction, detail.strip()
-        else:
-            self.stages[stage] = fraction
-            loss = LOSS.search(detail)
-            if loss is not None and loss[0] != self._heard:
-                self._heard = loss[0]
-                self.losses = [*self.losses, float(loss[1])]
+        if report.stage == ALL_STAGES:
+            self.overall, self.left = report.fraction, report.details
+            return
+        self.stages[report.stage] = report.fraction
+        loss = report.metrics.get("loss")
+        if loss is not None and [loss] != self.losses[-1:]:
+            self.losses = [*self.losses, loss]
 
 
 def command(request: TrainingRequest) -> list[str]:

@@ -417,7 +417,7 @@ def train_encoder(out: Path, config: EncoderConfig, progress: Progress) -> list[
     run.resume(work / "state.pt")
     while run.step < config.steps:
         run.advance(sampler.batch(config, np.random.default_rng((config.seed, 17, run.step))))
-        progress(f"training: step {run.step}, loss {run.loss:.3f}", run.step / config.steps)
+        progress("training", run.step / config.steps, f"step {run.step}", loss=run.loss)
         if run.step % SAVE_EVERY == 0 or run.step == config.steps:
             run.save(work / "state.pt")
             export(run.mean, out)

@@ -14,7 +14,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress
-from langsplat_core.semantics.masks import LevelMasks
+from langsplat_core.semantics.masks import LevelMasks, MaskSource
 
 PHRASE_KINDS = ("object", "colour+object", "part", "subpart")  # of phrases, in the order of tables
 MIN_REGION = 16  # px: of a smaller region not even an oracle's crop shows anything
@@ -102,7 +102,7 @@ def _asked(region: Region) -> Iterator[tuple[str, str]]:
         yield f"{region.thing} {region.word}", region.level
 
 
-class TruthMasks:
+class TruthMasks(MaskSource):
     """A `MaskSource` that gives the regions of the truth, at its three levels.
 
     A photograph is recognised by its content, since a mask source is given nothing else.

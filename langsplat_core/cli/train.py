@@ -23,7 +23,7 @@ from langsplat_core.config import (
     with_preset,
 )
 from langsplat_core.errors import InputError
-from langsplat_core.progress import LineProgress, TerminalProgress, silent
+from langsplat_core.progress import LineProgress, Progress, TerminalProgress, silent
 
 log = logging.getLogger("langsplat")
 
@@ -45,7 +45,8 @@ class Train:
     """How much is spent: quick takes minutes on a CPU, good perhaps half an hour, full is as published and
     for a GPU; options beside it still count."""
     progress: Literal["bars", "lines"] = "bars"
-    """How progress is shown: as bars, or for other programs as lines of JSON, both on standard error."""
+    """How progress is shown: as bars, or for other programs as lines of JSON (stage, fraction, note,
+    metrics), both on standard error."""
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml")] = None
     """A file of options, `preset = "good"` or `radiance.steps = 7000`; options beside it count more."""
     gaussians: Path | None = None
@@ -55,28 +56,28 @@ class Train:
     def run(self) -> None:
         # They import torch: seconds that --help need not pay.
         from langsplat_core.pipeline.forecast import Forecast, count_photographs, forecast_in_words, plan
-        from langsplat_core.pipeline.stages import join_crew
+        from langsplat_core.pipeline.stages import join_processes
         from langsplat_core.pipeline.train import train_scene
         from langsplat_core.semantics.weights import torch_device
 
-        crew = join_crew()
+        processes = join_processes()
         shown = LineProgress() if self.progress == "lines" else TerminalProgress()
         photographs, given = count_photographs(self.dataset)
         on_gpu = torch_device(self.config.clip.device) != "cpu"
         stages = plan(self.config, photographs, given, self.gaussians is not None, on_gpu)
-        if crew.leads and photographs:
+        if processes.is_main and photographs:
             log.info("%d photographs: %s", photographs, forecast_in_words(stages, on_gpu))
-        with shown if crew.leads else nullcontext(silent) as progress:
+        with shown if processes.is_main else nullcontext(silent) as progress:
             report = train_scene(
                 self.dataset,
                 self.out,
                 self.config,
                 self.work,
-                Forecast(stages, progress),
-                crew=crew,
+                Progress(Forecast(stages, progress).show),
+                processes=processes,
                 gaussians_from=self.gaussians,
             )
-        if not crew.leads:
+        if not processes.is_main:
             return
         psnr = "no held-out views" if report.psnr is None else f"held-out PSNR {report.psnr:.2f} dB"
         print(
@@ -86,8 +87,8 @@ class Train:
             f"(99 % below {report.relevancy_error_p99:.3f}); "
             f"{sum(report.seconds.values()):.0f} s"
         )
-        for doubt in report.doubts:
-            print(f"warning: {doubt}")
+        for warning in report.warnings:
+            print(f"warning: {warning}")
 
 
 def train_command(args: Sequence[str]) -> type[Train]:

@@ -1,5 +1,5 @@
-"""Developed photographs in bounded memory: beyond a limit they lie in files without a name, which the system
-reads in where they are looked at and forgets when it needs the room."""
+"""Captures: photographs, read and developed in bounded memory, with known cameras and the length of a
+unit."""
 
 import hashlib
 import logging
@@ -27,7 +27,8 @@ IN_MEMORY = 512_000_000  # bytes of photographs
 
 
 class Album:
-    """Keeps pictures. The files lie in the temporary folder (`TMPDIR`) and end with the process."""
+    """Pictures in bounded memory: beyond a limit they lie in files without a name in the temporary folder
+    (`TMPDIR`), which the system reads in where they are looked at and which end with the process."""
 
     def __init__(self, in_memory: int = IN_MEMORY) -> None:
         self._left = in_memory
@@ -151,8 +152,8 @@ def _fits(size: tuple[int, int], intrinsics: PhotoIntrinsics) -> bool:
 
 
 def developer(max_side: int) -> Callable[[Photo], tuple[Camera, Array]]:
-    """What makes a pinhole camera, yet without a name, and a (H, W, 3) uint8 picture of at most `max_side`
-    pixels of a photograph. It raises PictureError for a file that cannot be read."""
+    """Return the function that makes a pinhole camera, yet without a name, and a (H, W, 3) uint8 picture of
+    at most `max_side` pixels of a photograph. It raises PictureError for a file that cannot be read."""
 
     # Photographs of one lens share its pinhole and its map; a few maps are kept, not one per photograph.
     @lru_cache(maxsize=4)
@@ -260,10 +261,11 @@ class Capture:
         return [i for i in range(len(self)) if i not in test], test
 
     def digest(self, indices: Sequence[int]) -> str:
-        """Of all that a training on the photographs at `indices` sees: these in their order, their cameras,
-        and the points. Structure from motion run again may place the same photographs in another world, so
-        names alone do not identify a capture. Poses and points count to `DECIMALS`, so that a work folder is
-        taken up on another processor too, whose products of matrices differ in their last digits."""
+        """Digest of all that a training on the photographs at `indices` sees: these in their order, their
+        cameras, and the points. Structure from motion run again may place the same photographs in another
+        world, so names alone do not identify a capture. Poses and points count to `DECIMALS`, so that a work
+        folder is taken up on another processor too, whose products of matrices differ in their last
+        digits."""
         digest = hashlib.blake2b(digest_size=16)
         for camera, image in ((self.cameras[i], self.images[i]) for i in indices):
             digest.update(repr((camera.name, camera.intrinsics)).encode())
@@ -364,6 +366,6 @@ def _place(exif: Exif) -> tuple[float, float]:
 
 
 def _degrees(parts: tuple[float, float, float]) -> float:
-    """Of degrees, minutes and seconds."""
+    """Degrees of degrees, minutes and seconds."""
     degrees, minutes, seconds = map(float, parts)
     return degrees + minutes / 60 + seconds / 3600

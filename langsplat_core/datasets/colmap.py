@@ -91,7 +91,7 @@ class ModelImage:
 
 @dataclass(frozen=True, eq=False)
 class SparseModel:
-    """What a COLMAP model says."""
+    """Content of a COLMAP model."""
 
     cameras: dict[int, ModelCamera]
     images: list[ModelImage]
@@ -102,34 +102,29 @@ class SparseModel:
 
 
 def has_model(folder: Path) -> bool:
-    """Whether cameras and images lie in `folder`, both binary or both text."""
-    return _suffix(folder) is not None
+    """Return True where cameras and images lie in `folder`, both binary or both text."""
+    return any(_complete(folder, suffix) for suffix in (".bin", ".txt"))
 
 
-def _suffix_of(folder: Path) -> str:
-    """InputError where there is no model."""
-    suffix = _suffix(folder)
-    if suffix is None:
+def _complete(folder: Path, suffix: str) -> bool:
+    return all((folder / f"{part}{suffix}").is_file() for part in ("cameras", "images"))
+
+
+def _suffix(folder: Path) -> str:
+    if not has_model(folder):
         raise InputError(f"{folder} holds no cameras.bin and images.bin (or .txt)")
-    return suffix
-
-
-def _suffix(folder: Path) -> str | None:
-    for suffix in (".bin", ".txt"):
-        if all((folder / f"{part}{suffix}").is_file() for part in ("cameras", "images")):
-            return suffix
-    return None
+    return ".bin" if _complete(folder, ".bin") else ".txt"
 
 
 def read_images(folder: Path) -> list[ModelImage]:
-    """Those of the model in `folder`, alone. FormatError where they are damaged."""
-    suffix = _suffix_of(folder)
+    """Read the images of the model in `folder` alone. FormatError where they are damaged."""
+    suffix = _suffix(folder)
     return _guarded((_BINARY if suffix == ".bin" else _TEXT)[1], folder / f"images{suffix}")
 
 
 def read_model(folder: Path) -> SparseModel:
     """Read the model in `folder`; binary is preferred. FormatError names the file that is broken."""
-    suffix = _suffix_of(folder)
+    suffix = _suffix(folder)
     read_cameras, _, read_points = _BINARY if suffix == ".bin" else _TEXT
     cameras = _guarded(read_cameras, folder / f"cameras{suffix}")
     images = read_images(folder)
@@ -311,7 +306,7 @@ def find_model(folder: Path) -> Path | None:
 
 
 def _photographs_of(model_folder: Path) -> int:
-    """How many a model has cameras for; none if it is damaged."""
+    """Count the photographs that a model has cameras for; 0 if it is damaged."""
     try:
         return len({image.name for image in read_images(model_folder)})
     except FormatError:

@@ -28,7 +28,7 @@ __all__ = ["pycolmap"]
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """What is loaded meanwhile keeps to one thread."""
+    """Have what is loaded meanwhile keep to one thread."""
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(dict.fromkeys(names, "1"))

@@ -140,7 +140,7 @@ def _write_pictures(
 
 
 def _params(camera: Camera) -> str:
-    """As COLMAP's PINHOLE takes them."""
+    """Intrinsics as COLMAP's PINHOLE takes them."""
     return ",".join(repr(float(value)) for value in (camera.fx, camera.fy, camera.cx, camera.cy))
 
 

@@ -1,4 +1,4 @@
-"""What a photograph's EXIF data say of its lens, as COLMAP takes it from a smaller copy."""
+"""Cameras of plain photographs by structure from motion (pycolmap)."""
 
 import errno
 import hashlib
@@ -34,7 +34,8 @@ _PLAUSIBLE = (1, 5_000)  # mm on film, of any lens that is sold
 
 
 def optics(path: Path) -> Image.Exif:
-    """Only what tells the focal length: other tags, orientation first of all, would be wrong for a copy.
+    """EXIF data that tell the focal length alone: other tags, orientation first of all, would be wrong for a
+    copy.
 
     Where a camera gives pixels per inch of its sensor instead of the length on film, that is worked out:
     COLMAP compares those with the size of the picture, which is another for a copy.
@@ -69,7 +70,7 @@ def _on_film(inner: dict[int, Any], size: tuple[int, int]) -> dict[int, int]:
 
 
 def tags(exif: Image.Exif) -> dict[int, object]:
-    """All of them, the inner ones too."""
+    """Return all tags, the inner ones too."""
     return dict(exif) | dict(exif.get_ifd(_EXIF_IFD))
 
 
@@ -159,7 +160,7 @@ def _register(database: Path, images: Path, group: Group) -> None:
 
 
 def _reader(group: Group, camera_id: int) -> "pycolmap.ImageReaderOptions":
-    """How photographs of a group are taken in; with -1 COLMAP makes a new camera for them."""
+    """Options to take in photographs of a group; with -1 COLMAP makes a new camera for them."""
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = group.model
     reader.camera_params = group.params
@@ -339,7 +340,7 @@ def best_model(best: Model | None, models: Iterable[Model]) -> Model | None:
 
 
 def _worth(model: Model) -> tuple[int, float]:
-    """How many photographs are located, and the mean reprojection error, px."""
+    """Number of located photographs, and the mean reprojection error, px."""
     return len(located_names(model)), float(model.compute_mean_reprojection_error())
 
 
@@ -417,13 +418,13 @@ def write_left_out(folder: Path, located: Collection[str]) -> None:
         names = {image.image_id: image.name for image in database.read_all_images()}
         features = {number: database.num_keypoints_for_image(number) for number in names}
         pairs, inliers = database.read_two_view_geometry_num_inliers()
-    friends: dict[int, int] = dict.fromkeys(names, 0)
+    matched: dict[int, int] = dict.fromkeys(names, 0)
     for pair, count in zip(pairs, inliers, strict=True):
         if count >= FEWEST_MATCHES:
             for number in pycolmap.pair_id_to_image_pair(pair):
-                friends[number] += 1
+                matched[number] += 1
     why = {
-        name: _reason(features[number], friends[number])
+        name: _reason(features[number], matched[number])
         for number, name in names.items()
         if name not in located
     }
@@ -431,13 +432,13 @@ def write_left_out(folder: Path, located: Collection[str]) -> None:
         temporary.write_text(json.dumps(why, sort_keys=True))
 
 
-def _reason(features: int, friends: int) -> str:
-    """In words, from the number of features and of photographs that share enough of them."""
+def _reason(features: int, matched: int) -> str:
+    """Reason in words, from the number of features and of photographs that share enough of them."""
     if features == 0:
         return "no features (nothing but plain areas, or blurred)"
     if features < FEWEST_FEATURES:
         return "too few features (plain, dark, blurred or tiny)"
-    if friends == 0:
+    if matched == 0:
         return "no matches with any other"
     return "matched, but from one and the same place, or without enough overlap"
 
@@ -463,7 +464,7 @@ class _Copy:
 
 
 def photo_folder(folder: Path) -> Path | None:
-    """Where the photographs of a dataset without cameras lie: in `folder` itself or one level down."""
+    """Folder of the photographs of a dataset without cameras: `folder` itself or one level down."""
     candidates = (folder, folder / "images", folder / "photos")
     return next((candidate for candidate in candidates if find_photos(candidate)), None)
 
@@ -518,7 +519,7 @@ def _content(path: Path) -> str:
 
 
 def _twins(numbered: dict[str, Path], contents: dict[str, str]) -> dict[str, str]:
-    """For photographs that are the same as an earlier one, which: names in the workspace -> file names."""
+    """Photographs that are the same as an earlier one: names in the workspace -> file names."""
     first: dict[str, str] = {}
     return {
         name: earlier

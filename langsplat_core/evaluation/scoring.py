@@ -112,7 +112,7 @@ def score_scene(
             scores.append(replace(score, trained_on=source.trained_on(frame.name), grid=size))
             if pictures is not None and not isinstance(answer, str):
                 write_picture(pictures / labelled.name, frame, label, answer, truth)
-        progress(f"{labelled.name}: asking phrases", (done + 1) / len(labelled.frames))
+        progress("asking phrases", (done + 1) / len(labelled.frames), labelled.name)
     return SceneScores(tuple(scores), tuple(left_out))
 
 

@@ -1,4 +1,4 @@
-"""How long a training will take: said beforehand from measured costs, then from how fast this run is.
+"""Forecast of a training's duration: from measured costs beforehand, then from how fast this run is.
 
 The costs are seconds of two CPU cores, measured on photographs and rooms (docs/photographs.md,
 docs/encoders.md); what a GPU makes of them is a guess. They are rough; what a run has behind it corrects them
@@ -13,16 +13,15 @@ from typing import Literal
 
 from langsplat_core.config import MaskConfig, TrainConfig
 from langsplat_core.io.hostile import PHOTO_SUFFIXES
-from langsplat_core.progress import Progress
+from langsplat_core.progress import ALL_STAGES, Progress, Report, coarse, duration
 
 ASPECT = 0.75  # height by width of an ordinary photograph
 SLOWEST, FASTEST = 20.0, 0.02  # limits of the pace: more is a sleeping machine, less a stage that was kept
 SURE = 0.05  # share of a stage from which its own speed is trusted
-ALL = "all stages"
 GPU = 1 / 30  # of the seconds of two CPU cores; not measured
 POINT = 0.17  # seconds of a point that a segmenter is asked at
 REGIONS = 300  # of an ordinary photograph
-# Millions of weights by what a hub id contains, the first that fits; TIPS sees five times as many patches.
+# Millions of weights by what a hub id contains, the first that fits.
 MILLIONS = {
     "vit-huge": 641,
     "vit-large": 312,
@@ -35,7 +34,6 @@ MILLIONS = {
     "vit-l": 428,
     "so400m": 878,
     "large": 400,
-    "tips": 590,
 }
 USUAL = 150  # millions of weights of any other: CLIP's of ViT-B
 Given = Literal["nothing", "cameras", "points"]  # what photographs come with: cameras, or cameras and points
@@ -46,7 +44,7 @@ class Stage:
     """One of the steps from photographs to a scene."""
 
     name: str
-    begins: tuple[str, ...]  # how the labels begin that it reports under
+    reported: tuple[str, ...]  # names that it reports under; none where it takes every other
     seconds: float  # that it is expected to take
 
 
@@ -74,9 +72,9 @@ def plan(
             ),
             photographs * {"nothing": 5.0, "cameras": 2.5, "points": 0.05}[given],
         ),
-        Stage("masks and vectors", ("masks (",), photographs * per_photograph),
-        Stage("Gaussians", ("Training Gaussians",), 0.0 if has_gaussians else config.radiance.steps * step),
-        Stage("language field", ("",), lifting + codec),  # whatever follows
+        Stage("masks and vectors", ("masks and vectors",), photographs * per_photograph),
+        Stage("Gaussians", ("training Gaussians",), 0.0 if has_gaussians else config.radiance.steps * step),
+        Stage("language field", (), lifting + codec),
     )
 
 
@@ -106,7 +104,7 @@ def _millions(model: str) -> float:
 
 
 def count_photographs(dataset: Path) -> tuple[int, Given]:
-    """How many photographs lie in a dataset, and what comes with them. Does not raise."""
+    """Count the photographs in a dataset, and name what comes with them. Does not raise."""
     try:
         folder = dataset if dataset.is_dir() else dataset.parent
         images = folder / "images" if (folder / "images").is_dir() else folder
@@ -123,23 +121,16 @@ def _given(folder: Path) -> Given:
     return "points" if (folder / "sparse").is_dir() else "nothing"
 
 
-def in_words(seconds: float) -> str:
-    """ "40 s", "12 min", "3 h": as exact as a forecast is."""
-    if seconds < 90:
-        return f"{max(10 * round(seconds / 10), 10):.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 90 * 60 else f"{seconds / 3600:.0f} h"
-
-
 def forecast_in_words(stages: Sequence[Stage], on_gpu: bool = False) -> str:
-    """What a plan costs: "about 6 min on two CPU cores (photographs 80 s, ...)"."""
+    """Return the cost of a plan: "about 6 min on two CPU cores (photographs 80 s, ...)"."""
     where = "two CPU cores and a GPU" if on_gpu else "two CPU cores"
-    parts = ", ".join(f"{stage.name} {in_words(stage.seconds)}" for stage in stages if stage.seconds > 1)
-    return f"about {in_words(sum(stage.seconds for stage in stages))} on {where} ({parts})"
+    parts = ", ".join(f"{stage.name} {duration(stage.seconds)}" for stage in stages if stage.seconds > 1)
+    return f"about {duration(sum(stage.seconds for stage in stages))} on {where} ({parts})"
 
 
 @dataclass(eq=False)
 class Forecast:
-    """A `Progress` that passes everything on and adds how far the whole is, and what is left of it."""
+    """Passes reports on and adds one of the whole: how far it is, and the seconds that are left of it."""
 
     stages: tuple[Stage, ...]
     inner: Progress
@@ -147,31 +138,28 @@ class Forecast:
     _current: int = 0
     _began: list[float] = field(default_factory=list)  # when each stage began, seconds
 
-    def __call__(self, label: str, fraction: float) -> None:
-        self.inner(label, fraction)
-        now, stage = self.clock(), self._stage_of(label)
+    def show(self, report: Report) -> None:
+        """Pass on a report of a stage; ``Progress(forecast.show)`` is what the work reports to."""
+        self.inner.show(report)
+        now, stage = self.clock(), self._stage_of(report.stage)
+        if stage < self._current:
+            return
+        self._current = stage
         while len(self._began) <= stage:
             self._began.append(now)
-        self._current = max(self._current, stage)
-        if stage == self._current:
-            done, left = self._measure(now, fraction)
-            self.inner(f"{ALL}: about {in_words(left)} left", done)
+        done, left = self._measure(now, report.fraction)
+        self.inner(ALL_STAGES, done, seconds_left=coarse(left))
 
-    def _stage_of(self, label: str) -> int:
-        """The stage that reports so; one does not go back."""
-        for number in range(self._current, len(self.stages)):
-            if label.startswith(self.stages[number].begins):
-                is_last = number == len(self.stages) - 1
-                known = any(label.startswith(stage.begins) for stage in self.stages[: self._current])
-                return self._current if is_last and known else number
-        return self._current
+    def _stage_of(self, name: str) -> int:
+        known = (number for number, stage in enumerate(self.stages) if name in stage.reported)
+        return next(known, len(self.stages) - 1)
 
     def _measure(self, now: float, fraction: float) -> tuple[float, float]:
         """Share of the whole that is done, and seconds that are left."""
         pace = self._pace()
         stage = self.stages[self._current]
         expected, spent = stage.seconds * pace, now - self._began[self._current]
-        if fraction > SURE and stage.begins != ("",) and len(stage.begins) == 1:  # it is that of the stage
+        if fraction > SURE and len(stage.reported) == 1:  # it is that of the stage
             expected = spent + (spent / fraction - spent + expected * (1 - fraction)) / 2
         current = max(expected - spent, 0.0)
         left = current + pace * sum(stage.seconds for stage in self.stages[self._current + 1 :])
@@ -179,7 +167,7 @@ class Forecast:
         return (before / (before + left) if before + left > 0 else 1.0), left
 
     def _pace(self) -> float:
-        """How many times longer than expected the stages behind took."""
+        """Ratio of the time that the stages behind took to the time expected."""
         expected = sum(stage.seconds for stage in self.stages[: self._current])
         if expected <= 0:
             return 1.0

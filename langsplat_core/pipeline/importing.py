@@ -43,7 +43,7 @@ BLOCK = 16_384  # Gaussians read at a time: 32 MB at 512 float32 numbers
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What became of a foreign scene."""
+    """Report on the import of a foreign scene."""
 
     method: str
     codec: str  # its kind; empty without a language field

@@ -6,11 +6,10 @@ memory depends on a block of Gaussians and not on all of them times all photogra
 """
 
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from langsplat_core.config import LiftConfig, TrainConfig
 from langsplat_core.errors import InputError
 from langsplat_core.pipeline.stages import (
     Arrays,
-    Crew,
+    ProcessGroup,
     features_digest,
     gaussians_digest,
     kept,
@@ -78,7 +77,7 @@ def language_field(
     config: TrainConfig,
     work: Path,
     progress: Progress,
-    crew: Crew | None = None,
+    processes: ProcessGroup | None = None,
 ) -> tuple[LanguageField, CodecReport]:
     """The language field of the views' mask vectors, and what its codec loses.
 
@@ -86,7 +85,7 @@ def language_field(
     """
     check_lift(config)
     check_masks(features for _, features in views)
-    stages = _Stages(gaussians, views, encoder, config, work, crew or Crew(), progress)
+    stages = _Stages(gaussians, views, encoder, config, work, processes or ProcessGroup(), progress)
     codec, report = stages.codec()
     latents, confidence = stages.latents(codec)
     field = LanguageField(
@@ -121,7 +120,7 @@ def check_masks(features: Iterable[ImageFeatures]) -> None:
 
 
 class _Stages:
-    """What is made on the way, each at most once, and not at all where it is kept."""
+    """Results on the way to a field, each made at most once, or read where it was kept."""
 
     def __init__(
         self,
@@ -130,11 +129,11 @@ class _Stages:
         encoder: Encoder,
         config: TrainConfig,
         work: Path,
-        crew: Crew,
+        processes: ProcessGroup,
         progress: Progress,
     ) -> None:
         self._gaussians, self._views, self._encoder = gaussians, views, encoder
-        self._config, self._work, self._crew, self._progress = config, work, crew, progress
+        self._config, self._work, self._processes, self._progress = config, work, processes, progress
         self._lift = _what_matters(config.lift)
         self._robust = self._lift.mode == "median"
         self._vectors, digests = [], []
@@ -151,29 +150,31 @@ class _Stages:
         path = self._work / f"{stage_key('codec', 2, *self._inputs, fitted_to, self._config.codec)}.npz"
         if self._lift.mode not in LATENT_LIFTS and not path.exists():
             self._mask_weights()  # everyone's work, unlike the fit
-        return self._crew.once(lambda: kept(path, self._fit, _pack_codec, _unpack_codec))
+        return self._processes.once(lambda: kept(path, self._fit, _pack_codec, _unpack_codec))
 
     def latents(self, codec: Codec) -> Latents:
-        """Of every Gaussian at every level, and the confidence in them."""
+        """Return the latents of every Gaussian at every level, and the confidence in them."""
         blocks = self._work / stage_key("latents", 2, *self._inputs, self._lift, self._config.codec)
         done = blocks.with_name(f"{blocks.name}.npz")
         if self._lift.mode not in LATENT_LIFTS and not done.exists():
             self._lift_blocks(codec, blocks)
-            self._crew.meet()
-        made = self._crew.once(lambda: kept(done, lambda: self._all_latents(codec, blocks), _pack, _unpack))
-        if self._crew.leads:
+            self._processes.barrier()
+        made = self._processes.once(
+            lambda: kept(done, lambda: self._all_latents(codec, blocks), _pack, _unpack)
+        )
+        if self._processes.is_main:
             shutil.rmtree(blocks, ignore_errors=True)
         return made
 
     def things(self) -> Array | None:
-        """Which thing each Gaussian belongs to; None where latents are averaged themselves, which needs no
-        mask_weights."""
+        """Return the instance of each Gaussian; None where latents are averaged themselves, which needs no
+        mask weights."""
         if self._lift.mode in LATENT_LIFTS:
             return None
         path = self._work / f"{stage_key('things', 1, *self._inputs)}.npy"
         if not path.exists():
             self._mask_weights()  # everyone's work
-        self._crew.once(lambda: kept_array(path, self._find_things))
+        self._processes.once(lambda: kept_array(path, self._find_things))
         return np.array(open_array(path))
 
     def _find_things(self) -> Array:
@@ -207,20 +208,21 @@ class _Stages:
         def lift(number: int) -> Latents:
             return _encoded(codec, lift_block(mask_weights, groups, number, self._robust))
 
-        for number in self._crew.share(range(len(mask_weights.blocks))):
-            kept(_numbered(folder, number), partial(lift, number), _pack, _unpack)
+        for number in self._processes.share(range(len(mask_weights.blocks))):
+            kept(folder / f"{number:05d}.npz", partial(lift, number), _pack, _unpack)
             self._progress("averaging mask vectors", (number + 1) / len(mask_weights.blocks))
 
     def _all_latents(self, codec: Codec, folder: Path) -> Latents:
         if self._lift.mode in LATENT_LIFTS:
-            lift = LATENT_LIFTS[self._lift.mode]
             scene = (self._rasterizer(), self._gaussians, self._views, codec)
-            return lift(*scene, config=self._config.lift, progress=self._progress)
+            if self._lift.mode == "one-pass":
+                return lift_latents(*scene, progress=self._progress)
+            return lift_by_gradient(*scene, config=self._config.lift, progress=self._progress)
         shape = (len(LEVELS), len(self._gaussians), codec.latent_dim)
         latents, confidence = np.zeros(shape, codec.dtype), np.zeros(shape[:2], np.float32)
         for number, (first, last) in enumerate(self._mask_weights()[0].blocks):
             latents[:, first:last], confidence[:, first:last] = _unpack(
-                read_arrays(_numbered(folder, number))
+                read_arrays(folder / f"{number:05d}.npz")
             )
         return latents, confidence
 
@@ -230,12 +232,12 @@ class _Stages:
             folder = self._work / stage_key("memberships", 2, *self._inputs)
             files = [folder / f"{index:05d}.npy" for index in range(len(self._views))]
             rasterizer = self._rasterizer()
-            for index in self._crew.share(range(len(self._views))):
+            for index in self._processes.share(range(len(self._views))):
                 kept_array(files[index], partial(self._pairs, rasterizer, index))
                 self._progress("lifting masks onto the Gaussians", (index + 1) / len(self._views))
-            self._crew.meet()
+            self._processes.barrier()
             pairs = [open_array(path) for path in files]
-            groups = self._crew.once(lambda: self._groups(folder / "groups.npz"))
+            groups = self._processes.once(lambda: self._groups(folder / "groups.npz"))
             self._made = MaskWeights(pairs, len(self._gaussians)), groups
         return self._made
 
@@ -261,21 +263,8 @@ def _what_matters(config: LiftConfig) -> LiftConfig:
     return replace(config, backend="auto")
 
 
-def _one_pass(
-    rasterizer: LiftingRasterizer,
-    gaussians: Gaussians,
-    views: Views,
-    codec: Codec,
-    config: LiftConfig,
-    progress: Progress,
-) -> Latents:
-    return lift_latents(rasterizer, gaussians, views, codec, progress=progress)
-
-
 # Modes that lift latents of a codec that is fitted to the masks' vectors alone.
-LATENT_LIFTS: Mapping[str, Callable[..., Latents]] = MappingProxyType(
-    {"one-pass": _one_pass, "gradient": lift_by_gradient}
-)
+LATENT_LIFTS = frozenset({"one-pass", "gradient"})
 
 
 def _encoded(codec: Codec, lifted: Lifted) -> Latents:
@@ -283,10 +272,6 @@ def _encoded(codec: Codec, lifted: Lifted) -> Latents:
     levels, count, dim = lifted.vectors.shape
     latents = codec.encode(lifted.vectors.reshape(-1, dim)).reshape(levels, count, -1)
     return np.where(lifted.confidence[..., None] > 0, latents, 0).astype(latents.dtype), lifted.confidence
-
-
-def _numbered(folder: Path, number: int) -> Path:
-    return folder / f"{number:05d}.npz"
 
 
 def _pack(latents: Latents) -> Arrays:

@@ -1,4 +1,4 @@
-"""What a training did, as `report.json` of its work folder says; read without torch."""
+"""Report of a training, `report.json` in its work folder; read without torch."""
 
 import json
 from collections.abc import Sequence
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 REPORT = "report.json"
 LIMIT = 1_000_000  # bytes; a report has about a thousand
-MOST_DOUBTS = 5  # that are taken from a file
+MOST_WARNINGS = 5  # that are taken from a file
 
 
 @dataclass(frozen=True)
 class TrainReport:
-    """What a run did."""
+    """Figures of a training."""
 
     views: int
     held_out: int
@@ -39,29 +39,29 @@ class TrainReport:
     relevancy_error: float  # mean absolute, of what the codec makes of it, over everyday phrases
     relevancy_error_p99: float
     observed: float  # fraction of Gaussians with a meaning at the whole level
-    doubts: tuple[str, ...]  # what speaks against the scene, with the remedy
+    warnings: tuple[str, ...]  # what speaks against the scene, with the remedy
     seconds: dict[str, float]  # per stage, of this run: a stage that was already done takes almost none
 
 
 def work_folder(out: Path) -> Path:
-    """Where the training of a scene keeps its stages, if no other folder was named."""
+    """Default folder in which the training of a scene keeps its stages."""
     return out.with_name(f"{out.stem}.work")
 
 
 def write_report(work: Path, report: TrainReport) -> None:
-    """Into the work folder, whole or not at all."""
+    """Write the report into the work folder, whole or not at all."""
     with atomic_path(work / REPORT) as temporary:
         temporary.write_text(json.dumps(asdict(report), indent=1))
 
 
 def read_report(work: Path) -> TrainReport:
-    """That of the run which has just ended, in this process or another."""
+    """Read the report of the run which has just ended, in this process or another."""
     stated = json.loads((work / REPORT).read_text())
-    return TrainReport(**stated | {"doubts": tuple(stated["doubts"])})
+    return TrainReport(**stated | {"warnings": tuple(stated["warnings"])})
 
 
-def stated_doubts(scene: Path, gaussians: int) -> tuple[str, ...]:
-    """What the report beside a scene says against it. Nothing where there is no report, where it cannot be
+def stated_warnings(scene: Path, gaussians: int) -> tuple[str, ...]:
+    """Quality warnings of the report beside a scene. None where there is no report, where it cannot be
     read, or where it is of a scene with another number of Gaussians than this file has."""
     try:
         stated = read_json_file(work_folder(scene) / REPORT, LIMIT)
@@ -69,8 +69,8 @@ def stated_doubts(scene: Path, gaussians: int) -> tuple[str, ...]:
         return ()
     if not isinstance(stated, dict) or stated.get("gaussians") != gaussians:
         return ()
-    said = stated.get("doubts")
-    lines = said[:MOST_DOUBTS] if isinstance(said, list) else []
+    said = stated.get("warnings", stated.get("doubts"))  # the name in reports of earlier versions
+    lines = said[:MOST_WARNINGS] if isinstance(said, list) else []
     return tuple(printable_line(line, 300) for line in lines if isinstance(line, str))
 
 
@@ -82,7 +82,7 @@ LEAST_COVERED = 0.5  # of a picture's pixels
 APART = 10.0  # times the median step to a neighbouring camera; captures that went well have at most 5
 
 
-def doubts(scores: Sequence["ViewScore"], cameras: Sequence[Camera]) -> tuple[str, ...]:
+def quality_warnings(scores: Sequence["ViewScore"], cameras: Sequence[Camera]) -> tuple[str, ...]:
     """One sentence each, with the remedy; none where nothing speaks against the scene.
 
     scores: of held-out views, or none; cameras: all that were trained on.

@@ -42,8 +42,8 @@ def stage_key(name: str, version: int, *inputs: Any) -> str:
 
 
 def kept(path: Path, make: Callable[[], T], pack: Callable[[T], Arrays], unpack: Callable[[Arrays], T]) -> T:
-    """What a stage makes: taken from `path` (*.npz) where it was made before, else made and stored there,
-    whole or not at all. `pack` and `unpack` turn it into named arrays and back."""
+    """Return the result of a stage: read from `path` (*.npz) where it was made before, else made and stored
+    there, whole or not at all. `pack` and `unpack` turn it into named arrays and back."""
     if path.exists():
         log.debug("%s: kept from an earlier run", path.name)
         return unpack(read_arrays(path))
@@ -54,7 +54,7 @@ def kept(path: Path, make: Callable[[], T], pack: Callable[[T], Arrays], unpack:
 
 
 def kept_array(path: Path, make: Callable[[], Array]) -> None:
-    """See to it that `path` (*.npy) holds what `make` gives, which is not called where the file is there."""
+    """Store what `make` gives in `path` (*.npy), unless the file is there."""
     if not path.exists():
         write_npy(path, make())
 
@@ -80,12 +80,12 @@ def read_arrays(path: Path) -> dict[str, Array]:
 
 
 def gaussians_digest(gaussians: Gaussians) -> str:
-    """Of every number of the Gaussians."""
+    """Digest of every number of the Gaussians."""
     return _digest(*(getattr(gaussians, field.name) for field in fields(gaussians)))
 
 
 def features_digest(features: list[ImageFeatures]) -> str:
-    """Of the masks and vectors of photographs, in their order."""
+    """Digest of the masks and vectors of photographs, in their order."""
     return _digest(*(array for item in features for array in (item.labels, item.vectors)))
 
 
@@ -164,22 +164,22 @@ PATIENCE = timedelta(days=7)  # radiance training is one process's work, and the
 
 
 @dataclass(frozen=True)
-class Crew:
+class ProcessGroup:
     """This process among all of them; alone by default."""
 
     rank: int = 0
     size: int = 1
 
     @property
-    def leads(self) -> bool:
-        """Whether this is the process that does what cannot be shared, and that speaks."""
+    def is_main(self) -> bool:
+        """True for the process that does what cannot be shared, and that speaks."""
         return self.rank == 0
 
     def share(self, items: Sequence[T]) -> list[T]:
         """The items that are this process's."""
         return list(items[self.rank :: self.size])
 
-    def meet(self) -> None:
+    def barrier(self) -> None:
         """Wait for all. Raises InputError where one of them is no more."""
         if self.size < 2:
             return
@@ -196,23 +196,23 @@ class Crew:
 
     def once(self, make: Callable[[], T]) -> T:
         """The result of `make`, which keeps it in a file: made by one process and read by the others."""
-        if self.leads:
+        if self.is_main:
             result = make()
-            self.meet()
+            self.barrier()
             return result
-        self.meet()
+        self.barrier()
         return make()
 
 
-def join_crew() -> Crew:
-    """The crew that torchrun started this process in; a crew of one without it."""
+def join_processes() -> ProcessGroup:
+    """Join the processes that torchrun started; a group of one without it."""
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size < 2:
-        return Crew()
+        return ProcessGroup()
     import torch.distributed
 
     if not torch.distributed.is_initialized():
         torch.distributed.init_process_group("gloo", timeout=PATIENCE)
     if torch.cuda.is_available():
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
-    return Crew(torch.distributed.get_rank(), torch.distributed.get_world_size())
+    return ProcessGroup(torch.distributed.get_rank(), torch.distributed.get_world_size())

@@ -1,4 +1,8 @@
-"""Views with masks that are read when they are needed: hundreds of label maps are more than memory wants."""
+"""From photographs to a searchable scene: the whole method, one line a stage.
+
+Every stage keeps its result in the work folder under a key of its settings, so that an interrupted run
+continues where it stopped and a changed setting recomputes only what depends on it.
+"""
 
 import logging
 import time
@@ -6,7 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import overload
+from typing import Any
 
 import numpy as np
 
@@ -18,45 +22,21 @@ from langsplat_core.io.files import check_output_folder, shown
 from langsplat_core.io.ply import read_ply, write_ply
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.pipeline.language import check_lift, check_masks, language_field
-from langsplat_core.pipeline.report import TrainReport, doubts, read_report, work_folder, write_report
-from langsplat_core.pipeline.stages import Crew, sole_use, stage_key
+from langsplat_core.pipeline.report import (
+    TrainReport,
+    quality_warnings,
+    read_report,
+    work_folder,
+    write_report,
+)
+from langsplat_core.pipeline.stages import ProcessGroup, sole_use, stage_key
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, load_encoder
 from langsplat_core.semantics.masks import MaskSource
-from langsplat_core.semantics.sources import load_mask_source
+from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures, describe_capture
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
-
-
-class StoredViews(Sequence[tuple[Camera, ImageFeatures]]):
-    """Cameras, and the features of what each saw."""
-
-    def __init__(self, cameras: Sequence[Camera], features: Sequence[ImageFeatures]) -> None:
-        """`features`: such as `StoredFeatures`; one per camera."""
-        if len(cameras) != len(features):
-            raise ValueError(f"{len(cameras)} cameras, {len(features)} features")
-        self._cameras, self._features = cameras, features
-
-    def __len__(self) -> int:
-        return len(self._cameras)
-
-    @overload
-    def __getitem__(self, index: int) -> tuple[Camera, ImageFeatures]: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> "StoredViews": ...
-
-    def __getitem__(self, index: int | slice) -> "tuple[Camera, ImageFeatures] | StoredViews":
-        if isinstance(index, slice):
-            return StoredViews(self._cameras[index], self._features[index])
-        return self._cameras[index], self._features[index]
-
-
-# From photographs to a searchable scene: the whole method, one line a stage.
-#
-# Every stage keeps its result in the work folder under a key of its settings, so that an interrupted run
-# continues where it stopped and a changed setting recomputes only what depends on it.
 
 FEWEST_VIEWS = 3
 
@@ -70,14 +50,15 @@ def train_scene(
     work: Path | None = None,
     progress: Progress = silent,
     masks_of: Callable[[Capture], MaskSource] | None = None,
-    crew: Crew | None = None,
+    processes: ProcessGroup | None = None,
     gaussians_from: Path | None = None,
 ) -> TrainReport:
     """Train `out` (a .ply; sidecar and cameras beside it) from the photographs in `dataset`.
 
-    `masks_of` makes another mask source than ``config.masks`` names, once the photographs are read. `crew`:
-    the processes that share the work; all call this with the same arguments, and one writes the scene.
-    `gaussians_from`: a scene in the photographs' world whose Gaussians are taken instead of training some.
+    `masks_of` makes another mask source than ``config.masks`` names, once the photographs are read.
+    `processes`: the processes that share the work; all call this with the same arguments, and one writes the
+    scene. `gaussians_from`: a scene in the photographs' world whose Gaussians are taken instead of training
+    some.
     """
     check_settings(config)
     check_lift(config)
@@ -88,9 +69,9 @@ def train_scene(
     check_output_folder(work)
     # First: a scene that cannot be read should not cost an hour.
     given = None if gaussians_from is None else load_scene(gaussians_from)
-    crew = crew or Crew()
-    with sole_use(work) if crew.leads else nullcontext():
-        return _train(dataset, out, config, work, progress, masks_of, crew, given)
+    processes = processes or ProcessGroup()
+    with sole_use(work) if processes.is_main else nullcontext():
+        return _train(dataset, out, config, work, progress, masks_of, processes, given)
 
 
 def _train(
@@ -100,7 +81,7 @@ def _train(
     work: Path,
     progress: Progress,
     masks_of: Callable[[Capture], MaskSource] | None,
-    crew: Crew,
+    processes: ProcessGroup,
     given: Scene | None,
 ) -> TrainReport:
     """`train_scene` in a folder that is its own; `given`: the scene whose Gaussians are taken."""
@@ -109,7 +90,7 @@ def _train(
     encoder = load_encoder(config.clip.model, config.clip.device, config.clip.batch)
     named = None if masks_of else load_mask_source(config.masks, config.clip.device)
     # One process solves for cameras, the others find them in the work folder.
-    capture = crew.once(lambda: load_capture(dataset, config.dataset, work, progress))
+    capture = processes.once(lambda: load_capture(dataset, config.dataset, work, progress))
     if len(capture) < FEWEST_VIEWS and not config.dataset.allow_few_cameras:
         raise InputError(
             f"{shown(dataset)}: only {len(capture)} photographs have cameras, and a scene needs "
@@ -123,17 +104,17 @@ def _train(
     clock.lap("photographs")
 
     store = FeatureStore(work / "features")  # keyed by mask settings, encoder and image
-    mine = crew.share(train)
+    mine = processes.share(train)
     names = [capture.cameras[i].name for i in mine]
     describe_capture([capture.images[i] for i in mine], names, mask_source, encoder, store, progress)
-    crew.meet()
+    processes.barrier()
     cameras = tuple(capture.cameras[i] for i in train)
     features = StoredFeatures(store, [camera.name for camera in cameras])
     check_masks(features)  # before the Gaussians, which may cost hours
     clock.lap("masks and vectors")
 
     if given is None:
-        gaussians = crew.once(lambda: trained_gaussians(capture, train, config, work, progress))
+        gaussians = processes.once(lambda: trained_gaussians(capture, train, config, work, progress))
     else:
         gaussians = given.gaussians
     said = None if given is None else given.metres_per_unit  # the dataset's may be an estimate
@@ -141,12 +122,12 @@ def _train(
     clock.lap("radiance")
 
     views = StoredViews(cameras, features)
-    language, loss = language_field(gaussians, views, encoder, config, work, progress, crew)
+    language, loss = language_field(gaussians, views, encoder, config, work, progress, processes)
     if not capture.drawn:
         language = replace(language, reading=language.reading.elsewhere)
     clock.lap("language field")
 
-    if crew.leads:
+    if processes.is_main:
         save_scene(out, Scene(gaussians, language, cameras, metres_per_unit=metres))
         scores = evaluate_views(gaussians, capture, held_out) if held_out else []
         clock.lap("saving and held-out views")
@@ -164,11 +145,11 @@ def _train(
             relevancy_error=loss.error_mean,
             relevancy_error_p99=loss.error_p99,
             observed=float((language.confidence[2] > 0).mean()) if len(gaussians) else 0.0,
-            doubts=doubts(scores, cameras),
+            warnings=quality_warnings(scores, cameras),
             seconds=clock.laps,
         )
         write_report(work, report)
-    crew.meet()
+    processes.barrier()
     return read_report(work)
 
 
@@ -191,8 +172,23 @@ def trained_gaussians(
     return gaussians
 
 
+class StoredViews(Sequence[tuple[Camera, ImageFeatures]]):
+    """Cameras with the features of what each saw, read when a view is looked at: hundreds of label maps are
+    more than memory holds."""
+
+    def __init__(self, cameras: Sequence[Camera], features: Sequence[ImageFeatures]) -> None:
+        self._cameras, self._features = cameras, features
+
+    def __len__(self) -> int:
+        return len(self._cameras)
+
+    def __getitem__(self, index: Any) -> Any:
+        """Return view `index`, a number; slices are not supported."""
+        return self._cameras[index], self._features[index]
+
+
 class _Clock:
-    """Seconds per stage."""
+    """Clock of the seconds that each stage takes."""
 
     def __init__(self) -> None:
         self.laps: dict[str, float] = {}

@@ -388,13 +388,13 @@ class Describer:
         for level in reversed(range(len(LEVELS))):
             claims = list(_claims(self.engine.field, held, self.words[level], level, self.areas))
             for done, claim in enumerate(claims):
-                progress(f"checking words: {LEVELS[level]}", done / len(claims))
+                progress("checking words", done / len(claims), LEVELS[level])
                 if named.isdisjoint(claim.phrases):
                     entry = self._verified(claim)
                     if entry is not None:
                         entries.append(entry)
                         named.update(claim.phrases)
-            progress(f"checking words: {LEVELS[level]}", 1.0)
+            progress("checking words", 1.0, LEVELS[level])
         return entries
 
     def _verified(self, claim: _Claim) -> Entry | None:

@@ -19,8 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.semantics.encoder import Logits
-from langsplat_core.semantics.tokens import FILE, check_whole
+from langsplat_core.semantics.encoder import FILE, check_whole
 from langsplat_core.semantics.weights import CONFIG, SAFE, Weights
 
 # Of the text half. NumPy was the quicker one at 63 million too (docs/encoders.md); but checkpoints that large
@@ -52,7 +51,7 @@ PIECES = re.compile(
 
 @dataclass(frozen=True)
 class TextConfig:
-    """What the weights alone do not say; defaults as of `transformers.CLIPTextConfig`."""
+    """Settings that the weights alone do not say; defaults as of `transformers.CLIPTextConfig`."""
 
     vocab_size: int = 49_408
     hidden_size: int = 512
@@ -85,21 +84,18 @@ class TextConfig:
 
 
 class PlainClipText:
-    """A `TextTower`."""
+    """A `TextTower` in NumPy."""
 
     def __init__(self, id: str, config: TextConfig, tensors: Tensors, tokenizer: "PairTokenizer") -> None:
         self.id = id
         self.temperature = TEMPERATURE
-        self.logits: Logits | None = None
         self._config, self._tensors, self._tokenizer = config, tensors, tokenizer
 
     @property
     def dim(self) -> int:
-        """See `TextTower`."""
         return self._config.projection_dim
 
     def encode(self, texts: list[str]) -> Array:
-        """See `TextTower`."""
         begin, end = self._tokenizer.begin, self._tokenizer.end
         rows = [[begin, *self._tokenizer.encode(text), end] for text in texts]
         for text, row in zip(texts, rows, strict=True):
@@ -204,7 +200,7 @@ _ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {"quick_gelu": _quick_gel
 
 
 def _text_config(weights: Weights) -> TextConfig | None:
-    """What config.json says of the text half; None where it says what cannot be understood."""
+    """Settings of the text half in config.json; None where they cannot be understood."""
     try:
         whole = json.loads((weights.folder / CONFIG).read_text(encoding="utf-8"))
         stated = {**(whole.get("text_config") or {}), **(whole.get("text_config_dict") or {})}
@@ -220,7 +216,7 @@ def _text_config(weights: Weights) -> TextConfig | None:
 
 @dataclass(frozen=True)
 class PairTokenizer:
-    """CLIP's byte-pair encoding."""
+    """Tokenizer of CLIP's byte-pair encoding."""
 
     numbers: Mapping[str, int]  # token -> its number
     ranks: Mapping[tuple[str, str], int]  # pair of tokens that are merged -> its place, the lowest first
@@ -249,7 +245,7 @@ class PairTokenizer:
 
 
 def _pieces(text: str) -> Iterator[str]:
-    """What `SPLIT` finds in `text` behind the normalizers: words, single numbers, runs of marks."""
+    """Pieces that `SPLIT` finds in `text` behind the normalizers: words, single numbers, runs of marks."""
     plain = "".join(letter.lower() for letter in unicodedata.normalize("NFC", text))
     for found in PIECES.findall(plain):
         for is_word, letters in groupby(found, str.isalpha) if found[0].isalnum() else [(True, found)]:

@@ -1,11 +1,12 @@
-"""What every image-text encoder does alike: checks of phrases and pictures, batches, unit vectors.
+"""Image-text encoders as callers see them: checks of phrases and images, batches, unit vectors.
 
-A family of models brings two towers, each a few lines (`families/`); everything a caller sees is here.
+A family of models (`encoders`) brings two towers, each a few lines.
 """
 
+import html
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -18,6 +19,116 @@ from langsplat_core.errors import EncoderError, InputError, UnknownWordError
 from langsplat_core.scene import Calibration, Odds, Reading
 from langsplat_core.semantics.weights import OPEN_CLIP_CONFIG, Weights
 
+# Phrases as rows of token numbers of one length, by the tokenizer.json that lies beside the weights. The file
+# is read as it is, by the `tokenizers` library: what transformers' own classes add around it (which side is
+# padded, whether an end token is there) differs between its versions, and one needs SentencePiece.
+
+FILE = "tokenizer.json"
+STATED_IN = ("tokenizer_config.json", "special_tokens_map.json")  # which token pads, which one ends
+USUAL = {"eos_token": ("</s>", "<eos>"), "pad_token": ("<pad>", "</s>")}
+
+
+@dataclass(frozen=True, eq=False)
+class Tokens:
+    """A tokenizer that always fills its rows."""
+
+    tokenizer: Any  # tokenizers.Tokenizer
+    length: int  # tokens per phrase
+    pad: int
+    end: int  # put behind every phrase
+
+    @property
+    def is_unigram(self) -> bool:
+        """True for SentencePiece's unigram kind, as SigLIP's is and SigLIP 2's is not."""
+        return type(self.tokenizer.model).__name__ == "Unigram"
+
+    def rows(self, texts: list[str]) -> Any:
+        """Return the (B, length) int64 tensor of token numbers. Raises as `check_whole`."""
+        import torch
+
+        ids = torch.full((len(texts), self.length), self.pad)
+        for row, found in enumerate(self.tokenizer.encode_batch(texts, add_special_tokens=False)):
+            check_whole(texts[row], found.ids, self.length - 1, {self.end})
+            ids[row, : len(found.ids) + 1] = torch.tensor([*found.ids, self.end])
+        return ids
+
+
+def load_tokens(weights: Weights, length: int) -> Tokens:
+    """Read the folder's tokenizer; EncoderError where it is absent or lacks tokens that pad and end."""
+    path = weights.folder / FILE
+    if not path.is_file():
+        raise EncoderError(f"{weights.id}: no {FILE} in this folder, which its phrases are read with")
+    tokenizer = read_tokenizer(weights)
+    pad = _number(weights, tokenizer, "pad_token")
+    return Tokens(tokenizer, length, pad, _number(weights, tokenizer, "eos_token"))
+
+
+def text_cleaner() -> Callable[[str], str]:
+    """Return the cleaning that open_clip does before its tokenizer reads a text: broken Unicode is mended,
+    curly quotes and ligatures are made plain, names of HTML replaced, spaces made single.
+
+    The function raises InputError where no letter and no digit is left.
+    """
+    import ftfy
+
+    def clean(text: str) -> str:
+        plain = " ".join(html.unescape(html.unescape(ftfy.fix_text(text))).split())
+        if not any(map(str.isalnum, plain)):
+            raise InputError(f"empty phrase {text!r}: type a word or a few, such as 'red mug'")
+        return plain
+
+    return clean
+
+
+def check_whole(text: str, ids: Sequence[int], room: int, ends: Collection[int]) -> None:
+    """Refuse a phrase of which a model would not see all.
+
+    ids: its tokens without those that begin and end a phrase; room: how many the model reads; ends: tokens
+    that end a phrase, which some tokenizers give for every mark that they cannot read. Raises InputError for
+    a phrase that is too long, EncoderError for one that would end early.
+    """
+    if len(ids) > room:
+        raise InputError(
+            f"'{text[:40]} ...' is too long: {len(ids)} tokens; this encoder reads {room}, so use fewer words"
+        )
+    if not set(ends).isdisjoint(ids):
+        raise EncoderError(f"{text[:80]!r} holds marks that this encoder cannot read; use plain words")
+
+
+def read_tokenizer(weights: Weights) -> Any:
+    """The folder's `tokenizers.Tokenizer`, which neither cuts nor pads. EncoderError for a damaged file."""
+    from tokenizers import Tokenizer
+
+    try:
+        tokenizer = Tokenizer.from_file(str(weights.folder / FILE))
+        tokenizer.no_truncation()
+        tokenizer.no_padding()
+        return tokenizer
+    except Exception as error:  # the library raises no narrower class for a damaged file
+        reason = (str(error).splitlines() or ["unreadable"])[0]
+        raise EncoderError(f"{weights.id}: {FILE} is no tokenizer ({reason})") from error
+
+
+def _number(weights: Weights, tokenizer: Any, role: str) -> int:
+    """The number of the token with a role: as the folder states it, else by its usual names."""
+    stated = [_stated(weights, name, role) for name in STATED_IN]
+    for token in (*stated, *USUAL[role]):
+        number = None if token is None else tokenizer.token_to_id(token)
+        if number is not None:
+            return int(number)
+    raise EncoderError(f"{weights.id}: its tokenizer has no {role}, such as {USUAL[role][0]}")
+
+
+def _stated(weights: Weights, name: str, role: str) -> str | None:
+    path = weights.folder / name
+    try:
+        token = json.loads(path.read_text(encoding="utf-8")).get(role)
+    except (OSError, ValueError, AttributeError):
+        return None
+    content = token.get("content") if isinstance(token, dict) else token
+    return content if isinstance(content, str) else None
+
+
 OPEN_MODEL = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
 VOCABULARY = "vocabulary.txt"  # beside the weights: the only words the encoder was taught, one per line
 READING = "reading.json"  # beside the weights, optional: fields of `scene.Reading`, but for the temperature
@@ -26,26 +137,12 @@ EXAMPLES = 12  # known words to name where a phrase has an unknown one
 SUGGESTIONS = 2  # known words offered for an unknown one
 TEXT_BATCH = 64  # phrases per forward pass
 Triple = tuple[float, float, float]
-SHARE_OF_SCALE = 0.1  # of a model's logit scale: the temperature of relevancy, see `Logits.temperature`
-
-
-@dataclass(frozen=True)
-class Logits:
-    """How a model was trained to turn a cosine into a logit: scale * cosine + bias."""
-
-    scale: float
-    bias: float = 0.0  # of no effect on relevancy, which is made of differences of cosines
-
-    @property
-    def temperature(self) -> float:
-        """What a difference of cosines is multiplied by before the sigmoid of relevancy.
-
-        LERF and LangSplat take 10 for CLIP, whose training caps the scale at 100: a tenth. The scale says
-        how far apart a model's training pushed the cosines of right and wrong pairs (the larger it is, the
-        smaller the gaps that it had to make), so a tenth of it gives the margins of two families like
-        relevancies. It is a rule of proportion, not a calibration: verdicts need thresholds of their own.
-        """
-        return SHARE_OF_SCALE * self.scale
+# Share of a model's logit scale that is the temperature of relevancy, the factor of a difference of cosines
+# before the sigmoid. LERF and LangSplat take 10 for CLIP, whose training caps the scale at 100: a tenth. The
+# larger the scale, the smaller the gaps between cosines of right and wrong pairs that training had to make,
+# so a tenth of it gives the margins of two families like relevancies. It is a rule of proportion, not a
+# calibration: verdicts need thresholds of their own.
+SHARE_OF_SCALE = 0.1
 
 
 class TextTower(Protocol):
@@ -57,23 +154,19 @@ class TextTower(Protocol):
 
     @property
     def temperature(self) -> float:
-        """Of relevancy, see `Logits.temperature`."""
-
-    @property
-    def logits(self) -> Logits | None:
-        """As the weights state it; None where a family does not need it."""
+        """Temperature of relevancy, see `SHARE_OF_SCALE`."""
 
     def encode(self, texts: list[str]) -> Array:
         """(B, D) float32 vectors, of any length, of B > 0 phrases. Raises InputError and EncoderError as
         `tokens.check_whole`: no part of a phrase is left out in silence."""
 
 
-class PictureTower(Protocol):
-    """The half of a model that sees pictures."""
+class ImageTower(Protocol):
+    """The half of a model that sees images."""
 
     @property
     def image_size(self) -> int:
-        """Side of the pictures it takes, px."""
+        """Side of the images it takes, px."""
 
     @property
     def statistics(self) -> tuple[Array, Array]:
@@ -89,17 +182,17 @@ class Family:
 
     name: str  # in messages
     text: Callable[[Weights], TextTower]
-    pictures: Callable[[Weights], PictureTower]
+    images: Callable[[Weights], ImageTower]
 
 
 class PhraseEncoder:
     """The text half of a model, in float32; it satisfies `query.engine.TextEncoder`."""
 
     def __init__(self, weights: Weights, tower: TextTower) -> None:
-        self.id = weights.id
+        self.id = weights.id  # hub id or folder as it was asked for; "demo" for the bundled encoder
         self._tower = tower
         self._words = _vocabulary(weights.folder)
-        self._reading = _reading(weights, self._tower.temperature)
+        self.reading = _reading(weights, tower.temperature)  # how its cosines are read, as a scene stores it
 
     @property
     def dim(self) -> int:
@@ -108,18 +201,8 @@ class PhraseEncoder:
 
     @property
     def temperature(self) -> float:
-        """With which a margin of cosines, phrase minus nearest canonical phrase, becomes relevancy."""
+        """Factor with which a margin of cosines, phrase minus nearest canonical phrase, becomes relevancy."""
         return self._tower.temperature
-
-    @property
-    def reading(self) -> Reading:
-        """How its cosines are read, as a scene made with it stores it."""
-        return self._reading
-
-    @property
-    def logits(self) -> Logits | None:
-        """Learned scale and bias of the model's own logits, where its family states them."""
-        return self._tower.logits
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
         """Words of `text` that the encoder was never taught; empty when it was taught open vocabulary."""
@@ -171,63 +254,24 @@ class PhraseEncoder:
         return " ".join(self._taught(word) or "" for word in WORD.findall(text.lower()))
 
 
-class Encoder:
-    """Both halves of a model; it satisfies `embed.ImageEncoder` too."""
+class Encoder(PhraseEncoder):
+    """Both halves of a model; it satisfies `store.ImageEncoder` too."""
 
-    def __init__(self, text: PhraseEncoder, pictures: PictureTower, device: str, batch: int) -> None:
-        self._text = text
-        self._pictures = pictures
-        self._device = device
-        self._batch = batch
-
-    @property
-    def id(self) -> str:
-        """Hub id or folder as it was asked for; "demo" for the bundled encoder."""
-        return self._text.id
-
-    @property
-    def dim(self) -> int:
-        """Length D of the vectors."""
-        return self._text.dim
-
-    @property
-    def temperature(self) -> float:
-        """As `PhraseEncoder.temperature`."""
-        return self._text.temperature
-
-    @property
-    def reading(self) -> Reading:
-        """As `PhraseEncoder.reading`."""
-        return self._text.reading
-
-    @property
-    def logits(self) -> Logits | None:
-        """As `PhraseEncoder.logits`."""
-        return self._text.logits
+    def __init__(self, weights: Weights, text: TextTower, images: ImageTower, batch: int) -> None:
+        super().__init__(weights, text)
+        self._images, self._device, self._batch = images, weights.device, batch
 
     @property
     def image_size(self) -> int:
-        """Side of the pictures it takes, px."""
-        return self._pictures.image_size
-
-    def unknown_words(self, text: str) -> tuple[str, ...]:
-        """As `PhraseEncoder.unknown_words`."""
-        return self._text.unknown_words(text)
-
-    def near_words(self, word: str) -> tuple[str, ...]:
-        """As `PhraseEncoder.near_words`."""
-        return self._text.near_words(word)
-
-    def encode_texts(self, texts: Sequence[str]) -> Array:
-        """As `PhraseEncoder.encode_texts`."""
-        return self._text.encode_texts(texts)
+        """Side of the images it takes, px."""
+        return self._images.image_size
 
     def encode_images(self, crops: Array | Sequence[Array]) -> Array:
-        """(M, D) float32 unit vectors of M pictures (image_size, image_size, 3) uint8, display values."""
+        """(M, D) float32 unit vectors of M images (image_size, image_size, 3) uint8, display values."""
         size = self.image_size
         for crop in crops:
             if crop.shape != (size, size, 3):
-                raise ValueError(f"crops: expected {size} x {size} x 3 pictures, got shape {crop.shape}")
+                raise ValueError(f"crops: expected {size} x {size} x 3 images, got shape {crop.shape}")
         starts = range(0, len(crops), self._batch)
         parts = [self._encode(np.stack(list(crops[i : i + self._batch]))) for i in starts]
         return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
@@ -235,10 +279,10 @@ class Encoder:
     def _encode(self, crops: Array) -> Array:
         import torch
 
-        mean, std = self._pictures.statistics
+        mean, std = self._images.statistics
         pixels = (crops.astype(np.float32) / 255 - mean) / std
         inputs = torch.from_numpy(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))).to(self._device)
-        return unit(inferred(lambda: self._pictures.encode(inputs)))
+        return unit(inferred(lambda: self._images.encode(inputs)))
 
 
 def inferred(forward: Callable[[], Any]) -> Array:

@@ -120,7 +120,7 @@ SAM2_SIDE = 1024  # px, of the square that SAM 2 sees, which no shape tells
 
 @dataclass(frozen=True)
 class Hiera:
-    """What the shapes of a SAM 2 do not tell of its encoder."""
+    """Settings of a SAM 2's encoder that shapes do not tell."""
 
     heads: int  # of the first stage; they double with the width
     windows: tuple[int, int, int, int]  # side by stage, in positions of its grid
@@ -192,7 +192,7 @@ def _read(id: str, file: Path) -> Tensors:
 
 
 class _Module:
-    """Stands for every class of a TorchScript archive: its attributes, and none of its code."""
+    """Stand-in for every class of a TorchScript archive: its attributes, and none of its code."""
 
     parts: Mapping[Any, Any] = MappingProxyType({})
 
@@ -201,7 +201,7 @@ class _Module:
 
 
 def _script_tensors(file: Path) -> dict[str, Any]:
-    """The tensors of a TorchScript archive, as OpenAI publishes CLIP, by their modules' names.
+    """Tensors of a TorchScript archive, as OpenAI publishes CLIP, by their modules' names.
 
     torch reads such an archive only by running it, so what holds the tensors is put into one of its own.
     """
@@ -255,7 +255,7 @@ def _clip(file: Path, tensors: Tensors) -> Converted:
 
 
 def _stated(path: Path) -> Settings:
-    """What open_clip_config.json says; nothing where there is none."""
+    """Content of open_clip_config.json; empty where there is none."""
     if not path.is_file():
         return {}
     try:
@@ -269,7 +269,7 @@ def _stated(path: Path) -> Settings:
 
 
 def _clip_config(tensors: Tensors) -> Settings:
-    """What the shapes tell, as a config.json of transformers would."""
+    """Settings by the shapes, as in a config.json of transformers."""
     words, wide = _shape(tensors, "token_embedding.weight", 2)
     channels, _, patch, _ = _shape(tensors, "visual.conv1.weight", 4)
     positions, _ = _shape(tensors, "visual.positional_embedding", 2)
@@ -365,7 +365,7 @@ def _sam_tensors(tensors: Tensors, names: Names) -> dict[str, Any]:
 
 
 def _sam_config(tensors: Tensors) -> Settings:
-    """What the shapes tell, as a config.json of transformers would."""
+    """Settings by the shapes, as in a config.json of transformers."""
     _, grid, _, wide = _shape(tensors, "image_encoder.pos_embed", 4)
     patch = _shape(tensors, "image_encoder.patch_embed.proj.weight", 4)[2]
     layers = _count(tensors, r"image_encoder\.blocks\.(\d+)\.")
@@ -394,7 +394,7 @@ def _sam_config(tensors: Tensors) -> Settings:
 
 
 def _decoder_config(tensors: Tensors, first: str) -> Settings:
-    """What the shapes tell of the halves for prompts and masks; `first`: of the two layers of an "mlp"."""
+    """Settings of the halves for prompts and masks, by the shapes; `first`: of the two layers of an "mlp"."""
     tokens, size = _shape(tensors, "mask_decoder.mask_tokens.weight", 2)
     decoder = "mask_decoder.transformer.layers.0."
     narrow = _shape(tensors, f"{decoder}cross_attn_token_to_image.q_proj.weight", 2)[0]
@@ -426,7 +426,7 @@ def _sam2(tensors: dict[str, Any]) -> Converted:
 
 
 def _sam2_config(tensors: Tensors) -> Settings:
-    """What shapes and the published sizes tell, as a config.json of transformers would."""
+    """Settings by shapes and published sizes, as in a config.json of transformers."""
     _, wide, *background = _shape(tensors, "image_encoder.trunk.pos_embed", 4)
     blocks = _count(tensors, r"image_encoder\.trunk\.blocks\.(\d+)\.")
     if (wide, blocks) not in SAM2_SIZES:
@@ -467,5 +467,5 @@ def _shape(tensors: Tensors, name: str, axes: int) -> tuple[int, ...]:
 
 
 def _count(tensors: Tensors, pattern: str) -> int:
-    """How many numbers the names have that begin with `pattern`."""
+    """Count the numbers in names that begin with `pattern`."""
     return len({found[1] for found in map(re.compile(pattern).match, tensors) if found})

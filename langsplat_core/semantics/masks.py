@@ -2,9 +2,10 @@
 
 import heapq
 import json
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 from PIL import Image
@@ -33,22 +34,21 @@ class MaskSource(Protocol):
 
     @property
     def name(self) -> str:
-        """What the user is told, such as "graph (no weights)"."""
+        """Name for messages, such as "graph (no weights)"."""
 
     @property
     def key(self) -> str:
         """Everything that its masks depend on besides the photograph: stored masks with another are stale."""
 
+    @abstractmethod
     def __call__(self, image: Array, progress: Progress) -> LevelMasks:
         """Masks of an image (H, W, 3) uint8."""
 
-
-@runtime_checkable
-class SplitMaskSource(MaskSource, Protocol):
-    """One whose work has two parts: a model sees the next photograph while the second is done."""
-
     def begin(self, image: Array, progress: Progress) -> Callable[[], LevelMasks]:
-        """Do the model's part; what is returned does the rest, in any thread."""
+        """Do the model's part; what is returned does the rest, in any thread, while a model sees the next
+        photograph. By default all is done at once."""
+        found = self(image, progress)
+        return lambda: found
 
 
 def label_maps(levels: LevelMasks) -> Array:
@@ -201,14 +201,13 @@ MERGE_COSTS = (6.0, 11.0, 19.0)  # colour difference plus contrast; chosen on ph
 MIN_FRACTIONS = (0.0008, 0.002, 0.004)  # of the picture's area
 
 
-class GraphMasks:
-    """A `MaskSource` that needs no weights."""
+class GraphMasks(MaskSource):
+    """Masks without weights: regions of like colour."""
 
     name = "graph (no weights)"
 
     @property
     def key(self) -> str:
-        """See `MaskSource`."""
         return json.dumps(["graph", VERSION, WORK_SIDE, MERGE_COSTS, MIN_FRACTIONS])
 
     def __call__(self, image: Array, progress: Progress) -> LevelMasks:

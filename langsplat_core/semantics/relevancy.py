@@ -64,7 +64,7 @@ def latent_relevancy(
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """How the cosines of a field are read."""
+    """Scale on which the cosines of a field are read."""
 
     canonical: Array  # (C, D) float32 unit
     everyday: Array | None  # (V, D) float32 unit; None: as published
@@ -96,5 +96,5 @@ class Scale:
 
 
 def relevancy_of(cosines: Array, zero: Array, rate: Array) -> Array:
-    """Of shapes that go together, in (0, 1)."""
+    """Relevancy in (0, 1) of cosines, zeros and rates whose shapes go together."""
     return sigmoid(rate * (cosines - zero))

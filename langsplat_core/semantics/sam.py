@@ -1,4 +1,4 @@
-"""What segmenters of the SAM family do alike: a picture is seen once and then asked about points."""
+"""Masks by models of the SAM family: a picture is seen once, asked about a grid of points, and filtered."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -14,10 +14,10 @@ from scipy import ndimage
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import MaskConfig
-from langsplat_core.errors import EncoderError
+from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress
 from langsplat_core.semantics.layouts import open_weights
-from langsplat_core.semantics.masks import LevelMasks
+from langsplat_core.semantics.masks import GraphMasks, LevelMasks, MaskSource
 from langsplat_core.semantics.weights import (
     Weights,
     load_config,
@@ -65,10 +65,10 @@ class Segmenter(Protocol):
 
     @property
     def name(self) -> str:
-        """What the user is told, such as "SAM 2"."""
+        """Name for messages, such as "SAM 2"."""
 
     def look(self, image: Array) -> Look:
-        """See (H, W, 3) uint8 once."""
+        """Show the model a picture (H, W, 3) uint8 once."""
 
 
 def by_area(ious: Any, logits: Any) -> tuple[Any, Any]:
@@ -115,7 +115,7 @@ def upscale(logits: Any, side: int, size: tuple[int, int] | None, shape: tuple[i
     return interpolate(square, shape, mode="bilinear", align_corners=False)[:, 0]
 
 
-# Segment Anything (Kirillov et al. 2023), and SAM-HQ (Ke et al. 2023), which refines its masks.
+# Segment Anything (Kirillov et al. 2023).
 
 EPSILON = 1e-5  # of the norms between attentions in segment_anything, PyTorch's; transformers has 1e-6 there
 
@@ -128,46 +128,18 @@ class Sam:
     def __init__(self, weights: Weights) -> None:
         from transformers import SamConfig, SamModel
 
-        self._model = _load(SamModel, SamConfig, weights, self.name)
+        settings = load_config(SamConfig, weights, self.name)
+        settings.mask_decoder_config.layer_norm_eps = EPSILON
+        self._model: Any = load_model(SamModel, weights, settings)
 
     def look(self, image: Array) -> Look:
-        """See `Segmenter`."""
-        pixels, side, size = _seen(self._model, image)
-        seen = {"image_embeddings": self._model.get_image_embeddings(pixels)}
+        import torch
+
+        side = int(self._model.config.vision_config.image_size)
+        pixels, size = padded(image, side)
+        given = torch.from_numpy(pixels).to(self._model.device)
+        seen = {"image_embeddings": self._model.get_image_embeddings(given)}
         return Look(self._model, seen, side, size, image.shape[:2], ordered=True)
-
-
-class SamHq:
-    """A `Segmenter`. transformers gives its masks by falling score, so their size must tell the level; and
-    one refinement is added to all three, which brings them closer together than SAM's are."""
-
-    name = "SAM-HQ"
-
-    def __init__(self, weights: Weights) -> None:
-        from transformers import SamHQConfig, SamHQModel
-
-        self._model = _load(SamHQModel, SamHQConfig, weights, self.name)
-
-    def look(self, image: Array) -> Look:
-        """See `Segmenter`."""
-        pixels, side, size = _seen(self._model, image)
-        embedding, inner = self._model.get_image_embeddings(pixels)
-        seen = {"image_embeddings": embedding, "intermediate_embeddings": inner}
-        return Look(self._model, seen, side, size, image.shape[:2], ordered=False)
-
-
-def _load(kind: Any, config: Any, weights: Weights, name: str) -> Any:
-    settings = load_config(config, weights, name)
-    settings.mask_decoder_config.layer_norm_eps = EPSILON
-    return load_model(kind, weights, settings)
-
-
-def _seen(model: Any, image: Array) -> tuple[Any, int, tuple[int, int]]:
-    import torch
-
-    side = int(model.config.vision_config.image_size)
-    pixels, size = padded(image, side)
-    return torch.from_numpy(pixels).to(model.device), side, size
 
 
 # SAM 2 and 2.1 (Ravi et al. 2024) on single pictures, by the image half of their video model.
@@ -185,7 +157,6 @@ class Sam2:
         self._model: Any = load_model(Sam2Model, weights, load_config(Sam2Config, weights, self.name))
 
     def look(self, image: Array) -> Look:
-        """See `Segmenter`."""
         import torch
 
         side = int(self._model.config.prompt_encoder_config.image_size)
@@ -194,10 +165,10 @@ class Sam2:
         return Look(self._model, seen, side, None, image.shape[:2], ordered=False)
 
 
-# Segmenters by hub id, folder or file: a new family is one file and one row here.
+# Segmenters by hub id, folder or file: a new family is a class above and one row here.
 
 FAMILIES: Mapping[str, Callable[[Weights], Segmenter]] = MappingProxyType(  # by `model_type` of config.json
-    {"sam": Sam, "sam2": Sam2, "sam2_video": Sam2, "sam_hq": SamHq}
+    {"sam": Sam, "sam2": Sam2, "sam2_video": Sam2}
 )
 
 
@@ -374,6 +345,20 @@ MASKS_AT_ONCE = 4
 HALF_ON = "cuda"  # where products are float16's: bfloat16's error is seven times as large (docs/encoders.md)
 
 
+def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:
+    """The source that `config` asks for; "auto" is SAM where `config.sam` names weights, else the graph.
+
+    Raises EncoderError where SAM's weights are absent, InputError where they are not named at all.
+    """
+    if config.source == "graph" or (config.source == "auto" and not config.sam):
+        return GraphMasks()
+    if not config.sam:
+        raise InputError(
+            "masks.source sam: name the weights too, such as `--masks.sam facebook/sam-vit-huge`"
+        )
+    return load_sam(config, device)
+
+
 def load_sam(config: MaskConfig, device: str = "auto") -> "SamMasks":
     """Load the weights that `config.sam` names: a folder in Hugging Face layout or a hub id.
 
@@ -401,8 +386,8 @@ class Proposal:
         return mask
 
 
-class SamMasks:
-    """A `MaskSource` that asks a segmenter."""
+class SamMasks(MaskSource):
+    """Masks of a segmenter's answers to a grid of points."""
 
     def __init__(self, segmenter: Segmenter, config: MaskConfig, half: bool = False) -> None:
         """half: whether the model multiplies in float16, see `HALF_ON`."""
@@ -412,12 +397,11 @@ class SamMasks:
 
     @property
     def name(self) -> str:
-        """See `MaskSource`."""
         return f"{self._segmenter.name} {self._config.sam}"
 
     @property
     def key(self) -> str:
-        """See `MaskSource`. The size of batches changes no result."""
+        """Settings that change the masks; the size of batches does not."""
         settings = asdict(self._config) | {"source": "sam", "points_per_batch": 0}
         return json.dumps(["sam", VERSION, settings, *["float16"] * self._half], sort_keys=True)
 
@@ -426,11 +410,11 @@ class SamMasks:
         return self.begin(image, progress)()
 
     def begin(self, image: Array, progress: Progress) -> Callable[[], LevelMasks]:
-        """See `SplitMaskSource`: the model is asked here, pixels are compared there."""
+        """Ask the model; what is returned compares pixels."""
         crops = crop_boxes(image.shape[:2], self._config.crop_layers)
         levels: list[list[Proposal]] = [[] for _ in range(LEVELS)]
         for index, crop in enumerate(crops):
-            part = _part(progress, index, len(crops))
+            part = progress.part(index, len(crops))
             try:
                 found = self._in_crop(image, crop, part, self._half)
             except OverflowError:
@@ -475,7 +459,7 @@ class SamMasks:
     def _passing(
         self, look: Look, answer: tuple[Any, Any], crop: Array, shape: tuple[int, int]
     ) -> tuple[Array, Any]:
-        """Of the masks that pass the tests for themselves: (M, 7) level, predicted IoU, stability and box in
+        """Masks that pass the tests for themselves: (M, 7) level, predicted IoU, stability and box in
         the picture, and (M, h, w) logits, low resolution, still on the device."""
         import torch
 
@@ -492,7 +476,8 @@ class SamMasks:
         return figures[good], logits[rows[torch.from_numpy(good).to(rows.device)]]
 
     def _best(self, look: Look, figures: Array, logits: Any, level: int, crop: Array) -> list[Proposal]:
-        """Those of a level whose box no better one resembles: only they are enlarged and leave the device."""
+        """Proposals of a level whose box no better one resembles: only they are enlarged and leave the
+        device."""
         rows = np.flatnonzero(figures[:, 0] == level)
         rows = rows[box_nms(figures[rows, 3:], figures[rows, 1], self._config.box_nms)]
         area = int((crop[2] - crop[0]) * (crop[3] - crop[1]))
@@ -528,7 +513,7 @@ def measure(logits: Any, offset: float) -> Any:
 def filter_level(
     proposals: list[Proposal], shape: tuple[int, int], config: MaskConfig
 ) -> tuple[Array, Array]:
-    """What remains of one level: (M, H, W) bool masks and (M,) float32 scores, stability times IoU.
+    """Filter one level: (M, H, W) bool masks and (M,) float32 scores, stability times IoU.
 
     proposals: of each crop those that no better one resembled. Order of the steps as in SAM's mask generator
     with LangSplat's mask suppression behind it: boxes of different crops, where the smaller crop shows more
@@ -555,8 +540,3 @@ def grid_points(per_side: int, size: tuple[int, int]) -> Array:
     centres = (np.arange(per_side) + 0.5) / per_side
     x, y = np.meshgrid(centres * size[1], centres * size[0])
     return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
-
-
-def _part(progress: Progress, index: int, count: int) -> Progress:
-    """Reports the work on one crop of `count` as a part of the whole."""
-    return lambda label, fraction: progress(label, (index + fraction) / count)

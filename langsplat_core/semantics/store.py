@@ -1,4 +1,4 @@
-"""The picture that CLIP is shown of one mask."""
+"""Regions of photographs: what CLIP is shown of each, its vectors, and their store on disk."""
 
 import hashlib
 import json
@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, overload
+from typing import Any, Protocol
 from urllib.parse import quote, unquote
 
 import numpy as np
@@ -20,7 +20,7 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import exists, read_npz
 from langsplat_core.progress import Progress, silent
-from langsplat_core.semantics.masks import LevelMasks, MaskSource, SplitMaskSource, label_maps
+from langsplat_core.semantics.masks import LevelMasks, MaskSource, label_maps
 
 
 def masked_crop(image: Array, mask: Array, size: int) -> Array:
@@ -114,7 +114,7 @@ class FeatureStore:
         self._reported: set[str] = set()  # names whose damaged files were told of
 
     def path(self, name: str) -> Path:
-        """Where the photograph called `name` is kept: by its name, percent-encoded, or, where that is longer
+        """File of the photograph called `name`: by its name, percent-encoded, or, where that is longer
         than files' names may be, by the beginning of it and a digest. The file itself holds the whole."""
         quoted = quote(name, safe=" ", errors="surrogateescape")
         if len(quoted) > LONGEST_NAME:
@@ -136,7 +136,7 @@ class FeatureStore:
         return os.fsdecode(stored.tobytes())
 
     def has(self, name: str, key: str | None = None) -> bool:
-        """Whether a whole file for `name` exists; with `key`, only if it was saved with that key.
+        """Return True where a whole file for `name` exists; with `key`, only if it was saved with that key.
 
         A damaged one counts as absent, and is told of once: what it held is then made again.
         """
@@ -213,16 +213,12 @@ class StoredFeatures(Sequence[ImageFeatures]):
     def __len__(self) -> int:
         return len(self._names)
 
-    @overload
-    def __getitem__(self, index: int) -> ImageFeatures: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> "StoredFeatures": ...
-
-    def __getitem__(self, index: int | slice) -> "ImageFeatures | StoredFeatures":
-        if isinstance(index, slice):
-            return StoredFeatures(self._store, self._names[index])
+    def __getitem__(self, index: Any) -> Any:
+        """Return the features of photograph `index`, a number; slices are not supported."""
         return self._store.load(self._names[index])
+
+
+MASKS_STAGE = "masks and vectors"
 
 
 def describe_capture(
@@ -239,7 +235,6 @@ def describe_capture(
     `progress` interrupts the work. Each photograph's regions are encoded by themselves: its file does not
     depend on which others were made beside it.
     """
-    label = f"masks ({mask_source.name}) and vectors"
     made_by = fingerprint(encoder)
 
     def keep(finish: Callable[[], LevelMasks], image: Array, name: str, key: str) -> None:
@@ -249,27 +244,15 @@ def describe_capture(
     with ThreadPoolExecutor(1) as worker:  # filters, crops and files of one while masks of the next are found
         before: Future[None] | None = None
         for index, (image, name) in enumerate(zip(images, names, strict=True)):
-            part = _part(progress, f"{label}: {name}", index, len(images))
-            part("", 0.0)
+            part = progress.part(index, len(images), MASKS_STAGE, name)
+            part(MASKS_STAGE, 0.0)
             key = feature_key(image, mask_source, made_by)
             if not store.has(name, key):
-                finish = _begin(mask_source, image, part)
+                finish = mask_source.begin(image, part)
                 if before is not None:  # one photograph's full-size masks at a time
                     before.result()
                 before = worker.submit(keep, finish, image, name, key)
         if before is not None:
             before.result()
-    progress(label, 1.0)
+    progress(MASKS_STAGE, 1.0)
     return StoredFeatures(store, names)
-
-
-def _begin(source: MaskSource, image: Array, progress: Progress) -> Callable[[], LevelMasks]:
-    if isinstance(source, SplitMaskSource):
-        return source.begin(image, progress)
-    found = source(image, progress)
-    return lambda: found
-
-
-def _part(progress: Progress, label: str, index: int, count: int) -> Progress:
-    """Reports the work on item `index` of `count`, as a part of the whole and under one label."""
-    return lambda _, fraction: progress(label, (index + fraction) / count)

@@ -79,7 +79,7 @@ def _is_hub_id(model: str) -> bool:
 
 
 def is_hugging_face(folder: Path) -> bool:
-    """Whether a folder holds weights and their configuration as transformers saves them."""
+    """Return True where a folder holds weights and their configuration as transformers saves them."""
     weights = any(next(folder.glob(pattern), None) for pattern in SAFE + PICKLED)
     return weights and (folder / CONFIG).is_file()
 
@@ -163,7 +163,7 @@ def load_model(kind: Any, weights: Weights, config: Any) -> Any:
 
 
 def read_scalars(weights: Weights, names: Iterable[str]) -> dict[str, float]:
-    """Those of the named numbers that are among the weights, without loading the rest of them.
+    """Read those of the named numbers that are among the weights, without loading the rest of them.
 
     Half a model (a text tower) has no place for what belongs to the pair, such as a logit scale.
     """
@@ -219,7 +219,8 @@ def loading_errors(id: str, kind: str) -> Iterator[None]:
 
 
 def torch_device(device: str) -> str:
-    """What "auto" means here: cuda where PyTorch sees one, else cpu. EncoderError for an absent device.
+    """Device that "auto" means here: cuda where PyTorch sees one, else cpu. EncoderError for an absent
+    device.
 
     By its number: which one is current is a matter of each thread.
     """

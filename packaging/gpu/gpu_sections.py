@@ -58,7 +58,6 @@ from langsplat_core.semantics.sam import grid_points, load_segmenter
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.mask_weights import find_mask_weights
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
-from tests.support.full_size import MODELS, PHOTOGRAPH
 
 
 class Missing(Exception):
@@ -76,7 +75,7 @@ class Plan:
     most: int  # Gaussians of the bundled scene, where it is lifted onto or drawn
     pictures: int  # drawn from the bundled scene: to train on, and to lift from
     size: tuple[int, int]  # of those
-    models: tuple[str, ...]  # of `tests.support.full_size.MODELS`
+    models: tuple[str, ...]  # of `MODELS`
     crops: int  # shown to an encoder at once
     batches: int  # of 64 points that a segmenter is asked at
     million: int  # Gaussians of the larger OpenGL scene
@@ -508,6 +507,52 @@ def tables(plan: Plan, context: moderngl.Context) -> Iterator[str]:
 
 REPEATS = 5  # of a batch of crops: 320, about as many regions as a photograph has
 ENLARGED = 16  # masks at once
+
+
+PHOTOGRAPH = (1080, 1440)  # height, width, px: what LangSplat shrinks photographs to
+
+
+@dataclass(frozen=True)
+class Model:
+    """A checkpoint of the hub, made in its real size with random weights."""
+
+    id: str
+    million: float  # parameters
+    make: Callable[[Path], None]
+    segments: bool  # else it encodes
+
+
+def make_sam(folder: Path) -> None:
+    """Write facebook/sam-vit-huge."""
+    from transformers import SamConfig, SamModel
+
+    vision = {"hidden_size": 1280, "num_hidden_layers": 32, "num_attention_heads": 16, "mlp_dim": 5120}
+    vision |= {"global_attn_indexes": [7, 15, 23, 31], "output_channels": 256}
+    # The default, 1e-10, makes numbers so small that sums of them crawl.
+    torch.manual_seed(0)
+    SamModel(SamConfig(vision_config=vision | {"initializer_range": 0.02})).save_pretrained(folder)
+
+
+def make_clip(folder: Path) -> None:
+    """Write laion/CLIP-ViT-B-16-laion2B-s34B-b88K."""
+    from transformers import CLIPConfig, CLIPModel, CLIPTokenizer
+
+    letters = "abcdefghijklmnopqrstuvwxyz"
+    tokens = ["<|startoftext|>", "<|endoftext|>", *letters, *(f"{letter}</w>" for letter in letters)]
+    tokens += [f"word{i}</w>" for i in range(49408 - len(tokens))]
+    CLIPTokenizer(vocab={token: i for i, token in enumerate(tokens)}, merges=[]).save_pretrained(folder)
+    text = {"hidden_size": 512, "intermediate_size": 2048, "num_attention_heads": 8, "hidden_act": "gelu"}
+    text |= {"vocab_size": 49408, "bos_token_id": 0, "eos_token_id": 1, "projection_dim": 512}
+    vision = {"patch_size": 16, "hidden_act": "gelu", "projection_dim": 512}
+    torch.manual_seed(0)
+    config = CLIPConfig(text_config=text, vision_config=vision, projection_dim=512)
+    CLIPModel(config).save_pretrained(folder)
+
+
+MODELS = {
+    "sam-vit-huge": Model("facebook/sam-vit-huge", 641.1, make_sam, True),
+    "clip": Model("laion/CLIP-ViT-B-16-laion2B-s34B-b88K", 149.6, make_clip, False),
+}
 
 
 def measure_encoders(plan: Plan) -> Iterator[str]:

@@ -12,7 +12,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import TextEncoder
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import LEVELS, Camera, Gaussians
-from langsplat_core.semantics.masks import LevelMasks
+from langsplat_core.semantics.masks import LevelMasks, MaskSource
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.mask_weights import MaskGroups, find_mask_weights
 
@@ -108,7 +108,7 @@ def _as_rows(ids: Array) -> tuple[Array, Array]:
     return rows, np.array(numbers, np.int64)
 
 
-class TileMasks:
+class TileMasks(MaskSource):
     """A `semantics.masks.MaskSource` that looks at nothing: a grid of squares at each level."""
 
     name = "tiles"

@@ -56,7 +56,7 @@ from langsplat_core.scene import LEVELS, Camera, Gaussians, LanguageField, Scene
 from langsplat_core.semantics.encoder import Encoder
 from langsplat_core.semantics.encoders import load_encoder, model_path
 from langsplat_core.semantics.masks import MaskSource
-from langsplat_core.semantics.sources import load_mask_source
+from langsplat_core.semantics.sam import load_mask_source
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, describe_capture
 from langsplat_core.training.language.codec_fit import CodecReport
 from tests.benchmarks.clip_geometry import ClipGeometry, read_geometry
@@ -360,7 +360,7 @@ class Room:
 
 def labelled(progress: Progress, prefix: str) -> Progress:
     """`progress` under labels that begin with `prefix`."""
-    return lambda label, fraction: progress(prefix + label, fraction)
+    return Progress(lambda at: progress.show(replace(at, stage=prefix + at.stage)))
 
 
 def median_seconds(work: Callable[[], object]) -> float:

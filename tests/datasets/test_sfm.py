@@ -1,34 +1,33 @@
-"""Structure from motion and triangulation, on a small textured room whose shape is known."""
+"""A walk straight ahead between two walls: what structure from motion finds hardest to begin with."""
 
+import json
 import logging
 import os
-import random
 import shutil
-import signal
-import sqlite3
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Collection, Iterator
-from contextlib import closing, contextmanager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import DatasetConfig
 from langsplat_core.datasets import load_capture, sfm
-from langsplat_core.datasets.capture import Capture
+from langsplat_core.datasets.capture import Capture, find_photos
 from langsplat_core.datasets.intrinsics import BrownDistortion, PhotoIntrinsics
 from langsplat_core.datasets.known_poses import add_points, neighbouring_views
-from langsplat_core.datasets.sfm import pairs_by_name
+from langsplat_core.datasets.sfm import optics, pairs_by_name
 from langsplat_core.errors import InputError
-from langsplat_core.progress import Cancelled, Progress, silent
+from langsplat_core.progress import Cancelled, Progress, Report, silent
 from langsplat_core.scene import Camera, look_at
+from tests.support.full_disk import files_of_at_most
 from tests.support.photographed import (
     colmap_reconstruction,
     distance_to_room,
@@ -36,6 +35,50 @@ from tests.support.photographed import (
     poses,
     write_photos,
 )
+from tests.support.stops import stop_at
+
+LENGTH, HALF_WIDTH, HEIGHT = 40.0, 3.0, 4.0  # world units; one walks along y at x = 0 and looks along it
+TEXELS = 24  # per unit
+SIZE, FOCAL = (480, 320), 420.0
+EYE = 1.6  # above the ground
+
+
+@cache
+def _texture(seed: int, across: float) -> Array:
+    """(texels along, texels across) in [0, 255], of the length of the street; nothing repeats."""
+    noise = np.random.default_rng(seed).normal(size=(int(LENGTH * TEXELS) + 2, int(across * TEXELS) + 2))
+    layers = [gaussian_filter(noise, sigma) for sigma in (1.5, 4, 12)]
+    return np.clip(128 + sum(40 * layer / layer.std() for layer in layers), 0, 255)
+
+
+def walk(folder: Path, count: int, step: float = 0.8) -> list[str]:
+    """PNG files in `folder`, taken every `step` units; returns their names."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names = [f"step_{index:02d}.png" for index in range(count)]
+    for index, name in enumerate(names):
+        Image.fromarray(_seen_from(3 + step * index)).reduce(2).save(folder / name)
+    return names
+
+
+def _seen_from(y: float) -> Array:
+    """(2 H, 2 W) uint8."""
+    width, height, focal = 2 * SIZE[0], 2 * SIZE[1], 2 * FOCAL
+    v, u = np.mgrid[:height, :width] + 0.5
+    right, up = (u - width / 2) / focal, (height / 2 - v) / focal - 0.03  # a little downward
+    picture = np.full((height, width), 200.0)
+    with np.errstate(divide="ignore"):
+        depths = np.stack([-EYE / up, -HALF_WIDTH / right, HALF_WIDTH / right])
+    depths[~(depths > 0)] = np.inf
+    nearest, depth = depths.argmin(0), depths.min(0)
+    across = [right * depth + HALF_WIDTH, EYE + up * depth, EYE + up * depth]
+    for number, extent in enumerate((2 * HALF_WIDTH, HEIGHT, HEIGHT)):
+        seen = (nearest == number) & (depth + y < LENGTH) & (across[number] < extent)
+        place = TEXELS * np.stack([depth[seen] + y, across[number][seen]])
+        picture[seen] = map_coordinates(_texture(number, extent), place, order=1, mode="nearest")
+    return picture.astype(np.uint8)
+
+
+# Structure from motion and triangulation, on a small textured room whose shape is known.
 
 pytestmark = pytest.mark.long
 
@@ -49,75 +92,6 @@ STAGES = [
     "locating cameras",
     "reading photographs",
 ]
-TABLES = ("keypoints", "descriptors", "matches", "two_view_geometries")
-RUNS = 20  # that are killed, beside BUSY processes that never rest
-BUSY = 4
-KILLED = """
-import os, signal, sys, threading
-from pathlib import Path
-from langsplat_core.config import DatasetConfig
-from langsplat_core.datasets import load_capture
-timer = threading.Timer(float(sys.argv[3]), os.kill, (os.getpid(), signal.SIGKILL))
-timer.daemon = True
-timer.start()
-load_capture(Path(sys.argv[1]), DatasetConfig(max_side=400), Path(sys.argv[2]))
-"""
-
-
-@contextmanager
-def recorded(folder: Path) -> Iterator[None]:
-    """Keeps in `folder` what every way of the mapper is given and gives: ``0.db``, ``0-0/cameras.bin`` ..."""
-    folder.mkdir(parents=True)
-
-    def watched(number: int, way: Callable[..., Collection[sfm.Model]]) -> Callable[..., object]:
-        def run(workspace: Path, attempts: Path, advance: Callable[[], None]) -> Collection[sfm.Model]:
-            models = list(way(workspace, attempts, advance))
-            with closing(sqlite3.connect(workspace / "database.db")) as database:
-                database.execute("VACUUM INTO ?", (str(folder / f"{number}.db"),))
-            for index, model in enumerate(models):
-                (folder / f"{number}-{index}").mkdir()
-                model.write_binary(folder / f"{number}-{index}")
-            return models
-
-        return run
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sfm, "WAYS", tuple(watched(*each) for each in enumerate(sfm.WAYS)))
-        yield
-
-
-def contents(record: Path) -> dict[str, bytes]:
-    """Tables of the databases, and files of the models, in what was `recorded`."""
-    found = {str(path.relative_to(record)): path.read_bytes() for path in record.rglob("*.bin")}
-    for path in record.glob("*.db"):
-        with closing(sqlite3.connect(path)) as database:
-            for table in TABLES:
-                rows = database.execute(f"SELECT * FROM {table} ORDER BY 1").fetchall()
-                found[f"{path.name} {table}"] = repr(rows).encode()
-    return found
-
-
-def assert_same(ours: Path, theirs: Path) -> None:
-    """Two work folders: what differs is printed, of both, each table and each way's model by itself."""
-    a, b = contents(ours / "record"), contents(theirs / "record")
-    assert {f"{way}.db {table}" for way in range(3) for table in TABLES} < a.keys()
-    lines = []
-    for name in sorted(a.keys() | b.keys()):
-        mine, other = a.get(name, b""), b.get(name, b"")
-        if mine != other:
-            pairs = enumerate(zip(mine, other, strict=False))
-            at = next((place for place, (x, y) in pairs if x != y), min(len(mine), len(other)))
-            lines.append(f"{name} from byte {at}: {mine[at : at + 32]!r} and {other[at : at + 32]!r}")
-    assert not lines, "\n".join([*lines, f"kept: {ours}", f"and {theirs}"])
-
-
-def solve(photos: Path, work: Path, progress: Progress = silent) -> Capture:
-    """Goes on from what is in `work`; what the mapper was given and gave, and the model, is in ``record``."""
-    with recorded(work / "record"):
-        capture = load_capture(photos, CONFIG, work, progress)
-    (stage,) = work.glob("sfm-*")
-    shutil.copytree(stage / "sparse", work / "record" / "sparse")
-    return capture
 
 
 @pytest.fixture(scope="module")
@@ -140,12 +114,8 @@ def located(
     features were found, and then repeated."""
     work = tmp_path_factory.mktemp("work")
 
-    def cancel(label: str, _: float) -> None:
-        if label == "matching photographs":
-            raise Cancelled
-
     with pytest.raises(Cancelled):
-        load_capture(photos, CONFIG, work, cancel)
+        load_capture(photos, CONFIG, work, stop_at("matching photographs"))
 
     labels: list[str] = []
     messages: list[str] = []
@@ -154,7 +124,7 @@ def located(
     logging.getLogger("langsplat").addHandler(handler)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pycolmap, "extract_features", _never)
-        capture = solve(photos, work, lambda label, _: labels.append(label))
+        capture = load_capture(photos, CONFIG, work, Progress(lambda at: labels.append(at.stage)))
     logging.getLogger("langsplat").removeHandler(handler)
     return capture, work, labels, messages
 
@@ -218,44 +188,11 @@ def test_cameras_are_the_same_byte_for_byte(
     shutil.copytree(photos, tmp_path / "moved")
     for photo in (tmp_path / "moved" / "images").iterdir():
         os.utime(photo, (0, 0))
-    solve(tmp_path / "moved", tmp_path / "work")
-    assert_same(located[1], tmp_path / "work")
+    load_capture(tmp_path / "moved", CONFIG, tmp_path / "work")
     (ours,), (theirs,) = located[1].glob("sfm-*"), (tmp_path / "work").glob("sfm-*")
     assert ours.name == theirs.name
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(os.name == "nt", reason="no signal 9")
-def test_killed_anywhere_beside_load_it_ends_the_same(photos: Path, tmp_path: Path) -> None:
-    """Every run is killed at a random moment of a fixed seed, and then goes on to its end."""
-    rest = "import time\nwhile time.monotonic() < float('{}'): pass"
-    busy = [
-        subprocess.Popen([sys.executable, "-c", rest.format(time.monotonic() + 3600)]) for _ in range(BUSY)
-    ]
-    generator, kills = random.Random(0), 0
-    try:
-        start = time.monotonic()
-        solve(photos, tmp_path / "whole")
-        seconds = time.monotonic() - start
-        for number in range(RUNS):
-            work = tmp_path / str(number)
-            words = [str(photos), str(work), str(generator.uniform(0, seconds))]
-            code = subprocess.run([sys.executable, "-c", KILLED, *words], check=False).returncode
-            assert code in (0, -signal.SIGKILL)
-            left = sorted(path.name for path in work.glob("sfm-*/*"))
-            if "sparse" in left:  # it was faster than the whole one
-                for path in (tmp_path / "whole" / "record" / "sparse").iterdir():
-                    assert next(work.glob(f"sfm-*/sparse/{path.name}")).read_bytes() == path.read_bytes()
-                continue
-            kills += 1
-            solve(photos, work)
-            assert_same(tmp_path / "whole", work)
-            print(f"| {number} | killed after {float(words[2]):.1f} s | left {left} | same |", flush=True)
-        assert kills > RUNS / 2
-    finally:
-        for process in busy:
-            process.kill()
-            process.wait()
+    for path in (ours / "sparse").iterdir():
+        assert (theirs / "sparse" / path.name).read_bytes() == path.read_bytes()
 
 
 def test_changed_photographs_are_computed_again(
@@ -287,7 +224,7 @@ def known(count: int = VIEWS, size: tuple[int, int] = (320, 240)) -> Capture:
 def test_known_poses_give_points_in_their_own_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = known(4)
     labels: list[str] = []
-    found = add_points(capture, range(4), tmp_path, lambda label, _: labels.append(label))
+    found = add_points(capture, range(4), tmp_path, Progress(lambda at: labels.append(at.stage)))
     assert list(dict.fromkeys(labels)) == [STAGES[0], *STAGES[1:3], "triangulating points"]
     assert found.cameras is capture.cameras
     assert len(found.points) > 200
@@ -375,12 +312,8 @@ def test_copies_are_upright_and_keep_the_focal_length(tmp_path: Path) -> None:
     for index in range(3):
         Image.linear_gradient("L").resize((90, 60)).convert("RGB").save(tmp_path / f"{index}.jpg", exif=exif)
 
-    def cancel(label: str, _: float) -> None:
-        if label == "finding features":
-            raise Cancelled
-
     with pytest.raises(Cancelled):
-        load_capture(tmp_path, CONFIG, tmp_path / "work", cancel)
+        load_capture(tmp_path, CONFIG, tmp_path / "work", stop_at("finding features"))
     (stage,) = (tmp_path / "work").glob("sfm-*")
     camera = pycolmap.infer_camera_from_image(stage / "images/00000.jpg")
     assert (camera.width, camera.height) == (60, 90)
@@ -388,12 +321,6 @@ def test_copies_are_upright_and_keep_the_focal_length(tmp_path: Path) -> None:
     assert camera.focal_length == pytest.approx(35 / np.hypot(36, 24) * np.hypot(60, 90), rel=0.01)
     with Image.open(stage / "images/00002.jpg") as copy:
         assert copy.getexif().get(0x0112, 1) == 1
-
-
-def test_too_few_photographs_say_so(tmp_path: Path) -> None:
-    write_photos(tmp_path / "two", LENS.regridded(64, 48), poses(2))
-    with pytest.raises(InputError, match="has 2 photographs; at least 3"):
-        load_capture(tmp_path / "two", CONFIG, tmp_path / "work")
 
 
 def test_photographs_that_do_not_overlap_say_so(tmp_path: Path) -> None:
@@ -420,3 +347,240 @@ def test_each_photograph_that_has_no_camera_is_told_why(tmp_path: Path) -> None:
     assert "from one and the same place, or without enough overlap: a.png" in message
     assert "the same picture as a.png: b.png, c.png" in message
     assert "no features (nothing but plain areas, or blurred): black.png, tiny.png" in message
+
+
+# Structure from motion that has to try several ways, and what is done where it finds too little.
+
+STEPS = 8
+SMALL = DatasetConfig(max_side=64)
+PINHOLE_LENS = PhotoIntrinsics(400, 300, 380.0, 380.0, 200.0, 150.0)
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("street")
+    walk(folder, STEPS)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def matched(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The street's workspace before it is mapped."""
+    work = tmp_path_factory.mktemp("matched")
+
+    with pytest.raises(Cancelled):
+        load_capture(street, SMALL, work, stop_at("locating cameras"))
+    (workspace,) = work.glob("sfm-*")
+    return workspace
+
+
+def advance() -> None:
+    pass
+
+
+def test_a_walk_straight_ahead_is_located(street: Path, tmp_path: Path) -> None:
+    capture = load_capture(street, SMALL, tmp_path / "work")
+    assert len(capture) == STEPS
+    along = np.array([camera.position for camera in capture.cameras])
+    steps = np.linalg.norm(np.diff(along, axis=0), axis=1)
+    assert steps.max() < 1.1 * steps.min()  # one step after the other, and all as long
+    axis = (along[-1] - along[0]) / np.linalg.norm(along[-1] - along[0])
+    assert np.abs(np.diff(along, axis=0) @ axis - steps).max() < 0.01 * steps.mean()
+
+
+@pytest.mark.parametrize(("way", "found"), [(0, 0), (1, STEPS), (2, STEPS)])
+def test_every_way_gives_the_same_bytes_again(way: int, found: int, matched: Path, tmp_path: Path) -> None:
+    """And the usual way is what does not find this street."""
+    written = []
+    for name in ("first", "second"):
+        folder = tmp_path / name
+        folder.mkdir()
+        models = sfm.WAYS[way](matched, folder, advance)
+        assert max((len(sfm.located_names(model)) for model in models), default=0) == found
+        for model in models:
+            model.write_binary(folder)
+        written.append({path.name: path.read_bytes() for path in sorted(folder.glob("*.bin"))})
+        if not found:
+            return
+    assert written[0] == written[1]
+    assert "images.bin" in written[0]
+
+
+def synthetic(images: int, points: int) -> "pycolmap.Reconstruction":
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig = 1, 1
+    options.num_frames_per_rig, options.num_points3D = images, points
+    return pycolmap.synthesize_dataset(options)
+
+
+def test_the_model_with_most_well_held_photographs_is_kept() -> None:
+    small, large = synthetic(4, 100), synthetic(6, 100)
+    assert sfm.best_model(None, [small, large]) is large
+    again = pycolmap.Reconstruction(large)
+    assert sfm.best_model(large, [small, again]) is large  # equal: the earlier way
+    wobbly = synthetic(7, sfm.FEWEST_POINTS - 1)  # all of its cameras are guesses
+    assert sfm.best_model(large, [wobbly]) is large
+    assert sfm.best_model(None, [wobbly]) is None
+
+
+def test_of_models_about_as_good_the_first_is_kept() -> None:
+    def erring(images: int, error: float) -> "pycolmap.Reconstruction":
+        model = synthetic(images, 100)
+        for point in model.points3D.values():
+            point.error = error
+        return model
+
+    first, better, more = erring(6, 1.0), erring(6, 0.94), erring(7, 2.0)
+    assert sfm.best_model(first, [erring(6, 0.96)]) is first
+    assert sfm.best_model(None, [first, erring(6, 0.96), better]) is better
+    assert sfm.best_model(None, [better, more, first]) is more
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_libraries_inside_of_pycolmap_keep_to_one_thread_and_others_do_not() -> None:
+    code = """
+import ctypes, os
+from langsplat_core.datasets.intrinsics import pycolmap
+libraries = {line.split()[-1] for line in open("/proc/self/maps") if "pycolmap.libs/libgomp" in line}
+print([ctypes.CDLL(path).omp_get_max_threads() for path in libraries], os.environ["OMP_NUM_THREADS"])
+"""
+    environment = os.environ | {"OMP_NUM_THREADS": "3"}
+    told = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert told.stdout.split() == ["[1]", "3"]
+
+
+@pytest.fixture(scope="module")
+def mostly_noise(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four photographs of a room and five of nothing."""
+    folder = tmp_path_factory.mktemp("noise")
+    write_photos(folder, PINHOLE_LENS, poses(4))
+    for index in range(5):
+        noise = np.random.default_rng(index).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(folder / f"noise_{index}.png")
+    return folder
+
+
+def test_below_half_is_refused_each_time_unless_told_otherwise(mostly_noise: Path, tmp_path: Path) -> None:
+    for _ in range(2):  # the second time from what the first one kept
+        with pytest.raises(InputError, match="only 4 of 9 photographs could be located") as caught:
+            load_capture(mostly_noise, SMALL, tmp_path)
+        said = str(caught.value)
+        assert ", ".join(f"noise_{index}.png" for index in range(5)) in said
+        assert "--dataset.allow-few-cameras" in said
+    told = DatasetConfig(max_side=64, allow_few_cameras=True)
+    assert len(load_capture(mostly_noise, told, tmp_path)) == 4
+    (stage,) = tmp_path.glob("sfm-*")
+    assert len(json.loads((stage / sfm.LEFT_OUT).read_text())) == 5
+
+
+def test_two_views_are_refused_although_they_are_half(
+    mostly_noise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """COLMAP may end with a first pair that nothing else was added to."""
+    for path in find_photos(mostly_noise)[-4:]:  # the room's
+        (tmp_path / path.name).symlink_to(path)
+
+    def gives_up(folder: Path, count: int, progress: object) -> None:
+        model = synthetic(2, 100)
+        for number, image in sorted(model.images.items()):
+            image.name = f"{number - 1:05d}.jpg"
+        sfm.write_left_out(folder, sfm.located_names(model))
+        sfm.store_model(model, folder)
+
+    monkeypatch.setattr(sfm, "map_cameras", gives_up)
+    for _ in range(2):
+        with pytest.raises(InputError, match="only 2 of 4 photographs"):
+            load_capture(tmp_path, SMALL, tmp_path / "work")
+
+
+@pytest.mark.parametrize("label", ["finding features", "matching photographs", "locating cameras"])
+def test_a_full_disk_is_said_before_pycolmap_ends_the_process(
+    label: str, mostly_noise: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill(at: Report) -> None:
+        if at.stage == label:
+            monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1000))
+
+    told = DatasetConfig(max_side=64, allow_few_cameras=True)
+    with pytest.raises(OSError, match="No space left") as caught:
+        load_capture(mostly_noise, told, tmp_path, Progress(fill))
+    assert Path(caught.value.filename).parent == tmp_path
+    monkeypatch.undo()
+    assert len(load_capture(mostly_noise, told, tmp_path)) == 4
+
+
+def test_a_model_that_was_cut_off_is_not_kept(tmp_path: Path) -> None:
+    """pycolmap writes what fits and says nothing."""
+    model = synthetic(4, 100)
+    (tmp_path / "whole").mkdir()
+    model.write_binary(tmp_path / "whole")
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        with (
+            files_of_at_most((tmp_path / "whole" / name).stat().st_size - 1),
+            pytest.raises(OSError, match="No space"),
+        ):
+            sfm.store_model(model, tmp_path)
+        assert not (tmp_path / "sparse").exists()
+    sfm.store_model(model, tmp_path)
+    assert (tmp_path / "sparse").is_dir()
+
+
+# The lens of a photograph, as COLMAP learns of it from our smaller copy.
+
+FOCAL_TAG, ON_FILM, PLANE_X, PLANE_UNIT, WIDTH = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002
+
+
+def photo(path: Path, tags: dict[int, float], size: tuple[int, int] = (2000, 1500)) -> Path:
+    exif = Image.Exif()
+    exif[0x010F] = "Maker"
+    exif.get_ifd(0x8769).update(tags)
+    exif.get_ifd(0x8825).update({1: "N", 2: (47.0, 22.0, 0.0), 3: "E", 4: (8.0, 32.0, 0.0)})  # a place
+    Image.linear_gradient("L").resize(size).convert("RGB").save(path, exif=exif)
+    return path
+
+
+def on_film(path: Path) -> float | None:
+    return optics(path).get_ifd(0x8769).get(ON_FILM)
+
+
+@pytest.mark.parametrize(("unit", "millimetres"), [(2, 25.4), (3, 10.0), (4, 1.0), (None, 25.4)])
+def test_a_sensor_counted_by_the_inch(unit: int | None, millimetres: float, tmp_path: Path) -> None:
+    """A sensor 22.3 mm wide, of 4 to 3, 4000 pixels; the file was made smaller since."""
+    tags: dict[int, float] = {FOCAL_TAG: 18.0, PLANE_X: 4000 / 22.3 * millimetres, WIDTH: 4000}
+    if unit is not None:
+        tags[PLANE_UNIT] = unit
+    expected = 18 / (22.3 * 1.25) * np.hypot(36, 24)
+    assert on_film(photo(tmp_path / "a.jpg", tags)) == round(expected)
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {},
+        {FOCAL_TAG: 18.0},
+        {FOCAL_TAG: 18.0, PLANE_X: 0.0},
+        {FOCAL_TAG: 0.0, PLANE_X: 4500.0},
+        {FOCAL_TAG: 18.0, PLANE_X: 4500.0, PLANE_UNIT: 77},
+        {FOCAL_TAG: 1e6, PLANE_X: 1e9},
+    ],
+)
+def test_what_is_no_lens_is_left_out(tags: dict[int, float], tmp_path: Path) -> None:
+    assert on_film(photo(tmp_path / "a.jpg", tags)) is None
+
+
+def test_colmap_begins_with_it(tmp_path: Path) -> None:
+    """The database's camera, of photographs that were shrunk; where they were taken is not passed on."""
+    for index in range(3):
+        photo(tmp_path / f"{index}.jpg", {FOCAL_TAG: 18.0, PLANE_X: 4000 / 22.3 * 25.4, WIDTH: 4000})
+
+    with pytest.raises(Cancelled):
+        load_capture(tmp_path, DatasetConfig(), tmp_path / "work", stop_at("matching photographs"))
+    (stage,) = (tmp_path / "work").glob("sfm-*")
+    with pycolmap.Database.open(stage / "database.db") as database:
+        (camera,) = database.read_all_cameras()
+        assert database.num_pose_priors() == 0
+    assert (camera.width, camera.height) == (1600, 1200)
+    assert camera.has_prior_focal_length
+    assert camera.focal_length == pytest.approx(18 / 22.3 * 1600, rel=0.02)  # whole millimetres

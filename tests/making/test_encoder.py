@@ -26,7 +26,7 @@ from assets.making.encoder import (
 from assets.making.kit import COLOURS, to_lch
 from assets.making.vocabulary import Label, phrase_book
 from langsplat_core.errors import EncoderError
-from langsplat_core.progress import Cancelled, silent
+from langsplat_core.progress import Cancelled, Progress, Report, silent
 from langsplat_core.scene import CANONICAL_PHRASES
 from langsplat_core.semantics.encoders import load_encoder
 
@@ -180,14 +180,14 @@ def test_training_in_miniature(monkeypatch, few_crops, tmp_path):
     monkeypatch.setattr(demo_encoder, "SAVE_EVERY", 2)
     config = EncoderConfig(steps=4, batch=8, phrases=8)
 
-    def interrupt(label: str, fraction: float) -> None:
-        if fraction > 0.7:
+    def interrupt(at: Report) -> None:
+        if at.fraction > 0.7:
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        train_encoder(tmp_path, config, interrupt)
+        train_encoder(tmp_path, config, Progress(interrupt))
     seen = []
-    figures = train_encoder(tmp_path, config, lambda label, fraction: seen.append(fraction))
+    figures = train_encoder(tmp_path, config, Progress(lambda at: seen.append(at.fraction)))
     assert "| colour |" in report_table(figures)
     assert seen == [0.75, 1.0]  # went on at step 3 of 4
     encoder = load_encoder(str(tmp_path), "cpu")

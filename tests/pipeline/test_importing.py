@@ -32,7 +32,7 @@ from tests.support.same import assert_same
 from tests.support.scenes import random_gaussians
 from tests.support.tiny_clip import tiny_clip
 
-pytestmark = pytest.mark.long  # transformers alone takes seconds to load
+pytestmark = pytest.mark.long
 
 N, D = 60, 24
 G = random_gaussians(N, sh_degree=2)

@@ -1,15 +1,104 @@
-"""Trainings that are killed in every stage end as if nothing had been; `-s` shows the table."""
+"""Trainings that are killed, and how far they were."""
 
 import os
+import random
 import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
-from tests.support.kills import SCENE, moments, train
+from langsplat_core.progress import ALL_STAGES, Report
 from tests.support.photographed import colmap_reconstruction, poses, write_photos
 from tests.support.tiny_clip import tiny_clip
+
+START = "starting"  # before the first report
+SCENE = ("scene.ply", "scene.langsplat.safetensors", "scene.cameras.json")
+SETTINGS = (
+    *("--dataset.max-side", "64", "--dataset.test-every", "4", "--radiance.steps", "30"),
+    *("--radiance.sh-degree", "0", "--radiance.checkpoint-every", "5", "--masks.source", "graph"),
+    *("--clip.device", "cpu", "--codec.size", "9", "--phrases", "red mug", "--progress", "lines"),
+)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When a process is killed: some seconds after a stage has come so far, or is over."""
+
+    stage: str
+    fraction: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A process: its code, what it said besides its progress, and when its stages began."""
+
+    code: int
+    said: str
+    began: dict[str, float]  # seconds since the process did
+    seconds: float
+
+
+def train(data: Path, encoder: Path, folder: Path, kill: Moment | None = None) -> Ended:
+    """Train ``folder/scene.ply``, and kill it with signal 9 at a moment."""
+    words = ["train", str(data), "--out", str(folder / SCENE[0]), "--clip.model", str(encoder), *SETTINGS]
+    start = time.monotonic()
+    began, said = {START: 0.0}, []
+    with subprocess.Popen(
+        [sys.executable, "-m", "langsplat_core", *words],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        killer = threading.Timer(kill.seconds if kill else 0, process.send_signal, (signal.SIGKILL,))
+        if kill is not None and kill.stage == START:
+            killer.start()
+        assert process.stderr is not None
+        for line in process.stderr:
+            report = _report(line)
+            if report is None:
+                said.append(line)
+                continue
+            stage, fraction = report
+            began.setdefault(stage, time.monotonic() - start)
+            passed = kill is not None and kill.stage in began
+            passed = passed and (stage != kill.stage or fraction >= kill.fraction)
+            if passed and not killer.is_alive() and not killer.finished.is_set():
+                killer.start()
+        code = process.wait()
+    killer.cancel()
+    return Ended(code, "".join(said), began, time.monotonic() - start)
+
+
+def _report(line: str) -> tuple[str, float] | None:
+    """Stage and fraction of a line of progress; None for other lines and for the progress of the whole."""
+    try:
+        report = Report.from_json(line)
+    except ValueError:
+        return None
+    return None if report.stage == ALL_STAGES else (report.stage, report.fraction)
+
+
+def moments(whole: Ended, seed: int) -> list[Moment]:
+    """One in every stage of a run, in their order: anywhere in its progress, and where there is none to see,
+    before the first report and after the last, anywhere in its time."""
+    first, *stages, last = sorted(whole.began, key=whole.began.__getitem__)
+    generator = random.Random(seed)
+    before, after = whole.began[stages[0]], whole.seconds - whole.began[last]
+    return [
+        Moment(first, 0, generator.uniform(0, before)),
+        *(Moment(stage, generator.random(), 0) for stage in stages),
+        Moment(last, 0, generator.uniform(0, after)),
+    ]
+
+
+# Trainings that are killed in every stage end as if nothing had been; `-s` shows the table.
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name == "nt", reason="no signal 9")]
 LENS = PhotoIntrinsics(320, 240, 300.0, 300.0, 160.0, 120.0)

@@ -55,12 +55,6 @@ def test_later_masks_cover_earlier_ones_and_hidden_masks_have_no_row() -> None:
     assert (maps[2] == -1).all()
 
 
-def test_a_level_without_masks_may_come_first() -> None:
-    one = np.ones((1, 1, 1), bool)
-    maps = label_maps(level_masks(np.zeros((0, 1, 1), bool), one, one))
-    assert maps.ravel().tolist() == [-1, 0, 1]
-
-
 def test_levels_of_different_sizes_are_refused() -> None:
     with pytest.raises(ValueError, match=r"masks\[1\]"):
         level_masks(np.ones((1, 4, 4), bool), np.ones((1, 4, 5), bool), np.ones((1, 4, 4), bool))

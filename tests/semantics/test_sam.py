@@ -1,4 +1,4 @@
-"""SAM masks: the real loading path, with a tiny model made here, against one point at a time."""
+"""The suppression of masks in plain loops, one pair at a time."""
 
 import json
 from collections.abc import Callable
@@ -9,32 +9,226 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
 from scipy import ndimage
-from transformers import Sam2Model, SamHQModel, SamModel
+from transformers import Sam2Model, SamModel
 
 from langsplat_core.config import MaskConfig
 from langsplat_core.errors import EncoderError, InputError
-from langsplat_core.progress import silent
+from langsplat_core.progress import Progress, silent
 from langsplat_core.semantics import sam
 from langsplat_core.semantics.sam import (
     Look,
     SamMasks,
+    box_nms,
     by_area,
     clean_regions,
+    common_pixels,
+    crop_boxes,
+    cut_by_crop,
     grid_points,
+    load_mask_source,
     load_sam,
     load_segmenter,
     mask_boxes,
+    mask_nms,
     padded,
     squashed,
     upscale,
 )
-from langsplat_core.semantics.sources import load_mask_source
-from tests.support.plain_filters import plain_box_nms, plain_mask_nms
-from tests.support.tiny_sam import SIDE, tiny_sam, tiny_sam2, tiny_sam2_video, tiny_sam_hq
+from tests.support.tiny_sam import SIDE, tiny_sam, tiny_sam2, tiny_sam2_video
 
-pytestmark = pytest.mark.long  # transformers alone takes seconds to load
+
+def plain_mask_nms(masks: np.ndarray, scores: np.ndarray, config: MaskConfig) -> list[int]:
+    """The rule of LangSplat's preprocessing, one pair at a time."""
+    kept = []
+    for i, mask in enumerate(masks):
+        good = scores[i] > config.nms_score
+        for j, other in enumerate(masks):
+            if i == j:
+                continue
+            both = (mask & other).sum()
+            if scores[j] > scores[i] and both / (mask | other).sum() > config.nms_iou:
+                good = False
+            mine, its = both / mask.sum(), both / other.sum()
+            if mine >= 0.85 and its < 0.5 and 1 - mine * its > config.nms_inner:
+                good = False
+        if good:
+            kept.append(i)
+    return kept
+
+
+def plain_box_nms(boxes: np.ndarray, scores: np.ndarray, limit: float) -> list[int]:
+    kept: list[int] = []
+    for i in sorted(range(len(boxes)), key=lambda k: (-scores[k], k)):
+        a = np.zeros((100, 100), bool)
+        a[boxes[i][1] : boxes[i][3], boxes[i][0] : boxes[i][2]] = True
+        for j in kept:
+            b = np.zeros((100, 100), bool)
+            b[boxes[j][1] : boxes[j][3], boxes[j][0] : boxes[j][2]] = True
+            if (a & b).sum() / (a | b).sum() > limit:
+                break
+        else:
+            kept.append(i)
+    return kept
+
+
+# The filters of masks against plain loops.
+
+pytestmark = pytest.mark.long
+
+
+def blobs(count: int, seed: int) -> np.ndarray:
+    """Masks of many sizes, many of them nested, doubled or nearly so."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[0:40, 0:50]
+    masks = []
+    for _ in range(count):
+        centre, radius = rng.uniform((5, 5), (35, 45)), rng.choice([3, 5, 8, 12, 15])
+        masks.append((y - centre[0]) ** 2 + (x - centre[1]) ** 2 <= radius**2)
+        if rng.random() < 0.5:
+            masks.append(np.roll(masks[-1], rng.integers(-2, 3, 2), (0, 1)))
+    return np.stack(masks)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_suppression_agrees_with_double_loops(seed: int) -> None:
+    masks = blobs(40, seed)
+    scores = np.random.default_rng(seed).uniform(0.6, 1, len(masks))
+    boxes = mask_boxes(masks)
+    assert box_nms(boxes, scores, 0.7).tolist() == plain_box_nms(boxes, scores, 0.7)
+    kept = mask_nms(masks, scores, MaskConfig()).tolist()
+    assert kept == plain_mask_nms(masks, scores, MaskConfig())
+    assert 3 < len(kept) < len(masks) - 10
+
+
+def test_common_pixels_are_exact_beyond_one_product() -> None:
+    masks = np.random.default_rng(0).random((3, 300, 400)) < 0.7  # two chunks of 65536
+    want = [[(a & b).sum() for b in masks] for a in masks]
+    np.testing.assert_array_equal(common_pixels(masks), want)
+
+
+def plain_clean(mask: np.ndarray, min_region: int) -> np.ndarray:
+    """Holes, then islands, on the whole picture, one component at a time."""
+    mask = mask.copy()
+    for value in (False, True):
+        parts, count = ndimage.label(mask == value, np.ones((3, 3)))
+        sizes = [(parts == i).sum() for i in range(1, count + 1)]
+        small = [i for i, size in enumerate(sizes, 1) if size < min_region]
+        if value and len(small) == count:
+            small.remove(1 + int(np.argmax(sizes)))
+        for i in small:
+            mask[parts == i] = not value
+    return mask
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_cleaning_agrees_with_the_whole_picture(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    shape = rng.integers(6, 40, 2)
+    noise = ndimage.gaussian_filter(rng.normal(size=shape), rng.choice([0.7, 1.5, 3]))
+    mask = noise > np.quantile(noise, rng.choice([0.1, 0.5, 0.9]))
+    if seed % 3 == 0:
+        mask[: rng.integers(1, 4)] = mask[:, : rng.integers(1, 4)] = False
+    if not mask.any():
+        mask[-1, -1] = True
+    for min_region in (2, 12, 60):
+        want = plain_clean(mask, min_region)
+        got, changed = clean_regions(mask, min_region)
+        np.testing.assert_array_equal(got, want)
+        assert changed == (want != mask).any()
+
+
+def test_a_box_tied_at_the_limit_stays() -> None:
+    boxes = np.array([[0, 0, 9, 10], [0, 0, 9, 7]])  # 63 of 90 px, though 0.7 * 90 is less than 63 in floats
+    assert box_nms(boxes, np.array([0.9, 0.8]), 0.7).tolist() == [0, 1]
+    assert box_nms(boxes, np.array([0.9, 0.8]), 0.69).tolist() == [0]
+
+
+# The crops that SAM sees beside the whole picture, and what becomes of the masks that they give.
+
+
+def test_crops_are_those_of_the_public_code() -> None:
+    # overlap int(1080 * 512 / 1500) = 368; width (1440 + 368) / 2 = 904, height (1080 + 368) / 2 = 724
+    corners = [(0, 0), (0, 356), (536, 0), (536, 356)]
+    want = [(0, 0, 1440, 1080), *((x, y, x + 904, y + 724) for x, y in corners)]
+    assert crop_boxes((1080, 1440), 1).tolist() == [list(box) for box in want]
+    assert crop_boxes((1080, 1440), 0).tolist() == [[0, 0, 1440, 1080]]
+    assert len(crop_boxes((1080, 1440), 2)) == 1 + 4 + 16
+    for shape in [(1, 1), (1, 70), (7, 3)]:
+        boxes = crop_boxes(shape, 2)
+        assert (boxes[:, :2] < boxes[:, 2:]).all()
+        assert boxes.max(axis=0).tolist() == [*boxes[:, :2].max(axis=0), shape[1], shape[0]]
+
+
+def test_a_mask_that_goes_on_outside_its_crop_is_not_taken() -> None:
+    crop, shape = np.array([0, 0, 904, 724]), (1080, 1440)
+    assert not cut_by_crop(np.array([30, 30, 500, 500]), crop, shape)
+    assert not cut_by_crop(np.array([0, 0, 500, 500]), crop, shape)  # the picture itself ends there
+    assert cut_by_crop(np.array([30, 30, 890, 500]), crop, shape)
+    assert not cut_by_crop(np.array([0, 0, 1440, 1080]), np.array([0, 0, 1440, 1080]), shape)
+
+
+class Blind:
+    """Stands in for a SAM that overlooks small things in large pictures: a mask is what has one colour."""
+
+    name = "blind"
+
+    def look(self, image: np.ndarray) -> "Seen":
+        return Seen(image[..., 0])
+
+
+class Seen:
+    def __init__(self, colours: np.ndarray) -> None:
+        self.colours = colours
+        self.from_afar = colours.size >= 200 * 200
+
+    def ask(self, points: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        masks = [self.mask(self.colours[int(y), int(x)]) for x, y in points]
+        logits = torch.from_numpy(np.stack(masks) * 20.0 - 10)[:, None].repeat(1, 3, 1, 1)
+        scores = torch.zeros(len(points), 3)
+        scores[:, 0] = torch.tensor([(0.95 if self.from_afar else 0.9) * mask.any() for mask in masks])
+        return scores, logits
+
+    def mask(self, colour: int) -> np.ndarray:
+        mask = (self.colours == colour) & (colour > 0)
+        if self.from_afar:
+            return mask & (mask.sum() >= 400)
+        rows, columns = np.nonzero(mask)
+        if len(rows):  # by this the mask of a crop can be told from that of the whole picture
+            mask[int(rows.mean()), int(columns.mean())] = False
+        return mask
+
+    def enlarge(self, logits: torch.Tensor) -> torch.Tensor:
+        return logits
+
+
+def test_crops_find_small_things_and_win_where_both_see_a_thing_whole() -> None:
+    image = np.zeros((200, 200, 3), np.uint8)  # crops of 134 px begin at 0 and 66
+    small, across, both = np.s_[30:40, 30:40], np.s_[70:130, 70:130], np.s_[25:65, 140:180]
+    for colour, place in enumerate((small, across, both), start=1):
+        image[place] = colour
+    config = MaskConfig(points_per_side=16, predicted_iou=0.5, min_region=0)
+    alone = SamMasks(Blind(), config)(image, silent).masks[0]
+    assert sorted(mask.sum() for mask in alone) == [1600, 3600]
+    with_crops = SamMasks(
+        Blind(), MaskConfig(points_per_side=16, predicted_iou=0.5, min_region=0, crop_layers=1)
+    )
+    found = with_crops(image, silent)
+    assert sorted(mask.sum() for mask in found.masks[0]) == [99, 1599, 3600]
+    for mask in found.masks[0]:
+        assert len(np.unique(image[..., 0][mask])) == 1  # in its place in the whole picture
+    assert [len(masks) for masks in found.masks[1:]] == [0, 0]
+
+
+def test_progress_runs_once_through_all_crops() -> None:
+    seen: list[float] = []
+    config = MaskConfig(points_per_side=4, points_per_batch=8, crop_layers=1)
+    SamMasks(Blind(), config)(np.zeros((40, 40, 3), np.uint8), Progress(lambda at: seen.append(at.fraction)))
+    assert seen == sorted(seen)
+    assert (seen[0], seen[-1], len(seen)) == (0.0, 1.0, 5 * 2 + 1)
+
+
+# SAM masks: the real loading path, with a tiny model made here, against one point at a time.
 
 # Random weights give random scores: thresholds that let some masks through each filter, and stop some.
 LOOSE = MaskConfig(
@@ -55,7 +249,6 @@ LOOSE = MaskConfig(
 # Likewise: a family's tiny model, its class, and what its random scores need.
 FAMILIES: dict[str, tuple[Callable[[Path], Any], Any, MaskConfig]] = {
     "sam": (tiny_sam, SamModel, LOOSE),
-    "sam_hq": (tiny_sam_hq, SamHQModel, replace(LOOSE, predicted_iou=0.5, stability=0.9)),
     "sam2": (tiny_sam2, Sam2Model, replace(LOOSE, predicted_iou=0.4)),
     "sam2_video": (tiny_sam2_video, Sam2Model, replace(LOOSE, predicted_iou=0.5)),
 }
@@ -218,11 +411,8 @@ def test_a_layer_of_crops_agrees_with_crops_one_after_another(family: str, tmp_p
     assert load_sam(config, "cpu").key != load_sam(replace(config, crop_layers=0), "cpu").key
 
 
-@pytest.mark.parametrize("make", [tiny_sam, tiny_sam_hq])
-def test_the_decoder_has_its_authors_norms_whatever_the_file_states(
-    make: Callable[[Path], Any], tmp_path: Path
-) -> None:
-    make(tmp_path)
+def test_the_decoder_has_its_authors_norms_whatever_the_file_states(tmp_path: Path) -> None:
+    tiny_sam(tmp_path)
     answers = []
     for epsilon in (1e-6, 0.5):
         stated = json.loads((tmp_path / "config.json").read_text(encoding="utf-8"))
@@ -244,20 +434,6 @@ def test_three_answers_are_put_in_order_of_size_for_each_point() -> None:
     np.testing.assert_allclose(ious, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])  # of equals the first stays first
     assert (ordered > 0).flatten(2).sum(2).tolist() == [[4, 8, 12], [4, 8, 8]]
     assert ordered[:, :, 0, 0].tolist() == [[2, 3, 1], [3, 1, 2]]
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-def test_pickled_weights_give_the_same_masks(family: str, tmp_path: Path) -> None:
-    make, _, thresholds = FAMILIES[family]
-    make(tmp_path)
-    config = replace(thresholds, sam=str(tmp_path), points_per_side=3)
-    before = load_sam(config, "cpu")(photograph(), silent)
-    state = load_file(tmp_path / "model.safetensors")
-    (tmp_path / "model.safetensors").unlink()
-    torch.save(state, tmp_path / "pytorch_model.bin")
-    after = load_sam(config, "cpu")(photograph(), silent)
-    for got, want in zip(after.masks, before.masks, strict=True):
-        np.testing.assert_array_equal(got, want)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -291,14 +467,6 @@ def test_no_mask_at_all_is_an_answer(config: MaskConfig) -> None:
 def test_thin_pictures_work(config: MaskConfig, shape: tuple[int, int]) -> None:
     levels = load_sam(config, "cpu")(np.full((*shape, 3), 80, np.uint8), silent)
     assert all(masks.shape[1:] == shape for masks in levels.masks)
-
-
-def test_progress_rises_to_one_and_may_interrupt(config: MaskConfig) -> None:
-    seen: list[float] = []
-    load_sam(config, "cpu")(photograph(), lambda _, fraction: seen.append(fraction))
-    assert seen == sorted(seen)
-    assert (seen[0], seen[-1]) == (0.0, 1.0)
-    assert len(seen) == 5  # 25 points in batches of 7, and the end
 
 
 def test_sources_are_chosen_and_absences_named(config: MaskConfig, tmp_path: Path) -> None:

@@ -12,8 +12,6 @@ from transformers import (
     Sam2VideoModel,
     Sam2VisionConfig,
     SamConfig,
-    SamHQConfig,
-    SamHQModel,
     SamModel,
 )
 
@@ -46,14 +44,6 @@ def tiny_sam(folder: Path, decoder_heads: int = 2) -> SamModel:
     decoder = DECODER | {"num_attention_heads": decoder_heads}
     config = SamConfig(vision_config=ENCODER, prompt_encoder_config=prompts, mask_decoder_config=decoder)
     return _saved(SamModel, config, folder, seed=9)
-
-
-def tiny_sam_hq(folder: Path) -> SamHQModel:
-    """A SAM-HQ likewise."""
-    config = SamHQConfig(
-        vision_config=ENCODER, prompt_encoder_config=PROMPTS, mask_decoder_config=DECODER | {"vit_dim": 16}
-    )
-    return _saved(SamHQModel, config, folder, seed=9)
 
 
 def sam2_vision() -> Sam2VisionConfig:

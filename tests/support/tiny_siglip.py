@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, processors
-from transformers import Siglip2Config, Siglip2Model, Siglip2Tokenizer, SiglipConfig, SiglipModel
+from transformers import Siglip2Tokenizer, SiglipConfig, SiglipModel
 
 SIDE = 32
 LENGTH = 40  # tokens that every phrase is padded to
@@ -56,16 +56,6 @@ def tiny_siglip(folder: Path, second: bool = False) -> SiglipModel:
         vision_config=TOWER | {"image_size": SIDE, "patch_size": 8},
     )
     return _saved(SiglipModel, config, folder)
-
-
-def tiny_naflex(folder: Path) -> Siglip2Model:
-    """A SigLIP 2 that takes up to 16 patches of 8 px."""
-    words = gemma_tokenizer(folder)
-    config = Siglip2Config(
-        text_config=TOWER | {"vocab_size": words, "max_position_embeddings": LENGTH, "projection_size": 32},
-        vision_config=TOWER | {"num_patches": 16, "patch_size": 8},
-    )
-    return _saved(Siglip2Model, config, folder)
 
 
 def _saved(kind: Any, config: Any, folder: Path) -> Any:

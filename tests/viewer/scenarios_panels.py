@@ -113,8 +113,9 @@ def switch_between_scenes(s: Any) -> None:
 TRAINS = """
 import json, sys, time
 for step in range(60):
-    label = f"Training Gaussians: {300 + step} Gaussians, loss {0.04 + 0.2 / (1 + step):.4f}"
-    print(json.dumps({"label": label, "fraction": step / 60}), file=sys.stderr, flush=True)
+    report = {"stage": "training Gaussians", "fraction": step / 60, "note": f"{300 + step} Gaussians"}
+    report["metrics"] = {"loss": 0.04 + 0.2 / (1 + step)}
+    print(json.dumps(report), file=sys.stderr, flush=True)
 time.sleep(60)
 """
 

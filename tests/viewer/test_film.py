@@ -15,7 +15,7 @@ from PIL import Image
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import save_scene
-from langsplat_core.progress import Cancelled
+from langsplat_core.progress import Cancelled, Progress, Report
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.camera.flight import Flight, Keyframe
 from langsplat_viewer.files.flights import write_flight
@@ -110,12 +110,12 @@ def test_every_image_of_a_film_is_that_of_its_request(folder):
 
 
 def test_a_folder_is_filled_where_it_was_left(folder):
-    def stop(label: str, fraction: float) -> None:
-        if fraction > 0.5:
+    def stop(at: Report) -> None:
+        if at.fraction > 0.5:
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        make_film(shot(), folder / "film", stop)
+        make_film(shot(), folder / "film", Progress(stop))
     assert sorted(path.name for path in (folder / "film").iterdir()) == ["film.json", *FRAMES[:3]]
     before = (folder / "film" / FRAMES[1]).stat().st_mtime_ns
     assert "3 of them kept" in make_film(shot(), folder / "film")[0]
@@ -202,12 +202,12 @@ def test_what_ffmpeg_complains_of_is_one_line_and_the_old_film_stays(ffmpeg, vie
 def test_a_stopped_video_leaves_nothing(ffmpeg, folder):
     ffmpeg(FAKE_FFMPEG)
 
-    def stop(label: str, fraction: float) -> None:
-        if fraction > 0.5:
+    def stop(at: Report) -> None:
+        if at.fraction > 0.5:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        make_film(shot(), folder / "a.mp4", stop)
+        make_film(shot(), folder / "a.mp4", Progress(stop))
     assert not [path for path in folder.iterdir() if path.suffix == ".mp4"]
 
 

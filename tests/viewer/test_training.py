@@ -25,8 +25,9 @@ from tests.support.windowless import SCENES, errors, settle
 
 SAYS = """
 import json, sys
-for label, fraction in (("reading photographs", 1.0), ("all stages: about 3 min left", 0.25)):
-    print(json.dumps({"label": label, "fraction": fraction}), file=sys.stderr, flush=True)
+for stage, fraction, left in (("reading photographs", 1.0, 0), ("all stages", 0.25, 180)):
+    report = {"stage": stage, "fraction": fraction, "metrics": {"seconds_left": left}}
+    print(json.dumps(report), file=sys.stderr, flush=True)
 """
 GOOD = SAYS + "print('done: 3 Gaussians')"
 BAD = SAYS + "print('langsplat: photos: none can be located', file=sys.stderr); sys.exit(2)"
@@ -158,9 +159,9 @@ def test_the_command_is_one_that_the_program_understands():
 
 def test_what_is_no_progress_is_kept_as_words():
     progress = TrainingProgress()
-    for line in ("plain words\n", '{"label": 3}', '"text"', "", "[1]", '{"label": "a: b", "fraction": 0.5}'):
+    for line in ("plain words\n", '{"stage": 3}', '"text"', "", "[1]", '{"stage": "a", "fraction": 0.5}'):
         progress.hear(line)
-    assert progress.said == ["plain words", '{"label": 3}', '"text"', "[1]"]
+    assert progress.said == ["plain words", '{"stage": 3}', '"text"', "[1]"]
     assert progress.stages == {"a": 0.5}
     for number in range(100):
         progress.hear(f"line {number}")
@@ -169,17 +170,17 @@ def test_what_is_no_progress_is_kept_as_words():
 
 def test_the_loss_is_heard_once_for_every_time_that_it_is_said():
     progress = TrainingProgress()
-    for label, fraction in (
-        ("Training Gaussians: 300 Gaussians", 0.0),
-        ("Training Gaussians: 300 Gaussians, loss 0.2500", 0.1),
-        ("Training Gaussians: 310 Gaussians, loss 0.2500", 0.11),
-        ("Training Gaussians: 320 Gaussians, loss 0.1250", 0.2),
-        ("all stages: about 3 min left", 0.5),
-        ("fitting: loss of something", 0.5),
+    for fraction, metrics in (
+        (0.0, {}),
+        (0.1, {"loss": 0.25}),
+        (0.11, {"loss": 0.25}),
+        (0.2, {"loss": 0.125}),
     ):
-        progress.hear(json.dumps({"label": label, "fraction": fraction}))
+        report = {"stage": "training Gaussians", "fraction": fraction, "metrics": metrics}
+        progress.hear(json.dumps(report))
+    progress.hear('{"stage": "all stages", "fraction": 0.5, "metrics": {"seconds_left": 180}}')
     assert progress.losses == [0.25, 0.125]
-    assert progress.stages["Training Gaussians"] == 0.2
+    assert progress.stages == {"training Gaussians": 0.2}
 
 
 def checkpoint(folder: Path, scene: Scene) -> Path:

@@ -14,7 +14,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.io import cameras, language
 from langsplat_core.io.scenes import format_of, scene_files
 from langsplat_core.pipeline.forecast import count_photographs
-from langsplat_core.pipeline.report import stated_doubts
+from langsplat_core.pipeline.report import stated_warnings
 from langsplat_core.progress import Progress
 from langsplat_core.query import surface
 from langsplat_core.query.engine import no_field
@@ -79,7 +79,7 @@ def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Cal
         if scene.language is not None:
             latent_colours(scene.language)  # kept for the window's thread
         unusable = scene.gaussians.invalid_rows()
-        doubts = stated_doubts(path, len(scene.gaussians))
+        doubts = stated_warnings(path, len(scene.gaussians))
         return _Opened(scene, unusable, extent_of(scene), read, doubts)
 
     def done(opened: _Opened) -> None:

@@ -246,7 +246,7 @@ class _Roll:
     def draw(self, number: int) -> Array:
         """(H, W, 3) uint8. InputError at the last image where none showed anything."""
         cameras, request = self._shot.cameras, self._shot.request
-        self._progress(f"drawing: {number + 1} of {len(cameras)} pictures", number / len(cameras))
+        self._progress("drawing", number / len(cameras), f"{number + 1} of {len(cameras)} pictures")
         image = self._renderer.read(request.seen_by(cameras[number]))
         self.empty += self._renderer.shows_nothing()
         if self.empty == len(cameras):

@@ -122,7 +122,7 @@ def _train(vectors: Array, config: AutoencoderConfig, progress: Progress) -> Aut
         optimiser.step()
         schedule.step()
         if step % 50 == 0 or step + 1 == config.steps:
-            progress(f"codec: cosine {cosine.item():.3f}", (step + 1) / config.steps)
+            progress("codec", (step + 1) / config.steps, cosine=cosine.item())
     _settle_statistics(encoder, data)
     return AutoencoderCodec(folded_layers(encoder), folded_layers(decoder))
 
@@ -200,7 +200,7 @@ def fit_codebook(
     generator = np.random.default_rng(config.seed)
 
     def grow(size: int, start: Array | None) -> Array:
-        progress(f"codebook: {size} codewords", 0.1 + 0.6 * min(size / 2_048, 1))
+        progress("codebook", 0.1 + 0.6 * min(size / 2_048, 1), f"{size} codewords")
         rounds = FIRST_ROUNDS if start is None else FURTHER_ROUNDS
         return rounded(spherical_kmeans(fitted, size, rounds, start, generator))
 

@@ -203,24 +203,25 @@ def lift_by_gradient(
 
     `config` says for how many steps, how fast, from where. Deterministic for a given seed on the CPU.
     """
-    import torch  # seconds that the other ways of lifting need not wait for
+    start, confidence = lift_latents(rasterizer, gaussians, views, codec, settings, progress)
+    import torch  # seconds that other modes need not pay
 
-    x, confidence = lift_latents(rasterizer, gaussians, views, codec, settings, progress)
     check_settings(config, "--lift.")
     published = config.start == "zeros-as-published"
-    if published:
-        x[:] = 0
-    leaf = torch.from_numpy(x)  # shares its memory
-    adam = torch.optim.Adam([leaf], lr=config.lr, betas=BETAS, eps=EPSILON, fused=True)
+    x = np.zeros_like(start) if published else start.copy()
+    features = torch.from_numpy(x)  # the same memory
+    adam = torch.optim.Adam([features], config.lr, BETAS, EPSILON, fused=True)
     targets = [_target(camera, features, codec) for camera, features in views]
     weights = _Weights(rasterizer, gaussians, [camera for camera, _ in views], settings)
     for step, index in enumerate(_shuffled(len(views), config.steps, config.seed), 1):
         loss, by_y = loss_and_gradient(weights.of(index), targets[index], blended(x, published))
-        leaf.grad = torch.from_numpy(plain(by_features(x, by_y) if published else by_y))
+        gradient = by_features(x, by_y) if published else by_y
+        features.grad = torch.from_numpy(plain(gradient))
         adam.step()
         if step % 20 == 0 or step == config.steps:
-            progress(f"training language features: loss {loss:.4f}", step / config.steps)
-    return np.where(confidence[..., None] > 0, unit(x), 0).astype(np.float32), confidence
+            progress("training language features", step / config.steps, loss=loss)
+    latents = unit(x)
+    return np.where(confidence[..., None] > 0, latents, 0).astype(np.float32), confidence
 
 
 def blended(x: Array, published: bool) -> Array:

@@ -107,7 +107,6 @@ class CpuRenderer:
         self._rasterizer = CpuRasterizer()
 
     def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> Rendered:
-        """See `DifferentiableRenderer.render`."""
         p = parameters
         probe = torch.zeros(len(p["means"]), 2, requires_grad=p["means"].requires_grad)
         visible: list[Tensor] = []
@@ -138,7 +137,6 @@ class CudaRenderer:
             raise BackendError(f"backend cuda: {error}; use --backend cpu") from error
 
     def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> Rendered:
-        """See `DifferentiableRenderer.render`."""
         names = ("means", "log_scales", "quats_wxyz", "opacity_logits")
         gaussians = gsplat.DeviceGaussians(**{name: parameters[name] for name in names})
         colours = sh_coefficients(parameters, sh_degree)

@@ -1,4 +1,4 @@
-"""Gaussians to begin with: one per structure-from-motion point (Kerbl et al. 2023, section 5.1)."""
+"""State of radiance training: first Gaussians, Adam's rows, checkpoints, density control."""
 
 import hashlib
 import json
@@ -37,7 +37,8 @@ RANDOM_POINTS = 10_000  # ... or to this one, when they are too few to show wher
 def initial_gaussians(
     capture: Capture, train_indices: Sequence[int], sh_degree: int, max_gaussians: int, seed: int
 ) -> Gaussians:
-    """Isotropic Gaussians at the capture's points, as large as the mean distance to three neighbours.
+    """Isotropic Gaussians at the capture's points (Kerbl et al. 2023, section 5.1), as large as the mean
+    distance to three neighbours.
 
     Points that no training camera sees, repeated points and isolated outliers are left out. Too few
     points are topped up with random ones from the volume that the training cameras see.
@@ -318,7 +319,7 @@ FEWEST_GAUSSIANS = 64  # pruning never leaves fewer; the most opaque ones stay
 
 @dataclass(frozen=True)
 class DensifyReport:
-    """What one round did, in Gaussians."""
+    """Result of one round, in Gaussians."""
 
     cloned: int
     split: int  # parents, each replaced by two children

@@ -1,9 +1,9 @@
-"""When what happens during radiance training, and how fast parameters learn, for any number of steps.
+"""Radiance training: Gaussians fitted to photographs as in 3D Gaussian Splatting (Kerbl et al. 2023).
 
-At the reference budget this is exactly the INRIA schedule (Kerbl et al. 2023, arguments/__init__.py and
-train.py of the public code). A smaller budget shortens every interval in proportion, but not below what
-it needs to make sense: a gradient mean wants some views, a reset opacity wants time to
-recover. Steps count from 1.
+The schedule says when what happens and how fast parameters learn, for any number of steps. At the reference
+budget this is exactly the INRIA schedule (Kerbl et al. 2023, arguments/__init__.py and train.py of the public
+code). A smaller budget shortens every interval in proportion, but not below what it needs to make sense: a
+gradient mean wants some views, a reset opacity wants time to recover. Steps count from 1.
 
 Positions, scales and rotations then learn faster, by the square root of the missing factor: Adam moves a
 parameter by about its rate per step, and 600 steps at rates meant for 30 000 leave Gaussians where they
@@ -129,22 +129,18 @@ def schedule_for(config: RadianceConfig, extent: float) -> Schedule:
     )
 
 
-# Radiance training: Gaussians fitted to photographs as in 3D Gaussian Splatting (Kerbl et al. 2023).
-#
 # One step draws one photograph's view, compares, and moves every parameter by Adam; densification,
 # pruning and opacity resets follow the `Schedule`. On the CPU a run is deterministic given its seed and
 # resumes from a checkpoint exactly where it stopped.
 
-LOSSES_SAID = 200  # how often in a run its loss is said
+LOSSES_SAID = 200  # mean losses reported in a run
 COARSE_MIN_SIDE = 64  # px: smaller pictures are never halved
 SMALLEST_EXTENT = 0.05  # of the distance to the scene: one camera, or cameras in one place, have no extent
-
-OnStep = Callable[[TrainingState, float], None]  # (state after the step, its loss)
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """How well one photograph is reproduced."""
+    """Scores of one photograph's reproduction."""
 
     name: str
     psnr: float  # dB
@@ -184,7 +180,7 @@ def _halved(camera: Camera, image: Array) -> tuple[Camera, Array]:
 
 @dataclass(frozen=True)
 class _Run:
-    """What stays the same from step to step."""
+    """Constants of a run."""
 
     config: RadianceConfig
     schedule: Schedule
@@ -194,18 +190,18 @@ class _Run:
 
 
 class _Losses:
-    """The loss as it is said: its mean over a share of the steps, since every photograph has another."""
+    """The mean loss over a share of the steps, since every photograph has another."""
 
     def __init__(self, steps: int) -> None:
         self._steps = steps
-        self._latest: list[float] = []  # since it was said last
-        self.said = ""
+        self._latest: list[float] = []  # of the share under way
+        self.mean: float | None = None
 
     def add(self, step: int, loss: float) -> None:
-        """That of one step, counted from 1."""
+        """Add the loss of one step, counted from 1."""
         self._latest.append(loss)
         if step * LOSSES_SAID // self._steps > (step - 1) * LOSSES_SAID // self._steps:
-            self.said = f", loss {np.mean(self._latest):.4f}"
+            self.mean = float(np.mean(self._latest))
             self._latest = []
 
 
@@ -215,13 +211,12 @@ def train_radiance(
     train_indices: Sequence[int],
     checkpoint: Path | None = None,
     progress: Progress = silent,
-    on_step: OnStep | None = None,
 ) -> Gaussians:
     """Fit Gaussians to the photographs at `train_indices`; returns those that can be seen.
 
     With a `checkpoint` path the run continues from that file if it exists, and writes it every
     `config.checkpoint_every` steps, at the end, and when it is interrupted (Ctrl-C, or `Cancelled` from
-    `progress` or `on_step`). Raises InputError when a setting is out of its range, there is nothing to train
+    `progress`). Raises InputError when a setting is out of its range, there is nothing to train
     on or the checkpoint belongs to another run, BackendError when the chosen backend does not work.
     """
     check_settings(config, "--radiance.")
@@ -248,11 +243,10 @@ def train_radiance(
             while state.step < config.steps:
                 loss = _step(run, state)
                 losses.add(state.step, loss)
+                metrics = {} if losses.mean is None else {"loss": losses.mean}
                 progress(
-                    f"Training Gaussians: {len(state)} Gaussians{losses.said}", state.step / config.steps
+                    "training Gaussians", state.step / config.steps, f"{len(state)} Gaussians", **metrics
                 )
-                if on_step:
-                    on_step(state, loss)
                 raise_if_interrupted()
                 if state.step % config.checkpoint_every == 0 or state.step == config.steps:
                     save()

@@ -19,6 +19,7 @@ from langsplat_core.training.language.lift import (
     lift_latents,
 )
 from tests.support.scenes import random_camera, random_gaussians
+from tests.support.stops import stop_at
 
 pytestmark = pytest.mark.long
 
@@ -101,9 +102,5 @@ def test_it_is_deterministic_and_can_be_interrupted():
     other = lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, replace(SHORT, seed=1))[0]
     assert not np.array_equal(one, other)
 
-    def stop(label: str, fraction: float) -> None:
-        if label.startswith("training language"):
-            raise Cancelled
-
     with pytest.raises(Cancelled):
-        lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, SHORT, progress=stop)
+        lift_by_gradient(cpu, GAUSSIANS, pairs, CODEC, SHORT, progress=stop_at("training language features"))

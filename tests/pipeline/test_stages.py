@@ -1,7 +1,8 @@
-"""Several processes that share one training: the same scene as from one."""
+"""A work folder belongs to one training at a time, and to none once that has ended, however it ended."""
 
 import multiprocessing
 import os
+import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -12,7 +13,7 @@ import torch.distributed
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
-from langsplat_core.pipeline.stages import Crew, join_crew
+from langsplat_core.pipeline.stages import LOCK, ProcessGroup, join_processes, sole_use
 from langsplat_core.pipeline.train import StoredViews
 from langsplat_core.training.language import codec_fit
 from tests.support.lifting import make_views
@@ -20,6 +21,40 @@ from tests.support.tiny_room import tiny_room
 from tests.support.tiny_sam import tiny_sam
 
 pytestmark = pytest.mark.long
+
+HOLD = (
+    "import sys, time\nfrom pathlib import Path\nfrom langsplat_core.pipeline.stages import sole_use\n"
+    "with sole_use(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)\n"
+)
+
+
+def test_a_second_one_is_told_who_is_there_and_a_dead_one_holds_nothing(tmp_path: Path) -> None:
+    work = tmp_path / "scene.work"
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(work)], stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(InputError, match=f"process {other.pid} on .*--work"), sole_use(work):
+            pass
+        other.kill()  # -9: it can tidy nothing up
+        other.wait()
+        assert (work / LOCK).exists()
+        with sole_use(work):
+            assert (work / LOCK).read_text().startswith(f"process {os.getpid()} ")
+
+
+def test_one_after_the_other_and_never_two_in_one_process(tmp_path: Path) -> None:
+    work = tmp_path / "c"
+    for _ in range(2):
+        with sole_use(work), pytest.raises(InputError, match="--work"), sole_use(work):
+            pass
+    with sole_use(tmp_path / "a"), sole_use(tmp_path / "b"):
+        (tmp_path / "a" / "result").touch()
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a", LOCK, "result"]  # b held nothing
+
+
+# Several processes that share one training: the same scene as from one.
 
 OPTIONS = (
     *("--dataset.max-side", "64", "--dataset.test-every", "4", "--radiance.steps", "20"),
@@ -29,16 +64,16 @@ OPTIONS = (
 
 def test_every_item_is_shared_once():
     items = list(range(11))
-    shares = [Crew(rank, 3).share(items) for rank in range(3)]
+    shares = [ProcessGroup(rank, 3).share(items) for rank in range(3)]
     assert sorted(item for share in shares for item in share) == items
     assert max(map(len, shares)) - min(map(len, shares)) <= 1
-    assert [Crew(rank, 3).leads for rank in range(3)] == [True, False, False]
+    assert [ProcessGroup(rank, 3).is_main for rank in range(3)] == [True, False, False]
 
 
 def test_alone_without_a_launcher(monkeypatch):
     monkeypatch.delenv("WORLD_SIZE", raising=False)
-    assert join_crew() == Crew(0, 1)
-    assert Crew().once(lambda: 7) == 7
+    assert join_processes() == ProcessGroup(0, 1)
+    assert ProcessGroup().once(lambda: 7) == 7
 
 
 def test_a_lost_process_is_said_in_one_line(monkeypatch):
@@ -47,7 +82,7 @@ def test_a_lost_process_is_said_in_one_line(monkeypatch):
 
     monkeypatch.setattr("torch.distributed.barrier", lost)
     with pytest.raises(InputError, match=r"ended \(Connection closed by peer .*what is finished is kept"):
-        Crew(1, 2).meet()
+        ProcessGroup(1, 2).barrier()
 
 
 def test_views_are_read_when_they_are_looked_at():
@@ -55,9 +90,7 @@ def test_views_are_read_when_they_are_looked_at():
     views = StoredViews([camera for camera, _ in pairs], [features for _, features in pairs])
     assert len(views) == 3
     assert views[1][1] is pairs[1][1]
-    assert [camera for camera, _ in views[1:]] == [camera for camera, _ in pairs[1:]]
-    with pytest.raises(ValueError, match="3 cameras, 2 features"):
-        StoredViews([camera for camera, _ in pairs], [pairs[0][1]] * 2)
+    assert [camera for camera, _ in views] == [camera for camera, _ in pairs]
 
 
 def train(room: Path, out: Path, said: Path, surroundings: dict[str, str], *more: str) -> None:
@@ -77,7 +110,7 @@ def train_by_two(room: Path, out: Path, *more: str) -> tuple[list[int | None], l
     there = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(store.port), "WORLD_SIZE": "2"}
     there["TORCHELASTIC_USE_AGENT_STORE"] = "True"
     processes = multiprocessing.get_context("forkserver")
-    processes.set_forkserver_preload(["tests.pipeline.test_crew"])
+    processes.set_forkserver_preload(["tests.pipeline.test_stages"])
     two, said = [], [out.with_name("0.txt"), out.with_name("1.txt")]
     for rank, text in enumerate(said):
         surroundings = there | {"RANK": str(rank), "LOCAL_RANK": str(rank)}

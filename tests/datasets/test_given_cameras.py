@@ -1,0 +1,631 @@
+"""COLMAP models: read as COLMAP reads them, and turned into pinhole captures."""
+
+import json
+import logging
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from plyfile import PlyData, PlyElement
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import DatasetConfig
+from langsplat_core.datasets import load_capture
+from langsplat_core.datasets.colmap import find_model, good_points, read_model
+from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortion, PhotoIntrinsics
+from langsplat_core.datasets.nerfstudio import load_nerfstudio
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.progress import Progress, silent
+from tests.support.photographed import (
+    colmap_reconstruction,
+    photograph,
+    pinhole_picture,
+    poses,
+    psnr,
+    write_photos,
+)
+from tests.support.small_datasets import (
+    CONFIG,
+    refuse,
+    write_colmap,
+    write_nerfstudio,
+    write_picture,
+)
+
+pytestmark = pytest.mark.long
+
+BANANA = Path(__file__).parents[3] / "shared" / "data" / "banana" / "colmap_640"
+PARAMS = [190.0, 188.0, 103.0, 74.0, -0.1, 0.02, 0.001, -0.001]
+LENS = PhotoIntrinsics(200, 150, *PARAMS[:4], BrownDistortion(*PARAMS[4:]))
+WHOLE = DatasetConfig(max_side=200)
+
+
+def write_dataset(folder: Path, form: str = "bin", subfolder: str = "sparse/0", views: int = 3) -> None:
+    """Photographs of the room through an OPENCV lens, and a model with ten points on its floor."""
+    matrices = poses(views)
+    names = write_photos(folder / "images", LENS, matrices)
+    # Listed backwards: the order of the file must not matter.
+    model = colmap_reconstruction("OPENCV", (200, 150), PARAMS, names[::-1], matrices[::-1])
+    track = pycolmap.Track()
+    for index in range(10):
+        model.add_point3D(np.array([3.0, 0.2 * index + 1.5, 0.0]), track, np.array([index, 2, 3], np.uint8))
+    out = folder / subfolder
+    out.mkdir(parents=True)
+    (model.write_binary if form == "bin" else model.write_text)(out)
+
+
+@pytest.mark.parametrize("form", ["bin", "txt"])
+def test_a_model_reads_as_pycolmap_reads_it(tmp_path: Path, form: str) -> None:
+    write_dataset(tmp_path, form)
+    ours, theirs = read_model(tmp_path / "sparse/0"), pycolmap.Reconstruction(tmp_path / "sparse/0")
+    assert {image.name for image in ours.images} == {image.name for image in theirs.images.values()}
+    for image in ours.images:
+        want = theirs.find_image_with_name(image.name).cam_from_world().matrix()
+        np.testing.assert_allclose(image.world_to_camera[:3], want, atol=1e-12)
+    camera = ours.cameras[1]
+    assert (camera.model, camera.width, camera.height) == ("OPENCV", 200, 150)
+    assert camera.params == pytest.approx(PARAMS)
+    points = [theirs.points3D[key] for key in sorted(theirs.points3D)]
+    np.testing.assert_allclose(ours.points, [p.xyz for p in points])
+    np.testing.assert_array_equal(ours.colours, [p.color for p in points])
+
+
+@pytest.mark.skipif(not BANANA.is_dir(), reason="real data absent")
+@pytest.mark.parametrize("folder", ["sparse", "sparse_text"])
+def test_a_real_model_reads_as_pycolmap_reads_it(folder: str) -> None:
+    ours, theirs = read_model(BANANA / folder), pycolmap.Reconstruction(BANANA / folder)
+    points = [theirs.points3D[key] for key in sorted(theirs.points3D)]
+    order = np.lexsort(ours.points.T)
+    want = np.array([p.xyz for p in points])
+    np.testing.assert_allclose(ours.points[order], want[np.lexsort(want.T)], rtol=1e-9)
+    assert sorted(ours.track_lengths) == sorted(p.track.length() for p in points)
+    assert ours.errors.mean() == pytest.approx(np.mean([p.error for p in points]))
+    for image in ours.images:
+        pose = theirs.find_image_with_name(image.name).cam_from_world().matrix()
+        np.testing.assert_allclose(image.world_to_camera[:3], pose, atol=1e-9)
+
+
+@pytest.mark.parametrize(("form", "subfolder"), [("bin", "sparse/0"), ("txt", "sparse")])
+def test_a_capture_shows_what_its_cameras_see(tmp_path: Path, form: str, subfolder: str) -> None:
+    write_dataset(tmp_path, form, subfolder)
+    labels: list[str] = []
+    capture = load_capture(tmp_path, WHOLE, tmp_path / "work", Progress(lambda at: labels.append(at.stage)))
+    assert [camera.name for camera in capture.cameras] == ["view_0", "view_1", "view_2"]
+    for camera, image, matrix in zip(capture.cameras, capture.images, poses(3), strict=True):
+        np.testing.assert_allclose(camera.world_to_camera, matrix, atol=1e-12)
+        assert psnr(image, pinhole_picture(camera, 3)) > 35  # 28 when half a pixel off
+    assert capture.points.shape == (10, 3)
+    assert set(labels) == {"reading photographs"}
+    assert not (tmp_path / "work").exists()  # nothing had to be computed
+
+
+def test_of_several_models_the_one_with_most_photographs_is_taken(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name, views in (("0", 2), ("1", 4), ("2", 4), ("10", 3)):
+        write_dataset(tmp_path, subfolder=f"sparse/{name}", views=views)
+    (tmp_path / "sparse/other").mkdir()
+    with caplog.at_level(logging.WARNING, "langsplat"):
+        assert len(load_capture(tmp_path, WHOLE, tmp_path / "work")) == 4
+    (said,) = [record.getMessage() for record in caplog.records if "models" in record.getMessage()]
+    assert "4 models; 1 is taken, which has most photographs (0: 2, 1: 4, 2: 4, 10: 3)" in said
+
+    images = tmp_path / "sparse/1/images.bin"
+    images.write_bytes(images.read_bytes()[:100])
+    assert find_model(tmp_path) == tmp_path / "sparse/2"
+    for path in tmp_path.glob("sparse/*/images.bin"):
+        path.write_bytes(b"\xff" * 20)
+    with pytest.raises(InputError, match=r"sparse/0/images\.bin is no readable COLMAP file"):
+        load_capture(tmp_path, WHOLE, tmp_path / "work")
+
+
+def test_photographs_in_subfolders_keep_apart(tmp_path: Path) -> None:
+    matrices = poses(2)
+    names = ["left/0001.png", "right/0001.png"]
+    for name, matrix in zip(names, matrices, strict=True):
+        (tmp_path / "images" / name).parent.mkdir(parents=True)
+        Image.fromarray(photograph(LENS, matrix)).save(tmp_path / "images" / name)
+    model = colmap_reconstruction("OPENCV", (200, 150), PARAMS, names, matrices)
+    model.add_point3D(np.zeros(3), pycolmap.Track(), np.zeros(3, np.uint8))
+    (tmp_path / "sparse").mkdir()
+    model.write_text(tmp_path / "sparse")
+    capture = load_capture(tmp_path, WHOLE, tmp_path / "work")
+    assert [camera.name for camera in capture.cameras] == ["left_0001", "right_0001"]
+
+
+def test_missing_photographs_are_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_dataset(tmp_path)
+    (tmp_path / "images/view_1.png").unlink()
+    with caplog.at_level(logging.WARNING, "langsplat"):
+        capture = load_capture(tmp_path, WHOLE, tmp_path / "work")
+    assert [camera.name for camera in capture.cameras] == ["view_0", "view_2"]
+    assert [r.getMessage() for r in caplog.records] == [
+        "1 of 3 photographs of the model do not exist and are left out: view_1.png"
+    ]
+
+
+def test_a_model_of_few_of_the_photographs_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_dataset(tmp_path)
+    for index in range(4):
+        Image.new("RGB", (8, 8)).save(tmp_path / "images" / f"other_{index}.png")
+    with caplog.at_level(logging.WARNING, "langsplat"):
+        assert len(load_capture(tmp_path, WHOLE, tmp_path / "work")) == 3
+    (message,) = [record.getMessage() for record in caplog.records]
+    assert "cameras for only 3 of the 7 photographs" in message
+
+
+def test_no_photograph_at_all_is_an_error(tmp_path: Path) -> None:
+    write_dataset(tmp_path)
+    for photo in (tmp_path / "images").iterdir():
+        photo.unlink()
+    with pytest.raises(InputError, match=r"none of its 3 photographs .*view_.*png"):
+        load_capture(tmp_path, WHOLE, tmp_path / "work")
+
+
+def test_photographs_shrunk_by_the_user_still_fit(tmp_path: Path) -> None:
+    write_dataset(tmp_path)
+    for photo in (tmp_path / "images").iterdir():
+        Image.open(photo).reduce(2).save(photo)
+    capture = load_capture(tmp_path, WHOLE, tmp_path / "work")
+    assert capture.cameras[0].width <= 110
+    assert psnr(capture.images[0], pinhole_picture(capture.cameras[0], 4)) > 30
+
+
+def test_photographs_of_another_shape_are_refused(tmp_path: Path) -> None:
+    write_dataset(tmp_path)
+    photo = tmp_path / "images/view_1.png"
+    Image.open(photo).crop((0, 0, 150, 150)).save(photo)
+    with pytest.raises(InputError, match=r"view_1\.png is 150x150 pixels but its camera is 200x150"):
+        load_capture(tmp_path, WHOLE, tmp_path / "work")
+
+
+@pytest.mark.parametrize(("tag", "turn"), [(6, Image.Transpose.ROTATE_90), (8, Image.Transpose.ROTATE_270)])
+def test_a_turned_photograph_is_turned_back_when_its_camera_is_upright(
+    tmp_path: Path, tag: int, turn: Image.Transpose
+) -> None:
+    write_dataset(tmp_path)
+    want = load_capture(tmp_path, WHOLE, tmp_path / "work")
+    exif = Image.Exif()
+    exif[0x0112] = tag
+    photo = tmp_path / "images/view_1.png"
+    Image.open(photo).transpose(turn).save(photo, exif=exif)
+    got = load_capture(tmp_path, WHOLE, tmp_path / "work")
+    np.testing.assert_array_equal(got.images[1], want.images[1])
+
+
+def test_plainly_wrong_points_are_dropped(tmp_path: Path) -> None:
+    write_dataset(tmp_path, "txt")
+    rows = [
+        "1 1 2 3 9 8 7 0.5 1 1 2 2",  # seen twice: kept
+        "2 1 2 3 9 8 7 0.5 1 1",  # seen once
+        "3 1 2 3 9 8 7 4.5 1 1 2 2 3 3",  # too far off
+        "4 nan 2 3 9 8 7 0.5 1 1 2 2",
+        "5 1 2 3 9 8 7 -1",  # no track, error unknown: a cloud from elsewhere, kept
+    ]
+    (tmp_path / "sparse/0/points3D.txt").write_text("\n".join(rows))
+    points, colours = good_points(read_model(tmp_path / "sparse/0"))
+    np.testing.assert_array_equal(points, [[1, 2, 3], [1, 2, 3]])
+    np.testing.assert_array_equal(colours, [[9, 8, 7], [9, 8, 7]])
+
+
+@pytest.mark.skipif(not BANANA.is_dir(), reason="real data absent")
+def test_real_points_lie_where_the_photographs_show_them(tmp_path: Path) -> None:
+    capture = load_capture(BANANA, DatasetConfig(max_side=320), tmp_path)
+    assert len(capture) == 14
+    assert len(capture.points) == 7308
+    camera, image = capture.cameras[7], capture.images[7].astype(float)
+    pixels, depth = camera.project(capture.points)
+    seen = (depth > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+    x, y = pixels[seen].astype(int).T
+    off = np.abs(image[y, x] - capture.colours[seen]).mean(1)
+    shuffled = np.abs(image[y, x] - capture.colours[seen][::-1]).mean(1)
+    assert np.median(off) < 0.7 * np.median(shuffled)
+
+
+# transforms.json: poses, intrinsics in all their spellings, points, and what may be missing.
+
+FOX = Path(__file__).parents[3] / "shared" / "data" / "fox"
+NERFSTUDIO_LENS = PhotoIntrinsics(
+    160, 120, 150.0, 148.0, 83.0, 58.0, BrownDistortion(-0.1, 0.02, 0.001, -0.001)
+)
+GLOBAL = {
+    "w": 160, "h": 120, "fl_x": 150.0, "fl_y": 148.0, "cx": 83.0, "cy": 58.0,
+    "k1": -0.1, "k2": 0.02, "p1": 0.001, "p2": -0.001,
+}  # fmt: skip
+
+
+def opengl_pose(world_to_camera: Array) -> list[list[float]]:
+    """Camera-to-world with y up and z backwards, spelled out column by column."""
+    rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
+    right, down, forward = rotation
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([right, -down, -forward, -rotation.T @ translation], axis=1)
+    return matrix.tolist()
+
+
+def write_transforms(
+    folder: Path, top: dict[str, Any], intrinsics: PhotoIntrinsics = NERFSTUDIO_LENS, views: int = 3
+) -> dict[str, Any]:
+    matrices = poses(views)
+    names = write_photos(folder / "images", intrinsics, matrices)
+    frames = [
+        {"file_path": f"./images/{name}", "transform_matrix": opengl_pose(matrix)}
+        for name, matrix in zip(names, matrices, strict=True)
+    ]
+    data = {**top, "frames": frames}
+    rewrite(folder, data)
+    return data
+
+
+def rewrite(folder: Path, data: object) -> Path:
+    (folder / "transforms.json").write_text(json.dumps(data))
+    return folder / "transforms.json"
+
+
+def load(folder: Path):  # type: ignore[no-untyped-def]
+    return load_nerfstudio(folder / "transforms.json", 160, silent)
+
+
+def test_pictures_are_what_the_cameras_see(tmp_path: Path) -> None:
+    write_transforms(tmp_path, GLOBAL)
+    capture = load(tmp_path)
+    assert [camera.name for camera in capture.cameras] == ["view_0", "view_1", "view_2"]
+    for camera, image, matrix in zip(capture.cameras, capture.images, poses(3), strict=True):
+        np.testing.assert_allclose(camera.world_to_camera, matrix, atol=1e-9)
+        assert psnr(image, pinhole_picture(camera, 3)) > 33  # 26 when half a pixel off
+
+
+def test_a_fisheye_lens(tmp_path: Path) -> None:
+    intrinsics = PhotoIntrinsics(160, 120, 120.0, 120.0, 80.0, 60.0, FisheyeDistortion(0.02, -0.01))
+    top = {"w": 160, "h": 120, "fl_x": 120.0, "fl_y": 120.0, "cx": 80.0, "cy": 60.0, "k1": 0.02, "k2": -0.01}
+    write_transforms(tmp_path, {**top, "camera_model": "OPENCV_FISHEYE"}, intrinsics)
+    capture = load(tmp_path)
+    assert psnr(capture.images[1], pinhole_picture(capture.cameras[1], 3)) > 33
+
+
+def test_intrinsics_from_the_field_of_view_and_the_file(tmp_path: Path) -> None:
+    intrinsics = PhotoIntrinsics(160, 120, 140.0, 140.0, 80.0, 60.0)
+    write_transforms(tmp_path, {"camera_angle_x": 2 * np.arctan(80 / 140.0)}, intrinsics)
+    camera = load(tmp_path).cameras[0]
+    assert (camera.width, camera.height) == (160, 120)
+    np.testing.assert_allclose((camera.fx, camera.fy, camera.cx, camera.cy), (140, 140, 80, 60))
+
+
+def test_a_frame_may_have_its_own_intrinsics(tmp_path: Path) -> None:
+    data = write_transforms(tmp_path, {"w": 160, "h": 120, "fl_x": 140.0, "cx": 80.0, "cy": 60.0})
+    data["frames"][1].update(fl_x=111.0, fl_y=112.0, cx=70.0)
+    rewrite(tmp_path, data)
+    first, second, _ = load(tmp_path).cameras
+    assert (first.fx, first.fy, first.cx) == (140, 140, 80)
+    assert (second.fx, second.fy, second.cx) == (111, 112, 70)
+
+
+def test_paths_without_suffix_and_with_backslashes(tmp_path: Path) -> None:
+    data = write_transforms(tmp_path, GLOBAL)
+    data["frames"][0]["file_path"] = "images/view_0"
+    data["frames"][1]["file_path"] = "images\\view_1.png"
+    rewrite(tmp_path, data)
+    assert len(load(tmp_path)) == 3
+
+
+def test_missing_frames_are_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_transforms(tmp_path, GLOBAL)
+    (tmp_path / "images/view_1.png").unlink()
+    (tmp_path / "images/view_2.png").write_bytes(b"")
+    with caplog.at_level(logging.WARNING, "langsplat"):
+        capture = load(tmp_path)
+    assert [camera.name for camera in capture.cameras] == ["view_0"]
+    (record,) = caplog.records
+    assert record.getMessage().startswith("2 of 3 photographs in transforms.json")
+    assert "view_1.png" in record.getMessage()
+
+
+def write_ply(path: Path, columns: dict[str, Array]) -> None:
+    rows = np.zeros(len(columns["x"]), [(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        rows[name] = column
+    PlyData([PlyElement.describe(rows, "vertex")]).write(path)
+
+
+def test_points_stay_in_the_cameras_world(tmp_path: Path) -> None:
+    """An applied_transform is already in poses and points, so it must change neither."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(50, 3)).astype(np.float32)
+    points[7, 1] = np.nan
+    colours = rng.integers(0, 256, (50, 3), dtype=np.uint8)
+    write_ply(
+        tmp_path / "cloud.ply",
+        dict(zip(("x", "y", "z", "red", "green", "blue"), [*points.T, *colours.T], strict=True)),
+    )
+    transform = [[0, 1, 0, 3], [1, 0, 0, 2], [0, 0, -1, 1]]
+    write_transforms(tmp_path, {**GLOBAL, "ply_file_path": "cloud.ply", "applied_transform": transform})
+    capture = load_capture(tmp_path / "transforms.json", DatasetConfig(max_side=160), tmp_path / "work")
+    good = np.delete(np.arange(50), 7)
+    np.testing.assert_array_equal(capture.points, points[good])
+    np.testing.assert_array_equal(capture.colours, colours[good])
+    np.testing.assert_allclose(capture.cameras[0].world_to_camera, poses(3)[0], atol=1e-9)
+
+
+def test_points_that_are_not_there_are_named_in_short(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_transforms(tmp_path, {**GLOBAL, "ply_file_path": "a" * 2000 + ".ply"})
+    with caplog.at_level(logging.WARNING, "langsplat"):
+        assert len(load(tmp_path).points) == 0
+    (said,) = (record.getMessage() for record in caplog.records if "do not exist" in record.getMessage())
+    assert "aaa" in said
+    assert len(said) < 300
+
+
+def test_colours_may_be_fractions_or_absent(tmp_path: Path) -> None:
+    write_transforms(tmp_path, {**GLOBAL, "ply_file_path": "cloud.ply"})
+    xyz = {axis: np.ones(2, np.float64) for axis in "xyz"}
+    write_ply(tmp_path / "cloud.ply", xyz | {c: np.array([0, 1], "f4") for c in ("red", "green", "blue")})
+    np.testing.assert_array_equal(load(tmp_path).colours, [[0, 0, 0], [255, 255, 255]])
+    write_ply(tmp_path / "cloud.ply", xyz)
+    np.testing.assert_array_equal(load(tmp_path).colours, np.full((2, 3), 128))
+
+
+def test_transparent_photographs_lie_over_black(tmp_path: Path) -> None:
+    intrinsics = PhotoIntrinsics(160, 120, 140.0, 140.0, 80.0, 60.0)
+    write_transforms(tmp_path, {"fl_x": 140.0}, intrinsics)
+    pixels = np.full((120, 160, 4), 200, np.uint8)
+    pixels[..., 3] = 255
+    pixels[:60, :, 3] = 0
+    pixels[60, :, 3] = 51
+    Image.fromarray(pixels).save(tmp_path / "images/view_0.png")
+    image = load(tmp_path).images[0]
+    assert (image[:60] == 0).all()
+    assert (image[60] == 40).all()
+    assert (image[61:] == 200).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"transform_matrix": [[1, 2], [3, 4]]}, "transform_matrix"),
+        ({"transform_matrix": None}, "transform_matrix"),
+        ({"transform_matrix": [["a"] * 4] * 4}, "transform_matrix"),
+        ({"transform_matrix": np.diag([2.0, 2, 2, 1]).tolist()}, "rotation"),
+        ({"transform_matrix": np.diag([1.0, 1, -1, 1]).tolist()}, "rotation"),
+        ({"transform_matrix": np.full((4, 4), np.nan).tolist()}, "transform_matrix"),
+        ({"transform_matrix": [[10**400] * 4] * 4}, "transform_matrix"),
+        ({"transform_matrix": [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0]]}, "transform_matrix"),
+        ({"fl_x": "wide"}, "fl_x"),
+        ({"fl_x": 1e-9}, "none has such a lens"),
+        ({"fl_x": 1e14}, "none has such a lens"),
+        ({"cx": 1e14}, "far outside"),
+        ({"w": 1e9, "h": 1e9}, "pixels a side"),
+        ({"fl_x": -3}, "focal"),
+        ({"fl_x": float("inf")}, "fl_x"),
+        ({"w": 0}, "pixels"),
+        ({"cx": None}, "cx"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
+        ({"k4": 0.1}, "k4"),
+        ({"file_path": 3}, "file_path"),
+    ],
+)
+def test_a_broken_frame_is_named(tmp_path: Path, change: dict[str, Any], words: str) -> None:
+    data = write_transforms(tmp_path, GLOBAL)
+    data["frames"][1].update(change)
+    rewrite(tmp_path, data)
+    with pytest.raises(FormatError, match=words) as caught:
+        load(tmp_path)
+    assert "frame 1" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_neither_focal_length_nor_angle(tmp_path: Path) -> None:
+    write_transforms(tmp_path, {})
+    with pytest.raises(FormatError, match=r"fl_x.*camera_angle_x"):
+        load(tmp_path)
+
+
+@pytest.mark.skipif(not FOX.is_dir(), reason="real data absent")
+def test_the_real_dataset_with_missing_files(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING, "langsplat"):
+        capture = load_nerfstudio(FOX / "transforms.json", 128, silent)
+    assert len(capture) == 50
+    assert "17 of 67" in caplog.text
+    assert {max(image.shape) for image in capture.images} == {128}
+    assert all(image.mean() > 30 for image in capture.images)
+
+
+def test_a_dataset_may_say_how_long_its_unit_is_and_that_it_is_drawn(tmp_path: Path) -> None:
+    data = write_transforms(tmp_path, GLOBAL)
+    assert load(tmp_path).metres_per_unit is None
+    rewrite(tmp_path, {**data, "metres_per_unit": 0.5})
+    assert load(tmp_path).metres_per_unit == 0.5
+    (tmp_path / "work").mkdir()
+    assert not load(tmp_path).drawn
+    for said in (True, "yes"):
+        rewrite(tmp_path, {**data, "drawn": said})
+        assert load(tmp_path).drawn == (said is True)
+    rewrite(tmp_path, {**data, "metres_per_unit": 0.5})
+    given = load_capture(tmp_path, DatasetConfig(metres_per_unit=2.0), tmp_path / "work")
+    assert given.metres_per_unit == 2.0
+    for wrong in (0, -1, "1 m", [1]):
+        rewrite(tmp_path, {**data, "metres_per_unit": wrong})
+        with pytest.raises(FormatError, match="metres_per_unit"):
+            load(tmp_path)
+    with pytest.raises(InputError, match=r"--dataset\.metres-per-unit 0: must be above 0"):
+        load_capture(tmp_path, DatasetConfig(metres_per_unit=0.0), tmp_path / "work")
+
+
+# Datasets that are broken, odd or meant to harm: what is sound loads, the rest is refused in one line.
+
+
+def test_what_is_no_dataset_is_told_what_is(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "scene.ply").write_bytes(b"ply")
+    (tmp_path / "photo.jpg" / "inner").mkdir(parents=True)  # a folder that is called like a photograph
+    for name in ("absent", "empty", "scene.ply", "photo.jpg", "."):
+        message = refuse(tmp_path / name, tmp_path / "work")
+        assert "transforms.json" in message
+        assert "sparse/0" in message
+        assert "three photographs" in message
+
+
+def test_half_a_colmap_model_is_no_model(tmp_path: Path) -> None:
+    (write_colmap(tmp_path) / "cameras.bin").unlink()
+    assert "2 photographs" in refuse(tmp_path, tmp_path / "work")  # taken for a plain folder of photographs
+
+
+@pytest.mark.parametrize("side", [0, -5, 3])
+def test_a_useless_size_is_refused(tmp_path: Path, side: int) -> None:
+    write_colmap(tmp_path)
+    with pytest.raises(InputError, match=r"--dataset\.max-side"):
+        load_capture(tmp_path, DatasetConfig(max_side=side), tmp_path / "work")
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_a_model_cut_anywhere_is_refused(tmp_path: Path, name: str) -> None:
+    """pycolmap reads such a model without complaint, with numbers that happened to lie in memory."""
+    folder = write_colmap(tmp_path)
+    whole = (folder / name).read_bytes()
+    for length in range(len(whole)):
+        (folder / name).write_bytes(whole[:length])
+        with pytest.raises(FormatError, match=name.replace(".", r"\.")):
+            read_model(folder)
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_a_count_of_a_million_million_is_refused(tmp_path: Path, name: str) -> None:
+    folder = write_colmap(tmp_path)
+    whole = (folder / name).read_bytes()
+    (folder / name).write_bytes(struct.pack("<Q", 10**12) + whole[8:])
+    assert name in refuse(tmp_path, tmp_path / "work")
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_changed_bytes_never_crash(tmp_path: Path, name: str) -> None:
+    folder = write_colmap(tmp_path)
+    whole = (folder / name).read_bytes()
+    rng = np.random.default_rng(0)
+    refused = 0
+    for _ in range(200):
+        data = bytearray(whole)
+        data[rng.integers(len(data))] = rng.integers(256)
+        (folder / name).write_bytes(data)
+        try:
+            read_model(folder)
+        except FormatError:
+            refused += 1
+    assert refused > 0
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("cameras.txt", "1 PINHOLE 40 30 50 50 20\n"),
+        ("cameras.txt", "1 PANORAMA 40 30 50 50 20 15\n"),
+        ("cameras.txt", "1 PINHOLE 0 30 50 50 20 15\n"),
+        ("cameras.txt", "1 PINHOLE 40 30 nan 50 20 15\n"),
+        ("cameras.txt", "1 PINHOLE 40 30 -50 50 20 15\n"),
+        ("cameras.txt", "1 PINHOLE wide 30 50 50 20 15\n"),
+        ("cameras.txt", "1\n"),
+        ("cameras.txt", "2 PINHOLE 40 30 50 50 20 15\n"),
+        ("images.txt", "1 0 0 0 0 0 0 0 1 a.png\n\n"),
+        ("images.txt", "1 1 0 0 0 nan 0 0 1 a.png\n\n"),
+        ("images.txt", "1 1 0 0 0 0 0 0 1\n\n"),
+        ("images.txt", "1 1 0 0 0 0 0 0 9 a.png\n\n"),
+        ("images.txt", f"1 1 0 0 0 0 0 0 {'9' * 400} a.png\n\n"),
+        ("cameras.txt", f"{'9' * 400} PINHOLE 40 30 50 50 20 15\n"),
+        ("points3D.txt", f"1 0 0 0 1 2 {'9' * 400} 0.5\n"),
+        ("images.txt", "\x00\x01\x02"),
+        ("points3D.txt", "1 0 0 zero 1 2 3 0.5\n"),
+        ("points3D.txt", "1 0 0 0 1 2 300 0.5\n"),
+        ("points3D.txt", "1 0 0\n"),
+    ],
+)
+def test_a_broken_line_of_a_text_model_is_refused(tmp_path: Path, name: str, text: str) -> None:
+    (write_colmap(tmp_path, "txt") / name).write_text(text)
+    message = refuse(tmp_path, tmp_path / "work")
+    assert "sparse" in message
+    assert len(message) < 400
+
+
+def test_names_that_no_file_system_holds_count_as_missing(tmp_path: Path) -> None:
+    text = (write_colmap(tmp_path, "txt") / "images.txt").read_text()
+    (tmp_path / "sparse/0/images.txt").write_text(text.replace("a.png", "a" * 5000 + ".png"))
+    assert len(load_capture(tmp_path, CONFIG, tmp_path / "work")) == 1
+
+
+def test_an_image_listed_twice_counts_once(tmp_path: Path) -> None:
+    text = (write_colmap(tmp_path, "txt") / "images.txt").read_text()
+    (tmp_path / "sparse/0/images.txt").write_text(text.replace("a.png", "b.png"))
+    capture = load_capture(tmp_path, CONFIG, tmp_path / "work")
+    assert [camera.name for camera in capture.cameras] == ["b"]
+
+
+def test_names_with_spaces_and_accents(tmp_path: Path) -> None:
+    text = (write_colmap(tmp_path, "txt") / "images.txt").read_text()
+    (tmp_path / "images/a.png").rename(tmp_path / "images/mon été 1.png")
+    (tmp_path / "sparse/0/images.txt").write_text(text.replace("a.png", "mon été 1.png"), encoding="utf-8")
+    capture = load_capture(tmp_path, CONFIG, tmp_path / "work")
+    assert [camera.name for camera in capture.cameras] == ["b", "mon été 1"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{",
+        b"\xff\xfe\x00\x80",
+        b"[]",
+        b"null",
+        b"{}",
+        b'{"frames": []}',
+        b'{"frames": {}}',
+        b'{"frames": [3]}',
+        b'{"frames": [{}]}',
+        b'{"frames": ' + b"[" * 100_000,
+        b'{"frames": [{"file_path": "", "transform_matrix": []}]}',
+        b'{"frames": [{"file_path": "/", "transform_matrix": []}]}',
+        b'{"frames": [{"file_path": "a\\u0000b", "transform_matrix": []}]}',
+        b'{"fl_x": 1' + b"0" * 5000 + b', "frames": [{"file_path": "a.png"}]}',
+        b'{"fl_x": 1' + b"0" * 400 + b', "frames": [{"file_path": "a.png"}]}',
+    ],
+)
+def test_a_broken_json_is_refused(tmp_path: Path, content: bytes) -> None:
+    write_picture(tmp_path / "a.png")
+    (tmp_path / "transforms.json").write_bytes(content)
+    assert "transforms.json" in refuse(tmp_path, tmp_path / "work")
+
+
+AXES = b"property float x\nproperty float y\nproperty float z\n"
+PLY = b"ply\nformat %s 1.0\nelement vertex %d\n" + AXES + b"end_header\n"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"not a ply",
+        PLY % (b"binary_little_endian", 10**12) + bytes(24),
+        PLY % (b"binary_little_endian", 3) + bytes(35),
+        PLY % (b"ascii", 2) + b"1 2 3\n",
+        PLY % (b"ascii", 2) + b"1 2 3\n1 two 3\n",
+        PLY % (b"ascii", 10**12) + b"1 2 3\n",
+        b"ply\nformat ascii 1.0\nelement face 0\nproperty float x\nend_header\n",
+        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
+        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar float x\n"
+        b"property float y\nproperty float z\nend_header\n1 5 2 3\n",
+        (PLY % (b"ascii", 1)).replace(b"vertex 1", b"vertex -4"),
+    ],
+)
+def test_a_broken_cloud_is_refused(tmp_path: Path, content: bytes) -> None:
+    write_nerfstudio(tmp_path, ply_file_path="cloud.ply")
+    (tmp_path / "cloud.ply").write_bytes(content)
+    assert "cloud.ply" in refuse(tmp_path, tmp_path / "work")
+
+
+@pytest.mark.parametrize("name", [None, 3, "", "absent.ply", "."])
+def test_a_cloud_that_is_not_there_is_done_without(tmp_path: Path, name: object) -> None:
+    write_nerfstudio(tmp_path, ply_file_path=name)
+    capture = load_capture(tmp_path, CONFIG, tmp_path / "work")
+    assert len(capture.points) > 100  # random ones: a single view triangulates nothing

@@ -1,0 +1,509 @@
+"""CLIP through the real loading path, with a tiny model made here."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tokenizers import Tokenizer
+from transformers import (
+    CLIPModel,
+    CLIPTokenizer,
+    CLIPTokenizerFast,
+    PreTrainedTokenizerFast,
+    Siglip2Tokenizer,
+    SiglipModel,
+)
+
+from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.scene import Calibration, Odds, Reading
+from langsplat_core.semantics.clip_plain import (
+    BYTES,
+    PlainClipText,
+    TextConfig,
+    plain_text_tower,
+    read_pair_tokenizer,
+)
+from langsplat_core.semantics.encoders import (
+    CLIP_MEAN,
+    CLIP_STD,
+    ClipText,
+    clip_text,
+    load_encoder,
+    load_text_encoder,
+)
+from langsplat_core.semantics.weights import Weights
+from tests.support.tiny_clip import SIDE, WORDS, tiny_clip
+from tests.support.tiny_siglip import LENGTH, SCALE, tiny_siglip
+
+pytestmark = pytest.mark.long
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("clip")
+    tiny_clip(folder)
+    return folder
+
+
+def crops(count: int) -> np.ndarray:
+    return np.random.default_rng(1).integers(0, 256, (count, SIDE, SIDE, 3), dtype=np.uint8)
+
+
+def test_images_agree_with_the_whole_model(folder: Path) -> None:
+    pictures = crops(5)
+    encoder = load_encoder(str(folder), "cpu", batch=2)
+    got = encoder.encode_images(pictures)
+    assert (encoder.dim, encoder.image_size, encoder.id) == (24, SIDE, str(folder))
+    model = CLIPModel.from_pretrained(folder).eval()
+    pixels = (pictures / 255 - np.array(CLIP_MEAN)) / np.array(CLIP_STD)
+    inputs = torch.from_numpy(pixels.transpose(0, 3, 1, 2).astype(np.float32))
+    with torch.no_grad():
+        want = model.visual_projection(model.vision_model(inputs).pooler_output).numpy()
+    want /= np.linalg.norm(want, axis=1, keepdims=True)
+    assert got.dtype == np.float32
+    np.testing.assert_allclose(got, want, atol=2e-6)  # float32, batches of another size
+
+
+def test_texts_agree_with_the_whole_model_one_at_a_time(folder: Path) -> None:
+    phrases = ["red mug", "handle", "green mug"]
+    got = load_text_encoder(str(folder)).encode_texts(phrases)
+    np.testing.assert_array_equal(got, load_encoder(str(folder), "cpu").encode_texts(phrases))
+    model = CLIPModel.from_pretrained(folder).eval()
+    tokenizer = CLIPTokenizer.from_pretrained(folder)
+    for phrase, vector in zip(phrases, got, strict=True):  # alone, so without any padding
+        tokens = tokenizer([phrase], truncation=True, max_length=12, return_tensors="pt").input_ids
+        with torch.no_grad():
+            want = model.text_projection(model.text_model(input_ids=tokens).pooler_output).numpy()[0]
+        np.testing.assert_allclose(vector, want / np.linalg.norm(want), atol=2e-6)
+
+
+def test_the_folder_may_state_its_own_normalisation(tmp_path: Path) -> None:
+    tiny_clip(tmp_path)
+    before = load_encoder(str(tmp_path), "cpu").encode_images(crops(1))
+    settings = '{"image_mean": [0.5, 0.5, 0.5], "image_std": [0.5, 0.5, 0.5]}'
+    (tmp_path / "preprocessor_config.json").write_text(settings, encoding="utf-8")
+    assert abs(load_encoder(str(tmp_path), "cpu").encode_images(crops(1)) - before).max() > 1e-4
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"image_mean": [0.5]}', '{"image_std": [0, 0, 0]}'])
+def test_a_broken_normalisation_is_one_line(tmp_path: Path, text: str) -> None:
+    tiny_clip(tmp_path)
+    (tmp_path / "preprocessor_config.json").write_text(text, encoding="utf-8")
+    with pytest.raises(EncoderError, match=r"preprocessor_config\.json") as error:
+        load_encoder(str(tmp_path), "cpu")
+    assert "\n" not in str(error.value)
+
+
+def test_pickled_weights_give_the_same_vectors(tmp_path: Path) -> None:
+    state = tiny_clip(tmp_path).state_dict()
+    before = load_encoder(str(tmp_path), "cpu").encode_images(crops(1))
+    (tmp_path / "model.safetensors").unlink()
+    torch.save(state, tmp_path / "pytorch_model.bin")
+    after = load_encoder(str(tmp_path), "cpu").encode_images(crops(1))
+    # equal weights at other addresses: torch may add up in another order
+    np.testing.assert_allclose(after, before, rtol=0, atol=2e-7)
+
+
+@pytest.mark.parametrize("phrase", ["", "   ", "?!"])
+def test_an_empty_phrase_is_an_input_error(folder: Path, phrase: str) -> None:
+    with pytest.raises(InputError, match="type a word"):
+        load_text_encoder(str(folder)).encode_texts([phrase])
+
+
+def test_a_vocabulary_makes_words_unknown(tmp_path: Path) -> None:
+    tiny_clip(tmp_path)
+    assert load_text_encoder(str(tmp_path)).unknown_words("ardent mule") == ()
+    (tmp_path / "vocabulary.txt").write_text("\n".join(WORDS), encoding="utf-8")
+    encoder = load_text_encoder(str(tmp_path))
+    assert encoder.unknown_words("Red, APPLE handl") == ("handl",)
+    assert encoder.encode_texts(["Red  mug"]).shape == (1, 24)
+    with pytest.raises(
+        EncoderError,
+        match=r"'handl' \(did you mean 'handle'\?\); .* 7 words, such as apple, .*--clip\.model laion/",
+    ) as error:
+        encoder.encode_texts(["handl"])
+    assert "\n" not in str(error.value)
+
+
+def test_absent_weights_say_what_to_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    with pytest.raises(EncoderError, match=r"no such folder; pass `--clip\.model FOLDER`"):
+        load_encoder("./nowhere")
+    with pytest.raises(EncoderError, match=r"no config\.json with model\.safetensors"):
+        load_encoder(str(tmp_path))
+    with pytest.raises(
+        EncoderError, match=r"HF_HUB_OFFLINE is set.*`hf download nobody/nothing-here`"
+    ) as error:
+        load_encoder("nobody/nothing-here")
+    assert "\n" not in str(error.value)
+
+
+def test_weights_of_another_model_are_refused(tmp_path: Path) -> None:
+    tiny_clip(tmp_path)
+    config = tmp_path / "config.json"
+    text = config.read_text(encoding="utf-8")
+    config.write_text(text.replace('"intermediate_size": 48', '"intermediate_size": 40'), encoding="utf-8")
+    with pytest.raises(EncoderError, match="6 do not fit, such as"):
+        load_encoder(str(tmp_path), "cpu")
+    config.write_text(text.replace('"num_hidden_layers": 2', '"num_hidden_layers": 3'), encoding="utf-8")
+    with pytest.raises(EncoderError, match="16 do not fit, such as"):  # else they would be random
+        load_encoder(str(tmp_path), "cpu")
+
+
+def test_how_an_encoder_is_read_lies_beside_its_weights(tmp_path):
+    tiny_clip(tmp_path)
+    odds = {"constant": -1, "whole": 18.5, "finer": 2.5, "found": 0.7}
+    stated = {"thing": odds, "part": {"constant": 0, "whole": 0, "finer": 9}, "inside": odds}
+    (tmp_path / "reading.json").write_text("{}")
+    assert load_text_encoder(str(tmp_path)).reading == Reading(10.0, 0.6)
+    (tmp_path / "reading.json").write_text(json.dumps({"calibration": stated}))
+    want = Reading(10.0, 0.6, Calibration(Odds(-1, 18.5, 2.5, 0.7), Odds(0, 0, 9), Odds(-1, 18.5, 2.5, 0.7)))
+    assert load_text_encoder(str(tmp_path)).reading == want
+    assert load_encoder(str(tmp_path), "cpu").reading == want
+    odds.pop("found")
+    (tmp_path / "reading.json").write_text(json.dumps({"found": 0.8, "calibration": stated}))
+    reading = load_text_encoder(str(tmp_path)).reading
+    assert reading == Reading(10.0, 0.8, Calibration(Odds(-1, 18.5, 2.5), Odds(0, 0, 9), Odds(-1, 18.5, 2.5)))
+
+
+ODDS = '{"constant": 0, "whole": 1, "finer": 0}'
+BROKEN_READINGS = (
+    *('{"found": 2}', '{"found": null}', '{"found": 1' + "0" * 400 + "}", "[", "[]", "3", "", '"found"'),
+    *('{"calibration": null}', '{"calibration": {}}', '{"verdict": {}}'),
+    f'{{"calibration": {{"thing": {ODDS}, "part": {ODDS}}}}}',
+    f'{{"calibration": {{"thing": {ODDS}, "part": {ODDS}, "inside": {ODDS}, "other": {ODDS}}}}}',
+    *(
+        f'{{"calibration": {{"thing": {ODDS}, "part": {{"constant": 0, {broken}}}, "inside": {ODDS}}}}}'
+        for broken in (
+            '"whole": 1',
+            '"whole": 1, "finer": 0, "part": 2',
+            '"whole": NaN, "finer": 0',
+            '"whole": "1", "finer": 0',
+            '"whole": -1, "finer": 0.5',
+            '"whole": 1, "finer": 0, "found": 0.4',
+            '"whole": 1' + "0" * 400 + ', "finer": 0',
+        )
+    ),
+)
+
+
+@pytest.mark.parametrize("broken", BROKEN_READINGS)
+def test_a_broken_reading_is_one_line(tmp_path, broken):
+    tiny_clip(tmp_path)
+    (tmp_path / "reading.json").write_text(broken)
+    with pytest.raises(EncoderError, match=r"reading\.json is not") as caught:
+        load_text_encoder(str(tmp_path))
+    assert "\n" not in str(caught.value)
+
+
+# SigLIP and SigLIP 2 through the real loading path, with tiny models made here.
+
+Maker = Callable[[Path], Any]
+MAKERS: dict[str, Maker] = {
+    "siglip": tiny_siglip,
+    "siglip2": lambda folder: tiny_siglip(folder, second=True),
+}
+
+
+@pytest.fixture(scope="module", params=sorted(MAKERS))
+def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
+    folder = tmp_path_factory.mktemp("made") / request.param
+    folder.mkdir()
+    return folder, MAKERS[request.param](folder)
+
+
+def unit_tensor(tensor: torch.Tensor) -> np.ndarray:
+    rows = tensor.detach().numpy()
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def padded_ids(tokenizer: Any, phrases: list[str]) -> torch.Tensor:
+    """As the model's own pages say: padding="max_length", and no attention mask."""
+    found = tokenizer(phrases, padding="max_length", max_length=LENGTH, truncation=True, return_tensors="pt")
+    return found.input_ids
+
+
+def test_texts_agree_with_the_whole_model(tmp_path: Path) -> None:
+    model = tiny_siglip(tmp_path)
+    phrases = ["red mug", "red", "a red mug with a very long handle"]
+    tokenizer = PreTrainedTokenizerFast(
+        tokenizer_file=str(tmp_path / "tokenizer.json"), pad_token="</s>", eos_token="</s>"
+    )
+    ids = padded_ids(tokenizer, phrases)
+    assert ids.shape == (3, LENGTH)
+    assert ids[0].tolist() == [4, 5] + [1] * (LENGTH - 2)  # end and padding are one token
+    want = unit_tensor(model.get_text_features(input_ids=ids).pooler_output)
+    got = load_text_encoder(str(tmp_path)).encode_texts(phrases)
+    assert got.dtype == np.float32
+    np.testing.assert_allclose(got, want, atol=2e-6)
+    one_by_one = np.concatenate([load_text_encoder(str(tmp_path)).encode_texts([p]) for p in phrases])
+    np.testing.assert_allclose(got, one_by_one, atol=2e-6)  # a phrase does not depend on its neighbours
+
+
+def test_texts_of_the_second_generation_agree_with_transformers(tmp_path: Path) -> None:
+    model = MAKERS["siglip2"](tmp_path)
+    phrases = ["Red mug", "red", "a red mug, with a very long handle"]
+    ids = padded_ids(Siglip2Tokenizer.from_pretrained(tmp_path), phrases)
+    assert ids[1].tolist()[1:] == [1] + [0] * (LENGTH - 2)  # an end, then padding to the right
+    want = unit_tensor(model.get_text_features(input_ids=ids).pooler_output)
+    got = load_text_encoder(str(tmp_path)).encode_texts(phrases)
+    np.testing.assert_allclose(got, want, atol=2e-6)
+
+
+def test_case_does_not_matter_and_punctuation_only_to_the_second(made: tuple[Path, Any]) -> None:
+    encoder = load_text_encoder(str(made[0]))
+    small, large, dotted = encoder.encode_texts(["red mug", "RED Mug", "red mug!"])
+    np.testing.assert_allclose(small, large, atol=1e-6)
+    assert np.allclose(small, dotted, atol=1e-6) == (made[0].name == "siglip")
+
+
+def test_images_agree_with_the_whole_siglip(tmp_path: Path) -> None:
+    model, pictures = tiny_siglip(tmp_path), crops(5)
+    encoder = load_encoder(str(tmp_path), "cpu", batch=2)
+    assert (encoder.dim, encoder.image_size, encoder.id) == (32, SIDE, str(tmp_path))
+    pixels = torch.from_numpy((pictures / 127.5 - 1).transpose(0, 3, 1, 2).astype(np.float32))
+    want = unit_tensor(model.get_image_features(pixel_values=pixels).pooler_output)
+    np.testing.assert_allclose(encoder.encode_images(pictures), want, atol=2e-6)
+
+
+def test_the_temperature_is_a_tenth_of_the_learned_scale(made: tuple[Path, Any]) -> None:
+    for load in (load_encoder, load_text_encoder):
+        assert load(str(made[0]), "cpu").temperature == pytest.approx(SCALE / 10)
+
+
+def remove_tokenizer(folder: Path) -> None:
+    (folder / "tokenizer.json").unlink()
+
+
+def damage_tokenizer(folder: Path) -> None:
+    (folder / "tokenizer.json").write_text('{"version": "1.0"}', encoding="utf-8")
+
+
+def remove_special_tokens(folder: Path) -> None:
+    path = folder / "tokenizer.json"
+    path.write_text(path.read_text(encoding="utf-8").replace("</s>", "<o>"), encoding="utf-8")
+
+
+def remove_logit_scale(folder: Path) -> None:
+    model = SiglipModel.from_pretrained(folder)
+    state = {name: value for name, value in model.state_dict().items() if name != "logit_scale"}
+    (folder / "model.safetensors").unlink()
+    torch.save(state, folder / "pytorch_model.bin")
+
+
+def another_model(folder: Path) -> None:
+    change_config(folder, lambda config: config.update(model_type="bert"))
+
+
+def no_json(folder: Path) -> None:
+    (folder / "config.json").write_text("{", encoding="utf-8")
+
+
+def change_config(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    path = folder / "config.json"
+    config = json.loads(path.read_text(encoding="utf-8"))
+    change(config)
+    path.write_text(json.dumps(config), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (remove_tokenizer, r"no tokenizer\.json in this folder"),
+        (damage_tokenizer, r"tokenizer\.json is no tokenizer"),
+        (remove_special_tokens, "no eos_token"),
+        (remove_logit_scale, "logit_scale is not in them"),
+        (another_model, "'bert' model is no image-text encoder known here; known are clip, siglip"),
+        (no_json, r"config\.json cannot be read"),
+    ],
+)
+def test_a_broken_folder_is_one_line(tmp_path: Path, damage: Callable[[Path], None], message: str) -> None:
+    tiny_siglip(tmp_path)
+    damage(tmp_path)
+    with pytest.raises(EncoderError, match=message) as error:
+        load_text_encoder(str(tmp_path))
+    assert "\n" not in str(error.value)
+
+
+# The text half of a small CLIP in NumPy, against transformers' in float64.
+
+DEMO = Path(str(files("langsplat_assets"))) / "demo_encoder"
+PHRASES = ["red mug", "handle", "a", "the handle of a red mug things"]
+CLOSE = 1e-5  # of unit vectors
+
+
+def unit_rows(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def by_transformers(folder: Path, phrases: list[str]) -> np.ndarray:
+    """(M, D) float64 unit vectors, one phrase at a time and so without padding."""
+    model = CLIPModel.from_pretrained(folder, dtype=torch.float64).eval()
+    tokenizer = CLIPTokenizerFast.from_pretrained(folder)
+    with torch.inference_mode():
+        ids = [torch.tensor([tokenizer(phrase).input_ids]) for phrase in phrases]
+        rows = [model.text_projection(model.text_model(input_ids=row).pooler_output)[0] for row in ids]
+    return unit_rows(torch.stack(rows).numpy())
+
+
+def taught(folder: Path) -> list[str]:
+    return (folder / "vocabulary.txt").read_text(encoding="utf-8").split()
+
+
+def test_the_bundled_encoder_says_the_same_of_every_word_it_knows(measured) -> None:
+    words = taught(DEMO)
+    phrases = [*words, *(f"{a} {b}" for a, b in zip(words, words[7:], strict=False)), "handle of the red mug"]
+    tower = clip_text(Weights("demo", DEMO, "cpu"))
+    assert isinstance(tower, PlainClipText)
+    got, want = unit_rows(tower.encode(phrases)), by_transformers(DEMO, phrases)
+    assert got.dtype == np.float32
+    error = np.abs(got - want).max()
+    measured("demo text vectors", "largest error", float(error))
+    assert error < CLOSE
+
+
+@pytest.mark.parametrize("activation", ["quick_gelu", "gelu"])
+@pytest.mark.parametrize("half", [False, True])
+def test_a_random_one_agrees_with_float64(tmp_path: Path, activation: str, half: bool) -> None:
+    tiny_clip(tmp_path, half)
+    change_config(tmp_path, lambda config: config["text_config"].update(hidden_act=activation))
+    tower = clip_text(Weights("tiny", tmp_path, "cpu"))
+    assert isinstance(tower, PlainClipText)
+    phrases = ["red mug", "a", "handle"]
+    np.testing.assert_allclose(
+        unit_rows(tower.encode(phrases)), by_transformers(tmp_path, phrases), atol=CLOSE
+    )
+    by_torch = ClipText(Weights("tiny", tmp_path, "cpu"))
+    np.testing.assert_allclose(tower.encode(phrases), by_torch.encode(phrases), rtol=1e-4, atol=CLOSE)
+    assert tower.dim == by_torch.dim == 24
+
+
+def test_an_end_token_numbered_as_of_old(tmp_path: Path) -> None:
+    """OpenAI's and OpenCLIP's configurations say 2, and mean the token with the highest number."""
+    tiny_clip(tmp_path)
+    path = tmp_path / "tokenizer.json"
+    path.write_text(path.read_text(encoding="utf-8"), encoding="utf-8")
+    change_config(tmp_path, lambda config: config["text_config"].update(eos_token_id=2))
+    assert plain_text_tower(Weights("tiny", tmp_path, "cpu")) is None  # whose end token is the second
+
+
+def text_setting(**settings: object) -> Callable[[Path], None]:
+    return lambda folder: change_config(folder, lambda config: config["text_config"].update(settings))
+
+
+NOT_PLAIN: dict[str, Callable[[Path], object]] = {
+    "no tokenizer": lambda folder: (folder / "tokenizer.json").unlink(),
+    "another activation": text_setting(hidden_act="relu"),
+    "more layers": text_setting(num_hidden_layers=3),
+    "narrower": text_setting(intermediate_size=40),
+    "no heads": text_setting(num_attention_heads=0),
+    "cut weights": lambda folder: os.truncate(folder / "model.safetensors", 2000),
+    "broken configuration": lambda folder: (folder / "config.json").write_text("[]"),
+}
+
+
+@pytest.mark.parametrize("case", NOT_PLAIN)
+def test_what_is_not_computed_here_is_left_to_torch(tmp_path: Path, case: str) -> None:
+    tiny_clip(tmp_path)
+    weights = Weights("tiny", tmp_path, "cpu")
+    assert plain_text_tower(weights) is not None
+    NOT_PLAIN[case](tmp_path)
+    assert plain_text_tower(weights) is None
+
+
+def test_large_models_and_other_devices_are_left_to_torch(tmp_path: Path) -> None:
+    tiny_clip(tmp_path)
+    count = sum(int(np.prod(shape)) for shape in TextConfig().shapes().values())
+    assert count == 63_428_096  # the text half of ViT-B/16
+    assert plain_text_tower(Weights("tiny", tmp_path, "cpu"), most=1_000) is None
+    assert plain_text_tower(Weights("tiny", tmp_path, "cuda")) is None
+
+
+@pytest.mark.parametrize("plain", [True, False])
+def test_no_phrase_loses_words_in_silence(tmp_path: Path, plain: bool) -> None:
+    """The tokenizer's token for what it cannot read is the one that ends a phrase."""
+    tiny_clip(tmp_path)
+    weights = Weights("tiny", tmp_path, "cpu")
+    tower = clip_text(weights) if plain else ClipText(weights)
+    assert isinstance(tower, PlainClipText) == plain
+    for phrase in ("red-mug", '"red"', "mug ☕ mug", "red <|endoftext|> mug"):
+        with pytest.raises(EncoderError, match="marks that this encoder cannot read"):
+            tower.encode(["red", phrase])
+    with pytest.raises(InputError, match="is too long: 42 tokens; this encoder reads 38"):
+        tower.encode(["handle " * 7])
+    assert tower.encode(["handle mugs"]).shape == (1, 24)
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [
+        ('"red mug"', "red mug"),
+        ("red-mug!", "red mug"),
+        ("lamp-shade", "lamp shade"),
+        ("duck/penguin", "duck penguin"),
+        ("the mug's handle", "the mug handle"),
+        ("red <mug>", "red mug"),
+    ],
+)
+def test_the_bundled_encoder_is_asked_words_alone(written: str, meant: str) -> None:
+    encoder = load_text_encoder("demo")
+    np.testing.assert_array_equal(encoder.encode_texts([written]), encoder.encode_texts([meant]))
+    assert encoder.unknown_words("penguni's") == ("penguni's",)
+    assert encoder.near_words("penguni")[0] == "penguin"
+
+
+def spelled_bytes(path: Path) -> Tokenizer:
+    """The bundled tokenizer with a vocabulary that has every byte, within a word and at its end, and a few
+    merges; written to `path`."""
+    stated = json.loads((DEMO / "tokenizer.json").read_text(encoding="utf-8"))
+    tokens = ["<|startoftext|>", "<|endoftext|>", *(byte + end for end in ("", "</w>") for byte in BYTES)]
+    merges = [["a", "b"], ["ab", "ab"], ["a", "a"], ["'", "'"], ["Ã", "Ł"], ["0", "1</w>"], ["b", "a</w>"]]
+    tokens += ["".join(pair) for pair in merges]
+    stated["model"] |= {"vocab": {token: i for i, token in enumerate(tokens)}, "merges": merges}
+    path.write_text(json.dumps(stated), encoding="utf-8")
+    return Tokenizer.from_file(str(path))
+
+
+def test_phrases_are_read_as_tokenizers_reads_them(tmp_path: Path) -> None:
+    theirs = spelled_bytes(tmp_path / "tokenizer.json")
+    ours = read_pair_tokenizer(tmp_path / "tokenizer.json")
+    assert ours is not None
+    # Letters as old as any table of Unicode: the two libraries have tables of different years.
+    likely = st.sampled_from("aaabb01' -_.sÀßΣσİé\u0301²½Ⅷ漢ﬁ\t\n")
+
+    @given(st.text(likely | st.characters(max_codepoint=0x2FF)))
+    def check(phrase: str) -> None:
+        assert ours.encode(phrase) == theirs.encode(phrase, add_special_tokens=False).ids
+
+    check()
+    assert ours.encode("red <|endoftext|>")[-1] == ours.end
+
+
+@pytest.mark.parametrize("place", ["normalizer", "pre_tokenizer", "post_processor"])
+def test_a_tokenizer_of_other_rules_is_not_read(tmp_path: Path, place: str) -> None:
+    path = tmp_path / "tokenizer.json"
+    spelled_bytes(path)
+    stated = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps(stated | {place: {"type": "Sequence"}}), encoding="utf-8")
+    assert read_pair_tokenizer(path) is None
+
+
+def test_neither_torch_nor_transformers_is_imported() -> None:
+    code = (
+        "import sys; from langsplat_core import load_text_encoder;"
+        "assert load_text_encoder('demo').encode_texts(['red mug']).shape == (1, 512);"
+        "heavy = ('torch', 'transformers', 'tokenizers', 'huggingface_hub', 'scipy');"
+        "print([m for m in heavy if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
