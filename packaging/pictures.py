@@ -11,9 +11,9 @@ from imgui_bundle import hello_imgui, imgui  # isort: skip  (before glfw)
 from imgui_bundle.immapp import testing  # isort: skip
 
 from langsplat_core.io.hostile import opened
-from langsplat_viewer import actions
-from langsplat_viewer.drawing.frame import FrameRenderer
+from langsplat_viewer.actions import filming, selecting, settings, training, viewpoint
 from langsplat_viewer.options import scene_path, services
+from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.window import Window, WindowRequest
 
@@ -37,11 +37,11 @@ QUERIES = ("teddy bear", "blue gift", "hamburger")
 
 
 def _found(ctx: Any, window: Window) -> None:
-    actions.toggle_overlay(window.viewer, "things")
+    settings.toggle_overlay(window.viewer, "things")
 
 
 def _under_the_cursor(ctx: Any, window: Window) -> None:
-    actions.toggle_pointing(window.viewer)
+    viewpoint.toggle_pointing(window.viewer)
     ctx.mouse_teleport_to_pos((480, 430))
     for _ in range(FRAMES):
         ctx.yield_()
@@ -52,79 +52,79 @@ def _under_the_cursor(ctx: Any, window: Window) -> None:
 
 def _selected(ctx: Any, window: Window) -> None:
     viewer = window.viewer
-    actions.open_panel(viewer, "Select")
-    actions.select_query(viewer)
-    actions.set_display(viewer, "rgb")
+    settings.open_panel(viewer, "Select")
+    selecting.select_query(viewer)
+    settings.set_display(viewer, "rgb")
 
 
 def _side_by_side(ctx: Any, window: Window) -> None:
     viewer = window.viewer
-    actions.open_panel(viewer, "Record")
-    actions.compare_with(viewer, "latent", 2)
-    actions.toggle_overlay(viewer, "cube")
-    actions.toggle_overlay(viewer, "grid")
+    settings.open_panel(viewer, "Record")
+    settings.compare_with(viewer, "latent", 2)
+    settings.toggle_overlay(viewer, "cube")
+    settings.toggle_overlay(viewer, "grid")
 
 
 def _palette(ctx: Any, window: Window) -> None:
-    actions.show_palette(window.viewer, True)
-    actions.type_command(window.viewer, "sel")
+    settings.show_palette(window.viewer, True)
+    settings.type_command(window.viewer, "sel")
 
 
 def _with_structure(ctx: Any, window: Window) -> None:
-    actions.toggle_overlay(window.viewer, "things")
+    settings.toggle_overlay(window.viewer, "things")
 
 
 def _light(ctx: Any, window: Window) -> None:
     viewer = window.viewer
-    actions.set_theme(viewer, "light")
-    actions.set_colour_map(viewer, "cividis")
+    settings.set_theme(viewer, "light")
+    settings.set_colour_map(viewer, "cividis")
 
 
 def _three_levels(ctx: Any, window: Window) -> None:
-    actions.set_display(window.viewer, "latent")
-    actions.toggle_levels(window.viewer)
+    settings.set_display(window.viewer, "latent")
+    settings.toggle_levels(window.viewer)
 
 
 def _overlays(ctx: Any, window: Window) -> None:
     viewer = window.viewer
-    actions.open_panel(viewer, "Overlays")
+    settings.open_panel(viewer, "Overlays")
     for overlay in ("cameras", "cube", "grid"):
-        actions.show_overlay(viewer, overlay, True)
-    actions.set_display(viewer, "rgb")
-    actions.step_camera(viewer, 6)
-    actions.zoom_by(viewer, 2.2)
-    actions.measure(viewer, True)
+        settings.show_overlay(viewer, overlay, True)
+    settings.set_display(viewer, "rgb")
+    viewpoint.step_camera(viewer, 6)
+    viewpoint.zoom_by(viewer, 2.2)
+    settings.measure(viewer, True)
     ctx.yield_(30)
     for place in ((0.35, 0.55), (0.6, 0.62)):
-        actions.measure_at(viewer, *place)
+        settings.measure_at(viewer, *place)
         ctx.yield_(10)
 
 
 def _orthographic(ctx: Any, window: Window) -> None:
     viewer = window.viewer
-    actions.set_display(viewer, "rgb")
-    actions.toggle_orthographic(viewer)
-    actions.look_from(viewer, "top")
+    settings.set_display(viewer, "rgb")
+    viewpoint.toggle_orthographic(viewer)
+    viewpoint.look_from(viewer, "top")
     _settled(ctx, window)
-    actions.zoom_by(viewer, 1.6)
-    actions.show_overlay(viewer, "cube", True)
-    actions.show_overlay(viewer, "grid", True)
+    viewpoint.zoom_by(viewer, 1.6)
+    settings.show_overlay(viewer, "cube", True)
+    settings.show_overlay(viewer, "grid", True)
     _settled(ctx, window)
 
 
 def _film(ctx: Any, window: Window) -> None:
     viewer = window.viewer
-    actions.open_panel(viewer, "Record")
+    settings.open_panel(viewer, "Record")
     for _ in range(4):
-        actions.step_camera(viewer, 2)
+        viewpoint.step_camera(viewer, 2)
         _settled(ctx, window)
-        actions.add_keyframe(viewer)
-    actions.scrub(viewer, 2.5)
+        filming.add_keyframe(viewer)
+    viewpoint.scrub(viewer, 2.5)
 
 
 def _timed(ctx: Any, window: Window) -> None:
     viewer = window.viewer
-    actions.open_panel(viewer, "Timing")
+    settings.open_panel(viewer, "Timing")
     ctx.yield_(30)
     ctx.item_click("//Timing/Compare with the reference")  # what draws must run where the window does
     ctx.mouse_teleport_to_pos((900, 600))
@@ -137,12 +137,12 @@ def _trained(ctx: Any, window: Window) -> None:
     viewer, folder = window.viewer, Path(tempfile.mkdtemp())
     room = ["demo", "dataset", "--seed", "3", "--views", "12", "--out", str(folder / "room")]
     subprocess.run([sys.executable, "-m", "langsplat_core", *room], check=True)
-    actions.open_panel(viewer, "Train")
-    actions.fill_in(viewer, TrainingForm(str(folder / "room"), str(folder / "room.ply"), "quick"))
-    actions.start_training(viewer)
-    training = viewer.training
-    assert training is not None
-    while training.exit_code is None and len(training.progress.losses) < 120:
+    settings.open_panel(viewer, "Train")
+    training.fill_in(viewer, TrainingForm(str(folder / "room"), str(folder / "room.ply"), "quick"))
+    training.start_training(viewer)
+    process = viewer.training
+    assert process is not None
+    while process.exit_code is None and len(process.progress.losses) < 120:
         ctx.yield_()
 
 
@@ -176,7 +176,7 @@ def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
     request = WindowRequest(
         scene_path(None), queries=queries, display="relevancy", size=(1280, 800), camera=CAMERA
     )
-    window = Window(request, services(""), FrameRenderer)
+    window = Window(request, services(""), GlRenderer)
     window.idles = False
     whole = path.with_suffix(".whole.png")
 

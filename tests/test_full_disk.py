@@ -27,7 +27,7 @@ from langsplat_core.scene import Scene
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from langsplat_core.training.radiance.state import save_checkpoint
 from langsplat_viewer.files.browsing import QuerySet, SavedQuery, write_queries
-from langsplat_viewer.files.flight_files import Bookmark, Shelf, write_flight
+from langsplat_viewer.files.flights import Bookmark, Shelf, write_flight
 from langsplat_viewer.files.preferences import Preferences, save_preferences
 from langsplat_viewer.output.film import Film, write_film
 from langsplat_viewer.output.saving import save_png

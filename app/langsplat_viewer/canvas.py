@@ -1,237 +1,225 @@
-"""The pictures of the scene as textures, drawn again only when something it depends on has changed.
+"""The image of the scene as textures, drawn again only when its render request has changed.
 
-Needs a GL context but no window. While the camera moves on a slow machine the picture is drawn at a
-fraction of the window's resolution, of a large scene from merged Gaussians; as soon as it rests, once more
-with everything, which another thread rasterizes where that takes long.
+Needs a GL context but no window. It is in one of three phases:
+
+- "moving": the camera moved a moment ago. On a slow machine the image has fewer pixels, and of a large scene
+  merged Gaussians.
+- "settling": the camera rests and the image is not yet the one that is wanted. Where that takes long another
+  thread rasterizes it, and merged Gaussians stand in.
+- "still": the image is the one that is wanted. Nothing is done.
 """
 
 import time
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass, replace
+from typing import Generic, Literal, TypeVar
 
 import moderngl
-import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import BackendError
-from langsplat_core.progress import watched
-from langsplat_core.scene import Camera
-from langsplat_core.scene.gaussians import Merged
-from langsplat_viewer import actions, staging
+from langsplat_core.progress import Progress, watched
+from langsplat_core.scene import Gaussians
+from langsplat_core.scene.gaussians import Merged, merged
+from langsplat_viewer.actions import selecting, undoing, viewpoint
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.commands import with_key
-from langsplat_viewer.drawing.channels import UNCLIPPED, Layers, why_nothing, why_undrawable
-from langsplat_viewer.drawing.renderer import FINE, Level, Pace, Rasterized, Renderer
-from langsplat_viewer.keys import Changed
-from langsplat_viewer.staging import (
-    Background,
-    Depiction,
-    MarkedScene,
-    Merger,
-    Stage,
-    depiction,
-    marked_scene,
-)
+from langsplat_viewer.jobs import Worker
+from langsplat_viewer.rendering.depth import UNCLIPPED, why_nothing, why_undrawable
+from langsplat_viewer.rendering.renderer import GlRenderer, Rasterized, Rasterizing
+from langsplat_viewer.rendering.request import FULL, Detail, RenderRequest
 from langsplat_viewer.state import FrameStats, ViewerState
 
-REST_SECONDS = 0.1  # without a move, after which the fine picture is drawn
-KEPT_SIZES = 3  # of pictures: the fine one and two coarse ones
+REST_SECONDS = 0.1  # without a move, after which the camera rests
+KEPT_SIZES = 3  # of images: the full one and two coarse ones
 NOTHING_LEFT = "all of the scene is hidden or deleted"
 NOTHING_BETWEEN = "nothing of the scene in this picture lies between the cuts: move them in the panel Camera"
 
-
-Key = tuple[int, int, int]  # which picture, width, height
+Phase = Literal["moving", "settling", "still"]
+Key = tuple[int, int, int]  # which pane, width, height
 
 
 class Canvas:
-    """Keeps a texture up to date with a `ViewerState`."""
+    """Keeps textures up to date with a `ViewerState`."""
 
     def __init__(
         self,
         ctx: moderngl.Context,
-        renderer: Renderer,
+        renderer: GlRenderer,
         clock: Callable[[], float] = time.perf_counter,
-        quick: Renderer | None = None,
+        quick: GlRenderer | None = None,
     ) -> None:
         """`clock`, in seconds, times the drawing. `quick`: another renderer, which draws merged Gaussians
-        while the camera moves, where pictures take long."""
-        self._ctx = ctx
-        self._fine = Stage(renderer)
-        self._quick = None if quick is None else Stage(quick)
-        self._renderer = renderer  # that drew the last picture
-        self._merger = Merger()
-        self._background = Background(clock)
+        while the camera moves, where images take long."""
+        self._ctx, self._fine, self._quick, self._clock = ctx, renderer, quick, clock
+        self._merger: Latest[Gaussians, Merged] = Latest(merged)
+        self._background: Latest[Rasterizing, Rasterized] = Latest(
+            lambda wanted, report: _rasterize(wanted, report, clock)
+        )
         self._pace = Pace()
-        self._clock = clock
         self._targets: dict[Key, moderngl.Framebuffer] = {}  # the latest used last
         self._textures: dict[Key, moderngl.Texture] = {}
-        self._state: ViewerState | None = None  # that was last shown
-        self._marked: MarkedScene | None = None  # what is drawn
-        self._drawn: Depiction | None = None  # what the textures show
-        self._drawn_at = FINE
+        self.phase: Phase = "still"
         self._view: OrbitCamera | None = None
         self._moved = -1e9  # when the view last changed, seconds
-        self._camera: Camera | None = None
-        self._timed = False  # the steps of the pictures are measured
-        self._unsure = False  # whether the picture shows anything is not known yet
-        # Of `splitting.pictures`; RGBA8, first row at the bottom, as GL has it.
+        self._tried: RenderRequest | None = None  # the last one that was drawn, if only in vain
+        self._shown: RenderRequest | None = None  # what the textures show
+        self._timed = False  # the steps of drawing are measured
+        self._unsure = False  # whether the image shows anything is not known yet
+        # One for each pane; RGBA8, first row at the bottom, as GL has it.
         self.textures: tuple[moderngl.Texture, ...] = ()
 
     def update(self, state: ViewerState, now: float) -> bool:
-        """Draw if anything changed since the last call; returns whether a finer picture is still due.
+        """Draw if anything changed since the last call; returns whether a finer image is still due.
 
         `now` in seconds. Raises what the renderer raises (BackendError, moderngl.Error); the same
-        picture is then not tried again.
+        request is then not tried again.
         """
-        self._state = state
         if state.scene is None or state.view is None:
             self._background.drop()
+            self.phase = "still"
             return False
         if state.view is not self._view:
-            if self._view is not None:
-                self._moved = now
+            self._moved = now if self._view is not None else self._moved
             self._view = state.view
-        moving = now - self._moved < REST_SECONDS
-        coarse = moving and state.coarse_while_moving
-        shown = staging.shown_pictures(state)
-        wanted = depiction(state, shown)
-        if self._begins_timing(state, moving):
-            self._drawn = None
-            self._fine.renderer.forget()
+        request = state.request().without_line()
         self._pace.expect(len(state.scene.gaussians))
-        is_due = wanted != self._drawn or (self._drawn_at != FINE and not coarse)
-        if is_due and not moving and self._pace.is_slow:
-            self._draw_at_rest(state, shown, wanted)
+        moving = now - self._moved < REST_SECONDS
+        if self._begins_timing(state, moving):
+            self._tried = None
+            self._fine.forget()
+        self.phase = "moving" if moving else self._at_rest(request)
+        if self.phase == "settling" and self._pace.is_slow:
+            self._settle(state, request)
         else:
             self._background.drop()
-            if is_due:
-                level = self._pace.level(self._merged() is not None) if coarse else FINE
-                self._draw(state, shown, wanted, level)
-        if self._unsure and not moving and not self.waits and self._camera is not None:
-            self._unsure = False  # asked at rest only: it reads the picture back
-            if self._renderer.shows_nothing():
-                state.nothing = self._why_nothing(wanted, self._camera, state.preferences.keys)
-        return moving or self.waits
+            if self.phase == "settling":
+                self._draw(state, request)
+            elif moving:
+                self._follow(state, request)
+        self.phase = "moving" if moving else self._at_rest(request)
+        if self.phase == "still":
+            self._explain_nothing(state)
+        return self.phase != "still"
+
+    def _at_rest(self, request: RenderRequest) -> Phase:
+        return "still" if request == self._tried else "settling"
 
     @property
     def waits(self) -> bool:
-        """Whether another thread rasterizes the picture; it calls what `wake_with` was given when it has."""
+        """True while another thread rasterizes the image; it calls what `wake_with` was given when it has."""
         return self._background.waits
 
     @property
     def is_running(self) -> bool:
-        """Whether other threads are at work, wanted or not."""
-        return self._background.worker.is_running or self._merger.is_running
+        """True while other threads are at work, wanted or not."""
+        return self._background.worker.is_running or self._merger.worker.is_running
 
     def wake_with(self, wake: Callable[[], None]) -> None:
         """Have `wake` called on another thread when `update` should be."""
         self._background.worker.wake = wake
 
-    def _draw_at_rest(self, state: ViewerState, shown: Sequence[ViewerState], wanted: Depiction) -> None:
-        """Draw the fine picture once another thread has rasterized it; until then one of merged
-        Gaussians where they are there, else what was there stays."""
-        camera = wanted.view.camera(*wanted.size)
-        rasterizing = self._fine.ahead(wanted, shown, self._mark(wanted), camera)
+    def _follow(self, state: ViewerState, request: RenderRequest) -> None:
+        """Moving: draw as finely as is fast enough."""
+        if not state.coarse_while_moving:
+            if request != self._tried:
+                self._draw(state, request)
+        elif self._changes(request):
+            level = self._pace.level(self._merged(request) is not None)
+            self._draw(state, self._at(request, level))
+
+    def _settle(self, state: ViewerState, request: RenderRequest) -> None:
+        """Settling, slowly: draw the full image once another thread has rasterized it; until then one of
+        merged Gaussians where they are there, else what was there stays."""
+        rasterizing = self._fine.ahead(request)
         if rasterizing is None:
             self._background.drop()
-            self._draw(state, shown, wanted, FINE)
+            self._draw(state, request)
             return
+        self._background.want(rasterizing)
         try:
-            made = self._background.get(rasterizing)
+            made = self._background.made(rasterizing)
         except BackendError:
-            self._drawn, self._drawn_at = wanted, FINE
+            self._background.drop()
+            self._tried = request
             raise
         if made is not None:
-            self._draw(state, shown, wanted, FINE, made)
-        elif wanted != self._drawn and state.coarse_while_moving and self._merged() is not None:
+            self._background.drop()
+            self._draw(state, request, made)
+        elif self._changes(request) and state.coarse_while_moving and self._merged(request) is not None:
             level = self._pace.stand_in()
             if level is not None:
-                self._draw(state, shown, wanted, level)
+                self._draw(state, self._at(request, level))
+
+    def _changes(self, request: RenderRequest) -> bool:
+        """True where the image on screen is of another request, at any level of detail."""
+        return self._tried is None or replace(self._tried, detail=FULL) != request
+
+    def _merged(self, request: RenderRequest) -> Merged | None:
+        """Gaussians that the quick renderer can draw, if they are there."""
+        if self._quick is not None:
+            with suppress(BackendError):  # for want of memory: images stay as they are
+                return self._merger.made(request.scene.scene.gaussians)
+        return None
+
+    def _at(self, request: RenderRequest, level: "Level") -> RenderRequest:
+        fewer = self._merged(request) if level.merged else None
+        return replace(request, detail=Detail(level.scale, fewer))
+
+    def _renderer_of(self, request: RenderRequest) -> GlRenderer:
+        return self._fine if request.detail.merged is None or self._quick is None else self._quick
+
+    def _draw(self, state: ViewerState, request: RenderRequest, made: Rasterized | None = None) -> None:
+        """`made`: by another thread, of the full image."""
+        is_projected = self._tried is None or request.placement != self._tried.placement
+        if self._quick is not None and (
+            self._tried is None or request.scene.source is not self._tried.scene.source
+        ):
+            self._quick.forget()  # another scene
+        self._tried = request  # also where it fails: it is not tried again
+        camera, detail = request.drawn_camera, request.detail
+        keys = [(place, camera.width, camera.height) for place in range(len(request.panes))]
+        targets = [self._target(key, len(keys)) for key in keys]
+        began = self._clock()
+        with watched() if state.timing.wanted else nullcontext(dict[str, float]()) as laps:
+            if made is not None:
+                self._fine.take(made)
+            self._renderer_of(request).draw(request, targets)
+        self._ctx.finish()
+        milliseconds = 1e3 * (self._clock() - began)
+        if made is not None:
+            milliseconds, laps = milliseconds + made.milliseconds, {**made.laps, **laps}
+        if state.timing.wanted and detail == FULL:
+            for name, taken in (*laps.items(), ("picture", milliseconds)):
+                state.timing.add(name, taken)
+        if is_projected:
+            self._pace.drew(Level(detail.scale, detail.merged is not None), milliseconds)
+        if self._quick is not None and self._pace.is_slow:
+            self._merger.want(request.scene.scene.gaussians)
+        self._shown = request
+        self.textures = tuple(self._textures[key] for key in keys)
+        size = (camera.width, camera.height)
+        state.stats = FrameStats(milliseconds, *size, detail.scale, detail.merged is not None)
+        state.nothing, self._unsure = "", True
 
     def _begins_timing(self, state: ViewerState, moving: bool) -> bool:
-        """Whether this is the first frame whose steps are measured: what was kept of earlier ones would have
+        """True for the first frame whose steps are measured: what was kept of earlier ones would have
         taken no time."""
         if state.timing.wanted and moving:
             return False  # once it rests
         before, self._timed = self._timed, state.timing.wanted
         return self._timed and not before
 
-    def _why_nothing(self, wanted: Depiction, camera: Camera, keys: Changed) -> str:
-        source = wanted.model.scene
-        gaussians = source.gaussians if self._marked is None else self._marked.scene.gaussians
-        if len(source.gaussians) and not len(gaussians):
-            shown = with_key("show what is hidden", actions.show_hidden, keys)
-            return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', actions.undo, keys)}"
-        if wanted.clip != UNCLIPPED and gaussians.valid().any():
-            return NOTHING_BETWEEN
-        reason = why_nothing(gaussians, camera)
-        elsewhere = not why_undrawable(gaussians)  # another view would show something
-        back = with_key("return to the opening view", actions.reset_view, keys)
-        return f"{reason}: {back}" if elsewhere else reason
-
-    def _merged(self) -> Merged | None:
-        """What the quick renderer can draw, if it is there."""
-        if self._quick is None or self._marked is None:
-            return None
-        return self._merger.made_of(self._marked.scene.gaussians)
-
-    def _prepare(
-        self, wanted: Depiction, shown: Sequence[ViewerState], camera: Camera, level: Level
-    ) -> list[Layers | None]:
-        """Choose the renderer and have it ready to draw all pictures; returns the layers of each."""
-        marked = self._mark(wanted)
-        instead = self._merged() if level.merged else None
-        stage = self._fine if instead is None or self._quick is None else self._quick
-        self._renderer = stage.renderer
-        if self._quick is not None:
-            self._quick.let_go(wanted.model.scene)
-        return stage.prepare(wanted, shown, marked, camera, instead)
-
-    def _mark(self, wanted: Depiction) -> MarkedScene:
-        """What is drawn of the scene."""
-        self._marked = marked_scene(wanted.model.scene, wanted.model.marks, self._marked)
-        return self._marked
-
-    def _draw(
-        self,
-        state: ViewerState,
-        shown: Sequence[ViewerState],
-        wanted: Depiction,
-        level: Level,
-        made: Rasterized | None = None,
-    ) -> None:
-        """`made`: by another thread, of the fine picture."""
-        is_projected = level != self._drawn_at or self._drawn is None or not wanted.is_placed_as(self._drawn)
-        self._drawn, self._drawn_at = wanted, level  # also where it fails: it is not tried again
-        width, height = (max(1, round(side * level.scale)) for side in wanted.size)
-        camera = wanted.view.camera(width, height)
-        keys = [(place, width, height) for place in range(len(shown))]
-        targets = [self._target(key, len(shown)) for key in keys]
-        began = self._clock()
-        with watched() if state.timing.wanted else nullcontext(dict[str, float]()) as laps:
-            if made is not None:
-                self._fine.renderer.take(made)
-            prepared = self._prepare(wanted, shown, camera, level)
-            for target, look, layers in zip(targets, wanted.looks, prepared, strict=True):
-                self._renderer.draw(target, camera, look.picture, look.heat_ranges, layers)
-        self._ctx.finish()
-        milliseconds = 1e3 * (self._clock() - began)
-        if made is not None:
-            milliseconds, laps = milliseconds + made.milliseconds, {**made.laps, **laps}
-        if state.timing.wanted and level == FINE:
-            for name, taken in (*laps.items(), ("picture", milliseconds)):
-                state.timing.add(name, taken)
-        if is_projected:
-            self._pace.drew(level, milliseconds)
-        if self._quick is not None and self._marked is not None and self._pace.is_slow:
-            self._merger.want(self._marked.scene.gaussians)
-        self._camera = camera
-        self.textures = tuple(self._textures[key] for key in keys)
-        state.stats = FrameStats(milliseconds, width, height, level.scale, level.merged)
-        state.nothing, self._unsure = "", True
+    def _explain_nothing(self, state: ViewerState) -> None:
+        """Say why an image shows nothing; asked once, at rest, since it reads the image back."""
+        if self._unsure and self._shown is not None:
+            self._unsure = False
+            if self._renderer_of(self._shown).shows_nothing():
+                state.nothing = _why_nothing(self._shown)
 
     def _target(self, key: Key, count: int) -> moderngl.Framebuffer:
-        """A framebuffer for one of `count` pictures; those of the last few sizes are kept, because moving
+        """A framebuffer for one of `count` panes; those of the last few sizes are kept, because moving
         alternates between two."""
         if key not in self._targets:
             while len(self._targets) >= KEPT_SIZES * count:
@@ -248,31 +236,163 @@ class Canvas:
     def close(self) -> None:
         """The window closes."""
         self._background.worker.close()
-        self._merger.close()
+        self._merger.worker.close()
 
     def point_at(self, u: float, v: float) -> Array | None:
         """See `viewer.Surface`."""
-        if self._camera is None or self._state is None:
+        if self._shown is None:
             return None
-        u = staging.within_picture(self._state.seeing.split, u)
-        pixel = (u * self._camera.width, v * self._camera.height)
-        depth = self._renderer.depth_at(*pixel)
-        return None if depth is None or depth <= 0 else self._camera.unproject(pixel, depth)
+        camera = self._shown.drawn_camera
+        pixel = (self._shown.split.within_pane(u) * camera.width, v * camera.height)
+        depth = self._renderer_of(self._shown).depth_at(self._shown, *pixel)
+        return None if depth is None else camera.unproject(pixel, depth)
 
     def depths(self) -> Array | None:
         """See `viewer.Surface`."""
-        return None if self._camera is None else self._renderer.depth_map()
+        return None if self._shown is None else self._renderer_of(self._shown).depth_map(self._shown)
 
-    def capture(self, state: ViewerState) -> Array:
+    def capture(self, request: RenderRequest) -> Array:
         """See `viewer.Surface`."""
-        shown = staging.shown_pictures(state)
-        wanted = depiction(state, shown)
-        if state is not self._state:  # of another size: what is on screen is drawn again
-            self._drawn = None
-        self._camera = camera = wanted.view.camera(*wanted.size)
-        prepared = self._prepare(wanted, shown, camera, FINE)
-        images = [
-            np.asarray(self._renderer.read(camera, look.picture, look.heat_ranges, layers))
-            for look, layers in zip(wanted.looks, prepared, strict=True)
-        ]
-        return staging.joined(state.seeing.split, images)
+        return self._fine.read(request)
+
+
+def _why_nothing(request: RenderRequest) -> str:
+    gaussians = request.scene.scene.gaussians
+    if len(request.scene.source.gaussians) and not len(gaussians):
+        shown = with_key("show what is hidden", selecting.show_hidden)
+        return f"{NOTHING_LEFT}: {shown}, or {with_key('undo', undoing.undo)}"
+    if request.clip != UNCLIPPED and gaussians.valid().any():
+        return NOTHING_BETWEEN
+    reason = why_nothing(gaussians, request.camera)
+    elsewhere = not why_undrawable(gaussians)  # another view would show something
+    back = with_key("return to the opening view", viewpoint.reset_view)
+    return f"{reason}: {back}" if elsewhere else reason
+
+
+# Level of detail while the camera moves, learned from the times of earlier images.
+
+MOVING_BUDGET = 50.0  # milliseconds: with the panels, some fifteen images a second
+GUESS = 5e-4  # milliseconds of a full image for each Gaussian, before one was drawn
+MERGED_SHARE = 0.25  # of an image's time, guessed, when four Gaussians are drawn as one
+FORGET = 0.8  # what was learned is lowered by this with every full image, so that better is tried again
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of detail."""
+
+    scale: float = 1.0  # of the window's resolution
+    merged: bool = False  # see `langsplat_core.scene.gaussians`
+
+    @property
+    def guess(self) -> float:
+        """Time, as a share of a full image's."""
+        return self.scale**2 * (MERGED_SHARE if self.merged else 1)
+
+
+FINE = Level()
+PLAIN = (FINE, Level(0.5), Level(0.25))
+# Merged at half the resolution is nearer to the full image than all of it at a quarter, and cheaper.
+WITH_MERGED = (FINE, Level(0.5), Level(0.5, merged=True), Level(0.25, merged=True))
+
+
+class Pace:
+    """Times of images by level of detail, in milliseconds."""
+
+    def __init__(self) -> None:
+        self._count = 1
+        self._each = GUESS  # of a full image's time, for one Gaussian
+        self._shares: dict[Level, float] = {}  # of the full image's time, measured
+
+    def expect(self, count: int) -> None:
+        """Images are of so many Gaussians from now on."""
+        self._count = max(count, 1)
+
+    @property
+    def is_slow(self) -> bool:
+        """True where full images are too slow to follow a movement."""
+        return not self._is_within(FINE)
+
+    def drew(self, level: Level, milliseconds: float) -> None:
+        """An image took so long."""
+        if level == FINE:
+            self._each = milliseconds / self._count
+            self._shares = {other: FORGET * share for other, share in self._shares.items()}
+        elif self._each > 0:
+            self._shares[level] = (self._share(level) + milliseconds / (self._each * self._count)) / 2
+
+    def level(self, has_merged: bool) -> Level:
+        """The finest at which an image is expected within the budget, or the coarsest of all."""
+        levels = WITH_MERGED if has_merged else PLAIN
+        return next(filter(self._is_within, levels), levels[-1])
+
+    def stand_in(self) -> Level | None:
+        """The finest of merged Gaussians that is expected within the budget, if there is one: all of them are
+        projected for few pixels, too."""
+        merged = (level for level in WITH_MERGED if level.merged)
+        return next(filter(self._is_within, merged), None)
+
+    def _is_within(self, level: Level) -> bool:
+        return self._each * self._count * self._share(level) <= MOVING_BUDGET
+
+    def _share(self, level: Level) -> float:
+        return 1.0 if level == FINE else self._shares.get(level, level.guess)
+
+
+# Other threads: one rasterizes the full image of a large scene, one merges its Gaussians.
+
+
+W = TypeVar("W")
+M = TypeVar("M")
+
+
+class Latest(Generic[W, M]):
+    """Makes one thing at a time on a thread of its own: the one that is wanted now. Results of others are
+    dropped."""
+
+    def __init__(self, make: Callable[[W, Progress], M]) -> None:
+        self.worker = Worker()
+        self._make = make
+        self._wanted: W | None = None
+        self._made: M | None = None
+        self._problem = ""
+
+    @property
+    def waits(self) -> bool:
+        """True while something is wanted that has not been dropped."""
+        return self._wanted is not None
+
+    def want(self, wanted: W) -> None:
+        """Begin with it, unless that was done."""
+        if wanted != self._wanted:
+            self.drop()
+            self._wanted = wanted
+            make = self._make
+            self.worker.submit("", lambda report: make(wanted, report), self._keep, self._fail)
+
+    def made(self, wanted: W) -> M | None:
+        """The result, if it is ready. Raises BackendError, once, where it failed."""
+        self.worker.poll()
+        problem, self._problem = self._problem, ""
+        if problem:
+            raise BackendError(problem)
+        return self._made if wanted == self._wanted else None
+
+    def drop(self) -> None:
+        """Nothing is wanted any more."""
+        self.worker.cancel()
+        self.worker.poll()  # so that nothing of a job that was left is held
+        self._wanted, self._made, self._problem = None, None, ""
+
+    def _keep(self, made: M) -> None:
+        self._made = made
+
+    def _fail(self, problem: str) -> None:
+        self._problem = problem
+
+
+def _rasterize(wanted: Rasterizing, report: Progress, clock: Callable[[], float]) -> Rasterized:
+    began = clock()
+    with watched() as laps:
+        finish = wanted.work(report)
+    return Rasterized(wanted, finish, 1e3 * (clock() - began), laps)

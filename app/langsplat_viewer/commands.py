@@ -8,13 +8,12 @@ from pathlib import Path
 from langsplat_core.config import Display
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
-from langsplat_viewer import actions
+from langsplat_viewer.actions import filming, opening, queries, selecting, settings, undoing, viewpoint
 from langsplat_viewer.actions.selecting import Part
 from langsplat_viewer.camera.controls import Side, adopt_up, level
-from langsplat_viewer.drawing.channels import Overlay
-from langsplat_viewer.keys import Changed
 from langsplat_viewer.marks import TOOLS, Tool
 from langsplat_viewer.output import saving
+from langsplat_viewer.state import Overlay
 from langsplat_viewer.viewer import Viewer
 
 
@@ -29,7 +28,7 @@ class Button:
 
 def buttons_of(row: DisplayRow) -> tuple[Button, ...]:
     """One for the display, but for each level one where it shows latents."""
-    if row.extra != "latent":
+    if not row.by_level:
         return (Button(row.label, row.name),)
     return tuple(Button(f"{name}##{row.name}", row.name, index) for index, name in enumerate(LEVELS))
 
@@ -39,7 +38,7 @@ BUTTONS = tuple(button for row in DISPLAYS.values() for button in buttons_of(row
 
 @dataclass(frozen=True)
 class Command:
-    """One row: what it does, in words, and the keys for it, which a user may change (`keys_of`).
+    """One row: what it does, in words, and the keys for it.
 
     Keys are written as people read them: "Ctrl+Shift+P", "F1", "R", or a typed character such as "?",
     wherever that is on the keyboard. Those with Ctrl, and F1, also work while something is typed;
@@ -55,7 +54,7 @@ class Command:
 
 
 def _show(button: Button) -> Callable[[Viewer], None]:
-    return lambda viewer: actions.set_display(viewer, button.display, button.latent_level)
+    return lambda viewer: settings.set_display(viewer, button.display, button.latent_level)
 
 
 def _name(button: Button) -> str:
@@ -66,13 +65,13 @@ def _name(button: Button) -> str:
 
 
 def _panel(title: str) -> Command:
-    return Command(f"panel: {title}", lambda viewer: actions.open_panel(viewer, title))
+    return Command(f"panel: {title}", lambda viewer: settings.open_panel(viewer, title))
 
 
 def _overlay(name: Overlay, title: str) -> Command:
     keys = ("B",) if name == "things" else ()
     return Command(
-        f"show or hide the {title}", lambda viewer: actions.toggle_overlay(viewer, name), keys, "View"
+        f"show or hide the {title}", lambda viewer: settings.toggle_overlay(viewer, name), keys, "View"
     )
 
 
@@ -85,18 +84,18 @@ OVERLAY_TITLES: dict[Overlay, str] = {
 
 
 def _tool(tool: Tool) -> Command:
-    return Command(f"select: {tool}", lambda viewer: actions.use_tool(viewer, tool), menu="Select")
+    return Command(f"select: {tool}", lambda viewer: selecting.use_tool(viewer, tool), menu="Select")
 
 
 def _export(does: str, part: Part, as_points: bool = False) -> Command:
     return Command(
-        does, lambda viewer: actions.export(viewer, Path.cwd(), part, as_points=as_points), menu="Select"
+        does, lambda viewer: selecting.export(viewer, Path.cwd(), part, as_points=as_points), menu="Select"
     )
 
 
 def _side(side: Side, key: str) -> Command:
     where = {"top": "above", "bottom": "below"}.get(side, f"the {side}")
-    return Command(f"look from {where}", lambda viewer: actions.look_from(viewer, side), (key,), "Camera")
+    return Command(f"look from {where}", lambda viewer: viewpoint.look_from(viewer, side), (key,), "Camera")
 
 
 SIDE_KEYS: tuple[tuple[Side, str], ...] = (
@@ -114,81 +113,80 @@ PANEL_TITLES = (
 MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
 COMMANDS: tuple[Command, ...] = (
-    Command("open a scene", actions.ask_for_file, ("Ctrl+O",), "File"),
-    Command("reload the scene", actions.reload, ("F5",), "File"),
+    Command("open a scene", opening.ask_for_file, ("Ctrl+O",), "File"),
+    Command("reload the scene", opening.reload, ("F5",), "File"),
     Command(
-        "next scene of the list", lambda viewer: actions.step_scene(viewer, 1), ("Ctrl+PageDown",), "File"
+        "next scene of the list", lambda viewer: opening.step_scene(viewer, 1), ("Ctrl+PageDown",), "File"
     ),
     Command(
-        "previous scene of the list", lambda viewer: actions.step_scene(viewer, -1), ("Ctrl+PageUp",), "File"
+        "previous scene of the list", lambda viewer: opening.step_scene(viewer, -1), ("Ctrl+PageUp",), "File"
     ),
-    Command("train a scene", lambda viewer: actions.open_panel(viewer, "Train"), menu="File"),
+    Command("train a scene", lambda viewer: settings.open_panel(viewer, "Train"), menu="File"),
     Command(
         "save a picture", lambda viewer: saving.save_picture(viewer, Path.cwd()), ("Ctrl+S", "P"), "File"
     ),
     Command("save the view", lambda viewer: saving.save_view(viewer, Path.cwd()), menu="File"),
-    Command("save the queries", lambda viewer: actions.save_queries(viewer, Path.cwd()), menu="File"),
+    Command("save the queries", lambda viewer: queries.save_queries(viewer, Path.cwd()), menu="File"),
     Command(
         "copy the command of this picture",
-        lambda viewer: actions.copy_command(viewer, Path.cwd()),
+        lambda viewer: filming.copy_command(viewer, Path.cwd()),
         ("Ctrl+Shift+C",),
         "File",
     ),
     Command(
         "save a picture of the size of the film",
-        lambda viewer: actions.save_sized_picture(viewer, Path.cwd()),
+        lambda viewer: filming.save_sized_picture(viewer, Path.cwd()),
         menu="File",
     ),
-    Command("save a film of the path", lambda viewer: actions.save_film(viewer, Path.cwd()), menu="File"),
-    Command("save the camera path", lambda viewer: actions.save_path(viewer, Path.cwd()), menu="File"),
-    Command("search", actions.focus_search, ("Ctrl+F", "/"), "Edit"),
-    Command("undo", actions.undo, ("Ctrl+Z",), "Edit", repeats=True, is_edit=True),
-    Command("redo", actions.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), "Edit", repeats=True, is_edit=True),
-    Command("select everything", actions.select_all, ("Ctrl+A",), "Select", is_edit=True),
-    Command("select nothing", actions.select_none, ("Ctrl+D", "Ctrl+Shift+A"), "Select", is_edit=True),
-    Command("invert the selection", actions.invert_selection, ("Ctrl+I",), "Select", is_edit=True),
-    Command("select what the search found", actions.select_query, menu="Select"),
-    Command("grow the selection", actions.grow_selection, menu="Select"),
-    Command("shrink the selection", actions.shrink_selection, menu="Select"),
+    Command("save a film of the path", lambda viewer: filming.save_film(viewer, Path.cwd()), menu="File"),
+    Command("save the camera path", lambda viewer: filming.save_path(viewer, Path.cwd()), menu="File"),
+    Command("search", queries.focus_search, ("Ctrl+F", "/"), "Edit"),
+    Command("undo", undoing.undo, ("Ctrl+Z",), "Edit", repeats=True, is_edit=True),
+    Command("redo", undoing.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), "Edit", repeats=True, is_edit=True),
+    Command("select everything", selecting.select_all, ("Ctrl+A",), "Select", is_edit=True),
+    Command("select nothing", selecting.select_none, ("Ctrl+D", "Ctrl+Shift+A"), "Select", is_edit=True),
+    Command("invert the selection", selecting.invert_selection, ("Ctrl+I",), "Select", is_edit=True),
+    Command("select what the search found", selecting.select_query, menu="Select"),
+    Command("grow the selection", selecting.grow_selection, menu="Select"),
+    Command("shrink the selection", selecting.shrink_selection, menu="Select"),
     *(_tool(tool) for tool in TOOLS),
-    Command("hide the selection", actions.hide_selected, ("H",), "Select"),
-    Command("isolate the selection", actions.isolate_selected, ("Shift+H",), "Select"),
-    Command("show all that is hidden", actions.show_hidden, ("U", "Alt+H"), "Select"),
-    Command("delete the selection", actions.delete_selected, ("Delete",), "Select"),
+    Command("hide the selection", selecting.hide_selected, ("H",), "Select"),
+    Command("isolate the selection", selecting.isolate_selected, ("Shift+H",), "Select"),
+    Command("show all that is hidden", selecting.show_hidden, ("U", "Alt+H"), "Select"),
+    Command("delete the selection", selecting.delete_selected, ("Delete",), "Select"),
     _export("save the selection", "selection"),
     _export("save the selection as points", "selection", as_points=True),
     _export("save the rest", "rest"),
     _export("save the scene without what was deleted", "edited"),
     *(Command(_name(button), _show(button), (str(key),), "View") for key, button in enumerate(BUTTONS, 1)),
-    Command("say what is under the cursor", actions.toggle_pointing, ("I",), "View"),
-    Command("compare two displays", actions.toggle_wipe, ("V",), "View"),
-    Command("three levels side by side", actions.toggle_levels, menu="View"),
+    Command("say what is under the cursor", viewpoint.toggle_pointing, ("I",), "View"),
+    Command("compare two displays", settings.toggle_wipe, ("V",), "View"),
+    Command("three levels side by side", settings.toggle_levels, menu="View"),
     *(_overlay(name, title) for name, title in OVERLAY_TITLES.items()),
-    Command("compare the picture with the reference", actions.compare_with_reference, menu="View"),
-    Command("measure a distance", actions.toggle_measuring, ("M",), "View"),
-    Command("return to the opening view", actions.reset_view, ("R", "Home"), "Camera"),
-    Command("frame everything", actions.frame_scene, ("Shift+F",), "Camera"),
-    Command("focus on the latest result found", actions.focus_result, ("F",), "Camera"),
+    Command("compare the picture with the reference", viewpoint.compare_with_reference, menu="View"),
+    Command("measure a distance", settings.toggle_measuring, ("M",), "View"),
+    Command("return to the opening view", viewpoint.reset_view, ("R", "Home"), "Camera"),
+    Command("frame everything", viewpoint.frame_scene, ("Shift+F",), "Camera"),
+    Command("focus on the latest result found", viewpoint.focus_result, ("F",), "Camera"),
     Command(
-        "previous training camera", lambda viewer: actions.step_camera(viewer, -1), (",",), "Camera", True
+        "previous training camera", lambda viewer: viewpoint.step_camera(viewer, -1), (",",), "Camera", True
     ),
-    Command("next training camera", lambda viewer: actions.step_camera(viewer, 1), (".",), "Camera", True),
-    Command("level the horizon", lambda viewer: actions.move(viewer, level), menu="Camera"),
+    Command("next training camera", lambda viewer: viewpoint.step_camera(viewer, 1), (".",), "Camera", True),
+    Command("level the horizon", lambda viewer: viewpoint.move(viewer, level), menu="Camera"),
     Command(
-        "take the picture's up as the world's", lambda viewer: actions.move(viewer, adopt_up), menu="Camera"
+        "take the picture's up as the world's", lambda viewer: viewpoint.move(viewer, adopt_up), menu="Camera"
     ),
     *(_side(side, key) for side, key in SIDE_KEYS),
-    Command("orthographic view, and back", actions.toggle_orthographic, ("O", "Keypad5"), "Camera"),
-    Command("walk in place of flying, and back", actions.toggle_walking, menu="Camera"),
-    Command("bookmark this view", actions.add_bookmark, ("Ctrl+B",), "Camera"),
-    Command("add a keyframe here", actions.add_keyframe, ("K",), "Camera"),
-    Command("play the camera path, or stop", actions.toggle_playing, ("Shift+K",), "Camera"),
-    Command("hide or show the panels", actions.toggle_panel, ("Tab",), "Window"),
+    Command("orthographic view, and back", viewpoint.toggle_orthographic, ("O", "Keypad5"), "Camera"),
+    Command("walk in place of flying, and back", viewpoint.toggle_walking, menu="Camera"),
+    Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), "Camera"),
+    Command("add a keyframe here", filming.add_keyframe, ("K",), "Camera"),
+    Command("play the camera path, or stop", viewpoint.toggle_playing, ("Shift+K",), "Camera"),
+    Command("hide or show the panels", settings.toggle_panel, ("Tab",), "Window"),
     *(_panel(title) for title in PANEL_TITLES),
-    Command("find a command", lambda viewer: actions.show_palette(viewer, True), ("Ctrl+Shift+P",), "Help"),
-    Command("list of keys", actions.toggle_help, ("F1", "?"), "Help"),
-    Command("change the keys", lambda viewer: actions.edit_keys(viewer, True), menu="Help"),
-    Command("close what lies over the scene", actions.escape, ("Esc",)),
+    Command("find a command", lambda viewer: settings.show_palette(viewer, True), ("Ctrl+Shift+P",), "Help"),
+    Command("list of keys", settings.toggle_help, ("F1", "?"), "Help"),
+    Command("close what lies over the scene", settings.escape, ("Esc",)),
 )
 
 # What the mouse does and what keys do for as long as they are held (`panels.navigation`), for people to read.
@@ -205,17 +203,9 @@ HELD: tuple[tuple[str, str], ...] = (
 )
 
 
-def keys_of(command: Command, changed: Changed) -> tuple[str, ...]:
-    """The keys of a command: those that it was given, else those of the table that no other was given."""
-    if command.does in changed:
-        return changed[command.does]
-    given = {key for keys in changed.values() for key in keys}
-    return tuple(key for key in command.keys if key not in given)
-
-
-def with_key(text: str, act: Callable[[Viewer], object], changed: Changed) -> str:
+def with_key(text: str, act: Callable[[Viewer], object]) -> str:
     """`text`, and in brackets the key of the command that does it."""
-    keys = next((keys_of(command, changed) for command in COMMANDS if command.act is act), ())
+    keys = next((command.keys for command in COMMANDS if command.act is act), ())
     return f"{text} ({keys[0]})" if keys else text
 
 

@@ -44,7 +44,6 @@ def fallbacks() -> list[Path]:
 
 
 def _bundled() -> Path | None:
-    """DejaVu Sans as matplotlib brings it, without importing matplotlib."""
     spec = find_spec("matplotlib")
     if spec is None or spec.origin is None:
         return None
@@ -53,7 +52,6 @@ def _bundled() -> Path | None:
 
 
 def _installed() -> Path | None:
-    """The best of the system's fonts with many scripts."""
     files: dict[str, Path] = {}
     for folder in FOLDERS.get(sys.platform, ()):
         for path in Path(folder).expanduser().rglob("*.[to]t[fc]"):

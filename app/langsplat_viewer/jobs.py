@@ -1,14 +1,12 @@
-"""What the window's process keeps of memory, and gives back; on Linux, elsewhere nothing happens."""
+"""The worker thread of the window, and the memory that its process gives back on Linux."""
 
 import ctypes
-import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass, field
-from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
@@ -16,9 +14,6 @@ from langsplat_core.errors import LangSplatError
 from langsplat_core.progress import Cancelled, Progress, Report
 
 _ARENA_MAX = -8  # M_ARENA_MAX of malloc.h
-_PAGE_OUT = 21  # MADV_PAGEOUT of asm-generic/mman-common.h; Linux before 5.4 refuses it
-# Compilers of kernels and, in software drivers of OpenGL, of shaders: needed only while one is loaded.
-_COMPILERS = re.compile(r"^(\w+)-(\w+) r.*/lib(?:llvmlite|LLVM)\b.*$", re.MULTILINE)
 
 
 def share_one_heap() -> None:
@@ -28,33 +23,17 @@ def share_one_heap() -> None:
 
 
 def give_memory_back() -> None:
-    """Return to the system what the C library keeps of memory that was freed, where it can (reading a scene
-    leaves tens of megabytes of it), and the code of compilers: what is needed of it again is read again from
-    its file."""
+    """Return to the system what the C library keeps of memory that was freed, where it can: reading a scene
+    leaves tens of megabytes of it."""
     _in_c_library("malloc_trim", 0)
-    for start, size in _compilers():
-        _in_c_library("madvise", ctypes.c_void_p(start), ctypes.c_size_t(size), _PAGE_OUT)
-
-
-def _compilers() -> Iterator[tuple[int, int]]:
-    """Address and size of every stretch of memory that shows one of their files."""
-    if sys.platform != "linux":
-        return
-    for start, end in _COMPILERS.findall(Path("/proc/self/maps").read_text(errors="replace")):
-        yield int(start, 16), int(end, 16) - int(start, 16)
 
 
 def _in_c_library(name: str, *arguments: object) -> None:
     if sys.platform == "linux":
-        function = getattr(ctypes.CDLL(None), name, None)  # not every C library has the first two
+        function = getattr(ctypes.CDLL(None), name, None)  # not every C library has them
         if function is not None:
             function(*arguments)
 
-
-# One worker thread, so that the window stays alive while a scene loads or a text encoder is imported.
-#
-# Work is submitted from the window's thread and its outcome is handed back there by `poll`: no other module
-# needs to know about threads.
 
 T = TypeVar("T")
 
@@ -146,7 +125,7 @@ class Worker:
 
     @property
     def current(self) -> tuple[str, float] | None:
-        """What is being done and how far it is, for the status line; None when idle or only winding up."""
+        """Label and fraction of the present job, for the status line; None when idle or only winding up."""
         for job in self._jobs:
             if not job.stopped.is_set():
                 return job.reached.text or job.label, job.reached.fraction
@@ -154,7 +133,7 @@ class Worker:
 
     @property
     def is_running(self) -> bool:
-        """Whether some job has not come to its end yet, cancelled or not."""
+        """True while some job has not come to its end, cancelled or not."""
         return any(not job.future.done() for job in self._jobs)
 
     def close(self, patience: float = 0.0) -> None:

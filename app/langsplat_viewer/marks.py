@@ -1,4 +1,4 @@
-"""Which Gaussians are selected, hidden and deleted, and the tools that say so."""
+"""Selection: which Gaussians are selected, hidden and deleted, and the tools that mark them."""
 
 import math
 from collections.abc import Callable
@@ -10,7 +10,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.query.instances import Instance
 from langsplat_core.query.selection import (
     in_box,
     in_polygon,
@@ -22,8 +21,6 @@ from langsplat_core.query.selection import (
 )
 from langsplat_core.scene import Camera
 
-# Which Gaussians of the scene are selected, hidden and deleted, and the tool that selects with the mouse.
-#
 # The scene itself is never changed: deleting marks, and what is marked is left out of pictures and of what is
 # saved. So everything can be undone, and an answer's numbers per Gaussian keep their places.
 
@@ -37,7 +34,7 @@ REACHES = (0.001, 1.0)  # least and largest reach, scene radii
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """What is marked among a scene's N Gaussians. Nothing that is hidden or deleted is selected."""
+    """Masks over a scene's N Gaussians. Nothing that is hidden or deleted is selected."""
 
     selected: Array  # (N,) bool
     hidden: Array  # (N,) bool: in no picture until it is shown again
@@ -54,7 +51,7 @@ class Marks:
         return ~self.deleted
 
     def same(self, other: "Marks") -> bool:
-        """Whether the same are marked in both."""
+        """Return whether the same are marked in both."""
         return all(
             a is b or np.array_equal(a, b)
             for a, b in (
@@ -66,7 +63,7 @@ class Marks:
 
 
 def unmarked(count: int) -> Marks:
-    """Of a scene that was just opened."""
+    """Return the marks of a scene that was just opened: none."""
     nothing = np.zeros(count, bool)
     return Marks(nothing, nothing, nothing)
 
@@ -107,24 +104,15 @@ def deleting(marks: Marks) -> Marks:
 
 @dataclass(frozen=True)
 class Stroke:
-    """What is being drawn with the mouse. Places are fractions of the picture, (0, 0) its top left corner."""
+    """A stroke of the mouse. Places are fractions of the picture, (0, 0) its top left corner."""
 
     path: tuple[tuple[float, float], ...]  # where the mouse was, one place or more
     centre: tuple[float, float, float] | None = None  # of a sphere or box: on the surface, world units
 
 
 @dataclass(frozen=True, eq=False)
-class Things:
-    """The instances of an answer, to be selected one by one."""
-
-    phrase: str
-    result: Any  # the `QueryResult` whose they are
-    found: tuple[Instance, ...]  # best first
-
-
-@dataclass(frozen=True, eq=False)
 class Leaving:
-    """What waits for an answer to whether deletions are to be saved."""
+    """An action that waits for the answer whether deletions are to be saved."""
 
     then: Callable[[Any], None]  # takes the `Viewer`
     to: str  # what it does, in words: "the window closes"
@@ -132,7 +120,7 @@ class Leaving:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """All there is to know about selecting; replaced as a whole at every change."""
+    """Marks, tool and its settings; replaced as a whole at every change."""
 
     marks: Marks = field(default_factory=lambda: unmarked(0))
     saved: Array | None = None  # (N,) what was deleted when the scene was last saved; None: not yet
@@ -142,21 +130,20 @@ class Selection:
     reach: float = 0.05  # how far growing goes, and how large a sphere of one click is; of the scene's radius
     only_visible: bool = True  # rectangle, lasso and brush leave out what lies behind something
     stroke: Stroke | None = None
-    things: Things | None = None
     leaving: Leaving | None = None
     writing: Future[Any] | None = None  # what was last written, or is being written
     may_close: bool = False  # the window closes at the next frame
 
     @property
     def is_unsaved(self) -> bool:
-        """Whether something was deleted since the scene was opened or saved."""
+        """True where something was deleted since the scene was opened or saved."""
         deleted = self.marks.deleted
         return bool(deleted.any()) and (self.saved is None or not np.array_equal(deleted, self.saved))
 
 
 def of_scene(selection: Selection, count: int) -> Selection:
     """For another scene, of `count` Gaussians: the tool and its settings stay."""
-    return replace(selection, marks=unmarked(count), saved=None, stroke=None, things=None, leaving=None)
+    return replace(selection, marks=unmarked(count), saved=None, stroke=None, leaving=None)
 
 
 # Marks as history keeps them: one bit each, and none for what is not marked at all.
@@ -238,7 +225,8 @@ class Drawn:
 
     @property
     def radius(self) -> float:
-        """Of a sphere, or half the side of a box: how far the drag leads from its centre, world units."""
+        """Radius of a sphere, or half the side of a box: how far the drag leads from its centre, world
+        units."""
         first, last = self.pixels[[0, -1]]
         if np.linalg.norm(last - first) < CLICK * self.camera.height:
             return self.reach
@@ -295,7 +283,6 @@ def outlines(drawn: Drawn) -> list[Array]:
 
 
 def _of_sphere(drawn: Drawn) -> list[Array]:
-    """The circle around its centre that faces the camera."""
     turns = np.linspace(0, 2 * math.pi, ROUND + 1)
     right, down, _ = drawn.camera.rotation
     around = np.cos(turns)[:, None] * right + np.sin(turns)[:, None] * down
@@ -303,7 +290,6 @@ def _of_sphere(drawn: Drawn) -> list[Array]:
 
 
 def _of_box(drawn: Drawn) -> list[Array]:
-    """Its twelve edges."""
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
     edges = [np.stack(ends) for ends in combinations(corners, 2) if np.abs(ends[0] - ends[1]).sum() == 2]
     return _projected(drawn, [drawn.centre + drawn.radius * edge for edge in edges])

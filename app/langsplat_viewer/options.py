@@ -1,12 +1,25 @@
-"""The program's arguments, and what they mean: sizes, cameras, displays. Imports no windowing library."""
+"""The program's arguments: options, sizes, cameras, displays. Imports no windowing library."""
 
+import math
 import re
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from langsplat_core.config import Display, LevelChoice
-from langsplat_core.display.displays import DISPLAYS
+import tyro
+
+from langsplat_core.config import (
+    ColourMap,
+    Display,
+    LevelChoice,
+    NotNegative,
+    PictureConfig,
+    Positive,
+    Range,
+    Share,
+)
+from langsplat_core.display.displays import DISPLAYS, MAX_QUERIES
 from langsplat_core.errors import InputError
 from langsplat_core.io.cameras import read_cameras
 from langsplat_core.io.scenes import format_of, load_scene
@@ -14,10 +27,97 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
+from langsplat_viewer.camera.flight import SPAN_LIMITS
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.renderer import Backend
 from langsplat_viewer.viewer import Services
 
 DisplayChoice = Literal["auto", Display]
 MAX_SIDE = 16_384  # pixels; beyond it drivers refuse textures
+Seconds = Annotated[float, Range(0.1, 36_000.0)]
+PicturesPerSecond = Annotated[float, Range(0.1, 240.0)]
+Span = Annotated[float, Range(*SPAN_LIMITS)]
+Cuts = tuple[Share, ...]
+Colours = tuple[Annotated[int, Range(1, MAX_QUERIES)], ...]
+
+
+@dataclass(frozen=True)
+class ViewerOptions:
+    """Options of `langsplat-viewer`, for the window and for images without one."""
+
+    scene: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[SCENE]")] = None
+    """Scene file, *.ply (default: the bundled demo)."""
+    query: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="TEXT")] = ()
+    """Phrase to search for; repeat it for several. The last three are shown."""
+    level: LevelChoice = "auto"
+    """Semantic level of the search; auto takes the one that answers best."""
+    display: DisplayChoice = "auto"
+    """What is shown; auto is relevancy with a query, else rgb."""
+    colour: Annotated[tyro.conf.UseAppendAction[Colours], tyro.conf.arg(metavar="N")] = ()
+    """Without a window: colour of a query, 1 to 3; repeat it for each --query (default: in their order)."""
+    cut: Annotated[tyro.conf.UseAppendAction[Cuts], tyro.conf.arg(metavar="RELEVANCY")] = ()
+    """Without a window: relevancy from 0 to 1 at which an answer ends, 0 where it ends by itself; repeat it
+    for each --query."""
+    canonical: Annotated[str, tyro.conf.arg(metavar="PHRASES")] = ""
+    """Without a window: what everything is compared with, phrases between commas (default: the scene's)."""
+    near_cut: NotNegative = 0.0
+    """Without a window: depth up to which nothing is drawn, world units."""
+    far_cut: Positive | None = None
+    """Without a window: depth beyond which nothing is drawn, world units (default: everything is)."""
+    heat_opacity: Share = PictureConfig.heat_opacity
+    """How much of the heat map covers the colours where relevancy is high."""
+    dim: Share = PictureConfig.dim
+    """Brightness of what a query does not find."""
+    size: Annotated[str, tyro.conf.arg(metavar="WxH")] = ""
+    """Size of the window or picture in pixels."""
+    camera: Annotated[str, tyro.conf.arg(metavar="FILE|INDEX")] = ""
+    """First view: a camera file (JSON, as "Save view" writes it), or a training camera by number from 0."""
+    orthographic: Span | None = None
+    """Look without perspective: so many world units across the picture's shorter side."""
+    backend: Backend = "auto"
+    """What draws."""
+    encoder: Annotated[str, tyro.conf.arg(metavar="ID|FOLDER")] = ""
+    """Text encoder in place of the one that the scene names."""
+    fresh: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Neither use nor change the remembered layout, settings and recent files."""
+    headless: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Draw a picture or a film without a window and print the answers."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE.png")] = None
+    """Where --headless writes: a picture (.png); a film (.mp4, .webp, .gif) or a folder of its pictures."""
+    path: Annotated[Path | None, tyro.conf.arg(metavar="PATH.json")] = None
+    """A camera path: with --headless the film along it, else it is opened in the panel "Record"."""
+    turntable: Seconds | None = None
+    """With --headless: a film of so many seconds, once around what the camera sees in its middle."""
+    around: Literal["view", "answer"] = "view"
+    """What --turntable goes around; answer: the last query found, from near."""
+    fps: PicturesPerSecond = 30.0
+    """Pictures per second of a film."""
+    colour_map: ColourMap | None = None
+    """Colours of relevancy and depth in a picture of --headless (default: turbo)."""
+    transparent: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Draw the picture of --headless without a background, transparent where the scene is not."""
+
+    @property
+    def wanted_size(self) -> tuple[int, int] | None:
+        """Pixels; None: not said. InputError for a size that is none."""
+        return parse_size(self.size)
+
+    @property
+    def shown_display(self) -> Display:
+        """Relevancy when something is searched, colours otherwise, unless a display is named."""
+        if self.display == "auto":
+            return "relevancy" if self.query else "rgb"
+        return self.display
+
+    @property
+    def is_film(self) -> bool:
+        """True where `--headless` makes a film."""
+        return self.path is not None or self.turntable is not None
+
+    @property
+    def clip(self) -> Clip:
+        """Depths that are drawn."""
+        return Clip(self.near_cut, math.inf if self.far_cut is None else self.far_cut)
 
 
 def parse_size(text: str) -> tuple[int, int] | None:
@@ -73,13 +173,6 @@ def chosen_camera(scene: Scene, choice: str) -> Camera | None:
     return scene.cameras[int(choice)]
 
 
-def chosen_display(choice: DisplayChoice, queries: tuple[str, ...]) -> Display:
-    """Relevancy when something is searched, colours otherwise, unless a display is named."""
-    if choice == "auto":
-        return "relevancy" if queries else "rgb"
-    return choice
-
-
 def check_display(scene: Scene, display: Display, queries: tuple[str, ...]) -> None:
     """InputError for a display or query that this scene cannot answer."""
     if scene.language is None and (queries or DISPLAYS[display].needs_field):
@@ -98,11 +191,15 @@ def warm_up(scene: Scene, backend: str, progress: Progress = silent) -> None:
     if backend == "cpu":
         say_compiling(progress)
         from langsplat_core.raster import load_rasterizer
-        from langsplat_viewer.drawing.channels import ArrayChannels, Layers, Sight
+        from langsplat_viewer.rendering.renderer import ArrayChannels
+        from langsplat_viewer.rendering.request import RenderKey
 
-        channels, sight = ArrayChannels(load_rasterizer("cpu")), Sight(scene, scene.framing_camera((16, 16)))
-        channels.render(sight, Layers(), "none")
-        channels.depth_at(sight, 8, 8)
+        channels, key = (
+            ArrayChannels(load_rasterizer("cpu")),
+            RenderKey(scene, scene.framing_camera((16, 16))),
+        )
+        channels.render(key)
+        channels.depth_at(key, 8, 8)
 
 
 def say_compiling(progress: Progress) -> None:

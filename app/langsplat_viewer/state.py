@@ -1,31 +1,77 @@
-"""Where the time goes, and how right the picture is: what the panel "Timing" knows."""
+"""The viewer's state: plain data that actions change, and that panels and the canvas read."""
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from statistics import median
+from typing import Literal, get_args
 
 import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice, PictureConfig, TrainPreset
-from langsplat_core.display.displays import DISPLAYS, MAX_QUERIES, HeatRanges
+from langsplat_core.display.displays import MAX_QUERIES
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.describe import Pointed, Suggestions
 from langsplat_core.query.instances import Instance
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
-from langsplat_viewer.drawing import channels
-from langsplat_viewer.drawing.channels import Seeing
 from langsplat_viewer.files.browsing import Listing
-from langsplat_viewer.files.flight_files import Bookmark
+from langsplat_viewer.files.flights import Bookmark
 from langsplat_viewer.files.photographs import Photograph
 from langsplat_viewer.files.preferences import Preferences
-from langsplat_viewer.keys import Keying
 from langsplat_viewer.marks import Selection
+from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
+from langsplat_viewer.rendering.request import (
+    EditedScene,
+    Pane,
+    RenderRequest,
+    Splats,
+    Split,
+    edited_scene,
+    panes,
+)
+
+# View settings and the ruler.
+
+
+@dataclass(frozen=True)
+class ViewSettings:
+    """View settings of the scene, apart from display and camera; undone together."""
+
+    split: Split = field(default_factory=Split)
+    splats: Splats = field(default_factory=Splats)
+    clip: Clip = UNCLIPPED
+    transparent: bool = False  # images are saved without a background
+    fade: float = 0.0  # how much of the photograph of a training camera lies over the image, 0 to 1
+
+
+Overlay = Literal["things", "cameras", "cube", "grid"]
+OVERLAYS: tuple[Overlay, ...] = get_args(Overlay)
+Point = tuple[float, float, float]  # world units
+
+
+@dataclass(frozen=True)
+class Ruler:
+    """A distance between two points on the surface."""
+
+    measures: bool = False  # a click on the scene sets a point
+    points: tuple[Point, ...] = ()  # at most two
+
+    @property
+    def length(self) -> float | None:
+        """World units; None before there are two points."""
+        return math.dist(*self.points) if len(self.points) > 1 else None
+
+    def with_point(self, point: Point) -> "Ruler":
+        """Set the second point, or the first of a new measurement."""
+        return replace(self, points=(*self.points, point) if len(self.points) == 1 else (point,))
+
+
+# Times of the steps of drawing, and the comparison with the reference: the panel "Timing".
 
 KEPT = 31  # measurements of which the median is told
 STEPS = {  # names of laps, and what they are called; in the order of the panel
@@ -38,11 +84,18 @@ STEPS = {  # names of laps, and what they are called; in the order of the panel
     "panels": "Panels",
     "search": "Search",
 }
+LONGEST_SIDE = 160  # pixels of an image that is compared: the reference takes as long for more
+
+
+def compared_size(size: tuple[int, int]) -> tuple[int, int]:
+    """Pixels of the image that is compared, of the shape of a window of `size`."""
+    factor = min(LONGEST_SIDE / max(size), 1.0)
+    return max(round(size[0] * factor), 1), max(round(size[1] * factor), 1)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What is shown against the reference, at a small size; errors in display values, 0 to 255."""
+    """Differences of an image from the reference, at a small size; errors in display values, 0 to 255."""
 
     size: tuple[int, int]  # pixels
     largest: int
@@ -52,7 +105,7 @@ class Comparison:
 
 
 def compared(shown: Array, reference: Array, backend: str) -> Comparison:
-    """Of two (H, W, C) uint8 pictures of one size."""
+    """Return the differences of two (H, W, C) uint8 images of one size."""
     errors = np.abs(shown.astype(np.float64) - reference)
     squared = float((errors**2).mean())
     psnr = math.inf if squared == 0 else 10 * math.log10(255**2 / squared)
@@ -69,16 +122,16 @@ class Timing:
     comparison: Comparison | None = None  # the last one
 
     def add(self, name: str, milliseconds: float) -> None:
-        """One measurement more."""
+        """Add one measurement."""
         self.laps.setdefault(name, deque(maxlen=KEPT)).append(milliseconds)
 
     def medians(self) -> list[tuple[str, float]]:
-        """What was measured, in words, and the median of its last measurements in milliseconds."""
+        """Return the steps measured, in words, and the median of its last measurements in milliseconds."""
         return [(title, median(self.laps[name])) for name, title in STEPS.items() if self.laps.get(name)]
 
 
 def memory_bytes() -> int | None:
-    """What this process holds in memory; None where the system does not tell."""
+    """Bytes that this process holds in memory; None where the system does not tell."""
     try:
         lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     except OSError:
@@ -87,7 +140,7 @@ def memory_bytes() -> int | None:
     return 1024 * int(resident[0].split()[1]) if resident else None
 
 
-# What the panel "Record" knows: a camera path, where it is played, and what film is wanted of it.
+# Camera path and film: the panel "Record".
 
 SPACING = 2.0  # seconds from the last keyframe to one that is added
 TURN_SECONDS = 8.0
@@ -119,7 +172,7 @@ def flight_of(keyframes: tuple[Keyframe, ...]) -> Flight:
     return Flight(keyframes)
 
 
-# Everything a frame depends on, as one dataclass: actions change it, panels and the canvas read it.
+# The state as one dataclass.
 
 SLOTS = MAX_QUERIES  # queries shown at a time: one colour each
 MAX_MESSAGES = 50
@@ -162,7 +215,7 @@ class Glide:
 
 @dataclass(frozen=True)
 class FrameStats:
-    """How the picture on screen was made."""
+    """Size and time of the image on screen."""
 
     milliseconds: float = 0.0
     width: int = 0  # pixels
@@ -185,7 +238,7 @@ class Hover:
 
 @dataclass(frozen=True)
 class TrainingForm:
-    """What is typed in the panel that trains scenes."""
+    """Fields of the panel that trains scenes."""
 
     dataset: str = ""
     out: str = ""
@@ -194,45 +247,55 @@ class TrainingForm:
 
 
 @dataclass(eq=False)
-class ViewerState:
-    """The viewer without its window."""
+class SceneState:
+    """The part of the state that begins anew with every scene."""
 
     scene: Scene | None = None
     path: Path | None = None
-    scenes: tuple[Path, ...] = ()  # to switch between, absolute
-    opening: Path | None = None  # the file being read, until it is open or has failed
     extent: Extent | None = None  # there whenever a scene is
-    latent: Array | None = None  # (3, N, 3) latent colours per level, None without a language field
+    doubts: tuple[str, ...] = ()  # quality warnings of its training, with the remedies
+    nothing: str = ""  # why the image shows nothing of the scene, where it does not
 
     view: OrbitCamera | None = None
     glide: Glide | None = None
     opening_camera: Camera | None = None  # what R returns to, where that is not the scene's own choice
-    doubts: tuple[str, ...] = ()  # what its training says against the scene, with the remedies
-    nothing: str = ""  # why the picture shows nothing of the scene, where it does not
     camera_index: int | None = None  # training camera last jumped to
-    fly_speed: float = 0.5  # scene radii per second
-    walks: bool = False  # the keys fly level, as one walks
     photograph: Photograph | None = None  # that was looked for last
-    bookmarks: tuple[Bookmark, ...] = ()  # of the scene shown
+    bookmarks: tuple[Bookmark, ...] = ()
     bookmark_typed: str = ""
     record: Recording = field(default_factory=Recording)
-
-    pointing: bool = False  # it is said what lies under the cursor
     hover: Hover | None = None
+    ruler: Ruler = field(default_factory=Ruler)
+    selection: Selection = field(default_factory=Selection)
+
+    queries: list[Query] = field(default_factory=list)
+    selected: Query | None = None  # whose details are shown
+    canonical: tuple[str, ...] = ()  # phrases that everything is compared with; none: the scene's own
+    canonical_typed: str = ""
+    suggestions: Suggestions = field(default_factory=Suggestions)
+    suggestions_of: Scene | None = None  # the scene for which they were looked for
+    _edited: EditedScene | None = None  # of the last request
+
+
+@dataclass(eq=False)
+class ViewerState(SceneState):
+    """The viewer without its window."""
+
+    scenes: tuple[Path, ...] = ()  # to switch between, absolute
+    opening: Path | None = None  # the file being read, until it is open or has failed
 
     picture: PictureConfig = field(default_factory=PictureConfig)
     latent_level: int = 2  # index into scene.LEVELS
-    seeing: Seeing = field(default_factory=Seeing)
+    settings: ViewSettings = field(default_factory=ViewSettings)
     level: LevelChoice = "auto"
-    queries: list[Query] = field(default_factory=list)
-    selected: Query | None = None  # whose details are shown
+    pointing: bool = False  # it is said what lies under the cursor
+    fly_speed: float = 0.5  # scene radii per second
+    walks: bool = False  # the keys fly level, as one walks
+    coarse_while_moving: bool = True
+
     typed: str = ""
-    canonical: tuple[str, ...] = ()  # phrases that everything is compared with; none: the scene's own
-    canonical_typed: str = ""
     asked: list[str] = field(default_factory=list)  # what was searched for, the oldest first
     recalled: int = 0  # index into `asked` of the phrase last recalled; its length: none
-    suggestions: Suggestions = field(default_factory=Suggestions)
-    suggestions_of: Scene | None = None  # the scene for which they were looked for
     focus_input: bool = False  # the query box takes the keyboard at the next frame
 
     training_form: TrainingForm = field(default_factory=TrainingForm)
@@ -242,18 +305,20 @@ class ViewerState:
     stats: FrameStats = field(default_factory=FrameStats)
     backend: str = ""
     size: tuple[int, int] = (1, 1)  # pixels of the scene's area
-    coarse_while_moving: bool = True
     wanted_panel: str = ""  # the title of one that is opened and brought to the front at the next frame
     show_panel: bool = True  # the panels, as many as are open
     show_help: bool = False
-    keying: Keying = field(default_factory=Keying)
     show_palette: bool = False
     palette_typed: str = ""
     browser: Listing | None = None  # the folder that the file browser shows, while it is open
     picks_folder: bool = False  # it is there to choose the folder of the photographs
     preferences: Preferences = field(default_factory=Preferences)
-    selection: Selection = field(default_factory=Selection)
     letters_muted: bool = False  # letters are no keys: they were meant for a box that cannot be typed in
+
+    def begin(self, fresh: SceneState) -> None:
+        """Show another scene: all that belongs to the one before is gone."""
+        for part in fields(SceneState):
+            setattr(self, part.name, getattr(fresh, part.name))
 
     def say(self, text: str, is_error: bool = False) -> None:
         """Add one line to the messages area."""
@@ -274,34 +339,25 @@ class ViewerState:
         """Their answers."""
         return tuple(None if query is None else query.result for query in self.shown())
 
-    def heat_ranges(self) -> HeatRanges:
-        """The values at which the heat of each slot is 0 and 1."""
-        return channels.heat_ranges(self.shown_results(), self.picture.display)
+    def panes(self) -> tuple[Pane, ...]:
+        """Displays in the scene's area, from left to right."""
+        return panes(self.picture, self.latent_level, self.shown_results(), self.settings.split)
 
-    def shown_picture(self) -> PictureConfig:
-        """The settings of the picture with what follows from the answers."""
-        return channels.fitted(self.picture, self.shown_results())
-
-    def layers_key(self) -> tuple[object, ...]:
-        """Changes exactly when `latent_rgb`, `relevancies` or the marks would. Holds the objects themselves:
-        the id of a result that is gone may be given to the next one."""
-        wants_latent = self._shows_latents() and self.latent is not None
-        segments = self.picture.display == "segmentation"
-        level = self.latent_level if wants_latent else None
-        return self.scene, level, segments, self.shown_results(), self.selection.marks
-
-    def latent_rgb(self) -> Array | None:
-        """(N, 3) colours of the latents, while they are shown."""
-        if not self._shows_latents() or self.latent is None:
-            return None
-        colours: Array = self.latent[self.latent_level]
-        return colours
-
-    def _shows_latents(self) -> bool:
-        return DISPLAYS[self.picture.display].extra == "latent"
-
-    def relevancies(self) -> Array | None:
-        """(N, Q) float32 of the shown queries, see `painting.columns`."""
-        if self.scene is None:
-            return None
-        return channels.columns(self.shown_results(), self.picture.display, len(self.scene.gaussians))
+    def request(self, size: tuple[int, int] | None = None, transparent: bool = False) -> RenderRequest:
+        """The image that the scene's area shows, or the same of another size (width, height) in pixels."""
+        assert self.scene is not None
+        assert self.view is not None
+        settings = self.settings
+        size = size or self.size
+        self._edited = edited_scene(self.scene, self.selection.marks, self._edited)
+        return RenderRequest(
+            self._edited,
+            self.view.camera(*settings.split.pane_size(size)),
+            size[0],
+            replace(self.picture, transparent=transparent),
+            self.latent_level,
+            self.shown_results(),
+            settings.split,
+            settings.splats,
+            settings.clip,
+        )

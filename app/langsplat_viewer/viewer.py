@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, Any, Protocol, TypeVar
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import Display, TrainPreset
@@ -19,12 +19,13 @@ from langsplat_core.query.engine import LoadEncoder, QueryEngine
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.flight import Keyframe
-from langsplat_viewer.drawing.channels import Clip, Ruler
-from langsplat_viewer.files.flight_files import Shelf
+from langsplat_viewer.files.flights import Shelf
 from langsplat_viewer.files.watching import Stamps, Watch
-from langsplat_viewer.jobs import Worker
+from langsplat_viewer.jobs import Job, Worker
 from langsplat_viewer.marks import Pair
-from langsplat_viewer.state import Query, ViewerState
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.request import RenderRequest
+from langsplat_viewer.state import Query, Ruler, ViewerState
 
 PREVIEW_EVERY = 100  # steps between the checkpoints that can be looked at
 KEPT = 20  # lines of what it says that are kept
@@ -32,7 +33,7 @@ KEPT = 20  # lines of what it says that are kept
 
 @dataclass(frozen=True)
 class TrainingRequest:
-    """What to train."""
+    """Options of a training run."""
 
     dataset: Path
     out: Path  # *.ply
@@ -42,7 +43,7 @@ class TrainingRequest:
 
 @dataclass(eq=False)
 class TrainingProgress:
-    """Where it is. Written by the listening thread, read by the window's."""
+    """Progress of a training run. Written by the listening thread, read by the window's."""
 
     stages: dict[str, float] = field(default_factory=dict)  # name -> fraction in [0, 1], in their order
     overall: float = 0.0
@@ -138,7 +139,7 @@ class Training:
 
 @dataclass(frozen=True, eq=False)
 class Visit:
-    """What is found again."""
+    """State of a scene that was left, to be found again."""
 
     view: OrbitCamera | None
     opening_camera: Camera | None
@@ -154,7 +155,7 @@ class Visit:
 
 
 def visit_of(state: ViewerState) -> Visit:
-    """How things stand."""
+    """Return the state to be found again."""
     chosen = [place for place, query in enumerate(state.queries) if query is state.selected]
     return Visit(
         view=state.view,
@@ -166,17 +167,20 @@ def visit_of(state: ViewerState) -> Visit:
         selected=chosen[0] if chosen else None,
         canonical=state.canonical,
         keyframes=state.record.keyframes,
-        ruler=state.seeing.ruler,
-        clip=state.seeing.clip,
+        ruler=state.ruler,
+        clip=state.settings.clip,
     )
 
 
 def unanswered(query: Query) -> Query:
-    """The same question, to be asked again."""
+    """Return the same question without its answer, to be asked again."""
     return Query(query.phrase, query.slot, query.shown_since, cut=query.cut)
 
 
 # The viewer without its window: its state, what acts on it, and what it needs from elsewhere.
+
+
+T = TypeVar("T")
 
 
 class Surface(Protocol):
@@ -189,14 +193,13 @@ class Surface(Protocol):
         """(H, W) camera z of the surface all over the picture, world units, 0 where nothing is drawn; its
         size may be another than the window's. None while there is no picture."""
 
-    def capture(self, state: ViewerState) -> Array:
-        """(H, W, 3) uint8, or (H, W, 4) of a transparent picture: the scene as shown, at full resolution
-        and without panels."""
+    def capture(self, request: RenderRequest) -> Array:
+        """(H, W, 3) uint8, or (H, W, 4) of a transparent image: the request at full resolution."""
 
 
 @dataclass(frozen=True)
 class Services:
-    """What the viewer needs from the layers below; tests put small fakes here."""
+    """Functions that the viewer needs from the layers below; tests put small fakes here."""
 
     load_scene: Callable[[Path], Scene]
     load_encoder: LoadEncoder
@@ -205,7 +208,7 @@ class Services:
     warm_up: Callable[[Scene, str, Progress], None] = lambda scene, backend, progress: None
 
     def engine(self, scene: Scene) -> QueryEngine:
-        """What answers queries on `scene`."""
+        """Engine that answers queries on `scene`."""
         return QueryEngine(scene, self.load_encoder, encoder_id=self.encoder_id)
 
 
@@ -236,4 +239,24 @@ class Viewer:
     surface: Surface | None = None
     training: Training | None = None  # under way
     history: History = field(default_factory=History)
-    clock: float = 0.0  # seconds, as of the last `actions.tick`
+    clock: float = 0.0  # seconds, as of the last frame
+
+    def run(
+        self,
+        label: str,
+        work: Callable[[Progress], T],
+        done: Callable[[T], None] = lambda result: None,
+        failed: Callable[[str], None] | None = None,
+    ) -> Job:
+        """Have the worker do `work`; `take_results` then calls `done` with its result, or `failed` with the
+        reason, which by default is said."""
+        return self.worker.submit(label, work, done, failed or self.say_error)
+
+    def take_results(self) -> None:
+        """Hand over what the worker and the recorder have finished; the one place where results of other
+        threads arrive. Call once per frame."""
+        self.worker.poll()
+        self.recorder.poll()
+
+    def say_error(self, reason: str) -> None:
+        self.state.say(reason, is_error=True)

@@ -1,32 +1,127 @@
-"""The window. Only this and `display_probe` use hello_imgui and glfw; the rest is in actions and panels."""
+"""The window. This alone and the panels use hello_imgui and glfw; the rest is in actions."""
 
 import os
 import sys
+import warnings
+
+from imgui_bundle import glfw_utils  # noqa: F401  isort: skip  (before glfw: it brings a library of its own)
+import glfw  # isort: skip
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-# imgui_bundle brings its own GLFW library and must be imported first, else the process holds two.
-from imgui_bundle import ImVec4, hello_imgui, imgui, immapp  # isort: skip
+from imgui_bundle import hello_imgui
+
+from langsplat_core.errors import BackendError, InputError
+from langsplat_viewer.files.preferences import LAYOUT_NAME, Preferences, load_preferences, save_preferences
+from langsplat_viewer.jobs import one_line
+from langsplat_viewer.panels import style
+from langsplat_viewer.state import ViewerState
+
+from imgui_bundle import ImVec4, imgui, immapp  # isort: skip
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
-import glfw  # isort: skip
 import moderngl
 
 from langsplat_core.config import Display, LevelChoice, PictureConfig
-from langsplat_core.errors import BackendError, InputError, LangSplatError
-from langsplat_viewer import actions, fonts
+from langsplat_core.errors import LangSplatError
+from langsplat_viewer import fonts
+from langsplat_viewer.actions import filming, opening, queries, selecting, settings, training, viewpoint
 from langsplat_viewer.canvas import Canvas
-from langsplat_viewer.display_probe import probe_gl
-from langsplat_viewer.drawing.frame import Backend, FrameRenderer
-from langsplat_viewer.drawing.renderer import Renderer
-from langsplat_viewer.files.flight_files import Shelf
-from langsplat_viewer.jobs import give_memory_back, one_line, share_one_heap
+from langsplat_viewer.files.flights import Shelf
+from langsplat_viewer.jobs import give_memory_back, share_one_heap
 from langsplat_viewer.options import chosen_camera, latent_level
-from langsplat_viewer.panels import keyboard, layout, menu, navigation, over, photograph, pictures
-from langsplat_viewer.panels.area import scene_area
-from langsplat_viewer.remembered import Remembered
+from langsplat_viewer.panels import layout, navigation, overlays
+from langsplat_viewer.panels.style import scene_area
+from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.viewer import Services, Viewer
+
+# 4.3 sorts splats, 4.1 draws them on every system; 3.3 still shows the CPU's pictures.
+GL_VERSIONS = ((4, 3), (4, 1), (3, 3))
+
+
+def probe_gl() -> tuple[int, int]:
+    """The newest of `GL_VERSIONS` that a window can have here. Raises BackendError without a display."""
+    hint = "to draw a picture without a window add --headless --out picture.png"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", glfw.GLFWError)
+        is_linux = sys.platform.startswith("linux")
+        if is_linux and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            raise BackendError(f"no display to open a window on (DISPLAY is not set); {hint}")
+        if not glfw.init():
+            raise BackendError(f"the display cannot be reached; {hint}")
+        for major, minor in GL_VERSIONS:
+            glfw.window_hint(glfw.VISIBLE, False)
+            _gl_hints(major, minor)
+            window = glfw.create_window(16, 16, "probe", None, None)
+            glfw.default_window_hints()
+            if window:
+                glfw.destroy_window(window)
+                return major, minor
+    raise BackendError(f"the display offers no OpenGL 3.3; update the graphics driver, or {hint}")
+
+
+def _gl_hints(major: int, minor: int) -> None:
+    glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, major)
+    glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, minor)
+    glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
+    glfw.window_hint(glfw.OPENGL_FORWARD_COMPAT, True)
+
+
+# Preferences and the layout of the panels outlive the window.
+
+
+class Remembered:
+    """Keeps a folder and the window's looks in step with the preferences of a `ViewerState`."""
+
+    def __init__(self, folder: Path | None, state: ViewerState) -> None:
+        """`folder` None: nothing is read and nothing written."""
+        self._folder = folder
+        self._state = state
+        self._kept: Preferences | None = None  # as they lie on disk; None: they are not kept there
+        self._styled: Preferences | None = None  # as the window looks
+
+    def load(self, params: hello_imgui.RunnerParams, restore_size: bool) -> None:
+        """Take the preferences that are there, and say where the layout is. Where the folder cannot be
+        written or understood, the reason is said and nothing is kept."""
+        params.ini_disable = True
+        params.app_window_params.restore_previous_geometry = False
+        if self._folder is None:
+            return
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._state.preferences = load_preferences(self._folder)
+        except (OSError, InputError) as error:
+            self._state.say(f"settings are not remembered: {one_line(error)}", is_error=True)
+            return
+        self._kept = self._state.preferences
+        self._state.picture = replace(self._state.picture, colour_map=self._kept.colour_map)
+        params.ini_disable = False
+        params.ini_folder_type = hello_imgui.IniFolderType.absolute_path
+        params.ini_filename = str(self._folder / LAYOUT_NAME)
+        params.app_window_params.restore_previous_geometry = restore_size
+
+    def style(self) -> None:
+        """Make the window look as the preferences say."""
+        self._styled = self._state.preferences
+        style.apply(self._styled)
+
+    def update(self) -> None:
+        """Once per frame: apply and keep what has changed."""
+        preferences = self._state.preferences
+        if self._styled is not None and preferences != self._styled:
+            self.style()
+        if self._folder is None or self._kept is None or preferences == self._kept:
+            return
+        self._kept = preferences
+        try:
+            save_preferences(self._folder, preferences)
+        except OSError as error:
+            self._state.say(f"settings not written: {one_line(error)}", is_error=True)
+
+
+# imgui_bundle brings its own GLFW library and must be imported first, else the process holds two.
+
 
 TITLE = "LangSplat viewer"
 DEFAULT_SIZE = (1280, 800)
@@ -50,12 +145,12 @@ DRAW_ERRORS = (
 
 RECORDER_PATIENCE = 5.0  # seconds for a film that is being drawn to leave nothing half written
 
-MakeRenderer = Callable[[moderngl.Context], Renderer]
+MakeRenderer = Callable[[moderngl.Context], GlRenderer]
 
 
 @dataclass(frozen=True)
 class WindowRequest:
-    """What the window opens with."""
+    """Scene, queries and settings that the window opens with."""
 
     path: Path
     queries: tuple[str, ...] = ()
@@ -74,7 +169,7 @@ class WindowRequest:
 def open_window(request: WindowRequest, services: Services) -> None:
     """Run until the window is closed. Raises BackendError where there is no display or no OpenGL."""
     share_one_heap()
-    window = Window(request, services, lambda ctx: FrameRenderer(ctx, request.backend))
+    window = Window(request, services, lambda ctx: GlRenderer(ctx, request.backend))
     immapp.run(window.params())
     if window.failure is not None:
         raise window.failure
@@ -95,7 +190,7 @@ class Window:
         self._hiding, self._column = layout.Hiding(), layout.Column()
         self._remembered = Remembered(request.settings, self.viewer.state)
         self._canvas: Canvas | None = None
-        self._photograph: photograph.Overlay | None = None
+        self._photograph: overlays.PhotographOverlay | None = None
         self._screen: moderngl.Framebuffer | None = None
         self.unfinished = False  # a finer picture is due
         self.idles = True  # False for scripts that drive the window and count on its next frame
@@ -130,7 +225,7 @@ class Window:
         params.fps_idling.time_active_after_last_event = AWAKE_SECONDS
         params.callbacks.load_additional_fonts = fonts.load
         params.callbacks.setup_imgui_style = self._remembered.style
-        params.callbacks.show_menus = lambda: menu.draw(self.viewer)
+        params.callbacks.show_menus = lambda: layout.draw_menus(self.viewer)
         params.callbacks.post_init = self._start
         params.callbacks.show_gui = self._gui
         params.callbacks.before_imgui_render = self._picture
@@ -146,7 +241,7 @@ class Window:
             # A graphics device draws large scenes as they are.
             quick = self._make_renderer(ctx) if renderer.backend == "cpu" else None
             self._canvas = Canvas(ctx, renderer, quick=quick)
-            self._photograph = photograph.Overlay(ctx)
+            self._photograph = overlays.PhotographOverlay(ctx)
             self.viewer.state.backend = renderer.backend
         except DRAW_ERRORS as error:
             self.failure = BackendError(one_line(error))
@@ -159,7 +254,7 @@ class Window:
         self.viewer.watch.start()
         imgui.get_io().config_input_text_cursor_blink = False  # a blinking cursor would be drawn for ever
         glfw.set_drop_callback(glfw_window_hello_imgui(), self._dropped)  # type: ignore[arg-type]
-        actions.open_scene(self.viewer, self._request.path, self._first_view)
+        opening.open_scene(self.viewer, self._request.path, self._first_view)
 
     def _first_view(self, viewer: Viewer) -> None:
         """The scene of the command line is open: do what else the command line asks for."""
@@ -168,23 +263,23 @@ class Window:
         try:
             camera = chosen_camera(state.scene, request.camera)
             if camera is not None:
-                actions.open_at(viewer, camera)
+                viewpoint.open_at(viewer, camera)
         except InputError as error:
             state.say(str(error), is_error=True)
         if request.orthographic is not None:
-            actions.open_orthographic(viewer, request.orthographic)
+            viewpoint.open_orthographic(viewer, request.orthographic)
         looks = replace(state.picture, heat_opacity=request.heat_opacity, dim=request.dim)
-        actions.set_picture(viewer, looks)
+        settings.set_picture(viewer, looks)
         if request.path_file is not None:
-            actions.load_path(viewer, request.path_file)
-        actions.set_level(viewer, request.level)
+            filming.load_path(viewer, request.path_file)
+        queries.set_level(viewer, request.level)
         for phrase in request.queries:
-            actions.ask(viewer, phrase)
-        actions.set_display(viewer, request.display, latent_level(request.level))
+            queries.ask(viewer, phrase)
+        settings.set_display(viewer, request.display, latent_level(request.level))
 
     def drop(self, paths: list[str]) -> None:
         """Files were dropped onto the window."""
-        actions.open_dropped(self.viewer, [Path(path) for path in paths])
+        opening.open_dropped(self.viewer, [Path(path) for path in paths])
 
     def _dropped(self, window: object, paths: list[str]) -> None:
         self.drop(paths)
@@ -197,10 +292,11 @@ class Window:
         if viewer.state.selection.may_close:
             hello_imgui.get_runner_params().app_shall_exit = True
         self._began = time.perf_counter()
-        actions.tick(viewer, imgui.get_time())
-        actions.watch_training(viewer)
-        actions.fetch_photograph(viewer)
-        keyboard.muted_until_clicked(viewer)  # hello_imgui draws the panels after this
+        viewer.take_results()
+        viewpoint.tick(viewer, imgui.get_time())
+        training.watch_training(viewer)
+        opening.fetch_photograph(viewer)
+        navigation.muted_until_clicked(viewer)  # hello_imgui draws the panels after this
         self._hiding.apply(viewer)
         self._column.apply(viewer)
         layout.show_wanted(viewer)
@@ -235,13 +331,13 @@ class Window:
 
     @property
     def is_running(self) -> bool:
-        """Whether threads are still at work that would keep the process."""
+        """True while threads are at work that would keep the process."""
         workers = (self.viewer.worker, self.viewer.recorder)
         draws = self._canvas is not None and self._canvas.is_running
         return draws or any(worker.is_running for worker in workers)
 
     def is_minimised(self) -> bool:
-        """Whether nobody can see the window."""
+        """Return whether nobody can see the window."""
         return bool(glfw.get_window_attrib(glfw_window_hello_imgui(), glfw.ICONIFIED))
 
     def _title(self) -> None:
@@ -259,7 +355,7 @@ class Window:
         layout.draw_over(viewer)
         navigation.handle(viewer, area)
         scale = imgui.get_io().display_framebuffer_scale
-        actions.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))
+        settings.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))
         canvas, state = self._canvas, viewer.state
         if state.timing.wanted:
             state.timing.add("panels", 1e3 * (time.perf_counter() - self._began))
@@ -274,19 +370,18 @@ class Window:
         self._pace()
         self._screen.use()
         self._screen.color_mask = True, True, True, True  # a mask left set would colour the panels
-        pictures.draw(viewer, area, canvas.textures)
+        overlays.draw_pictures(viewer, area, canvas.textures)
         if self._photograph is not None:
             self._photograph.draw(viewer, area)
-        over.draw(viewer, area)
+        overlays.draw_lines(viewer, area)
         state.timing.wanted = False  # the panel says so again, if it is still seen
 
     def _may_close(self) -> bool:
-        """The window is asked to close."""
         glfw.post_empty_event()  # where there is a question, it is drawn now
-        return actions.may_close(self.viewer)
+        return selecting.may_close(self.viewer)
 
     def _stop(self) -> None:
-        actions.finish_writing(self.viewer)
+        selecting.finish_writing(self.viewer)
         self._remembered.update()
         self.viewer.watch.close()
         if self._canvas is not None:

@@ -1,1 +1,1 @@
-"""How rasterized channels become a picture: the NumPy twin and the GLSL twin, side by side."""
+"""Displays: how rasterized channels become an image, in NumPy and in GLSL."""

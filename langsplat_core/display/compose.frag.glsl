@@ -1,6 +1,6 @@
-// From channels to a picture; compose.py beside it is the plain twin of this file and a test compares the
-// two. Channels are premultiplied by alpha, row 0 is the top row. DISPLAY_*, HEAT_FADE, SEGMENT_OPACITY,
-// LEAST_ALPHA, MAX_QUERIES and MAP_NODES are defined from there when the source is built.
+// From channels to an image; displays.py beside it is the plain twin of this file and a test compares the
+// two. Channels are premultiplied by alpha, row 0 is the top row. HEAT_FADE, SEGMENT_OPACITY, LEAST_ALPHA,
+// MAX_QUERIES, MAP_NODES and SHOWN, the drawings of all displays, are defined from there.
 
 uniform sampler2D colours;      // rgb, alpha
 uniform sampler2D extra;        // latent colours, alpha; one query per channel (0: none), alpha; or
@@ -9,8 +9,8 @@ uniform sampler2D colour_maps;  // MAP_NODES x maps
 uniform int colour_map;         // row of the one in use
 uniform vec3 query_colours[MAX_QUERIES];
 
-uniform int display;            // one of DISPLAY_*
-uniform vec2 heat_ranges[MAX_QUERIES];  // relevancies at which heat is 0 and 1
+uniform int display;            // index of its row
+uniform vec2 ranges[MAX_QUERIES];  // per component of the further channel, the values drawn as 0 and as 1
 uniform bool own_colours;       // heat in the colour of each query instead of the colour map
 uniform float heat_opacity;
 uniform float dim;
@@ -18,7 +18,6 @@ uniform float threshold;
 uniform float alpha_gate;
 uniform vec3 background;
 uniform bool transparent;       // no background, alpha as a fourth channel, colours not premultiplied
-uniform vec2 depth_range;       // world units
 
 in vec2 uv;
 out vec4 picture;
@@ -36,7 +35,7 @@ vec3 heat_map(vec3 base, vec3 relevancy) {
     float total = 0.0;
     vec3 mean = vec3(0.0);
     for (int j = 0; j < MAX_QUERIES; ++j) {
-        vec2 range = heat_ranges[j];
+        vec2 range = ranges[j];
         float own = clamp((relevancy[j] - range.x) / (range.y - range.x), 0.0, 1.0);
         heat = max(heat, own);
         total += own;
@@ -52,14 +51,16 @@ vec3 segments(vec3 base, vec3 relevancy) {
         if (relevancy[j] > relevancy[winner])
             winner = j;
     bool inside = relevancy[winner] > threshold;
-    vec2 range = heat_ranges[winner];
+    vec2 range = ranges[winner];
     float opacity = SEGMENT_OPACITY * clamp((1.0 - range.x) / (range.y - range.x), 0.0, 1.0);
     return inside ? mix(base, query_colours[winner], opacity) : base * dim;
 }
 
-vec3 depth_map(vec2 sums) {
-    float t = (sums.r / max(sums.g, 1e-9) - depth_range.x) / max(depth_range.y - depth_range.x, 1e-9);
-    return sums.g > alpha_gate ? mapped(1.0 - clamp(t, 0.0, 1.0)) : transparent ? vec3(0.0) : background;
+vec4 depth_map(vec2 sums) {
+    vec2 range = ranges[0];
+    float t = (sums.r / max(sums.g, 1e-9) - range.x) / max(range.y - range.x, 1e-9);
+    vec3 backdrop = transparent ? vec3(0.0) : background;
+    return sums.g > alpha_gate ? vec4(mapped(1.0 - clamp(t, 0.0, 1.0)), 1.0) : vec4(backdrop, 0.0);
 }
 
 void main() {
@@ -69,22 +70,7 @@ void main() {
     vec3 uncovered = transparent ? vec3(0.0) : (1.0 - c.a) * background;
     float share = transparent ? max(c.a, LEAST_ALPHA) : 1.0;
     vec3 base = clamp(c.rgb / share + uncovered, 0.0, 1.0);
-    float opacity = transparent ? c.a : 1.0;
-    vec3 relevancy = sums.a > alpha_gate ? sums.rgb / sums.a : vec3(0.0);
-    vec3 shown = base;
-    if (display == DISPLAY_LATENT)
-        shown = sums.rgb / share + uncovered;
-    else if (display == DISPLAY_RELEVANCY)
-        shown = heat_map(base, relevancy);
-    else if (display == DISPLAY_SEGMENTATION)
-        shown = segments(base, relevancy);
-    else if (display == DISPLAY_DEPTH)
-        shown = depth_map(sums.rg);
-    else if (display == DISPLAY_ALPHA)
-        shown = vec3(c.a);
-    if (transparent && display == DISPLAY_DEPTH)
-        opacity = sums.g > alpha_gate ? 1.0 : 0.0;
-    else if (display == DISPLAY_ALPHA)
-        opacity = 1.0;
-    picture = vec4(clamp(shown, 0.0, 1.0), opacity);
+    vec3 mean = sums.a > alpha_gate ? sums.rgb / sums.a : vec3(0.0);
+    vec4 shown = SHOWN;
+    picture = vec4(clamp(shown.rgb, 0.0, 1.0), transparent ? shown.a : 1.0);
 }

@@ -1,10 +1,17 @@
-"""Colours of numbers and of queries."""
+"""Displays: one table of what can be shown, and how rasterized channels become an image.
 
-from collections.abc import Callable, Mapping
+A rasterizer delivers premultiplied channels (colours, and the one further channel of the display) and alpha;
+`compose` turns them into what a person sees. Every display is drawn twice, here in NumPy and in
+`compose.frag.glsl`; constants reach the shader by `shader_defines`, and a test compares the images. Buttons,
+keys, options, channels and both drawings come from `DISPLAYS`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, Protocol
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -57,107 +64,146 @@ def mapped(t: Array, name: ColourMap = "turbo") -> Array:
     return table[low] * (1 - fraction) + table[low + 1] * fraction
 
 
-# What can be shown: one table, one row per display.
-#
-# The panel's buttons and keys, the arguments, the channels that are rasterized, and the numbers by which the
-# composite shader tells displays apart all come from here; the names are those of `config.Display`.
+# Values per Gaussian that displays show.
 
-Extra = Literal["none", "latent", "relevancies", "depth"]  # what is rasterized beside colours and alpha
-
-
-@dataclass(frozen=True)
-class DisplayRow:
-    """One display."""
-
-    name: Display
-    label: str  # on its button
-    extra: Extra = "none"  # the further channel that it shows
-    needs_field: bool = False  # shows the language field
-    needs_query: bool = False  # shows answers
+Ranges = tuple[tuple[float, float], ...]  # per component of a channel, the values drawn as 0 and as 1
+STRENGTH: Mapping[str, float] = MappingProxyType({"found": 1.0, "weak match": 0.5, "not here": 0.0})
+NO_HEAT = (0.5, 1.0)  # range of a slot without heat, whose values are 0
 
 
-_ROWS = (
-    DisplayRow("rgb", "Colours"),
-    DisplayRow("depth", "Depth", "depth"),
-    DisplayRow("alpha", "Alpha"),
-    DisplayRow("relevancy", "Relevancy", "relevancies", needs_field=True, needs_query=True),
-    DisplayRow("segmentation", "Segmentation", "relevancies", needs_field=True, needs_query=True),
-    DisplayRow("latent", "Latent", "latent", needs_field=True),
-)
-DISPLAYS: Mapping[Display, DisplayRow] = MappingProxyType({row.name: row for row in _ROWS})  # in this order
-NUMBERS: Mapping[Display, int] = MappingProxyType({name: number for number, name in enumerate(DISPLAYS)})
+class Answer(Protocol):
+    """The part of `query.answers.QueryResult` that displays show."""
+
+    @property
+    def verdict(self) -> Literal["found", "weak match", "not here"]: ...
+    @property
+    def level(self) -> int: ...
+    @property
+    def relevancy(self) -> Array: ...  # (3, N)
+    @property
+    def members(self) -> Array: ...  # (N,) bool
+    @property
+    def heat_range(self) -> tuple[float, float]: ...
 
 
-# Colours that show a language field's latents.
+Answers = Sequence[Answer | None]  # by colour slot; None: the slot has no answer
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """Input of a display's channel function."""
+
+    count: int  # Gaussians
+    language: LanguageField | None = None
+    answers: Answers = ()
+    level: int | None = None  # index into scene.LEVELS; None: the own level of each answer
+
+
+def painted(answers: Answers) -> list[int]:
+    """Slots that paint anything: an answer "not here" does not."""
+    return [slot for slot, answer in enumerate(answers) if answer is not None and STRENGTH[answer.verdict]]
+
+
+def relevancies(subject: Subject) -> Array | None:
+    """(N, Q) float32 raw relevancy per Gaussian and slot, 0 where a slot paints nothing."""
+
+    def of_level(answer: Answer) -> Array:
+        values: Array = answer.relevancy[answer.level if subject.level is None else subject.level]
+        return values
+
+    return _by_slot(subject, of_level)
+
+
+def members(subject: Subject) -> Array | None:
+    """(N, Q) float32, 1 for the Gaussians of each slot's answer."""
+    return _by_slot(subject, lambda answer: answer.members)
+
+
+def _by_slot(subject: Subject, values_of: Callable[[Answer], Array]) -> Array | None:
+    """None where no slot paints anything."""
+    slots = painted(subject.answers)
+    if not slots:
+        return None
+    values = np.zeros((subject.count, len(subject.answers)), np.float32)
+    for slot in slots:
+        answer = subject.answers[slot]
+        assert answer is not None
+        values[:, slot] = values_of(answer)
+    return values
+
+
+def heat_ranges(answers: Answers) -> Ranges:
+    """Relevancies at which the heat of each slot is 0 and 1; a weak match gets no hotter than a half."""
+    return _weakened(answers, lambda answer: answer.heat_range)
+
+
+def member_ranges(answers: Answers) -> Ranges:
+    """Range of members for each slot, which are 0 or 1; a weak match is half as opaque."""
+    return _weakened(answers, lambda answer: (0.0, 1.0))
+
+
+def _weakened(answers: Answers, range_of: Callable[[Answer], tuple[float, float]]) -> Ranges:
+    ranges = []
+    for answer in answers:
+        strength = 0.0 if answer is None else STRENGTH[answer.verdict]
+        low, high = range_of(answer) if answer is not None and strength else NO_HEAT
+        ranges.append((low, low + (high - low) / (strength or 1.0)))
+    return tuple(ranges)
+
+
+_LATENT: WeakKeyDictionary[LanguageField, Array] = WeakKeyDictionary()
+
+
+def latents(subject: Subject) -> Array | None:
+    """(N, 3) latent colours of a level."""
+    if subject.language is None or subject.level is None:
+        return None
+    colours: Array = latent_colours(subject.language)[subject.level]
+    return colours
 
 
 def latent_colours(field: LanguageField) -> Array:
-    """(3, N, 3) float32 colours in [0, 1] of the latents at each level; grey where nothing was observed.
+    """(3, N, 3) float32 colours in [0, 1] of the latents at each level; grey where nothing was observed. Made
+    once for each field.
 
     A codeword has its own. Latents of 3 numbers are colours by themselves, others have their first three
     principal axes over all levels together (one basis for the scene, so that colours agree between views
     and levels); each axis is stretched between its 2 % and 98 % quantiles.
     """
+    made = _LATENT.get(field)
+    if made is not None:
+        return made
     seen = field.known
     flat = field.latents.reshape(-1, field.latents.shape[2])
     colours = field.codec.colours(flat, seen.reshape(-1).astype(np.float64)).reshape(*seen.shape, 3)
-    return np.where(seen[..., None], colours, np.float32(0.5)).astype(np.float32)
+    _LATENT[field] = np.where(seen[..., None], colours, np.float32(0.5)).astype(np.float32)
+    return _LATENT[field]
 
 
-# From channels to a picture, in NumPy: the plain twin of the window's composite shader.
-#
-# A rasterizer delivers premultiplied channels (colours, latent colours, relevancies, depth sums) and alpha;
-# `compose` turns them into what a person sees. Every step below exists once here and once in
-# `compose.frag.glsl`; constants reach the shader by `shader_defines`, and a test compares the pictures.
+# From channels to an image.
 
 HEAT_FADE = 0.35  # heat at which the heat map reaches its full opacity
 SEGMENT_OPACITY = 0.6
-LEAST_ALPHA = 1 / 255  # that colours are divided by; what is less is not seen in a picture of bytes
-
-HeatRanges = tuple[tuple[float, float], ...]  # per query, the relevancies at which heat is 0 and 1
-
-
-def shader_defines() -> dict[str, int | float]:
-    """What the shader shares with this module: the displays' numbers and the constants."""
-    numbers = {f"DISPLAY_{name.upper()}": number for name, number in NUMBERS.items()}
-    return numbers | {
-        "HEAT_FADE": HEAT_FADE,
-        "SEGMENT_OPACITY": SEGMENT_OPACITY,
-        "LEAST_ALPHA": LEAST_ALPHA,
-        "MAX_QUERIES": MAX_QUERIES,
-        "MAP_NODES": NODES,
-    }
-
-
-def full_ranges(heat_ranges: HeatRanges, count: int) -> HeatRanges:
-    """`heat_ranges` for `count` queries: those without one spread their heat over all of [0, 1]."""
-    return (*heat_ranges[:count], *[(0.0, 1.0)] * (count - len(heat_ranges)))
+LEAST_ALPHA = 1 / 255  # that colours are divided by; what is less is not seen in an image of bytes
 
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """What one camera sees, as rasterized: every colour-like channel is premultiplied by alpha."""
+    """Rasterized view of one camera: every colour-like channel is premultiplied by alpha."""
 
     rgb: Array  # (H, W, 3)
     alpha: Array  # (H, W) in [0, 1]
-    latent: Array | None = None  # (H, W, 3) latent colours
-    relevancies: Array | None = None  # (H, W, Q), Q <= MAX_QUERIES; or which Gaussians are members, 0 or 1
-    depth_sum: Array | None = None  # (H, W) sum of weight * camera z, world units
-    depth_range: tuple[float, float] = (0.0, 1.0)  # near and far end of the depth display, world units
-
-    def extra(self, name: Extra) -> Array | None:
-        """The further channel of that name, if it is there."""
-        return {"latent": self.latent, "relevancies": self.relevancies, "depth": self.depth_sum}.get(name)
+    extra: Array | None = None  # (H, W, C) the display's further channel, C <= 3
 
 
 @dataclass(frozen=True, eq=False)
 class _Sheet:
-    """What a display draws from."""
+    """Input of a display's drawing."""
 
     channels: Channels
-    extra: Array  # (H, W, ...) the display's further channel; alpha for displays without one
+    extra: Array  # (H, W, C) the display's further channel; alpha for displays without one
     picture: PictureConfig
-    heat_ranges: HeatRanges
+    ranges: Ranges
 
     def uncovered(self) -> Array:
         """(H, W, 3) what shows of the background."""
@@ -170,16 +216,14 @@ class _Sheet:
         return np.clip(self.of_scene(self.channels.rgb) + self.uncovered(), 0, 1)
 
     def of_scene(self, total: Array) -> Array:
-        """(H, W, 3) premultiplied sums as they enter the picture: where that is transparent its colours are
+        """(H, W, 3) premultiplied sums as they enter the image: where that is transparent its colours are
         the scene's own, undiluted, as PNG wants them."""
-        return (
-            total / np.maximum(self.channels.alpha, LEAST_ALPHA)[..., None]
-            if self.picture.transparent
-            else total
-        )
+        if not self.picture.transparent:
+            return total
+        return total / np.maximum(self.channels.alpha, LEAST_ALPHA)[..., None]
 
-    def relevancy(self) -> Array:
-        """(H, W, Q) in [0, 1]."""
+    def mean(self) -> Array:
+        """(H, W, C) mean value of the further channel, 0 where alpha is below the gate."""
         return gated_mean(self.extra, self.channels.alpha, self.picture.alpha_gate)
 
 
@@ -189,29 +233,24 @@ def gated_mean(total: Array, alpha: Array, gate: float) -> Array:
     return np.where(open_[..., None], total / np.where(open_, alpha, 1)[..., None], 0)
 
 
-def compose(channels: Channels, picture: PictureConfig, heat_ranges: HeatRanges = ()) -> Array:
-    """(H, W, 3) uint8 picture; with `picture.transparent` (H, W, 4), its colours not premultiplied. Where a
-    display's further channel is absent it shows the plain colours.
+def full_ranges(ranges: Ranges, count: int) -> Ranges:
+    """`ranges` of `count` components: those without one spread over all of [0, 1]."""
+    return (*ranges[:count], *[(0.0, 1.0)] * (count - len(ranges)))
 
-    heat_ranges: per query, the relevancies at which its heat is 0 and 1; see `full_ranges`.
-    """
-    wanted = DISPLAYS[picture.display].extra
-    extra = channels.alpha if wanted == "none" else channels.extra(wanted)
-    draw = _colours if extra is None else _DRAW[picture.display]
-    sheet = _Sheet(channels, channels.alpha if extra is None else extra, picture, heat_ranges)
+
+def compose(channels: Channels, picture: PictureConfig, ranges: Ranges = ()) -> Array:
+    """(H, W, 3) uint8 image; with `picture.transparent` (H, W, 4), its colours not premultiplied. Where a
+    display's further channel is absent it shows the plain colours. `ranges`: see `full_ranges`."""
+    row = DISPLAYS[picture.display]
+    draw = row.draw if row.channel is None or channels.extra is not None else _colours
+    extra = channels.alpha[..., None] if channels.extra is None else channels.extra
+    sheet = _Sheet(channels, extra, picture, ranges)
     drawn = draw(sheet)
-    if picture.transparent:
-        drawn = np.concatenate([drawn, _opacity(sheet, draw)[..., None]], -1)
+    if not picture.transparent:
+        drawn = drawn[..., :3]
+    elif drawn.shape[-1] == 3:
+        drawn = np.concatenate([drawn, channels.alpha[..., None]], -1)
     return np.rint(255 * np.clip(drawn, 0, 1)).astype(np.uint8)
-
-
-def _opacity(sheet: _Sheet, draw: Callable[[_Sheet], Array]) -> Array:
-    """(H, W) alpha of a transparent picture: the scene's; the display of alpha itself is opaque, and depth
-    is there or not."""
-    alpha = sheet.channels.alpha
-    if draw is _depth:
-        return np.asarray(alpha > sheet.picture.alpha_gate, alpha.dtype)
-    return np.ones_like(alpha) if draw is _alpha else alpha
 
 
 def _colours(sheet: _Sheet) -> Array:
@@ -223,11 +262,11 @@ def _latent(sheet: _Sheet) -> Array:
 
 
 def _heat(sheet: _Sheet) -> Array:
-    """One query by the colour map. Several by their own colours: where they overlap, the mean of the colours,
-    weighted by heat, as opaque as the hottest of them."""
-    picture, relevancy = sheet.picture, sheet.relevancy()
+    """Heat map: one query by the colour map, several by their own colours. Where they overlap, the mean of
+    the colours, weighted by heat, as opaque as the hottest of them."""
+    picture, relevancy = sheet.picture, sheet.mean()
     count = relevancy.shape[-1]
-    low, high = np.transpose(full_ranges(sheet.heat_ranges, count))
+    low, high = np.transpose(full_ranges(sheet.ranges, count))
     heats = np.clip((relevancy - low) / (high - low), 0, 1)
     heat = heats.max(-1)
     if picture.own_colours:
@@ -241,8 +280,8 @@ def _heat(sheet: _Sheet) -> Array:
 
 def _segments(sheet: _Sheet) -> Array:
     """The query that has most of a pixel, in its colour, as opaque as its value of 1 is hot."""
-    picture, relevancy, colours = sheet.picture, sheet.relevancy(), sheet.colours()
-    low, high = np.transpose(full_ranges(sheet.heat_ranges, relevancy.shape[-1]))
+    picture, relevancy, colours = sheet.picture, sheet.mean(), sheet.colours()
+    low, high = np.transpose(full_ranges(sheet.ranges, relevancy.shape[-1]))
     opacity = SEGMENT_OPACITY * np.clip((1 - low) / (high - low), 0, 1)
     winner = relevancy.argmax(-1)
     inside = (relevancy.max(-1) > picture.threshold)[..., None]
@@ -251,25 +290,92 @@ def _segments(sheet: _Sheet) -> Array:
 
 
 def _depth(sheet: _Sheet) -> Array:
-    alpha, gate = sheet.channels.alpha, sheet.picture.alpha_gate
-    near, far = sheet.channels.depth_range
-    depth = gated_mean(sheet.extra[..., None], alpha, gate)[..., 0]
-    t = np.clip((depth - near) / max(far - near, 1e-9), 0, 1)
+    """Opaque, or nothing at all."""
+    covered = (sheet.channels.alpha > sheet.picture.alpha_gate)[..., None]
+    ((near, far),) = full_ranges(sheet.ranges, 1)
+    t = np.clip((sheet.mean()[..., 0] - near) / max(far - near, 1e-9), 0, 1)
     backdrop = np.zeros(3) if sheet.picture.transparent else np.asarray(sheet.picture.background)
-    return np.where((alpha > gate)[..., None], mapped(1 - t, sheet.picture.colour_map), backdrop)
+    colours = np.where(covered, mapped(1 - t, sheet.picture.colour_map), backdrop)
+    return np.concatenate([colours, covered], -1)
 
 
 def _alpha(sheet: _Sheet) -> Array:
-    return np.repeat(sheet.channels.alpha[..., None], 3, -1)
+    """Opaque."""
+    alpha = sheet.channels.alpha
+    return np.stack([alpha, alpha, alpha, np.ones_like(alpha)], -1)
 
 
-_DRAW: Mapping[Display, Callable[[_Sheet], Array]] = MappingProxyType(
-    {
-        "rgb": _colours,
-        "latent": _latent,
-        "relevancy": _heat,
-        "segmentation": _segments,
-        "depth": _depth,
-        "alpha": _alpha,
-    }
+# One row per display, in the order of buttons and keys.
+
+
+@dataclass(frozen=True)
+class DisplayRow:
+    """One display. Its GLSL is an expression of type vec4 in the variables of `main` in `compose.frag.glsl`,
+    its opacity that of a transparent image; a NumPy drawing without a fourth component has the scene's."""
+
+    name: Display
+    label: str  # on its button
+    draw: Callable[[_Sheet], Array]  # (H, W, 3 or 4) in [0, 1]
+    glsl: str
+    channel: Callable[[Subject], Array | None] | Literal["depth"] | None = None  # (N, 1 to 3), or camera z
+    ranges: Callable[[Answers], Ranges] = lambda answers: ()
+    is_colour: bool = False  # its channel is colours, tinted where Gaussians are selected
+    legend: bool = False  # a colour bar of the answers lies over the image
+    uses_map: bool = False  # it shows numbers by the colour map
+    by_level: bool = False  # it has a button for each semantic level
+    needs_field: bool = False  # shows the language field
+    needs_query: bool = False  # shows answers
+
+
+_ROWS = (
+    DisplayRow("rgb", "Colours", _colours, "vec4(base, c.a)"),
+    DisplayRow("depth", "Depth", _depth, "depth_map(sums.rg)", "depth", uses_map=True),
+    DisplayRow("alpha", "Alpha", _alpha, "vec4(vec3(c.a), 1.0)"),
+    DisplayRow(
+        "relevancy",
+        "Relevancy",
+        _heat,
+        "vec4(heat_map(base, mean), c.a)",
+        relevancies,
+        heat_ranges,
+        legend=True,
+        uses_map=True,
+        needs_field=True,
+        needs_query=True,
+    ),
+    DisplayRow(
+        "segmentation",
+        "Segmentation",
+        _segments,
+        "vec4(segments(base, mean), c.a)",
+        members,
+        member_ranges,
+        needs_field=True,
+        needs_query=True,
+    ),
+    DisplayRow(
+        "latent",
+        "Latent",
+        _latent,
+        "vec4(sums.rgb / share + uncovered, c.a)",
+        latents,
+        is_colour=True,
+        by_level=True,
+        needs_field=True,
+    ),
 )
+DISPLAYS: Mapping[Display, DisplayRow] = MappingProxyType({row.name: row for row in _ROWS})
+NUMBERS: Mapping[Display, int] = MappingProxyType({name: number for number, name in enumerate(DISPLAYS)})
+
+
+def shader_defines() -> dict[str, int | float | str]:
+    """Constants that the shader shares with this module, and all displays' drawings as one expression."""
+    shown = "".join(f"display == {number} ? ({row.glsl}) : " for number, row in enumerate(_ROWS))
+    return {
+        "HEAT_FADE": HEAT_FADE,
+        "SEGMENT_OPACITY": SEGMENT_OPACITY,
+        "LEAST_ALPHA": LEAST_ALPHA,
+        "MAX_QUERIES": MAX_QUERIES,
+        "MAP_NODES": NODES,
+        "SHOWN": f"({shown}vec4(base, c.a))",
+    }

@@ -50,7 +50,7 @@ from langsplat_core.errors import BackendError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.raster import gsplat, load_lifting_rasterizer, load_rasterizer
 from langsplat_core.raster.gsplat import require_device
-from langsplat_core.raster.opengl.scene_textures import create_egl_context
+from langsplat_core.raster.opengl.scene_textures import create_egl_context, is_software
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.encoders import load_encoder
@@ -58,7 +58,6 @@ from langsplat_core.semantics.sam import grid_points, load_segmenter
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.mask_weights import find_mask_weights
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
-from langsplat_viewer.drawing.frame import is_software
 
 
 class Missing(Exception):

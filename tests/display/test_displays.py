@@ -1,35 +1,190 @@
-"""The one list of displays, and what is derived from it."""
+"""The table of displays: channels of answers and latents, and composition in NumPy."""
 
-import re
+from dataclasses import replace
 from typing import get_args
 
-from langsplat_core.config import Display
-from langsplat_core.display.displays import DISPLAYS, NUMBERS, Extra, shader_defines
-from langsplat_core.raster.opengl.scene_textures import shader
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
 
-SHADER = shader("compose.frag", 330, "langsplat_core.display", **shader_defines())
+from langsplat_core.config import ColourMap, Display, PictureConfig
+from langsplat_core.display.displays import (
+    COLOUR_MAPS,
+    DISPLAYS,
+    NO_HEAT,
+    NODES,
+    QUERY_COLOURS,
+    SEGMENT_OPACITY,
+    TURBO,
+    Channels,
+    Subject,
+    compose,
+    heat_ranges,
+    latent_colours,
+    mapped,
+    member_ranges,
+    members,
+    painted,
+    relevancies,
+)
+from langsplat_core.scene import LanguageField, LinearCodec
+from tests.support.answers import random_answer
+
+PICTURE = PictureConfig()
+HEAT = PictureConfig(display="relevancy", heat_opacity=1.0)
+RANGES = ((0.5, 0.9),)
+FOUND = random_answer(360, 1)
+WEAK, ABSENT = replace(FOUND, verdict="weak match"), replace(FOUND, verdict="not here")
+
+
+def channels(display: Display = "rgb", value: float = 0.9, alpha: float = 1.0) -> Channels:
+    """A grey image; `value` is that of the further channel."""
+    count = 3 if display == "latent" else 1
+    extra = None if DISPLAYS[display].channel is None else np.full((4, 5, count), value * alpha)
+    return Channels(np.full((4, 5, 3), 0.5 * alpha), np.full((4, 5), alpha), extra)
 
 
 def test_the_table_has_exactly_the_displays_that_the_settings_know():
     assert set(DISPLAYS) == set(get_args(Display))
     assert all(name == row.name for name, row in DISPLAYS.items())
-    assert {row.extra for row in DISPLAYS.values()} == set(get_args(Extra))
-
-
-def test_answers_need_a_language_field():
+    assert len({row.label for row in DISPLAYS.values()}) == len(DISPLAYS)
     assert all(row.needs_field for row in DISPLAYS.values() if row.needs_query)
 
 
-def test_the_shader_tells_displays_apart_by_their_place_in_the_table():
-    assert list(NUMBERS.values()) == list(range(len(DISPLAYS)))
-    for name, number in NUMBERS.items():
-        assert f"#define DISPLAY_{name.upper()} {number}\n" in SHADER
-    code = SHADER[SHADER.index("void main") :]
-    handled = set(re.findall(r"display == DISPLAY_(\w+)", code))
-    assert handled == {name.upper() for name in DISPLAYS} - {"RGB"}  # which is what is left
-    assert not re.search(r"display == \d", code)
+@pytest.mark.parametrize(("channel", "ranges"), [(relevancies, heat_ranges), (members, member_ranges)])
+def test_nothing_is_painted_of_what_is_not_here(channel, ranges):
+    assert channel(Subject(360, answers=(ABSENT,))) is None
+    values = channel(Subject(360, answers=(ABSENT, FOUND)))
+    assert not values[:, 0].any()
+    assert values[:, 1].any()
+    assert ranges((ABSENT, FOUND, None))[0] == NO_HEAT
+    assert painted((ABSENT, FOUND, None)) == [1]
 
 
-def test_labels_are_told_apart():
-    labels = [row.label for row in DISPLAYS.values()]
-    assert len(set(labels)) == len(labels)
+def test_a_weak_match_is_never_hotter_than_half():
+    (low, high), (weak_low, weak_high) = heat_ranges((FOUND, WEAK))
+    assert (low, high) == FOUND.heat_range
+    assert (high - weak_low) / (weak_high - weak_low) == pytest.approx(0.5)
+    assert member_ranges((FOUND, WEAK)) == ((0.0, 1.0), (0.0, 2.0))
+
+
+def test_a_heat_map_shows_relevancy_at_a_level_and_a_segmentation_members():
+    assert_allclose(members(Subject(360, answers=(FOUND,)))[:, 0], FOUND.members)
+    for level, shown in ((None, 2), (0, 0), (1, 1)):
+        got = relevancies(Subject(360, answers=(FOUND,), level=level))
+        assert_allclose(got[:, 0], FOUND.relevancy[shown])
+
+
+def pixel(values: tuple[float, ...], **picture) -> np.ndarray:
+    """(3,) colour in [0, 1] of one black, opaque pixel."""
+    shown = Channels(np.zeros((1, 1, 3)), np.ones((1, 1)), np.array([[values]]))
+    return compose(shown, replace(HEAT, own_colours=True), ((0.0, 1.0),) * len(values))[0, 0] / 255
+
+
+def test_heats_that_overlap_mix_their_colours_by_heat():
+    assert_allclose(pixel((1.0, 0.0)), QUERY_COLOURS[0], atol=0.003)
+    assert_allclose(pixel((0.0, 1.0, 0.0)), QUERY_COLOURS[1], atol=0.003)
+    assert_allclose(pixel((1.0, 1.0)), QUERY_COLOURS[:2].mean(0), atol=0.003)
+    assert_allclose(pixel((1.0, 0.5)), QUERY_COLOURS[:2].T @ (2 / 3, 1 / 3), atol=0.003)
+    assert_allclose(pixel((0.5, 0.0)), 0.5 * QUERY_COLOURS[0], atol=0.003)  # smoothstep of 1/2
+    assert_allclose(pixel((0.0, 0.0)), 0)
+
+
+def test_a_weak_segment_is_half_as_opaque():
+    shown = Channels(np.zeros((1, 2, 3)), np.ones((1, 2)), np.array([[[1.0, 0], [0, 1.0]]]))
+    got = compose(shown, PictureConfig(display="segmentation"), ((0.0, 1.0), (0.0, 2.0)))[0] / 255
+    assert_allclose(got, SEGMENT_OPACITY * QUERY_COLOURS[:2] * [[1.0], [0.5]], atol=0.003)
+
+
+def test_turbo_runs_from_dark_blue_over_green_to_dark_red():
+    assert TURBO.shape == (256, 3)
+    low, middle, high = TURBO[0].astype(int), TURBO[128].astype(int), TURBO[255].astype(int)
+    assert low.sum() < 150
+    assert middle.argmax() == 1
+    assert high.argmax() == 0
+    np.testing.assert_allclose(mapped(np.array([0.0, 1.0])), TURBO[[0, 255]] / 255)
+
+
+@pytest.mark.parametrize("display", DISPLAYS)
+def test_every_display_is_a_picture(display):
+    picture = compose(channels(display), replace(PICTURE, display=display), RANGES)
+    assert picture.shape == (4, 5, 3)
+    assert picture.dtype == np.uint8
+    assert (picture == picture[0, 0]).all()
+
+
+def test_colours_lie_over_the_background():
+    half = compose(channels(alpha=0.5), replace(PICTURE, background=(1.0, 1.0, 1.0)))
+    assert half[0, 0].tolist() == [191, 191, 191]  # 0.25 + 0.5
+
+
+def test_uncovered_pixels_are_never_relevant():
+    faint, dark = (compose(channels("relevancy", value, 0.05), HEAT) for value in (1.0, 0.0))
+    assert (faint == dark).all()
+
+
+def test_heat_starts_at_the_lower_end_of_its_range_and_saturates_at_the_upper():
+    below = compose(channels("relevancy", 0.49), HEAT, RANGES)
+    assert below[0, 0].tolist() == [round(255 * 0.5 * PICTURE.dim)] * 3
+    assert_allclose(compose(channels("relevancy", 0.9), HEAT, RANGES)[0, 0], TURBO[255], atol=1)
+    for value in (0.0, 0.3, 1.0):  # without a range it is hot over all of 0 to 1
+        shown = channels("relevancy", value)
+        assert (compose(shown, HEAT) == compose(shown, HEAT, ((0.0, 1.0),))).all()
+
+
+@pytest.mark.parametrize("name", ["viridis", "cividis", "magma"])
+def test_published_colour_maps_are_as_published(name):
+    colormaps = pytest.importorskip("matplotlib").colormaps
+    expected = np.rint(255 * colormaps[name](np.arange(256))[:, :3])
+    np.testing.assert_array_equal(COLOUR_MAPS[name], expected)
+
+
+def test_every_colour_map_that_can_be_chosen_has_a_table():
+    assert tuple(COLOUR_MAPS) == get_args(ColourMap)
+    assert all(table.shape == (NODES, 3) and table.dtype == np.uint8 for table in COLOUR_MAPS.values())
+    assert mapped(np.array(0.25), "grey").tolist() == pytest.approx([0.25] * 3)
+    assert mapped(np.array(2.0), "magma").tolist() == (COLOUR_MAPS["magma"][-1] / 255).tolist()
+
+
+@pytest.mark.parametrize("name", ["viridis", "cividis", "magma", "grey"])
+def test_what_is_hotter_is_brighter_where_colours_may_not_be_told_apart(name):
+    luminance = COLOUR_MAPS[name] / 255.0 @ (0.2126, 0.7152, 0.0722)
+    assert (np.diff(luminance[::8]) > 0).all()
+
+
+@pytest.mark.parametrize("display", DISPLAYS)
+def test_a_transparent_picture_over_its_background_is_the_opaque_one(display):
+    """Colours that are not premultiplied, as PNG has them: laid over a background they give what is drawn
+    there, where the display draws the scene's own colours or latents."""
+    picture = replace(PICTURE, display=display, background=(0.2, 0.5, 0.9))
+    for alpha in (0.0, 0.2, 0.6, 1.0):
+        shown = channels(display, alpha=alpha)
+        clear = compose(shown, replace(picture, transparent=True), RANGES) / 255
+        assert clear.shape == (4, 5, 4)
+        share = clear[..., 3:]
+        over = clear[..., :3] * share + (1 - share) * picture.background
+        if display in ("rgb", "latent", "depth", "alpha") or alpha == 1:
+            np.testing.assert_allclose(over, compose(shown, picture, RANGES) / 255, atol=0.01)
+        if display not in ("alpha", "depth"):
+            np.testing.assert_allclose(share, alpha, atol=0.003)
+
+
+def test_missing_channels_show_plain_colours():
+    for display in (row.name for row in DISPLAYS.values() if row.channel is not None):
+        assert (compose(channels(), replace(PICTURE, display=display)) == 128).all()
+
+
+@pytest.mark.parametrize("d", [1, 2, 3, 8])
+def test_latent_colours_for_any_dimension(d):
+    rng = np.random.default_rng(d)
+    codec = LinearCodec(np.eye(12, dtype=np.float32)[:d])
+    latents = rng.normal(size=(3, 50, d)).astype(np.float32)
+    confidence = np.ones((3, 50), np.float32)
+    confidence[:, 10] = 0
+    field = LanguageField(latents, confidence, codec, np.eye(12, dtype=np.float32)[:4], "none")
+    colours = latent_colours(field)
+    assert colours.shape == (3, 50, 3)
+    assert colours.min() >= 0
+    assert colours.max() <= 1
+    assert (colours[:, 10] == 0.5).all()
+    assert np.ptp(colours[:, :10]) > 0.5

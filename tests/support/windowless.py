@@ -7,8 +7,9 @@ import numpy as np
 
 from langsplat_core.errors import FormatError
 from langsplat_core.scene import Scene
-from langsplat_viewer import actions
+from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.canvas import Canvas
+from langsplat_viewer.rendering.request import RenderRequest
 from langsplat_viewer.state import GLIDE_SECONDS, ViewerState
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import blob_scene
@@ -31,54 +32,42 @@ class FakeSurface:
         """Nothing is drawn, so that nothing is hidden."""
         return np.zeros((12, 16), np.float32)
 
-    def capture(self, state: ViewerState):
+    def capture(self, request: RenderRequest):
         return np.full((6, 8, 3), 77, np.uint8)
 
 
 class FakeRenderer:
-    """Notes what is asked of it, and takes as long as it is told to, on a clock of its own."""
+    """Notes the requests it draws, and takes as long as it is told to, on a clock of its own."""
 
     backend = "fake"
 
     def __init__(self, seconds: float = 0.0) -> None:
-        self.calls: list[tuple[str, object]] = []
-        self.seconds = seconds  # that a picture takes
+        self.drawn: list[RenderRequest] = []
+        self.seconds = seconds  # that an image takes
         self.now = 0.0
+        self.nothing = False  # whether images show nothing
+        self.depth: float | None = None  # of the surface; None: 2 in the right half
 
     def clock(self) -> float:
         return self.now
 
-    def set_scene(self, scene) -> None:
-        self.calls.append(("scene", scene))
-
-    def set_clip(self, clip) -> None:
-        self.calls.append(("clip", clip))
-
     def forget(self) -> None:
-        self.calls.append(("forget", None))
+        pass
 
-    def set_layers(self, latent_rgb, relevancies) -> None:
-        self.calls.append(("layers", latent_rgb is not None))
-
-    def prepare(self, camera, pictures) -> None:
-        self.calls.append(("prepare", [picture.display for picture, _ in pictures]))
-
-    def ahead(self, camera, pictures) -> None:
+    def ahead(self, request: RenderRequest) -> None:
         return None
 
-    def draw(self, target, camera, picture, heat_ranges=(), layers=None) -> None:
-        self.calls.append(("draw", (camera.width, camera.height)))
+    def draw(self, request: RenderRequest, targets) -> None:
+        self.drawn.append(request)
         self.now += self.seconds
-        target.clear(1.0, 0.0, 0.0, 1.0)
-
-    def read(self, camera, picture, heat_ranges=(), layers=None):
-        return np.zeros((camera.height, camera.width, 3), np.uint8)
+        for target in targets:
+            target.clear(1.0, 0.0, 0.0, 1.0)
 
     def shows_nothing(self) -> bool:
-        return False
+        return self.nothing
 
-    def depth_at(self, x_px, y_px):
-        return 2.0 if x_px > 100 else None
+    def depth_at(self, request: RenderRequest, x_px: float, y_px: float) -> float | None:
+        return self.depth or (2.0 if x_px > 100 else None)
 
 
 def load(path: Path) -> Scene:
@@ -92,14 +81,26 @@ def settle(viewer: Viewer, seconds: float = 120.0) -> None:
     end = time.monotonic() + seconds
     while viewer.worker.current is not None:
         assert time.monotonic() < end, "the worker never finished"
-        actions.tick(viewer, 0.0)
+        viewer.take_results()
+        viewpoint.tick(viewer, 0.0)
         time.sleep(0.002)
-    actions.tick(viewer, 0.0)
+    viewer.take_results()
+    viewpoint.tick(viewer, 0.0)
+
+
+def recorded(viewer: Viewer, seconds: float = 60.0) -> None:
+    """Until the recorder has nothing left to do."""
+    end = time.monotonic() + seconds
+    while viewer.recorder.current is not None:
+        assert time.monotonic() < end, "never finished"
+        viewer.take_results()
+        time.sleep(0.002)
+    viewer.take_results()
 
 
 def arrive(viewer: Viewer) -> None:
     """Let a gliding camera arrive."""
-    actions.tick(viewer, viewer.clock + 2 * GLIDE_SECONDS)
+    viewpoint.tick(viewer, viewer.clock + 2 * GLIDE_SECONDS)
 
 
 def errors(viewer: Viewer) -> list[str]:

@@ -3,12 +3,15 @@
 import os
 import shutil
 import subprocess
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from langsplat_viewer import actions
+from langsplat_viewer import __main__ as program
+from langsplat_viewer import options
+from langsplat_viewer.actions import opening
 from langsplat_viewer.viewer import Services, Viewer
 from tests.support.fakes import FakeEncoder
 from tests.support.windowless import FakeSurface, load, settle
@@ -25,7 +28,7 @@ def viewer() -> Iterator[Viewer]:
 @pytest.fixture
 def opened(viewer: Viewer) -> Viewer:
     """Shows the scene of three blobs."""
-    actions.open_scene(viewer, Path("blobs.ply"))
+    opening.open_scene(viewer, Path("blobs.ply"))
     settle(viewer)
     return viewer
 
@@ -48,3 +51,21 @@ def display() -> Iterator[str]:
     yield f":{number}"
     server.terminate()
     server.wait(10)
+
+
+Run = Callable[..., tuple[int, list[str], list[str]]]
+
+
+@pytest.fixture
+def run_viewer(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs the console script's function; returns exit code, stdout lines, stderr lines."""
+    monkeypatch.setattr(options, "load_text_encoder", lambda encoder_id: FakeEncoder())
+
+    def run(*arguments: str) -> tuple[int, list[str], list[str]]:
+        monkeypatch.setattr(sys, "argv", ["langsplat-viewer", *arguments])
+        with pytest.raises(SystemExit) as stop:
+            program.entry()
+        captured = capsys.readouterr()
+        return int(stop.value.code or 0), captured.out.splitlines(), captured.err.splitlines()
+
+    return run

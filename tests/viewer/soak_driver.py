@@ -23,11 +23,12 @@ import moderngl
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
-from langsplat_viewer import actions
+from langsplat_viewer.actions import opening, queries, settings, undoing
 from langsplat_viewer.commands import COMMANDS
-from langsplat_viewer.drawing.channels import Clip, Splats
-from langsplat_viewer.drawing.frame import Backend, FrameRenderer
 from langsplat_viewer.panels.layout import PANELS
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.renderer import Backend, GlRenderer
+from langsplat_viewer.rendering.request import Splats
 from langsplat_viewer.state import memory_bytes
 from tests.viewer.window_driver import Session
 
@@ -68,8 +69,8 @@ class SoakSession(Session):
         self._wanted: Callable[[], object] | None = None  # at the next frame
         super().__init__(folder, SCENES[0], backend=backend)
 
-    def _make_renderer(self, ctx: moderngl.Context) -> FrameRenderer:
-        return FrameRenderer(ctx, self.backend)
+    def _make_renderer(self, ctx: moderngl.Context) -> GlRenderer:
+        return GlRenderer(ctx, self.backend)
 
     def params(self) -> hello_imgui.RunnerParams:
         params = super().params()
@@ -118,12 +119,12 @@ class Soak:
         if way == "dropped":
             self.s.do(lambda: self.s.window.drop([str(path)]))
         elif way == "browsed":
-            self.s.do(lambda: actions.ask_for_file(self.viewer))
+            self.s.do(lambda: opening.ask_for_file(self.viewer))
             self.s.ctx.yield_(3)
             self.s.ctx.item_click(f"//**/{name}")
         else:
-            self.s.do(lambda: actions.add_scenes(self.viewer, [path]))
-            self.s.do(lambda: actions.switch_scene(self.viewer, path.absolute()))
+            self.s.do(lambda: opening.add_scenes(self.viewer, [path]))
+            self.s.do(lambda: opening.switch_scene(self.viewer, path.absolute()))
         self.s.ctx.yield_(3)
         if self.state.selection.leaving is not None:
             self.s.ctx.item_click("//**/Discard")
@@ -136,7 +137,7 @@ class Soak:
         way()
         self.s.ctx.yield_(2)
         if self.state.browser is not None:
-            self.s.do(lambda: actions.close_browser(self.viewer))
+            self.s.do(lambda: opening.close_browser(self.viewer))
         if self.rng.random() < 0.2:
             self.settle()
 
@@ -153,29 +154,29 @@ class Soak:
         if self.s.ctx.item_exists(box):
             self.s.search(self.rng.choice(PHRASES))
         else:
-            self.s.do(lambda: actions.ask(self.viewer, self.rng.choice(PHRASES)))
+            self.s.do(lambda: queries.ask(self.viewer, self.rng.choice(PHRASES)))
 
     def of_queries(self) -> None:
         """What the list of queries offers, and undoing."""
         viewer, rng = self.viewer, self.rng
-        self.s.do(lambda: actions.set_level(viewer, rng.choice(("auto", "subpart", "part", "whole"))))
+        self.s.do(lambda: queries.set_level(viewer, rng.choice(("auto", "subpart", "part", "whole"))))
         for query in rng.sample(self.state.queries, min(2, len(self.state.queries))):
-            act = rng.choice((actions.show, actions.hide, actions.remove, actions.select))
+            act = rng.choice((queries.show, queries.hide, queries.remove, queries.select))
             self.s.do(partial(act, viewer, query))
-            self.s.do(partial(actions.set_cut, viewer, query, rng.choice((None, 0.6, 0.7))))
-        self.s.do(partial(rng.choice((actions.undo, actions.redo)), viewer))
+            self.s.do(partial(queries.set_cut, viewer, query, rng.choice((None, 0.6, 0.7))))
+        self.s.do(partial(rng.choice((undoing.undo, undoing.redo)), viewer))
 
     def look(self) -> None:
         """What sliders and boxes of the panels do."""
         viewer, rng = self.viewer, self.rng
         steps: tuple[Callable[[], object], ...] = (
-            lambda: actions.set_picture(viewer, replace(self.state.picture, dim=rng.random())),
-            lambda: actions.set_splats(viewer, Splats(rng.uniform(0.1, 1), rng.randrange(4))),
-            lambda: actions.set_clip(viewer, Clip(rng.uniform(0, 3), rng.uniform(5, 9))),
-            lambda: actions.set_ui_scale(viewer, rng.choice((0.8, 1.0, 1.5))),
-            lambda: actions.open_panel(viewer, rng.choice(PANELS).title),
-            lambda: actions.set_canonical(viewer, ""),
-            lambda: actions.undo(viewer),
+            lambda: settings.set_picture(viewer, replace(self.state.picture, dim=rng.random())),
+            lambda: settings.set_splats(viewer, Splats(rng.uniform(0.1, 1), rng.randrange(4))),
+            lambda: settings.set_clip(viewer, Clip(rng.uniform(0, 3), rng.uniform(5, 9))),
+            lambda: settings.set_ui_scale(viewer, rng.choice((0.8, 1.0, 1.5))),
+            lambda: settings.open_panel(viewer, rng.choice(PANELS).title),
+            lambda: queries.set_canonical(viewer, ""),
+            lambda: undoing.undo(viewer),
         )
         self.s.do(rng.choice(steps))
 

@@ -17,9 +17,8 @@ from langsplat_core.io.cameras import write_cameras
 from langsplat_core.io.scenes import companion_path, save_scene
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer import __main__ as program
-from langsplat_viewer import options
 from langsplat_viewer.options import DisplayChoice, latent_level, parse_size
-from tests.support.fakes import CENTRES, FakeEncoder, blob_scene
+from tests.support.fakes import CENTRES, blob_scene
 
 MUG, BOOK, PLANT = CENTRES
 
@@ -42,21 +41,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.fixture
-def viewer(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    """Runs the console script's function; returns exit code, stdout lines, stderr lines."""
-    monkeypatch.setattr(options, "load_text_encoder", lambda encoder_id: FakeEncoder())
-
-    def run(*arguments: str) -> tuple[int, list[str], list[str]]:
-        monkeypatch.setattr(sys, "argv", ["langsplat-viewer", *arguments])
-        with pytest.raises(SystemExit) as stop:
-            program.entry()
-        captured = capsys.readouterr()
-        return int(stop.value.code or 0), captured.out.splitlines(), captured.err.splitlines()
-
-    return run
-
-
 def picture(path: Path) -> np.ndarray:
     return np.asarray(Image.open(path)).astype(int)
 
@@ -67,18 +51,18 @@ def colour_at(image: np.ndarray, camera: Camera, point: np.ndarray) -> np.ndarra
     return image[row - 2 : row + 3, column - 2 : column + 3].reshape(-1, 3).mean(0)
 
 
-def test_a_picture_from_the_first_training_camera(viewer, folder):
-    code, out, err = viewer("blobs.ply", "--headless", "--out", "a.png")
+def test_a_picture_from_the_first_training_camera(run_viewer, folder):
+    code, out, err = run_viewer("blobs.ply", "--headless", "--out", "a.png")
     assert (code, out, err) == (0, ["a.png: 160x120, rgb"], [])
     image, camera = picture(folder / "a.png"), blob_scene().cameras[0]
     assert image.shape == (120, 160, 3)
     assert [colour_at(image, camera, p).argmax() for p in (MUG, BOOK, PLANT)] == [0, 1, 2]
 
 
-def test_a_query_answers_in_words_and_as_heat(viewer, folder):
-    viewer("blobs.ply", "--headless", "--out", "rgb.png", "--camera", "1")
+def test_a_query_answers_in_words_and_as_heat(run_viewer, folder):
+    run_viewer("blobs.ply", "--headless", "--out", "rgb.png", "--camera", "1")
     arguments = ["--query", "plant", "--query", "Book", "--camera", "1"]
-    code, out, err = viewer("blobs.ply", "--headless", "--out", "a.png", *arguments)
+    code, out, err = run_viewer("blobs.ply", "--headless", "--out", "a.png", *arguments)
     assert (code, err) == (0, [])
     assert out[0] == "a.png: 160x120, relevancy"
     assert out[1].startswith("'plant': found, score ")
@@ -94,16 +78,16 @@ def test_a_query_answers_in_words_and_as_heat(viewer, folder):
     )  # what is not asked for is dimmed
 
 
-def test_a_fixed_level_is_used_and_named(viewer, folder):
-    _, out, _ = viewer("blobs.ply", "--headless", "--out", "a.png", "--query", "mug", "--level", "part")
+def test_a_fixed_level_is_used_and_named(run_viewer, folder):
+    _, out, _ = run_viewer("blobs.ply", "--headless", "--out", "a.png", "--query", "mug", "--level", "part")
     assert "not here" in out[1]
     assert "level part" in out[1]
 
 
-def test_every_display_is_another_picture(viewer, folder):
+def test_every_display_is_another_picture(run_viewer, folder):
     seen = []
     for display in get_args(Display):
-        code, out, _ = viewer(
+        code, out, _ = run_viewer(
             "blobs.ply", "--headless", "--out", f"{display}.png", "--query", "mug", "--display", display
         )
         assert (code, out[0]) == (0, f"{display}.png: 160x120, {display}")
@@ -112,9 +96,9 @@ def test_every_display_is_another_picture(viewer, folder):
         seen.append(image)
 
 
-def test_a_transparent_picture_in_another_colour_map(viewer, folder):
+def test_a_transparent_picture_in_another_colour_map(run_viewer, folder):
     for out, more in (("a.png", ()), ("b.png", ("--colour-map", "cividis", "--transparent"))):
-        code, _, errors = viewer("blobs.ply", "--display", "depth", "--headless", "--out", out, *more)
+        code, _, errors = run_viewer("blobs.ply", "--display", "depth", "--headless", "--out", out, *more)
         assert (code, errors) == (0, [])
     plain, clear = picture(folder / "a.png"), picture(folder / "b.png")
     assert (plain.shape[2], clear.shape[2]) == (3, 4)
@@ -135,8 +119,8 @@ def test_a_transparent_picture_in_another_colour_map(viewer, folder):
         (("--far-cut", "1"), "Camera"),
     ],
 )
-def test_options_of_pictures_say_where_the_window_has_them(viewer, folder, option, panel):
-    code, _, errors = viewer("blobs.ply", *option)
+def test_options_of_pictures_say_where_the_window_has_them(run_viewer, folder, option, panel):
+    code, _, errors = run_viewer("blobs.ply", *option)
     assert code == 2
     assert f"panel {panel}" in errors[0]
 
@@ -155,16 +139,16 @@ def test_options_of_pictures_say_where_the_window_has_them(viewer, folder, optio
         (("--orthographic", "4", "--near-cut", "30"), "nothing of the scene"),
     ],
 )
-def test_cuts_and_canonical_phrases_that_cannot_be_are_one_line(viewer, folder, options, said):
-    code, _, errors = viewer("blobs.ply", "--headless", "--out", "a.png", *options)
+def test_cuts_and_canonical_phrases_that_cannot_be_are_one_line(run_viewer, folder, options, said):
+    code, _, errors = run_viewer("blobs.ply", "--headless", "--out", "a.png", *options)
     assert (code, len(errors)) == (2, 1)
     assert said in errors[0]
     assert not (folder / "a.png").exists()
 
 
-def test_without_perspective_the_picture_has_the_scale_that_was_asked_for(viewer, folder):
+def test_without_perspective_the_picture_has_the_scale_that_was_asked_for(run_viewer, folder):
     """Three units across 120 pixels; each blob is as large as the others, however far away."""
-    code, out, err = viewer("blobs.ply", "--headless", "--orthographic", "3", "--out", "a.png")
+    code, out, err = run_viewer("blobs.ply", "--headless", "--orthographic", "3", "--out", "a.png")
     assert (code, out, err) == (0, ["a.png: 160x120, rgb"], [])
     image, camera = picture(folder / "a.png").astype(int), blob_scene().cameras[0]
     sizes, middles = [], []
@@ -178,33 +162,33 @@ def test_without_perspective_the_picture_has_the_scale_that_was_asked_for(viewer
     assert abs(middles[2] - middles[0] - along * 120 / 3) < 4
 
 
-def test_a_cut_of_zero_is_the_answers_own(viewer, folder):
+def test_a_cut_of_zero_is_the_answers_own(run_viewer, folder):
     asked = ("blobs.ply", "--headless", "--display", "segmentation", "--query", "mug", "--query", "plant")
     for out, cuts in (("a.png", ()), ("b.png", ("0", "0")), ("c.png", ("0", "0.2"))):
         words = [word for cut in cuts for word in ("--cut", cut)]
-        assert viewer(*asked, "--out", out, *words)[0] == 0
+        assert run_viewer(*asked, "--out", out, *words)[0] == 0
     own, zero, cut = (picture(folder / name) for name in ("a.png", "b.png", "c.png"))
     assert (own == zero).all()
     assert np.abs(own - cut).max() > 30
 
 
-def test_a_size_holds_the_whole_photograph(viewer, folder):
-    viewer("blobs.ply", "--headless", "--out", "a.png")
-    viewer("blobs.ply", "--headless", "--out", "b.png", "--size", "400x120")
+def test_a_size_holds_the_whole_photograph(run_viewer, folder):
+    run_viewer("blobs.ply", "--headless", "--out", "a.png")
+    run_viewer("blobs.ply", "--headless", "--out", "b.png", "--size", "400x120")
     wide = picture(folder / "b.png")
     assert wide.shape == (120, 400, 3)
     np.testing.assert_allclose(wide[:, 120:280], picture(folder / "a.png"), atol=1)
 
 
-def test_a_camera_file_gives_that_view(viewer, folder):
+def test_a_camera_file_gives_that_view(run_viewer, folder):
     write_cameras(folder / "view.json", (blob_scene().cameras[2],))
-    viewer("blobs.ply", "--headless", "--out", "a.png", "--camera", "2")
-    viewer("blobs.ply", "--headless", "--out", "b.png", "--camera", "view.json")
+    run_viewer("blobs.ply", "--headless", "--out", "a.png", "--camera", "2")
+    run_viewer("blobs.ply", "--headless", "--out", "b.png", "--camera", "view.json")
     np.testing.assert_array_equal(picture(folder / "a.png"), picture(folder / "b.png"))
 
 
-def test_a_scene_without_cameras_is_framed(viewer, folder):
-    code, out, _ = viewer("plain.ply", "--headless", "--out", "new/folder/a.png", "--size", "96x64")
+def test_a_scene_without_cameras_is_framed(run_viewer, folder):
+    code, out, _ = run_viewer("plain.ply", "--headless", "--out", "new/folder/a.png", "--size", "96x64")
     assert (code, out) == (0, ["new/folder/a.png: 96x64, rgb"])
     covered = (picture(folder / "new/folder/a.png").max(-1) > 40).mean()
     assert 0.02 < covered < 0.9
@@ -239,8 +223,8 @@ def test_a_scene_without_cameras_is_framed(viewer, folder):
         (["blobs.ply", "plain.ply"], "plain.ply"),
     ],
 )
-def test_what_cannot_work_is_one_line(viewer, folder, arguments, reason):
-    code, out, err = viewer(*arguments, "--headless", "--out", "a.png")
+def test_what_cannot_work_is_one_line(run_viewer, folder, arguments, reason):
+    code, out, err = run_viewer(*arguments, "--headless", "--out", "a.png")
     assert code == 2
     assert out == []
     assert len(err) == 1
@@ -260,9 +244,9 @@ def test_what_cannot_work_is_one_line(viewer, folder, arguments, reason):
         (["--out", "a.png"], "add --headless"),
     ],
 )
-def test_an_impossible_out_is_one_line(viewer, folder, arguments, reason):
+def test_an_impossible_out_is_one_line(run_viewer, folder, arguments, reason):
     (folder / "folder.png").mkdir()
-    code, out, err = viewer("blobs.ply", *arguments)
+    code, out, err = run_viewer("blobs.ply", *arguments)
     assert (code, out, len(err)) == (2, [], 1)
     assert reason in err[0]
 
@@ -280,11 +264,11 @@ def test_an_encoder_that_is_absent_is_one_line(monkeypatch, folder, capsys):
     assert not (folder / "a.png").exists()
 
 
-def test_a_failed_picture_leaves_the_old_one(viewer, folder):
+def test_a_failed_picture_leaves_the_old_one(run_viewer, folder):
     (folder / "a.png").write_bytes(b"old")
-    viewer("truncated.ply", "--headless", "--out", "a.png")
+    run_viewer("truncated.ply", "--headless", "--out", "a.png")
     assert (folder / "a.png").read_bytes() == b"old"
-    viewer("plain.ply", "--headless", "--out", "a.png", "--size", "32x32")
+    run_viewer("plain.ply", "--headless", "--out", "a.png", "--size", "32x32")
     assert picture(folder / "a.png").shape == (32, 32, 3)
     assert not [path for path in folder.iterdir() if path.name.startswith(".a")]
 
@@ -341,3 +325,32 @@ def test_the_choices_are_the_displays_and_auto():
 
 def test_latents_are_those_of_the_level_asked_for():
     assert [latent_level(level) for level in ("subpart", "part", "whole", "auto")] == [0, 1, 2, 2]
+
+
+BLOBS = blob_scene().gaussians
+NOTHING = {
+    "empty": (BLOBS.take(np.zeros(360, bool)), "the scene holds no Gaussians"),
+    "nan": (replace(BLOBS, means=np.full((360, 3), np.nan)), "none of the 360 Gaussians can be drawn"),
+    "clear": (replace(BLOBS, opacity_logits=np.full(360, -20.0)), "all 360 Gaussians are transparent"),
+}
+
+
+def looking_away() -> Camera:
+    camera = blob_scene().cameras[1]
+    matrix = camera.world_to_camera.copy()
+    matrix[[0, 2]] *= -1
+    return replace(camera, world_to_camera=matrix)
+
+
+@pytest.mark.parametrize("case", [*NOTHING, "away"])
+def test_without_a_window_nothing_is_one_line_and_no_file(case, tmp_path: Path, run_viewer):
+    gaussians, reason = NOTHING.get(case, (BLOBS, "behind the camera"))
+    save_scene(tmp_path / "scene.ply", Scene(gaussians))
+    write_cameras(tmp_path / "view.json", (looking_away(),))
+    options = ["--camera", str(tmp_path / "view.json")] if case == "away" else []
+    out = tmp_path / "a.png"
+    arguments = [str(tmp_path / "scene.ply"), "--headless", "--backend", "cpu", "--out", str(out), *options]
+    code, _, lines = run_viewer(*arguments)
+    assert (code, len(lines)) == (2, 1)
+    assert reason in lines[0]
+    assert not out.exists()

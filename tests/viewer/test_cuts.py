@@ -10,13 +10,12 @@ import pytest
 from langsplat_core.config import PictureConfig
 from langsplat_core.raster.protocol import farthest
 from langsplat_core.scene import look_at
-from langsplat_viewer import actions
-from langsplat_viewer.actions.filming import subject_of
+from langsplat_viewer.actions import opening, selecting, settings, viewpoint
 from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.canvas import NOTHING_BETWEEN, Canvas
-from langsplat_viewer.drawing.channels import UNCLIPPED, Clip, depth_range, looking_settings
-from langsplat_viewer.drawing.frame import FrameRenderer
-from langsplat_viewer.output.still import painter
+from langsplat_viewer.rendering.depth import UNCLIPPED, Clip, depth_range, image_formation
+from langsplat_viewer.rendering.renderer import GlRenderer
+from langsplat_viewer.rendering.request import plain_request
 from tests.support.fakes import CENTRES, blob_scene
 from tests.support.selected import marked
 from tests.support.windowless import rest, settle
@@ -32,29 +31,26 @@ DEPTHS = blob_scene().gaussians.means @ SIDE.rotation[2] + SIDE.world_to_camera[
 @pytest.mark.parametrize("display", ["rgb", "depth", "alpha"])
 @pytest.mark.parametrize("clip", [BOOK_ALONE, Clip(near=4.4), Clip(far=4.4)])
 def test_what_is_cut_away_is_as_if_it_were_not_there(gl, backend, display, clip):
-    scene, picture = blob_scene(), PictureConfig(display=display)
+    scene = blob_scene()
     kept = scene.take(np.flatnonzero(clip.keeps(DEPTHS)))
     assert 0 < len(kept.gaussians) < 360
-    frame = FrameRenderer(gl, backend, "single")
-    frame.set_scene(kept)
-    expected = frame.read(SIDE, picture)
-    frame.set_scene(scene)
-    whole = frame.read(SIDE, picture)
-    frame.set_clip(clip)
-    seen = frame.read(SIDE, picture)
-    frame.set_clip(UNCLIPPED)
-    again = frame.read(SIDE, picture)
-    frame.release()
-    np.testing.assert_allclose(seen.astype(int), expected, atol=1)
-    assert np.abs(seen.astype(int) - whole).max() > 20
-    np.testing.assert_array_equal(again, whole)
+    renderer, whole = (
+        GlRenderer(gl, backend, "single"),
+        plain_request(scene, SIDE, PictureConfig(display=display)),
+    )
+    expected = renderer.read(plain_request(kept, SIDE, whole.picture)).astype(int)
+    seen = [renderer.read(request).astype(int) for request in (whole, replace(whole, clip=clip), whole)]
+    renderer.release()
+    np.testing.assert_allclose(seen[1], expected, atol=1)
+    assert np.abs(seen[1] - seen[0]).max() > 20
+    np.testing.assert_array_equal(seen[2], seen[0])
 
 
 def test_the_near_cut_never_comes_nearer_than_the_near_plane_and_the_far_one_is_none_by_itself():
     scene = blob_scene()
-    plain = looking_settings(scene, SIDE)
-    assert looking_settings(scene, SIDE, Clip(0.01, 7.0)) == replace(plain, far=7.0)
-    assert looking_settings(scene, SIDE, Clip(3.0)) == replace(plain, near=3.0)
+    plain = image_formation(scene, SIDE)
+    assert image_formation(scene, SIDE, Clip(0.01, 7.0)) == replace(plain, far=7.0)
+    assert image_formation(scene, SIDE, Clip(3.0)) == replace(plain, near=3.0)
     assert (plain.far, farthest(plain)) == (None, math.inf)
 
 
@@ -64,59 +60,49 @@ def test_the_scale_of_depth_is_that_of_what_is_left():
 
 
 def test_the_far_cut_stays_the_farther(opened):
-    actions.set_clip(opened, Clip(3.0, 2.0))
-    assert opened.state.seeing.clip == Clip(3.0, 3.0)
-    actions.set_clip(opened, Clip(-1.0, 2.0))
-    assert opened.state.seeing.clip == Clip(0.0, 2.0)
+    settings.set_clip(opened, Clip(3.0, 2.0))
+    assert opened.state.settings.clip == Clip(3.0, 3.0)
+    settings.set_clip(opened, Clip(-1.0, 2.0))
+    assert opened.state.settings.clip == Clip(0.0, 2.0)
 
 
 @pytest.fixture
 def beside(opened):
     """Stands at `SIDE`."""
-    actions.resize(opened, *SIZE)
-    actions.move(opened, lambda view: from_camera(SIDE, opened.state.extent))
+    settings.resize(opened, *SIZE)
+    viewpoint.move(opened, lambda view: from_camera(SIDE, opened.state.extent))
     return opened
 
 
 def test_the_canvas_draws_another_cut_once_and_says_where_nothing_is_left(gl, beside):
-    renderer = FrameRenderer(gl, "cpu")
+    renderer = GlRenderer(gl, "cpu")
     canvas, state = Canvas(gl, renderer), beside.state
     rest(canvas, state, 0.0)
-    actions.set_clip(beside, BOOK_ALONE)
+    settings.set_clip(beside, BOOK_ALONE)
     rest(canvas, state, 1.0)
     book = np.frombuffer(canvas.textures[0].read(), np.uint8).reshape(120, 160, 4)[60, 80]
     assert book[:3].argmax() == 1
     assert abs(canvas.point_at(0.5, 0.5)[0] - CENTRES[1][0]) < 0.6  # of the surface that is seen
-    actions.set_clip(beside, Clip(20.0, 30.0))
+    settings.set_clip(beside, Clip(20.0, 30.0))
     rest(canvas, state, 2.0)
     assert state.nothing == NOTHING_BETWEEN
-    actions.set_clip(beside, UNCLIPPED)
+    settings.set_clip(beside, UNCLIPPED)
     rest(canvas, state, 3.0)
     assert state.nothing == ""
     renderer.release()
 
 
-def test_a_film_is_cut_as_the_window_is(beside):
-    actions.set_clip(beside, BOOK_ALONE)
-    subject = subject_of(beside.state)
-    with painter(subject, "cpu") as paint:
-        seen = paint(SIDE).image
-    assert seen[60, 80].argmax() == 1
-    with painter(replace(subject, clip=UNCLIPPED), "cpu") as paint:
-        assert paint(SIDE).image[60, 80].argmax() == 0
-
-
 def test_an_outline_does_not_select_what_is_cut_away(beside):
-    actions.use_tool(beside, "rectangle")
-    actions.set_clip(beside, BOOK_ALONE)
-    actions.begin_stroke(beside, 0.0, 0.0)
-    actions.extend_stroke(beside, 1.0, 1.0)
-    actions.end_stroke(beside)
+    selecting.use_tool(beside, "rectangle")
+    settings.set_clip(beside, BOOK_ALONE)
+    selecting.begin_stroke(beside, 0.0, 0.0)
+    selecting.extend_stroke(beside, 1.0, 1.0)
+    selecting.end_stroke(beside)
     assert marked(beside)[0] == "book"
 
 
 def test_another_scene_is_whole(beside):
-    actions.set_clip(beside, BOOK_ALONE)
-    actions.open_scene(beside, Path("bare.ply"))
+    settings.set_clip(beside, BOOK_ALONE)
+    opening.open_scene(beside, Path("bare.ply"))
     settle(beside)
-    assert beside.state.seeing.clip == UNCLIPPED
+    assert beside.state.settings.clip == UNCLIPPED

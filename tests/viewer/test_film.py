@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from langsplat_core.config import PictureConfig
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.progress import Cancelled, Progress, Report
-from langsplat_viewer import __main__ as program
-from langsplat_viewer import options
 from langsplat_viewer.camera.controls import extent_of
 from langsplat_viewer.camera.flight import Flight, Keyframe
-from langsplat_viewer.files.flight_files import write_flight
+from langsplat_viewer.files.flights import write_flight
 from langsplat_viewer.output import film
 from langsplat_viewer.output.film import Shot, cameras_of, find_ffmpeg, fingerprint, make_film
-from langsplat_viewer.output.still import Subject, render_picture
-from tests.support.fakes import FakeEncoder, blob_scene
+from langsplat_viewer.rendering.renderer import render_image
+from langsplat_viewer.rendering.request import RenderRequest, plain_request
+from tests.support.fakes import blob_scene
 from tests.support.flights import flight
 
 SIZE = (32, 24)
@@ -42,11 +42,14 @@ sys.exit(1)
 """
 
 
+def request() -> RenderRequest:
+    scene = blob_scene()
+    return plain_request(scene, scene.cameras[0].resized(*SIZE), PictureConfig())
+
+
 def shot(away: float = 0.0, **changed) -> Shot:
     given = {"fps": 4.0, "backend": "cpu", **changed}
-    return Shot(
-        Subject(blob_scene()), cameras_of(flight(away), extent_of(blob_scene()), given["fps"], SIZE), **given
-    )
+    return Shot(request(), cameras_of(flight(away), extent_of(blob_scene()), given["fps"], SIZE), **given)
 
 
 def picture(path: Path) -> np.ndarray:
@@ -81,19 +84,9 @@ def ffmpeg(folder: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.fixture
-def viewer(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    """Runs the console script's function; returns exit code, stdout lines, stderr lines."""
-    monkeypatch.setattr(options, "load_text_encoder", lambda encoder_id: FakeEncoder())
-
-    def run(*arguments: str) -> tuple[int, list[str], list[str]]:
-        given = ["langsplat-viewer", *arguments, "--headless", "--backend", "cpu"]
-        monkeypatch.setattr(sys, "argv", given)
-        with pytest.raises(SystemExit) as stop:
-            program.entry()
-        captured = capsys.readouterr()
-        return int(stop.value.code or 0), captured.out.splitlines(), captured.err.splitlines()
-
-    return run
+def viewer(run_viewer):
+    """Runs the program without a window, on the CPU."""
+    return lambda *arguments: run_viewer(*arguments, "--headless", "--backend", "cpu")
 
 
 def test_a_film_is_a_folder_of_pictures(viewer, folder):
@@ -108,10 +101,11 @@ def test_a_film_is_a_folder_of_pictures(viewer, folder):
     assert all(np.abs(a - b).max() > 30 for a, b in pairwise(seen))
 
 
-def test_every_picture_is_the_one_that_a_still_would_be(folder):
+def test_every_image_of_a_film_is_that_of_its_request(folder):
     make_film(shot(), folder / "film")
+    assert json.loads((folder / "film" / "film.json").read_text())["pictures"] == 5
     for name, camera in zip(FRAMES, shot().cameras, strict=True):
-        expected = render_picture(blob_scene(), camera, Subject(blob_scene()).picture, backend="cpu")
+        expected = render_image(request().seen_by(camera), "cpu")
         np.testing.assert_array_equal(picture(folder / "film" / name), expected)
 
 
@@ -182,7 +176,7 @@ def test_ffmpeg_is_given_the_pictures(ffmpeg, folder):
     assert make_film(shot(), Path("a.mp4")) == ["a.mp4: 32x24, 5 pictures, 4 a second"]
     command, _, data = (folder / "a.mp4").read_bytes().partition(b"|")
     pictures = np.frombuffer(data, np.uint8).reshape(5, 24, 32, 3)
-    expected = render_picture(blob_scene(), shot().cameras[4], Subject(blob_scene()).picture, backend="cpu")
+    expected = render_image(request().seen_by(shot().cameras[4]), "cpu")
     np.testing.assert_array_equal(pictures[4], expected)
     words = ast.literal_eval(command.decode())
     for option, value in (("-s", "32x24"), ("-r", "4"), ("-pix_fmt", "rgb24"), ("-i", "pipe:0")):
@@ -233,7 +227,7 @@ def test_a_film_of_nothing_is_refused(folder):
 def test_pictures_of_nothing_are_counted(folder):
     keys = (*flight().keyframes, Keyframe(2.0, flight(1.0).keyframes[2].pose))
     cameras = cameras_of(Flight(keys), extent_of(blob_scene()), 2.0, SIZE)
-    lines = make_film(Shot(Subject(blob_scene()), cameras, 2.0, "cpu"), folder / "a.gif")
+    lines = make_film(Shot(request(), cameras, 2.0, "cpu"), folder / "a.gif")
     assert lines[1].endswith("of 5 pictures show nothing of the scene")
 
 
@@ -281,8 +275,3 @@ def test_the_sides_of_a_video_are_even(ffmpeg, viewer, folder):
     code, _, err = viewer("blobs.ply", "--turntable", "1", "--size", "33x24", "--out", "a.mp4")
     assert code == 2
     assert "choose 32x24" in err[0]
-
-
-def test_the_settings_of_a_folder_are_readable(folder):
-    make_film(shot(), folder / "film")
-    assert json.loads((folder / "film" / "film.json").read_text())["pictures"] == 5

@@ -7,12 +7,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from langsplat_core.scene import LEVELS
-from langsplat_viewer import actions
+from langsplat_viewer.actions import filming, opening, queries, settings, viewpoint
 from langsplat_viewer.actions.opening import standing_at
 from langsplat_viewer.camera.controls import from_side, zoom
-from langsplat_viewer.commands import COMMANDS, keys_of
-from langsplat_viewer.files.flight_files import Shelf
-from langsplat_viewer.panels.pointing import figures
+from langsplat_viewer.commands import COMMANDS
+from langsplat_viewer.files.flights import Shelf
+from langsplat_viewer.panels.overlays import pointed_figures
 from langsplat_viewer.state import GLIDE_SECONDS
 from langsplat_viewer.viewer import Viewer
 from tests.support.fakes import CENTRES
@@ -24,8 +24,8 @@ SIZE = (160, 120)
 @pytest.fixture
 def flat(opened: Viewer) -> Viewer:
     """Without perspective."""
-    actions.resize(opened, *SIZE)
-    actions.toggle_orthographic(opened)
+    settings.resize(opened, *SIZE)
+    viewpoint.toggle_orthographic(opened)
     return opened
 
 
@@ -35,8 +35,8 @@ def pixels(viewer: Viewer, points: np.ndarray) -> np.ndarray:
 
 def test_there_and_back_is_the_same_view(opened):
     before = opened.state.view
-    (command,) = (command for command in COMMANDS if command.act is actions.toggle_orthographic)
-    assert keys_of(command, {}) == ("O", "Keypad5")
+    (command,) = (command for command in COMMANDS if command.act is viewpoint.toggle_orthographic)
+    assert command.keys == ("O", "Keypad5")
     command.act(opened)
     assert opened.state.view.orthographic
     command.act(opened)
@@ -46,25 +46,25 @@ def test_there_and_back_is_the_same_view(opened):
 
 
 def test_before_a_scene_is_open_it_does_nothing(viewer):
-    actions.toggle_orthographic(viewer)
-    actions.open_orthographic(viewer, 2.0)
+    viewpoint.toggle_orthographic(viewer)
+    viewpoint.open_orthographic(viewer, 2.0)
     assert viewer.state.view is None
 
 
 @pytest.mark.parametrize(
     "go",
     [
-        actions.reset_view,
-        actions.frame_scene,
-        actions.focus_result,
-        lambda viewer: actions.look_from(viewer, "top"),
-        lambda viewer: actions.turn_to_face(viewer, "left"),
-        lambda viewer: actions.focus_pixel(viewer, 0.5, 0.5),
-        lambda viewer: actions.zoom_by(viewer, 0.5),
+        viewpoint.reset_view,
+        viewpoint.frame_scene,
+        viewpoint.focus_result,
+        lambda viewer: viewpoint.look_from(viewer, "top"),
+        lambda viewer: settings.turn_to_face(viewer, "left"),
+        lambda viewer: viewpoint.focus_pixel(viewer, 0.5, 0.5),
+        lambda viewer: viewpoint.zoom_by(viewer, 0.5),
     ],
 )
 def test_moving_keeps_it(flat, go):
-    actions.ask(flat, "plant")
+    queries.ask(flat, "plant")
     settle(flat)
     before = flat.state.view
     go(flat)
@@ -74,12 +74,12 @@ def test_moving_keeps_it(flat, go):
 
 
 def test_the_opening_view_of_a_scene_without_cameras_holds_all_of_it(viewer):
-    actions.open_scene(viewer, Path("bare.ply"))
+    opening.open_scene(viewer, Path("bare.ply"))
     settle(viewer)
-    actions.resize(viewer, *SIZE)
-    actions.toggle_orthographic(viewer)
-    actions.move(viewer, lambda view: zoom(view, 0.1, 0.0))
-    actions.reset_view(viewer)
+    settings.resize(viewer, *SIZE)
+    viewpoint.toggle_orthographic(viewer)
+    viewpoint.move(viewer, lambda view: zoom(view, 0.1, 0.0))
+    viewpoint.reset_view(viewer)
     arrive(viewer)
     sample = viewer.state.extent.sample
     places = pixels(viewer, sample.points)
@@ -89,32 +89,32 @@ def test_the_opening_view_of_a_scene_without_cameras_holds_all_of_it(viewer):
 
 
 def test_a_training_camera_is_seen_with_perspective(flat):
-    actions.go_to_camera(flat, 1)
+    viewpoint.go_to_camera(flat, 1)
     arrive(flat)
     assert flat.state.view.orthographic is False
     assert standing_at(flat.state) is not None
-    actions.toggle_orthographic(flat)
+    viewpoint.toggle_orthographic(flat)
     assert standing_at(flat.state) is None  # its photograph would not fit
 
 
 def test_the_wheel_changes_the_scale(flat):
     before = np.ptp(pixels(flat, CENTRES), axis=0)
-    actions.zoom_by(flat, 0.5)
+    viewpoint.zoom_by(flat, 0.5)
     assert_allclose(np.ptp(pixels(flat, CENTRES), axis=0), 2 * before, rtol=1e-5)
 
 
 def test_a_double_click_keeps_the_scale(flat):
     span = flat.state.view.span
-    actions.focus_pixel(flat, 0.4, 0.6)
+    viewpoint.focus_pixel(flat, 0.4, 0.6)
     arrive(flat)
     assert_allclose(flat.state.view.target, [-0.1, 0.1, 0.0])
     assert flat.state.view.span == pytest.approx(span)
 
 
 def test_a_glide_under_way_goes_on(opened):
-    actions.look_from(opened, "top")
-    actions.tick(opened, opened.clock + 0.5 * GLIDE_SECONDS)
-    actions.toggle_orthographic(opened)
+    viewpoint.look_from(opened, "top")
+    viewpoint.tick(opened, opened.clock + 0.5 * GLIDE_SECONDS)
+    viewpoint.toggle_orthographic(opened)
     arrive(opened)
     wanted = from_side(opened.state.view, "top")
     assert_allclose(opened.state.view.rotation, wanted.rotation, atol=1e-9)
@@ -123,21 +123,21 @@ def test_a_glide_under_way_goes_on(opened):
 
 def test_keyframes_and_bookmarks_bring_their_own(flat, tmp_path):
     flat.shelf = Shelf(tmp_path)
-    actions.zoom_by(flat, 0.4)
+    viewpoint.zoom_by(flat, 0.4)
     marked = flat.state.view
-    actions.add_keyframe(flat)
-    actions.add_bookmark(flat, "flat")
-    actions.toggle_orthographic(flat)
-    actions.zoom_by(flat, 2.0)
-    actions.add_keyframe(flat)
-    actions.add_bookmark(flat, "deep")
+    filming.add_keyframe(flat)
+    viewpoint.add_bookmark(flat, "flat")
+    viewpoint.toggle_orthographic(flat)
+    viewpoint.zoom_by(flat, 2.0)
+    filming.add_keyframe(flat)
+    viewpoint.add_bookmark(flat, "deep")
     kept = flat.shelf.read(flat.state.path)
     for name, orthographic, go in (
-        ("flat", True, lambda: actions.go_to_bookmark(flat, kept[0])),
-        ("deep", False, lambda: actions.go_to_bookmark(flat, kept[1])),
-        ("first key", True, lambda: actions.choose_keyframe(flat, flat.state.record.keyframes[0])),
-        ("second key", False, lambda: actions.choose_keyframe(flat, flat.state.record.keyframes[1])),
-        ("played", True, lambda: actions.scrub(flat, 1.0)),
+        ("flat", True, lambda: viewpoint.go_to_bookmark(flat, kept[0])),
+        ("deep", False, lambda: viewpoint.go_to_bookmark(flat, kept[1])),
+        ("first key", True, lambda: filming.choose_keyframe(flat, flat.state.record.keyframes[0])),
+        ("second key", False, lambda: filming.choose_keyframe(flat, flat.state.record.keyframes[1])),
+        ("played", True, lambda: viewpoint.scrub(flat, 1.0)),
     ):
         go()
         arrive(flat)
@@ -150,20 +150,20 @@ def test_keyframes_and_bookmarks_bring_their_own(flat, tmp_path):
 def test_what_is_under_the_cursor_is_said_to_be_as_far_as_from_the_eye(flat):
     x, y = pixels(flat, CENTRES[1:2])[0]
     pixel = (int(x), int(y))
-    actions.toggle_pointing(flat)
-    actions.hover(flat, pixel)
+    viewpoint.toggle_pointing(flat)
+    viewpoint.hover(flat, pixel)
     flat.clock += 1.0
-    actions.hover(flat, pixel)
+    viewpoint.hover(flat, pixel)
     settle(flat)  # the first time kernels are compiled
     found = flat.state.hover.found
     assert len(found.words) == len(LEVELS)
-    away = float(figures(flat.state.hover)[-1].split(", ")[1].removesuffix(" away"))
+    away = float(pointed_figures(flat.state.hover)[-1].split(", ")[1].removesuffix(" away"))
     eye = flat.state.view.eye
     assert away == pytest.approx(float((found.position - eye) @ flat.state.view.rotation[2]), abs=0.006)
     assert np.linalg.norm(found.position - CENTRES[1]) < 0.6
 
 
 def test_opening_with_a_span_shows_as_much(opened):
-    actions.open_orthographic(opened, 3.0)
+    viewpoint.open_orthographic(opened, 3.0)
     assert opened.state.view.span_in(*SIZE) == pytest.approx(3.0)
     assert errors(opened) == []

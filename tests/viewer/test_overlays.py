@@ -1,15 +1,32 @@
 """Lines over the picture, against plain arithmetic."""
 
 import math
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from langsplat_core.errors import InputError
 from langsplat_core.query import instances
+from langsplat_core.query.describe import Describer, look_at_pixel
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import look_at
+from langsplat_viewer.actions import opening, queries, settings, viewpoint
 from langsplat_viewer.camera import overlays
-from langsplat_viewer.camera.controls import extent_of, frame_of
-from tests.support.fakes import blob_scene, cameras
+from langsplat_viewer.camera.controls import default_view, extent_of, frame_of, from_side, orbit
+from langsplat_viewer.camera.overlays import FACES, Label, face_at, facing, placed, visible_faces, world_axes
+from langsplat_viewer.files.photographs import LONGEST_SIDE, corners, find, read
+from langsplat_viewer.files.preferences import (
+    load_preferences,
+    save_preferences,
+)
+from langsplat_viewer.panels.overlays import pointed_figures, said
+from tests.support.fakes import CENTRES, FakeEncoder, blob_scene, cameras
+from tests.support.windowless import arrive, errors, settle
 
 SIZE = (120, 80)
 NEAR = 0.05
@@ -95,11 +112,6 @@ def test_round_lengths(length, rounded):
     assert overlays.round_length(length) == pytest.approx(rounded)
 
 
-def test_lengths_in_words():
-    assert overlays.length_text(1.23456, None) == "1.235 units"
-    assert overlays.length_text(2.0, 0.25) == "0.5 m (2 units)"
-
-
 @pytest.mark.parametrize("scale", [None, 0.3])
 def test_the_grid_lies_level_below_the_scene_at_round_distances(scale):
     scene = blob_scene()
@@ -125,3 +137,309 @@ def test_the_edges_of_a_box_join_neighbouring_corners():
     lengths = np.sort(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1))
     np.testing.assert_allclose(lengths, [2.0] * 4 + [4.0] * 4 + [6.0] * 4)
     assert len({tuple(sorted(map(tuple, edge))) for edge in edges.tolist()}) == 12
+
+
+# Words beside things: none covers another, and they stay where they are while nothing meets.
+
+PICTURE = (400.0, 300.0)
+
+
+def random_labels(seed: int, count: int) -> list[Label]:
+    rng = np.random.default_rng(seed)
+    return [
+        Label(*map(float, rng.uniform((-20, -20), (420, 320))), float(rng.uniform(20, 90)), 18.0)
+        for _ in range(count)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_none_covers_another_and_all_are_in_the_picture(seed):
+    found = placed(random_labels(seed, 25), PICTURE)
+    assert not any(a.covers(b) for a, b in combinations(found, 2))
+    for label in found:
+        assert 0 <= label.x <= PICTURE[0] - label.width
+        assert 0 <= label.y <= PICTURE[1] - label.height
+
+
+def test_at_the_top_they_go_down():
+    wanted = [Label(10, 0, 50, 20), Label(10, 5, 50, 20), Label(10, 8, 50, 20)]
+    assert [label.y for label in placed(wanted, PICTURE)] == [0, 20, 40]
+
+
+def test_where_there_is_no_room_they_stay():
+    wanted = [Label(0, 0, 50, 20), Label(0, 3, 50, 20), Label(0, 6, 50, 20)]
+    assert [label.y for label in placed(wanted, (50, 45))] == [0, 20, 6]
+
+
+def test_small_moves_move_labels_as_little_until_two_meet():
+    """Things that drift by a tenth of a pixel a frame: labels follow, but for a jump where two meet."""
+    start, rng = random_labels(3, 8), np.random.default_rng(0)
+    drift = rng.uniform(-0.1, 0.1, (8, 2))
+    before, jumps = placed(start, PICTURE), 0
+    for frame in range(1, 400):
+        moved = [
+            Label(label.x + frame * float(dx), label.y + frame * float(dy), label.width, label.height)
+            for label, (dx, dy) in zip(start, drift, strict=True)
+        ]
+        after = placed(moved, PICTURE)
+        jumps += sum(abs(a.y - b.y) > 0.25 for a, b in zip(before, after, strict=True))
+        before = after
+    assert jumps <= 8
+
+
+# The cube that shows and turns the view.
+
+SCENE = blob_scene()
+VIEW = replace(default_view(SCENE, extent_of(SCENE), (200, 100)), up=np.array([0.0, -1.0, 0.0]))
+
+
+@pytest.mark.parametrize("name", FACES)
+def test_a_face_that_is_turned_to_is_the_only_one_seen(name):
+    turned = facing(VIEW, name)
+    np.testing.assert_allclose(turned.target, VIEW.target)
+    assert turned.distance == VIEW.distance
+    np.testing.assert_allclose(turned.rotation @ turned.rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(turned.rotation) == pytest.approx(1)
+    (face,) = visible_faces(turned)
+    assert (face.name, face.towards) == (name, pytest.approx(1))
+    np.testing.assert_allclose(np.abs(face.corners), 1, atol=1e-9)
+    if name not in ("top", "bottom"):
+        np.testing.assert_allclose(-turned.rotation[1], VIEW.up, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", FACES)
+def test_from_any_side_the_face_in_front_is_under_its_centre(name):
+    pitch = -0.3 if name == "top" else 0.3  # away from the pole
+    view = orbit(orbit(facing(VIEW, name), 0.4, 0.0), 0.0, pitch)
+    faces = visible_faces(view)
+    assert 2 <= len(faces) <= 3
+    for face in faces:
+        assert face_at(faces, tuple(face.centre)) == face.name
+    assert face_at(faces, (3.0, 0.0)) == ""
+
+
+def test_the_worlds_axes_on_screen():
+    axes = world_axes(facing(VIEW, "front"))
+    np.testing.assert_allclose(np.abs(axes), np.eye(3), atol=1e-9)
+    assert axes[0, 0] > 0.9  # x to the right
+    assert axes[1, 1] > 0.9  # y down, as up is -y
+
+
+@pytest.mark.parametrize("side", ["front", "back", "left", "right", "top", "bottom"])
+@pytest.mark.parametrize("up", [(0, -1, 0), (0, 0, 1), (0.1, -0.9, 0.4)])
+def test_keys_and_cube_call_the_sides_by_the_same_names(side, up):
+    view = replace(VIEW, up=np.array(up, float) / np.linalg.norm(up))
+    (face,) = visible_faces(from_side(view, side))
+    assert face.name == side
+
+
+# What is said beside the cursor, without a window.
+
+
+@pytest.fixture(scope="module")
+def compiled() -> None:
+    """The kernels that look at a pixel: half a minute on a fresh machine."""
+    engine = QueryEngine(blob_scene(), lambda encoder_id: FakeEncoder())
+    camera = engine.scene.cameras[0].resized(16, 12)
+    look_at_pixel(load_lifting_rasterizer("cpu"), Describer(engine, ("mug",)), camera, (8, 6))
+
+
+@pytest.fixture
+def pointing(compiled, opened):
+    """The mug asked for, and the mouse asked about."""
+    settings.resize(opened, 160, 120)
+    queries.ask(opened, "mug")
+    settle(opened)
+    viewpoint.toggle_pointing(opened)
+    return opened
+
+
+def at(viewer, thing: int) -> tuple[int, int]:
+    (x, y), _ = (part[0] for part in viewer.state.view.camera(160, 120).project(CENTRES[thing][None]))
+    return int(x), int(y)
+
+
+def rest(viewer, pixel, seconds: float = 0.5) -> None:
+    """The mouse lies still there."""
+    began = viewer.clock
+    for now in (began, began + seconds):
+        viewpoint.tick(viewer, now)
+        viewpoint.hover(viewer, pixel)
+    settle(viewer)
+
+
+def test_it_is_said_once_the_mouse_rests(pointing):
+    rest(pointing, at(pointing, 0), seconds=0.05)
+    assert pointing.state.hover.found is None
+    rest(pointing, at(pointing, 0))
+    found = pointing.state.hover
+    assert found.phrases == ("mug",)
+    assert found.found.relevancy[0] > 0.9
+    assert "mug" in said(found.found.words[2], sure=False)
+    assert "%" not in said(found.found.words[2], sure=False)
+    assert "mug 100 %" in said(found.found.words[2], sure=True)
+    assert "away" in pointed_figures(found)[-1]
+    assert pointed_figures(found)[0].startswith("mug: ")
+
+
+def test_it_is_forgotten_when_the_mouse_or_the_camera_moves(pointing):
+    rest(pointing, at(pointing, 0))
+    viewpoint.hover(pointing, (3, 4))
+    assert pointing.state.hover.found is None
+    rest(pointing, at(pointing, 1))
+    assert pointing.state.hover.found is not None
+    viewpoint.step_camera(pointing, 1)
+    for now in (10.0, 11.0):
+        viewpoint.tick(pointing, now)
+    viewpoint.hover(pointing, at(pointing, 1))
+    assert pointing.state.hover.found is None
+    for elsewhere in (None, (-1, 5), (160, 5), (5, 120)):
+        viewpoint.hover(pointing, elsewhere)
+        assert pointing.state.hover is None
+
+
+def test_a_scene_that_means_nothing_says_so(pointing):
+    opening.open_scene(pointing, Path("plain.ply"))
+    settle(pointing)
+    assert not pointing.state.pointing
+    viewpoint.toggle_pointing(pointing)
+    assert not pointing.state.pointing
+    assert "langsplat train" in errors(pointing)[-1]
+
+
+# The photograph of a training camera, without a window.
+
+CAMERA = cameras()[0]  # of 160 x 120 pixels
+
+
+def photograph(path: Path, size=(160, 120), **options) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", size, (200, 100, 50)).save(path, **options)
+    return path
+
+
+@pytest.mark.parametrize("place", ["scene/images", "scene", "images", "."])
+def test_it_is_found_where_photographs_usually_lie(tmp_path, place):
+    wanted = photograph(tmp_path / place / "photo_0.JPG")
+    photograph(tmp_path / place / "photo_01.jpg")
+    assert find("photo_0", tmp_path / "scene.ply", "") == wanted
+
+
+@pytest.mark.parametrize("name", ["b", "left/b", "left_b"])
+def test_it_is_found_in_a_chosen_folder_and_those_in_it(tmp_path, name):
+    wanted = photograph(tmp_path / "photos" / "left" / "b.png")
+    photograph(tmp_path / "b.png")  # where it would be without a choice
+    assert find(name, tmp_path / "scene.ply", str(tmp_path / "photos")) == wanted
+
+
+@pytest.mark.parametrize("folder", ["", "away", "file.txt"])
+def test_where_there_is_none_the_reason_says_where_it_was_looked_for(tmp_path, folder):
+    (tmp_path / "file.txt").write_text("b")
+    (tmp_path / "b.txt").write_text("no photograph")
+    chosen = str(tmp_path / folder) if folder else ""
+    with pytest.raises(InputError, match="no photograph 'b' in ") as caught:
+        find("b", tmp_path / "scene.ply", chosen)
+    assert str(tmp_path) in str(caught.value)
+    with pytest.raises(InputError, match="does not name"):
+        find("", tmp_path / "scene.ply", chosen)
+
+
+def test_a_large_one_is_shrunk(tmp_path):
+    image = read(photograph(tmp_path / "a.jpg", (4000, 3000)), CAMERA)
+    assert image.shape == (LONGEST_SIDE * 3 // 4, LONGEST_SIDE, 3)
+    np.testing.assert_allclose(image.mean((0, 1)), (200, 100, 50), atol=2)
+
+
+def test_one_that_lies_on_its_side_is_turned(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    assert read(photograph(tmp_path / "a.jpg", (120, 160), exif=exif), CAMERA).shape == (120, 160, 3)
+    kept = replace(CAMERA, width=120, height=160)
+    assert read(tmp_path / "a.jpg", kept).shape == (160, 120, 3)  # it fits as it is
+
+
+@pytest.mark.parametrize("mode", ["L", "RGBA", "P", "I;16"])
+def test_every_kind_of_pixel_becomes_three_bytes(tmp_path, mode):
+    pixels = np.full((120, 160), 200, np.uint8)
+    picture = (
+        Image.fromarray(pixels).convert(mode)
+        if mode != "I;16"
+        else Image.fromarray(np.full((120, 160), 200 * 256, np.uint16))
+    )
+    picture.save(tmp_path / "a.png")
+    image = read(tmp_path / "a.png", CAMERA)
+    assert (image.shape, image.dtype) == ((120, 160, 3), np.uint8)
+    np.testing.assert_allclose(image, 200, atol=1)
+
+
+def test_one_of_another_shape_is_refused(tmp_path):
+    with pytest.raises(InputError, match="100x100 pixels, its camera 160x120"):
+        read(photograph(tmp_path / "a.png", (100, 100)), CAMERA)
+    (tmp_path / "b.png").write_bytes(b"no picture")
+    with pytest.raises(InputError, match=r"b\.png"):
+        read(tmp_path / "b.png", CAMERA)
+
+
+def test_it_lies_where_its_camera_saw_it(opened):
+    viewpoint.go_to_camera(opened, 1)
+    arrive(opened)
+    camera = opened.state.scene.cameras[1]
+    shown = opened.state.view.camera(500, 300)
+    left, top, right, bottom = corners(camera, shown)
+    point = np.array([[0.3, 0.2, 0.1]])
+    (there,), _ = camera.project(point)
+    (here,), _ = shown.project(point)
+    place = (left + there[0] * (right - left) / 160, top + there[1] * (bottom - top) / 120)
+    np.testing.assert_allclose(place, here, atol=1e-6)
+    assert bottom - top == pytest.approx(300)
+
+
+@pytest.fixture
+def beside_photograph(opened, tmp_path):
+    """A scene that lies beside the photograph of its second camera."""
+    opened.state.path = tmp_path / "blobs.ply"
+    photograph(tmp_path / "images" / "photo_1.png")
+    return opened
+
+
+def stand(viewer, index: int) -> None:
+    viewpoint.go_to_camera(viewer, index)
+    arrive(viewer)
+    opening.fetch_photograph(viewer)
+    settle(viewer)
+
+
+def test_it_is_read_once_it_is_wanted_and_only_at_its_camera(beside_photograph):
+    stand(beside_photograph, 1)
+    assert beside_photograph.state.photograph is None
+    opening.fade_photograph(beside_photograph, 3.0)
+    assert beside_photograph.state.settings.fade == 1
+    stand(beside_photograph, 1)
+    found = opening.photograph_here(beside_photograph.state)
+    assert found.image.shape == (120, 160, 3)
+    stand(beside_photograph, 1)
+    assert opening.photograph_here(beside_photograph.state) is found  # not read again
+    viewpoint.zoom_by(beside_photograph, 1.1)
+    assert opening.photograph_here(beside_photograph.state) is None
+    stand(beside_photograph, 2)
+    here = opening.photograph_here(beside_photograph.state)
+    assert here.image is None
+    assert "no photograph 'photo_2'" in here.reason
+
+
+def test_a_chosen_folder_is_looked_into_and_remembered(beside_photograph, tmp_path):
+    photograph(tmp_path / "away" / "deep" / "photo_2.jpg")
+    opening.fade_photograph(beside_photograph, 1.0)
+    stand(beside_photograph, 2)
+    opening.ask_for_photographs(beside_photograph)
+    assert beside_photograph.state.picks_folder
+    opening.choose_photograph_folder(beside_photograph, tmp_path / "away")
+    assert beside_photograph.state.browser is None
+    stand(beside_photograph, 2)
+    assert opening.photograph_here(beside_photograph.state).image.shape == (120, 160, 3)
+    save_preferences(tmp_path / "settings", beside_photograph.state.preferences)
+    assert load_preferences(tmp_path / "settings").photographs == {
+        str(tmp_path / "blobs.ply"): str(tmp_path / "away")
+    }
+    opening.ask_for_file(beside_photograph)
+    assert not beside_photograph.state.picks_folder

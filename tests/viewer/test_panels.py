@@ -1,9 +1,33 @@
 """Panels change nothing by themselves: what they are told goes through `actions`."""
 
 import ast
+import threading
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
-from langsplat_viewer import panels
+import pytest
+from matplotlib.ft2font import FT2Font
+
+from langsplat_core.errors import InputError
+from langsplat_viewer import fonts, panels
+from langsplat_viewer.actions import queries, settings, viewpoint
+from langsplat_viewer.commands import COMMANDS, PANEL_TITLES, matching
+from langsplat_viewer.files.preferences import (
+    FILE_NAME,
+    MOST_RECENT,
+    SCALES,
+    Preferences,
+    load_preferences,
+    preferences_folder,
+    save_preferences,
+    with_recent,
+)
+from langsplat_viewer.panels.layout import PANELS
+from langsplat_viewer.panels.navigation import chord
+from langsplat_viewer.panels.style import elided
+from langsplat_viewer.state import MAX_MESSAGES
+from tests.support.windowless import settle
 
 SOURCES = sorted(Path(panels.__path__[0]).glob("*.py"))
 
@@ -49,15 +73,182 @@ def test_panels_write_no_state():
     assert not found
 
 
-def test_the_rule_itself_can_fail():
-    for bad in (
-        "viewer.state.typed = ''",
-        "state.show_help, x = True, 1",
-        "_, state.coarse_while_moving = f()",
-        "state.picture.dim += 1",
-        "state.queries[0].slot = None",
-        "del viewer.state.view",
-        "setattr(state, 'typed', '')",
-    ):
-        assert writes(bad) == [1], bad
-    assert writes("state = viewer.state; typed = state.typed; x.y = state.typed") == []
+# The table of commands: keys, help and palette are made from it.
+
+KEYS = {key: command for command in COMMANDS for key in command.keys}
+
+
+def test_no_key_does_two_things():
+    assert [key for key, count in Counter(k for c in COMMANDS for k in c.keys).items() if count > 1] == []
+
+
+def test_every_key_is_understood_and_letters_are_plain():
+    for key in KEYS:
+        understood = chord(key)
+        assert (understood.key is None) == bool(understood.character)
+        assert understood.is_plain == (not key.startswith("Ctrl") and key not in ("F1", "Esc")), key
+    assert chord("Ctrl+Shift+P").ctrl
+    assert chord("Ctrl+Shift+P").shift
+    assert (chord("Alt+H").alt, chord("H").alt) == (True, False)
+    assert chord("Shift+F").is_plain  # a capital letter is typed
+
+
+def test_every_panel_can_be_opened_by_a_command(viewer):
+    assert tuple(panel.title for panel in PANELS) == PANEL_TITLES
+    for title in PANEL_TITLES:
+        (command,) = matching(f"panel: {title}")
+        command.act(viewer)
+        assert settings.take_wanted_panel(viewer) == title
+    assert settings.take_wanted_panel(viewer) == ""
+
+
+def test_commands_are_found_by_their_words(opened):
+    assert matching("") == list(COMMANDS)
+    (found,) = matching("OPENING view")
+    assert found.act is viewpoint.reset_view
+    assert matching("make coffee") == []
+
+
+def test_every_command_does_something_sensible_before_a_scene_is_open(viewer, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for command in COMMANDS:
+        command.act(viewer)
+    assert list(tmp_path.iterdir()) == []
+
+
+# What is shown and how; messages; the worker.
+
+
+def test_messages_do_not_grow_without_end(viewer):
+    for number in range(3 * MAX_MESSAGES):
+        viewer.state.say(f"message {number}")
+    viewer.state.say(f"message {3 * MAX_MESSAGES - 1}")  # repeated: once is enough
+    assert len(viewer.state.messages) == MAX_MESSAGES
+    assert viewer.state.messages[-1].text == f"message {3 * MAX_MESSAGES - 1}"
+    assert viewer.state.messages[-2].text != viewer.state.messages[-1].text
+
+
+def test_worker_delivers_in_order_and_names_user_errors_plainly(viewer):
+    seen = []
+
+    def fail(progress):
+        raise InputError("two\n lines")
+
+    viewer.worker.submit("a", lambda progress: 1, seen.append, seen.append)
+    viewer.worker.submit("b", fail, seen.append, seen.append)
+    viewer.worker.submit("c", lambda progress: progress("half", 0.5) or 3, seen.append, seen.append)
+    settle(viewer)
+    assert seen == [1, "two lines", 3]
+
+
+def test_the_worker_wakes_the_window_when_there_is_news(viewer):
+    woken = []
+    viewer.worker.wake = lambda: woken.append(viewer.worker.is_running)
+    viewer.worker.submit("a", lambda progress: progress("half", 0.5), lambda nothing: None, print)
+    settle(viewer)
+    assert len(woken) == 2  # the report, and the end
+    assert viewer.worker.delivered == 1
+    assert not viewer.worker.is_running
+
+
+def test_a_job_that_hangs_does_not_keep_the_process(viewer):
+    begun, release = threading.Event(), threading.Event()
+
+    def hang(progress):
+        begun.set()
+        release.wait(10)
+
+    viewer.worker.submit("slow", hang, print, print)
+    assert begun.wait(10)
+    viewer.worker.close()
+    assert viewer.worker.is_running
+    assert [t.daemon for t in threading.enumerate() if t.name == "langsplat-worker"] != [False]
+    release.set()
+
+
+def test_letters_meant_for_a_box_that_is_not_there_are_no_keys(viewer):
+    queries.focus_search(viewer)
+    assert viewer.state.letters_muted
+    assert "open a scene" in viewer.state.messages[-1].text
+    settings.escape(viewer)
+    assert not viewer.state.letters_muted
+
+
+def test_long_lines_are_cut_where_they_fit():
+    assert elided("red mug", 7, len) == "red mug"
+    assert elided("a red mug on the table", 10, len) == "a red m..."
+    assert elided("two\nlines", 20, len) == "two lines"
+    assert elided("anything", 1, len) == "..."
+
+
+# What one window leaves for the next.
+
+
+def test_they_come_back_as_they_were(tmp_path):
+    assert load_preferences(tmp_path / "none") == Preferences()
+    kept = Preferences("light", 1.5, ("/a/b.ply", "/ü.ply"), ("Search",))
+    save_preferences(tmp_path / "new" / "folder", kept)
+    assert load_preferences(tmp_path / "new" / "folder") == kept
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{",
+        '{"theme": "pink"}',
+        '{"theme": []}',
+        '{"ui_scale": 0}',
+        '{"ui_scale": NaN}',
+        '{"ui_scale": true}',
+        '{"ui_scale": "large"}',
+        '{"recent": 3}',
+        '{"recent": [3]}',
+        '{"recent": null}',
+        '{"panels": "Search"}',
+        "[" * 100_000,
+        "\xff\xfe",
+    ],
+)
+def test_a_file_that_makes_no_sense_is_one_line(tmp_path, text):
+    (tmp_path / FILE_NAME).write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=FILE_NAME) as caught:
+        load_preferences(tmp_path)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 300
+
+
+def test_recent_scenes_are_not_listed_twice_nor_without_end():
+    preferences = Preferences()
+    for number in (*range(MOST_RECENT + 3), 5):
+        preferences = with_recent(preferences, Path(f"/{number}.ply"))
+    assert len(preferences.recent) == MOST_RECENT
+    assert preferences.recent[:2] == ("/5.ply", f"/{MOST_RECENT + 2}.ply")
+
+
+def test_they_lie_in_the_platforms_folder(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    assert preferences_folder().name == "langsplat-viewer"
+
+
+def test_looks_are_chosen_within_limits(viewer):
+    settings.set_theme(viewer, "light")
+    settings.set_ui_scale(viewer, 99.0)
+    assert viewer.state.preferences == replace(Preferences(), theme="light", ui_scale=SCALES[1])
+
+
+# Letters beyond Latin.
+
+
+def test_the_first_fallback_has_the_scripts_that_it_is_there_for():
+    letters = FT2Font(fonts.fallbacks()[0]).get_charmap()
+    for text in ("жук", "κούπα", "čaj żółć", "ספל", "كوب", "→ ≥ ✓"):
+        assert all(ord(letter) in letters for letter in text if letter != " "), text
+
+
+@pytest.mark.parametrize("platform", ["linux", "darwin", "win32", "emscripten"])
+def test_a_system_without_fonts_is_no_error(monkeypatch, platform):
+    monkeypatch.setattr(fonts.sys, "platform", platform)
+    monkeypatch.setattr(fonts, "FOLDERS", {})
+    assert [path.name for path in fonts.fallbacks()] == [fonts.PLAIN]

@@ -1,8 +1,6 @@
-"""The panel "Record" without its window: keyframes, playing, undo, files, films, commands."""
+"""Camera paths, films, saved images and commands, as actions of the window."""
 
 import shlex
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -11,22 +9,22 @@ from numpy.testing import assert_allclose
 from PIL import Image
 
 from langsplat_core.config import PictureConfig
+from langsplat_core.io.cameras import read_cameras
 from langsplat_core.io.scenes import save_scene
-from langsplat_viewer import __main__ as program
-from langsplat_viewer import actions, options
-from langsplat_viewer.actions.filming import subject_of
+from langsplat_viewer.actions import filming, opening, queries, settings, undoing, viewpoint
 from langsplat_viewer.camera.controls import orbit, zoom
-from langsplat_viewer.drawing.channels import Clip, Splats
-from langsplat_viewer.files.flight_files import read_flight
-from langsplat_viewer.output import film
-from langsplat_viewer.output.still import Subject, draw_something, painter
+from langsplat_viewer.files.flights import read_flight
+from langsplat_viewer.output import film, saving
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.renderer import render_image
+from langsplat_viewer.rendering.request import Splats
 from langsplat_viewer.viewer import Viewer
-from tests.support.fakes import FakeEncoder, blob_scene
-from tests.support.windowless import arrive, errors, settle
+from tests.support.fakes import blob_scene
+from tests.support.windowless import arrive, errors, recorded, settle
 
 
 def turn(viewer: Viewer, yaw: float) -> None:
-    actions.move(viewer, lambda view: orbit(view, yaw, 0.05))
+    viewpoint.move(viewer, lambda view: orbit(view, yaw, 0.05))
 
 
 def record_three(viewer: Viewer) -> list:
@@ -34,19 +32,9 @@ def record_three(viewer: Viewer) -> list:
     views = []
     for _ in range(3):
         views.append(viewer.state.view)
-        actions.add_keyframe(viewer)
+        filming.add_keyframe(viewer)
         turn(viewer, 0.3)
     return views
-
-
-def drawn(viewer: Viewer, seconds: float = 60.0) -> None:
-    """Until the recorder has nothing left to do."""
-    end = time.monotonic() + seconds
-    while viewer.recorder.current is not None:
-        assert time.monotonic() < end, "never finished"
-        actions.tick(viewer, viewer.clock)
-        time.sleep(0.002)
-    actions.tick(viewer, viewer.clock)
 
 
 def times(viewer: Viewer) -> list[float]:
@@ -63,11 +51,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_played_path_goes_through_its_keyframes(opened):
     views = record_three(opened)
     assert times(opened) == [0, 2, 4]
-    actions.scrub(opened, 0)
-    actions.tick(opened, 100.0)
-    actions.toggle_playing(opened)
+    viewpoint.scrub(opened, 0)
+    viewpoint.tick(opened, 100.0)
+    viewpoint.toggle_playing(opened)
     for seconds, view in zip((0, 2, 4), views, strict=True):
-        actions.tick(opened, 100.0 + seconds)
+        viewpoint.tick(opened, 100.0 + seconds)
         assert_allclose(opened.state.view.eye, view.eye, atol=1e-9)
         assert_allclose(opened.state.view.rotation, view.rotation, atol=1e-9)
     assert opened.state.record.began is None  # it has ended
@@ -76,44 +64,44 @@ def test_a_played_path_goes_through_its_keyframes(opened):
 
 def test_a_loop_begins_again_and_a_drag_ends_it(opened):
     views = record_three(opened)
-    actions.set_looping(opened, True)
-    actions.scrub(opened, 1.0)
-    actions.toggle_playing(opened)
-    actions.tick(opened, opened.clock + 5.0)  # at 6 of 4 seconds
+    filming.set_looping(opened, True)
+    viewpoint.scrub(opened, 1.0)
+    viewpoint.toggle_playing(opened)
+    viewpoint.tick(opened, opened.clock + 5.0)  # at 6 of 4 seconds
     assert opened.state.record.at == pytest.approx(2.0)
     assert_allclose(opened.state.view.eye, views[1].eye, atol=1e-9)
     turn(opened, 0.1)
     view = opened.state.view
-    actions.tick(opened, opened.clock + 1.0)
+    viewpoint.tick(opened, opened.clock + 1.0)
     assert opened.state.view is view
 
 
 def test_stopping_stays_and_playing_goes_on_from_there(opened):
     record_three(opened)
-    actions.scrub(opened, 0)
-    actions.toggle_playing(opened)
-    actions.tick(opened, opened.clock + 1.5)
-    actions.toggle_playing(opened)
-    actions.tick(opened, opened.clock + 9)
+    viewpoint.scrub(opened, 0)
+    viewpoint.toggle_playing(opened)
+    viewpoint.tick(opened, opened.clock + 1.5)
+    viewpoint.toggle_playing(opened)
+    viewpoint.tick(opened, opened.clock + 9)
     assert opened.state.record.at == pytest.approx(1.5)
-    actions.toggle_playing(opened)
-    actions.tick(opened, opened.clock + 0.25)
+    viewpoint.toggle_playing(opened)
+    viewpoint.tick(opened, opened.clock + 0.25)
     assert opened.state.record.at == pytest.approx(1.75)
 
 
 def test_a_turntable_comes_back_and_begins_anew_after_a_drag(opened):
     start = opened.state.view
-    actions.set_turning(opened, True)
-    actions.set_path_seconds(opened, 4.0)
-    actions.toggle_playing(opened)
+    filming.set_turning(opened, True)
+    filming.set_path_seconds(opened, 4.0)
+    viewpoint.toggle_playing(opened)
     began = opened.clock
-    actions.tick(opened, began + 2)
+    viewpoint.tick(opened, began + 2)
     assert_allclose(opened.state.view.target, start.target)
     flat = (opened.state.view.eye - start.target) + (start.eye - start.target)
     assert_allclose(flat - (flat @ start.up) * start.up, 0, atol=1e-9)  # on the other side
-    actions.tick(opened, began + 4)
+    viewpoint.tick(opened, began + 4)
     assert_allclose(opened.state.view.eye, start.eye, atol=1e-9)
-    actions.move(opened, lambda view: zoom(view, 0.5, 0.01))
+    viewpoint.move(opened, lambda view: zoom(view, 0.5, 0.01))
     assert opened.state.record.turn_from is None
     assert opened.state.record.at == 0
 
@@ -121,31 +109,31 @@ def test_a_turntable_comes_back_and_begins_anew_after_a_drag(opened):
 def test_keyframes_are_changed_and_changes_undone(opened):
     record_three(opened)
     first, second, third = opened.state.record.keyframes
-    actions.move_keyframe(opened, second, 5.0)
+    filming.move_keyframe(opened, second, 5.0)
     assert times(opened) == [0, 4, 5]
-    actions.move_keyframe(opened, opened.state.record.keyframes[2], 4.0)  # there is one
+    filming.move_keyframe(opened, opened.state.record.keyframes[2], 4.0)  # there is one
     assert times(opened) == [0, 4, 4.01]
-    actions.delete_keyframe(opened, first)
+    filming.delete_keyframe(opened, first)
     assert times(opened) == [4, 4.01]
     for expected in ([0, 4, 4.01], [0, 4, 5], [0, 2, 4], [0, 2]):
-        actions.undo(opened)
+        undoing.undo(opened)
         assert times(opened) == expected
     assert opened.state.record.keyframes == (first, second)
-    actions.redo(opened)
+    undoing.redo(opened)
     assert opened.state.record.keyframes == (first, second, third)
-    actions.replace_keyframe(opened, first)
+    filming.replace_keyframe(opened, first)
     assert_allclose(opened.state.record.keyframes[0].pose.position, opened.state.view.eye)
-    actions.set_path_seconds(opened, 8)
+    filming.set_path_seconds(opened, 8)
     assert times(opened) == [0, 4, 8]
-    actions.clear_path(opened)
+    filming.clear_path(opened)
     assert times(opened) == []
-    actions.undo(opened)
+    undoing.undo(opened)
     assert times(opened) == [0, 4, 8]
 
 
 def test_choosing_a_keyframe_goes_there(opened):
     views = record_three(opened)
-    actions.choose_keyframe(opened, opened.state.record.keyframes[1])
+    filming.choose_keyframe(opened, opened.state.record.keyframes[1])
     arrive(opened)
     assert_allclose(opened.state.view.eye, views[1].eye, atol=1e-9)
     assert opened.state.record.at == 2
@@ -153,37 +141,37 @@ def test_choosing_a_keyframe_goes_there(opened):
 
 def test_a_path_is_saved_loaded_and_dropped(opened, folder):
     record_three(opened)
-    path = actions.save_path(opened, folder)
+    path = filming.save_path(opened, folder)
     assert path.name == "blobs-001.path.json"
     assert len(read_flight(path).keyframes) == 3
-    actions.clear_path(opened)
-    actions.open_dropped(opened, [path])
+    filming.clear_path(opened)
+    opening.open_dropped(opened, [path])
     assert times(opened) == [0, 2, 4]
     assert opened.state.wanted_panel == "Record"
     (folder / "bad.path.json").write_text("{}")
-    actions.type_path_file(opened, "bad.path.json")
-    actions.load_typed_path(opened, folder)
+    filming.type_path_file(opened, "bad.path.json")
+    filming.load_typed_path(opened, folder)
     assert "no camera path" in errors(opened)[-1]
     assert times(opened) == [0, 2, 4]
 
 
 def test_another_scene_has_no_path_of_this_one(opened):
     record_three(opened)
-    actions.set_film_size(opened, 640, 0)
-    actions.open_scene(opened, Path("plain.ply"))
+    filming.set_film_size(opened, 640, 0)
+    opening.open_scene(opened, Path("plain.ply"))
     settle(opened)
     assert times(opened) == []
     assert opened.state.record.size == (640, 1)
 
 
 def test_what_cannot_be_done_is_said(viewer, opened, folder):
-    actions.toggle_playing(opened)
-    actions.save_film(opened, folder)
-    actions.save_path(opened, folder)
-    actions.load_typed_path(opened, folder)
+    viewpoint.toggle_playing(opened)
+    filming.save_film(opened, folder)
+    filming.save_path(opened, folder)
+    filming.load_typed_path(opened, folder)
     record_three(opened)
-    actions.type_film(opened, "film.avi")
-    actions.save_film(opened, folder)
+    filming.type_film(opened, "film.avi")
+    filming.save_film(opened, folder)
     wanted = ["two keyframes", "needs a path", "needs a keyframe", "type the name", "a film is .mp4"]
     assert [reason in text for reason, text in zip(wanted, errors(opened), strict=True)] == [True] * 5
     assert list(folder.iterdir()) == []
@@ -191,62 +179,47 @@ def test_what_cannot_be_done_is_said(viewer, opened, folder):
 
 def test_a_film_is_made_beside_the_window(opened, folder):
     record_three(opened)
-    actions.set_film_size(opened, 32, 24)
-    actions.set_film_fps(opened, 1.0)
-    actions.save_film(opened, folder)
-    actions.ask(opened, "mug")  # the other worker answers meanwhile
-    drawn(opened)
+    filming.set_film_size(opened, 32, 24)
+    filming.set_film_fps(opened, 1.0)
+    request = opened.state.request((32, 24))
+    filming.save_film(opened, folder)
+    queries.ask(opened, "mug")  # the other worker answers meanwhile, and changes what is shown
+    recorded(opened)
     assert "blobs-film-001/: 32x24, 5 pictures" in " ".join(m.text for m in opened.state.messages)
     seen = sorted((folder / "blobs-film-001").glob("*.png"))
     assert len(seen) == 5
     camera = opened.state.record.keyframes[1].pose.camera(32, 24)
-    with painter(Subject(opened.state.scene), "cpu") as paint:
-        np.testing.assert_array_equal(np.asarray(Image.open(seen[2])), paint(camera).image)
+    expected = render_image(request.seen_by(camera), "cpu")
+    np.testing.assert_array_equal(np.asarray(Image.open(seen[2])), expected)
 
 
 def test_a_film_can_be_stopped(opened, folder):
     record_three(opened)
-    actions.set_film_size(opened, 320, 240)
-    actions.save_film(opened, folder)
-    actions.cancel_film(opened)
-    drawn(opened)
+    filming.set_film_size(opened, 320, 240)
+    filming.save_film(opened, folder)
+    filming.cancel_film(opened)
+    recorded(opened)
     opened.recorder.close(10.0)
     assert len(list(folder.glob("blobs-film-001/*.png"))) < 121
     assert not list(folder.glob("**/.*"))
 
 
 def test_a_picture_of_any_size(opened, folder):
-    actions.set_film_size(opened, 97, 41)
-    actions.save_sized_picture(opened, folder)
-    drawn(opened)
+    filming.set_film_size(opened, 97, 41)
+    filming.save_sized_picture(opened, folder)
+    recorded(opened)
     assert Image.open(folder / "blobs-97x41-001.png").size == (97, 41)
 
 
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    """Runs a command as a shell would."""
-    monkeypatch.setattr(options, "load_text_encoder", lambda encoder_id: FakeEncoder())
-
-    def go(command: str) -> np.ndarray:
-        words = shlex.split(command)
-        monkeypatch.setattr(sys, "argv", [*words, "--backend", "cpu"])
-        with pytest.raises(SystemExit) as stop:
-            program.entry()
-        assert not stop.value.code, capsys.readouterr().err
-        return np.asarray(Image.open(words[words.index("--out") + 1])).astype(int)
-
-    return go
-
-
 def see_depth(viewer) -> None:
-    actions.set_display(viewer, "depth")
-    actions.set_colour_map(viewer, "viridis")
+    settings.set_display(viewer, "depth")
+    settings.set_colour_map(viewer, "viridis")
 
 
 def cut_by_hand(viewer) -> None:
-    actions.set_display(viewer, "segmentation")
+    settings.set_display(viewer, "segmentation")
     query = viewer.state.queries[1]
-    actions.set_cut(viewer, query, float(np.median(query.automatic.even[query.automatic.members])))
+    queries.set_cut(viewer, query, float(np.median(query.automatic.even[query.automatic.members])))
 
 
 QUERIES = ("queries", "colours", "sliders", "cuts", "canonical")
@@ -255,61 +228,96 @@ SLIDERS = PictureConfig(display="relevancy", heat_opacity=0.3, dim=0.9)
 
 def look_flat(viewer) -> None:
     """In a tall window, and with a cut, which counts from the eye."""
-    actions.resize(viewer, 130, 200)
-    actions.toggle_orthographic(viewer)
-    actions.zoom_by(viewer, 0.8)
-    actions.set_clip(viewer, Clip(3.9, 4.3))
+    settings.resize(viewer, 130, 200)
+    viewpoint.toggle_orthographic(viewer)
+    viewpoint.zoom_by(viewer, 0.8)
+    settings.set_clip(viewer, Clip(3.9, 4.3))
 
 
 LOOKS = {
     "orthographic": look_flat,
-    "colours": lambda viewer: actions.hide(viewer, viewer.state.queries[0]),
-    "sliders": lambda viewer: actions.set_picture(viewer, SLIDERS),
+    "colours": lambda viewer: queries.hide(viewer, viewer.state.queries[0]),
+    "sliders": lambda viewer: settings.set_picture(viewer, SLIDERS),
     "cuts": cut_by_hand,
     "depth": see_depth,
-    "clip": lambda viewer: actions.set_clip(viewer, Clip(4.4, 5.1)),
-    "latent": lambda viewer: actions.set_display(viewer, "latent", 1),
+    "clip": lambda viewer: settings.set_clip(viewer, Clip(4.4, 5.1)),
+    "latent": lambda viewer: settings.set_display(viewer, "latent", 1),
 }
 
 
 @pytest.mark.parametrize(
     "case", ["training camera", "elsewhere", *QUERIES, "latent", "depth", "clip", "orthographic"]
 )
-def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run, case):
+def test_the_command_on_the_clipboard_draws_the_same_picture(opened, folder, run_viewer, case):
     where = folder / "with a space"
     where.mkdir()
     save_scene(where / "blobs.ply", blob_scene(phrasebook=True))
     opened.state.path = where / "blobs.ply"
-    actions.resize(opened, 200, 130)
+    settings.resize(opened, 200, 130)
     if case != "training camera":
         turn(opened, 0.2)
     if case == "canonical":
-        actions.set_canonical(opened, "book, plant")
+        queries.set_canonical(opened, "book, plant")
     if case in QUERIES:
         for word in ("mug", "plant", "book"):
-            actions.ask(opened, word)
+            queries.ask(opened, word)
         settle(opened)
     LOOKS.get(case, lambda viewer: None)(opened)
-    command = actions.copy_command(opened, folder)
-    assert actions.take_clipboard(opened) == command
-    assert actions.take_clipboard(opened) == ""
+    command = filming.copy_command(opened, folder)
+    assert filming.take_clipboard(opened) == command
+    assert filming.take_clipboard(opened) == ""
     assert [path.suffix for path in folder.iterdir() if path.is_file()] == (
         [] if case == "training camera" else [".json"]
     )
-    with painter(subject_of(opened.state), "cpu") as paint:
-        expected = draw_something(
-            subject_of(opened.state), opened.state.view.camera(*opened.state.size), paint
-        )
-    assert_allclose(run(command), expected.astype(int), atol=2)
+    expected = render_image(opened.state.request(), "cpu")
+    words = shlex.split(command)
+    code, _, problems = run_viewer(*words[1:], "--backend", "cpu")
+    assert (code, problems) == (0, [])
+    image = np.asarray(Image.open(words[words.index("--out") + 1]))
+    assert_allclose(image.astype(int), expected.astype(int), atol=2)
     assert expected.std() > 5
     assert errors(opened) == []
 
 
 def test_what_the_command_cannot_say_is_said(opened, folder):
-    actions.set_splats(opened, Splats(0.5))
-    actions.toggle_wipe(opened)
-    actions.copy_command(opened, folder)
+    settings.set_splats(opened, Splats(0.5))
+    settings.toggle_wipe(opened)
+    filming.copy_command(opened, folder)
     (said,) = errors(opened)
     assert "the size of splats" in said
     assert "the picture beside it" in said
     assert "backdrop" not in said
+
+
+# Images and views to files.
+
+
+def test_pictures_are_saved_under_new_names(opened, tmp_path):
+    first, second = saving.save_picture(opened, tmp_path), saving.save_picture(opened, tmp_path)
+    assert [first.name, second.name] == ["blobs-001.png", "blobs-002.png"]
+    assert np.asarray(Image.open(second)).tolist() == np.full((6, 8, 3), 77).tolist()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["blobs-001.png", "blobs-002.png"]
+
+
+def test_a_saved_view_can_be_read_again(opened, tmp_path):
+    opened.state.size = (321, 123)
+    camera = read_cameras(saving.save_view(opened, tmp_path))[0]
+    expected = opened.state.view.camera(321, 123)
+    assert (camera.width, camera.height) == (321, 123)
+    assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-9)
+    assert camera.fx == pytest.approx(expected.fx)
+
+
+def test_an_unwritable_folder_is_one_line(opened, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    assert saving.save_picture(opened, blocked) is None
+    assert saving.save_view(opened, blocked) is None
+    assert len(errors(opened)) == 2
+    assert all("not saved" in text for text in errors(opened))
+
+
+def test_nothing_to_save_before_a_scene_is_open(viewer, tmp_path):
+    assert saving.save_picture(viewer, tmp_path) is None
+    assert saving.save_view(viewer, tmp_path) is None
+    assert len(errors(viewer)) == 2

@@ -1,33 +1,40 @@
 """Selecting, hiding and deleting without a window: verbs, answers, settings, undo."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from plyfile import PlyData
 
-from langsplat_viewer import actions, marks
-from langsplat_viewer.actions.selecting import NOTHING, take
-from langsplat_viewer.panels.select import counts
-from tests.support.selected import blob, marked, marks_of, names
-from tests.support.windowless import errors, settle
+from langsplat_core.io.scenes import load_scene
+from langsplat_core.scene import look_at
+from langsplat_viewer.actions import opening, queries, selecting, settings, undoing, viewpoint
+from langsplat_viewer.actions.selecting import take
+from langsplat_viewer.camera.controls import from_camera
+from langsplat_viewer.marks import Drawn, Stroke, outlines
+from langsplat_viewer.rendering.depth import Clip
+from tests.support.fakes import CENTRES, COLOURS, PER_BLOB
+from tests.support.selected import blob, marked, marks_of
+from tests.support.windowless import SCENES, FakeSurface, errors, settle
 
 
 @pytest.fixture
 def searched(opened):
     """One answer: the book."""
-    actions.ask(opened, "book")
+    queries.ask(opened, "book")
     settle(opened)
     return opened
 
 
 def test_everything_nothing_and_the_rest(opened):
-    actions.select_all(opened)
+    selecting.select_all(opened)
     assert marked(opened) == ("mug book plant", "", "")
-    actions.select_none(opened)
+    selecting.select_none(opened)
     assert marked(opened) == ("", "", "")
     take(opened, blob("book"))
-    actions.invert_selection(opened)
+    selecting.invert_selection(opened)
     assert marked(opened) == ("mug plant", "", "")
 
 
@@ -37,46 +44,40 @@ def test_everything_nothing_and_the_rest(opened):
 )
 def test_what_is_found_is_combined_by_the_mode(opened, mode, selected):
     take(opened, blob("mug") | blob("book"))
-    actions.set_mode(opened, mode)
+    selecting.set_mode(opened, mode)
     take(opened, blob("book") | blob("plant"))
     assert marked(opened)[0] == selected
 
 
-def test_a_mode_that_is_held_goes_before_the_one_that_is_set(opened):
-    actions.set_mode(opened, "remove")
-    take(opened, blob("mug"), "add")
-    assert marked(opened)[0] == "mug"
-
-
 def test_hidden_and_deleted_ones_are_never_selected(opened):
     take(opened, blob("mug"))
-    actions.hide_selected(opened)
+    selecting.hide_selected(opened)
     take(opened, blob("plant"))
-    actions.delete_selected(opened)
+    selecting.delete_selected(opened)
     assert marked(opened) == ("", "mug", "plant")
-    actions.select_all(opened)
+    selecting.select_all(opened)
     assert marked(opened) == ("book", "mug", "plant")
-    actions.invert_selection(opened)
+    selecting.invert_selection(opened)
     assert marked(opened) == ("", "mug", "plant")
-    actions.show_hidden(opened)
-    actions.select_all(opened)
+    selecting.show_hidden(opened)
+    selecting.select_all(opened)
     assert marked(opened) == ("mug book", "", "plant")
 
 
 def test_isolating_hides_all_else_but_what_is_gone(opened):
     take(opened, blob("plant"))
-    actions.delete_selected(opened)
+    selecting.delete_selected(opened)
     take(opened, blob("mug"))
-    actions.isolate_selected(opened)
+    selecting.isolate_selected(opened)
     assert marked(opened) == ("mug", "book", "plant")
 
 
 def test_every_change_is_one_step_back_and_forth(opened):
     take(opened, blob("mug"))
-    actions.hide_selected(opened)
+    selecting.hide_selected(opened)
     take(opened, blob("book"))
-    actions.delete_selected(opened)
-    actions.show_hidden(opened)
+    selecting.delete_selected(opened)
+    selecting.show_hidden(opened)
     states = [
         ("", "", "book"),
         ("", "mug", "book"),
@@ -87,132 +88,412 @@ def test_every_change_is_one_step_back_and_forth(opened):
     ]
     assert marked(opened) == states[0]
     for state in states[1:]:
-        actions.undo(opened)
+        undoing.undo(opened)
         assert marked(opened) == state
     for state in states[-2::-1]:
-        actions.redo(opened)
+        undoing.redo(opened)
         assert marked(opened) == state
 
 
 def test_what_changes_nothing_is_no_step(opened):
-    actions.select_none(opened)
-    actions.show_hidden(opened)
+    selecting.select_none(opened)
+    selecting.show_hidden(opened)
     take(opened, blob("mug"))
     take(opened, blob("mug"))
     assert len(opened.history.past) == 1
-    actions.use_tool(opened, "brush")
-    actions.set_brush(opened, 0.1)
+    selecting.use_tool(opened, "brush")
+    selecting.set_brush(opened, 0.1)
     assert len(opened.history.past) == 1
-
-
-def test_undo_of_a_query_keeps_the_selection_of_then(searched):
-    take(searched, blob("mug"))
-    actions.ask(searched, "plant")
-    settle(searched)
-    actions.undo(searched)
-    assert marked(searched)[0] == "mug"
-    assert [query.phrase for query in searched.state.queries] == ["book"]
 
 
 def test_what_the_search_found(searched):
-    actions.select_query(searched)
+    selecting.select_query(searched)
     assert marked(searched)[0] == "book"
-    actions.ask(searched, "mug")
+    queries.ask(searched, "mug")
     settle(searched)
-    actions.select_query(searched, mode="add")
+    selecting.select_query(searched, mode="add")
     assert marked(searched)[0] == "mug book"
 
 
 def test_nothing_was_searched_or_found(searched):
     query = searched.state.queries[0]
     query.result = replace(query.result, found=False, probability=None, excess=None)
-    actions.select_query(searched)
+    selecting.select_query(searched)
     assert "'book' is not here" in searched.state.messages[-1].text
-    actions.find_things(searched)
-    assert searched.worker.current is None
-    actions.remove(searched, query)
-    actions.select_query(searched)
+    queries.remove(searched, query)
+    selecting.select_query(searched)
     assert "search for something first" in searched.state.messages[-1].text
     assert marked(searched) == ("", "", "")
 
 
 def test_things_of_an_answer_one_by_one(searched):
-    actions.find_things(searched)
-    settle(searched)
-    things = searched.state.selection.things
-    assert things.phrase == "book"
-    assert len(things.found) == 1
-    actions.select_thing(searched, 0)
-    np.testing.assert_array_equal(np.flatnonzero(marks_of(searched).selected), things.found[0].members)
-    actions.select_thing(searched, 1)  # there is none
-    assert marks_of(searched).selected.sum() == things.found[0].count
+    (thing,) = searched.state.queries[0].things
+    selecting.select_thing(searched, thing)
+    np.testing.assert_array_equal(np.flatnonzero(marks_of(searched).selected), thing.members)
 
 
 def test_growing_and_shrinking_follow_the_surface(opened):
     means = opened.state.scene.gaussians.means
     core = np.linalg.norm(means, axis=1) < 0.15
     take(opened, core)
-    actions.set_reach(opened, 0.15)
-    actions.grow_selection(opened)
+    selecting.set_reach(opened, 0.15)
+    selecting.grow_selection(opened)
     settle(opened)
     grown = marks_of(opened).selected.copy()
     assert core.sum() < grown.sum()
     assert (grown >= core).all()
     assert not (grown & ~blob("book")).any()  # the others are not on its surface
-    actions.shrink_selection(opened)
+    selecting.shrink_selection(opened)
     settle(opened)
     assert marks_of(opened).selected.sum() < grown.sum()
-    actions.undo(opened)
+    undoing.undo(opened)
     assert (marks_of(opened).selected == grown).all()
 
 
 def test_what_is_found_too_late_is_not_taken(opened):
     take(opened, blob("mug"))
-    actions.grow_selection(opened)
+    selecting.grow_selection(opened)
     opened.state.scene = None  # another one is being shown
     settle(opened)
     assert marked(opened)[0] == "mug"
 
 
-def test_nothing_selected_is_said(opened):
-    for act in (actions.hide_selected, actions.isolate_selected, actions.delete_selected):
-        act(opened)
-        assert opened.state.messages[-1].text == NOTHING
-    actions.grow_selection(opened)
-    actions.shrink_selection(opened)
-    assert opened.worker.current is None
-    assert opened.history.past == []
-
-
-def test_without_a_scene_it_is_said(viewer):
-    for act in (actions.select_all, actions.invert_selection, actions.show_hidden, actions.delete_selected):
-        act(viewer)
-    assert set(errors(viewer)) == {"open a scene first, then select in it"}
-
-
 def test_another_scene_has_no_marks_but_the_tool_stays(opened):
     take(opened, blob("mug"))
-    actions.hide_selected(opened)
-    actions.use_tool(opened, "lasso")
-    actions.set_mode(opened, "add")
-    actions.open_scene(opened, Path("plain.ply"))
+    selecting.hide_selected(opened)
+    selecting.use_tool(opened, "lasso")
+    selecting.set_mode(opened, "add")
+    opening.open_scene(opened, Path("plain.ply"))
     settle(opened)
     assert marked(opened) == ("", "", "")
     assert (opened.state.selection.tool, opened.state.selection.mode) == ("lasso", "add")
 
 
-def test_settings_keep_their_limits(opened):
-    actions.set_brush(opened, 9.0)
-    actions.set_reach(opened, 0.0)
-    assert opened.state.selection.brush == marks.BRUSHES[1]
-    assert opened.state.selection.reach == marks.REACHES[0]
-    assert actions.reach(opened) == pytest.approx(marks.REACHES[0] * opened.state.extent.radius)
+# Selecting with the mouse: what a stroke encloses, and what becomes of it. No window.
+
+SIZE = (400, 300)
 
 
-def test_counts_are_said(opened):
+@pytest.fixture
+def front(opened):
+    """From straight ahead, so that the blobs lie in a row: mug, book, plant from left to right."""
+    camera = look_at(np.array([0, 0, -5.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
+    settings.resize(opened, *SIZE)
+    viewpoint.move(opened, lambda view: from_camera(camera, opened.state.extent))
+    return opened
+
+
+def place(viewer, point) -> tuple[float, float]:
+    """Of a world point, as fractions of the picture."""
+    (pixel,), _ = viewer.state.view.camera(*SIZE).project(np.asarray(point, float)[None])
+    return pixel[0] / SIZE[0], pixel[1] / SIZE[1]
+
+
+def around(viewer, centre, radius: float = 0.58) -> list[tuple[float, float]]:
+    """Places all around a blob."""
+    turns = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    return [place(viewer, centre + radius * np.array([np.cos(t), np.sin(t), 0])) for t in turns]
+
+
+def draw(viewer, places, mode=None) -> None:
+    selecting.begin_stroke(viewer, *places[0])
+    for u, v in places[1:]:
+        selecting.extend_stroke(viewer, u, v)
+    selecting.end_stroke(viewer, mode)
+
+
+def corners(viewer, centre, half: float = 0.58) -> list[tuple[float, float]]:
+    return [place(viewer, centre + half * np.array([sign, sign, 0])) for sign in (-1, 1)]
+
+
+def test_a_rectangle_selects_the_blob_inside_it_and_is_undone(front):
+    selecting.use_tool(front, "rectangle")
+    draw(front, corners(front, CENTRES[0]))
+    assert marked(front)[0] == "mug"
+    draw(front, corners(front, CENTRES[2])[::-1], "add")
+    assert marked(front)[0] == "mug plant"
+    undoing.undo(front)
+    assert marked(front)[0] == "mug"
+
+
+def test_a_lasso_selects_what_it_goes_around(front):
+    selecting.use_tool(front, "lasso")
+    draw(front, around(front, CENTRES[1]))
+    assert marked(front)[0] == "book"
+
+
+def test_a_brush_selects_what_it_sweeps_over(front):
+    selecting.use_tool(front, "brush")
+    selecting.set_brush(front, 0.12)
+    draw(front, [place(front, CENTRES[0]), place(front, CENTRES[1])])
+    assert marked(front)[0] == "mug book"
+    selecting.set_brush(front, 0.01)
+    draw(front, [place(front, CENTRES[2])])
+    assert 0 < marks_of(front).selected.sum() < PER_BLOB
+
+
+@pytest.mark.parametrize("tool", ["sphere", "box"])
+def test_a_body_is_as_large_as_the_drag_or_the_reach(front, tool, monkeypatch):
+    monkeypatch.setattr(FakeSurface, "point_at", lambda self, u, v: CENTRES[2])
+    selecting.use_tool(front, tool)
+    draw(front, [place(front, CENTRES[2]), place(front, CENTRES[2] + [0.7, 0, 0])])
+    assert marked(front)[0] == "plant"
+    draw(front, [place(front, CENTRES[2])])  # a click
+    offsets = np.abs(front.state.scene.gaussians.means - CENTRES[2])
+    far = np.linalg.norm(offsets, axis=1) if tool == "sphere" else offsets.max(1)
+    np.testing.assert_array_equal(marks_of(front).selected, far <= selecting.reach(front))
+    assert marks_of(front).selected.any()
+
+
+def test_what_lies_behind_something_is_left_out_unless_all_is_wanted(front, monkeypatch):
+    monkeypatch.setattr(FakeSurface, "depths", lambda self: np.full((30, 40), 4.95))
+    selecting.use_tool(front, "rectangle")
+    draw(front, corners(front, CENTRES[1]))
+    z = front.state.scene.gaussians.means[:, 2]
+    in_front = marks_of(front).selected
+    selecting.set_only_visible(front, False)
+    draw(front, corners(front, CENTRES[1]))
+    assert marked(front)[0] == "book"
+    np.testing.assert_array_equal(in_front, marks_of(front).selected & (z + 5 <= 4.95 * 1.03))
+    assert 20 < in_front.sum() < 100
+
+
+def test_without_perspective_strokes_meet_the_same(front, monkeypatch):
+    """Depths count from the eye: what hides, and what is cut away."""
+    viewpoint.toggle_orthographic(front)
+    monkeypatch.setattr(FakeSurface, "depths", lambda self: np.full((30, 40), 4.95))
+    z = front.state.scene.gaussians.means[:, 2]
+    selecting.use_tool(front, "lasso")
+    draw(front, around(front, CENTRES[0], 0.7))
+    in_front = marks_of(front).selected
+    selecting.set_only_visible(front, False)
+    draw(front, around(front, CENTRES[0], 0.7))
+    assert marked(front)[0] == "mug"
+    np.testing.assert_array_equal(in_front, marks_of(front).selected & (z + 5 <= 4.95 * 1.03))
+    assert 20 < in_front.sum() < 100
+    settings.set_clip(front, Clip(5.0))
+    draw(front, around(front, CENTRES[0], 0.7))
+    assert 20 < marks_of(front).selected.sum() < 100
+    assert (z[marks_of(front).selected] > 0).all()
+
+
+def test_a_click_selects_the_thing_at_the_level_of_the_queries(front, monkeypatch):
+    monkeypatch.setattr(FakeSurface, "point_at", lambda self, u, v: CENTRES[1])
+    selecting.use_tool(front, "thing")
+    draw(front, [(0.5, 0.5)])
+    settle(front)
+    assert marked(front)[0] == "book"
+    undoing.undo(front)
+    assert marked(front)[0] == ""
+
+
+def test_a_click_on_nothing_and_without_a_field(front, monkeypatch):
+    selecting.use_tool(front, "sphere")
+    draw(front, [(0.95, 0.5)])  # where the picture is empty
+    assert "nothing under the cursor" in front.state.messages[-1].text
+    front.state.scene = type(front.state.scene)(front.state.scene.gaussians)
+    selecting.use_tool(front, "thing")
+    draw(front, [(0.5, 0.5)])
+    assert "without a language field" in errors(front)[-1]
+    assert marked(front) == ("", "", "")
+
+
+def test_escape_gives_up_the_stroke_then_the_tool_and_help_before_both(front):
+    selecting.use_tool(front, "lasso")
+    selecting.begin_stroke(front, 0.1, 0.1)
+    settings.show_help(front, True)
+    settings.escape(front)
+    assert front.state.selection.stroke is not None
+    settings.escape(front)
+    assert (front.state.selection.stroke, front.state.selection.tool) == (None, "lasso")
+    selecting.end_stroke(front)  # of nothing
+    settings.escape(front)
+    assert front.state.selection.tool is None
+    assert marked(front) == ("", "", "")
+
+
+def drawn(tool, path, centre=None) -> Drawn:
+    camera = look_at(np.array([0, 0, -5.0]), np.zeros(3), np.array([0, -1.0, 0]), SIZE)
+    return Drawn(tool, Stroke(tuple(path), centre), camera, 0.03, 0.5)
+
+
+def test_outlines_are_what_is_enclosed():
+    (rectangle,) = outlines(drawn("rectangle", [(0.2, 0.3), (0.6, 0.5)]))
+    assert rectangle.tolist() == [[0.2, 0.3], [0.6, 0.3], [0.6, 0.5], [0.2, 0.5], [0.2, 0.3]]
+    (lasso,) = outlines(drawn("lasso", [(0.2, 0.3), (0.6, 0.5), (0.1, 0.9)]))
+    assert lasso[0].tolist() == lasso[-1].tolist()
+    (brush,) = outlines(drawn("brush", [(0.2, 0.3), (0.6, 0.5)]))
+    assert len(brush) == 2
+    assert outlines(drawn("thing", [(0.2, 0.3)])) == []
+
+
+def test_the_circle_of_a_sphere_goes_through_the_mouse():
+    end = (0.6, 0.5)
+    (circle,) = outlines(drawn("sphere", [(0.5, 0.5), end], (0.0, 0.0, 0.0)))
+    np.testing.assert_allclose(np.abs(circle - end).max(1).min(), 0, atol=1e-9)
+    edges = outlines(drawn("box", [(0.5, 0.5), end], (0.0, 0.0, 0.0)))
+    assert len(edges) == 12
+    behind = drawn("box", [(0.5, 0.5)], (0.0, 0.0, -5.0))  # the eye is inside
+    assert len(outlines(behind)) < 12
+
+
+# Saving what is selected, the rest and the scene; and what is asked before deletions are lost.
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def without_plant(viewer) -> None:
+    take(viewer, blob("plant"))
+    selecting.delete_selected(viewer)
+
+
+def test_the_selection_and_the_rest_are_scenes_with_their_field(opened, tmp_path):
+    without_plant(opened)
     take(opened, blob("mug"))
-    actions.delete_selected(opened)
-    take(opened, blob("book"))
-    assert counts(marks_of(opened)) == "120 of 360 selected, 0 hidden, 120 deleted"
-    assert counts(marks.unmarked(0)) == "0 of 0 selected, 0 hidden, 0 deleted"
-    assert names(blob("book")) == "book"
+    for part, word in (("selection", "mug"), ("rest", "book")):
+        selecting.export(opened, tmp_path, part)
+        settle(opened)
+        assert f"saved {tmp_path / f'blobs-{part}-001.ply'}: 120 Gaussians" == opened.state.messages[-1].text
+        written = load_scene(tmp_path / f"blobs-{part}-001.ply")
+        np.testing.assert_array_equal(
+            written.gaussians.means, SCENES["blobs.ply"].gaussians.means[blob(word)]
+        )
+        assert len(written.language) == 120
+        assert len(written.cameras) == 3
+    assert opened.state.selection.is_unsaved  # neither is the scene
+
+
+def test_points_have_their_colours(opened, tmp_path):
+    take(opened, blob("mug"))
+    selecting.export(opened, tmp_path, "selection", as_points=True)
+    settle(opened)
+    assert names_in(tmp_path) == ["blobs-selection-points-001.ply"]
+    table = PlyData.read(tmp_path / "blobs-selection-points-001.ply")["vertex"]
+    assert len(table) == 120
+    np.testing.assert_allclose([table["red"][0], table["blue"][0]], 255 * COLOURS[0, [0, 2]], atol=1)
+
+
+def test_nothing_is_ever_written_over(opened, tmp_path):
+    take(opened, blob("mug"))
+    taken = tmp_path / "blobs-selection-001.langsplat.safetensors"  # what would belong to the first name
+    taken.write_text("precious")
+    for _ in range(2):  # both are asked for before either is written
+        selecting.export(opened, tmp_path, "selection")
+    settle(opened)
+    assert taken.read_text() == "precious"
+    assert [name for name in names_in(tmp_path) if name.endswith(".ply")] == [
+        "blobs-selection-002.ply",
+        "blobs-selection-003.ply",
+    ]
+
+
+def test_what_cannot_be_written_is_said(opened, tmp_path):
+    selecting.export(opened, tmp_path, "selection")
+    assert "nothing is selected" in opened.state.messages[-1].text
+    selecting.select_all(opened)
+    selecting.export(opened, tmp_path, "rest")
+    assert "the rest holds no Gaussians" in errors(opened)[-1]
+    (tmp_path / "file").write_text("")
+    selecting.export(opened, tmp_path / "file", "selection")
+    settle(opened)
+    assert errors(opened)[-1].startswith("not saved: ")
+    assert names_in(tmp_path) == ["file"]
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_is_locked(opened, tmp_path):
+    tmp_path.chmod(0o500)
+    without_plant(opened)
+    selecting.export(opened, tmp_path, "edited")
+    settle(opened)
+    assert "not saved" in errors(opened)[-1]
+    assert opened.state.selection.is_unsaved
+
+
+def test_deleting_is_unsaved_until_the_scene_is_saved(opened, tmp_path):
+    selection = lambda: opened.state.selection  # noqa: E731  replaced at every change
+    assert not selection().is_unsaved
+    without_plant(opened)
+    assert selection().is_unsaved
+    undoing.undo(opened)
+    assert not selection().is_unsaved
+    undoing.redo(opened)
+    selecting.export(opened, tmp_path, "edited")
+    settle(opened)
+    assert not selection().is_unsaved
+    assert len(load_scene(tmp_path / "blobs-edited-001.ply").gaussians) == 240
+    take(opened, blob("mug"))
+    selecting.delete_selected(opened)
+    assert selection().is_unsaved
+
+
+def test_another_scene_waits_for_the_answer(opened, tmp_path):
+    without_plant(opened)
+    opening.open_scene(opened, Path("plain.ply"))
+    assert opened.state.opening is None
+    assert opened.state.selection.leaving.to == "plain.ply is opened"
+    selecting.stay(opened)
+    settle(opened)
+    assert (opened.state.path.name, opened.state.selection.leaving) == ("blobs.ply", None)
+    assert marked(opened) == ("", "", "plant")
+
+    opening.open_scene(opened, Path("plain.ply"))
+    settings.escape(opened)
+    assert opened.state.selection.leaving is None
+
+    opening.open_scene(opened, Path("plain.ply"))
+    selecting.discard_and_leave(opened)
+    settle(opened)
+    assert opened.state.path.name == "plain.ply"
+    assert names_in(tmp_path) == []
+
+
+def test_saving_comes_before_what_waited(opened, tmp_path):
+    without_plant(opened)
+    then = []
+    opening.open_scene(opened, Path("plain.ply"), then.append)
+    selecting.save_and_leave(opened, tmp_path)
+    settle(opened)
+    settle(opened)
+    assert then == [opened]
+    assert opened.state.path.name == "plain.ply"
+    assert len(load_scene(tmp_path / "blobs-edited-001.ply").gaussians) == 240
+
+
+def test_where_saving_fails_nothing_is_left(opened, tmp_path):
+    without_plant(opened)
+    selecting.quit_viewer(opened)
+    (tmp_path / "file").write_text("")
+    selecting.save_and_leave(opened, tmp_path / "file")
+    settle(opened)
+    assert "not saved" in errors(opened)[-1]
+    assert not opened.state.selection.may_close
+    assert opened.state.selection.is_unsaved
+
+
+def test_a_broken_scene_after_discarding_loses_nothing(opened):
+    without_plant(opened)
+    opening.open_scene(opened, Path("broken.ply"))
+    selecting.discard_and_leave(opened)
+    settle(opened)
+    assert marked(opened) == ("", "", "plant")
+    assert opened.state.selection.is_unsaved
+
+
+def test_the_window_closes_at_once_or_asks(opened):
+    without_plant(opened)
+    assert not selecting.may_close(opened)
+    assert opened.state.selection.leaving.to == "the window closes"
+    selecting.stay(opened)
+    undoing.undo(opened)
+    assert selecting.may_close(opened)
+
+
+def test_what_is_being_written_is_waited_for(opened, tmp_path):
+    selecting.finish_writing(opened)  # nothing is
+    take(opened, blob("mug"))
+    selecting.export(opened, tmp_path, "selection")
+    selecting.finish_writing(opened)
+    assert "blobs-selection-001.ply" in names_in(tmp_path)

@@ -15,7 +15,8 @@ from langsplat_core.cli.app import parse
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.pipeline.report import REPORT
 from langsplat_core.scene import Scene
-from langsplat_viewer import actions, viewer
+from langsplat_viewer import viewer
+from langsplat_viewer.actions import opening, settings, training, viewpoint
 from langsplat_viewer.files.watching import IN_TRAINING, NAME, write_preview
 from langsplat_viewer.viewer import PREVIEW_EVERY, TrainingProgress, TrainingRequest, command
 from tests.support.fakes import blob_scene
@@ -50,7 +51,7 @@ def trains(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
 def finish(viewer, seconds: float = 20.0) -> None:
     end = time.monotonic() + seconds
     while viewer.training is not None and time.monotonic() < end:
-        actions.watch_training(viewer)
+        training.watch_training(viewer)
         time.sleep(0.02)
     assert viewer.training is None
     settle(viewer)
@@ -58,12 +59,12 @@ def finish(viewer, seconds: float = 20.0) -> None:
 
 def test_a_folder_of_photographs_becomes_a_scene_that_opens(viewer, folder, monkeypatch):
     trains(monkeypatch, GOOD)
-    actions.open_dropped(viewer, [folder])
+    opening.open_dropped(viewer, [folder])
     form = viewer.state.training_form
     assert (form.dataset, form.out) == (str(folder), str(folder.with_suffix(".ply")))
-    assert actions.take_wanted_panel(viewer) == "Train"
-    actions.fill_in(viewer, replace(form, out=str(folder.with_name("blobs.ply"))))
-    actions.start_training(viewer)
+    assert settings.take_wanted_panel(viewer) == "Train"
+    training.fill_in(viewer, replace(form, out=str(folder.with_name("blobs.ply"))))
+    training.start_training(viewer)
     progress = viewer.training.progress
     finish(viewer)
     assert progress.stages == {"reading photographs": 1.0}
@@ -82,24 +83,24 @@ def test_what_speaks_against_the_scene_is_said(viewer, folder, monkeypatch):
     report.parent.mkdir()
     report.write_text(json.dumps({"gaussians": 360, "doubts": doubts}))
     trains(monkeypatch, GOOD + "".join(f"; print('warning: {doubt}')" for doubt in doubts))
-    actions.choose_photographs(viewer, folder)
-    actions.fill_in(viewer, replace(viewer.state.training_form, out=str(folder.with_name("blobs.ply"))))
-    actions.start_training(viewer)
+    opening.choose_photographs(viewer, folder)
+    training.fill_in(viewer, replace(viewer.state.training_form, out=str(folder.with_name("blobs.ply"))))
+    training.start_training(viewer)
     finish(viewer)
     assert viewer.state.doubts == tuple(doubts)
     assert errors(viewer) == doubts
     said = [message.text for message in viewer.state.messages]
     assert "done: 3 Gaussians" in said  # not pushed out by the warnings, which are not said twice
     assert not any(text.startswith("warning") for text in said)
-    actions.open_scene(viewer, folder.with_name("plain.ply"))
+    opening.open_scene(viewer, folder.with_name("plain.ply"))
     settle(viewer)
     assert viewer.state.doubts == ()
 
 
 def test_what_goes_wrong_is_said(viewer, folder, monkeypatch):
     trains(monkeypatch, BAD)
-    actions.choose_photographs(viewer, folder)
-    actions.start_training(viewer)
+    opening.choose_photographs(viewer, folder)
+    training.start_training(viewer)
     finish(viewer)
     assert errors(viewer) == ["langsplat: photos: none can be located"]
     assert viewer.state.scene is None
@@ -107,14 +108,14 @@ def test_what_goes_wrong_is_said(viewer, folder, monkeypatch):
 
 def test_it_can_be_stopped_and_one_is_enough(viewer, folder, monkeypatch):
     trains(monkeypatch, SLOW)
-    actions.choose_photographs(viewer, folder)
-    actions.start_training(viewer)
-    actions.start_training(viewer)
+    opening.choose_photographs(viewer, folder)
+    training.start_training(viewer)
+    training.start_training(viewer)
     assert "under way" in errors(viewer)[-1]
-    actions.look_at_training(viewer)
+    training.look_at_training(viewer)
     assert "no Gaussians to look at yet" in viewer.state.messages[-1].text
     process = viewer.training.process
-    actions.stop_training(viewer)
+    training.stop_training(viewer)
     finish(viewer)
     assert process.returncode == -signal.SIGTERM
     assert "goes on" in viewer.state.messages[-1].text
@@ -122,14 +123,14 @@ def test_it_can_be_stopped_and_one_is_enough(viewer, folder, monkeypatch):
 
 def test_the_gaussians_can_be_looked_at_before_the_end(viewer, folder, monkeypatch):
     trains(monkeypatch, SLOW)
-    actions.choose_photographs(viewer, folder)
-    actions.start_training(viewer)
+    opening.choose_photographs(viewer, folder)
+    training.start_training(viewer)
     work = folder.with_name("photos.work")
     work.mkdir()
     (work / "radiance-0.ply").write_bytes(b"")
     SCENES["radiance-0.ply"] = SCENES["plain.ply"]
     try:
-        actions.look_at_training(viewer)
+        training.look_at_training(viewer)
         settle(viewer)
     finally:
         del SCENES["radiance-0.ply"]
@@ -140,8 +141,8 @@ def test_the_gaussians_can_be_looked_at_before_the_end(viewer, folder, monkeypat
 @pytest.mark.parametrize("dataset", ["", "  ", "gone", "."])
 def test_a_folder_without_photographs_is_said(viewer, tmp_path, monkeypatch, dataset):
     monkeypatch.chdir(tmp_path)
-    actions.fill_in(viewer, replace(viewer.state.training_form, dataset=dataset))
-    actions.start_training(viewer)
+    training.fill_in(viewer, replace(viewer.state.training_form, dataset=dataset))
+    training.start_training(viewer)
     assert "no photographs" in errors(viewer)[-1]
     assert viewer.training is None
 
@@ -206,31 +207,31 @@ def training_now(viewer, folder, monkeypatch):
     """A training is under way."""
     viewer.services = replace(viewer.services, load_scene=load_scene)
     trains(monkeypatch, SLOW)
-    actions.choose_photographs(viewer, folder)
-    actions.start_training(viewer)
+    opening.choose_photographs(viewer, folder)
+    training.start_training(viewer)
     yield viewer
     viewer.training.end()
 
 
 def test_gaussians_in_training_are_looked_at_and_followed(training_now, folder):
     viewer = training_now
-    actions.look_at_training(viewer)
+    training.look_at_training(viewer)
     assert "no Gaussians to look at yet" in viewer.state.messages[-1].text
     whole = blob_scene()
     checkpoint(folder.parent, whole.take(np.arange(0, 360, 2)))
-    actions.look_at_training(viewer)
+    training.look_at_training(viewer)
     settle(viewer)
     assert viewer.state.path == folder.parent / "photos.work" / NAME
     seen = viewer.state.scene.gaussians
     assert (len(seen), seen.sh_degree) == (180, 1)
     np.testing.assert_array_equal(seen.means, whole.gaussians.means[::2])
-    actions.zoom_by(viewer, 1.5)
+    viewpoint.zoom_by(viewer, 1.5)
     view = viewer.state.view
-    actions.watch_training(viewer)
+    training.watch_training(viewer)
     assert viewer.worker.current is None  # nothing new
 
     checkpoint(folder.parent, whole)
-    actions.watch_training(viewer)
+    training.watch_training(viewer)
     settle(viewer)
     assert len(viewer.state.scene.gaussians) == 360
     assert viewer.state.view is view
@@ -251,17 +252,10 @@ def test_a_checkpoint_of_training_itself_is_read(tmp_path):
         np.testing.assert_array_equal(getattr(seen, field.name), getattr(gaussians, field.name))
 
 
-def test_another_scene_is_left_alone_while_a_training_goes_on(training_now, folder):
-    viewer = training_now
-    checkpoint(folder.parent, blob_scene())
-    actions.watch_training(viewer)
-    assert viewer.worker.current is None
-
-
 def test_a_damaged_checkpoint_is_one_line(training_now, folder):
     path = checkpoint(folder.parent, blob_scene())
     path.write_bytes(path.read_bytes()[:100])
-    actions.look_at_training(training_now)
+    training.look_at_training(training_now)
     settle(training_now)
     assert "no Gaussians in training" in errors(training_now)[-1]
     assert training_now.state.scene is None

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from langsplat_viewer import actions
+from langsplat_viewer.actions import opening, queries, selecting, settings, undoing
 from langsplat_viewer.actions.history import GESTURE, LONGEST
 from langsplat_viewer.actions.selecting import mark
-from langsplat_viewer.drawing.channels import Clip, Splats
 from langsplat_viewer.marks import Marks, hiding, unmarked
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.request import Splats
 from tests.support.windowless import settle
 
 
@@ -23,35 +24,35 @@ def phrases(viewer) -> list[str]:
 
 def test_a_query_is_undone_and_done_again(opened):
     for word in ("mug", "book"):
-        actions.ask(opened, word)
+        queries.ask(opened, word)
     settle(opened)
-    actions.undo(opened)
+    undoing.undo(opened)
     assert phrases(opened) == ["mug"]
-    actions.undo(opened)
+    undoing.undo(opened)
     assert phrases(opened) == []
     assert opened.state.picture.display == "rgb"
-    actions.undo(opened)
+    undoing.undo(opened)
     assert "nothing to undo" in opened.state.messages[-1].text
-    actions.redo(opened)
-    actions.redo(opened)
+    undoing.redo(opened)
+    undoing.redo(opened)
     settle(opened)
     assert phrases(opened) == ["mug", "book"]
     assert [query.slot for query in opened.state.queries] == [0, 1]
     assert opened.state.picture.display == "relevancy"
-    assert opened.state.relevancies().shape == (360, 2)
-    actions.redo(opened)
+    assert len(opened.state.shown_results()) == 2
+    undoing.redo(opened)
     assert "nothing to redo" in opened.state.messages[-1].text
 
 
 def test_a_removed_query_comes_back_with_its_answer_and_colour(opened):
     for word in ("mug", "book"):
-        actions.ask(opened, word)
+        queries.ask(opened, word)
     settle(opened)
     mug = opened.state.queries[0]
-    actions.set_cut(opened, mug, 0.6)
+    queries.set_cut(opened, mug, 0.6)
     count = mug.result.members.sum()
-    actions.remove(opened, mug)
-    actions.undo(opened)
+    queries.remove(opened, mug)
+    undoing.undo(opened)
     settle(opened)
     assert opened.state.queries[0] is mug
     assert mug.slot == 0
@@ -62,98 +63,90 @@ def test_a_removed_query_comes_back_with_its_answer_and_colour(opened):
 
 
 def leave_by_removing(viewer) -> None:
-    actions.remove(viewer, viewer.state.queries[-1])
+    queries.remove(viewer, viewer.state.queries[-1])
 
 
-@pytest.mark.parametrize("leave", [leave_by_removing, actions.undo])
+@pytest.mark.parametrize("leave", [leave_by_removing, undoing.undo])
 def test_history_keeps_no_answers_of_queries_that_are_gone(opened, leave):
     """Each has a number for every Gaussian and level."""
-    actions.ask(opened, "mug")
+    queries.ask(opened, "mug")
     settle(opened)
     stays, gone = opened.state.queries[0].result, []
     for word in ("book", "plant"):
-        actions.ask(opened, word)
+        queries.ask(opened, word)
         settle(opened)
         gone.append(weakref.ref(opened.state.queries[-1].result))
-        opened.state.relevancies()
+        opened.state.panes()
         leave(opened)
     gc.collect()
     assert [there() for there in gone] == [None, None]
     assert opened.state.queries[0].result is stays
-    (actions.redo if leave is actions.undo else actions.undo)(opened)
+    (undoing.redo if leave is undoing.undo else undoing.undo)(opened)
     settle(opened)
     assert opened.state.queries[-1].phrase == "plant"
     assert opened.state.queries[-1].result.found
 
 
 def test_an_answer_that_comes_after_its_query_was_taken_off_is_dropped(opened):
-    actions.ask(opened, "mug")
+    queries.ask(opened, "mug")
     mug = opened.state.queries[0]
-    actions.remove(opened, mug)
+    queries.remove(opened, mug)
     settle(opened)
     assert (mug.result, mug.pending) == (None, False)
-    actions.undo(opened)
+    undoing.undo(opened)
     assert mug.pending
     settle(opened)
     assert mug.result.found
 
 
 def test_colour_level_and_display_are_undone(opened):
-    actions.ask(opened, "mug")
+    queries.ask(opened, "mug")
     settle(opened)
     query = opened.state.queries[0]
-    actions.hide(opened, query)
-    actions.set_level(opened, "part")
-    actions.set_display(opened, "depth")
+    queries.hide(opened, query)
+    queries.set_level(opened, "part")
+    settings.set_display(opened, "depth")
     settle(opened)
-    actions.undo(opened)
+    undoing.undo(opened)
     assert opened.state.picture.display == "relevancy"
-    actions.undo(opened)
+    undoing.undo(opened)
     settle(opened)
     assert (opened.state.level, query.result.level) == ("auto", 2)
-    actions.undo(opened)
+    undoing.undo(opened)
     assert query.slot == 0
-
-
-def test_a_change_after_an_undo_ends_what_could_be_redone(opened):
-    actions.ask(opened, "mug")
-    actions.undo(opened)
-    actions.ask(opened, "book")
-    actions.redo(opened)
-    assert phrases(opened) == ["book"]
 
 
 def test_another_scene_and_a_long_day(opened):
     for _ in range(LONGEST):
-        actions.set_display(opened, "depth")
-        actions.set_display(opened, "rgb")
+        settings.set_display(opened, "depth")
+        settings.set_display(opened, "rgb")
     assert len(opened.history.past) == LONGEST
-    actions.open_scene(opened, Path("bare.ply"))
+    opening.open_scene(opened, Path("bare.ply"))
     settle(opened)
     assert opened.history.past == []
 
 
 SETTINGS = {
-    "picture": lambda v: actions.set_picture(
+    "picture": lambda v: settings.set_picture(
         v, replace(v.state.picture, dim=0.2, background=(1.0, 1.0, 1.0))
     ),
-    "colour map": lambda v: actions.set_colour_map(v, "viridis"),
-    "wipe": actions.toggle_wipe,
-    "levels": actions.toggle_levels,
-    "line": lambda v: actions.move_line(v, 0.3),
-    "splats": lambda v: actions.set_splats(v, Splats(0.5, 0)),
-    "cut": lambda v: actions.set_clip(v, Clip(1.0, 2.0)),
-    "overlay": lambda v: actions.toggle_overlay(v, "grid"),
-    "backdrop": lambda v: actions.save_transparent(v, True),
-    "photograph": lambda v: actions.fade_photograph(v, 0.5),
-    "latents": lambda v: actions.set_display(v, "latent", 1),
+    "colour map": lambda v: settings.set_colour_map(v, "viridis"),
+    "wipe": settings.toggle_wipe,
+    "levels": settings.toggle_levels,
+    "line": lambda v: settings.move_line(v, 0.3),
+    "splats": lambda v: settings.set_splats(v, Splats(0.5, 0)),
+    "cut": lambda v: settings.set_clip(v, Clip(1.0, 2.0)),
+    "overlay": lambda v: settings.toggle_overlay(v, "grid"),
+    "backdrop": lambda v: settings.save_transparent(v, True),
+    "photograph": lambda v: opening.fade_photograph(v, 0.5),
+    "latents": lambda v: settings.set_display(v, "latent", 1),
 }
 
 
 def looks(viewer) -> tuple[object, ...]:
     state = viewer.state
     kept = (state.preferences.overlays, state.preferences.colour_map)
-    return state.picture, state.seeing, state.latent_level, kept
+    return state.picture, state.settings, state.latent_level, kept
 
 
 @pytest.mark.parametrize("name", SETTINGS)
@@ -164,10 +157,10 @@ def test_a_setting_of_what_is_seen_is_undone_in_one_step(opened, name):
     assert after != before
     SETTINGS["wipe" if name == "levels" else "levels"](opened)
     for wanted in (after, before):
-        actions.undo(opened)
+        undoing.undo(opened)
         assert looks(opened) == wanted
     assert opened.history.past == []
-    actions.redo(opened)
+    undoing.redo(opened)
     assert looks(opened) == after
 
 
@@ -184,7 +177,7 @@ def test_what_changes_nothing_is_no_step(opened, name):
 
 def slide(viewer, seconds: float, dim: float) -> None:
     viewer.clock = seconds
-    actions.set_picture(viewer, replace(viewer.state.picture, dim=dim))
+    settings.set_picture(viewer, replace(viewer.state.picture, dim=dim))
 
 
 def test_a_slider_that_is_moved_is_one_step_and_another_time_another(opened):
@@ -193,56 +186,36 @@ def test_a_slider_that_is_moved_is_one_step_and_another_time_another(opened):
     assert len(opened.history.past) == 1
     slide(opened, 5.9 + 1.1 * GESTURE, 0.9)
     assert len(opened.history.past) == 2
-    actions.undo(opened)
+    undoing.undo(opened)
     assert opened.state.picture.dim == pytest.approx(0.31)
     slide(opened, opened.clock, 0.8)  # after an undo a step of its own
-    actions.undo(opened)
+    undoing.undo(opened)
     assert opened.state.picture.dim == pytest.approx(0.31)
-    actions.undo(opened)
+    undoing.undo(opened)
     assert opened.state.picture.dim == 0.45
 
 
-def test_two_sliders_are_two_steps(opened):
-    slide(opened, 1.0, 0.2)
-    actions.set_picture(opened, replace(opened.state.picture, heat_opacity=0.3))
-    slide(opened, 1.0, 0.1)
-    assert len(opened.history.past) == 3
-
-
 def test_the_ruler_is_not_undone(opened):
-    actions.toggle_wipe(opened)
-    actions.measure(opened, True)
-    actions.undo(opened)
-    assert opened.state.seeing.ruler.measures
-    assert opened.state.seeing.split.mode == "off"
+    settings.toggle_wipe(opened)
+    settings.measure(opened, True)
+    undoing.undo(opened)
+    assert opened.state.ruler.measures
+    assert opened.state.settings.split.mode == "off"
 
 
 def test_an_undone_setting_leaves_the_marks_the_same_objects(opened):
     """Else the scene would be made anew for every slider."""
-    actions.select_all(opened)
-    actions.toggle_wipe(opened)
+    selecting.select_all(opened)
+    settings.toggle_wipe(opened)
     marks = opened.state.selection.marks
-    actions.undo(opened)
-    actions.redo(opened)
+    undoing.undo(opened)
+    undoing.redo(opened)
     assert opened.state.selection.marks is marks
-    actions.hide_selected(opened)
+    selecting.hide_selected(opened)
     hidden = opened.state.selection.marks.hidden
     mark(opened, replace(opened.state.selection.marks, selected=~hidden | True))
-    actions.undo(opened)
+    undoing.undo(opened)
     assert opened.state.selection.marks.hidden is hidden
-
-
-def test_marks_come_back_bit_for_bit(opened):
-    rng, seen = np.random.default_rng(0), []
-    for _ in range(12):
-        seen.append(opened.state.selection.marks)
-        mark(opened, Marks(*(rng.uniform(size=360) < 0.4 for _ in range(3))))
-    for marks in reversed(seen):
-        actions.undo(opened)
-        assert opened.state.selection.marks.same(marks)
-    for marks in seen[1:]:
-        actions.redo(opened)
-        assert opened.state.selection.marks.same(marks)
 
 
 def changed(marks: Marks, rng: np.random.Generator, step: int) -> Marks:

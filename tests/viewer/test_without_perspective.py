@@ -21,10 +21,10 @@ from langsplat_viewer.camera.controls import (
     zoom,
 )
 from langsplat_viewer.camera.flight import Flight, Keyframe, camera_of, pose_at, pose_of, turntable, view_of
-from langsplat_viewer.drawing.channels import Clip, depth_range, looking_settings, why_nothing
-from langsplat_viewer.drawing.frame import FrameRenderer
 from langsplat_viewer.options import scene_path
-from langsplat_viewer.output.still import render_picture
+from langsplat_viewer.rendering.depth import Clip, depth_range, image_formation, why_nothing
+from langsplat_viewer.rendering.renderer import GlRenderer, render_image
+from langsplat_viewer.rendering.request import plain_request
 from tests.support.fakes import CENTRES, blob_scene
 
 SIZE = (1280, 720)
@@ -63,7 +63,7 @@ def test_rasterizers_agree_on_it(room, side):
     scene, _, opening = room
     view = from_side(with_projection(opening, orthographic=True), side)
     images = [
-        render_picture(scene, view.camera(320, 180), PictureConfig(), backend=backend).astype(int)
+        render_image(plain_request(scene, view.camera(320, 180), PictureConfig()), backend).astype(int)
         for backend in ("cpu", "opengl")
     ]
     difference = np.abs(images[0] - images[1])
@@ -77,18 +77,16 @@ def test_what_is_clicked_is_where_it_is(gl, backend):
     """By the depth of one pixel, and by that of all of them."""
     view = with_projection(VIEW, orthographic=True)
     camera = view.camera(320, 240)
-    renderer = FrameRenderer(gl, backend, "half")
-    renderer.set_scene(BLOBS)
-    renderer.read(camera, PictureConfig())
+    renderer, request = GlRenderer(gl, backend, "half"), plain_request(BLOBS, camera, PictureConfig())
     for centre in CENTRES:
         (pixel,), _ = camera.project(centre[None])
         x, y = np.floor(pixel) + 0.5
-        one, every = renderer.depth_at(x, y), renderer.depth_map()[int(y), int(x)]
+        one, every = renderer.depth_at(request, x, y), renderer.depth_map(request)[int(y), int(x)]
         for depth in (one, every):
             found = camera.unproject((x, y), float(depth)) - centre
             assert -0.5 < found @ view.rotation[2] < 0.1  # the front of the blob
             assert np.linalg.norm(found[:2]) < 0.3
-    assert renderer.depth_at(2.5, 2.5) is None
+    assert renderer.depth_at(request, 2.5, 2.5) is None
     renderer.release()
 
 
@@ -132,7 +130,7 @@ def test_what_lies_behind_the_eye_is_left_out_and_cuts_count_from_the_eye():
     _, z = exact(inside, BLOBS.gaussians.means)
     _, depths = camera.project(BLOBS.gaussians.means.astype(np.float64))
     for clip in (Clip(), Clip(0.1, 0.3)):
-        settings = looking_settings(BLOBS, camera, clip)
+        settings = image_formation(BLOBS, camera, clip)
         shown = depths > settings.near
         shown &= depths <= (np.inf if settings.far is None else settings.far)
         np.testing.assert_array_equal(shown, (z > clip.near) & (z <= clip.far))

@@ -17,15 +17,14 @@ from langsplat_core.display.displays import QUERY_COLOURS
 from langsplat_core.errors import BackendError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import Scene
-from langsplat_viewer import actions
-from langsplat_viewer.drawing.frame import Backend, FrameRenderer
-from langsplat_viewer.panels.area import scene_area
+from langsplat_viewer.actions import settings
+from langsplat_viewer.panels.style import scene_area
+from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest
 from tests.support.fakes import CENTRES, FakeEncoder
 from tests.support.on_display import serve
-from tests.viewer import scenarios_files, scenarios_layout, scenarios_seeing, scenarios_select
-from tests.viewer.scenarios_record import RECORD_SCENARIOS
+from tests.viewer import scenarios_panels, scenarios_scene
 
 MUG, BOOK, PLANT = CENTRES
 PATIENCE = 240.0  # seconds: other tests may have the cores
@@ -35,16 +34,16 @@ def digit_key(digit: int) -> imgui.Key:
     return imgui.Key[f"_{digit}"]
 
 
-class CountingRenderer(FrameRenderer):
+class CountingRenderer(GlRenderer):
     """Counts the pictures it draws."""
 
     def __init__(self, ctx, backend: Backend) -> None:
         super().__init__(ctx, backend)
         self.count = 0
 
-    def draw(self, *args, **kwargs) -> None:
-        self.count += 1
-        super().draw(*args, **kwargs)
+    def draw(self, request, targets) -> None:
+        self.count += len(targets)
+        super().draw(request, targets)
 
 
 class Session:
@@ -63,6 +62,7 @@ class Session:
         **request,
     ) -> None:
         self.folder, self.backend = folder, backend
+        self.is_slow = load is not load_scene  # the scenario begins while the scene is read
         self.renderer: CountingRenderer | None = None
         services = Services(load, lambda encoder_id: FakeEncoder())
         self.window = Window(
@@ -80,6 +80,9 @@ class Session:
             self.ctx = ctx
             engine = imgui.test_engine.get_io(hello_imgui.get_imgui_test_engine())
             engine.config_watchdog_warning = engine.config_watchdog_kill_test = self.patience
+            if not self.is_slow:
+                self.wait(lambda: self.state.scene is not None)
+                self.settle()
             test(self)
 
         testing.run(test_function=body, runner_params=self.params())
@@ -164,7 +167,6 @@ class Session:
 
 
 def look_and_search(s: Session) -> None:
-    s.wait(lambda: s.state.scene is not None)
     rgb = s.shot("rgb")
     assert [s.at(rgb, thing).argmax() for thing in CENTRES] == [0, 1, 2]
 
@@ -277,8 +279,6 @@ def save_with_a_key(s: Session) -> None:
 
 
 def without_field(s: Session) -> None:
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
     assert any("langsplat train" in message.text for message in s.state.messages)
     assert not s.ctx.item_exists("//**/##phrase")
     s.ctx.key_press(digit_key(4))  # relevancy: refused with a line, not a crash
@@ -294,10 +294,10 @@ def without_field(s: Session) -> None:
     s.wait(lambda: s.state.path.name == "blobs.ply")
     s.settle()
     assert s.ctx.item_exists("//**/##phrase")
-    actions.open_panel(s.window.viewer, "Scene")
+    settings.open_panel(s.window.viewer, "Scene")
     s.ctx.yield_(3)
     s.ctx.item_click("//**/Keys")
-    actions.open_panel(s.window.viewer, "Camera")
+    settings.open_panel(s.window.viewer, "Camera")
     s.ctx.yield_(3)
     s.ctx.item_click("//**/##next")
     s.wait(lambda: s.state.camera_index == 1)
@@ -305,8 +305,6 @@ def without_field(s: Session) -> None:
 
 
 def from_the_command_line(s: Session) -> None:
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
     assert [query.phrase for query in s.state.queries] == ["mug", "sofa", "plant"]
     assert [query.result is not None for query in s.state.queries] == [True, False, True]
     assert s.state.picture.display == "segmentation"
@@ -324,15 +322,13 @@ def broken_renderer(s: Session) -> None:
     def fail(*args, **kwargs) -> None:
         raise BackendError("the driver gave up; use --backend cpu")
 
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
     s.renderer.draw = fail
-    s.ctx.key_press(imgui.Key.r)
+    s.ctx.key_press(digit_key(2))
     s.settle()
     s.ctx.yield_(20)
     assert s.state.messages[-1].text == "the driver gave up; use --backend cpu"
     del s.renderer.draw
-    s.ctx.key_press(digit_key(2))
+    s.ctx.key_press(digit_key(3))
     assert s.shot("mended")[:, 400:].max() > 100
 
 
@@ -361,8 +357,6 @@ def use_the_palette(s: Session) -> None:
 
 def use_shortcuts(s: Session) -> None:
     """Chords work everywhere, letters only by themselves and never while typing."""
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
     key, ctrl, shift = imgui.Key, imgui.Key.mod_ctrl, imgui.Key.mod_shift
     before = s.state.view
     for chord in (ctrl | key.r, ctrl | key.p, ctrl | key.d, ctrl | digit_key(2), ctrl | key.q):
@@ -412,8 +406,6 @@ def use_shortcuts(s: Session) -> None:
 
 def many_queries(s: Session) -> None:
     """However many there are and however long: the list keeps its place, the newest is on top."""
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
     display = s.ctx.item_info("//**/Colours").rect_full.min.y
     for phrase in (
         "mug",
@@ -445,8 +437,6 @@ def buttons(s: Session, label: str) -> list:
 
 def arrange_panels(s: Session) -> None:
     """Menus do what keys do; panels are closed, opened and moved; the browser opens a scene."""
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
     s.menu("View", "Show depth")
     s.ctx.yield_(3)
     assert s.state.picture.display == "depth"
@@ -489,8 +479,6 @@ def arrange_panels(s: Session) -> None:
 
 def leave_settings(s: Session) -> None:
     """The next window finds them; see `find_settings`."""
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
     s.menu("Window", "Light theme")
     s.menu("Window", "Display")
     s.ctx.yield_(3)
@@ -501,8 +489,6 @@ def leave_settings(s: Session) -> None:
 
 def find_settings(s: Session) -> None:
     """What `leave_settings` has left."""
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
     assert s.state.preferences.theme == "light"
     assert [Path(path).name for path in s.state.preferences.recent] == ["blobs.ply"]
     assert s.state.size[0] < 700
@@ -534,8 +520,6 @@ def type_while_opening(s: Session) -> None:
 
 def look_at_nothing(s: Session) -> None:
     """A scene of which nothing can be drawn says so over the picture."""
-    s.wait(lambda: s.state.scene is not None)
-    s.settle()
     assert "none of the 360 Gaussians can be drawn" in s.state.nothing
     said = s.shot("nothing")[250:370, 400:]
     assert said.max() > 150
@@ -568,12 +552,12 @@ SCENARIOS = {
     "many_queries": (many_queries, "blobs.ply", {}),
     "type_while_opening": (type_while_opening, "blobs.ply", {"load": slow_load}),
     "look_at_nothing": (look_at_nothing, "nothing.ply", {}),
-    **scenarios_select.SCENARIOS,
-    **RECORD_SCENARIOS,
+    **scenarios_scene.SELECTING,
+    **scenarios_panels.RECORD,
     "close_while_opening": (close_while_opening, "blobs.ply", {"load": slow_load}),
-    **scenarios_seeing.SCENARIOS,
-    **scenarios_files.SCENARIOS,
-    **scenarios_layout.SCENARIOS,
+    **scenarios_scene.SEEING,
+    **scenarios_panels.FILES,
+    **scenarios_panels.LAYOUT,
 }
 
 

@@ -15,9 +15,9 @@ from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import InputError, LangSplatError
 from langsplat_core.progress import Progress
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.actions.camera import glide_to, leave_path, path_seconds
 from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.settings import open_panel
+from langsplat_viewer.actions.viewpoint import glide_to, leave_path, path_seconds
 from langsplat_viewer.camera.controls import from_camera, with_projection
 from langsplat_viewer.camera.flight import (
     LONGEST,
@@ -30,13 +30,14 @@ from langsplat_viewer.camera.flight import (
     view_of,
     with_keyframe,
 )
-from langsplat_viewer.drawing.channels import Layers, Splats
-from langsplat_viewer.files.flight_files import MOST, SUFFIX, read_flight, write_flight
+from langsplat_viewer.files.flights import MOST, SUFFIX, read_flight, write_flight
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.options import MAX_SIDE, say_compiling
 from langsplat_viewer.output.film import VIDEO, Shot, cameras_of, check_film, find_ffmpeg, make_film
+from langsplat_viewer.output.headless import draw_something
 from langsplat_viewer.output.saving import free_name, save_png, save_view
-from langsplat_viewer.output.still import Subject, draw_something, painter
+from langsplat_viewer.rendering.renderer import open_renderer
+from langsplat_viewer.rendering.request import Splats
 from langsplat_viewer.state import SPACING, ViewerState, flight_of
 from langsplat_viewer.viewer import Viewer
 
@@ -71,7 +72,7 @@ def delete_keyframe(viewer: Viewer, key: Keyframe) -> None:
 
 
 def move_keyframe(viewer: Viewer, key: Keyframe, seconds: float) -> None:
-    """To another time; to that of another one: beside it."""
+    """Move it to another time, or beside a keyframe that has that time."""
     others = tuple(other for other in viewer.state.record.keyframes if other is not key)
     seconds = min(max(seconds, 0.0), LONGEST)
     while any(abs(other.seconds - seconds) < SAME_TIME for other in others):
@@ -114,18 +115,18 @@ def _set(viewer: Viewer, keyframes: tuple[Keyframe, ...], chosen: Keyframe | Non
 
 
 def set_turning(viewer: Viewer, turns: bool) -> None:
-    """Whether the path goes once around what the view turns around, in place of the keyframes."""
+    """Have the path go once around what the view turns around, in place of the keyframes."""
     leave_path(viewer)
     viewer.state.record.turns, viewer.state.record.at = turns, 0.0
 
 
 def set_looping(viewer: Viewer, loops: bool) -> None:
-    """Whether a played path begins again at its end."""
+    """Have a played path begin again at its end."""
     viewer.state.record.loops = loops
 
 
 def type_path_file(viewer: Viewer, text: str) -> None:
-    """What stands in the box for a file with a path."""
+    """Set the text of the box for a file with a path."""
     viewer.state.record.path_typed = text
 
 
@@ -177,7 +178,7 @@ def load_typed_path(viewer: Viewer, folder: Path) -> None:
 
 
 def set_film_size(viewer: Viewer, width: int, height: int) -> None:
-    """Of films and of pictures of any size, pixels."""
+    """Set the size of films and of images of any size, pixels."""
     width, height = (min(max(side, 1), MAX_SIDE) for side in (width, height))
     viewer.state.record.size = (width, height)
 
@@ -188,7 +189,7 @@ def set_film_fps(viewer: Viewer, fps: float) -> None:
 
 
 def type_film(viewer: Viewer, text: str) -> None:
-    """What stands in the box for where the film goes."""
+    """Set the text of the box for where the film goes."""
     viewer.state.record.film_typed = text
 
 
@@ -208,14 +209,14 @@ def save_film(viewer: Viewer, folder: Path) -> None:
     if motion is None or state.extent is None:
         state.say("a film needs a path: add a keyframe, or choose a turntable", is_error=True)
         return
-    subject = subject_of(state)
+    request = state.request(record.size)
     try:
         out = check_film(_film_out(viewer, folder), record.size)
         cameras = cameras_of(motion, state.extent, record.fps, record.size)
     except (InputError, OSError) as error:
         state.say(f"no film: {error}", is_error=True)
         return
-    shot = Shot(subject, cameras, record.fps, "cpu")
+    shot = Shot(request, cameras, record.fps, "cpu")
 
     def work(progress: Progress) -> str:
         say_compiling(progress)
@@ -239,14 +240,14 @@ def save_sized_picture(viewer: Viewer, folder: Path) -> None:
         state.say("open a scene first, then save a picture of it", is_error=True)
         return
     width, height = state.record.size
-    subject, camera = subject_of(state), state.view.camera(width, height)
+    request = state.request((width, height), state.settings.transparent)
     stem = f"{state.path.stem if state.path else 'picture'}-{width}x{height}"
 
     def work(progress: Progress) -> str:
         say_compiling(progress)
         path = free_name(folder, stem, ".png")
-        with painter(subject, "cpu") as paint:
-            save_png(path, draw_something(subject, camera, paint))
+        with open_renderer("cpu") as renderer:
+            save_png(path, draw_something(request, renderer))
         return f"saved {path}"
 
     _submit(viewer, f"picture of {width} x {height}", work)
@@ -261,13 +262,6 @@ def cancel_film(viewer: Viewer) -> None:
 def _submit(viewer: Viewer, label: str, work: Callable[[Progress], str]) -> None:
     state = viewer.state
     viewer.recorder.submit(label, work, state.say, lambda reason: state.say(reason, is_error=True))
-
-
-def subject_of(state: ViewerState) -> Subject:
-    """What is shown now."""
-    assert state.scene is not None
-    layers = Layers(state.latent_rgb(), state.relevancies())
-    return Subject(state.scene, state.shown_picture(), layers, state.heat_ranges(), state.seeing.clip)
 
 
 def copy_command(viewer: Viewer, folder: Path) -> str:
@@ -296,7 +290,7 @@ def copy_command(viewer: Viewer, folder: Path) -> str:
 
 
 def take_clipboard(viewer: Viewer) -> str:
-    """What is put on the clipboard now, "" for nothing; said once."""
+    """Return what is put on the clipboard now, "" for nothing; once."""
     text, viewer.state.record.clipboard = viewer.state.record.clipboard, ""
     return text
 
@@ -315,10 +309,10 @@ def _training_camera(state: ViewerState) -> str | None:
 
 
 def _display_words(state: ViewerState) -> list[str]:
-    """What is shown, as options; queries only where the display shows them."""
+    """Return what is shown as options; queries only where the display shows them."""
     row, picture = DISPLAYS[state.picture.display], state.picture
     words = ["--display", picture.display]
-    if row.extra == "latent":
+    if row.by_level:
         words += ["--level", LEVELS[state.latent_level]]
     shown = [(slot, query) for slot, query in enumerate(state.shown()) if query is not None]
     if not row.needs_query:
@@ -342,8 +336,8 @@ def _display_words(state: ViewerState) -> list[str]:
 
 
 def _look_words(state: ViewerState) -> list[str]:
-    """How it is shown, as options; what has none is said."""
-    clip, picture = state.seeing.clip, state.picture
+    """Return how it is shown as options; say what has none."""
+    clip, picture = state.settings.clip, state.picture
     words = []
     if picture.colour_map != PictureConfig.colour_map:
         words += ["--colour-map", picture.colour_map]
@@ -354,9 +348,9 @@ def _look_words(state: ViewerState) -> list[str]:
     marks = state.selection.marks
     left_out = {
         "what is hidden or selected": not marks.shown.all() or bool(marks.selected.any()),
-        "the size of splats and their SH degree": state.seeing.splats != Splats(),
+        "the size of splats and their SH degree": state.settings.splats != Splats(),
         "the backdrop": picture.background != PictureConfig.background,
-        "the picture beside it": state.seeing.split.mode != "off",
+        "the picture beside it": state.settings.split.mode != "off",
     }
     names = ", ".join(name for name, is_there in left_out.items() if is_there)
     if names:

@@ -1,12 +1,11 @@
-"""What was asked, shown and marked before, so that it can be undone."""
+"""History: queries, view settings and marks as they were before each change, to be undone."""
 
 from dataclasses import dataclass
 
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_viewer.camera.flight import Keyframe
-from langsplat_viewer.drawing.channels import Seeing
 from langsplat_viewer.marks import PackedMarks, pack
-from langsplat_viewer.state import Query
+from langsplat_viewer.state import Query, ViewSettings
 from langsplat_viewer.viewer import Viewer
 
 LONGEST = 100  # steps that can be undone
@@ -22,14 +21,14 @@ class Moment:
     picture: PictureConfig
     latent_level: int
     level: LevelChoice
-    seeing: Seeing  # its ruler is not undone
+    settings: ViewSettings
     overlays: tuple[str, ...]
     marks: PackedMarks
     keyframes: tuple[Keyframe, ...]
 
 
 def now(viewer: Viewer) -> Moment:
-    """How things stand."""
+    """Return the present moment."""
     state = viewer.state
     viewer.history.marks = pack(state.selection.marks, viewer.history.marks)
     return Moment(
@@ -38,7 +37,7 @@ def now(viewer: Viewer) -> Moment:
         picture=state.picture,
         latent_level=state.latent_level,
         level=state.level,
-        seeing=state.seeing,
+        settings=state.settings,
         overlays=state.preferences.overlays,
         marks=viewer.history.marks.packed,
         keyframes=state.record.keyframes,
@@ -46,8 +45,8 @@ def now(viewer: Viewer) -> Moment:
 
 
 def remember(viewer: Viewer, setting: str = "") -> None:
-    """What follows can be undone: to be called before a change. `setting` names one that is moved, as sliders
-    are: its changes in quick succession are one step."""
+    """Make what follows one step that can be undone; call it before a change. `setting` names one that is
+    moved, as sliders are: its changes in quick succession are one step."""
     history = viewer.history
     goes_on = setting != "" and setting == history.setting and viewer.clock - history.set_at < GESTURE
     history.setting, history.set_at = setting, viewer.clock

@@ -1,5 +1,6 @@
-"""Opening scenes, and stopping what is under way."""
+"""Opening scenes: read, shown, listed, returned to, chosen in the file browser; and their photographs."""
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,27 +11,32 @@ from langsplat_core.arrays import Array
 from langsplat_core.compiled import is_compiled
 from langsplat_core.display.displays import DISPLAYS, latent_colours
 from langsplat_core.errors import InputError
-from langsplat_core.io.scenes import scene_files
+from langsplat_core.io import cameras, language
+from langsplat_core.io.scenes import format_of, scene_files
+from langsplat_core.pipeline.forecast import count_photographs
 from langsplat_core.pipeline.report import stated_warnings
 from langsplat_core.progress import Progress
 from langsplat_core.query import surface
 from langsplat_core.query.engine import no_field
 from langsplat_core.scene import Camera, Scene
 from langsplat_core.semantics.encoders import DEMO
-from langsplat_viewer.actions import camera
-from langsplat_viewer.actions.camera import opening_view
+from langsplat_viewer.actions.filming import load_path
 from langsplat_viewer.actions.history import forget, remember
-from langsplat_viewer.actions.queries import ask_again, set_canonical
+from langsplat_viewer.actions.queries import ask_again, load_queries, set_canonical
 from langsplat_viewer.actions.selecting import leave
+from langsplat_viewer.actions.settings import open_panel
+from langsplat_viewer.actions.viewpoint import opening_view, read_bookmarks
 from langsplat_viewer.camera.controls import Extent, extent_of
-from langsplat_viewer.drawing.channels import UNCLIPPED, Ruler, why_undrawable
 from langsplat_viewer.files import photographs
-from langsplat_viewer.files.browsing import list_folder
+from langsplat_viewer.files.browsing import SUFFIX as QUERIES
+from langsplat_viewer.files.browsing import Entry, list_folder
+from langsplat_viewer.files.flights import SUFFIX as PATHS
 from langsplat_viewer.files.photographs import Photograph
 from langsplat_viewer.files.preferences import with_photographs, with_recent
 from langsplat_viewer.files.watching import Stamps, stamps
 from langsplat_viewer.marks import of_scene
-from langsplat_viewer.state import Recording, ViewerState
+from langsplat_viewer.rendering.depth import UNCLIPPED, why_undrawable
+from langsplat_viewer.state import Recording, SceneState, ViewerState
 from langsplat_viewer.viewer import Viewer, Visit, unanswered, visit_of
 
 
@@ -41,7 +47,6 @@ class _Opened:
     scene: Scene
     unusable: dict[str, int]  # reason -> Gaussians that are therefore not drawn
     extent: Extent
-    latent: Array | None  # (3, N, 3) colours
     read: Stamps  # its files as they were before they were read
     doubts: tuple[str, ...]  # what the report of its training says against it
 
@@ -71,10 +76,11 @@ def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Cal
         progress(f"preparing {path.name}", 0.6)
         viewer.services.warm_up(scene, backend, progress)
         progress(f"preparing {path.name}", 0.9)
-        latent = None if scene.language is None else latent_colours(scene.language)
+        if scene.language is not None:
+            latent_colours(scene.language)  # kept for the window's thread
         unusable = scene.gaussians.invalid_rows()
         doubts = stated_warnings(path, len(scene.gaussians))
-        return _Opened(scene, unusable, extent_of(scene), latent, read, doubts)
+        return _Opened(scene, unusable, extent_of(scene), read, doubts)
 
     def done(opened: _Opened) -> None:
         _show_scene(viewer, path, opened)
@@ -84,7 +90,7 @@ def _open(viewer: Viewer, path: Path, then: Callable[[Viewer], None], check: Cal
         viewer.state.opening = None
         viewer.state.say(reason, is_error=True)
 
-    viewer.worker.submit(f"opening {path.name}", work, done, failed)
+    viewer.run(f"opening {path.name}", work, done, failed)
 
 
 def cancel(viewer: Viewer) -> None:
@@ -104,51 +110,54 @@ def _show_scene(viewer: Viewer, path: Path, opened: _Opened) -> None:
     state, scene = viewer.state, opened.scene
     if state.path is not None:
         viewer.visits[state.path.absolute()] = visit_of(state)
-    state.opening, state.path = None, path
-    if path.absolute() not in state.scenes:
-        state.scenes = (*state.scenes, path.absolute())
-    viewer.watch.begin(opened.read)
-    state.scene, state.extent, state.latent = scene, opened.extent, opened.latent
-    state.doubts = opened.doubts
-    state.queries, state.selected, state.glide = [], None, None
-    state.canonical, state.canonical_typed = (), ""
-    state.selection = of_scene(state.selection, len(scene.gaussians))
-    state.camera_index = 0 if scene.cameras else None
-    state.seeing = replace(state.seeing, ruler=Ruler(), clip=UNCLIPPED)
-    forget(viewer)
-    state.preferences = with_recent(state.preferences, path.absolute())
-    state.opening_camera = None
-    camera.load(viewer)
-    state.record = Recording(size=state.record.size, fps=state.record.fps)
-    state.view, state.nothing = opening_view(viewer), why_undrawable(scene.gaussians)
-    viewer.engine, viewer.describer, state.hover = viewer.services.engine(scene), None, None
-    state.pointing = state.pointing and scene.language is not None
-    if scene.language is None and DISPLAYS[state.picture.display].needs_field:
-        state.picture = replace(state.picture, display="rgb")
-    reasons = ", ".join(f"{count:,} with {reason}" for reason, count in opened.unusable.items())
-    not_drawn = f"; not drawn: {reasons}" if reasons else ""
-    state.say(f"{path.name}: {len(scene.gaussians):,} Gaussians{not_drawn}")
-    for reason in scene.unread:
-        state.say(f"opened without what lies beside it: {reason}", is_error=True)
-    for doubt in opened.doubts:
-        state.say(doubt, is_error=True)
+    fresh = SceneState(
+        scene=scene,
+        path=path,
+        extent=opened.extent,
+        doubts=opened.doubts,
+        nothing=why_undrawable(scene.gaussians),
+        camera_index=0 if scene.cameras else None,
+        bookmarks=read_bookmarks(viewer, path),
+        record=Recording(size=state.record.size, fps=state.record.fps),
+        selection=of_scene(state.selection, len(scene.gaussians)),
+    )
+    state.begin(fresh)
+    state.view, state.opening = opening_view(viewer), None
+    state.settings = replace(state.settings, clip=UNCLIPPED)
     if scene.language is None:
-        state.say(no_field(scene))
-    else:
+        state.pointing = False
+        if DISPLAYS[state.picture.display].needs_field:
+            state.picture = replace(state.picture, display="rgb")
+    add_scenes(viewer, [path])
+    state.preferences = with_recent(state.preferences, path.absolute())
+    viewer.engine, viewer.describer = viewer.services.engine(scene), None
+    viewer.watch.begin(opened.read)
+    forget(viewer)
+    _say_opened(viewer, path, opened)
+    if scene.language is not None:
         _compile_search(viewer)
         _warm_up_encoder(viewer, viewer.services.encoder_id or scene.language.encoder_id)
 
 
+def _say_opened(viewer: Viewer, path: Path, opened: _Opened) -> None:
+    scene = opened.scene
+    reasons = ", ".join(f"{count:,} with {reason}" for reason, count in opened.unusable.items())
+    not_drawn = f"; not drawn: {reasons}" if reasons else ""
+    viewer.state.say(f"{path.name}: {len(scene.gaussians):,} Gaussians{not_drawn}")
+    for reason in scene.unread:
+        viewer.say_error(f"opened without what lies beside it: {reason}")
+    for doubt in opened.doubts:
+        viewer.say_error(doubt)
+    if scene.language is None:
+        viewer.state.say(no_field(scene))
+
+
 def _compile_search(viewer: Viewer) -> None:
-    """Have what queries run on compiled before the first one, and say so, unless an earlier run did it."""
     engine = viewer.engine
     if engine is None or is_compiled(Path(surface.__file__)):
         return
-    viewer.worker.submit(
-        "compiling the search kernels, once per installation (half a minute)",
-        lambda progress: engine.regions,
-        lambda regions: None,
-        lambda reason: viewer.state.say(reason, is_error=True),
+    viewer.run(
+        "compiling the search kernels, once per installation (half a minute)", lambda progress: engine.regions
     )
 
 
@@ -157,15 +166,10 @@ def _warm_up_encoder(viewer: Viewer, encoder_id: str) -> None:
     first query that needs it."""
     if viewer.engine is None or not (encoder_id == DEMO or Path(encoder_id).expanduser().is_dir()):
         return
-    viewer.worker.submit(
-        "loading the text encoder",
-        viewer.engine.load_encoder,
-        lambda encoder: None,
-        lambda reason: viewer.state.say(reason, is_error=True),
-    )
+    viewer.run("loading the text encoder", viewer.engine.load_encoder)
 
 
-# Coming back to a scene.
+# Visits: a scene that was shown before is found again as it was left.
 
 
 def return_to(viewer: Viewer, visit: Visit) -> None:
@@ -177,7 +181,7 @@ def return_to(viewer: Viewer, visit: Visit) -> None:
     count = len(state.scene.cameras)
     if visit.camera_index is not None and visit.camera_index < count:
         state.camera_index = visit.camera_index
-    state.seeing = replace(state.seeing, ruler=visit.ruler, clip=visit.clip)
+    state.settings, state.ruler = replace(state.settings, clip=visit.clip), visit.ruler
     state.record.keyframes = visit.keyframes
     if state.scene.language is None and DISPLAYS[visit.display].needs_field:
         return
@@ -218,8 +222,7 @@ def keep_old(viewer: Viewer) -> None:
     viewer.watch.dismiss()
 
 
-# Several scenes to switch between. One is in memory at a time; of the others it is known where one stood and
-# what was asked.
+# The list of scenes. One is in memory at a time; of the others the visit is kept.
 
 MOST = 100  # scenes that are listed
 
@@ -269,7 +272,7 @@ def unlist_scene(viewer: Viewer, path: Path) -> None:
     viewer.visits.pop(path, None)
 
 
-# The photograph of the training camera at which one stands, laid over the picture.
+# The photograph of the training camera at which the view stands, laid over the image.
 
 SAME = 1e-6  # of the scene's radius, and of a rotation: nearer is the same place
 
@@ -293,7 +296,7 @@ def standing_at(state: ViewerState) -> Camera | None:
 
 
 def photograph_here(state: ViewerState) -> Photograph | None:
-    """That of the camera at which one stands, as far as it was looked for."""
+    """Return the photograph of the camera at which the view stands, as far as it was looked for."""
     photograph = state.photograph
     return photograph if photograph is not None and photograph.camera is standing_at(state) else None
 
@@ -301,15 +304,15 @@ def photograph_here(state: ViewerState) -> Photograph | None:
 def fade_photograph(viewer: Viewer, fade: float) -> None:
     """How much of the photograph is laid over the picture, 0 to 1."""
     fade = min(max(fade, 0.0), 1.0)
-    if fade != viewer.state.seeing.fade:
+    if fade != viewer.state.settings.fade:
         remember(viewer, "fade")
-        viewer.state.seeing = replace(viewer.state.seeing, fade=fade)
+        viewer.state.settings = replace(viewer.state.settings, fade=fade)
 
 
 def fetch_photograph(viewer: Viewer) -> None:
     """Once per frame: have the worker look for the photograph that is wanted now and was not looked for."""
     state = viewer.state
-    camera = standing_at(state) if state.seeing.fade > 0 else None
+    camera = standing_at(state) if state.settings.fade > 0 else None
     if camera is None or state.path is None:
         return
     path, folder = state.path, _folder(viewer)
@@ -329,7 +332,7 @@ def fetch_photograph(viewer: Viewer) -> None:
         if state.photograph is wanted:
             state.photograph = replace(wanted, reason=reason)
 
-    viewer.worker.submit(f"reading the photograph {camera.name}", work, done, failed)
+    viewer.run(f"reading the photograph {camera.name}", work, done, failed)
 
 
 def _folder(viewer: Viewer) -> str:
@@ -351,3 +354,121 @@ def choose_photograph_folder(viewer: Viewer, folder: Path) -> None:
     state.browser = None
     if state.path is not None:
         state.preferences = with_photographs(state.preferences, state.path.absolute(), folder.absolute())
+
+
+# The file browser, typed paths, files dropped onto the window, and recent scenes.
+
+COMPANIONS = (cameras.SUFFIX, language.SUFFIX)  # files beside a scene, read with it
+NAMED = 3  # files that a message names
+
+
+def ask_for_file(viewer: Viewer) -> None:
+    """Open the browser in the folder of the scene that is shown."""
+    state = viewer.state
+    folder = state.path.parent if state.path is not None else Path.cwd()
+    state.path_typed, state.browser, state.picks_folder = "", list_folder(folder.absolute()), False
+
+
+def close_browser(viewer: Viewer) -> None:
+    """Choose nothing."""
+    viewer.state.browser = None
+
+
+def browse(viewer: Viewer, folder: Path) -> None:
+    """Show another folder."""
+    viewer.state.path_typed, viewer.state.browser = "", list_folder(folder)
+
+
+def choose(viewer: Viewer, entry: Entry) -> None:
+    """Go into a folder, or open a scene."""
+    if entry.is_file:
+        close_browser(viewer)
+        open_file(viewer, entry.path)
+    else:
+        browse(viewer, entry.path)
+
+
+def open_file(viewer: Viewer, path: Path) -> None:
+    """Open a scene, ask a set of queries, or take a camera path."""
+    if path.name.endswith(QUERIES):
+        load_queries(viewer, path)
+    elif path.name.endswith(PATHS):
+        load_path(viewer, path)
+    else:
+        open_scene(viewer, path)
+
+
+def open_dropped(viewer: Viewer, paths: Sequence[Path]) -> None:
+    """Open the first scene among files that were dropped onto the window, list the others, ask the queries
+    among them, and say what is none of these; what belongs to a scene lies beside it. A folder of photographs
+    is offered for training."""
+    if len(paths) == 1 and _is_plain_folder(paths[0]) and count_photographs(paths[0])[0]:
+        choose_photographs(viewer, paths[0])
+        open_panel(viewer, "Train")
+        return
+    sets = [path for path in paths if path.name.endswith((QUERIES, PATHS))]
+    files = [path for path in paths if path not in sets]
+    scenes = [path for path in files if not path.name.endswith(COMPANIONS)] or files
+    if not scenes:
+        _ask_sets(viewer, sets)
+        return
+    known = [path for path in scenes if format_of(path)] or scenes[:1]
+    others = [path.name for path in scenes if path not in known]
+    if others:
+        more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
+        viewer.state.say(f"not opened: {', '.join(others[:NAMED])}{more}", is_error=True)
+    add_scenes(viewer, known)
+    if len(known) > 1:
+        viewer.state.say(f"{len(known)} scenes: the panel Scene lists them")
+        open_panel(viewer, "Scene")
+    first = known[0]
+    open_scene(viewer, first, lambda viewer: _ask_sets(viewer, sets))
+
+
+def choose_photographs(viewer: Viewer, folder: Path) -> None:
+    """Take a folder of photographs, and a name beside it for the scene."""
+    form = viewer.state.training_form
+    out = form.out or str(folder.with_name(f"{folder.name or 'scene'}.ply"))
+    viewer.state.training_form = replace(form, dataset=str(folder), out=out)
+
+
+def open_all(viewer: Viewer) -> None:
+    """List the scenes of the folder that the browser shows, and open the first."""
+    listing = viewer.state.browser
+    if listing is not None:
+        open_scenes(
+            viewer, [entry.path for entry in listing.entries if entry.is_file and format_of(entry.path)]
+        )
+        open_panel(viewer, "Scene")
+
+
+def _ask_sets(viewer: Viewer, sets: Sequence[Path]) -> None:
+    for path in sets:
+        open_file(viewer, path)
+
+
+def open_recent(viewer: Viewer, path: str) -> None:
+    """Open a scene again that was open before."""
+    close_browser(viewer)
+    open_scene(viewer, Path(path))
+
+
+def type_path(viewer: Viewer, text: str) -> None:
+    """Take the text of the box for a path."""
+    viewer.state.path_typed = text
+
+
+def open_typed(viewer: Viewer) -> None:
+    """Go to the folder, or open the scene, that the box names: from the folder shown where it is relative."""
+    text, listing = viewer.state.path_typed.strip(), viewer.state.browser
+    if not text:
+        return
+    path = (listing.folder if listing else Path.cwd()) / os.path.expanduser(text)
+    choose(viewer, Entry(path, is_file=not _is_plain_folder(path)))
+
+
+def _is_plain_folder(path: Path) -> bool:
+    try:
+        return path.is_dir() and format_of(path) is None
+    except OSError:  # a name that no file system takes: opening it says so
+        return False

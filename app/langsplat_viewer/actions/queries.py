@@ -71,7 +71,7 @@ def ask_unanswered(viewer: Viewer) -> None:
 
 
 def type_phrase(viewer: Viewer, text: str) -> None:
-    """What stands in the search box."""
+    """Take the text of the search box."""
     viewer.state.typed = text
 
 
@@ -97,7 +97,7 @@ def focus_search(viewer: Viewer) -> None:
 
 
 def take_search_focus(viewer: Viewer) -> bool:
-    """Whether the search box takes the keyboard now; said once."""
+    """Return whether the search box takes the keyboard now; True once."""
     wanted, viewer.state.focus_input = viewer.state.focus_input, False
     return wanted
 
@@ -140,7 +140,7 @@ def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
         viewer.state.say(reason, is_error=True)
 
     query.pending = True
-    viewer.worker.submit(f"searching '{query.phrase}'", work, done, failed)
+    viewer.run(f"searching '{query.phrase}'", work, done, failed)
 
 
 def _take(query: Query, composed: ComposedResult, things: tuple[Instance, ...]) -> None:
@@ -223,7 +223,7 @@ def set_cut(viewer: Viewer, query: Query, cut: float | None, *, is_new: bool = T
 
 
 def type_canonical(viewer: Viewer, text: str) -> None:
-    """What stands in the box of the canonical phrases."""
+    """Take the text of the box of canonical phrases."""
     viewer.state.canonical_typed = text
 
 
@@ -244,7 +244,7 @@ def set_canonical(viewer: Viewer, text: str) -> None:
         state.say(f"compared with {', '.join(canonical)}")
         ask_again(viewer)
 
-    viewer.worker.submit("encoding canonical phrases", work, done, lambda reason: state.say(reason, True))
+    viewer.run("encoding canonical phrases", work, done)
 
 
 def save_queries(viewer: Viewer, folder: Path) -> Path | None:
@@ -265,7 +265,7 @@ def save_queries(viewer: Viewer, folder: Path) -> Path | None:
 
 
 def load_queries(viewer: Viewer, path: Path) -> None:
-    """Ask everything that a file has, after what is in the list already."""
+    """Ask all queries of a file, after those that are listed already."""
     state = viewer.state
     try:
         wanted = read_queries(path)
@@ -305,12 +305,12 @@ def prepare_suggestions(viewer: Viewer) -> None:
         if viewer.state.scene is scene:
             viewer.state.suggestions = found
 
-    viewer.worker.submit("finding examples", work, done, lambda reason: None)
+    viewer.run("finding examples", work, done, lambda reason: None)
 
 
 def offers(viewer: Viewer) -> tuple[str, tuple[str, ...]]:
-    """What to offer now, and its title: phrases that go on from what is typed, else a correction of the last
-    query, else, before the first query, examples."""
+    """Return a title and the phrases to offer now: those that go on from what is typed, else a correction of
+    the last query, else, before the first query, examples."""
     state = viewer.state
     if state.typed.strip():
         return "", tuple(completions(state.typed, state.suggestions.phrases))

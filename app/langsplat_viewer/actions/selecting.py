@@ -1,4 +1,4 @@
-"""Selecting without the mouse: the verbs, answers and their things, and how tools behave.
+"""Selection: verbs, answers and their instances, tools of the mouse, export, and the question before leaving.
 
 Every change of what is selected, hidden or deleted is one step that can be undone; the settings of tools are
 not.
@@ -23,9 +23,9 @@ from langsplat_core.query.selection import at_point, grow, of_rows, shrink
 from langsplat_core.scene import LEVELS, Scene
 from langsplat_viewer import marks
 from langsplat_viewer.actions.history import remember
-from langsplat_viewer.drawing.channels import UNCLIPPED
-from langsplat_viewer.marks import Drawn, Leaving, Marks, Mode, Stroke, Things, Tool
+from langsplat_viewer.marks import Drawn, Leaving, Marks, Mode, Stroke, Tool
 from langsplat_viewer.output.saving import free_name
+from langsplat_viewer.rendering.depth import UNCLIPPED
 from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
 
@@ -47,14 +47,14 @@ def take(viewer: Viewer, found: Array, mode: Mode | None = None) -> None:
 
 
 def has_scene(viewer: Viewer) -> bool:
-    """Whether a scene is open; says so where none is."""
+    """Return whether a scene is open; say so where none is."""
     if viewer.state.scene is None:
         viewer.state.say("open a scene first, then select in it", is_error=True)
     return viewer.state.scene is not None
 
 
 def has_selection(viewer: Viewer) -> bool:
-    """Whether something is selected; says so where nothing is."""
+    """Return whether something is selected; say so where nothing is."""
     if not has_scene(viewer):
         return False
     some = bool(viewer.state.selection.marks.selected.any())
@@ -64,62 +64,62 @@ def has_selection(viewer: Viewer) -> bool:
 
 
 def select_all(viewer: Viewer) -> None:
-    """Everything that is shown."""
+    """Select everything that is shown."""
     if has_scene(viewer):
         take(viewer, viewer.state.selection.marks.shown, "replace")
 
 
 def select_none(viewer: Viewer) -> None:
-    """Nothing."""
+    """Select nothing."""
     if has_scene(viewer):
         take(viewer, np.zeros_like(viewer.state.selection.marks.selected), "replace")
 
 
 def invert_selection(viewer: Viewer) -> None:
-    """Of what is shown, that which was not selected."""
+    """Select what is shown and was not selected."""
     if has_scene(viewer):
         take(viewer, ~viewer.state.selection.marks.selected, "replace")
 
 
 def hide_selected(viewer: Viewer) -> None:
-    """Out of the picture, until all is shown again."""
+    """Take the selection out of the image until all is shown again."""
     if has_selection(viewer):
         mark(viewer, marks.hiding(viewer.state.selection.marks))
 
 
 def isolate_selected(viewer: Viewer) -> None:
-    """Everything else out of the picture."""
+    """Hide everything else."""
     if has_selection(viewer):
         mark(viewer, marks.isolating(viewer.state.selection.marks))
 
 
 def show_hidden(viewer: Viewer) -> None:
-    """All that was hidden."""
+    """Show everything that was hidden."""
     if has_scene(viewer):
         mark(viewer, marks.showing_all(viewer.state.selection.marks))
 
 
 def delete_selected(viewer: Viewer) -> None:
-    """Out of the scene, as far as it is saved from now on; the file that was opened stays as it is."""
+    """Take the selection out of the image and of what is saved; the file that was opened stays as it is."""
     if has_selection(viewer):
         mark(viewer, marks.deleting(viewer.state.selection.marks))
 
 
 def reach(viewer: Viewer) -> float:
-    """How far growing and shrinking go at a time, world units."""
+    """Return how far growing and shrinking go at a time, world units."""
     extent = viewer.state.extent
     return viewer.state.selection.reach * (0.0 if extent is None else extent.radius)
 
 
 def grow_selection(viewer: Viewer) -> None:
-    """And what is within reach along the surface."""
+    """Add what is within reach along the surface."""
     if has_selection(viewer):
         selected, distance = viewer.state.selection.marks.selected, reach(viewer)
         find(viewer, "growing", lambda engine: grow(engine.surface, selected, distance), "add")
 
 
 def shrink_selection(viewer: Viewer) -> None:
-    """Without what is within reach of something else, along the surface."""
+    """Leave out what is within reach of something else along the surface."""
     if has_selection(viewer):
         selected, distance = viewer.state.selection.marks.selected, reach(viewer)
         find(viewer, "shrinking", lambda engine: shrink(engine.surface, selected, distance), "intersect")
@@ -135,21 +135,17 @@ def find(viewer: Viewer, label: str, work: Callable[[QueryEngine], Array], mode:
         if viewer.state.scene is scene:
             take(viewer, found, mode)
 
-    viewer.worker.submit(f"{label} the selection", lambda progress: work(engine), done, _failed(viewer))
-
-
-def _failed(viewer: Viewer) -> Callable[[str], None]:
-    return lambda reason: viewer.state.say(reason, is_error=True)
+    viewer.run(f"{label} the selection", lambda progress: work(engine), done)
 
 
 def chosen_query(viewer: Viewer) -> Query | None:
-    """The query whose details are shown, else the latest; None without one."""
+    """Return the query whose details are shown, else the latest; None without one."""
     state = viewer.state
     return state.selected or (state.queries[-1] if state.queries else None)
 
 
 def select_query(viewer: Viewer, query: Query | None = None, mode: Mode | None = None) -> None:
-    """What answers a query, by default that of `chosen_query`."""
+    """Select the members of an answer, by default that of `chosen_query`."""
     query = query or chosen_query(viewer)
     if has_scene(viewer) and query is not None and query.result is not None:
         if query.result.verdict == "not here":
@@ -160,56 +156,36 @@ def select_query(viewer: Viewer, query: Query | None = None, mode: Mode | None =
         viewer.state.say("search for something first, then select what was found")
 
 
-def find_things(viewer: Viewer, query: Query | None = None) -> None:
-    """Have the worker take an answer apart into its things, for `select_thing`."""
-    query, engine = query or chosen_query(viewer), viewer.engine
-    if engine is None or query is None or query.result is None or query.result.verdict == "not here":
-        select_query(viewer, query)  # which says why not
-        return
-    phrase, result = query.phrase, query.result
-
-    def done(found: tuple[Instance, ...]) -> None:
-        if viewer.engine is engine:
-            viewer.state.selection = replace(viewer.state.selection, things=Things(phrase, result, found))
-
-    def work(progress: Progress) -> tuple[Instance, ...]:
-        return engine.instances(result)
-
-    viewer.worker.submit(f"taking '{phrase}' apart", work, done, _failed(viewer))
-
-
-def select_thing(viewer: Viewer, number: int, mode: Mode | None = None) -> None:
-    """One of the things that `find_things` found, counted from 0."""
-    selection = viewer.state.selection
-    if selection.things is not None and 0 <= number < len(selection.things.found):
-        members = selection.things.found[number].members
-        take(viewer, of_rows(members, len(selection.marks.selected)), mode)
+def select_thing(viewer: Viewer, thing: Instance, mode: Mode | None = None) -> None:
+    """Select one of the things that an answer found."""
+    if has_scene(viewer):
+        take(viewer, of_rows(thing.members, len(viewer.state.selection.marks.selected)), mode)
 
 
 def use_tool(viewer: Viewer, tool: Tool | None) -> None:
-    """What a drag in the scene does from now on; None: it turns the camera again."""
+    """Choose the tool of the left button; None: a drag turns the camera again."""
     viewer.state.selection = replace(viewer.state.selection, tool=tool, stroke=None)
 
 
 def set_mode(viewer: Viewer, mode: Mode) -> None:
-    """How what is found is combined with the selection, unless a key that is held says otherwise."""
+    """Set how what is found is combined with the selection, unless a held key says otherwise."""
     viewer.state.selection = replace(viewer.state.selection, mode=mode)
 
 
 def set_brush(viewer: Viewer, radius: float) -> None:
-    """The brush's radius, of the picture's height."""
+    """Set the brush's radius, of the image's height."""
     low, high = marks.BRUSHES
     viewer.state.selection = replace(viewer.state.selection, brush=min(max(radius, low), high))
 
 
 def set_reach(viewer: Viewer, share: float) -> None:
-    """How far growing goes, of the scene's radius."""
+    """Set how far growing goes, of the scene's radius."""
     low, high = marks.REACHES
     viewer.state.selection = replace(viewer.state.selection, reach=min(max(share, low), high))
 
 
 def set_only_visible(viewer: Viewer, only: bool) -> None:
-    """Whether rectangle, lasso and brush leave out what lies behind something."""
+    """Set whether rectangle, lasso and brush leave out what lies behind something."""
     viewer.state.selection = replace(viewer.state.selection, only_visible=only)
 
 
@@ -272,12 +248,11 @@ def export(
     def failed(reason: str) -> None:
         state.say(f"not saved: {reason}", is_error=True)
 
-    job = viewer.worker.submit(f"saving the {part}", work, done, failed)
+    job = viewer.run(f"saving the {part}", work, done, failed)
     state.selection = replace(state.selection, writing=job.future)
 
 
 def _write(scene: Scene, rows: Array, folder: Path, stem: str, as_points: bool) -> Written:
-    """The name is chosen here, one writing after the other, so that no two choose the same."""
     path = free_name(folder, stem, ".ply", () if as_points else COMPANIONS)
     if as_points:
         return Written(path, write_points(path, scene.gaussians.take(rows)))
@@ -305,7 +280,7 @@ def leave(viewer: Viewer, then: Callable[[Viewer], None], to: str) -> None:
 
 
 def may_close(viewer: Viewer) -> bool:
-    """Whether the window may close now; where not, it is asked about."""
+    """Return whether the window may close now; where not, ask."""
     if not viewer.state.selection.may_close:
         quit_viewer(viewer)
     return viewer.state.selection.may_close
@@ -390,7 +365,7 @@ def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
         return
     wanted = state.selection.only_visible and drawn.tool in marks.ON_SCREEN and viewer.surface is not None
     depths = viewer.surface.depths() if wanted and viewer.surface is not None else None
-    means, clip = state.scene.gaussians.means, state.seeing.clip
+    means, clip = state.scene.gaussians.means, state.settings.clip
     found = marks.caught(drawn, means, depths)
     if clip != UNCLIPPED and drawn.tool in marks.ON_SCREEN:  # what is not drawn lies under no outline
         found &= clip.keeps(means @ drawn.camera.rotation[2] + drawn.camera.world_to_camera[2, 3])

@@ -5,30 +5,20 @@ from dataclasses import fields, replace
 from langsplat_core.config import ColourMap, Display, PictureConfig
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.query.engine import no_field
-from langsplat_viewer.actions.camera import glide_to
 from langsplat_viewer.actions.history import remember
 from langsplat_viewer.actions.selecting import leave_tool, stay
+from langsplat_viewer.actions.viewpoint import glide_to
 from langsplat_viewer.camera.overlays import facing
-from langsplat_viewer.drawing.channels import (
-    AT_RANGE,
-    MOST_DEGREE,
-    OVERLAYS,
-    SIZE_RANGE,
-    Clip,
-    Overlay,
-    Ruler,
-    Seeing,
-    Splats,
-    Split,
-)
 from langsplat_viewer.files.preferences import SCALES, Theme
-from langsplat_viewer.keys import Keying
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.request import AT_RANGE, MOST_DEGREE, SIZE_RANGE, Splats, Split
+from langsplat_viewer.state import OVERLAYS, Overlay, Ruler, ViewSettings
 from langsplat_viewer.viewer import Viewer
 
 
 def compare_with(viewer: Viewer, display: Display, latent_level: int | None = None) -> None:
     """Show a second display right of a line across the scene; `latent_level` indexes `scene.LEVELS`."""
-    split = viewer.state.seeing.split
+    split = viewer.state.settings.split
     level = split.second_level if latent_level is None else latent_level
     if _can_show(viewer, DISPLAYS[display].needs_field):
         _set_split(viewer, replace(split, mode="wipe", second=display, second_level=level))
@@ -36,7 +26,7 @@ def compare_with(viewer: Viewer, display: Display, latent_level: int | None = No
 
 def toggle_wipe(viewer: Viewer) -> None:
     """Show the second display that was chosen last, or one picture again."""
-    split = viewer.state.seeing.split
+    split = viewer.state.settings.split
     if split.mode == "wipe":
         show_one(viewer)
     else:
@@ -45,7 +35,7 @@ def toggle_wipe(viewer: Viewer) -> None:
 
 def toggle_levels(viewer: Viewer) -> None:
     """Show the three semantic levels side by side, or one picture again."""
-    split = viewer.state.seeing.split
+    split = viewer.state.settings.split
     if split.mode == "levels":
         show_one(viewer)
     elif _can_show(viewer, needs_field=True):
@@ -53,18 +43,18 @@ def toggle_levels(viewer: Viewer) -> None:
 
 
 def show_one(viewer: Viewer) -> None:
-    """One picture fills the scene's area."""
-    _set_split(viewer, replace(viewer.state.seeing.split, mode="off"))
+    """Have one image fill the scene's area."""
+    _set_split(viewer, replace(viewer.state.settings.split, mode="off"))
 
 
 def move_line(viewer: Viewer, at: float) -> None:
-    """Where the line is that divides the two pictures, as a fraction of the area's width."""
+    """Move the line that divides the two pictures, as a fraction of the area's width."""
     low, high = AT_RANGE
-    _set_split(viewer, replace(viewer.state.seeing.split, at=min(max(at, low), high)), "line")
+    _set_split(viewer, replace(viewer.state.settings.split, at=min(max(at, low), high)), "line")
 
 
 def set_colour_map(viewer: Viewer, colour_map: ColourMap) -> None:
-    """The colours of relevancy and depth; remembered."""
+    """Set the colours of relevancy and depth; remembered."""
     state = viewer.state
     if colour_map != state.picture.colour_map:
         remember(viewer)
@@ -73,27 +63,27 @@ def set_colour_map(viewer: Viewer, colour_map: ColourMap) -> None:
 
 
 def save_transparent(viewer: Viewer, transparent: bool) -> None:
-    """Whether pictures are saved without their background."""
-    _see(viewer, replace(viewer.state.seeing, transparent=transparent))
+    """Set whether images are saved without their background."""
+    _set(viewer, replace(viewer.state.settings, transparent=transparent))
 
 
 def set_splats(viewer: Viewer, splats: Splats) -> None:
-    """How the Gaussians are drawn, within what there is."""
+    """Set how the Gaussians are drawn, within the range of settings."""
     low, high = SIZE_RANGE
     degree = min(max(splats.sh_degree, 0), MOST_DEGREE)
     kept = Splats(min(max(splats.size, low), high), degree)
-    _see(viewer, replace(viewer.state.seeing, splats=kept), "splats")
+    _set(viewer, replace(viewer.state.settings, splats=kept), "splats")
 
 
 def set_clip(viewer: Viewer, clip: Clip) -> None:
-    """Between which depths Gaussians are drawn; the far one stays the farther."""
+    """Set between which depths Gaussians are drawn; the far one stays the farther."""
     near = max(clip.near, 0.0)
     kept = Clip(near, max(clip.far, near))
-    _see(viewer, replace(viewer.state.seeing, clip=kept), "clip")
+    _set(viewer, replace(viewer.state.settings, clip=kept), "clip")
 
 
 def show_overlay(viewer: Viewer, overlay: Overlay, shown: bool) -> None:
-    """Whether something lies over the scene; remembered."""
+    """Set whether something lies over the scene; remembered."""
     preferences = viewer.state.preferences
     kept = {*preferences.overlays, overlay} if shown else {*preferences.overlays} - {overlay}
     overlays = tuple(name for name in OVERLAYS if name in kept)
@@ -114,15 +104,15 @@ def turn_to_face(viewer: Viewer, face: str) -> None:
 
 
 def measure(viewer: Viewer, on: bool) -> None:
-    """Whether clicks on the scene set the points of the ruler; what was measured goes when it ends."""
-    ruler = viewer.state.seeing.ruler
+    """Set whether clicks on the scene set the points of the ruler; what was measured goes when it ends."""
+    ruler = viewer.state.ruler
     if on != ruler.measures:
-        viewer.state.seeing = replace(viewer.state.seeing, ruler=Ruler(on))
+        viewer.state.ruler = Ruler(on)
 
 
 def toggle_measuring(viewer: Viewer) -> None:
     """Begin to measure, or end it."""
-    measure(viewer, not viewer.state.seeing.ruler.measures)
+    measure(viewer, not viewer.state.ruler.measures)
 
 
 def measure_at(viewer: Viewer, u: float, v: float) -> None:
@@ -132,12 +122,11 @@ def measure_at(viewer: Viewer, u: float, v: float) -> None:
         viewer.state.say("nothing under the cursor to measure from")
         return
     x, y, z = (float(part) for part in point)
-    seeing = viewer.state.seeing
-    viewer.state.seeing = replace(seeing, ruler=seeing.ruler.with_point((x, y, z)))
+    viewer.state.ruler = viewer.state.ruler.with_point((x, y, z))
 
 
 def _can_show(viewer: Viewer, needs_field: bool) -> bool:
-    """Whether the scene has a language field where one is needed; says so where it has none."""
+    """Return whether the scene has a language field where one is needed; says so where it has none."""
     scene = viewer.state.scene
     if needs_field and scene is not None and scene.language is None:
         viewer.state.say(no_field(scene), is_error=True)
@@ -146,14 +135,14 @@ def _can_show(viewer: Viewer, needs_field: bool) -> bool:
 
 
 def _set_split(viewer: Viewer, split: Split, setting: str = "") -> None:
-    _see(viewer, replace(viewer.state.seeing, split=split), setting)
+    _set(viewer, replace(viewer.state.settings, split=split), setting)
 
 
-def _see(viewer: Viewer, seeing: Seeing, setting: str = "") -> None:
-    """Look at the scene like that; `setting` as in `remember`."""
-    if seeing != viewer.state.seeing:
+def _set(viewer: Viewer, settings: ViewSettings, setting: str = "") -> None:
+    """Take other view settings; `setting` as in `remember`."""
+    if settings != viewer.state.settings:
         remember(viewer, setting)
-        viewer.state.seeing = seeing
+        viewer.state.settings = settings
 
 
 # What is shown and how; which parts of the window are.
@@ -181,7 +170,7 @@ def set_picture(viewer: Viewer, picture: PictureConfig) -> None:
 
 
 def set_coarse_while_moving(viewer: Viewer, coarse: bool) -> None:
-    """Whether a slow machine draws fewer pixels while the camera moves."""
+    """Set whether a slow machine draws fewer pixels while the camera moves."""
     viewer.state.coarse_while_moving = coarse
 
 
@@ -191,7 +180,7 @@ def set_theme(viewer: Viewer, theme: Theme) -> None:
 
 
 def set_ui_scale(viewer: Viewer, scale: float) -> None:
-    """How large letters and widgets are, within `preferences.SCALES`."""
+    """Set how large letters and widgets are, within `preferences.SCALES`."""
     low, high = SCALES
     viewer.state.preferences = replace(viewer.state.preferences, ui_scale=min(max(scale, low), high))
 
@@ -202,7 +191,7 @@ def resize(viewer: Viewer, width: int, height: int) -> None:
 
 
 def show_panel(viewer: Viewer, shown: bool) -> None:
-    """Whether the panels are there."""
+    """Set whether the panels are there."""
     viewer.state.show_panel = shown
 
 
@@ -231,9 +220,8 @@ def note_panels(viewer: Viewer, titles: tuple[str, ...]) -> None:
 
 
 def show_help(viewer: Viewer, shown: bool) -> None:
-    """Whether the list of keys is there; it is only read at first."""
-    if shown != viewer.state.show_help:
-        viewer.state.show_help, viewer.state.keying = shown, Keying()
+    """Show or hide the list of keys."""
+    viewer.state.show_help = shown
 
 
 def toggle_help(viewer: Viewer) -> None:
@@ -241,29 +229,18 @@ def toggle_help(viewer: Viewer) -> None:
     show_help(viewer, not viewer.state.show_help)
 
 
-def edit_keys(viewer: Viewer, edits: bool) -> None:
-    """Whether the list of keys is there to change them."""
-    show_help(viewer, True)
-    viewer.state.keying = Keying(edits)
-
-
-def type_keys(viewer: Viewer, text: str) -> None:
-    """What stands in the box of that list."""
-    viewer.state.keying = replace(viewer.state.keying, typed=text)
-
-
 def show_palette(viewer: Viewer, shown: bool) -> None:
-    """Whether the list of everything that can be done is there, its box empty."""
+    """Set whether the list of everything that can be done is there, its box empty."""
     viewer.state.show_palette, viewer.state.palette_typed = shown, ""
 
 
 def type_command(viewer: Viewer, text: str) -> None:
-    """What stands in the box of that list."""
+    """Set the text of the box of that list."""
     viewer.state.palette_typed = text
 
 
 def mute_letters(viewer: Viewer, muted: bool) -> None:
-    """Whether letters do nothing for now: they were meant for a box that cannot be typed in."""
+    """Set whether letters do nothing for now: they were meant for a box that cannot be typed in."""
     viewer.state.letters_muted = muted
 
 

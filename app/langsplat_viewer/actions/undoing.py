@@ -21,7 +21,6 @@ def redo(viewer: Viewer) -> None:
 
 
 def _step(viewer: Viewer, there: list[Moment], back: list[Moment], otherwise: str) -> None:
-    """Go to the nearest moment of `there`, and keep how things stand in `back`."""
     if not there:
         viewer.state.say(otherwise)
         return
@@ -44,7 +43,7 @@ def _restore(viewer: Viewer, moment: Moment) -> None:
     state.selection = replace(state.selection, marks=marks, stroke=None)
     state.record.keyframes, state.record.chosen = moment.keyframes, None
     state.picture, state.latent_level = moment.picture, moment.latent_level
-    state.seeing = replace(moment.seeing, ruler=state.seeing.ruler)
+    state.settings = moment.settings
     looks = replace(state.preferences, colour_map=moment.picture.colour_map, overlays=moment.overlays)
     state.preferences = looks
     past, future = history.past, history.future

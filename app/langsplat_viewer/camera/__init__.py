@@ -1,1 +1,1 @@
-"""Where one stands, as plain maths: no window, no graphics device."""
+"""The camera as plain maths: no window, no graphics device."""

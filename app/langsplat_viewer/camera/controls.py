@@ -16,7 +16,7 @@ def narrowed(inner: Intrinsics, factor: float) -> Intrinsics:
     return replace(inner, fx=inner.fx * factor, fy=inner.fy * factor)
 
 
-# Where to stand so that a scene fills the picture: plain maths on a sample of its Gaussians.
+# Framing: the eye from which a scene fills the image, from a sample of its Gaussians.
 
 SAMPLE = 50_000  # Gaussians looked at; quantiles need no more
 SHARE = 0.99  # of the weight that a framing view holds: what is left out are floaters
@@ -112,7 +112,7 @@ def _quantile(values: Array, weights: Array, share: float) -> float:
     return _pick(_ordered(values, weights), share) if len(values) else 0.0
 
 
-# Camera control as plain maths: what the mouse and the keys do, without a window.
+# Camera controls: the moves of mouse and keys.
 #
 # An `OrbitCamera` turns around a target point. Every control is a function from one camera to the next,
 # so that a test can do and undo it.
@@ -129,14 +129,15 @@ Side = Literal["front", "back", "left", "right", "top", "bottom"]
 
 
 def symmetric_intrinsics(fov_degrees: float = DEFAULT_FOV) -> Intrinsics:
-    """Of a square picture that shows `fov_degrees` across, its principal point in the centre."""
+    """Return the intrinsics of a square image that shows `fov_degrees` across, its principal point in the
+    centre."""
     focal = 0.5 / math.tan(math.radians(fov_degrees) / 2)
     return Intrinsics(1.0, 1.0, focal, focal, 0.5, 0.5)
 
 
 @dataclass(frozen=True, eq=False)
 class OrbitCamera:
-    """Where the viewer stands and what it turns around."""
+    """A view that turns around a target."""
 
     rotation: Array  # (3, 3) world-to-camera, rows are right, down and forward
     target: Array  # (3,) world units, on the optical axis
@@ -313,7 +314,7 @@ def between(start: OrbitCamera, end: OrbitCamera, t: float) -> OrbitCamera:
 
 @dataclass(frozen=True, eq=False)
 class Extent:
-    """What the camera needs to know about a scene; computed once, because it looks at every Gaussian."""
+    """Centre, size and up of a scene, for the camera; computed once, because it looks at every Gaussian."""
 
     centre: Array  # (3,) robust middle, world units
     radius: float  # robust, world units, > 0

@@ -29,7 +29,7 @@ SAME_TIME = 1e-3  # seconds: two keyframes are not nearer
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Where a camera stands, how it is turned, and how much it sees."""
+    """Position, rotation and field of view of a camera."""
 
     position: Array  # (3,) world units
     rotation: Array  # (3, 3) world to camera, rows are right, down and forward
@@ -63,10 +63,10 @@ class Motion(Protocol):
 
     @property
     def closed(self) -> bool:
-        """Whether it ends where it began."""
+        """True where it ends as it began."""
 
     def poses(self, seconds: Array) -> tuple[Pose, ...]:
-        """Where the camera is at (T,) times; before the start and after the end it stands still."""
+        """Return the poses at (T,) times; before the start and after the end it stands still."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ def camera_of(pose: Pose, extent: Extent, size: tuple[int, int]) -> Camera:
 
 
 def pose_at(motion: Motion, seconds: float) -> Pose:
-    """Where the camera is at one time."""
+    """Return the pose at one time."""
     return motion.poses(np.array([seconds]))[0]
 
 
@@ -173,7 +173,7 @@ def stretched(keyframes: tuple[Keyframe, ...], seconds: float) -> tuple[Keyframe
 
 
 class _Curve:
-    """What is computed once for two or more keyframes."""
+    """The curve through two or more keyframes."""
 
     def __init__(self, keyframes: tuple[Keyframe, ...]) -> None:
         # 12 MB of modules, for those who record a path.

@@ -1,4 +1,4 @@
-"""Where words stand beside things in the picture so that none covers another: plain maths, no window."""
+"""Overlays as plain maths in float64: labels, lines, ground grid and view cube. No window."""
 
 import math
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ class Label:
     height: float
 
     def covers(self, other: "Label") -> bool:
-        """Whether the two overlap; edges that touch do not."""
+        """Return whether the two overlap; edges that touch do not."""
         beside = self.x + self.width <= other.x or other.x + other.width <= self.x
         return not (beside or self.y + self.height <= other.y or other.y + other.height <= self.y)
 
@@ -44,7 +44,7 @@ def placed(labels: Sequence[Label], size: tuple[float, float]) -> list[Label]:
 
 
 def _moved(label: Label, others: Sequence[Label], *, up: bool) -> Label | None:
-    """Up or down as far as it must; None beyond the upper edge of the picture."""
+    """Move a label up or down as far as it must; None beyond the upper edge of the picture."""
     while label.y >= 0:
         met = next((other for other in others if label.covers(other)), None)
         if met is None:
@@ -54,8 +54,7 @@ def _moved(label: Label, others: Sequence[Label], *, up: bool) -> Label | None:
     return None
 
 
-# What lies over the picture as lines: where they are in the world, and where on screen. Plain maths in
-# float64, no window.
+# Lines: where they are in the world, and where on screen.
 
 LEAST_DEPTH = 1e-3  # of the scene's radius: lines end this far in front of the eye
 FRUSTUM_DEPTH = 0.12  # of the scene's radius: how deep a camera is drawn
@@ -120,7 +119,7 @@ def box_edges(corners: Array) -> Array:
 
 
 def nearest_segment(segments: Array, point: tuple[float, float]) -> tuple[int, float]:
-    """Of (K, 2, 2) segments on screen the row nearest to a point, and its distance in pixels; (-1, inf)
+    """Return the row of (K, 2, 2) segments that is nearest to a point, and its distance in pixels; (-1, inf)
     without any."""
     if not len(segments):
         return -1, math.inf
@@ -175,12 +174,10 @@ def ground_grid(extent: Extent, up: Array, metres_per_unit: float | None) -> Gri
 
 
 def _multiples(low: float, high: float, spacing: float) -> Array:
-    """The multiples of `spacing` that hold [low, high] between them."""
     return spacing * np.arange(math.floor(low / spacing), math.ceil(high / spacing) + 1)
 
 
 def _lowest(sample: Sample, up: Array, otherwise: float) -> float:
-    """Height along `up` below which `GROUND_SHARE` of the scene's weight lies."""
     if not len(sample.points):
         return otherwise
     heights = sample.points @ up
@@ -189,7 +186,7 @@ def _lowest(sample: Sample, up: Array, otherwise: float) -> float:
     return float(heights[order][np.searchsorted(shares, GROUND_SHARE * shares[-1])])
 
 
-# The cube that shows which way one looks, and turns the view: plain maths, no window.
+# The view cube.
 
 # Name of a face -> its normal in the axes right, up and front.
 FACES: dict[str, tuple[int, int, int]] = {

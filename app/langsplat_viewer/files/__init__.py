@@ -1,1 +1,1 @@
-"""What the window reads and writes beside scenes, and where it looks for it."""
+"""Files that the window reads and writes beside scenes."""

@@ -1,4 +1,4 @@
-"""Sets of queries as files: what was asked of a scene, to be asked again of it or of another."""
+"""Query sets as files, and folders as the file browser lists them."""
 
 import json
 import math
@@ -10,7 +10,7 @@ from langsplat_core.config import LevelChoice
 from langsplat_core.errors import InputError, printable_line
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.scenes import format_of
-from langsplat_viewer.files.flight_files import SUFFIX as PATHS
+from langsplat_viewer.files.flights import SUFFIX as PATHS
 
 SUFFIX = ".queries.json"
 FORMAT = "langsplat-queries"
@@ -84,7 +84,7 @@ def _is_phrase(text: Any) -> bool:
     return isinstance(text, str) and len(text.strip()) > 0 and len(text) <= LONGEST
 
 
-# What the file browser lists: folders, files that may be scenes, sets of queries and camera paths.
+# Folders, files that may be scenes, query sets and camera paths.
 
 MOST_LISTED = 2000  # entries of a folder that are listed
 

@@ -19,7 +19,7 @@ ASPECT_TOLERANCE = 0.02  # shrunk copies round their sizes
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """That of one camera, or why there is none."""
+    """The photograph of one camera, or the reason why there is none."""
 
     camera: Camera
     folder: str  # that was chosen when it was looked for, "" for none
@@ -54,8 +54,8 @@ def find(name: str, scene: Path, folder: str) -> Path:
 
 
 def _names(path: PurePath) -> set[str]:
-    """What a camera of this photograph may be called: training names cameras by the stem, where two have the
-    same by the path."""
+    """Return the names that a camera of this photograph may have: training names cameras by the stem, where
+    two have the same by the path."""
     whole = path.with_suffix("").as_posix()
     return {path.stem, whole, whole.replace("/", "_")}
 

@@ -1,4 +1,4 @@
-"""What a user chose once and wants again the next time: kept in the platform's folder for settings."""
+"""Preferences: choices that outlive a window, kept in the platform's folder for settings."""
 
 import json
 from collections.abc import Iterable
@@ -11,7 +11,6 @@ import platformdirs
 from langsplat_core.config import ColourMap
 from langsplat_core.errors import InputError, printable_line
 from langsplat_core.io.files import atomic_path
-from langsplat_viewer.keys import problem
 
 Theme = Literal["dark", "light"]
 THEMES: tuple[Theme, ...] = get_args(Theme)
@@ -32,8 +31,7 @@ class Preferences:
     recent: tuple[str, ...] = ()  # scenes that were opened, the latest first
     panels: tuple[str, ...] | None = None  # titles of those that are open; None: those that are at first
     colour_map: ColourMap = "turbo"  # of relevancy and depth
-    overlays: tuple[str, ...] = ()  # of `seeing.OVERLAYS`, those that lie over the scene
-    keys: dict[str, tuple[str, ...]] = field(default_factory=dict)  # other than in the table of commands
+    overlays: tuple[str, ...] = ()  # of `state.OVERLAYS`, those that lie over the scene
     photographs: dict[str, str] = field(default_factory=dict)  # scene -> folder; the latest chosen last
 
     def __post_init__(self) -> None:
@@ -50,9 +48,6 @@ class Preferences:
                 raise InputError(f"{name} is not a list of texts")
         if not (isinstance(self.photographs, dict) and _are_texts(self.photographs.values())):
             raise InputError("photographs is not an object of texts")
-        for text in (text for keys in self.keys.values() for text in keys):
-            if problem(text):
-                raise InputError(f"keys: {printable_line(problem(text), 60)}")
 
 
 def _are_texts(values: Iterable[object]) -> bool:
@@ -60,12 +55,13 @@ def _are_texts(values: Iterable[object]) -> bool:
 
 
 def preferences_folder() -> Path:
-    """Where they are kept; need not exist."""
+    """Return the folder of the preferences; it need not exist."""
     return Path(platformdirs.user_config_path("langsplat-viewer", appauthor=False))
 
 
 def load_preferences(folder: Path) -> Preferences:
-    """Those of `folder`, the defaults where there are none. InputError where the file makes no sense."""
+    """Read the preferences in `folder`, the defaults where there are none. InputError where the file makes no
+    sense."""
     path = folder / FILE_NAME
     try:
         text = path.read_bytes()[:LARGEST]
@@ -87,16 +83,7 @@ def _from_json(top: Any) -> Preferences:
             values[name] = tuple(values[name])
         elif values[name] is not None or name != "panels":
             raise InputError(f"{name} is not a list of texts")
-    if "keys" in values:
-        values["keys"] = _keys(values["keys"])
     return Preferences(**values)
-
-
-def _keys(of_file: Any) -> dict[str, tuple[str, ...]]:
-    lists = list(of_file.values()) if isinstance(of_file, dict) else [None]
-    if not all(isinstance(keys, list) and _are_texts(keys) for keys in lists):
-        raise InputError("keys is not an object of lists of texts")
-    return {does: tuple(keys) for does, keys in of_file.items()}
 
 
 def save_preferences(folder: Path, preferences: Preferences) -> None:

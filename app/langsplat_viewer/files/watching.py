@@ -1,4 +1,4 @@
-"""Whether the files of the scene that is shown are others than when they were read. No window here.
+"""Watching: a scene's files that change while it is shown, and the checkpoints of a training. No window here.
 
 A thread of its own looks about once a second, so that the window can sleep until there is something to say.
 """
@@ -77,13 +77,13 @@ class Watch:
             self.wake()
 
     def dismiss(self) -> None:
-        """What lies there now is not spoken of again."""
+        """Take the files as they are now for read."""
         with self._lock:
             self._read = self._last
             self.changed = False
 
     def close(self) -> None:
-        """Look no more."""
+        """End the watching thread."""
         self._closed.set()
 
 

@@ -6,42 +6,30 @@ it before, the pictures that are there are kept.
 
 import hashlib
 import json
-import logging
 import re
 import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 
+import moderngl
 import numpy as np
 from PIL import Image
 
 from langsplat_core.arrays import Array
-from langsplat_core.errors import InputError, printable_line
+from langsplat_core.errors import BackendError, InputError, printable_line
 from langsplat_core.io.files import atomic_path, check_output_file, check_output_folder
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import Camera
-from langsplat_viewer.camera.controls import Extent, extent_of, focus, from_camera, holding_distance
-from langsplat_viewer.camera.flight import Motion, camera_of, frame_times, turntable
-from langsplat_viewer.drawing.channels import why_nothing
-from langsplat_viewer.drawing.frame import Backend
-from langsplat_viewer.files.flight_files import read_flight
+from langsplat_viewer.camera.controls import Extent
+from langsplat_viewer.camera.flight import Motion, camera_of, frame_times
 from langsplat_viewer.output.saving import save_png
-from langsplat_viewer.output.still import (
-    Drawn,
-    Prepared,
-    StillRequest,
-    Subject,
-    in_one_line,
-    painter,
-    prepare,
-    say_drawing,
-    say_unread,
-)
-from langsplat_viewer.viewer import Services
+from langsplat_viewer.rendering.depth import why_nothing
+from langsplat_viewer.rendering.renderer import ArrayRenderer, Backend, GlRenderer, open_renderer
+from langsplat_viewer.rendering.request import Inputs, RenderRequest
 
 VIDEO, ANIMATIONS = ".mp4", (".webp", ".gif")
 SETTINGS = "film.json"  # in a folder of pictures: what they are pictures of
@@ -54,7 +42,7 @@ Draw = Callable[[int], Array]  # (H, W, 3) uint8 picture by its number from 0
 
 @dataclass(frozen=True)
 class Film:
-    """What is to be written."""
+    """A film to be written."""
 
     out: Path  # .mp4, .webp or .gif; else a folder
     count: int  # pictures
@@ -64,7 +52,7 @@ class Film:
 
 
 def check_film(out: Path | None, size: tuple[int, int] | None) -> Path:
-    """Where the film goes: `out`, or, for a video where the system has no ffmpeg, a folder of its name.
+    """Return where the film goes: `out`, or, for a video on a system without ffmpeg, a folder of its name.
     InputError where that cannot work, before anything slow is done."""
     if out is None:
         raise InputError("--headless needs somewhere to draw to; add --out film.mp4, or --out folder/")
@@ -84,7 +72,7 @@ def check_film(out: Path | None, size: tuple[int, int] | None) -> Path:
 
 
 def is_folder(out: Path) -> bool:
-    """Whether a film to `out` is a folder of pictures."""
+    """True where a film to `out` is a folder of pictures."""
     return out.is_dir() or not out.suffix
 
 
@@ -107,7 +95,7 @@ def write_film(film: Film, draw: Draw) -> int:
 
 
 def frame_name(number: int) -> str:
-    """Of a picture in a folder."""
+    """Name of an image in a folder."""
     return f"frame-{number:05d}.png"
 
 
@@ -120,7 +108,7 @@ def _check_own(folder: Path) -> None:
 
 
 def _write_pictures(film: Film, draw: Draw) -> int:
-    """Those that are missing."""
+    """Write the images that are missing."""
     folder = film.out
     folder.mkdir(parents=True, exist_ok=True)
     _check_own(folder)
@@ -204,7 +192,7 @@ def _ffmpeg(film: Film, target: Path) -> list[str]:
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """Of whatever is left of it."""
+    """End the process and close what is left of it."""
     if process.poll() is None:
         process.kill()
     process.wait()
@@ -213,82 +201,21 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
             process.stdin.close()
 
 
-# A film without a window: `langsplat-viewer --headless --path path.json --out film.mp4`.
-
-log = logging.getLogger("langsplat")
-
-
-@dataclass(frozen=True)
-class FilmRequest:
-    """What film is wanted: a path, or a turn of some seconds around what the camera sees, or around the last
-    query that is found."""
-
-    still: StillRequest  # scene, queries, size, where it goes; its camera begins a turntable
-    path: Path | None = None  # a camera path
-    turntable: float | None = None  # seconds
-    around_answer: bool = False
-    fps: float = 30.0
+# A film of the scene.
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A subject seen by a camera that moves."""
+    """A request seen by a camera that moves."""
 
-    subject: Subject
-    cameras: tuple[Camera, ...]  # one for each picture, all of one size
+    request: RenderRequest
+    cameras: tuple[Camera, ...]  # one for each image, of its size
     fps: float
     backend: Backend = "auto"
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Of a picture, pixels."""
-        return self.cameras[0].width, self.cameras[0].height
-
-
-def draw_film(request: FilmRequest, services: Services, progress: Progress = silent) -> list[str]:
-    """Draw and write the film; returns the lines to print: the film's, then one for each query."""
-    still = request.still
-    out = check_film(still.out, still.size)
-    flight = None if request.path is None else read_flight(request.path)  # before anything slow is done
-    if out != still.out:
-        log.warning("this system has no ffmpeg: pictures are written into the folder %s instead", out)
-    prepared = prepare(still, services, progress)
-    size = (prepared.camera.width, prepared.camera.height)
-    if out.suffix.lower() == VIDEO:  # of a training camera
-        size = (max(size[0] - size[0] % 2, 2), max(size[1] - size[1] % 2, 2))
-    shot = Shot(
-        prepared.subject,
-        cameras_of(flight or turn(prepared, request), extent_of(prepared.subject.scene), request.fps, size),
-        request.fps,
-        still.backend,
-    )
-    say_drawing(still.backend, progress)
-    lines = make_film(shot, out, progress)
-    say_unread(prepared.subject.scene)
-    return [*lines, *prepared.lines]
-
-
-def turn(prepared: Prepared, request: FilmRequest) -> Motion:
-    """Once around what the camera sees in its middle, or around the place of the last answer, from as far
-    as it fills half of the picture. InputError where nothing was found."""
-    extent = extent_of(prepared.subject.scene)
-    view = from_camera(prepared.camera, extent)
-    if request.around_answer:
-        found = [r for r in prepared.results if r.verdict != "not here" and r.place is not None]
-        if not found:
-            raise InputError("--around answer: nothing was found; add --query with a thing of this scene")
-        place, box = found[-1].place, found[-1].box
-        assert place is not None
-        if box is None:
-            box = np.stack([place, place + 0.1 * extent.radius])
-        nearer = min(holding_distance(view, box), float(np.linalg.norm(place - view.eye)))
-        view = focus(view, place, None if view.orthographic else nearer)  # whose scale was chosen
-    assert request.turntable is not None
-    return turntable(view, request.turntable)
-
 
 def cameras_of(motion: Motion, extent: Extent, fps: float, size: tuple[int, int]) -> tuple[Camera, ...]:
-    """One for each picture of a film. InputError for more than `MOST_FRAMES`."""
+    """One camera of `size` pixels for each image of a film. InputError for more than `MOST_FRAMES`."""
     if motion.seconds * fps > MOST_FRAMES:
         raise InputError(f"a film of {motion.seconds * fps:.0f} pictures; at most {MOST_FRAMES}, lower --fps")
     return tuple(camera_of(pose, extent, size) for pose in motion.poses(frame_times(motion, fps)))
@@ -297,10 +224,10 @@ def cameras_of(motion: Motion, extent: Extent, fps: float, size: tuple[int, int]
 def make_film(shot: Shot, out: Path, progress: Progress = silent) -> list[str]:
     """Draw and write a film; returns the lines to print. Raises InputError, among others where no picture
     shows anything of the scene, and BackendError; `progress` may raise to stop it."""
-    width, height = shot.size
-    film = Film(out, len(shot.cameras), shot.size, shot.fps, fingerprint(shot))
-    with in_one_line(out, f"{width}x{height}"), painter(shot.subject, shot.backend) as paint:
-        roll = _Roll(shot, paint, progress)
+    width, height = shot.request.size
+    film = Film(out, len(shot.cameras), (width, height), shot.fps, fingerprint(shot))
+    with in_one_line(out, f"{width}x{height}"), open_renderer(shot.backend) as renderer:
+        roll = _Roll(shot, renderer, progress)
         drawn = write_film(film, roll.draw)
     kept = f", {film.count - drawn} of them kept" if drawn < film.count else ""
     name = f"{out}/" if is_folder(out) else str(out)
@@ -310,39 +237,49 @@ def make_film(shot: Shot, out: Path, progress: Progress = silent) -> list[str]:
 
 
 class _Roll:
-    """Draws picture after picture and says how far it is."""
+    """Draws image after image and says how far it is."""
 
-    def __init__(self, shot: Shot, paint: Callable[[Camera], Drawn], progress: Progress) -> None:
-        self._shot, self._paint, self._progress = shot, paint, progress
-        self._drawn = 0
-        self.empty = 0  # pictures that show nothing of the scene
+    def __init__(self, shot: Shot, renderer: ArrayRenderer | GlRenderer, progress: Progress) -> None:
+        self._shot, self._renderer, self._progress = shot, renderer, progress
+        self.empty = 0  # images that show nothing of the scene
 
     def draw(self, number: int) -> Array:
-        """(H, W, 3) uint8. InputError at the last picture where none showed anything."""
-        cameras = self._shot.cameras
+        """(H, W, 3) uint8. InputError at the last image where none showed anything."""
+        cameras, request = self._shot.cameras, self._shot.request
         self._progress("drawing", number / len(cameras), f"{number + 1} of {len(cameras)} pictures")
-        drawn = self._paint(cameras[number])
-        self._drawn += 1
-        self.empty += drawn.nothing
+        image = self._renderer.read(request.seen_by(cameras[number]))
+        self.empty += self._renderer.shows_nothing()
         if self.empty == len(cameras):
-            scene = self._shot.subject.scene
+            scene = request.scene.scene
             raise InputError(
                 f"{scene.path}: no picture of the film shows anything of the scene: "
                 f"{why_nothing(scene.gaussians, cameras[number])}; mend the path"
             )
-        return drawn.image
+        return image
+
+
+@contextmanager
+def in_one_line(out: Path, size: str) -> Iterator[None]:
+    """Say what goes wrong while images are drawn and written as a line for the user."""
+    try:
+        yield
+    except MemoryError:
+        raise InputError(f"not enough memory for a picture of {size}; choose a smaller --size") from None
+    except moderngl.Error as error:
+        raise BackendError(f"OpenGL cannot draw {size} here ({error}); try --backend cpu") from None
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be written ({error.strerror or error})") from None
 
 
 def fingerprint(shot: Shot) -> str:
-    """The same for shots that give the same pictures, whoever asks for them."""
-    digest = hashlib.sha256()
-    _add(digest.update, shot.subject.scene.gaussians)
-    _add(digest.update, shot.subject.scene.raster_settings())
-    subject = shot.subject
-    _add(
-        digest.update,
-        (subject.picture, subject.layers, subject.heat_ranges, subject.clip, shot.backend, shot.cameras),
-    )
+    """Return a digest that is the same for shots that give the same images, whoever asks for them."""
+    digest, inputs = hashlib.sha256(), Inputs()
+    request = shot.request
+    scene = inputs.key(request).scene
+    _add(digest.update, (scene.gaussians, scene.raster_settings(), request.clip, request.split, request.size))
+    _add(digest.update, [(pane.picture, pane.ranges) for pane in request.panes])
+    _add(digest.update, [channel.values for channel in inputs.channels(request)])
+    _add(digest.update, (shot.backend, shot.fps, shot.cameras))
     return digest.hexdigest()
 
 

@@ -1,7 +1,5 @@
 """Pictures and cameras to files, whole or not at all."""
 
-from copy import copy
-from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
@@ -36,14 +34,12 @@ def save_picture(viewer: Viewer, folder: Path) -> Path | None:
     """Save the scene as shown, without its background if that was chosen, to a new PNG in `folder`;
     returns its path, None if that failed."""
     state = viewer.state
-    if viewer.surface is None or state.scene is None:
+    if viewer.surface is None or state.scene is None or state.view is None:
         state.say("open a scene first, then save a picture of it", is_error=True)
         return None
     path = free_name(folder, state.path.stem if state.path else "picture", ".png")
     try:
-        shown = copy(state)
-        shown.picture = replace(state.picture, transparent=state.seeing.transparent)
-        save_png(path, viewer.surface.capture(shown))
+        save_png(path, viewer.surface.capture(state.request(transparent=state.settings.transparent)))
     except (OSError, LangSplatError) as error:
         state.say(f"{path}: not saved ({one_line(error)})", is_error=True)
         return None

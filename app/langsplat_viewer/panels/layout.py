@@ -1,34 +1,250 @@
-"""Where the panels lie: docked around the scene, each where its user left it."""
+"""The layout of the window: menus, command palette, list of keys, docked panels, messages and timing."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_viewer import actions
+from langsplat_viewer.actions import filming, opening, selecting, settings, viewpoint
+from langsplat_viewer.commands import COMMANDS, HELD, MENUS, Command, in_menu, matching
+from langsplat_viewer.files.preferences import SCALES, THEMES
 from langsplat_viewer.panels import (
-    bookmarks,
-    browser,
-    changed,
-    cube,
-    help,
-    legend,
-    messages,
-    palette,
-    pictures,
-    pointing,
+    overlays,
     record,
     scene,
     search,
     select,
-    stroke,
-    timing,
-    train,
-    unsaved,
     view,
 )
-from langsplat_viewer.panels.area import MAIN_DOCK, scene_area
+from langsplat_viewer.panels.scene import in_words
+from langsplat_viewer.panels.style import MAIN_DOCK, bad, muted, scene_area, small_wrapped, stoppable, tip
+from langsplat_viewer.state import Comparison, memory_bytes
 from langsplat_viewer.viewer import Viewer
+
+UI_SCALES = (0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
+
+
+def draw_menus(viewer: Viewer) -> None:
+    """Inside the menu bar."""
+    for menu in MENUS:
+        if imgui.begin_menu(menu):
+            for command in in_menu(menu):
+                title = command.does[0].upper() + command.does[1:]
+                if imgui.menu_item(title, ", ".join(command.keys[:1]), False)[0]:
+                    command.act(viewer)
+            if menu == "File":
+                _recent(viewer)
+            if menu == "Window":
+                _panels()
+                _looks(viewer)
+            imgui.end_menu()
+
+
+def _recent(viewer: Viewer) -> None:
+    recent = viewer.state.preferences.recent
+    if imgui.begin_menu("Open recent", bool(recent)):
+        for number, path in enumerate(recent):
+            name = Path(path)
+            if imgui.menu_item(f"{name.parent.name}/{name.name}##{number}", "", False)[0]:
+                opening.open_recent(viewer, path)
+            if imgui.is_item_hovered():
+                imgui.set_tooltip(path)
+        imgui.end_menu()
+    imgui.separator()
+    if imgui.menu_item("Quit", "", False)[0]:
+        selecting.quit_viewer(viewer)
+
+
+def _panels() -> None:
+    imgui.separator()
+    docking = hello_imgui.get_runner_params().docking_params
+    for window in docking.dockable_windows:
+        _, window.is_visible = imgui.menu_item(window.label, "", window.is_visible)
+    if imgui.menu_item("Panels as at first", "", False)[0]:
+        docking.layout_reset = True
+    imgui.separator()
+
+
+def _looks(viewer: Viewer) -> None:
+    preferences = viewer.state.preferences
+    for theme in THEMES:
+        if imgui.menu_item(f"{theme.capitalize()} theme", "", preferences.theme == theme)[0]:
+            settings.set_theme(viewer, theme)
+    if imgui.begin_menu("Size of letters"):
+        for scale in UI_SCALES:
+            if SCALES[0] <= scale <= SCALES[1]:
+                chosen = abs(preferences.ui_scale - scale) < 1e-6
+                if imgui.menu_item(f"{100 * scale:.0f} %", "", chosen)[0]:
+                    settings.set_ui_scale(viewer, scale)
+        imgui.end_menu()
+
+
+# The command palette.
+
+WIDTH_EM, HEIGHT_EM = 26.0, 20.0
+GAP_EM = 0.6  # from the keys to the scrollbar
+
+
+def draw_palette(viewer: Viewer) -> None:
+    """A box and the commands that match; Enter does the first, Esc closes."""
+    if not viewer.state.show_palette:
+        return
+    top = imgui.get_main_viewport().get_center()
+    imgui.set_next_window_pos(ImVec2(top.x, 0.15 * top.y), imgui.Cond_.appearing, ImVec2(0.5, 0))
+    imgui.set_next_window_size(hello_imgui.em_to_vec2(WIDTH_EM, HEIGHT_EM))
+    imgui.set_next_window_bg_alpha(1.0)
+    flags = imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_collapse
+    imgui.begin("Commands", None, flags)
+    if imgui.is_window_appearing():
+        imgui.set_keyboard_focus_here()
+    imgui.set_next_item_width(-1)
+    entered, typed = imgui.input_text_with_hint(
+        "##command", "what to do", viewer.state.palette_typed, imgui.InputTextFlags_.enter_returns_true
+    )
+    settings.type_command(viewer, typed)
+    found = matching(typed)
+    chosen = found[0] if entered and found else _clicked(found)
+    left = not imgui.is_window_focused(imgui.FocusedFlags_.root_and_child_windows)
+    escaped = imgui.is_key_pressed(imgui.Key.escape)
+    imgui.end()
+    if chosen is not None or escaped or (left and not imgui.is_window_appearing()):
+        settings.show_palette(viewer, False)
+    if chosen is not None:
+        chosen.act(viewer)
+
+
+def _clicked(found: list[Command]) -> Command | None:
+    """The list; the command that was clicked."""
+    chosen = None
+    if imgui.begin_child("found"):
+        right = imgui.get_content_region_avail().x - hello_imgui.em_size(GAP_EM)
+        for command in found:
+            if imgui.selectable(command.does, False)[0]:
+                chosen = command
+            keys = ", ".join(command.keys)
+            imgui.same_line(right - imgui.calc_text_size(keys).x)
+            imgui.text_colored(muted(), keys)
+    imgui.end_child()
+    return chosen
+
+
+# The list of keys.
+
+KEYS_EM, DOES_EM = 14.0, 20.0  # widths of the columns
+HELP_SHARE = 0.94  # of the window's height
+
+
+def key_rows() -> tuple[tuple[str, str], ...]:
+    """(keys, what they do)."""
+    commands = ((", ".join(command.keys), command.does) for command in COMMANDS)
+    return (*HELD, *(row for row in commands if row[0]))
+
+
+def draw_help(viewer: Viewer) -> None:
+    """A small window that can be closed."""
+    if not viewer.state.show_help:
+        return
+    flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_collapse
+    centre = imgui.get_main_viewport().get_center()
+    room = imgui.get_main_viewport().work_size
+    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(room.x, HELP_SHARE * room.y))
+    imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
+    imgui.set_next_window_bg_alpha(1.0)
+    _, still_open = imgui.begin("Keys", True, flags)
+    settings.show_help(viewer, bool(still_open))
+    _table()
+    imgui.end()
+
+
+def _table() -> None:
+    if imgui.begin_table("keys", 2):
+        imgui.table_setup_column("key", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(KEYS_EM))
+        imgui.table_setup_column("does", imgui.TableColumnFlags_.width_fixed, hello_imgui.em_size(DOES_EM))
+        for key, what in key_rows():
+            imgui.table_next_row()
+            imgui.table_next_column()
+            imgui.text_unformatted(key)
+            imgui.table_next_column()
+            imgui.text_disabled(what)
+        imgui.end_table()
+
+
+# The panel "Messages".
+
+LEAST_LINES = 2  # of messages, however low the panel is
+
+
+def draw_messages(viewer: Viewer) -> None:
+    """Draw progress, messages (the latest first) and the speed of images."""
+    if viewer.worker.current is not None and stoppable(*viewer.worker.current):
+        opening.cancel(viewer)
+    line = imgui.get_text_line_height_with_spacing()
+    height = max(imgui.get_content_region_avail().y - line, LEAST_LINES * line)
+    if imgui.begin_child("messages", ImVec2(0, height)):
+        for message in reversed(viewer.state.messages):
+            small_wrapped(message.text, bad() if message.is_error else muted())
+    imgui.end_child()
+    idling = hello_imgui.get_runner_params().fps_idling.is_idling
+    imgui.text_colored(muted(), figures(viewer, None if idling else imgui.get_io().framerate))
+
+
+def figures(viewer: Viewer, frames_per_second: float | None) -> str:
+    """One line: frames per second (None: the window sleeps until something happens), backend, time and
+    size of the last picture."""
+    stats = viewer.state.stats
+    speed = "idle" if frames_per_second is None else f"{frames_per_second:.0f} fps"
+    parts = [speed, viewer.state.backend]
+    if stats.width:
+        parts += [f"{stats.milliseconds:.0f} ms", f"{stats.width} x {stats.height}"]
+    return "   ".join(part for part in parts if part)
+
+
+# The panel "Timing".
+
+
+def draw_timing(viewer: Viewer) -> None:
+    """Medians of the last pictures, memory, and a comparison."""
+    viewpoint.measure_frame(viewer)
+    rows = [(title, f"{milliseconds:.1f} ms") for title, milliseconds in viewer.state.timing.medians()]
+    memory = memory_bytes()
+    if memory is not None:
+        rows.append(("Memory", in_words(memory)))
+    if imgui.begin_table("timing", 2):
+        imgui.table_setup_column("step", imgui.TableColumnFlags_.width_stretch, 5)
+        imgui.table_setup_column("time", imgui.TableColumnFlags_.width_stretch, 4)
+        for title, text in rows:
+            imgui.table_next_row()
+            imgui.table_next_column()
+            imgui.text(title)
+            imgui.table_next_column()
+            imgui.text_colored(muted(), text)
+        imgui.end_table()
+    work = viewer.recorder.current
+    if work is not None:
+        if stoppable(*work, tag="comparison"):
+            viewpoint.stop_comparing(viewer)
+    else:
+        imgui.begin_disabled(viewer.state.scene is None)
+        if imgui.button("Compare with the reference"):
+            viewpoint.compare_with_reference(viewer)
+        imgui.end_disabled()
+        tip("Draws this view small in float64, in the background: about 15 s for 100,000 Gaussians")
+    if viewer.state.timing.comparison is not None:
+        small_wrapped(in_numbers(viewer.state.timing.comparison), muted())
+
+
+def in_numbers(comparison: Comparison) -> str:
+    """One line."""
+    width, height = comparison.size
+    what = f"{comparison.backend} against the reference, {width} x {height}"
+    if comparison.largest == 0:
+        return f"{what}: every pixel is the same"
+    errors = f"error at most {comparison.largest} of 255, mean {comparison.mean:.3g}"
+    return f"{what}: {errors}, PSNR {comparison.psnr:.1f} dB"
+
+
+# Panels, docked around the scene, each where its user left it.
 
 LEFT, MIDDLE, FOOT = "Left", "Middle", "Foot"  # docks of the column beside the scene
 COLUMN = 345.0  # its width at first, window units
@@ -51,12 +267,12 @@ PANELS: tuple[Panel, ...] = (
     Panel("Display", MIDDLE, view.draw_display),
     Panel("Camera", MIDDLE, view.draw_camera),
     Panel("Select", MIDDLE, select.draw, is_open=False),
-    Panel("Train", LEFT, train.draw, is_open=False),
+    Panel("Train", LEFT, scene.draw_training, is_open=False),
     Panel("Record", LEFT, record.draw, is_open=False),
-    Panel("Bookmarks", LEFT, bookmarks.draw, is_open=False),
-    Panel("Messages", FOOT, messages.draw),
+    Panel("Bookmarks", LEFT, record.draw_bookmarks, is_open=False),
+    Panel("Messages", FOOT, draw_messages),
     Panel("Overlays", MIDDLE, view.draw_overlays, is_open=False),
-    Panel("Timing", LEFT, timing.draw, is_open=False),
+    Panel("Timing", LEFT, draw_timing, is_open=False),
 )
 
 
@@ -88,7 +304,7 @@ def _window(viewer: Viewer, panel: Panel) -> hello_imgui.DockableWindow:
 
 def show_wanted(viewer: Viewer) -> None:
     """Open the panel that an action wants seen, in front of those it shares its place with."""
-    title = actions.take_wanted_panel(viewer)
+    title = settings.take_wanted_panel(viewer)
     if title:
         docking = hello_imgui.get_runner_params().docking_params
         docking.dockable_window_of_name(title).is_visible = True
@@ -145,33 +361,33 @@ class Hiding:
             self._hidden = []
         if shown:
             visible = (window.label for window in docking.dockable_windows if window.is_visible)
-            actions.note_panels(viewer, tuple(visible))
+            settings.note_panels(viewer, tuple(visible))
 
 
 def draw_over(viewer: Viewer) -> None:
-    """What lies over the scene, after the panels."""
+    """Draw what lies over the scene, after the panels."""
     area = scene_area()
     said = _said(viewer)
     if said:
-        legend.say(said, area)
+        overlays.say(said, area)
     else:
-        legend.draw(viewer, area)
-        pointing.draw(viewer)
-        stroke.draw(viewer, area)
-    pictures.draw_grip(viewer, area)
-    cube.draw(viewer, area)
-    changed.draw(viewer, area)
-    unsaved.draw(viewer)
-    copied = actions.take_clipboard(viewer)
+        overlays.draw_legend(viewer, area)
+        overlays.draw_pointing(viewer)
+        select.draw_stroke(viewer, area)
+    overlays.draw_grip(viewer, area)
+    overlays.draw_cube(viewer, area)
+    scene.draw_changed(viewer, area)
+    scene.draw_unsaved(viewer)
+    copied = filming.take_clipboard(viewer)
     if copied:
         imgui.set_clipboard_text(copied)
-    browser.draw(viewer)
-    help.draw(viewer)
-    palette.draw(viewer)
+    scene.draw_browser(viewer)
+    draw_help(viewer)
+    draw_palette(viewer)
 
 
 def _said(viewer: Viewer) -> str:
-    """What there is to say in place of a picture; empty while there is one."""
+    """Return the words in place of an image; empty while there is one."""
     state = viewer.state
     if state.scene is None:
         return f"opening {state.opening.name} ..." if state.opening else "Drop a scene here, or use Open ..."

@@ -1,14 +1,82 @@
-"""Mouse and held keys over the scene -> camera moves; pressed keys -> commands."""
+"""Mouse and keys: pressed keys run commands, held keys and drags move the camera."""
 
 import math
+from dataclasses import dataclass
+from functools import cache
 
 from imgui_bundle import imgui
 
-from langsplat_viewer import actions
+from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera import controls
-from langsplat_viewer.panels import keyboard, stroke
-from langsplat_viewer.panels.area import Area
+from langsplat_viewer.commands import COMMANDS, Command
+from langsplat_viewer.panels import select
+from langsplat_viewer.panels.style import Area
 from langsplat_viewer.viewer import Viewer
+
+NAMED = {  # keys whose name in imgui is another
+    "Esc": "escape",
+    "PageUp": "page_up",
+    "PageDown": "page_down",
+    **{name: f"{name.lower()}_arrow" for name in ("Left", "Right", "Up", "Down")},
+}
+WHILE_TYPING = ("F1", "Esc")  # beside those with Ctrl
+
+
+@dataclass(frozen=True)
+class Chord:
+    """A key with what must be held with it, or a typed character."""
+
+    key: imgui.Key | None = None
+    character: str = ""
+    ctrl: bool = False  # on a Mac the command key, as imgui has it
+    shift: bool = False
+    alt: bool = False
+    is_plain: bool = True  # not while something is typed
+
+
+@cache
+def chord(text: str) -> Chord:
+    """Parse a key such as "Ctrl+Shift+P", "F1", "R", "7" or "?". KeyError for an unknown key."""
+    *held, name = text.split("+")
+    if not name.isalnum():
+        return Chord(character=name)
+    key = _key(name)
+    ctrl, shift, alt = (name in held for name in ("Ctrl", "Shift", "Alt"))
+    return Chord(key, "", ctrl, shift, alt, is_plain=not ctrl and name not in WHILE_TYPING)
+
+
+def _key(name: str) -> imgui.Key:
+    return imgui.Key[f"_{name}" if name.isdigit() else NAMED.get(name, name.lower())]
+
+
+def handle_keys(viewer: Viewer) -> None:
+    """Run the commands whose keys were pressed in this frame."""
+    state, typing = viewer.state, imgui.get_io().want_text_input
+    for command in COMMANDS:
+        if any(_pressed(chord(text), command, typing, state.letters_muted) for text in command.keys):
+            command.act(viewer)
+            return
+
+
+def _pressed(wanted: Chord, command: Command, typing: bool, muted: bool) -> bool:
+    io = imgui.get_io()
+    if (typing and (wanted.is_plain or command.is_edit)) or (muted and wanted.is_plain):
+        return False
+    if wanted.key is None:
+        return not io.key_ctrl and wanted.character in map(chr, io.input_queue_characters)
+    held = (io.key_ctrl, io.key_shift, io.key_alt)
+    if io.key_super or held != (wanted.ctrl, wanted.shift, wanted.alt):
+        return False
+    return imgui.is_key_pressed(wanted.key, command.repeats)
+
+
+def muted_until_clicked(viewer: Viewer) -> None:
+    """Letters are keys again once something is clicked; to be called before the panels are drawn."""
+    if imgui.is_mouse_clicked(imgui.MouseButton_.left):
+        settings.mute_letters(viewer, False)
+
+
+# Mouse and held keys over the scene.
 
 ROLL_SPEED = 1.0  # radians per second
 LONGEST_FRAME = 0.1  # seconds; a stalled frame must not throw a flying camera across the scene
@@ -18,19 +86,19 @@ WHEEL_STEP = 0.88  # factor of the distance per notch
 def handle(viewer: Viewer, area: Area) -> None:
     """Once per frame, after the panels: they take what is theirs first."""
     io = imgui.get_io()
-    stroke.handle(viewer, area)
+    select.handle_stroke(viewer, area)
     if viewer.state.view is not None and not io.want_capture_mouse:
         _mouse(viewer, area)
-    actions.hover(viewer, _pixel(area))
-    keyboard.handle(viewer)
+    viewpoint.hover(viewer, _pixel(area))
+    handle_keys(viewer)
     letters = not (io.want_text_input or io.key_ctrl or viewer.state.letters_muted)
-    letters = letters and not viewer.state.keying.waiting
     if viewer.state.view is not None and letters:
         _fly(viewer)
 
 
 def _pixel(area: Area) -> tuple[int, int] | None:
-    """Where the mouse is in the scene's area, pixels; None where a panel has it, or a button is held."""
+    """Return the mouse's place in the scene's area, pixels; None where a panel has it, or a button is
+    held."""
     io = imgui.get_io()
     if io.want_capture_mouse or any(imgui.is_mouse_down(button) for button in range(3)):
         return None
@@ -45,25 +113,25 @@ def _mouse(viewer: Viewer, area: Area) -> None:
     free = viewer.state.selection.tool is None
     turns = 0 if free else 2
     if free and imgui.is_mouse_double_clicked(0):
-        actions.focus_pixel(viewer, *area.fraction(io.mouse_pos.x, io.mouse_pos.y))
+        viewpoint.focus_pixel(viewer, *area.fraction(io.mouse_pos.x, io.mouse_pos.y))
         return
     dx, dy = io.mouse_delta.x, io.mouse_delta.y
     if dx or dy:
         turn = math.pi / area.height  # a drag over the whole height is half a turn
         if _held(1) or (free and (_held(2) or (_held(0) and io.key_shift))):
             size = (max(round(area.width), 1), max(round(area.height), 1))
-            actions.move(viewer, lambda view: controls.pan(view, dx, dy, size))
+            viewpoint.move(viewer, lambda view: controls.pan(view, dx, dy, size))
         elif _held(turns) and io.key_ctrl:
-            actions.move(viewer, lambda view: controls.look(view, dx * turn, dy * turn))
+            viewpoint.move(viewer, lambda view: controls.look(view, dx * turn, dy * turn))
         elif _held(turns):
-            actions.move(viewer, lambda view: controls.orbit(view, dx * turn, dy * turn))
+            viewpoint.move(viewer, lambda view: controls.orbit(view, dx * turn, dy * turn))
     if io.mouse_wheel:
-        actions.zoom_by(viewer, WHEEL_STEP**io.mouse_wheel)
+        viewpoint.zoom_by(viewer, WHEEL_STEP**io.mouse_wheel)
 
 
 def _held(button: int) -> bool:
-    """Whether a button drags. Where frames are slow, the way to the place of the click and the click itself
-    fall into one frame; that way was no drag."""
+    """Return whether a button drags. Where frames are slow, the way to the place of the click and the click
+    itself fall into one frame; that way was no drag."""
     return imgui.is_mouse_down(button) and not imgui.is_mouse_clicked(button)
 
 
@@ -81,7 +149,7 @@ def _fly(viewer: Viewer) -> None:
         pace = 4.0 if io.key_shift else 0.25 if io.key_alt else 1.0
         step = pace * viewer.state.fly_speed * extent.radius * seconds
         go = controls.walk if viewer.state.walks else controls.fly
-        actions.move(viewer, lambda view: go(view, right * step, up * step, ahead * step))
+        viewpoint.move(viewer, lambda view: go(view, right * step, up * step, ahead * step))
     turn = held(key.right_bracket, key.left_bracket)
     if turn:
-        actions.move(viewer, lambda view: controls.roll(view, turn * ROLL_SPEED * seconds))
+        viewpoint.move(viewer, lambda view: controls.roll(view, turn * ROLL_SPEED * seconds))

@@ -4,17 +4,19 @@ from pathlib import Path
 
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_viewer import actions
+from langsplat_viewer.actions import filming, viewpoint
 from langsplat_viewer.camera.flight import Keyframe
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.panels.style import (
     beside,
     beside_boxed,
+    elided,
     leave_room,
     muted,
     small_wrapped,
     stoppable,
     tip,
+    width_of,
 )
 from langsplat_viewer.state import FPS_CHOICES
 from langsplat_viewer.viewer import Viewer
@@ -27,10 +29,10 @@ def draw(viewer: Viewer) -> None:
     """From top to bottom: what the path is, playing it, saving it, films."""
     record = viewer.state.record
     if imgui.radio_button("Keyframes", not record.turns):
-        actions.set_turning(viewer, False)
+        filming.set_turning(viewer, False)
     beside_boxed("Turntable")
     if imgui.radio_button("Turntable", record.turns):
-        actions.set_turning(viewer, True)
+        filming.set_turning(viewer, True)
     tip("Once around what the view turns around; F makes that the latest result")
     imgui.begin_disabled(viewer.state.view is None)
     _play(viewer)
@@ -43,30 +45,30 @@ def draw(viewer: Viewer) -> None:
 
 
 def _play(viewer: Viewer) -> None:
-    record, seconds = viewer.state.record, actions.path_seconds(viewer)
+    record, seconds = viewer.state.record, viewpoint.path_seconds(viewer)
     imgui.begin_disabled(seconds <= 0)
     if imgui.button("Stop##path" if record.began is not None else "Play##path"):
-        actions.toggle_playing(viewer)
-    tip(with_key("Play", actions.toggle_playing, viewer.state.preferences.keys))
+        viewpoint.toggle_playing(viewer)
+    tip(with_key("Play", viewpoint.toggle_playing))
     imgui.same_line()
     loop = imgui.calc_text_size("Loop").x + imgui.get_frame_height() + 2 * imgui.get_style().item_spacing.x
     imgui.set_next_item_width(-loop)
     changed, at = imgui.slider_float("##at", record.at, 0.0, max(seconds, 1e-3), "%.2f s")
     if changed:
-        actions.scrub(viewer, at)
+        viewpoint.scrub(viewer, at)
     imgui.end_disabled()
     imgui.same_line()
     changed, loops = imgui.checkbox("Loop", record.loops)
     if changed:
-        actions.set_looping(viewer, loops)
+        filming.set_looping(viewer, loops)
 
 
 def _duration(viewer: Viewer) -> None:
-    seconds = actions.path_seconds(viewer)
+    seconds = viewpoint.path_seconds(viewer)
     imgui.begin_disabled(seconds <= 0)
     wanted = _number("Duration", seconds, 1.0)
     if wanted is not None:
-        actions.set_path_seconds(viewer, wanted)
+        filming.set_path_seconds(viewer, wanted)
     imgui.end_disabled()
 
 
@@ -81,12 +83,12 @@ def _number(label: str, value: float, step: float) -> float | None:
 def _keyframes(viewer: Viewer) -> None:
     record = viewer.state.record
     if imgui.button("Add keyframe"):
-        actions.add_keyframe(viewer)
-    tip(with_key("The current view", actions.add_keyframe, viewer.state.preferences.keys))
+        filming.add_keyframe(viewer)
+    tip(with_key("The current view", filming.add_keyframe))
     beside("Clear")
     imgui.begin_disabled(not record.keyframes)
     if imgui.button("Clear"):
-        actions.clear_path(viewer)
+        filming.clear_path(viewer)
     imgui.end_disabled()
     beside("Duration", hello_imgui.em_size(NUMBER_EM))
     _duration(viewer)
@@ -112,20 +114,20 @@ def _line(viewer: Viewer, number: int, key: Keyframe) -> None:
     if imgui.selectable(
         f"{number}   {key.seconds:.2f} s##keyframe", key is viewer.state.record.chosen, size=size
     )[0]:
-        actions.choose_keyframe(viewer, key)
+        filming.choose_keyframe(viewer, key)
     imgui.same_line(imgui.get_cursor_start_pos().x + right - side)
     if imgui.button("x", ImVec2(side, 0)):
-        actions.delete_keyframe(viewer, key)
+        filming.delete_keyframe(viewer, key)
     tip("Take it off the path")
 
 
 def _chosen(viewer: Viewer, key: Keyframe) -> None:
     seconds = _number("##time of the keyframe", key.seconds, 0.5)
     if seconds is not None:
-        actions.move_keyframe(viewer, key, seconds)
+        filming.move_keyframe(viewer, key, seconds)
     beside("Set to this view")
     if imgui.button("Set to this view"):
-        actions.replace_keyframe(viewer, key)
+        filming.replace_keyframe(viewer, key)
     tip("Put the current view in its place")
 
 
@@ -133,13 +135,13 @@ def _file(viewer: Viewer) -> None:
     leave_room("", NUMBER_EM + 2)
     hint = "file.path.json"
     _, typed = imgui.input_text_with_hint("##path file", hint, viewer.state.record.path_typed)
-    actions.type_path_file(viewer, typed)
+    filming.type_path_file(viewer, typed)
     beside("Save path")
     if imgui.button("Save path"):
-        actions.save_path(viewer, Path.cwd())
+        filming.save_path(viewer, Path.cwd())
     beside("Load")
     if imgui.button("Load"):
-        actions.load_typed_path(viewer, Path.cwd())
+        filming.load_typed_path(viewer, Path.cwd())
 
 
 def _film(viewer: Viewer) -> None:
@@ -148,30 +150,65 @@ def _film(viewer: Viewer) -> None:
     imgui.set_next_item_width(hello_imgui.em_size(NUMBER_EM))
     changed, size = imgui.input_int2("Size", list(record.size))
     if changed:
-        actions.set_film_size(viewer, *size)
+        filming.set_film_size(viewer, *size)
     beside("fps", hello_imgui.em_size(FPS_EM))
     imgui.set_next_item_width(hello_imgui.em_size(FPS_EM))
     if imgui.begin_combo("fps", f"{record.fps:g}"):
         for fps in FPS_CHOICES:
             if imgui.selectable(f"{fps:g}", fps == record.fps)[0]:
-                actions.set_film_fps(viewer, fps)
+                filming.set_film_fps(viewer, fps)
         imgui.end_combo()
     imgui.set_next_item_width(-1)
     hint = "film.mp4, .webp, .gif or a folder; empty: a new name"
     _, typed = imgui.input_text_with_hint("##film", hint, record.film_typed)
-    actions.type_film(viewer, typed)
+    filming.type_film(viewer, typed)
     work = viewer.recorder.current
     if work is not None:
         if stoppable(*work, tag="film"):
-            actions.cancel_film(viewer)
+            filming.cancel_film(viewer)
         return
     if imgui.button("Save film"):
-        actions.save_film(viewer, Path.cwd())
+        filming.save_film(viewer, Path.cwd())
     beside("Save picture")
     if imgui.button("Save picture##sized"):
-        actions.save_sized_picture(viewer, Path.cwd())
+        filming.save_sized_picture(viewer, Path.cwd())
     tip("What is shown now, in this size")
     beside("Copy as command")
     if imgui.button("Copy as command"):
-        actions.copy_command(viewer, Path.cwd())
+        filming.copy_command(viewer, Path.cwd())
     tip("The command that draws this picture without a window")
+
+
+# The panel "Bookmarks".
+
+
+def draw_bookmarks(viewer: Viewer) -> None:
+    """A box for a name, and the list."""
+    state = viewer.state
+    imgui.begin_disabled(state.view is None)
+    button = imgui.calc_text_size("Keep").x + 2 * imgui.get_style().frame_padding.x
+    imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
+    flags, hint = imgui.InputTextFlags_.enter_returns_true, "name of this view"
+    entered, typed = imgui.input_text_with_hint("##bookmark", hint, state.bookmark_typed, flags)
+    viewpoint.type_bookmark(viewer, typed)
+    imgui.same_line()
+    if imgui.button("Keep") or entered:
+        viewpoint.add_bookmark(viewer, state.bookmark_typed)
+    imgui.end_disabled()
+    if imgui.begin_child("bookmarks"):
+        if not state.bookmarks:
+            words = "views that you keep are listed here"
+            small_wrapped(with_key(words, viewpoint.add_bookmark), muted())
+        for number, bookmark in enumerate(state.bookmarks):
+            imgui.push_id(number)
+            side, right = imgui.get_frame_height(), imgui.get_content_region_avail().x
+            room = right - side - imgui.get_style().item_spacing.x
+            name = elided(bookmark.name, room, width_of)
+            imgui.align_text_to_frame_padding()
+            if imgui.selectable(f"{name}##bookmark", False, size=ImVec2(room, 0))[0]:
+                viewpoint.go_to_bookmark(viewer, bookmark)
+            imgui.same_line(imgui.get_cursor_start_pos().x + right - side)
+            if imgui.button("x", ImVec2(side, 0)):
+                viewpoint.delete_bookmark(viewer, bookmark)
+            imgui.pop_id()
+    imgui.end_child()

@@ -1,13 +1,30 @@
-"""The file: what is open, opening another, saving pictures."""
+"""Files: the panels "Scene" and "Train", the file browser, and the questions about changed and unsaved
+files."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
-from imgui_bundle import ImVec2, imgui
+import numpy as np
+from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_viewer import actions
+from langsplat_core.config import TrainPreset
+from langsplat_core.io.scenes import format_of
+from langsplat_viewer.actions import opening, selecting, settings, training
+from langsplat_viewer.files.browsing import Entry, Listing
 from langsplat_viewer.output import saving
-from langsplat_viewer.panels.style import bad, beside, elided, muted, small_wrapped, tip, width_of
-from langsplat_viewer.viewer import Viewer
+from langsplat_viewer.panels.style import (
+    Area,
+    bad,
+    beside,
+    beside_boxed,
+    elided,
+    muted,
+    small_wrapped,
+    tip,
+    width_of,
+)
+from langsplat_viewer.viewer import Training, Viewer
 
 DIALOG_PROGRAMS = ("zenity", "kdialog", "matedialog", "qarma")  # one of them draws the dialog on Linux
 
@@ -24,7 +41,7 @@ def draw(viewer: Viewer) -> None:
             small_wrapped(doubt.partition(":")[0], bad())
             tip(doubt)
     if imgui.button("Open ..."):
-        actions.ask_for_file(viewer)
+        opening.ask_for_file(viewer)
     beside("Save picture")
     if imgui.button("Save picture"):
         saving.save_picture(viewer, Path.cwd())
@@ -33,7 +50,7 @@ def draw(viewer: Viewer) -> None:
         saving.save_view(viewer, Path.cwd())
     beside("Keys")
     if imgui.button("Keys"):
-        actions.toggle_help(viewer)
+        settings.toggle_help(viewer)
     if len(state.scenes) > 1:
         _list(viewer)
 
@@ -52,12 +69,12 @@ def _list(viewer: Viewer) -> None:
             name = elided(name, room, width_of)
             imgui.align_text_to_frame_padding()
             if imgui.selectable(f"{name}##scene", path == shown, size=ImVec2(room, 0))[0]:
-                actions.switch_scene(viewer, path)
+                opening.switch_scene(viewer, path)
             tip(str(path))
             imgui.same_line(room + imgui.get_style().item_spacing.x)
             imgui.begin_disabled(path == shown)
             if imgui.button("x", ImVec2(side, 0)):
-                actions.unlist_scene(viewer, path)
+                opening.unlist_scene(viewer, path)
             imgui.end_disabled()
             imgui.pop_id()
     imgui.end_child()
@@ -71,3 +88,264 @@ def _figures(viewer: Viewer) -> str:
         parts.append(f"{len(scene.cameras)} cameras")
     parts.append("no language field" if scene.language is None else "searchable")
     return ", ".join(parts)
+
+
+# The file browser.
+
+OPEN, PICK = "Open a scene", "Folder of the photographs"
+WIDTH_EM, HEIGHT_EM = 40.0, 30.0
+UNITS = ("bytes", "kB", "MB", "GB", "TB")
+
+
+def draw_browser(viewer: Viewer) -> None:
+    """A box for a path, the folders above, what is in this one, and what was open before."""
+    listing = viewer.state.browser
+    title = PICK if viewer.state.picks_folder else OPEN
+    if listing is not None and not imgui.is_popup_open(title):
+        imgui.open_popup(title)
+    centre = imgui.get_main_viewport().get_center()
+    imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
+    imgui.set_next_window_size(hello_imgui.em_to_vec2(WIDTH_EM, HEIGHT_EM), imgui.Cond_.appearing)
+    shown, stays = imgui.begin_popup_modal(title, True, imgui.WindowFlags_.no_saved_settings)
+    if not shown:
+        return
+    if listing is not None:
+        _path_box(viewer)
+        _above(viewer, listing.folder)
+        _entries(viewer, listing)
+        _foot(viewer, listing)
+    if not stays or imgui.is_key_pressed(imgui.Key.escape):
+        opening.close_browser(viewer)
+    if viewer.state.browser is None:
+        imgui.close_current_popup()
+    imgui.end_popup()
+
+
+def _foot(viewer: Viewer, listing: Listing) -> None:
+    if viewer.state.picks_folder:
+        if imgui.button("Take this folder"):
+            opening.choose_photograph_folder(viewer, listing.folder)
+    elif has_several(listing) and imgui.button("Open all scenes here"):
+        opening.open_all(viewer)
+
+
+def has_several(listing: Listing) -> bool:
+    """Return whether there is more than one scene to open."""
+    return sum(entry.is_file and format_of(entry.path) is not None for entry in listing.entries) > 1
+
+
+def _path_box(viewer: Viewer) -> None:
+    button = imgui.calc_text_size("Open").x + 2 * imgui.get_style().frame_padding.x
+    imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
+    if imgui.is_window_appearing():
+        imgui.set_keyboard_focus_here()
+    flags = imgui.InputTextFlags_.enter_returns_true
+    picks = viewer.state.picks_folder
+    hint = "path of a folder" if picks else "path of a scene or folder, or drop files onto the window"
+    entered, typed = imgui.input_text_with_hint("##path", hint, viewer.state.path_typed, flags)
+    opening.type_path(viewer, typed)
+    imgui.same_line()
+    if imgui.button("Open") or entered:
+        opening.open_typed(viewer)
+
+
+def _above(viewer: Viewer, folder: Path) -> None:
+    """The folders above, each to be gone to."""
+    for number, parent in enumerate((*reversed(folder.parents), folder)):
+        if number:
+            imgui.same_line(0, 2)
+            name = parent.name or str(parent)
+            width = imgui.calc_text_size(name).x + 2 * imgui.get_style().frame_padding.x
+            if imgui.get_content_region_avail().x < width:
+                imgui.new_line()
+        if imgui.small_button(f"{parent.name or parent}##above {number}"):
+            opening.browse(viewer, parent)
+
+
+def _entries(viewer: Viewer, listing: Listing) -> None:
+    picks = viewer.state.picks_folder
+    recent = () if picks else viewer.state.preferences.recent
+    lines = min(len(recent), 4) + 1 if recent else 0
+    below = lines * imgui.get_text_line_height_with_spacing() + 8 * bool(recent)
+    below += imgui.get_frame_height_with_spacing() * (picks or has_several(listing))
+    if imgui.begin_child("entries", ImVec2(0, -below), imgui.ChildFlags_.borders):
+        if listing.problem:
+            small_wrapped(listing.problem, bad())
+        elif not listing.entries:
+            small_wrapped("no folders here" if picks else "no scenes and no folders here", muted())
+        for entry in (entry for entry in listing.entries if not (picks and entry.is_file)):
+            _entry(viewer, entry)
+        if listing.left_out:
+            small_wrapped(f"{listing.left_out:,} more: type a path", muted())
+    imgui.end_child()
+    if recent:
+        imgui.text_colored(muted(), "Recent")
+        foot = imgui.get_frame_height_with_spacing() * has_several(listing)
+        if imgui.begin_child("recent", ImVec2(0, -foot)):
+            for path in recent:
+                if imgui.selectable(f"{path}##recent", False)[0]:
+                    opening.open_recent(viewer, path)
+        imgui.end_child()
+
+
+def _entry(viewer: Viewer, entry: Entry) -> None:
+    right = imgui.get_content_region_avail().x
+    name = entry.path.name if entry.is_file else f"{entry.path.name}/"
+    if imgui.selectable(name, False)[0]:
+        opening.choose(viewer, entry)
+    if entry.size:
+        text = in_words(entry.size)
+        imgui.same_line(right - imgui.calc_text_size(text).x)
+        imgui.text_colored(muted(), text)
+
+
+def in_words(size: float) -> str:
+    """Bytes as people read them: "1.4 MB"."""
+    unit = 0
+    while size >= 1000 and unit + 1 < len(UNITS):
+        size, unit = size / 1000, unit + 1
+    return f"{size:.0f} {UNITS[unit]}" if unit == 0 or size >= 100 else f"{size:.1f} {UNITS[unit]}"
+
+
+# The bar of a file that has changed.
+
+BAR = (
+    imgui.WindowFlags_.no_decoration
+    | imgui.WindowFlags_.no_move
+    | imgui.WindowFlags_.no_docking
+    | imgui.WindowFlags_.always_auto_resize
+    | imgui.WindowFlags_.no_saved_settings
+    | imgui.WindowFlags_.no_focus_on_appearing
+    | imgui.WindowFlags_.no_nav
+)
+
+
+def draw_changed(viewer: Viewer, area: Area) -> None:
+    """Draw the file that has changed, and buttons to read it or not."""
+    state = viewer.state
+    if not viewer.watch.changed or state.path is None or state.opening is not None:
+        return
+    top = ImVec2(area.left + area.width / 2, area.top + hello_imgui.em_size(3))  # below what a tool says
+    imgui.set_next_window_pos(top, imgui.Cond_.always, ImVec2(0.5, 0))
+    imgui.begin("changed", None, BAR)
+    imgui.align_text_to_frame_padding()
+    imgui.text_unformatted(f"{state.path.name} has changed on disk")
+    imgui.same_line()
+    if imgui.button("Reload"):
+        opening.reload(viewer)
+    tip("Read it again; camera, queries and view settings stay")
+    imgui.same_line()
+    if imgui.button("Not now"):
+        opening.keep_old(viewer)
+    imgui.end()
+
+
+# The question before deletions are lost.
+
+UNSAVED = "Not saved"
+
+
+def draw_unsaved(viewer: Viewer) -> None:
+    """Save, discard, cancel; over everything else, while something waits for the answer."""
+    leaving = viewer.state.selection.leaving
+    if leaving is not None and not imgui.is_popup_open(UNSAVED):
+        imgui.open_popup(UNSAVED)
+    centre = imgui.get_main_viewport().get_center()
+    imgui.set_next_window_pos(centre, imgui.Cond_.appearing, ImVec2(0.5, 0.5))
+    flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_saved_settings
+    if not imgui.begin_popup_modal(UNSAVED, None, flags)[0]:
+        return
+    if leaving is not None:
+        count = int(viewer.state.selection.marks.deleted.sum())
+        imgui.text_unformatted(f"{count:,} Gaussians were deleted, and the scene is not saved without them.")
+        imgui.text_unformatted(f"Save it as a new file before {leaving.to}?")
+        if imgui.button("Save"):
+            selecting.save_and_leave(viewer, Path.cwd())
+        imgui.same_line()
+        if imgui.button("Discard"):
+            selecting.discard_and_leave(viewer)
+        imgui.same_line()
+        if imgui.button("Cancel"):
+            selecting.stay(viewer)
+    if viewer.state.selection.leaving is None:
+        imgui.close_current_popup()
+    imgui.end_popup()
+
+
+# The panel "Train".
+
+PRESETS: tuple[TrainPreset, ...] = get_args(TrainPreset)
+LOSS_EM = 5.0  # height of its plot
+MEANS = {
+    "quick": "minutes on a CPU",
+    "good": "a quarter of an hour and more on a CPU",
+    "full": "as published: for a GPU",
+}
+
+
+def draw_training(viewer: Viewer) -> None:
+    """The form, or what a running training says."""
+    process = viewer.training
+    if process is None:
+        _form(viewer)
+    else:
+        _running(viewer, process)
+
+
+def _form(viewer: Viewer) -> None:
+    form = viewer.state.training_form
+    form = replace(
+        form, dataset=_text_box("Photographs", "a folder, a COLMAP project, transforms.json", form.dataset)
+    )
+    form = replace(form, out=_text_box("Scene", "scene.ply", form.out))
+    form = replace(form, encoder=_text_box("Encoder", '"demo", or a folder or hub id of CLIP', form.encoder))
+    for number, preset in enumerate(PRESETS):
+        if number:
+            beside_boxed(preset)
+        if imgui.radio_button(preset, form.preset == preset):
+            form = replace(form, preset=preset)
+        if imgui.is_item_hovered():
+            imgui.set_tooltip(MEANS[preset])
+    training.fill_in(viewer, form)
+    if imgui.button("Train"):
+        training.start_training(viewer)
+    small_wrapped("An interrupted training continues where it stopped.", muted())
+    _doubts(viewer)
+
+
+def _doubts(viewer: Viewer) -> None:
+    state = viewer.state
+    if state.doubts and state.path is not None:
+        imgui.separator_text(f"What speaks against {state.path.name}")
+        for doubt in state.doubts:
+            small_wrapped(doubt, bad())
+
+
+def _text_box(label: str, hint: str, text: str) -> str:
+    imgui.text(label)
+    imgui.set_next_item_width(-1)
+    return str(imgui.input_text_with_hint(f"##{label} to train", hint, text)[1])
+
+
+def _running(viewer: Viewer, process: Training) -> None:
+    progress = process.progress
+    imgui.text_unformatted(process.request.out.name)
+    for label, fraction in list(progress.stages.items()):
+        small_wrapped(f"{label}: done" if fraction >= 1 else label, muted())
+        if fraction < 1:
+            imgui.progress_bar(fraction, ImVec2(-1, 0))
+    if len(progress.losses) > 1:
+        values = np.array(progress.losses, np.float32)
+        size = ImVec2(-1, hello_imgui.em_size(LOSS_EM))
+        imgui.plot_lines("##loss", values, scale_min=0.0, graph_size=size)
+        tip("How far the pictures are from the photographs, on average: lower is better")
+        imgui.text_colored(muted(), f"loss {values[-1]:.4f}, at first {values[0]:.4f}")
+    imgui.separator()
+    imgui.progress_bar(progress.overall, ImVec2(-1, 0), progress.left or "starting")
+    if imgui.button("Stop"):
+        training.stop_training(viewer)
+    beside("Look at it so far")
+    if imgui.button("Look at it so far"):
+        training.look_at_training(viewer)
+    for line in progress.said[-3:]:
+        small_wrapped(line, muted())

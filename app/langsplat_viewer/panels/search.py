@@ -1,16 +1,233 @@
-"""The search panel: a box to type in, and the list of what was searched."""
+"""The panel "Search": the box with its offers, the list of queries, and the details of the chosen one."""
 
+import math
+from functools import lru_cache
 from typing import get_args
 
-from imgui_bundle import imgui
+import numpy as np
+from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
+from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
+from langsplat_core.display.displays import QUERY_COLOURS
+from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import no_field
-from langsplat_core.scene import CANONICAL_PHRASES
-from langsplat_viewer import actions
-from langsplat_viewer.panels import answers, query_box
-from langsplat_viewer.panels.style import bad, beside_boxed, muted, small_wrapped, tip
+from langsplat_core.scene import CANONICAL_PHRASES, LEVELS
+from langsplat_viewer.actions import queries, settings, viewpoint
+from langsplat_viewer.panels.style import bad, beside_boxed, elided, good, muted, small_wrapped, tip, width_of
+from langsplat_viewer.state import Query
 from langsplat_viewer.viewer import Viewer
+
+HINT = "what to look for"
+HINT_EXAMPLES = 2
+OFFER_LINES = 2  # more are scrolled to
+
+
+def _box(viewer: Viewer) -> None:
+    """Box, button, offers."""
+    queries.prepare_suggestions(viewer)
+    button = imgui.calc_text_size("Search").x + 2 * imgui.get_style().frame_padding.x
+    imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
+    if queries.take_search_focus(viewer):
+        imgui.set_keyboard_focus_here()
+    flags = imgui.InputTextFlags_.enter_returns_true | imgui.InputTextFlags_.callback_history
+
+    def recalled(data: imgui.InputTextCallbackData) -> int:
+        text = queries.recall(viewer, -1 if data.event_key == imgui.Key.up_arrow else 1)
+        data.delete_chars(0, data.buf_text_len)
+        data.insert_chars(0, text)
+        return 0
+
+    typed = viewer.state.typed
+    entered, typed = imgui.input_text_with_hint("##phrase", hint(viewer), typed, flags, recalled)
+    queries.type_phrase(viewer, typed)
+    imgui.same_line()
+    clicked = imgui.button("Search")
+    if entered or clicked:
+        queries.ask_typed(viewer)
+    _offers(viewer)
+
+
+def hint(viewer: Viewer) -> str:
+    """Return the hint of the empty box: examples of this scene, once they are known."""
+    examples = viewer.state.suggestions.examples[:HINT_EXAMPLES]
+    return ", ".join((*examples, "...")) if examples else HINT
+
+
+def _offers(viewer: Viewer) -> None:
+    """Small buttons, as many in a row as fit, where there is anything to offer."""
+    title, phrases = queries.offers(viewer)
+    if not phrases:
+        return
+    height = OFFER_LINES * imgui.get_text_line_height_with_spacing()
+    if imgui.begin_child("offers", ImVec2(0, height), imgui.ChildFlags_.none):
+        _offer_buttons(viewer, title, phrases)
+    imgui.end_child()
+
+
+def _offer_buttons(viewer: Viewer, title: str, phrases: tuple[str, ...]) -> None:
+    imgui.text_colored(muted(), title)
+    margins = 2 * imgui.get_style().frame_padding.x
+    for number, phrase in enumerate(phrases):
+        imgui.same_line()
+        if imgui.get_content_region_avail().x < width_of(phrase) + margins:
+            imgui.new_line()
+        shown = elided(phrase, imgui.get_content_region_avail().x - margins, width_of)
+        if imgui.small_button(f"{shown}###offer {number}"):
+            queries.ask_offered(viewer, phrase)
+        if shown != phrase:
+            tip(phrase)
+
+
+# The threshold of an answer: a histogram of its relevancies, and a slider over it.
+
+BINS = 64
+HISTOGRAM_EM = 3.0
+
+
+def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
+    """Histogram, slider, and a button that lets the answer end by itself again."""
+    low, high, counts = histogram(query.automatic or result)
+    height = hello_imgui.em_size(HISTOGRAM_EM)
+    imgui.plot_histogram("##relevancies", counts, graph_size=ImVec2(-1, height))
+    corner, size = imgui.get_item_rect_min(), imgui.get_item_rect_size()
+    if imgui.is_item_hovered():
+        imgui.set_tooltip("Gaussians by relevancy, on a logarithmic scale; the line is where the answer ends")
+    x = corner.x + size.x * (min(max(result.cut, low), high) - low) / (high - low)
+    colour = imgui.get_color_u32(imgui.Col_.slider_grab_active)
+    imgui.get_window_draw_list().add_line(ImVec2(x, corner.y), ImVec2(x, corner.y + size.y), colour, 2.0)
+    own = result.own_cut is not None
+    button = imgui.calc_text_size("Auto").x + 2 * imgui.get_style().frame_padding.x
+    imgui.set_next_item_width(-(button + imgui.get_style().item_spacing.x) if own else -1)
+    changed, value = imgui.slider_float("##cut", result.cut, low, high, "ends at %.3f")
+    if changed:
+        queries.set_cut(viewer, query, value, is_new=not own)
+    if own:
+        imgui.same_line()
+        if imgui.button("Auto"):
+            queries.set_cut(viewer, query, None)
+    imgui.text_colored(muted(), f"{int(result.members.sum()):,} Gaussians")
+
+
+@lru_cache(maxsize=8)
+def histogram(result: QueryResult) -> tuple[float, float, Array]:
+    """Lowest and highest relevancy of an answer, and (BINS,) float32 log(1 + n) of how many Gaussians have
+    which."""
+    values = result.even[np.isfinite(result.even)]
+    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
+    high = max(high, low + 1e-3)
+    counts, _ = np.histogram(values, BINS, (low, high))
+    return low, high, np.log1p(counts).astype(np.float32)
+
+
+# The list of queries.
+
+ROWS = 3.5  # that the list shows at least: the half one says that there are more
+BELOW = 10  # rows that the details of a query take, and what follows them in the panel
+HIDDEN = (0.25, 0.25, 0.25)
+
+
+def _answers(viewer: Viewer) -> None:
+    """The list, newest first, which grows when something is asked and not when an answer arrives; and below
+    it the chosen query."""
+    row = imgui.get_frame_height_with_spacing()
+    rows = rows_shown(len(viewer.state.queries), imgui.get_content_region_avail().y / row)
+    if imgui.begin_child("queries", ImVec2(0, rows * row), imgui.ChildFlags_.none):
+        if not viewer.state.queries:
+            imgui.text_colored(muted(), "what you search is listed here")
+        for query in reversed(viewer.state.queries):
+            imgui.push_id(query.phrase)
+            _line(viewer, query)
+            imgui.pop_id()
+    imgui.end_child()
+    chosen = viewer.state.selected
+    if chosen is not None:
+        _details(viewer, chosen)
+
+
+def rows_shown(count: int, room: float) -> float:
+    """Return how many of `count` queries a panel with `room` rows shows: all where the details fit below."""
+    return min(count or 1, max(ROWS, math.floor(room - BELOW) + 0.5))
+
+
+def _line(viewer: Viewer, query: Query) -> None:
+    """Colour, phrase, verdict and a button to take it off; the phrase gets what the others leave."""
+    spacing, side = imgui.get_style().item_spacing.x, imgui.get_frame_height()
+    verdict_width = imgui.calc_text_size("weak match").x
+    left, right = imgui.get_cursor_pos_x(), imgui.get_content_region_avail().x
+    room = right - 2 * side - verdict_width - 3 * spacing
+    _swatch(viewer, query, side)
+    imgui.same_line()
+    chosen = viewer.state.selected is query
+    name = elided(query.phrase, room, width_of)
+    if imgui.selectable(f"{name}##phrase of list", chosen, size=ImVec2(room, 0))[0]:
+        queries.select(viewer, query)
+    if name != query.phrase and imgui.is_item_hovered():
+        imgui.set_tooltip(query.phrase)
+    imgui.same_line(left + right - side - spacing - verdict_width)
+    imgui.align_text_to_frame_padding()
+    _verdict(query)
+    imgui.same_line(left + right - side)
+    if imgui.button("x", ImVec2(side, 0)):
+        queries.remove(viewer, query)
+    if imgui.is_item_hovered():
+        imgui.set_tooltip("Take it off the list")
+
+
+def _swatch(viewer: Viewer, query: Query, side: float) -> None:
+    shown = query.slot is not None
+    red, green, blue = HIDDEN if query.slot is None else QUERY_COLOURS[query.slot]
+    flags = imgui.ColorEditFlags_.no_tooltip
+    if imgui.color_button("##shown", ImVec4(red, green, blue, 1.0), flags, ImVec2(side, side)):
+        if shown:
+            queries.hide(viewer, query)
+        else:
+            queries.show(viewer, query)
+    if imgui.is_item_hovered():
+        imgui.set_tooltip("Click to hide" if shown else "Click to show")
+
+
+def _verdict(query: Query) -> None:
+    if query.pending:
+        imgui.text_colored(muted(), "...")
+    elif query.problem:
+        imgui.text_colored(bad(), "not asked")
+    elif query.result is not None:
+        imgui.text_colored(good() if query.result.found else muted(), query.result.verdict)
+        probability = query.result.probability
+        if imgui.is_item_hovered() and probability is not None:
+            imgui.set_tooltip(f"{100 * probability:.0f} % likely to be there")
+
+
+def _details(viewer: Viewer, query: Query) -> None:
+    """Place and a button to go there, scores per level, how it was read or why it was not answered."""
+    result = query.result
+    place = None if result is None or result.verdict == "not here" else result.place
+    imgui.begin_disabled(place is None)
+    if imgui.button("Focus"):
+        viewpoint.focus_result(viewer, query)
+    imgui.end_disabled()
+    if place is not None:
+        imgui.same_line()
+        imgui.align_text_to_frame_padding()
+        imgui.text_colored(muted(), "at " + "  ".join(f"{v:.2f}" for v in place))
+    if query.problem:
+        small_wrapped(query.problem, bad())
+    if result is not None:
+        for index, (name, score) in enumerate(zip(LEVELS, result.scores, strict=True)):
+            if index:
+                imgui.same_line()
+            text = f"{name} {score:.2f}"
+            if index == result.level:
+                imgui.text(text)
+            else:
+                imgui.text_colored(muted(), text)
+        _cut(viewer, query, result)
+    if query.reading:
+        small_wrapped(f"read as: {query.reading}", muted())
+
+
+# The panel.
 
 CHOICES: tuple[LevelChoice, ...] = get_args(LevelChoice)
 
@@ -23,23 +240,23 @@ def draw(viewer: Viewer) -> None:
         return
     imgui.begin_disabled(scene is None)
     imgui.begin_group()
-    query_box.draw(viewer)
+    _box(viewer)
     imgui.end_group()
     hovered = imgui.is_item_hovered(imgui.HoveredFlags_.allow_when_disabled)
     if scene is None and hovered and imgui.is_mouse_clicked(imgui.MouseButton_.left):
-        actions.mute_letters(viewer, True)  # what is typed now was meant for the box
+        settings.mute_letters(viewer, True)  # what is typed now was meant for the box
     _level(viewer)
     imgui.end_disabled()
     if viewer.engine is not None:
         basis = viewer.engine.basis
         small_wrapped(basis.short, bad() if basis.guesses else muted())
         tip(basis.long)
-    answers.draw(viewer)
+    _answers(viewer)
     _canonical(viewer)
 
 
 def _canonical(viewer: Viewer) -> None:
-    """What everything is compared with."""
+    """Draw the canonical phrases."""
     if not imgui.collapsing_header("Compared with"):
         return
     state = viewer.state
@@ -48,11 +265,11 @@ def _canonical(viewer: Viewer) -> None:
     hint = ", ".join(state.canonical or CANONICAL_PHRASES)
     flags = imgui.InputTextFlags_.enter_returns_true
     entered, typed = imgui.input_text_with_hint("##canonical", hint, state.canonical_typed, flags)
-    actions.type_canonical(viewer, typed)
+    queries.type_canonical(viewer, typed)
     if entered:
-        actions.set_canonical(viewer, typed)
+        queries.set_canonical(viewer, typed)
     if state.canonical and imgui.button("The scene's own"):
-        actions.set_canonical(viewer, "")
+        queries.set_canonical(viewer, "")
 
 
 def _level(viewer: Viewer) -> None:
@@ -61,6 +278,6 @@ def _level(viewer: Viewer) -> None:
     for choice in CHOICES:
         beside_boxed(choice)
         if imgui.radio_button(choice, viewer.state.level == choice):
-            actions.set_level(viewer, choice)
+            queries.set_level(viewer, choice)
     if imgui.is_item_hovered():
         imgui.set_tooltip("auto: the level that answers best")

@@ -1,14 +1,19 @@
-"""The panel to select with: tools, what to do with what they find, and what becomes of it."""
+"""The panel "Select", and the strokes of its tools over the scene."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
-from imgui_bundle import hello_imgui, imgui
+from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_viewer import actions
+from langsplat_core.arrays import Array
+from langsplat_viewer import marks
+from langsplat_viewer.actions import selecting
 from langsplat_viewer.commands import with_key
-from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks
+from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks, Mode, Tool
+from langsplat_viewer.panels.overlays import QUIET
 from langsplat_viewer.panels.style import (
+    Area,
     beside,
     beside_boxed,
     elided,
@@ -18,38 +23,38 @@ from langsplat_viewer.panels.style import (
     tip,
     width_of,
 )
+from langsplat_viewer.rendering.request import TINT
 from langsplat_viewer.viewer import Viewer
 
-MOST_THINGS = 24  # of an answer that have a button
 Verb = tuple[str, Callable[[Viewer], object], str]  # button, action, tip
 CHANGES: tuple[Verb, ...] = (
-    ("All", actions.select_all, "Everything that is shown"),
-    ("None", actions.select_none, "Nothing"),
-    ("Invert", actions.invert_selection, "What was not selected"),
-    ("Grow", actions.grow_selection, "And what is within reach along the surface"),
-    ("Shrink", actions.shrink_selection, "Without what is within reach of the rest"),
+    ("All", selecting.select_all, "Everything that is shown"),
+    ("None", selecting.select_none, "Nothing"),
+    ("Invert", selecting.invert_selection, "What was not selected"),
+    ("Grow", selecting.grow_selection, "And what is within reach along the surface"),
+    ("Shrink", selecting.shrink_selection, "Without what is within reach of the rest"),
 )
 FATES: tuple[Verb, ...] = (
-    ("Hide", actions.hide_selected, "Out of the picture"),
-    ("Isolate", actions.isolate_selected, "Everything else out of the picture"),
-    ("Show all", actions.show_hidden, "Everything that was hidden"),
+    ("Hide", selecting.hide_selected, "Out of the picture"),
+    ("Isolate", selecting.isolate_selected, "Everything else out of the picture"),
+    ("Show all", selecting.show_hidden, "Everything that was hidden"),
     (
         "Delete",
-        actions.delete_selected,
+        selecting.delete_selected,
         "Out of the scene; its file stays as it is",
     ),
 )
 FILES: tuple[Verb, ...] = (
-    ("Selection", lambda viewer: actions.export(viewer, Path.cwd(), "selection"), "A PLY with its field"),
-    ("Rest", lambda viewer: actions.export(viewer, Path.cwd(), "rest"), "Everything else as a PLY"),
+    ("Selection", lambda viewer: selecting.export(viewer, Path.cwd(), "selection"), "A PLY with its field"),
+    ("Rest", lambda viewer: selecting.export(viewer, Path.cwd(), "rest"), "Everything else as a PLY"),
     (
         "Points",
-        lambda viewer: actions.export(viewer, Path.cwd(), "selection", as_points=True),
+        lambda viewer: selecting.export(viewer, Path.cwd(), "selection", as_points=True),
         "The selection as a point cloud",
     ),
     (
         "Scene",
-        lambda viewer: actions.export(viewer, Path.cwd(), "edited"),
+        lambda viewer: selecting.export(viewer, Path.cwd(), "edited"),
         "The scene without what was deleted, as a new PLY",
     ),
 )
@@ -63,7 +68,7 @@ def draw(viewer: Viewer) -> None:
     _found(viewer)
     imgui.separator()
     _buttons(viewer, CHANGES)
-    actions.set_reach(viewer, _slider("Reach", viewer.state.selection.reach, REACHES, "%.3f of the scene"))
+    selecting.set_reach(viewer, _slider("Reach", viewer.state.selection.reach, REACHES, "%.3f of the scene"))
     imgui.separator()
     _buttons(viewer, FATES)
     imgui.separator()
@@ -89,54 +94,45 @@ def _tools(viewer: Viewer) -> None:
         colour = imgui.Col_.button_active if active else imgui.Col_.button
         imgui.push_style_color(imgui.Col_.button, imgui.get_style_color_vec4(colour))
         if imgui.button(f"{tool.capitalize()}##tool"):
-            actions.use_tool(viewer, None if active else tool)
+            selecting.use_tool(viewer, None if active else tool)
         imgui.pop_style_color()
     for place, mode in enumerate(MODES):
         if place:
             beside_boxed(mode)
         if imgui.radio_button(mode.capitalize(), selection.mode == mode):
-            actions.set_mode(viewer, mode)
+            selecting.set_mode(viewer, mode)
     _, only = imgui.checkbox("Only what is visible", selection.only_visible)
-    actions.set_only_visible(viewer, only)
+    selecting.set_only_visible(viewer, only)
     tip("Rectangle, lasso and brush leave out what lies behind something")
     if selection.tool == "brush":
-        actions.set_brush(viewer, _slider("Brush", selection.brush, BRUSHES, "%.3f of the height"))
+        selecting.set_brush(viewer, _slider("Brush", selection.brush, BRUSHES, "%.3f of the height"))
 
 
 def _found(viewer: Viewer) -> None:
-    """What the search found, whole or thing by thing."""
-    query = actions.chosen_query(viewer)
+    """Draw buttons that select an answer, whole or thing by thing."""
+    query = selecting.chosen_query(viewer)
     if query is None or query.result is None:
         return
-    button = imgui.calc_text_size("Things").x + 2 * imgui.get_style().frame_padding.x
-    room = imgui.get_content_region_avail().x - button - imgui.get_style().item_spacing.x
-    name = elided(query.phrase, room - hello_imgui.em_size(4), width_of)
+    name = elided(query.phrase, imgui.get_content_region_avail().x - hello_imgui.em_size(4), width_of)
     if imgui.button(f"Found: {name}##found"):
-        actions.select_query(viewer, query)
+        selecting.select_query(viewer, query)
     tip("Select what the search has found")
-    imgui.same_line()
-    if imgui.button("Things"):
-        actions.find_things(viewer, query)
-    tip("Take it apart, to select one thing at a time")
-    things = viewer.state.selection.things
-    if things is None or things.result is not query.result:
+    if query.result.verdict == "not here" or len(query.things) < 2:
         return
-    for number, thing in enumerate(things.found[:MOST_THINGS]):
-        if number:
-            beside(str(number + 1))
-        if imgui.button(f"{number + 1}##thing"):
-            actions.select_thing(viewer, number)
+    for number, thing in enumerate(query.things, 1):
+        beside(str(number))
+        if imgui.button(f"{number}##thing"):
+            selecting.select_thing(viewer, thing)
         tip(f"{thing.count:,} Gaussians, {100 * thing.share:.0f} % of the answer, score {thing.score:.2f}")
 
 
 def _buttons(viewer: Viewer, verbs: Sequence[Verb]) -> None:
-    """As many in a row as fit."""
     for place, (name, act, what) in enumerate(verbs):
         if place:
             beside(name)
         if imgui.button(f"{name}##verb"):
             act(viewer)
-        tip(with_key(what, act, viewer.state.preferences.keys))
+        tip(with_key(what, act))
 
 
 def _slider(label: str, value: float, limits: tuple[float, float], text: str) -> float:
@@ -144,3 +140,98 @@ def _slider(label: str, value: float, limits: tuple[float, float], text: str) ->
     flags = imgui.SliderFlags_.always_clamp | imgui.SliderFlags_.logarithmic
     _, value = imgui.slider_float(label, value, *limits, text, flags)
     return value
+
+
+# Strokes: the left button while a tool selects.
+
+HINTS: dict[Tool, str] = {
+    "thing": "click a thing",
+    "rectangle": "drag from corner to corner",
+    "lasso": "draw around it",
+    "brush": "paint over it",
+    "sphere": "drag from the middle outwards, or click",
+    "box": "drag from the middle outwards, or click",
+}
+TOOL_KEYS = "Shift adds, Ctrl removes, both intersect; Esc leaves"
+LIGHT, DARK = (1.0, 1.0, 1.0, 0.95), (0.0, 0.0, 0.0, 0.6)  # a line in two colours is seen on every picture
+PAINT = (float(TINT[0]), float(TINT[1]), float(TINT[2]), 0.35)
+
+
+def handle_stroke(viewer: Viewer, area: Area) -> None:
+    """Once per frame: begin, go on with, or end a stroke."""
+    io, selection = imgui.get_io(), viewer.state.selection
+    if selection.tool is None:
+        return
+    place = area.fraction(io.mouse_pos.x, io.mouse_pos.y)
+    if selection.stroke is None:
+        if imgui.is_mouse_clicked(imgui.MouseButton_.left) and not io.want_capture_mouse:
+            selecting.begin_stroke(viewer, *place)
+    elif imgui.is_mouse_down(imgui.MouseButton_.left):
+        selecting.extend_stroke(viewer, *place)
+    else:
+        selecting.extend_stroke(viewer, *place)
+        selecting.end_stroke(viewer, held_mode())
+
+
+def held_mode() -> Mode | None:
+    """The mode that keys ask for; None: the one that is set."""
+    io = imgui.get_io()
+    if io.key_shift and io.key_ctrl:
+        return "intersect"
+    return "add" if io.key_shift else "remove" if io.key_ctrl else None
+
+
+def draw_stroke(viewer: Viewer, area: Area) -> None:
+    """The outline of what is being enclosed, the brush, and how the tool works."""
+    selection = viewer.state.selection
+    if selection.tool is None or viewer.state.scene is None:
+        return
+    paint = imgui.get_foreground_draw_list()
+    paint.push_clip_rect(ImVec2(area.left, area.top), ImVec2(area.left + area.width, area.top + area.height))
+    drawn, radius = selecting.drawn_stroke(viewer), selection.brush * area.height
+    for line in marks.outlines(drawn) if drawn is not None else []:
+        points = _on_screen(line, area)
+        if selection.tool == "brush":
+            _stripe(paint, points, radius)
+        else:
+            _outline(paint, points)
+    io = imgui.get_io()
+    if selection.tool == "brush" and (drawn is not None or not io.want_capture_mouse):
+        paint.add_circle(io.mouse_pos, radius, _colour(DARK), 0, 3.0)
+        paint.add_circle(io.mouse_pos, radius, _colour(LIGHT), 0, 1.0)
+    paint.pop_clip_rect()
+    _hint(selection.tool, area)
+
+
+def _on_screen(line: Array, area: Area) -> list[Any]:
+    """(K, 2) fractions of the area -> window units."""
+    return [ImVec2(area.left + u * area.width, area.top + v * area.height) for u, v in line.tolist()]
+
+
+def _outline(paint: Any, points: list[Any]) -> None:
+    paint.add_polyline(points, _colour(DARK), 3.0, 0)
+    paint.add_polyline(points, _colour(LIGHT), 1.5, 0)
+
+
+def _stripe(paint: Any, points: list[Any], radius: float) -> None:
+    """The way of the brush, as wide as it is; of a click a disk."""
+    if len(points) == 1:
+        paint.add_circle_filled(points[0], radius, _colour(PAINT))
+    else:
+        paint.add_polyline(points, _colour(PAINT), 2 * radius, 0)
+
+
+def _hint(tool: Tool, area: Area) -> None:
+    top = ImVec2(area.left + area.width / 2, area.top + hello_imgui.em_size(0.7))
+    imgui.set_next_window_pos(top, imgui.Cond_.always, ImVec2(0.5, 0))
+    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(0.95 * area.width, area.height))
+    imgui.set_next_window_bg_alpha(0.75)
+    imgui.begin("tool", None, QUIET)
+    imgui.push_text_wrap_pos(0.9 * area.width)
+    imgui.text_unformatted(f"{tool.capitalize()}: {HINTS[tool]}. {TOOL_KEYS}")
+    imgui.pop_text_wrap_pos()
+    imgui.end()
+
+
+def _colour(colour: tuple[float, float, float, float]) -> Any:
+    return imgui.get_color_u32(colour)

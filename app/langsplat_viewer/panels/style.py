@@ -1,11 +1,39 @@
-"""Colours and small widgets that the panels share."""
+"""Style: the scene's area of the window, colours, and small widgets that the panels share."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from textwrap import fill
 
 from imgui_bundle import ImVec2, ImVec4, hello_imgui, imgui
 
 from langsplat_viewer.files.preferences import Preferences
+
+MAIN_DOCK = "MainDockSpace"  # hello_imgui's name for the whole window below the menus
+
+
+@dataclass(frozen=True)
+class Area:
+    """The scene's part of the window, in window units (not pixels on a high-density screen)."""
+
+    left: float
+    top: float
+    width: float
+    height: float
+
+    def fraction(self, x: float, y: float) -> tuple[float, float]:
+        """A window position as fractions of the area; outside [0, 1] beyond its edges."""
+        return (x - self.left) / self.width, (y - self.top) / self.height
+
+
+def scene_area() -> Area:
+    """Return what menus and docked panels leave free, at least one unit wide and high."""
+    dock = hello_imgui.get_runner_params().docking_params.dock_space_id_from_name(MAIN_DOCK)
+    node = imgui.internal.dock_builder_get_central_node(dock) if dock else None
+    if node is None:  # in the first frame
+        display = imgui.get_io().display_size
+        return Area(0.0, 0.0, max(display.x, 1.0), max(display.y, 1.0))
+    return Area(node.pos.x, node.pos.y, max(node.size.x, 1.0), max(node.size.y, 1.0))
+
 
 TIP_LETTERS = 72  # of a line
 # Window units at a scale of 1.
@@ -37,17 +65,17 @@ def apply(preferences: Preferences) -> None:
 
 
 def good() -> ImVec4:
-    """What was found, readable on the theme's background."""
+    """Colour of what was found, readable on the theme's background."""
     return ImVec4(0.47, 0.80, 0.52, 1.0) if _is_dark() else ImVec4(0.05, 0.45, 0.15, 1.0)
 
 
 def bad() -> ImVec4:
-    """What went wrong."""
+    """Colour of errors."""
     return ImVec4(0.95, 0.58, 0.45, 1.0) if _is_dark() else ImVec4(0.70, 0.15, 0.05, 1.0)
 
 
 def muted() -> ImVec4:
-    """What explains."""
+    """Colour of explanations."""
     return ImVec4(0.62, 0.64, 0.67, 1.0) if _is_dark() else ImVec4(0.35, 0.36, 0.40, 1.0)
 
 
@@ -64,7 +92,7 @@ def small_wrapped(text: str, colour: ImVec4) -> None:
 
 
 def tip(text: str) -> None:
-    """What is said while the mouse is over the last item."""
+    """Show a tooltip while the mouse is over the last item."""
     if imgui.is_item_hovered():
         imgui.set_tooltip(fill(text, TIP_LETTERS, break_on_hyphens=False))
 
@@ -82,7 +110,7 @@ def stoppable(label: str, fraction: float, tag: str = "") -> bool:
 
 
 def width_of(text: str) -> float:
-    """Of one line, window units."""
+    """Return the width of one line, window units."""
     return float(imgui.calc_text_size(text).x)
 
 

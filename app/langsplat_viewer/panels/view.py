@@ -1,4 +1,4 @@
-"""What is shown, and from where."""
+"""The panels "Display", "Camera" and "Overlays"."""
 
 import math
 from dataclasses import replace
@@ -8,13 +8,13 @@ from imgui_bundle import imgui
 
 from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
-from langsplat_viewer import actions, staging
+from langsplat_viewer.actions import opening, settings, viewpoint
 from langsplat_viewer.camera.controls import FOV_RANGE, OrbitCamera, adopt_up, level, with_fov
 from langsplat_viewer.camera.overlays import length_text
 from langsplat_viewer.commands import BUTTONS, OVERLAY_TITLES, Button, buttons_of, with_key
-from langsplat_viewer.drawing.channels import MOST_DEGREE, SIZE_RANGE, Clip, Splats
-from langsplat_viewer.panels import photograph
 from langsplat_viewer.panels.style import beside, beside_boxed, leave_room, muted, small_wrapped, tip
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.request import MOST_DEGREE, SIZE_RANGE, Splats
 from langsplat_viewer.viewer import Viewer
 
 CUT_RANGE = (0.01, 20.0)  # of the scene's radius, the least and most that a cut can be chosen
@@ -23,7 +23,7 @@ BACKDROPS = {"Black": 0.0, "Grey": 0.5, "White": 1.0}
 
 
 def draw_display(viewer: Viewer) -> None:
-    """Which channel, and how strong the heat."""
+    """Draw the panel "Display"."""
     for _, group in groupby(DISPLAYS.values(), lambda row: (row.needs_field, row.needs_query)):
         _display_line(viewer, tuple(group))
     _compared(viewer)
@@ -37,19 +37,19 @@ def draw_display(viewer: Viewer) -> None:
         picture = replace(picture, dim=_slider("Rest dimmed to", picture.dim, 0.0, 1.0))
     _colour_map(viewer)
     picture = replace(picture, colour_map=viewer.state.picture.colour_map)
-    actions.set_picture(viewer, replace(picture, background=_backdrop(picture.background)))
+    settings.set_picture(viewer, replace(picture, background=_backdrop(picture.background)))
     tip("What shows where the scene is not")
-    transparent = viewer.state.seeing.transparent
+    transparent = viewer.state.settings.transparent
     changed, transparent = imgui.checkbox("Save without backdrop", transparent)
     if changed:
-        actions.save_transparent(viewer, transparent)
+        settings.save_transparent(viewer, transparent)
     tip("Pictures are saved transparent where the scene is not")
     _splats(viewer)
 
 
 def _splats(viewer: Viewer) -> None:
     """How the Gaussians are drawn."""
-    scene, splats = viewer.state.scene, viewer.state.seeing.splats
+    scene, splats = viewer.state.scene, viewer.state.settings.splats
     size = _slider("Splat size", splats.size, *SIZE_RANGE)
     tip("Smaller, every Gaussian can be seen; answers and files do not change")
     degree, most = splats.sh_degree, MOST_DEGREE if scene is None else scene.gaussians.sh_degree
@@ -59,7 +59,7 @@ def _splats(viewer: Viewer) -> None:
         changed, chosen = imgui.slider_int("SH degree", min(degree, most), 0, most, "%d", flags)
         degree = (MOST_DEGREE if chosen == most else chosen) if changed else degree
         tip("Up to which degree colours change with the direction that they are seen from")
-    actions.set_splats(viewer, Splats(size, degree))
+    settings.set_splats(viewer, Splats(size, degree))
 
 
 def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -77,15 +77,14 @@ def _backdrop(background: tuple[float, float, float]) -> tuple[float, float, flo
 
 
 def _colour_map(viewer: Viewer) -> None:
-    """Where something is shown by it."""
-    shown = {DISPLAYS[one.picture.display].name for one in staging.shown_pictures(viewer.state)}
-    if not shown & {"relevancy", "depth"}:
+    """Draw the choice of a colour map where something is shown by it."""
+    if not any(pane.row.uses_map for pane in viewer.state.panes()):
         return
     names = list(COLOUR_MAPS)
     leave_room("Colour map", WIDTH_EM)
     changed, chosen = imgui.combo("Colour map", names.index(viewer.state.picture.colour_map), list(names))
     if changed:
-        actions.set_colour_map(viewer, names[chosen])
+        settings.set_colour_map(viewer, names[chosen])
 
 
 def _display_line(viewer: Viewer, rows: tuple[DisplayRow, ...]) -> None:
@@ -107,52 +106,52 @@ def _display_button(viewer: Viewer, button: Button) -> None:
     chosen = state.picture.display == button.display and button.latent_level in (None, state.latent_level)
     imgui.begin_disabled(without_field and DISPLAYS[button.display].needs_field)
     if imgui.radio_button(button.label, chosen):
-        actions.set_display(viewer, button.display, button.latent_level)
+        settings.set_display(viewer, button.display, button.latent_level)
     imgui.end_disabled()
 
 
 def _compared(viewer: Viewer) -> None:
-    """What is shown beside it."""
-    state, split = viewer.state, viewer.state.seeing.split
-    second = Button("", split.second, split.second_level if split.second == "latent" else None)
+    """Draw the choice of what is shown beside it."""
+    state, split = viewer.state, viewer.state.settings.split
+    second = Button("", split.second, split.second_level if DISPLAYS[split.second].by_level else None)
     shown = {"off": "nothing", "levels": "three levels", "wipe": compared_name(second)}[split.mode]
     leave_room("Beside it", WIDTH_EM)
     if not imgui.begin_combo("Beside it", shown):
         return
     if imgui.selectable("nothing", split.mode == "off")[0]:
-        actions.show_one(viewer)
+        settings.show_one(viewer)
     without_field = state.scene is not None and state.scene.language is None
     for button in BUTTONS:
         imgui.begin_disabled(without_field and DISPLAYS[button.display].needs_field)
         if imgui.selectable(compared_name(button), shown == compared_name(button))[0]:
-            actions.compare_with(viewer, button.display, button.latent_level)
+            settings.compare_with(viewer, button.display, button.latent_level)
         imgui.end_disabled()
     imgui.begin_disabled(without_field)
     if imgui.selectable("three levels", split.mode == "levels")[0] and split.mode != "levels":
-        actions.toggle_levels(viewer)
+        settings.toggle_levels(viewer)
     imgui.end_disabled()
     imgui.end_combo()
 
 
 def compared_name(button: Button) -> str:
-    """What a display is called in the list of those that can be beside another."""
+    """Return the name of a display in the list of those that can be beside another."""
     row = DISPLAYS[button.display]
     return row.label if button.latent_level is None else f"{row.label}, {LEVELS[button.latent_level]}"
 
 
 def draw_overlays(viewer: Viewer) -> None:
-    """What lies over the scene, and the ruler."""
+    """Draw the panel "Overlays"."""
     state = viewer.state
     for name, title in OVERLAY_TITLES.items():
         changed, shown = imgui.checkbox(title.capitalize(), name in state.preferences.overlays)
         if changed:
-            actions.show_overlay(viewer, name, shown)
-    ruler, scene = state.seeing.ruler, state.scene
-    measure = with_key("Measure", actions.toggle_measuring, state.preferences.keys)
+            settings.show_overlay(viewer, name, shown)
+    ruler, scene = state.ruler, state.scene
+    measure = with_key("Measure", settings.toggle_measuring)
     imgui.begin_disabled(scene is None)
     changed, measures = imgui.checkbox(f"{measure}###measure", ruler.measures)
     if changed:
-        actions.measure(viewer, measures)
+        settings.measure(viewer, measures)
     tip("Click two points on the surface; Esc ends it")
     imgui.end_disabled()
     if ruler.measures:
@@ -167,62 +166,61 @@ def draw_overlays(viewer: Viewer) -> None:
 
 
 def draw_camera(viewer: Viewer) -> None:
-    """Training cameras, reset, lens, speed."""
+    """Draw the panel "Camera"."""
     state = viewer.state
     imgui.begin_disabled(state.view is None)
     if state.scene is not None and state.scene.cameras:
         _training_cameras(viewer)
-    keys = state.preferences.keys
-    if imgui.button(with_key("Reset", actions.reset_view, keys)):
-        actions.reset_view(viewer)
+    if imgui.button(with_key("Reset", viewpoint.reset_view)):
+        viewpoint.reset_view(viewer)
     tip("Return to the opening view")
-    focus = with_key("Focus", actions.focus_result, keys)
+    focus = with_key("Focus", viewpoint.focus_result)
     beside(focus)
     if imgui.button(focus):
-        actions.focus_result(viewer)
+        viewpoint.focus_result(viewer)
     beside("Frame all")
     if imgui.button("Frame all"):
-        actions.frame_scene(viewer)
-    tip(with_key("Show the whole scene from this side", actions.frame_scene, keys))
+        viewpoint.frame_scene(viewer)
+    tip(with_key("Show the whole scene from this side", viewpoint.frame_scene))
     if imgui.button("Horizon"):
-        actions.move(viewer, level)
+        viewpoint.move(viewer, level)
     tip("Turn the picture until the horizon is level")
     beside("Up is up")
     if imgui.button("Up is up"):
-        actions.move(viewer, adopt_up)
+        viewpoint.move(viewer, adopt_up)
     tip("Take what is up in the picture as the world's up")
     if state.view is not None:
         _projection(viewer, state.view)
     _cuts(viewer)
     speed = _slider("Fly speed", state.fly_speed, 0.05, 4.0, "%.2f", logarithmic=True)
-    actions.set_fly_speed(viewer, speed)
+    viewpoint.set_fly_speed(viewer, speed)
     _, walks = imgui.checkbox("Walk", state.walks)
-    actions.set_walking(viewer, walks)
+    viewpoint.set_walking(viewer, walks)
     tip("W A S D keep the height of the eye")
     beside_boxed("Coarse while moving")
     _, coarse = imgui.checkbox("Coarse while moving", state.coarse_while_moving)
-    actions.set_coarse_while_moving(viewer, coarse)
+    settings.set_coarse_while_moving(viewer, coarse)
     tip("Draw fewer pixels and merged Gaussians while the camera moves, where drawing is slow")
     imgui.end_disabled()
 
 
 def _projection(viewer: Viewer, view: OrbitCamera) -> None:
     """With perspective or without; the field of view is one of perspective."""
-    text = with_key("Orthographic", actions.toggle_orthographic, viewer.state.preferences.keys)
+    text = with_key("Orthographic", viewpoint.toggle_orthographic)
     _, orthographic = imgui.checkbox(f"{text}###orthographic", view.orthographic)
-    actions.set_orthographic(viewer, orthographic)
+    viewpoint.set_orthographic(viewer, orthographic)
     tip("No perspective: what is parallel looks parallel; the wheel changes the scale")
     before = view.intrinsics.fov_degrees
     imgui.begin_disabled(orthographic)
     fov = _slider("Field of view", before, *FOV_RANGE, "%.0f deg")
     imgui.end_disabled()
     if abs(fov - before) > 1e-3:
-        actions.move(viewer, lambda view: with_fov(view, fov))
+        viewpoint.move(viewer, lambda view: with_fov(view, fov))
 
 
 def _cuts(viewer: Viewer) -> None:
     """Near and far cut; at the ends of their sliders there is none."""
-    extent, clip = viewer.state.extent, viewer.state.seeing.clip
+    extent, clip = viewer.state.extent, viewer.state.settings.clip
     if extent is None:
         return
     low, high = (share * extent.radius for share in CUT_RANGE)
@@ -234,7 +232,7 @@ def _cuts(viewer: Viewer) -> None:
         "Far cut", min(clip.far, high), low, high, "%.3g" if clip.far < high else "off", logarithmic=True
     )
     tip("Farther than this nothing is drawn; world units")
-    actions.set_clip(
+    settings.set_clip(
         viewer, Clip(0.0 if near < 1.001 * low else near, math.inf if far > 0.999 * high else far)
     )
 
@@ -243,10 +241,10 @@ def _training_cameras(viewer: Viewer) -> None:
     state = viewer.state
     assert state.scene is not None
     if imgui.arrow_button("##previous", imgui.Dir.left):
-        actions.step_camera(viewer, -1)
+        viewpoint.step_camera(viewer, -1)
     imgui.same_line()
     if imgui.arrow_button("##next", imgui.Dir.right):
-        actions.step_camera(viewer, 1)
+        viewpoint.step_camera(viewer, 1)
     imgui.same_line()
     index = state.camera_index or 0
     imgui.set_next_item_width(-1)
@@ -256,8 +254,28 @@ def _training_cameras(viewer: Viewer) -> None:
     )
     tip("Training cameras: stand where a photograph was taken")
     if changed and index != state.camera_index:
-        actions.go_to_camera(viewer, index)
-    photograph.draw_slider(viewer)
+        viewpoint.go_to_camera(viewer, index)
+    _photograph(viewer)
+
+
+def _photograph(viewer: Viewer) -> None:
+    """How much of it is seen, and why it is not."""
+    state = viewer.state
+    leave_room("Photograph", WIDTH_EM)
+    flags = imgui.SliderFlags_.always_clamp
+    changed, fade = imgui.slider_float("Photograph", state.settings.fade, 0.0, 1.0, "%.2f", flags)
+    if changed:
+        opening.fade_photograph(viewer, fade)
+    tip("Lay the photograph of the training camera over the picture")
+    if state.settings.fade == 0:
+        return
+    photograph = opening.photograph_here(state)
+    if photograph is None:
+        small_wrapped("stand at a training camera to see its photograph", muted())
+    elif photograph.reason:
+        small_wrapped(photograph.reason, muted())
+        if imgui.button("Folder of photographs ..."):
+            opening.ask_for_photographs(viewer)
 
 
 def _slider(

@@ -53,7 +53,7 @@ def create_egl_context() -> moderngl.Context:
 SHADERS = "langsplat_core.raster.opengl.shaders"
 
 
-def shader(name: str, version: int = 410, package: str = SHADERS, **defines: int | float) -> str:
+def shader(name: str, version: int = 410, package: str = SHADERS, **defines: int | float | str) -> str:
     """Source of `name`.glsl in `package` with its GLSL version and `defines` in front."""
     head = [f"#version {version} core", *(f"#define {key} {value}" for key, value in defines.items())]
     return "\n".join([*head, files(package).joinpath(f"{name}.glsl").read_text(encoding="utf-8")])

@@ -1,0 +1,105 @@
+"""Training a scene from photographs, in a process of its own."""
+
+from pathlib import Path
+
+from langsplat_core.pipeline.forecast import count_photographs
+from langsplat_core.pipeline.report import work_folder
+from langsplat_viewer.actions.opening import open_scene, reload
+from langsplat_viewer.files import watching
+from langsplat_viewer.files.watching import Stamps
+from langsplat_viewer.jobs import one_line
+from langsplat_viewer.state import TrainingForm
+from langsplat_viewer.viewer import Training, TrainingRequest, Viewer
+
+WARNING = "warning: "  # before each doubt that `langsplat train` ends with
+
+
+def fill_in(viewer: Viewer, form: TrainingForm) -> None:
+    """Take the texts of the form."""
+    viewer.state.training_form = form
+
+
+def start_training(viewer: Viewer) -> None:
+    """Train, or go on with what was interrupted: the same photographs and name continue."""
+    state, form = viewer.state, viewer.state.training_form
+    if viewer.training is not None and viewer.training.exit_code is None:
+        state.say("a training is under way; stop it first", is_error=True)
+        return
+    dataset = Path(form.dataset.strip()).expanduser()
+    out = Path(form.out.strip() or f"{dataset}.ply").expanduser()
+    photographs, _ = count_photographs(dataset)
+    if not form.dataset.strip() or photographs == 0:
+        state.say(f"no photographs in '{form.dataset.strip()}'; name a folder that has some", is_error=True)
+        return
+    request = TrainingRequest(dataset, out, form.preset, form.encoder.strip() or "demo")
+    try:
+        viewer.training = Training(request, viewer.worker.wake)
+    except OSError as error:
+        state.say(f"training cannot be started ({one_line(error)})", is_error=True)
+        return
+    state.say(f"training {out.name} from {photographs} photographs")
+
+
+def stop_training(viewer: Viewer) -> None:
+    """Interrupt; `start_training` goes on from there."""
+    if viewer.training is not None:
+        viewer.training.interrupt()
+
+
+def look_at_training(viewer: Viewer) -> None:
+    """Open the Gaussians of a training under way, before they have a meaning; while they are still trained,
+    as they were at the last checkpoint, and from then on at the next ones."""
+    training = viewer.training
+    if training is None:
+        return
+    written = watching.newest(training.request.out)
+    if not written:
+        viewer.state.say("there are no Gaussians to look at yet")
+    elif written[0][0].name.endswith(watching.IN_TRAINING):
+        _show_checkpoint(viewer, training, written)
+    else:
+        open_scene(viewer, written[0][0])
+
+
+def _show_checkpoint(viewer: Viewer, training: Training, checkpoint: Stamps) -> None:
+    """Open it as a scene, or in place of the one before, where that is still shown."""
+    training.previewed = checkpoint
+    ((path, _),) = checkpoint
+
+    def done(written: Path) -> None:
+        if viewer.state.path == written:
+            reload(viewer)
+        else:
+            open_scene(viewer, written)
+
+    viewer.run("reading the Gaussians so far", lambda progress: watching.write_preview(path), done)
+
+
+def _follow(viewer: Viewer, training: Training) -> None:
+    folder = work_folder(training.request.out)
+    if viewer.state.path != folder / watching.NAME or viewer.worker.current is not None:
+        return
+    written = watching.newest(training.request.out)
+    if written != training.previewed and written and written[0][0].name.endswith(watching.IN_TRAINING):
+        _show_checkpoint(viewer, training, written)
+
+
+def watch_training(viewer: Viewer) -> None:
+    """Once per frame: open the scene when it is finished, or say why there is none."""
+    training, state = viewer.training, viewer.state
+    if training is None:
+        return
+    if training.exit_code is None:
+        _follow(viewer, training)
+        return
+    viewer.training = None
+    last = training.progress.said[-1] if training.progress.said else "no reason given"
+    if training.exit_code == 0:
+        told = [line for line in training.progress.said if not line.startswith(WARNING)]
+        for line in told[-3:]:  # what speaks against the scene is said with it, from its report
+            state.say(line)
+        open_scene(viewer, training.request.out)
+    elif training.interrupted:
+        state.say("training stopped; Train goes on where it was")
+    else:
+        state.say(last, is_error=True)

@@ -1,0 +1,465 @@
+"""The viewpoint: camera moves, the camera path as it is played, the cursor, bookmarks and the comparison."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import InputError
+from langsplat_core.progress import Progress
+from langsplat_core.query.describe import Describer, Pointed, look_at_pixel
+from langsplat_core.query.engine import no_field
+from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
+from langsplat_core.scene import Camera
+from langsplat_viewer.camera.controls import (
+    OrbitCamera,
+    Side,
+    between,
+    default_view,
+    focus,
+    frame_all,
+    from_camera,
+    from_side,
+    holding_distance,
+    orbit,
+    spanning,
+    with_projection,
+    zoom,
+)
+from langsplat_viewer.camera.flight import pose_at, pose_of, view_of
+from langsplat_viewer.files.flights import MOST_VIEWS, Bookmark, named
+from langsplat_viewer.jobs import one_line
+from langsplat_viewer.rendering.depth import image_formation
+from langsplat_viewer.rendering.renderer import ArrayRenderer
+from langsplat_viewer.state import GLIDE_SECONDS, Glide, Hover, Query, compared, compared_size, flight_of
+from langsplat_viewer.viewer import Viewer
+
+
+def path_seconds(viewer: Viewer) -> float:
+    """Return how long the path takes, seconds; 0 without one."""
+    record = viewer.state.record
+    if record.turns:
+        return record.turn_seconds
+    return record.keyframes[-1].seconds if record.keyframes else 0.0
+
+
+def toggle_playing(viewer: Viewer) -> None:
+    """Play the path from where it is, or stop there."""
+    record = viewer.state.record
+    if record.began is not None:
+        record.began = None
+    elif viewer.state.view is None:
+        viewer.state.say("open a scene first, then play a path in it", is_error=True)
+    elif path_seconds(viewer) <= 0:
+        viewer.state.say("a path needs two keyframes: add one at the current view", is_error=True)
+    else:
+        start = 0.0 if record.at >= path_seconds(viewer) else record.at
+        scrub(viewer, start)
+        record.began = viewer.clock - start
+
+
+def scrub(viewer: Viewer, seconds: float) -> None:
+    """Show the path at a time, stopped."""
+    state, record = viewer.state, viewer.state.record
+    if state.view is None or not (record.turns or record.keyframes):
+        return
+    if record.turns and record.turn_from is None:
+        record.turn_from = state.view
+    record.began, state.glide = None, None
+    _show(viewer, min(max(seconds, 0.0), path_seconds(viewer)))
+
+
+def advance(viewer: Viewer) -> None:
+    """Move a played path on to the viewer's clock; at its end it stops, or begins again."""
+    record = viewer.state.record
+    if record.began is None:
+        return
+    seconds, at = path_seconds(viewer), viewer.clock - record.began
+    if viewer.state.view is None or seconds <= 0:
+        record.began = None
+        return
+    if at >= seconds and record.loops:
+        at %= seconds
+        record.began = viewer.clock - at
+    elif at >= seconds:
+        record.began = None
+    _show(viewer, min(at, seconds))
+
+
+def leave_path(viewer: Viewer) -> None:
+    """The view goes elsewhere: nothing is played any more, and a turn begins anew from there."""
+    viewer.state.record.began = None
+    if viewer.state.record.turn_from is not None:
+        viewer.state.record.turn_from, viewer.state.record.at = None, 0.0
+
+
+def _show(viewer: Viewer, seconds: float) -> None:
+    viewer.state.record.at = seconds
+    viewer.state.view = _view_at(viewer, seconds)
+
+
+def _view_at(viewer: Viewer, seconds: float) -> OrbitCamera | None:
+    state, record = viewer.state, viewer.state.record
+    if record.turns and record.turn_from is not None:
+        return orbit(record.turn_from, 2 * math.pi * seconds / record.turn_seconds, 0)
+    if state.extent is None or not record.keyframes:
+        return state.view
+    return view_of(pose_at(flight_of(record.keyframes), seconds), state.extent)
+
+
+# Camera moves, at once or gliding from view to view.
+
+NEAREST = 0.004  # of the scene's radius: the closest that the eye comes to its centre of turning
+
+
+def tick(viewer: Viewer, now: float) -> None:
+    """Begin a frame at `now` seconds: move a gliding camera, or one that plays a path, on."""
+    viewer.clock = now
+    glide = viewer.state.glide
+    if glide is not None:
+        t = (now - glide.began) / GLIDE_SECONDS
+        viewer.state.view = between(glide.start, glide.end, t)
+        if t >= 1:
+            viewer.state.glide = None
+    advance(viewer)
+
+
+def move(viewer: Viewer, step: Callable[[OrbitCamera], OrbitCamera]) -> None:
+    """Apply one of the functions of `controls` at once; it ends a glide."""
+    if viewer.state.view is not None:
+        leave_path(viewer)
+        viewer.state.view, viewer.state.glide = step(viewer.state.view), None
+
+
+def open_at(viewer: Viewer, camera: Camera) -> None:
+    """Take a camera's view at once; it is the opening view from now on."""
+    extent, scene = viewer.state.extent, viewer.state.scene
+    if extent is not None and scene is not None:
+        same = (
+            i
+            for i, own in enumerate(scene.cameras)
+            if np.array_equal(own.world_to_camera, camera.world_to_camera)
+        )
+        viewer.state.camera_index = next(same, None)
+        viewer.state.opening_camera = camera
+        move(viewer, lambda view: from_camera(camera, extent))
+
+
+def glide_to(viewer: Viewer, end: OrbitCamera) -> None:
+    """Move smoothly to a view."""
+    if viewer.state.view is not None:
+        leave_path(viewer)
+        viewer.state.glide = Glide(viewer.state.view, end, viewer.clock)
+
+
+def zoom_by(viewer: Viewer, factor: float) -> None:
+    """Multiply the distance to the centre of turning, within what the scene's size makes sensible."""
+    extent = viewer.state.extent
+    if extent is not None:
+        nearest, farthest = NEAREST * extent.radius, extent.farthest
+        move(viewer, lambda view: zoom(view, factor, nearest, farthest))
+
+
+def set_fly_speed(viewer: Viewer, speed: float) -> None:
+    """How fast the keys fly, scene radii per second."""
+    viewer.state.fly_speed = speed
+
+
+def opening_view(viewer: Viewer) -> OrbitCamera | None:
+    """Return the first view of a scene: that of the camera that was asked for, else the first training
+    camera, else a view of everything in the window as it is now. None without a scene."""
+    state = viewer.state
+    if state.scene is None or state.extent is None:
+        return None
+    if state.opening_camera is not None:
+        return from_camera(state.opening_camera, state.extent)
+    return default_view(state.scene, state.extent, state.size)
+
+
+def reset_view(viewer: Viewer) -> None:
+    """Return to the opening view, in the projection of now."""
+    view, extent = opening_view(viewer), viewer.state.extent
+    if view is None or extent is None:
+        return
+    if viewer.state.view is not None and viewer.state.view.orthographic:
+        view = with_projection(view, orthographic=True)
+        if _opens_framed(viewer):
+            view = frame_all(view, extent, viewer.state.size)
+    glide_to(viewer, view)
+
+
+def _opens_framed(viewer: Viewer) -> bool:
+    scene = viewer.state.scene
+    return viewer.state.opening_camera is None and scene is not None and not scene.cameras
+
+
+def frame_scene(viewer: Viewer) -> None:
+    """Show the whole scene, from the side that it is seen from now."""
+    state = viewer.state
+    if state.view is not None and state.extent is not None:
+        glide_to(viewer, frame_all(state.view, state.extent, state.size))
+
+
+def look_from(viewer: Viewer, side: Side) -> None:
+    """Look at what the view turns around along one of the world's axes, from as far as now."""
+    if viewer.state.view is not None:
+        glide_to(viewer, from_side(viewer.state.view, side))
+
+
+def set_orthographic(viewer: Viewer, orthographic: bool) -> None:
+    """Look without perspective, or with it again; a glide under way goes on."""
+    state = viewer.state
+    view, extent, glide = state.view, state.extent, state.glide
+    if view is None or extent is None or view.orthographic == orthographic:
+        return
+
+    def turned(view: OrbitCamera) -> OrbitCamera:
+        return with_projection(view, orthographic)
+
+    move(viewer, turned)
+    state.glide = None if glide is None else replace(glide, end=turned(glide.end))
+
+
+def toggle_orthographic(viewer: Viewer) -> None:
+    """Look without perspective, or with it again."""
+    set_orthographic(viewer, viewer.state.view is not None and not viewer.state.view.orthographic)
+
+
+def open_orthographic(viewer: Viewer, span: float) -> None:
+    """Look without perspective, `span` world units across the shorter side of the uncropped picture."""
+    extent = viewer.state.extent
+    if extent is not None:
+        move(viewer, lambda view: spanning(view, span))
+
+
+def set_walking(viewer: Viewer, walks: bool) -> None:
+    """Set whether the keys that fly ahead keep the height of the eye."""
+    viewer.state.walks = walks
+
+
+def toggle_walking(viewer: Viewer) -> None:
+    """Walk, or fly again."""
+    set_walking(viewer, not viewer.state.walks)
+    viewer.state.say("W A S D walk at one height" if viewer.state.walks else "W A S D fly")
+
+
+def go_to_camera(viewer: Viewer, index: int) -> None:
+    """Stand where a training photograph was taken; indices beyond the ends wrap round."""
+    scene, extent = viewer.state.scene, viewer.state.extent
+    if scene is None or extent is None:
+        return
+    if not scene.cameras:
+        viewer.state.say("this scene has no training cameras (no .cameras.json beside it)", is_error=True)
+        return
+    viewer.state.camera_index = index % len(scene.cameras)
+    glide_to(viewer, from_camera(scene.cameras[viewer.state.camera_index], extent))
+
+
+def step_camera(viewer: Viewer, by: int) -> None:
+    """The next (1) or previous (-1) training camera."""
+    go_to_camera(viewer, (viewer.state.camera_index or 0) + by)
+
+
+def focus_result(viewer: Viewer, query: Query | None = None) -> None:
+    """Bring a query's place to the centre, as near as the thing is small; without `query` the latest
+    one shown that was found; without any the whole scene."""
+    state = viewer.state
+    if state.extent is None or state.view is None:
+        return
+    if query is None:
+        found = [q for q in state.in_order_of_showing() if q.result and q.result.found]
+        query = found[-1] if found else None
+    place = None if query is None or query.result is None else query.result.place
+    if query is None or query.result is None or place is None:
+        frame_scene(viewer)
+        return
+    glide_to(viewer, focus(state.view, place, _distance_for(viewer, place, query.result.box)))
+
+
+def _distance_for(viewer: Viewer, place: Array, box: Array | None) -> float:
+    """From where a thing at `place` (3,) in `box` (2, 3) is seen, world units: no farther back than the
+    eye or the opening view are now, which in a room would be behind its wall."""
+    view, extent, home = viewer.state.view, viewer.state.extent, opening_view(viewer)
+    assert view is not None
+    assert extent is not None
+    assert home is not None
+    if box is None:
+        box = np.stack([place, place + 0.1 * extent.radius])
+    most = max(float(np.linalg.norm(place - view.eye)), home.distance)
+    return min(max(holding_distance(view, box), NEAREST * extent.radius), most)
+
+
+def focus_pixel(viewer: Viewer, u: float, v: float) -> None:
+    """Turn around the surface under the cursor from now on; (u, v) are fractions of the scene's area."""
+    if viewer.surface is None or viewer.state.view is None:
+        return
+    point = viewer.surface.point_at(u, v)
+    if point is None:
+        viewer.state.say("nothing under the cursor to turn around")
+        return
+    view = viewer.state.view
+    # The eye stays, but without perspective the size of things does.
+    depth = None if view.orthographic else float((point - view.eye) @ view.rotation[2])
+    glide_to(viewer, focus(view, point, depth))
+
+
+# The cursor: what lies under it while it rests.
+
+REST_SECONDS = 0.2  # of the mouse, after which it is asked what lies there
+
+
+def toggle_pointing(viewer: Viewer) -> None:
+    """Say what is under the cursor from now on, or no longer."""
+    state = viewer.state
+    if not state.pointing and (state.scene is None or state.scene.language is None):
+        state.say("open a scene first" if state.scene is None else no_field(state.scene), is_error=True)
+        return
+    state.pointing, state.hover = not state.pointing, None
+
+
+def hover(viewer: Viewer, pixel: tuple[int, int] | None) -> None:
+    """Once per frame: the mouse is over this pixel (column, row) of the scene's area; None: elsewhere, or it
+    drags. What lies there is asked once the mouse and the camera rest."""
+    state = viewer.state
+    if not state.pointing or state.view is None or pixel is None:
+        state.hover = None
+        return
+    width, height = state.size
+    if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
+        state.hover = None
+        return
+    before = state.hover
+    same = before is not None and (before.pixel, before.view) == (pixel, state.view)
+    if not same or before is None:
+        state.hover = Hover(pixel, state.view, viewer.clock)
+    elif not before.asked and viewer.clock - before.since >= REST_SECONDS and viewer.worker.current is None:
+        before.asked = True
+        _ask(viewer, before)
+
+
+def _ask(viewer: Viewer, place: Hover) -> None:
+    engine = viewer.engine
+    if engine is None:
+        return
+    camera = place.view.camera(*viewer.state.size)
+    shown = [query for query in viewer.state.shown() if query is not None and query.result is not None]
+    settings = image_formation(engine.scene, camera, viewer.state.settings.clip)
+    results = [query.result for query in shown if query.result is not None]
+
+    def work(progress: Progress) -> tuple[Describer, Pointed | None]:
+        describer = viewer.describer
+        if describer is None or describer.engine is not engine:
+            describer = Describer(engine, progress=progress)
+        rasterizer = load_lifting_rasterizer("cpu")
+        return describer, look_at_pixel(
+            rasterizer, describer, camera, place.pixel, results, settings=settings
+        )
+
+    def done(found: tuple[Describer, Pointed | None]) -> None:
+        viewer.describer, place.found = found
+        place.phrases = tuple(query.phrase for query in shown)
+
+    viewer.run("looking under the cursor", work, done)
+
+
+# Bookmarks.
+
+
+def add_bookmark(viewer: Viewer, name: str = "") -> None:
+    """Keep the current view; in place of one of the same name. Without a name it gets a number."""
+    state = viewer.state
+    if state.view is None:
+        state.say("open a scene first, then bookmark a view of it", is_error=True)
+        return
+    kept = state.bookmarks
+    if not name.strip():
+        number = len(kept) + 1
+        while f"view {number}" in {bookmark.name for bookmark in kept}:
+            number += 1
+        name = f"view {number}"
+    added = Bookmark(named(name), pose_of(state.view), state.view.distance)
+    others = tuple(bookmark for bookmark in kept if bookmark.name != added.name)
+    if len(others) >= MOST_VIEWS:
+        state.say(f"a scene has at most {MOST_VIEWS} bookmarks: delete one", is_error=True)
+        return
+    state.bookmarks, state.bookmark_typed = (*others, added), ""
+    _keep(viewer)
+    state.say(f"bookmark '{added.name}'")
+
+
+def type_bookmark(viewer: Viewer, text: str) -> None:
+    """Take the text of the box for a name."""
+    viewer.state.bookmark_typed = text
+
+
+def go_to_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
+    """Stand where it was made, turning around the same point."""
+    if viewer.state.extent is not None:
+        view = view_of(bookmark.pose, viewer.state.extent)
+        target = view.eye + bookmark.distance * view.rotation[2]
+        glide_to(viewer, replace(view, target=target, distance=bookmark.distance))
+
+
+def delete_bookmark(viewer: Viewer, bookmark: Bookmark) -> None:
+    """Take it off the list."""
+    viewer.state.bookmarks = tuple(other for other in viewer.state.bookmarks if other is not bookmark)
+    _keep(viewer)
+
+
+def read_bookmarks(viewer: Viewer, scene: Path) -> tuple[Bookmark, ...]:
+    """Read the bookmarks of a scene file; where they make no sense, say so."""
+    try:
+        return viewer.shelf.read(scene)
+    except InputError as error:
+        viewer.say_error(str(error))
+        return ()
+
+
+def _keep(viewer: Viewer) -> None:
+    state = viewer.state
+    if state.path is None:
+        return
+    try:
+        viewer.shelf.write(state.path, state.bookmarks)
+    except (OSError, InputError) as error:
+        state.say(f"bookmarks not kept: {one_line(error)}", is_error=True)
+
+
+# Timing and the comparison with the reference.
+
+
+def measure_frame(viewer: Viewer) -> None:
+    """Have the steps of this frame measured: the panel is seen."""
+    viewer.state.timing.wanted = True
+
+
+def compare_with_reference(viewer: Viewer) -> None:
+    """Draw what is shown at a small size, have the reference rasterizer draw the same in the background, and
+    tell the difference."""
+    state = viewer.state
+    if state.scene is None or state.view is None or viewer.surface is None:
+        state.say("open a scene first, then compare its picture", is_error=True)
+        return
+    if viewer.recorder.current is not None:
+        state.say("a film or a comparison is being drawn; wait for it or cancel it", is_error=True)
+        return
+    request, backend = state.request(compared_size(state.size)), state.backend
+    shown = viewer.surface.capture(request)
+
+    def work(progress: Progress) -> Array:
+        return ArrayRenderer(load_rasterizer("reference")).read(request)
+
+    def done(reference: Array) -> None:
+        state.timing.comparison = compared(shown, reference, backend)
+
+    viewer.recorder.submit(
+        "comparing with the reference", work, done, lambda reason: state.say(reason, is_error=True)
+    )
+
+
+def stop_comparing(viewer: Viewer) -> None:
+    """Do not wait for it."""
+    viewer.recorder.cancel()

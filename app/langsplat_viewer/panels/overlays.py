@@ -1,0 +1,563 @@
+"""The images of the scene behind the panels, and the overlays on them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import moderngl
+import numpy as np
+from imgui_bundle import ImVec2, hello_imgui, imgui
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import ColourMap
+from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, mapped, painted
+from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.describe import Words
+from langsplat_core.scene import LEVELS, Camera
+from langsplat_viewer.actions import opening, settings, viewpoint
+from langsplat_viewer.camera import overlays
+from langsplat_viewer.camera.controls import OrbitCamera
+from langsplat_viewer.camera.overlays import Face, Label, face_at, placed, visible_faces, world_axes
+from langsplat_viewer.files.photographs import corners
+from langsplat_viewer.panels.style import Area, elided, muted, width_of
+from langsplat_viewer.state import Hover
+from langsplat_viewer.viewer import Viewer
+
+GRIP = 12.0  # width of what can be taken hold of, window units
+WHITE, SHADE = 0xFFFFFFFF, 0xA0000000
+UNMOVED = (
+    imgui.WindowFlags_.no_decoration
+    | imgui.WindowFlags_.no_background
+    | imgui.WindowFlags_.no_saved_settings
+    | imgui.WindowFlags_.no_focus_on_appearing
+    | imgui.WindowFlags_.no_bring_to_front_on_focus
+    | imgui.WindowFlags_.no_nav
+    | imgui.WindowFlags_.no_move
+    | imgui.WindowFlags_.no_docking
+)
+
+
+def draw_pictures(viewer: Viewer, area: Area, textures: tuple[moderngl.Texture, ...]) -> None:
+    """The textures of `Canvas.textures` where they belong, each with its name if there are several."""
+    split = viewer.state.settings.split
+    if split.mode == "wipe" and len(textures) > 1:
+        _image(area, textures[0], 0.0, split.at)
+        _image(area, textures[1], split.at, 1.0)
+        _divider(area, split.at)
+    elif split.mode == "levels" and len(textures) > 1:
+        width = area.width / len(textures)
+        for place, texture in enumerate(textures):
+            _image(Area(area.left + place * width, area.top, width, area.height), texture, 0.0, 1.0)
+        for place in range(1, len(textures)):
+            _divider(area, place / len(textures))
+    elif textures:
+        _image(area, textures[0], 0.0, 1.0)
+    _titles(viewer, area)
+
+
+def _image(area: Area, texture: moderngl.Texture, start: float, stop: float) -> None:
+    """The part of a texture between two fractions of its width, at its place in `area`."""
+    imgui.get_background_draw_list().add_image(
+        imgui.ImTextureRef(texture.glo),
+        ImVec2(area.left + start * area.width, area.top),
+        ImVec2(area.left + stop * area.width, area.top + area.height),
+        ImVec2(start, 1),  # GL's first row is the lowest
+        ImVec2(stop, 0),
+    )
+
+
+def _divider(area: Area, at: float) -> None:
+    x, paint = area.left + at * area.width, imgui.get_background_draw_list()
+    ends = ImVec2(x, area.top), ImVec2(x, area.top + area.height)
+    paint.add_line(*ends, SHADE, 4.0)
+    paint.add_line(*ends, WHITE, 1.5)
+
+
+def _titles(viewer: Viewer, area: Area) -> None:
+    """Write what each image shows at its upper edge: left and right of the line of a wipe."""
+    split, names = viewer.state.settings.split, tuple(pane.label for pane in viewer.state.panes())
+    gap, top = hello_imgui.em_size(0.6), area.top + hello_imgui.em_size(0.5)
+    if split.mode == "wipe":
+        x = area.left + split.at * area.width
+        text_on_shade(names[0], x - gap - imgui.calc_text_size(names[0]).x, top, area)
+        text_on_shade(names[1], x + gap, top, area)
+    elif split.mode == "levels":
+        for place, name in enumerate(names):
+            text_on_shade(name, area.left + place * area.width / len(names) + gap, top, area)
+
+
+def shade_edge() -> float:
+    """How far the shade of `text_on_shade` reaches beyond the text, window units."""
+    return float(hello_imgui.em_size(0.2))
+
+
+def text_on_shade(text: str, x: float, y: float, area: Area) -> None:
+    """On a shade, nowhere outside the area."""
+    paint, size, edge = imgui.get_background_draw_list(), imgui.calc_text_size(text), shade_edge()
+    paint.push_clip_rect(ImVec2(area.left, area.top), ImVec2(area.left + area.width, area.top + area.height))
+    paint.add_rect_filled(
+        ImVec2(x - edge, y - edge), ImVec2(x + size.x + edge, y + size.y + edge), SHADE, 3.0
+    )
+    paint.add_text(ImVec2(x, y), WHITE, text)
+    paint.pop_clip_rect()
+
+
+def draw_grip(viewer: Viewer, area: Area) -> None:
+    """Draw the grip of the line of a wipe; a double click puts it into the middle."""
+    split = viewer.state.settings.split
+    if split.mode != "wipe" or viewer.state.scene is None:
+        return
+    x = area.left + split.at * area.width
+    imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(0, 0))
+    imgui.push_style_var(imgui.StyleVar_.window_min_size, ImVec2(1, 1))
+    imgui.set_next_window_pos(ImVec2(x - GRIP / 2, area.top))
+    imgui.set_next_window_size(ImVec2(GRIP, area.height))
+    imgui.begin("split", None, UNMOVED)
+    imgui.invisible_button("line", ImVec2(GRIP, area.height))
+    if imgui.is_item_hovered() or imgui.is_item_active():
+        imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew)
+        _knob(x, area)
+    if imgui.is_item_hovered() and imgui.is_mouse_double_clicked(0):
+        settings.move_line(viewer, 0.5)
+    elif imgui.is_item_active() and imgui.get_io().mouse_delta.x:
+        settings.move_line(viewer, area.fraction(imgui.get_io().mouse_pos.x, 0)[0])
+    imgui.end()
+    imgui.pop_style_var(2)
+
+
+def _knob(x: float, area: Area) -> None:
+    middle, paint = ImVec2(x, area.top + area.height / 2), _foreground()
+    paint.add_circle_filled(middle, 0.5 * GRIP, WHITE)
+    paint.add_circle(middle, 0.5 * GRIP, SHADE, 0, 2.0)
+
+
+def _foreground() -> Any:
+    return imgui.get_foreground_draw_list()
+
+
+# The photograph of a training camera.
+
+
+class PhotographOverlay:
+    """Holds the photograph as a texture."""
+
+    def __init__(self, ctx: moderngl.Context) -> None:
+        self._ctx = ctx
+        self._image: Array | None = None  # what the texture has
+        self._texture: moderngl.Texture | None = None
+
+    def draw(self, viewer: Viewer, area: Area) -> None:
+        """Over every picture in the area, where one stands at its camera."""
+        state = viewer.state
+        photograph = opening.photograph_here(state)
+        if state.settings.fade == 0 or photograph is None or photograph.image is None or state.view is None:
+            return
+        texture = self._upload(photograph.image)
+        count = state.settings.split.columns
+        width, paint = area.width / count, imgui.get_background_draw_list()
+        shown = state.view.camera(max(round(width), 1), max(round(area.height), 1))
+        left, top, right, bottom = corners(photograph.camera, shown)
+        tint = imgui.get_color_u32((1.0, 1.0, 1.0, state.settings.fade))
+        for column in range(count):
+            x = area.left + column * width
+            end = ImVec2(x + width, area.top + area.height)
+            paint.push_clip_rect(ImVec2(x, area.top), end, True)
+            low, high = ImVec2(x + left, area.top + top), ImVec2(x + right, area.top + bottom)
+            reference = imgui.ImTextureRef(texture.glo)
+            paint.add_image(reference, low, high, ImVec2(0, 0), ImVec2(1, 1), tint)
+            paint.pop_clip_rect()
+
+    def _upload(self, image: Array) -> moderngl.Texture:
+        if self._texture is None or self._image is not image:
+            if self._texture is not None:
+                self._texture.release()
+            height, width = image.shape[:2]
+            texture = self._ctx.texture((width, height), 3, image.tobytes(), alignment=1)
+            texture.build_mipmaps()
+            texture.filter = moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR
+            texture.repeat_x = texture.repeat_y = False
+            self._texture, self._image = texture, image
+        return self._texture
+
+
+# Lines: training cameras, boxes of instances, ground grid, ruler; and the clicks on them.
+
+REACH = 7.0  # window units from a line at which a click means it
+STILL = 4.0  # a click that moves farther is a drag
+CAMERA, CHOSEN, HOVERED = (0.75, 0.82, 0.95, 0.75), (0.98, 0.62, 0.15, 1.0), (1.0, 1.0, 1.0, 1.0)
+GRID, RULER = (0.85, 0.85, 0.85, 0.4), (1.0, 0.9, 0.2, 1.0)
+
+
+@dataclass(frozen=True)
+class Named:
+    """A thing that has a name in the picture."""
+
+    text: str
+    corner: tuple[float, float]  # the highest one of its box, in units of the picture
+    colour: tuple[float, float, float, float]
+
+
+def draw_lines(viewer: Viewer, area: Area) -> None:
+    """Over every picture in the area, after they are drawn."""
+    state = viewer.state
+    if state.scene is None or state.view is None or state.extent is None:
+        return
+    count = state.settings.split.columns
+    width = area.width / count
+    paint = imgui.get_background_draw_list()
+    for column in range(count):
+        part = Area(area.left + column * width, area.top, width, area.height)
+        camera = state.view.camera(max(round(part.width), 1), max(round(part.height), 1))
+        low = ImVec2(part.left, part.top)
+        paint.push_clip_rect(low, ImVec2(part.left + part.width, part.top + part.height), True)
+        if "grid" in state.preferences.overlays:
+            _grid(viewer, part, camera, is_named=column == 0)
+        if "cameras" in state.preferences.overlays:
+            _cameras(viewer, part, camera)
+        if "things" in state.preferences.overlays:  # after the lines, so that its words are readable
+            _things(viewer, part, camera)
+        _ruler(viewer, part, camera)
+        paint.pop_clip_rect()
+    _orthographic(viewer, area)
+    if state.ruler.measures and not imgui.get_io().want_capture_mouse:
+        imgui.set_mouse_cursor(imgui.MouseCursor_.resize_all)
+        if clicked(area):
+            mouse = imgui.get_io().mouse_pos
+            settings.measure_at(viewer, *area.fraction(mouse.x, mouse.y))
+
+
+def _orthographic(viewer: Viewer, area: Area) -> None:
+    """Write that the camera is orthographic, and its scale."""
+    view, scene = viewer.state.view, viewer.state.scene
+    if view is None or scene is None or not view.orthographic:
+        return
+    line = imgui.get_text_line_height()
+    lines_below = 2 if "grid" in viewer.state.preferences.overlays else 1
+    span = overlays.length_text(view.span_in(*viewer.state.size), scene.metres_per_unit)
+    text = f"orthographic, {span} across the shorter side"
+    text_on_shade(text, area.left + 0.6 * line, area.top + area.height - 1.6 * lines_below * line, area)
+
+
+def clicked(area: Area) -> bool:
+    """Return whether the left button was clicked in the area, without modifiers and without a drag."""
+    io = imgui.get_io()
+    if io.want_capture_mouse or io.key_ctrl or io.key_shift or not imgui.is_mouse_released(0):
+        return False
+    moved = imgui.get_mouse_drag_delta(0, 0.0)
+    u, v = area.fraction(io.mouse_pos.x, io.mouse_pos.y)
+    return abs(moved.x) + abs(moved.y) < STILL and 0 <= u <= 1 and 0 <= v <= 1
+
+
+def _least_depth(viewer: Viewer) -> float:
+    """Camera z from which on lines are drawn: a little before the eye."""
+    assert viewer.state.extent is not None
+    return overlays.LEAST_DEPTH * viewer.state.extent.radius
+
+
+def _lines(area: Area, segments: Array, colour: tuple[float, float, float, float], thick: float) -> None:
+    """(K, 2, 2) segments in units of the picture in `area`."""
+    paint, packed = imgui.get_background_draw_list(), imgui.get_color_u32(colour)
+    for (x0, y0), (x1, y1) in (segments + (area.left, area.top)).tolist():
+        paint.add_line(ImVec2(x0, y0), ImVec2(x1, y1), packed, thick)
+
+
+def _cameras(viewer: Viewer, area: Area, camera: Camera) -> None:
+    """Draw all but the one that the view looks through; a click on one stands there."""
+    state = viewer.state
+    assert state.scene is not None
+    assert state.extent is not None
+    edges = overlays.frusta(state.scene.cameras, overlays.FRUSTUM_DEPTH * state.extent.radius)
+    away = np.linalg.norm(edges[:, 0, 0] - camera.position, axis=1) > _least_depth(viewer)
+    edges = edges * away[:, None, None, None]  # all in one point, which is no line
+    segments, rows = overlays.clip_segments(camera, edges.reshape(-1, 2, 3), _least_depth(viewer))
+    owners = rows // edges.shape[1]
+    segments, owners = segments[away[owners]], owners[away[owners]]
+    under = -1
+    if not (imgui.get_io().want_capture_mouse or state.ruler.measures):
+        mouse = imgui.get_io().mouse_pos
+        row, distance = overlays.nearest_segment(segments, (mouse.x - area.left, mouse.y - area.top))
+        under = int(owners[row]) if distance < REACH else -1
+    chosen = -1 if state.camera_index is None else state.camera_index
+    _lines(area, segments[(owners != under) & (owners != chosen)], CAMERA, 1.0)
+    _lines(area, segments[owners == chosen], CHOSEN, 2.0)
+    if under >= 0:
+        _lines(area, segments[owners == under], HOVERED, 2.0)
+        name = state.scene.cameras[under].name
+        text_on_shade(f"camera {under}  {name}", mouse.x + 14, mouse.y + 10, area)
+        if clicked(area):
+            viewpoint.go_to_camera(viewer, under)
+
+
+def _things(viewer: Viewer, area: Area, camera: Camera) -> None:
+    """A box around each thing that a query shown has found, and the phrase beside it."""
+    named: list[Named] = []
+    for query in viewer.state.shown():
+        if query is None or query.slot is None:
+            continue
+        red, green, blue = QUERY_COLOURS[query.slot]
+        for number, thing in enumerate(query.things, start=1):
+            edges = overlays.box_edges(thing.oriented.corners)
+            segments, _ = overlays.clip_segments(camera, edges, _least_depth(viewer))
+            _lines(area, segments, (0.0, 0.0, 0.0, 0.5), 3.0)
+            _lines(area, segments, (red, green, blue, 1.0), 1.5)
+            if len(segments):
+                x, y = segments.reshape(-1, 2)[segments.reshape(-1, 2)[:, 1].argmin()].tolist()
+                text = query.phrase if len(query.things) == 1 else f"{query.phrase} {number}"
+                named.append(Named(text, (x, y), (red, green, blue, 1.0)))
+    _names(named, area)
+
+
+def _names(named: list[Named], area: Area) -> None:
+    """The phrases, above the highest corners of their boxes; a line leads to those that had to make room."""
+    line, edge, paint = imgui.get_text_line_height(), shade_edge(), imgui.get_background_draw_list()
+    room = (area.width, area.height)
+    wanted = []
+    for name in named:
+        (x, y), size = name.corner, imgui.calc_text_size(name.text)
+        wanted.append(Label(x + 4 - edge, y - 1.4 * line - edge, size.x + 2 * edge, size.y + 2 * edge))
+    found = placed(wanted, room)
+    for name, alone, label in zip(named, wanted, found, strict=True):
+        if abs(label.y - placed([alone], room)[0].y) > label.height / 2:
+            start = ImVec2(area.left + name.corner[0], area.top + name.corner[1])
+            end = ImVec2(area.left + label.x, area.top + label.y + label.height / 2)
+            paint.add_line(start, end, imgui.get_color_u32(name.colour), 1.5)
+    for name, label in zip(named, found, strict=True):
+        text_on_shade(name.text, area.left + label.x + edge, area.top + label.y + edge, area)
+
+
+def _grid(viewer: Viewer, area: Area, camera: Camera, is_named: bool) -> None:
+    """On the ground, with the distance of its lines from the world's origin; named in the corner, or not."""
+    state = viewer.state
+    assert state.scene is not None
+    assert state.extent is not None
+    assert state.view is not None
+    scale = state.scene.metres_per_unit
+    grid = overlays.ground_grid(state.extent, state.view.up, scale)
+    segments, _ = overlays.clip_segments(camera, grid.segments, _least_depth(viewer))
+    _lines(area, segments, GRID, 1.0)
+    paint, packed = imgui.get_background_draw_list(), imgui.get_color_u32((*GRID[:3], 1.0))
+    for text, point in grid.marks:
+        place = _place(camera, point, _least_depth(viewer))
+        if place is not None:
+            paint.add_text(ImVec2(area.left + place[0] + 3, area.top + place[1]), packed, text)
+    if not is_named:
+        return
+    spacing = overlays.length_text(grid.spacing, scale)
+    line = imgui.get_text_line_height()
+    text_on_shade(f"grid {spacing}", area.left + 0.6 * line, area.top + area.height - 1.6 * line, area)
+
+
+def _ruler(viewer: Viewer, area: Area, camera: Camera) -> None:
+    """The points that were clicked, and what lies between them."""
+    ruler, scene = viewer.state.ruler, viewer.state.scene
+    assert scene is not None
+    paint, least = imgui.get_background_draw_list(), _least_depth(viewer)
+    for point in ruler.points:
+        place = _place(camera, np.array(point), least)
+        if place is not None:
+            middle = ImVec2(area.left + place[0], area.top + place[1])
+            paint.add_circle_filled(middle, 4.0, imgui.get_color_u32(RULER))
+            paint.add_circle(middle, 5.0, imgui.get_color_u32((0.0, 0.0, 0.0, 0.8)))
+    if ruler.length is None:
+        return
+    segments, _ = overlays.clip_segments(camera, np.array([ruler.points]), least)
+    _lines(area, segments, (0.0, 0.0, 0.0, 0.6), 4.0)
+    _lines(area, segments, RULER, 2.0)
+    for start, end in segments:
+        x, y = (start + end) / 2
+        text = overlays.length_text(ruler.length, scene.metres_per_unit)
+        text_on_shade(text, area.left + float(x) + 8, area.top + float(y) + 8, area)
+
+
+def _place(camera: Camera, point: Array, least_depth: float) -> tuple[float, float] | None:
+    """Project a world point (3,) to pixels; None outside the image."""
+    pixels, depths = camera.project(point[None].astype(np.float64))
+    x, y = (float(part) for part in pixels[0])
+    inside = depths[0] > least_depth and 0 <= x <= camera.width and 0 <= y <= camera.height
+    return (x, y) if inside else None
+
+
+# The legend of relevancy, and words in place of an image.
+
+STEPS = 32  # of a colour bar
+BAR_EM, BAR_HEIGHT_EM = 11.0, 0.8
+QUIET = (
+    imgui.WindowFlags_.no_decoration
+    | imgui.WindowFlags_.no_inputs
+    | imgui.WindowFlags_.always_auto_resize
+    | imgui.WindowFlags_.no_saved_settings
+    | imgui.WindowFlags_.no_focus_on_appearing
+    | imgui.WindowFlags_.no_bring_to_front_on_focus
+)
+
+
+def draw_legend(viewer: Viewer, area: Area) -> None:
+    """A colour bar with numbers for every query that is painted."""
+    state = viewer.state
+    shown = state.shown_results()
+    slots = painted(shown)
+    if state.scene is None or not slots or not any(pane.row.legend for pane in state.panes()):
+        return
+    corner = ImVec2(
+        area.left + area.width - hello_imgui.em_size(0.7), area.top + area.height - hello_imgui.em_size(0.7)
+    )
+    imgui.set_next_window_pos(corner, imgui.Cond_.always, ImVec2(1, 1))
+    imgui.set_next_window_bg_alpha(0.75)
+    imgui.begin("relevancy", None, QUIET)
+    for slot in slots:
+        result = shown[slot]
+        if result is not None:
+            strength = STRENGTH[result.verdict]
+            _bar(result, bar_colours(slot, strength, len(slots) == 1, state.picture.colour_map))
+    imgui.end()
+
+
+def say(text: str, area: Area) -> None:
+    """A line in the middle of the scene's area."""
+    centre = ImVec2(area.left + area.width / 2, area.top + area.height / 2)
+    imgui.set_next_window_pos(centre, imgui.Cond_.always, ImVec2(0.5, 0.5))
+    imgui.set_next_window_size_constraints(ImVec2(0, 0), ImVec2(0.9 * area.width, area.height))
+    imgui.set_next_window_bg_alpha(0.75)
+    imgui.begin("said over the scene", None, QUIET)
+    imgui.push_text_wrap_pos(0.85 * area.width)
+    imgui.text_unformatted(text)
+    imgui.pop_text_wrap_pos()
+    imgui.end()
+
+
+def bar_colours(slot: int, strength: float, alone: bool, colour_map: ColourMap = "turbo") -> Array:
+    """(STEPS, 3) colours of a bar from its coldest to its hottest end, as the picture has them: the colour
+    map for a query that is painted alone, else black to its own colour; what is half as strong ends there."""
+    heat = np.linspace(0, strength, STEPS)
+    if alone:
+        return mapped(heat, colour_map)
+    return (heat * heat * (3 - 2 * heat))[:, None] * QUERY_COLOURS[slot]
+
+
+def _bar(result: QueryResult, colours: Array) -> None:
+    """Phrase, bar, and the relevancies at its ends and in its middle."""
+    width, height = hello_imgui.em_size(BAR_EM), hello_imgui.em_size(BAR_HEIGHT_EM)
+    imgui.text_unformatted(elided(result.phrase, width, width_of))
+    start, paint = imgui.get_cursor_screen_pos(), imgui.get_window_draw_list()
+    for step, colour in enumerate(colours):
+        left, right = (round(start.x + width * edge / STEPS) for edge in (step, step + 1))  # no seams
+        paint.add_rect_filled(ImVec2(left, start.y), ImVec2(right, start.y + height), _opaque(colour))
+    imgui.dummy(ImVec2(width, height))
+    low, high = result.heat_range
+    x = imgui.get_cursor_pos_x()
+    for place, value in ((0.0, low), (0.5, (low + high) / 2), (1.0, high)):
+        text = f"{value:.2f}"
+        if place:
+            imgui.same_line(x + place * (width - imgui.calc_text_size(text).x))
+        imgui.text_unformatted(text)
+
+
+def _opaque(colour: Array) -> Any:
+    return imgui.get_color_u32((float(colour[0]), float(colour[1]), float(colour[2]), 1.0))
+
+
+# The tooltip: what lies under the cursor.
+
+UNSURE = 0.02  # a word less probable than this is not said
+
+
+def draw_pointing(viewer: Viewer) -> None:
+    """A tooltip, where something was found under the mouse."""
+    hover = viewer.state.hover
+    if hover is None or hover.found is None or not imgui.begin_tooltip():
+        return
+    imgui.push_text_wrap_pos(hello_imgui.em_size(24))
+    sure = viewer.engine is not None and viewer.engine.basis.calibration is not None
+    for name, words in zip(LEVELS, hover.found.words, strict=True):
+        imgui.text_colored(muted(), name)
+        imgui.same_line(hello_imgui.em_size(4.5))
+        imgui.text_unformatted(said(words, sure))
+    for line in pointed_figures(hover):
+        imgui.text_colored(muted(), line)
+    imgui.pop_text_wrap_pos()
+    imgui.end_tooltip()
+
+
+def said(words: Words, sure: bool) -> str:
+    """ "teddy bear 64 %, toy 12 %": the most probable words of a place at one level, without percentages
+    where none are `sure`."""
+    likely = [word for word in words.words if word.probability > UNSURE]
+    named = [word.phrase + (f" {100 * word.probability:.0f} %" if sure else "") for word in likely]
+    of_colour = "" if words.colour is None else f"{words.colour.phrase}: "
+    return of_colour + ", ".join(named) if named else "nothing known"
+
+
+def pointed_figures(hover: Hover) -> list[str]:
+    """Relevancies of what is shown, and the place."""
+    assert hover.found is not None
+    lines = [
+        f"{phrase}: {value:.2f}" for phrase, value in zip(hover.phrases, hover.found.relevancy, strict=True)
+    ]
+    x, y, z = hover.found.position
+    return [*lines, f"at {x:.2f}  {y:.2f}  {z:.2f}, {hover.found.depth:.2f} away"]
+
+
+# The view cube; a click on a face turns the view there.
+
+SIDE_EM = 7.0  # of the corner that it takes
+EDGE = 0.24  # of that side, half the cube's edge: its corners reach 1.73 times as far
+AXIS = 1.62  # length of the world's axes in the cube's units
+AXES = (("x", (0.93, 0.33, 0.31)), ("y", (0.45, 0.78, 0.30)), ("z", (0.36, 0.60, 0.98)))
+LIT, DARK, HOVERED_FACE = 0.80, 0.45, (0.98, 0.78, 0.35)
+INK = (0.08, 0.08, 0.10)
+
+
+def draw_cube(viewer: Viewer, area: Area) -> None:
+    """Over everything in the picture."""
+    view = viewer.state.view
+    if view is None or "cube" not in viewer.state.preferences.overlays:
+        return
+    side = min(hello_imgui.em_size(SIDE_EM), area.width, area.height)
+    corner = ImVec2(area.left + area.width - side, area.top)
+    imgui.push_style_var(imgui.StyleVar_.window_padding, ImVec2(0, 0))
+    imgui.set_next_window_pos(corner)
+    imgui.set_next_window_size(ImVec2(side, side))
+    imgui.begin("view cube", None, UNMOVED)
+    pressed = imgui.invisible_button("cube", ImVec2(side, side))
+    middle, scale = (corner.x + side / 2, corner.y + side / 2), EDGE * side
+    mouse, faces = imgui.get_io().mouse_pos, visible_faces(view)
+    place = ((mouse.x - middle[0]) / scale, (mouse.y - middle[1]) / scale)
+    under = face_at(faces, place) if imgui.is_item_hovered() else ""
+    _axes(view, middle, scale, behind=True)
+    for face in faces:
+        _face(face, middle, scale, face.name == under)
+    _axes(view, middle, scale, behind=False)
+    imgui.end()
+    imgui.pop_style_var()
+    if pressed and under:
+        settings.turn_to_face(viewer, under)
+
+
+def _face(face: Face, middle: tuple[float, float], scale: float, hovered: bool) -> None:
+    paint = imgui.get_window_draw_list()
+    corners: list[Any] = [_on_cube(corner, middle, scale) for corner in face.corners]  # of imgui's own union
+    grey = DARK + (LIT - DARK) * face.towards
+    paint.add_convex_poly_filled(corners, _faded(HOVERED_FACE if hovered else (grey, grey, grey), 0.92))
+    paint.add_polyline(corners, _faded(INK, 0.7), 1.0, imgui.ImDrawFlags_.closed)
+    if face.towards > 0.45:
+        size, centre = imgui.calc_text_size(face.name), _on_cube(face.centre, middle, scale)
+        paint.add_text(ImVec2(centre.x - size.x / 2, centre.y - size.y / 2), _faded(INK, 1.0), face.name)
+
+
+def _axes(view: OrbitCamera, middle: tuple[float, float], scale: float, *, behind: bool) -> None:
+    """The world's own axes, from the middle of the cube; those that point away lie behind it."""
+    paint = imgui.get_window_draw_list()
+    for (name, colour), axis in zip(AXES, world_axes(view), strict=True):
+        if (axis[2] > 0) == behind:
+            start, end = (
+                _on_cube(reach * axis[:2], middle, scale) for reach in (0.0 if behind else 1.0, AXIS)
+            )
+            paint.add_line(start, end, _faded(colour, 1.0), 2.0)
+            paint.add_text(ImVec2(end.x + 2, end.y - 8), _faded(colour, 1.0), name)
+
+
+def _on_cube(place: Array, middle: tuple[float, float], scale: float) -> ImVec2:
+    return ImVec2(middle[0] + scale * float(place[0]), middle[1] + scale * float(place[1]))
+
+
+def _faded(colour: tuple[float, float, float], alpha: float) -> int:
+    return int(imgui.get_color_u32((*colour, alpha)))

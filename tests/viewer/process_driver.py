@@ -1,0 +1,240 @@
+"""Opens the real window as the program does, without the test engine, and measures it.
+
+    python -m tests.viewer.process_driver [--scene SCENE.ply] [--count 500000] [--seconds 10]
+                                          [--size 1280 800] [--at-once] [--slow]
+    python -m tests.viewer.process_driver --idle SCENE.ply | --leave SCENE.ply
+
+By default the camera orbits. Prints JSON: pictures per second while it moves, seconds from the last move to
+the full picture, the longest that a frame kept the window's thread in either, and the processor time of both,
+which other work on the machine changes little. --at-once: full pictures are rasterized in the window's own
+thread. --idle: prints frames and the share of a core while nothing happens. --leave: closes the window while
+a scene is being read for a minute. Needs a display (xvfb-run).
+"""
+
+import argparse
+import json
+import statistics
+import threading
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import psutil
+from imgui_bundle import immapp
+from imgui_bundle.glfw_utils import glfw_window_hello_imgui
+
+import glfw  # isort: skip
+from langsplat_core.bench.query import repeated
+from langsplat_core.io.scenes import load_scene
+from langsplat_core.scene import Scene
+from langsplat_viewer import canvas
+from langsplat_viewer.actions import viewpoint
+from langsplat_viewer.camera.controls import orbit
+from langsplat_viewer.rendering.renderer import GlRenderer
+from langsplat_viewer.viewer import Services
+from langsplat_viewer.window import Window, WindowRequest, open_window
+from tests.support.fakes import FakeEncoder
+
+DEMO = Path(__file__).parents[2] / "assets" / "demo" / "scene.ply"
+STEP = 0.02  # radians a picture
+ROUNDS = 3  # of moving and resting
+
+
+@dataclass
+class Orbiting:
+    """What was seen; times in seconds."""
+
+    gaussians: int = 0
+    backend: str = ""
+    pictures_per_second: list[float] = field(default_factory=list)
+    cpu_per_picture: list[float] = field(default_factory=list)  # of the whole process
+    picture: list[float] = field(default_factory=list)  # median of the canvas's own times
+    sizes: list[tuple[int, int]] = field(default_factory=list)  # of the last picture while moving
+    merged: list[bool] = field(default_factory=list)  # whether its Gaussians were
+    longest_moving: list[float] = field(default_factory=list)  # that a frame kept the window's thread
+    longest_resting: list[float] = field(default_factory=list)  # the same, until the full picture is there
+    sharp_after: list[float] = field(default_factory=list)
+    cpu_to_sharp: list[float] = field(default_factory=list)
+
+
+class AtOnce(GlRenderer):
+    """Leaves nothing to other threads."""
+
+    def ahead(self, *_: object) -> None:
+        return None
+
+
+class Rider:
+    """Moves the camera once a frame and keeps time."""
+
+    def __init__(self, window: Window, seconds: float) -> None:
+        self.window, self.seconds = window, seconds
+        self.seen = Orbiting()
+        self._process = psutil.Process()
+        self._moving_since: float | None = None
+        self._resting_since: float | None = None
+        self._started = self._waited = 0.0
+        self._pictures: list[float] = []
+        self._framed = self._longest = 0.0
+
+    def _cpu(self) -> float:
+        times = self._process.cpu_times()
+        return times.user + times.system
+
+    def frame(self) -> None:
+        viewer, now = self.window.viewer, time.monotonic()
+        self._framed = now
+        state = viewer.state
+        if state.scene is None or viewer.worker.current is not None or state.stats.width == 0:
+            self._waited = now
+        elif now - self._waited < self.seconds and not self._pictures:
+            return  # while the scene is merged
+        elif self._resting_since is not None:
+            self._rest(now)
+        elif self._moving_since is None:
+            self._moving_since, self._started, self._pictures = now, self._cpu(), [0.0]
+            self._longest, self.window.idles = 0.0, False
+            self._turn()
+        elif now - self._moving_since < self.seconds:
+            self._pictures.append(state.stats.milliseconds / 1e3)
+            self._turn()
+        else:
+            self._stop(now)
+
+    def framed(self) -> None:
+        """Panels and picture of a frame are drawn."""
+        self._longest = max(self._longest, time.monotonic() - self._framed)
+
+    def _turn(self) -> None:
+        viewpoint.move(self.window.viewer, lambda view: orbit(view, STEP, 0.0))
+
+    def _stop(self, now: float) -> None:
+        stats, count = self.window.viewer.state.stats, len(self._pictures)
+        assert self._moving_since is not None
+        self.seen.pictures_per_second.append(count / (now - self._moving_since))
+        self.seen.cpu_per_picture.append((self._cpu() - self._started) / count)
+        self.seen.picture.append(statistics.median(self._pictures))
+        self.seen.sizes.append((stats.width, stats.height))
+        self.seen.merged.append(stats.merged)
+        self.seen.longest_moving.append(self._longest)
+        self._resting_since, self._started, self._longest = now, self._cpu(), 0.0
+        self.window.idles = True
+
+    def _rest(self, now: float) -> None:
+        if self.window.viewer.state.stats.scale < 1 or self.window.unfinished:
+            return
+        assert self._resting_since is not None
+        self.seen.longest_resting.append(self._longest)
+        self.seen.sharp_after.append(now - self._resting_since)
+        self.seen.cpu_to_sharp.append(self._cpu() - self._started)
+        self._moving_since = self._resting_since = None
+        if len(self.seen.sharp_after) == ROUNDS:
+            glfw.set_window_should_close(glfw_window_hello_imgui(), True)
+
+
+def ride(
+    scene: Path,
+    count: int,
+    seconds: float,
+    size: tuple[int, int],
+    renderer: type[GlRenderer] = GlRenderer,
+) -> Orbiting:
+    def load(path: Path) -> Scene:
+        found = load_scene(path)
+        return repeated(found, count) if count else found
+
+    window = Window(
+        WindowRequest(scene, size=size), Services(load, lambda encoder_id: FakeEncoder()), renderer
+    )
+    window.idles = False
+    rider = Rider(window, seconds)
+    params = window.params()
+    gui, picture = params.callbacks.show_gui, params.callbacks.before_imgui_render
+
+    def ridden() -> None:
+        rider.frame()
+        gui()
+
+    def pictured() -> None:
+        picture()
+        rider.framed()
+
+    params.callbacks.show_gui, params.callbacks.before_imgui_render = ridden, pictured
+    params.fps_idling.vsync_to_monitor = False
+    immapp.run(params)
+    state = window.viewer.state
+    assert state.scene is not None
+    rider.seen.gaussians, rider.seen.backend = len(state.scene.gaussians), state.backend
+    return rider.seen
+
+
+SETTLE, MEASURE = 3.0, 8.0  # seconds
+
+
+def slow_load(path: Path):
+    time.sleep(60)
+    return load_scene(path)
+
+
+def close() -> None:
+    """As the cross in the window's corner does; from any thread."""
+    glfw.set_window_should_close(glfw_window_hello_imgui(), True)
+    glfw.post_empty_event()
+
+
+def idle(path: Path) -> None:
+    services = Services(load_scene, lambda encoder_id: FakeEncoder())
+    window = Window(WindowRequest(path, size=(860, 620)), services, lambda ctx: GlRenderer(ctx, "opengl"))
+    params = window.params()
+    frames, gui = [], params.callbacks.show_gui
+
+    def counted() -> None:
+        frames.append(time.monotonic())
+        gui()
+
+    def measure() -> None:
+        while window.viewer.state.scene is None or window.viewer.worker.current is not None:
+            time.sleep(0.05)
+        time.sleep(SETTLE)
+        process = psutil.Process()
+        before, count = process.cpu_times(), len(frames)
+        time.sleep(MEASURE)
+        after = process.cpu_times()
+        used = after.user + after.system - before.user - before.system
+        print(f"frames {len(frames) - count} share {used / MEASURE:.4f}", flush=True)
+        close()
+
+    params.callbacks.show_gui = counted
+    threading.Thread(target=measure, daemon=True).start()
+    immapp.run(params)
+
+
+def leave(path: Path) -> None:
+    def wait() -> None:
+        time.sleep(3)
+        close()
+
+    threading.Thread(target=wait, daemon=True).start()
+    open_window(WindowRequest(path, size=(860, 620)), Services(slow_load, lambda encoder_id: FakeEncoder()))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--idle", type=Path, help="a scene; in place of orbiting")
+    parser.add_argument("--leave", type=Path, help="a scene; in place of orbiting")
+    parser.add_argument("--scene", type=Path, default=DEMO)
+    parser.add_argument("--count", type=int, default=500_000, help="Gaussians; 0: as the file has")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of moving, three times")
+    parser.add_argument("--size", type=int, nargs=2, default=(1280, 800))
+    parser.add_argument("--at-once", action="store_true", help="full pictures in the window's thread")
+    parser.add_argument("--slow", action="store_true", help="as if the machine were slow")
+    asked = parser.parse_args()
+    if asked.slow:
+        canvas.MOVING_BUDGET = 0.0
+    if asked.idle:
+        idle(asked.idle)
+    elif asked.leave:
+        leave(asked.leave)
+    else:
+        renderer = AtOnce if asked.at_once else GlRenderer
+        print(json.dumps(asdict(ride(asked.scene, asked.count, asked.seconds, tuple(asked.size), renderer))))

@@ -1,0 +1,324 @@
+"""Scenarios of `window_driver` in the panels: files, training, layout, recording, bookmarks."""
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from imgui_bundle import imgui  # isort: skip
+from langsplat_core.io.scenes import save_scene
+from langsplat_core.pipeline.report import REPORT
+from langsplat_viewer import viewer as training
+from langsplat_viewer.actions import filming, opening, settings, viewpoint
+from langsplat_viewer.files.flights import read_flight
+from langsplat_viewer.panels.layout import PANELS
+from langsplat_viewer.panels.style import scene_area
+from tests.support.fakes import CENTRES, blob_scene
+
+
+def reload_what_changed(s: Any) -> None:
+    """A bar appears by itself, its button reads the file again, camera and queries stay."""
+    s.search("mug")
+    s.drag((600, 300), (656, 279))
+    s.settle()
+    view, before = s.state.view, s.state.scene
+    assert not s.ctx.item_exists("//changed/Reload")
+    scene = replace(blob_scene(), path=None)
+    save_scene(s.state.path, replace(scene, gaussians=replace(scene.gaussians, sh=-scene.gaussians.sh)))
+    s.wait(lambda: s.window.viewer.watch.changed)
+    s.ctx.yield_(3)
+    s.shot("changed")
+    s.ctx.item_click("//changed/Reload")
+    s.wait(lambda: s.state.scene is not before)
+    s.settle()
+    assert s.state.view is view
+    assert s.state.queries[0].result.found
+    assert not s.ctx.item_exists("//changed/Reload")
+    hot = s.at(s.shot("reloaded"), CENTRES[0])
+    assert hot[0] > hot[2] + 60
+
+
+def fade_in_a_photograph(s: Any) -> None:
+    """The slider lays it over the picture where the camera saw it; elsewhere there is none."""
+    viewer, folder = s.window.viewer, s.folder / "elsewhere"
+    folder.mkdir()
+    colours = np.full((240, 320, 3), (250, 120, 10), np.uint8)
+    colours[:, 160:] = (20, 60, 240)
+    Image.fromarray(colours).save(folder / "photo_1.png")
+    settings.open_panel(viewer, "Camera")
+    viewpoint.go_to_camera(viewer, 1)
+    s.settle()
+    plain = s.shot("plain")
+    opening.fade_photograph(viewer, 1.0)
+    s.settle()
+    s.ctx.yield_(3)
+    assert "no photograph 'photo_1'" in s.state.photograph.reason
+    assert (s.shot("none")[100:500, 400:] == plain[100:500, 400:]).all()
+    s.ctx.item_click("//Camera/Folder of photographs ...")
+    s.ctx.yield_(4)
+    s.ctx.item_click("//**/elsewhere\\/")
+    s.ctx.yield_(4)
+    s.shot("browser")
+    s.ctx.item_click("//**/Take this folder")
+    s.wait(lambda: s.state.photograph.image is not None)
+    s.settle()
+    assert list(s.state.preferences.photographs.values()) == [str(folder.absolute())]
+    area, shot = scene_area(), s.shot("photograph")
+    middle, left = int(area.top + area.height / 2), int(area.left)
+    quarter = int(area.width / 4)
+    np.testing.assert_allclose(shot[middle, left + quarter], (250, 120, 10), atol=3)
+    np.testing.assert_allclose(shot[middle, left + 3 * quarter], (20, 60, 240), atol=3)
+    assert (shot[int(area.top) + 30, left + quarter] == plain[int(area.top) + 30, left + quarter]).all()
+    opening.fade_photograph(viewer, 0.5)
+    s.ctx.yield_(3)
+    half = s.shot("half")
+    place = middle, left + quarter
+    np.testing.assert_allclose(half[place], (shot[place] + plain[place]) / 2, atol=4)
+    s.drag((600, 300), (656, 279))
+    s.settle()
+    assert opening.photograph_here(s.state) is None
+
+
+def switch_between_scenes(s: Any) -> None:
+    """Dropped together; the list in the panel shows one after the other, as it was left."""
+    s.window.drop([str(s.folder / name) for name in ("blobs.ply", "plain.ply")])
+    s.ctx.yield_(2)
+    s.settle()
+    assert [path.name for path in s.state.scenes] == ["blobs.ply", "plain.ply"]
+    s.drag((600, 300), (656, 279))
+    s.settle()
+    view = s.state.view
+    s.shot("listed")
+    s.ctx.item_click("//**/plain.ply##scene")
+    s.wait(lambda: s.state.path.name == "plain.ply")
+    s.settle()
+    assert s.state.view is not view
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.page_up)
+    s.wait(lambda: s.state.path.name == "blobs.ply")
+    s.settle()
+    assert s.state.view is view
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.o)
+    s.ctx.yield_(4)
+    s.shot("all of them")
+    s.ctx.item_click("//**/Open all scenes here")
+    s.ctx.yield_(3)
+    s.settle()
+    assert s.state.path.name == "blobs.ply"
+
+
+TRAINS = """
+import json, sys, time
+for step in range(60):
+    report = {"stage": "training Gaussians", "fraction": step / 60, "note": f"{300 + step} Gaussians"}
+    report["metrics"] = {"loss": 0.04 + 0.2 / (1 + step)}
+    print(json.dumps(report), file=sys.stderr, flush=True)
+time.sleep(60)
+"""
+
+
+def watch_a_training(s: Any) -> None:
+    """The panel plots what the process says of its loss."""
+    viewer, photographs = s.window.viewer, s.folder / "photos"
+    photographs.mkdir()
+    for number in range(3):
+        (photographs / f"{number}.jpg").write_bytes(b"")
+    training.command = lambda request: [sys.executable, "-c", TRAINS]
+    opening.choose_photographs(viewer, photographs)
+    settings.open_panel(viewer, "Train")
+    s.ctx.yield_(3)
+    s.ctx.item_click("//Train/Train")
+    s.wait(lambda: viewer.training is not None and len(viewer.training.progress.losses) > 50)
+    s.ctx.yield_(3)
+    before = s.shot("loss")
+    plot = s.ctx.item_info("//Train/##loss").rect_full
+    inside = before[int(plot.min.y) : int(plot.max.y), int(plot.min.x) : int(plot.max.x)]
+    assert inside.max() - inside.min() > 60
+    s.ctx.item_click("//Train/Stop")
+    s.wait(lambda: viewer.training is None)
+    assert "training stopped" in s.state.messages[-1].text
+
+
+DOUBTS = [
+    "held-out photographs are reproduced at 11.3 dB, below 16: cameras may be wrong, or photographs too few; "
+    "take more that overlap, or give COLMAP's cameras",
+    "only 31 % of the held-out pictures' pixels show anything: photograph what is there from more sides, or "
+    "train for more steps",
+]
+
+
+def read_what_speaks_against(s: Any) -> None:
+    """A training that ends with doubts: the panels Train and Scene have them, for that scene alone."""
+    viewer, photographs = s.window.viewer, s.folder / "photos"
+    photographs.mkdir()
+    (photographs / "0.jpg").write_bytes(b"")
+    save_scene(s.folder / "photos.ply", replace(blob_scene(), path=None))
+    report = s.folder / "photos.work" / REPORT
+    report.parent.mkdir()
+    report.write_text(json.dumps({"gaussians": len(s.state.scene.gaussians), "doubts": DOUBTS}))
+    training.command = lambda request: [sys.executable, "-c", "print('photos.ply: 360 Gaussians')"]
+    opening.choose_photographs(viewer, photographs)
+    settings.open_panel(viewer, "Train")
+    s.ctx.yield_(3)
+    before = s.shot("before")
+    s.ctx.item_click("//Train/Train")
+    s.wait(lambda: s.state.path.name == "photos.ply")
+    s.settle()
+    s.ctx.yield_(3)
+    after = s.shot("doubts")
+    assert s.state.doubts == tuple(DOUBTS)
+    below = s.ctx.item_info("//Train/Train").rect_full
+    here = (
+        slice(int(below.max.y) + 30, int(below.max.y) + 200),
+        slice(int(below.min.x), int(below.min.x) + 200),
+    )
+    reddish = (after[here].astype(int)[..., 0] - after[here][..., 2] > 40).sum()
+    assert reddish > 200 > (before[here].astype(int)[..., 0] - before[here][..., 2] > 40).sum()
+    opening.switch_scene(viewer, s.folder / "blobs.ply")
+    s.wait(lambda: s.state.path.name == "blobs.ply")
+    s.settle()
+    assert s.state.doubts == ()
+
+
+def digit_key(digit: int) -> imgui.Key:
+    return imgui.Key[f"_{digit}"]
+
+
+Scenario = tuple[Callable[[Any], None], str, dict[str, Any]]
+FILES: dict[str, Scenario] = {
+    "reload_what_changed": (reload_what_changed, "blobs.ply", {}),
+    "fade_in_a_photograph": (fade_in_a_photograph, "blobs.ply", {}),
+    "switch_between_scenes": (switch_between_scenes, "blobs.ply", {}),
+    "watch_a_training": (watch_a_training, "blobs.ply", {}),
+    "read_what_speaks_against": (read_what_speaks_against, "blobs.ply", {}),
+}
+
+
+# Scenarios of `window_driver` about where things lie: large letters, long words.
+
+LONG = "mugg or boook or plent or mugg or boook or plent or mugg or boook or plent or mugg"
+
+
+def large_letters(s: Any) -> None:
+    """At twice the size, in a small window: the column grows, and no widget of any panel is cut off."""
+    for phrase in ("mug or plant", LONG):
+        s.search(phrase)
+    assert s.state.queries[-1].meant  # a long one, and so is the button for it
+    narrow = scene_area().left
+    settings.set_ui_scale(s.window.viewer, 2.0)
+    s.settle()
+    assert 1.3 * narrow < scene_area().left <= 0.41 * 1280
+    for panel in PANELS:
+        settings.open_panel(s.window.viewer, panel.title)
+        s.settle()
+        assert seen_items(s, panel.title), panel.title
+        assert cut_off(s, panel.title) == [], panel.title
+    settings.show_help(s.window.viewer, True)
+    s.settle()
+    keys = s.ctx.window_info("//Keys").window
+    assert 0 <= keys.pos.x <= keys.pos.x + keys.size.x <= 1280
+    assert 0 <= keys.pos.y <= keys.pos.y + keys.size.y <= 720
+    s.shot("large letters")
+    settings.escape(s.window.viewer)
+    settings.set_ui_scale(s.window.viewer, 1.0)
+    s.settle()
+    assert abs(scene_area().left - narrow) < 0.15 * narrow
+
+
+def seen_items(s: Any, title: str) -> list[Any]:
+    """The widgets of a panel."""
+    found = imgui.test_engine.TestItemList()
+    s.ctx.gather_items(found, f"//{title}")
+    return [found.get_by_index(place) for place in range(found.get_size())]
+
+
+def cut_off(s: Any, title: str) -> list[tuple[float, float]]:
+    """Right ends of the widgets that reach beyond their window, and where that ends."""
+    ends = [(item.rect_full.max.x, item.window.inner_rect.max.x) for item in seen_items(s, title)]
+    return [(right, end) for right, end in ends if right > end + 1]
+
+
+LAYOUT: dict[str, tuple[Callable[[Any], None], str, dict[str, Any]]] = {
+    "large_letters": (large_letters, "blobs.ply", {"size": (1280, 720)}),
+}
+
+
+# Scenarios of `window_driver`: the panel "Record", bookmarks, sides.
+
+
+def record_and_play(s) -> None:
+    """Keyframes by a key, played in the window, saved as a path and as a film."""
+    record = s.state.record
+    settings.open_panel(s.window.viewer, "Record")
+    s.ctx.yield_(4)
+    for end in ((656, 300), (700, 320)):
+        s.ctx.key_press(imgui.Key.k)
+        s.drag((600, 300), end)
+        s.settle()
+    s.ctx.item_click("//**/Add keyframe")
+    s.ctx.yield_(2)
+    assert [key.seconds for key in record.keyframes] == [0, 2, 4]
+    last = s.state.view
+    s.ctx.item_click("//**/Clear")
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
+    s.ctx.yield_(2)
+    assert len(record.keyframes) == 3
+
+    filming.set_path_seconds(s.window.viewer, 1.0)
+    start = s.shot("start")
+    s.ctx.item_click("//**/Play##path")
+    s.wait(lambda: 0.2 < record.at < 1.0)
+    moving = s.state.view
+    s.wait(lambda: record.began is None)
+    assert record.at == 1.0
+    np.testing.assert_allclose(s.state.view.eye, last.eye, atol=1e-6)
+    assert np.abs(moving.eye - last.eye).max() > 1e-3
+    s.ctx.key_press(imgui.Key.mod_shift | imgui.Key.k)  # from the start again
+    s.wait(lambda: 0 < record.at < 0.9)
+    s.drag((600, 300), (620, 310))  # the hand is stronger
+    s.settle()
+    assert record.began is None
+    assert np.abs(s.shot("elsewhere") - start)[100:500, 400:].max() > 30
+
+    s.ctx.item_click("//**/Save path")
+    s.ctx.yield_(2)
+    assert len(read_flight(s.folder / "blobs-001.path.json").keyframes) == 3
+    filming.set_film_size(s.window.viewer, 32, 24)
+    filming.set_film_fps(s.window.viewer, 4.0)
+    filming.type_film(s.window.viewer, "film")
+    s.ctx.item_click("//Record/Save film")
+    s.wait(lambda: s.window.viewer.recorder.current is None)
+    s.ctx.yield_(3)
+    assert len(list((s.folder / "film").glob("frame-*.png"))) == 5
+
+
+def mark_and_return(s) -> None:
+    """A bookmark by its key, the sides by theirs, the command on the clipboard."""
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.b)
+    s.ctx.yield_(2)
+    start = s.state.view
+    s.ctx.key_press(imgui.Key.keypad7)
+    s.settle()
+    np.testing.assert_allclose(s.state.view.rotation[2], -start.up, atol=1e-6)
+    settings.open_panel(s.window.viewer, "Bookmarks")
+    s.ctx.yield_(4)
+    s.ctx.item_click("//**/view 1##bookmark")
+    s.settle()
+    np.testing.assert_allclose(s.state.view.rotation, start.rotation, atol=1e-6)
+    s.ctx.item_click("//**/##bookmark")
+    s.ctx.key_chars_append_enter("by the key of k")
+    s.ctx.yield_(2)
+    assert [mark.name for mark in s.state.bookmarks] == ["view 1", "by the key of k"]
+    assert s.state.record.keyframes == ()
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.c)
+    s.ctx.yield_(3)
+    assert imgui.get_clipboard_text().startswith("langsplat-viewer ")
+
+
+RECORD = {
+    "record_and_play": (record_and_play, "blobs.ply", {}),
+    "mark_and_return": (mark_and_return, "blobs.ply", {}),
+}

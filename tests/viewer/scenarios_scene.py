@@ -1,0 +1,474 @@
+"""Scenarios of `window_driver` over the scene: several panes, overlays, measuring, selecting."""
+
+from collections.abc import Callable
+from itertools import combinations
+from threading import Event, current_thread
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from imgui_bundle import hello_imgui, imgui  # isort: skip
+from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
+import glfw  # isort: skip
+from langsplat_core.io.scenes import load_scene
+from langsplat_viewer import canvas
+from langsplat_viewer.actions import queries, selecting, settings, viewpoint
+from langsplat_viewer.camera.overlays import Label, visible_faces
+from langsplat_viewer.panels import overlays
+from langsplat_viewer.panels.overlays import EDGE
+from langsplat_viewer.panels.style import Area, scene_area
+from langsplat_viewer.rendering.renderer import ArrayChannels
+from langsplat_viewer.rendering.request import TINT
+from tests.support.fakes import CENTRES
+from tests.support.selected import marked
+
+MUG, BOOK, PLANT = CENTRES
+
+
+def split_the_view(s: Any) -> None:
+    """The line is dragged without the camera; nothing is drawn for it, and nothing at rest."""
+    rgb = s.shot("rgb")
+    s.ctx.key_press(imgui.Key.v)
+    s.settle()
+    assert s.state.settings.split.mode == "wipe"
+    both, area, before = s.shot("both"), scene_area(), s.state.view
+    np.testing.assert_allclose(s.at(both, MUG), s.at(rgb, MUG), atol=2)
+    assert np.abs(s.at(both, PLANT) - s.at(rgb, PLANT)).max() > 40  # depth
+
+    middle, y = area.left + area.width / 2, area.top + 0.8 * area.height
+    drawn = s.renderer.count
+    s.drag((middle, y), (area.left + 0.9 * area.width, y))
+    s.settle()
+    assert abs(s.state.settings.split.at - 0.9) < 0.02
+    assert s.state.view is before
+    assert s.renderer.count == drawn
+    np.testing.assert_allclose(s.at(s.shot("wiped"), PLANT), s.at(rgb, PLANT), atol=2)
+
+    s.drag((middle, y), (middle + 40, y))  # beside the line the camera turns as ever
+    s.settle()
+    assert s.state.view is not before
+    s.menu("View", "Three levels side by side")
+    s.settle()
+    levels = s.shot("levels")
+    assert s.renderer.count > drawn
+    thirds = [levels[250:400, int(area.left + (i + 0.5) * area.width / 3)] for i in range(3)]
+    assert np.abs(thirds[0] - thirds[2]).max() > 30
+    drawn = s.renderer.count
+    s.ctx.yield_(20)
+    assert s.renderer.count == drawn
+
+
+def on_screen(s: Any, point: np.ndarray) -> tuple[float, float]:
+    """Where a world point is in the window."""
+    area = scene_area()
+    pixels, _ = s.state.view.camera(*s.state.size).project(point[None])
+    return float(pixels[0, 0] + area.left), float(pixels[0, 1] + area.top)
+
+
+def click(s: Any, place: tuple[float, float]) -> None:
+    s.ctx.mouse_teleport_to_pos(place)
+    s.ctx.yield_(2)
+    s.ctx.mouse_click(0)
+    s.ctx.yield_(2)
+
+
+def draw_over_the_scene(s: Any) -> None:
+    """The cube turns the view, a click on a camera stands there, two clicks measure."""
+    s.menu("View", "Show or hide the view cube")
+    s.menu("View", "Show or hide the training cameras")
+    s.settle()
+    area = scene_area()
+    before = s.state.view
+    side = s.ctx.item_info("//view cube/cube").rect_full
+    assert side.max.x <= area.left + area.width + 1
+    name, place = next(face for face in faces_on_screen(s, side) if face[0] == "front")
+    click(s, place)
+    s.settle()
+    assert s.state.view is not before
+    assert [face[0] for face in faces_on_screen(s, side)] == [name]
+
+    for _ in range(8):  # until all cameras are in the picture
+        s.ctx.mouse_teleport_to_pos((area.left + area.width / 2, area.top + area.height / 2))
+        s.ctx.mouse_wheel_y(-1)
+        s.ctx.yield_(2)
+    s.settle()
+    camera = s.state.scene.cameras[2]
+    seen = s.shot("cameras")
+    s.menu("View", "Show or hide the training cameras")
+    s.settle()
+    assert np.abs(seen - s.shot("none"))[:, int(area.left) :].max() > 60
+    s.menu("View", "Show or hide the training cameras")
+    click(s, on_screen(s, camera.position))
+    s.settle()
+    assert s.state.camera_index == 2
+    got = s.state.view.camera(160, 120).world_to_camera
+    np.testing.assert_allclose(got, camera.world_to_camera, atol=1e-9)
+
+    s.ctx.key_press(imgui.Key.m)
+    s.ctx.yield_(2)
+    turned = s.state.view
+    for thing in (MUG, BOOK):
+        click(s, on_screen(s, thing))
+    assert s.state.view is turned
+    assert abs(s.state.ruler.length - np.linalg.norm(MUG - BOOK)) < 0.2
+    s.shot("ruler")
+    drawn = s.renderer.count
+    s.ctx.yield_(20)
+    assert s.renderer.count == drawn
+    s.ctx.key_press(imgui.Key.escape)
+    s.ctx.yield_(2)
+    assert not s.state.ruler.measures
+
+
+def cut_by_depth(s: Any) -> None:
+    """The sliders of the panel leave out what is nearer or farther; undone at their ends."""
+    settings.open_panel(s.window.viewer, "Camera")
+    s.ctx.yield_(3)
+    viewpoint.look_from(s.window.viewer, "left")
+    s.settle()
+    before = s.shot("whole")
+    depths = [float((thing - s.state.view.eye) @ s.state.view.rotation[2]) for thing in CENTRES]
+    s.ctx.item_input_value("//Camera/Near cut", max(min(depths), 0.1) + 0.6)
+    s.settle()
+    assert s.state.settings.clip.near > 0.5
+    cut = s.shot("cut")
+    assert np.abs(cut - before)[100:, 400:].max() > 60
+    s.ctx.item_input_value("//Camera/Near cut", 0.0)
+    s.settle()
+    assert s.state.settings.clip.near == 0
+    assert np.abs(s.shot("whole again") - before)[100:400, 400:].max() < 3
+
+
+def time_and_compare(s: Any) -> None:
+    """The panel tells medians while it is seen, and the error of what is shown."""
+    settings.open_panel(s.window.viewer, "Timing")
+    s.ctx.yield_(3)
+    for key in (imgui.Key["_2"], imgui.Key["_1"]):
+        s.ctx.key_press(key)
+        s.settle()
+    queries.ask(s.window.viewer, "mug")
+    s.settle()
+    told = dict(s.state.timing.medians())
+    assert {"Blend", "Picture, all of it", "Panels", "Search"} <= set(told)
+    s.ctx.item_click("//Timing/Compare with the reference")
+    s.wait(lambda: s.state.timing.comparison is not None)
+    assert s.state.timing.comparison.psnr > 40
+    s.shot("timing")
+    count = len(s.state.timing.laps["panels"])
+    assert count > 2
+    s.menu("Window", "Timing")
+    s.ctx.yield_(3)
+    drawn = len(s.state.timing.laps["blend"])
+    s.ctx.key_press(imgui.Key["_2"])
+    s.settle()
+    assert len(s.state.timing.laps["blend"]) == drawn
+
+
+def faces_on_screen(s: Any, side: Any) -> list[tuple[str, tuple[float, float]]]:
+    """Name and middle of each face of the cube that is seen, in the window."""
+    middle, scale = (
+        ((side.min.x + side.max.x) / 2, (side.min.y + side.max.y) / 2),
+        EDGE * (side.max.x - side.min.x),
+    )
+    return [
+        (face.name, (middle[0] + scale * face.centre[0], middle[1] + scale * face.centre[1]))
+        for face in visible_faces(s.state.view)
+    ]
+
+
+def rasterize_elsewhere(s: Any) -> None:
+    """While a thread rasterizes the fine picture the window shows a coarse one and works; what goes wrong
+    there is said once."""
+    gate, problems, rasterize = Event(), [], ArrayChannels.render
+
+    def gated(self: ArrayChannels, *arguments: Any) -> Any:
+        if current_thread().name == "langsplat-worker":
+            assert gate.wait(60)
+            if problems:
+                raise problems[0]
+        return rasterize(self, *arguments)
+
+    ArrayChannels.render = gated
+    canvas.MOVING_BUDGET = 0.0  # everything is slow
+    s.drag((600, 300), (656, 279))
+    s.wait(lambda: s.window.viewer.surface.waits)
+    assert s.state.stats.scale < 1
+    s.ctx.key_press(imgui.Key.f1)
+    s.ctx.yield_(3)
+    assert s.state.show_help
+    s.ctx.key_press(imgui.Key.f1)
+    s.ctx.yield_(3)
+    s.capture(s.folder / "coarse.png")
+    gate.set()
+    fine = s.shot("fine")
+    assert s.state.stats.scale == 1
+    coarse = np.asarray(Image.open(s.folder / "coarse.png").convert("RGB")).astype(int)
+    for thing in CENTRES:
+        np.testing.assert_allclose(s.at(coarse, thing), s.at(fine, thing), atol=25)
+
+    problems.append(FloatingPointError("out of range"))
+    s.drag((656, 279), (600, 300))
+    s.settle()
+    s.ctx.yield_(20)
+    said = [message.text for message in s.state.messages if message.is_error]
+    assert said == ["internal error: FloatingPointError: out of range"], said
+    problems.clear()
+    s.drag((600, 300), (656, 279))
+    s.settle()
+    assert s.state.stats.scale == 1
+
+
+Scenario = tuple[Callable[[Any], None], str, dict[str, Any]]
+
+
+def measure_and_select(s: Any) -> None:
+    """From the mug to the book, then the book by a lasso."""
+    s.ctx.key_press(imgui.Key.m)
+    s.ctx.yield_(2)
+    for thing in (MUG, BOOK):
+        click(s, on_screen(s, thing))
+    assert abs(s.state.ruler.length - np.linalg.norm(MUG - BOOK)) < 0.2
+    s.ctx.key_press(imgui.Key.escape)
+    s.ctx.yield_(2)
+
+    selecting.use_tool(s.window.viewer, "lasso")
+    middle = np.array(on_screen(s, BOOK))
+    reach = 0.45 * (on_screen(s, PLANT)[0] - middle[0])
+    turns = np.linspace(0, 2 * np.pi, 16)
+    places = middle + reach * np.stack([np.cos(turns), np.sin(turns)], 1)
+    s.ctx.mouse_teleport_to_pos(tuple(places[0]))
+    s.ctx.mouse_down(0)
+    for x, y in places:
+        s.ctx.mouse_teleport_to_pos((x, y))
+        s.ctx.yield_()
+    s.ctx.mouse_up(0)
+    s.ctx.yield_(2)
+    selected = s.state.selection.marks.selected.reshape(3, -1).sum(1)
+    assert selected[0] == selected[2] == 0
+    assert selected[1] > 40
+    s.shot("selected")
+    selecting.use_tool(s.window.viewer, None)
+
+
+def look_without_perspective(s: Any) -> None:
+    """A key takes perspective away until it is pressed again; axes, wheel, tools and the click on a camera
+    work as ever, and the picture says what it is."""
+    deep, view = s.shot("deep"), s.state.view
+    s.ctx.key_press(imgui.Key.o)
+    s.settle()
+    assert s.state.view.orthographic
+    flat, area = s.shot("flat"), scene_area()
+    for thing in CENTRES:
+        assert s.at(flat, thing).argmax() == s.at(deep, thing).argmax()
+    corner = (slice(int(area.top + area.height) - 40, None), slice(int(area.left), int(area.left) + 200))
+    assert (flat[corner].min(-1) > 200).sum() > 100  # words
+    assert (deep[corner].min(-1) > 200).sum() == 0
+
+    s.ctx.key_press(imgui.Key.keypad1)
+    s.settle()
+    before = on_screen(s, PLANT)[0] - on_screen(s, MUG)[0]
+    s.ctx.mouse_teleport_to_pos((area.left + area.width / 2, area.top + area.height / 2))
+    s.ctx.mouse_wheel_y(-1)
+    s.ctx.yield_(2)
+    s.settle()
+    assert abs((on_screen(s, PLANT)[0] - on_screen(s, MUG)[0]) / before - 0.88) < 1e-3
+
+    measure_and_select(s)
+    s.menu("View", "Show or hide the training cameras")
+    s.ctx.key_press(imgui.Key.home)
+    s.settle()
+    assert s.state.view.orthographic
+    settings.open_panel(s.window.viewer, "Camera")
+    s.ctx.yield_(4)
+    s.ctx.item_click("//Camera/###orthographic")
+    s.settle()
+    np.testing.assert_allclose(
+        s.state.view.camera(160, 120).world_to_camera, view.camera(160, 120).world_to_camera, atol=1e-9
+    )
+    s.ctx.key_press(imgui.Key.keypad5)
+    s.ctx.yield_(2)
+    assert s.state.view.orthographic
+    viewpoint.zoom_by(s.window.viewer, 4.0)  # until all cameras are in the picture
+    s.settle()
+    s.shot("cameras")
+    click(s, on_screen(s, s.state.scene.cameras[2].position))
+    s.settle()
+    assert (s.state.camera_index, s.state.view.orthographic) == (2, False)
+
+
+def name_what_is_close(s: Any) -> None:
+    """Things in one line of sight have their names one above the other."""
+    settings.show_overlay(s.window.viewer, "things", True)
+    for word in ("mug", "book", "plant"):
+        s.search(word)
+    viewpoint.look_from(s.window.viewer, "left")
+    s.settle()
+    written, write = [], overlays.text_on_shade
+
+    def remembered(text: str, x: float, y: float, area: Area) -> None:
+        size = imgui.calc_text_size(text)
+        written.append((text, Label(x, y, size.x, size.y)))
+        write(text, x, y, area)
+
+    overlays.text_on_shade = remembered
+    s.ctx.yield_(2)
+    overlays.text_on_shade = write
+    frame = dict(written)
+    assert set(frame) == {"mug", "book", "plant"}
+    assert not any(a.covers(b) for a, b in combinations(frame.values(), 2))
+    assert written[:3] == written[3:6]  # from frame to frame the same
+    s.shot("names")
+
+
+SEEING: dict[str, Scenario] = {
+    "name_what_is_close": (name_what_is_close, "blobs.ply", {}),
+    "look_without_perspective": (look_without_perspective, "blobs.ply", {}),
+    "split_the_view": (split_the_view, "blobs.ply", {}),
+    "cut_by_depth": (cut_by_depth, "blobs.ply", {}),
+    "time_and_compare": (time_and_compare, "blobs.ply", {}),
+    "rasterize_elsewhere": (rasterize_elsewhere, "blobs.ply", {"backend": "cpu"}),
+    "draw_over_the_scene": (draw_over_the_scene, "blobs.ply", {}),
+}
+
+
+# Selecting in the real window; played by `window_driver`.
+
+
+def around(s: Any, centre: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Two corners around a blob, as it is seen now."""
+    x, y = on_screen(s, centre)
+    right, _ = on_screen(s, centre + 0.6 * s.state.view.rotation[0])
+    half = right - x
+    return (x - half, y - half), (x + half, y + half)
+
+
+def looks_selected(colour: np.ndarray) -> bool:
+    """Whether a colour of the picture, 0 to 255, has the tint."""
+    return bool(np.abs(colour - 255 * TINT).max() < 0.55 * 255 and colour[2] > colour[1] + 60)
+
+
+def press(s: Any, item: str) -> None:
+    s.ctx.item_click(item)
+    s.settle()
+
+
+def select_with_the_mouse(s: Any) -> None:
+    """A rectangle, keys and buttons; everything is undone; what is left is saved."""
+    s.ctx.key_press(imgui.Key.period)  # the camera in front: no blob hides another
+    s.settle()
+    plain = s.shot("plain")
+    s.menu("Window", "Select")
+    s.settle()
+    press(s, "//**/Rectangle##tool")
+    s.drag(*around(s, PLANT))
+    s.settle()
+    seen = s.state.selection.marks.selected
+    assert 10 < seen.sum() < 110  # the front of it
+    press(s, "//**/Only what is visible")
+    before = s.state.view
+    s.drag(*around(s, PLANT))
+    s.settle()
+    assert s.state.view is before  # the drag turned nothing
+    assert marked(s.window.viewer) == ("plant", "", "")
+    chosen = s.shot("chosen")
+    assert looks_selected(s.at(chosen, PLANT))
+    np.testing.assert_allclose(s.at(chosen, BOOK), s.at(plain, BOOK), atol=6)
+
+    s.ctx.key_down(imgui.Key.mod_shift)
+    s.drag(*around(s, BOOK))
+    s.ctx.yield_(2)
+    s.ctx.key_up(imgui.Key.mod_shift)
+    s.settle()
+    assert marked(s.window.viewer)[0] == "book plant"
+
+    hide_and_undo(s, plain)
+    save_the_rest(s)
+    s.ctx.key_press(imgui.Key.escape)
+    s.ctx.yield_(3)
+    assert s.state.selection.tool is None
+    s.drag((600, 300), (656, 279))
+    s.settle()
+    assert not np.array_equal(before.rotation, s.state.view.rotation)  # the drag turns again
+
+
+def hide_and_undo(s: Any, plain: np.ndarray) -> None:
+    s.ctx.key_press(imgui.Key.h)
+    s.settle()
+    assert marked(s.window.viewer) == ("", "book plant", "")
+    hidden = s.shot("hidden")
+    assert s.at(hidden, PLANT).max() < 30
+    assert s.at(plain, PLANT).max() > 90
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
+    s.settle()
+    assert marked(s.window.viewer) == ("book plant", "", "")
+
+
+def save_the_rest(s: Any) -> None:
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.i)
+    s.settle()
+    assert marked(s.window.viewer)[0] == "mug"
+    s.menu("Select", "Save the selection")
+    s.settle()
+    written = load_scene(s.folder / "blobs-selection-001.ply")
+    assert len(written.gaussians) == len(written.language) == s.state.selection.marks.selected.sum()
+
+
+def outline_and_rest(s: Any) -> None:
+    """An outline is drawn while the button is held, Esc gives it up, and nothing is drawn again at rest."""
+    s.menu("Select", "Select: lasso")
+    s.settle()
+    s.ctx.mouse_teleport_to_pos((500, 200))
+    s.ctx.mouse_down(0)
+    for place in ((700, 200), (700, 400), (520, 390)):
+        s.ctx.mouse_teleport_to_pos(place)
+        s.ctx.yield_(2)
+    assert len(s.state.selection.stroke.path) == 4
+    line = s.shot("lasso")[196:205, 600]
+    assert line.min(1).max() > 100  # a light line on black
+    s.ctx.key_press(imgui.Key.escape)
+    s.ctx.mouse_up(0)
+    s.settle()
+    assert (s.state.selection.stroke, s.state.selection.tool) == (None, "lasso")
+    assert marked(s.window.viewer)[0] == ""
+    drawn = s.renderer.count
+    s.ctx.yield_(20)
+    assert s.renderer.count == drawn
+
+
+def ask_before_leaving(s: Any) -> None:
+    """What was deleted and not saved is asked about before another scene opens or the window closes."""
+    s.search("mug")
+    s.menu("Select", "Select what the search found")
+    s.ctx.key_press(imgui.Key.delete)
+    s.settle()
+    assert marked(s.window.viewer) == ("", "", "mug")
+    s.window.drop([str(s.folder / "plain.ply")])
+    s.ctx.yield_(4)
+    s.shot("question")
+    press(s, "//**/Cancel")
+    assert s.state.path.name == "blobs.ply"
+
+    s.menu("File", "Quit")
+    assert not hello_imgui.get_runner_params().app_shall_exit
+    press(s, "//**/Cancel")
+    assert not s.state.selection.may_close
+    glfw.set_window_should_close(glfw_window_hello_imgui(), True)  # its cross was clicked
+    s.wait(lambda: s.state.selection.leaving is not None)
+    press(s, "//**/Cancel")
+    assert marked(s.window.viewer) == ("", "", "mug")
+
+    s.window.drop([str(s.folder / "plain.ply")])
+    s.ctx.yield_(4)
+    press(s, "//**/Not saved/Save")
+    s.wait(lambda: s.state.path.name == "plain.ply")
+    s.settle()
+    assert len(load_scene(s.folder / "blobs-edited-001.ply").gaussians) < 360
+    assert len(load_scene(s.folder / "blobs.ply").gaussians) == 360  # as it was
+
+
+SELECTING: dict[str, tuple[Any, str, dict[str, Any]]] = {
+    "select_with_the_mouse": (select_with_the_mouse, "blobs.ply", {}),
+    "outline_and_rest": (outline_and_rest, "blobs.ply", {}),
+    "ask_before_leaving": (ask_before_leaving, "blobs.ply", {}),
+}

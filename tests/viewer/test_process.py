@@ -1,0 +1,157 @@
+"""The window's process: idle, closing, orbiting, its memory, and a long day of 50 scenes and 1000 actions."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from langsplat_core.io.scenes import save_scene
+from langsplat_core.scene import Scene
+from tests.support.fakes import blob_scene
+from tests.support.measured import Measure
+from tests.support.on_display import play
+
+ROOT = Path(__file__).parents[2]
+DEMO = ROOT / "assets" / "demo" / "scene.ply"
+
+
+def run(display: str, folder: Path, *arguments: str) -> str:
+    """Return what `process_driver` prints."""
+    return play(display, ["-m", "tests.viewer.process_driver", *arguments], folder, 200)
+
+
+@pytest.fixture
+def blobs(tmp_path: Path) -> str:
+    save_scene(tmp_path / "blobs.ply", blob_scene())
+    return str(tmp_path / "blobs.ply")
+
+
+@pytest.mark.long
+def test_idle_no_frame_is_drawn_and_no_time_is_used(display, tmp_path, blobs):
+    words = run(display, tmp_path, "--idle", blobs).split()
+    assert int(words[1]) <= 2  # one in a hundred seconds, and a late one
+    assert float(words[3]) < 0.01
+
+
+@pytest.mark.long
+def test_closing_does_not_wait_for_what_is_being_read(display, tmp_path, blobs):
+    began = time.monotonic()
+    run(display, tmp_path, "--leave", blobs)
+    assert time.monotonic() - began < 45  # the reading takes 60
+
+
+@pytest.mark.long
+def test_pictures_are_coarse_while_moving_and_sharp_afterwards(display, tmp_path):
+    options = ["--scene", str(DEMO), "--count", "0", "--seconds", "2", "--size", "860", "620", "--slow"]
+    seen = json.loads(run(display, tmp_path, *options))
+    assert len(seen["sharp_after"]) == 3
+    assert all(rate > 0 for rate in seen["pictures_per_second"])
+    if seen["backend"] == "cpu":
+        assert all(width < 250 for width, _ in seen["sizes"])  # a quarter of what the panels leave
+        assert seen["merged"] == [True] * 3
+
+
+@pytest.mark.long
+def test_the_window_is_not_heavier_than_it_has_to_be():
+    heavy = ("torch", "transformers", "pycolmap", "open3d", "skimage", "matplotlib")
+    script = (
+        f"import sys, langsplat_viewer.window\nprint([name for name in {heavy!r} if name in sys.modules])"
+    )
+    paths = os.pathsep.join((str(ROOT), str(ROOT / "app")))
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env=os.environ | {"PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+HEAPS = """
+import ctypes, sys, threading
+from langsplat_viewer.jobs import share_one_heap
+if sys.argv[1] == "one":
+    share_one_heap()
+library = ctypes.CDLL(None)
+library.malloc.restype = ctypes.c_void_p
+together = threading.Barrier(4)
+def take():
+    together.wait(30)
+    library.malloc(1000)
+    together.wait(30)
+threads = [threading.Thread(target=take) for _ in range(4)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+library.malloc_info(0, ctypes.c_void_p.in_dll(library, "stdout"))
+library.fflush(None)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="of glibc")
+def test_threads_share_one_heap():
+    def heaps(how: str) -> int:
+        said = subprocess.run([sys.executable, "-c", HEAPS, how], capture_output=True, text=True, check=True)
+        return said.stdout.count("<heap nr=")
+
+    if heaps("many") == 1:
+        pytest.skip("this C library does not tell")
+    assert heaps("one") == 1
+
+
+COPIES = 40  # of each Gaussian: a scene that is kept is megabytes
+MOST_GROWTH = 80.0  # MB; forty scenes that are kept would be some 200
+# The scene as it was read, marked, drawn and merged; answers of seven phrases at their levels; pictures of
+# the three sizes that moving and resting take.
+MOST_ALIVE = {"Scene": 8, "QueryEngine": 1, "QueryResult": 60}
+MOST_HELD = MOST_ALIVE | {"texture": 30, "buffer": 8, "framebuffer": 20, "vertexarray": 8, "program": 16}
+
+
+def crowded(scene: Scene, copies: int) -> Scene:
+    """With `copies` small ones about each Gaussian."""
+    rng = np.random.default_rng(0)
+    many = scene.take(np.repeat(np.arange(len(scene.gaussians)), copies))
+    means = many.gaussians.means + rng.normal(scale=0.05, size=many.gaussians.means.shape)
+    scales = many.gaussians.log_scales - 0.5 * np.log(copies)
+    return replace(many, gaussians=replace(many.gaussians, means=means, log_scales=scales))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """With and without a language field, cameras and a phrasebook, of several sizes."""
+    scenes = {
+        "blobs": crowded(blob_scene(), COPIES),
+        "plain": crowded(blob_scene(field=False), COPIES),
+        "many": crowded(blob_scene(phrasebook=True), 2 * COPIES),
+        "bare": crowded(blob_scene(with_cameras=False), COPIES),
+        "few": blob_scene(),
+    }
+    for name, scene in scenes.items():
+        save_scene(tmp_path / f"{name}.ply", replace(scene, path=None))
+    return tmp_path
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="reads /proc and libGL.so")
+@pytest.mark.parametrize("backend", ["opengl", "cpu"])
+def test_fifty_scenes_and_a_thousand_actions(backend: str, display: str, folder: Path, measured: Measure):
+    arguments = ["-m", "tests.viewer.soak_driver", backend, str(folder)]
+    said = play(display, arguments, folder, timeout=3000).splitlines()
+    assert said[-1].endswith("PASSED"), "\n".join(said)[-4000:]
+    first, *later = [json.loads(line[line.index("{") :]) for line in said if '"scenes"' in line]
+    assert (later[-1]["scenes"], later[-1]["actions"]) == (50, 1000)
+    measured(f"soak, {backend}", "MB after 10 scenes and 200 actions", first["MB"])
+    measured(f"soak, {backend}", "MB after 50 scenes and 1000 actions", later[-1]["MB"])
+    # Forty scenes lie between, each with its answers megabytes.
+    assert later[-1]["MB"] - first["MB"] < MOST_GROWTH
+    for held in (first, *later):
+        for kind, most in MOST_HELD.items():
+            assert held[kind] <= most, (kind, held)

@@ -1,0 +1,512 @@
+"""Renderers: rasterizing and compositing, what is kept between requests, picking, missing drivers."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import INRIA, PictureConfig
+from langsplat_core.display.displays import COLOUR_MAPS, DISPLAYS, Channels, compose
+from langsplat_core.io.ply import write_ply
+from langsplat_core.io.scenes import load_scene
+from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.scene import Camera, Gaussians, Scene, look_at
+from langsplat_viewer.camera.controls import default_view, extent_of
+from langsplat_viewer.rendering.depth import depth_range, near_plane, why_nothing, why_undrawable
+from langsplat_viewer.rendering.renderer import (
+    ArrayChannels,
+    ArrayRenderer,
+    ArraySource,
+    GlRenderer,
+    GlSource,
+    LastView,
+    render_image,
+    suits_opengl,
+)
+from langsplat_viewer.rendering.request import RenderKey, RenderRequest, Split, plain_request
+from tests.support.answers import random_answer, random_scene
+from tests.support.fakes import blob_scene
+from tests.support.gl_context import gl_state
+from tests.support.scenes import random_camera, random_gaussians
+
+COUNT = 150
+SCENE = random_scene(COUNT)
+CAMERA = random_camera(1, distance=2.0)
+ANSWERS = (random_answer(COUNT, 2), random_answer(COUNT, 7, heat_range=(0.5, 0.6)), random_answer(COUNT, 11))
+PICTURE = PictureConfig(background=(0.2, 0.5, 0.9))
+
+
+def request_for(display: str = "rgb", queries: int = 2, **more) -> RenderRequest:
+    picture = replace(PICTURE, display=display)
+    return plain_request(SCENE, CAMERA, picture, answers=ANSWERS[:queries], **more)
+
+
+@pytest.fixture(params=["opengl", "cpu"])
+def renderer(gl, request):
+    made = GlRenderer(gl, request.param, "single")
+    yield made
+    made.release()
+
+
+def largest_difference(a: Array, b: Array) -> int:
+    return int(np.abs(a.astype(int) - b.astype(int)).max())
+
+
+# Compositing.
+
+
+def random_channels(seed: int, display: str, queries: int) -> Channels:
+    """Alpha from 0 to 1 with many pixels about the gate, colours beyond 1, depths beyond the range."""
+    rng = np.random.default_rng(seed)
+    alpha = np.clip(rng.normal(0.4, 0.35, size=(40, 50)), 0, 1).astype(np.float32)
+    count = {"latent": 3, "relevancy": queries, "segmentation": queries}.get(display, 1)
+    rgb = rng.uniform(size=(40, 50, 3)).astype(np.float32) * alpha[..., None] * 1.3
+    if DISPLAYS[display].channel is None:
+        return Channels(rgb, alpha)
+    low, high = (0.5, 4.0) if display == "depth" else (0.0, 1.0)
+    return Channels(rgb, alpha, rng.uniform(low, high, (40, 50, count)).astype(np.float32) * alpha[..., None])
+
+
+SHOWN = [(display, queries, {}) for display in DISPLAYS for queries in (1, 2, 3)]
+SHOWN += [(display, 1, {"transparent": True}) for display in DISPLAYS]
+SHOWN += [(display, 1, {"colour_map": name}) for display in ("relevancy", "depth") for name in COLOUR_MAPS]
+
+
+@pytest.mark.parametrize(("display", "queries", "more"), SHOWN)
+def test_the_shader_composes_as_numpy_does(gl, monkeypatch, display, queries, more):
+    """The channels as numbers, whatever the rasterizer."""
+    shown = random_channels(queries, display, queries)
+    monkeypatch.setattr(ArrayChannels, "render", lambda *_: [shown])
+    monkeypatch.setattr("langsplat_viewer.rendering.renderer.depth_range", lambda *_: (1.0, 3.0))
+    settings = {"heat_opacity": 0.8, "dim": 0.4, "threshold": 0.55, "alpha_gate": 0.25, **more}
+    request = request_for(display, queries)
+    request = replace(request, camera=CAMERA.resized(50, 40), width=50)
+    request = replace(request, picture=replace(request.picture, **settings))
+    renderer = GlRenderer(gl, "cpu")
+    got, expected = renderer.read(request), ArrayRenderer(load_rasterizer("cpu")).read(request)
+    renderer.release()
+    assert got.shape == expected.shape == (40, 50, 4 if more.get("transparent") else 3)
+    assert largest_difference(got, expected) <= 1
+
+
+@pytest.mark.parametrize("display", DISPLAYS)
+def test_the_image_is_that_of_the_reference(renderer, display):
+    """Either backend against float64 channels composed in NumPy. Pixels at a threshold or at a cut-off
+    of image formation may flip; all others agree to 2/255."""
+    request = request_for(display)
+    got = renderer.read(request)
+    assert got.shape == (CAMERA.height, CAMERA.width, 3)
+    expected = ArrayRenderer(ReferenceRasterizer()).read(request)
+    assert (np.abs(got.astype(int) - expected).max(-1) > 2).mean() <= 2e-3
+
+
+def test_the_reference_image_is_composed_of_float64_channels():
+    """Apart from the renderers: colours, depths and relevancies splatted one by one."""
+    from langsplat_core.raster.reference import colours
+
+    gaussians, request = SCENE.gaussians, request_for("relevancy")
+    view = ReferenceRasterizer().view(gaussians, CAMERA)
+    values = np.stack([answer.relevancy[2] for answer in ANSWERS[:2]], 1)
+    rgb = colours(gaussians.sh, gaussians.means, CAMERA.position)
+    image, alpha = view.splat(np.concatenate([rgb, values, view.footprints.depths[:, None]], 1))
+    ranges = {"relevancy": ((0.5, 0.9), (0.5, 0.6)), "depth": (depth_range(gaussians, CAMERA),)}
+    for display, extra in (("relevancy", image[..., 3:5]), ("depth", image[..., 5:])):
+        picture = replace(PICTURE, display=display, own_colours=True)
+        expected = compose(Channels(image[..., :3], alpha, extra), picture, ranges[display])
+        request = replace(request, picture=replace(PICTURE, display=display))
+        got = ArrayRenderer(ReferenceRasterizer()).read(request)
+        assert (np.abs(got.astype(int) - expected).max(-1) > 1).mean() <= 2e-3
+
+
+@pytest.mark.parametrize("display", DISPLAYS)
+def test_images_with_and_without_a_graphics_device_agree(gl, display):
+    with_gl, without = (render_image(request_for(display), backend) for backend in ("opengl", "cpu"))
+    difference = np.abs(with_gl.astype(int) - without).max(-1)
+    assert np.quantile(difference, 0.95) <= 4  # half floats, and heat colours that magnify them
+    if display == "rgb":
+        assert difference.max() <= 3
+
+
+def test_a_missing_channel_shows_the_plain_colours(renderer):
+    plain = renderer.read(plain_request(replace(SCENE, language=None), CAMERA, PICTURE))
+    for display in (row.name for row in DISPLAYS.values() if row.needs_field):
+        picture = replace(PICTURE, display=display)
+        request = plain_request(replace(SCENE, language=None), CAMERA, picture)
+        assert largest_difference(renderer.read(request), plain) == 0
+
+
+# What is kept between requests.
+
+
+@pytest.fixture
+def passes(monkeypatch):
+    """Notes each pass of a rasterizer."""
+    made = []
+    for source in (GlSource, ArraySource):
+
+        def noting(*arguments, method=source.render):
+            made.append(arguments)
+            return method(*arguments)
+
+        monkeypatch.setattr(source, "render", noting)
+    return made
+
+
+def test_channels_are_kept_while_only_the_picture_settings_change(renderer, passes):
+    heat = request_for("relevancy")
+    first = renderer.read(heat)
+    faint = replace(heat, picture=replace(heat.picture, heat_opacity=0.1))
+    assert largest_difference(first, renderer.read(faint)) > 20
+    renderer.read(replace(heat, picture=replace(heat.picture, display="rgb")))
+    renderer.read(replace(heat, camera=replace(CAMERA, name="same view")))
+    assert len(passes) == 1
+    renderer.read(heat.seen_by(random_camera(4)))
+    assert len(passes) == 2
+    inverse = tuple(replace(one, relevancy=1 - one.relevancy) for one in ANSWERS[:2])
+    assert largest_difference(renderer.read(replace(heat, answers=inverse)), first) > 20
+    renderer.read(plain_request(Scene(random_gaussians(20, 3)), CAMERA, heat.picture))
+    assert len(passes) == 4
+
+
+def test_panes_of_one_camera_share_one_pass(renderer, passes):
+    """Two or three panes drawn together are those drawn alone."""
+    split = Split("wipe", second="depth", at=0.5)
+    for first in ("latent", "relevancy", "rgb", "depth"):
+        request = request_for(first, split=split)
+        alone = [renderer.read(request_for(display)).astype(int) for display in (first, "depth")]
+        renderer.read(request.seen_by(random_camera(7)))
+        passes.clear()
+        for _ in range(2):
+            both, middle = renderer.read(request), round(0.5 * CAMERA.width)
+            assert np.abs(both[:, :middle] - alone[0][:, :middle]).max() <= 1
+            assert np.abs(both[:, middle:] - alone[1][:, middle:]).max() <= 1
+        assert len(passes) == 1
+    renderer.read(request_for("latent", split=Split("levels")).seen_by(random_camera(9)))
+    assert len(passes) == 2
+
+
+class CountingRasterizer:
+    name = "counting"
+
+    def __init__(self) -> None:
+        self.views = 0
+
+    def view(self, gaussians, camera, settings=None):
+        self.views += 1
+        return self.views
+
+
+def test_a_view_is_kept_while_the_render_key_is_the_same():
+    scene = blob_scene()
+    views = LastView(CountingRasterizer())
+    keys = [RenderKey(scene, scene.cameras[place]) for place in (0, 0, 1, 1, 0)]
+    assert [views.of(key) for key in keys] == [1, 1, 2, 2, 3]
+    views.forget()
+    assert views.of(keys[0]) == 4
+
+
+def test_the_same_gaussians_with_another_mark_of_antialiasing_are_projected_anew(tmp_path):
+    scene, camera = small_scene(tmp_path, True), random_camera(1)
+    channels = ArrayChannels(load_rasterizer("cpu"))
+    keys = (RenderKey(scene, camera), RenderKey(replace(scene, antialiased=False), camera))
+    first, second = (channels.render(key)[0].alpha for key in keys)
+    assert np.abs(first - second).max() > 0.05
+
+
+# Pixels: where they are, and the surface in them.
+
+
+def wall(colour: tuple[float, float, float], centre: tuple[float, float, float], width: float) -> Gaussians:
+    """One opaque disc that faces the z axis."""
+    return Gaussians(
+        means=np.array([centre]),
+        log_scales=np.log([[width, width, 1e-3]]),
+        quats_wxyz=np.array([[1.0, 0, 0, 0]]),
+        opacity_logits=np.array([np.inf]),
+        sh=((np.array([[colour]]) - 0.5) / 0.28209479),
+    )
+
+
+FRONT = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
+
+
+def test_row_0_is_the_top(renderer):
+    """y points down: a red disc above the axis belongs into the upper half."""
+    scene = Scene(wall((1, 0, 0), (0, -1.0, 4.0), 0.2))
+    red = renderer.read(plain_request(scene, FRONT, PictureConfig()))[..., 0].astype(float)
+    assert red[:24].sum() > 100 * max(red[24:].sum(), 1)
+
+
+def test_the_viewport_alone_is_drawn_and_stretched(gl, renderer):
+    target = gl.framebuffer([gl.texture((200, 150), 4)])
+    target.clear(1.0, 0.0, 1.0)
+    target.viewport = (30, 20, 2 * CAMERA.width, 2 * CAMERA.height)
+    renderer.draw(request_for(), [target])
+    assert gl.fbo is target
+    target.viewport = (0, 0, 200, 150)
+    pixels = np.frombuffer(target.read(components=3), np.uint8).reshape(150, 200, 3)[::-1]
+    inside = np.s_[150 - 20 - 2 * CAMERA.height : 150 - 20, 30 : 30 + 2 * CAMERA.width]
+    small = pixels[inside].reshape(CAMERA.height, 2, CAMERA.width, 2, 3).mean((1, 3))
+    assert np.abs(small - renderer.read(request_for())).mean() < 2
+    outside = np.ones((150, 200), bool)
+    outside[inside] = False
+    assert (pixels[outside] == (255, 0, 255)).all()
+    gl.detect_framebuffer(0).use()
+    target.release()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks libGL.so.1")
+def test_a_user_interface_finds_a_plain_state(gl, renderer):
+    target = gl.framebuffer([gl.texture((64, 64), 4)])
+    target.use()
+    gl.enable_only(0)
+    gl.blend_func = 0x0302, 0x0303  # source alpha, 1 - source alpha
+    before = gl_state()
+    renderer.draw(request_for("relevancy"), [target])
+    np.testing.assert_array_equal(gl_state(), before)
+    gl.detect_framebuffer(0).use()
+    target.release()
+
+
+def test_picking_finds_the_surface(renderer):
+    """An opaque disc at z = 4 behind a faint one at z = 2: the surface is the opaque one."""
+    solid, veil = wall((1, 1, 1), (0, 0, 4.0), 0.5), wall((0, 0, 1), (0, 0, 2.0), 0.5)
+    faint = replace(veil, opacity_logits=np.array([-1.0]))
+    fields = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh")
+    both = Gaussians(*(np.concatenate([getattr(solid, f), getattr(faint, f)]) for f in fields))
+    request = plain_request(Scene(both), FRONT, PictureConfig())
+    renderer.read(request)
+    found = renderer.depth_at(request, 32.0, 24.0)
+    assert found == pytest.approx(4.0, rel=1e-5)
+    for beside in ((0.5, 0.5), (-1.0, 3.0), (64.0, 3.0)):
+        assert renderer.depth_at(request, *beside) is None
+    depths = renderer.depth_map(request)
+    assert depths.shape == (FRONT.height, FRONT.width)
+    assert depths[24, 32] == pytest.approx(found, rel=0.2)  # the mean on a device
+    assert depths[0, 0] == 0
+    alone = plain_request(Scene(faint), FRONT, PictureConfig())
+    assert renderer.depth_at(alone, 32.0, 24.0) == pytest.approx(2.0, rel=1e-5)  # half is never reached
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 1), (33, 21), (70, 45)])
+def test_every_size(renderer, size):
+    request = plain_request(SCENE, CAMERA.resized(*size), PICTURE)
+    assert renderer.read(request).shape == (size[1], size[0], 3)
+    assert renderer.read(replace(request, split=Split("levels"))).shape == (size[1], 3 * size[0], 3)
+
+
+def test_an_empty_scene_is_the_background(renderer):
+    empty = Scene(SCENE.gaussians.take(np.zeros(COUNT, bool)))
+    for display in ("rgb", "depth"):
+        request = plain_request(empty, CAMERA, replace(PICTURE, display=display))
+        assert np.abs(renderer.read(request) - np.round(255 * np.array(PICTURE.background))).max() <= 1
+    assert renderer.depth_at(request, 3, 3) is None
+
+
+def small_scene(tmp_path, antialiased: bool) -> Scene:
+    """Read from a file; its Gaussians are as small as pixels, where the compensation matters."""
+    gaussians = random_gaussians(60, scale_range=(0.002, 0.02))
+    write_ply(tmp_path / "a.ply", gaussians, ("SplatRenderMode: mip",) if antialiased else ())
+    return load_scene(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_a_file_marked_as_antialiased_is_drawn_as_the_reference_draws_it(tmp_path, renderer, antialiased):
+    scene, camera = small_scene(tmp_path, antialiased), random_camera(1)
+    want, other = (
+        ReferenceRasterizer()
+        .view(scene.gaussians, camera, replace(INRIA, antialiased=mark))
+        .splat(np.zeros((60, 0)))[1]
+        for mark in (antialiased, not antialiased)
+    )
+    assert np.abs(want - other).max() > 0.05  # the mark is worth something
+    request = plain_request(scene, camera, PictureConfig(display="alpha"))
+    alpha = renderer.read(request)[..., 0] / 255
+    np.testing.assert_allclose(alpha, want, atol=0.5 / 255 + 1e-3)
+    row, column = np.unravel_index(np.argmax(want), want.shape)
+    assert renderer.depth_at(request, column + 0.5, row + 0.5) is not None
+    channels = ArrayChannels(load_rasterizer("cpu"))
+    found = channels.depth_at(RenderKey(scene, camera), int(column), int(row))[1]
+    np.testing.assert_allclose(found, want.max(), atol=1e-4)
+
+
+# Depths: the near plane, the range of the depth display, and why nothing is seen.
+
+SIZE = (160, 120)
+
+
+def scaled(factor: float) -> Scene:
+    """The three blobs without cameras, `factor` times as large."""
+    scene = blob_scene(field=False, with_cameras=False)
+    gaussians = scene.gaussians
+    smaller = replace(
+        gaussians, means=factor * gaussians.means, log_scales=gaussians.log_scales + np.log(factor)
+    )
+    return replace(scene, gaussians=smaller)
+
+
+def opening(scene: Scene) -> Camera:
+    return default_view(scene, extent_of(scene), SIZE).camera(*SIZE)
+
+
+@pytest.mark.parametrize("factor", [0.02, 1e-3, 300.0])
+def test_a_scene_of_any_size_is_the_same_image(factor):
+    """Of radius 0.02 * 1.2 and less: nearer than training's near plane of 0.2."""
+    expected, got = (
+        render_image(plain_request(scene, opening(scene), PictureConfig()), "cpu").astype(int)
+        for scene in (scaled(1.0), scaled(factor))
+    )
+    assert (expected.max(-1) > 40).mean() > 0.02
+    assert np.abs(got - expected).max() <= 2
+    radii = [extent_of(scaled(one)).radius for one in (1.0, factor)]
+    np.testing.assert_allclose(radii[1], factor * radii[0], rtol=1e-4)
+
+
+def test_a_view_of_a_photograph_is_the_one_that_was_trained():
+    scene = blob_scene()
+    for camera in scene.cameras:
+        assert near_plane(scene.gaussians, camera) == INRIA.near
+
+
+def test_the_near_plane_comes_along_to_a_thing():
+    scene = blob_scene()
+    ahead = scene.cameras[0]
+    seen = []
+    for left in (1.0, 0.15, 0.1):  # of the way to the middle
+        matrix = ahead.world_to_camera.copy()
+        matrix[:3, 3] *= left
+        seen.append(near_plane(scene.gaussians, replace(ahead, world_to_camera=matrix)))
+    assert seen[0] == INRIA.near
+    assert seen[0] > seen[1] > seen[2] > 0
+
+
+def test_depth_range_covers_what_is_in_view():
+    camera = look_at(np.array([0.0, 0, -5]), np.zeros(3), np.array([0.0, -1, 0]), (64, 48))
+    near, far = depth_range(random_gaussians(500), camera)
+    assert 4 < near < 4.6
+    assert 5.4 < far < 6
+    assert depth_range(random_gaussians(0), camera) == (0.0, 1.0)
+
+
+def faulty(**fields: object) -> Gaussians:
+    return replace(blob_scene().gaussians, **fields)
+
+
+def looking_away() -> Camera:
+    camera = blob_scene().cameras[1]
+    matrix = camera.world_to_camera.copy()
+    matrix[[0, 2]] *= -1
+    return replace(camera, world_to_camera=matrix)
+
+
+NOTHING = {
+    "empty": (blob_scene().gaussians.take(np.zeros(360, bool)), "the scene holds no Gaussians"),
+    "nan": (faulty(means=np.full((360, 3), np.nan)), "none of the 360 Gaussians can be drawn"),
+    "clear": (faulty(opacity_logits=np.full(360, -20.0)), "all 360 Gaussians are transparent"),
+}
+
+
+@pytest.mark.parametrize("case", NOTHING)
+def test_why_no_camera_would_see_anything(case):
+    gaussians, reason = NOTHING[case]
+    assert why_undrawable(gaussians).startswith(reason)
+    assert why_nothing(gaussians, blob_scene().cameras[0]).startswith(reason)
+    assert np.isfinite(opening(Scene(gaussians)).world_to_camera).all()
+
+
+def test_why_this_camera_sees_nothing():
+    gaussians, camera = blob_scene().gaussians, blob_scene().cameras[1]
+    assert why_undrawable(gaussians) == ""
+    assert "behind the camera" in why_nothing(gaussians, looking_away())
+    aside = camera.world_to_camera.copy()
+    aside[0, 3] += 1e3
+    reason = why_nothing(gaussians, replace(camera, world_to_camera=aside))
+    assert "nothing of the scene lies in this picture" in reason
+
+
+def test_a_renderer_knows_an_empty_image(renderer):
+    assert not renderer.shows_nothing()  # nothing was drawn yet
+    for made in (renderer, ArrayRenderer(load_rasterizer("cpu"))):
+        for camera, nothing in ((blob_scene().cameras[0], False), (looking_away(), True)):
+            made.read(plain_request(blob_scene(), camera, PictureConfig()))
+            assert made.shows_nothing() == nothing
+
+
+# Drivers.
+
+
+def test_auto_takes_the_cpu_where_the_driver_is_software(gl):
+    renderer = GlRenderer(gl)
+    assert renderer.backend == ("opengl" if suits_opengl(gl) else "cpu")
+    renderer.release()
+
+
+DRIVERS = """
+import moderngl, sys
+from langsplat_core.config import PictureConfig
+from langsplat_core.errors import BackendError
+from langsplat_core.scene import Scene
+from langsplat_viewer.rendering.renderer import GlRenderer, render_image
+from langsplat_viewer.rendering.request import plain_request
+from tests.support.scenes import random_camera, random_gaussians
+request = plain_request(Scene(random_gaussians(20)), random_camera(), PictureConfig())
+"""
+OLD_DRIVER = """
+ctx = moderngl.create_context(standalone=True, backend="egl", require=330)
+assert ctx.version_code == 330, ctx.version_code
+renderer = GlRenderer(ctx)
+print(renderer.backend, renderer.read(request).any(), ctx.error)
+try:
+    GlRenderer(ctx, "opengl")
+except BackendError as error:
+    print(error)
+"""
+NO_DRIVER = """
+for backend in ("auto", "cpu"):
+    assert render_image(request, backend).any()
+try:
+    render_image(request, "opengl")
+except BackendError as error:
+    assert "libegl1" in str(error) and "--backend cpu" in str(error) and "\\n" not in str(error)
+    print("refused")
+print([name for name in ("glfw", "imgui_bundle") if name in sys.modules])
+"""
+OLDER = {"MESA_GL_VERSION_OVERRIDE": "3.3FC", "MESA_GLSL_VERSION_OVERRIDE": "330"}
+
+
+def lines_of(gl, code: str, driver: dict[str, str]) -> list[str]:
+    """Two lines that a process prints with another driver."""
+    if "MESA_GL_VERSION_OVERRIDE" in driver and "llvmpipe" not in gl.info["GL_RENDERER"]:
+        pytest.skip("only Mesa can pretend to be an older OpenGL")
+    run = subprocess.run(
+        [sys.executable, "-c", DRIVERS + code], env=os.environ | driver, capture_output=True, text=True
+    )
+    return (run.stdout.splitlines() or [run.stderr, ""])[:2]
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Mesa's override")
+def test_opengl_3_3_is_enough_with_the_cpu_rasterizer(gl):
+    first, second = lines_of(gl, OLD_DRIVER, OLDER)
+    assert first.split() == ["cpu", "True", "GL_NO_ERROR"]
+    assert "needs OpenGL 4.1, this driver offers 3.3" in second
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="hides EGL's drivers from its loader")
+@pytest.mark.parametrize(
+    "driver",
+    [
+        {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent.json"},
+        {"MESA_GL_VERSION_OVERRIDE": "2.1", "MESA_GLSL_VERSION_OVERRIDE": "120"},
+        OLDER,
+    ],
+    ids=["none", "2.1", "3.3"],
+)
+def test_without_a_driver_that_suffices_the_cpu_still_makes_images(gl, driver):
+    assert lines_of(gl, NO_DRIVER, driver) == ["refused", "[]"]

@@ -1,0 +1,459 @@
+"""Render requests: what they depend on, their panes, the edited scene; and that every image is one."""
+
+from dataclasses import MISSING, fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from langsplat_core.config import PictureConfig
+from langsplat_core.errors import InputError
+from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.raster.render import splat_colours
+from langsplat_core.scene import Scene
+from langsplat_viewer.actions import filming, opening, queries, selecting, settings, viewpoint
+from langsplat_viewer.canvas import Canvas
+from langsplat_viewer.commands import BUTTONS, COMMANDS, OVERLAY_TITLES, matching
+from langsplat_viewer.files.preferences import FILE_NAME, load_preferences, save_preferences
+from langsplat_viewer.marks import Marks, unmarked
+from langsplat_viewer.output import film, saving
+from langsplat_viewer.panels.overlays import STEPS, bar_colours
+from langsplat_viewer.panels.view import compared_name
+from langsplat_viewer.rendering.depth import Clip
+from langsplat_viewer.rendering.renderer import ArrayRenderer, GlRenderer
+from langsplat_viewer.rendering.request import (
+    AT_RANGE,
+    TINT,
+    TINT_STRENGTH,
+    Detail,
+    Inputs,
+    RenderKey,
+    RenderRequest,
+    Splats,
+    Split,
+    edited_scene,
+    plain_request,
+    with_splats,
+)
+from langsplat_viewer.state import OVERLAYS, Ruler, ViewerState
+from langsplat_viewer.viewer import Viewer
+from tests.support.fakes import blob_scene, cameras
+from tests.support.scenes import random_gaussians
+from tests.support.selected import blob
+from tests.support.windowless import errors, recorded, rest, settle
+
+SCENE = blob_scene()
+NOTHING = np.zeros(360, bool)
+
+
+def ask(viewer: Viewer, *phrases: str) -> None:
+    for phrase in phrases:
+        queries.ask(viewer, phrase)
+    settle(viewer)
+
+
+# Every image is of the same request.
+
+
+def edit_everything(viewer: Viewer, mode: str) -> None:
+    """Every setting off its default: one blob hidden in part, one selected, one deleted in part."""
+    state, odd = viewer.state, np.arange(360) % 2 == 1
+    settings.resize(viewer, 160, 120)
+    viewpoint.look_from(viewer, "left")
+    viewpoint.tick(viewer, viewer.clock + 10)
+    viewpoint.tick(viewer, viewer.clock + 10)
+    ask(viewer, "mug", "plant")
+    marks = Marks(blob("book") & odd, blob("mug") & odd, blob("plant") & odd)
+    state.selection = replace(state.selection, marks=marks)
+    settings.set_splats(viewer, Splats(0.8, 0))
+    settings.set_clip(viewer, Clip(0.5, 6.5))
+    picture = PictureConfig(
+        heat_opacity=0.6, dim=0.7, threshold=0.3, alpha_gate=0.2, background=(0.1, 0.6, 0.3)
+    )
+    settings.set_picture(viewer, picture)
+    settings.set_colour_map(viewer, "viridis")
+    settings.set_display(viewer, "relevancy", 1)
+    split = Split(mode, second="segmentation", second_level=0, at=0.4)
+    state.settings = replace(state.settings, split=split)
+
+
+def image(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path)).astype(int)
+
+
+def on_screen(canvas: Canvas, state: ViewerState) -> np.ndarray:
+    panes = [
+        np.frombuffer(texture.read(), np.uint8).reshape(*texture.size[::-1], 4)[::-1, :, :3]
+        for texture in canvas.textures
+    ]
+    return state.settings.split.joined(panes, state.size[0]).astype(int)
+
+
+@pytest.mark.parametrize("mode", ["wipe", "levels"])
+@pytest.mark.parametrize("backend", ["cpu", "opengl"])
+def test_screen_file_sized_image_film_and_reference_agree(gl, opened, tmp_path, monkeypatch, mode, backend):
+    """Nothing that is hidden or deleted comes back, in whatever way an image is made."""
+    monkeypatch.setattr(film, "find_ffmpeg", lambda: None)
+    edit_everything(opened, mode)
+    state, renderer = opened.state, GlRenderer(gl, backend, "single")
+    opened.surface = canvas = Canvas(gl, renderer)
+    state.backend = renderer.backend
+    request = state.request()
+    plain = plain_request(state.scene, request.camera, PictureConfig())
+    for field in fields(RenderRequest):
+        if field.name not in ("scene", "camera", "pose", "width", "detail"):  # detail: only while moving
+            assert field.default is not MISSING or field.default_factory is not MISSING, field.name
+            assert getattr(request, field.name) != getattr(plain, field.name), field.name
+    for field in fields(PictureConfig):
+        if field.name not in ("own_colours", "transparent"):  # follow from queries, and from the file
+            assert getattr(request.picture, field.name) != field.default, field.name
+
+    rest(canvas, state, 1.0)
+    images = {"screen": on_screen(canvas, state), "saved": image(saving.save_picture(opened, tmp_path))}
+    filming.set_film_size(opened, *state.size)
+    filming.save_sized_picture(opened, tmp_path)
+    recorded(opened)
+    images["sized"] = image(tmp_path / "blobs-160x120-001.png")
+    filming.set_turning(opened, True)
+    filming.set_path_seconds(opened, 1.0)
+    filming.set_film_fps(opened, 2.0)
+    filming.save_film(opened, tmp_path)
+    recorded(opened)
+    images["film"] = image(tmp_path / "blobs-film-001" / film.frame_name(0))
+    expected = ArrayRenderer(ReferenceRasterizer()).read(request).astype(int)
+    bare = ArrayRenderer(ReferenceRasterizer()).read(replace(request, scene=edited_scene(state.scene)))
+    assert np.abs(bare - expected).max() > 60  # the edits are seen
+    for name, got in images.items():
+        assert got.shape == expected.shape == (120, 160, 3), name
+        assert (np.abs(got - expected).max(-1) > 2).mean() <= 2e-3, name
+    viewpoint.compare_with_reference(opened)
+    recorded(opened)
+    assert state.timing.comparison.psnr > 45
+    assert errors(opened) == []
+    renderer.release()
+
+
+def test_images_are_saved_without_background_if_so_chosen(gl, opened, tmp_path):
+    opened.surface = Canvas(gl, GlRenderer(gl, "cpu"))
+    settings.resize(opened, 40, 30)
+    filming.set_film_size(opened, 40, 30)
+    assert image(saving.save_picture(opened, tmp_path)).shape == (30, 40, 3)
+    settings.save_transparent(opened, True)
+    saved = image(saving.save_picture(opened, tmp_path))
+    filming.save_sized_picture(opened, tmp_path)
+    recorded(opened)
+    assert saved.shape == (30, 40, 4)
+    np.testing.assert_allclose(image(tmp_path / "blobs-40x30-001.png"), saved, atol=1)
+    assert not opened.state.request().picture.transparent  # on screen there is a background
+
+
+# Requests are equal where the image is.
+
+CHANGES = {
+    "display": lambda v: settings.set_display(v, "depth"),
+    "slider": lambda v: settings.set_picture(v, replace(v.state.picture, dim=0.1)),
+    "hidden query": lambda v: queries.hide(v, v.state.queries[0]),
+    "cut": lambda v: queries.set_cut(v, v.state.queries[0], 0.7),
+    "split": settings.toggle_wipe,
+    "splats": lambda v: settings.set_splats(v, Splats(0.5)),
+    "near cut": lambda v: settings.set_clip(v, Clip(1.0)),
+    "marks": selecting.select_all,
+    "size": lambda v: settings.resize(v, 300, 200),
+    "view": lambda v: viewpoint.look_from(v, "left"),
+}
+UNSEEN = {
+    "line": lambda v: settings.move_line(v, 0.3),  # the window draws it
+    "ruler": settings.toggle_measuring,
+    "tool": lambda v: selecting.use_tool(v, "brush"),
+    "word": lambda v: queries.type_phrase(v, "plant"),
+    "chosen query": lambda v: queries.select(v, None),
+    "photograph": lambda v: opening.fade_photograph(v, 0.5),
+    "saved without background": lambda v: settings.save_transparent(v, True),
+}
+
+
+@pytest.fixture
+def asked(opened: Viewer) -> Viewer:
+    ask(opened, "mug")
+    settings.resize(opened, 240, 180)
+    return opened
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_is_seen_is_in_it(asked, name):
+    before = asked.state.request()
+    assert asked.state.request() == before
+    CHANGES[name](asked)
+    viewpoint.tick(asked, asked.clock + 10)
+    viewpoint.tick(asked, asked.clock + 10)
+    assert asked.state.request() != before
+
+
+@pytest.mark.parametrize("name", UNSEEN)
+def test_what_is_not_seen_is_not_in_it(asked, name):
+    before = asked.state.request().without_line()
+    UNSEEN[name](asked)
+    assert asked.state.request().without_line() == before
+
+
+def test_equal_requests_have_equal_keys_and_the_same_channels(asked):
+    settings.set_display(asked, "relevancy")
+    first, again, inputs = asked.state.request(), asked.state.request(), Inputs()
+    assert inputs.key(first) == inputs.key(again)
+    assert hash(inputs.key(first)) == hash(inputs.key(again))
+    assert inputs.channels(first)[0] is inputs.channels(again)[0]
+    coarse = replace(first, detail=Detail(0.5))
+    assert (inputs.key(coarse).camera.width, inputs.key(coarse).camera.height) == (120, 90)
+    assert inputs.channels(coarse)[0] is inputs.channels(first)[0]
+
+
+def test_render_keys_are_equal_where_the_projection_is():
+    first, second, _ = SCENE.cameras
+    key = RenderKey(SCENE, first)
+    assert key == RenderKey(SCENE, replace(first, name="again"))
+    others = (
+        RenderKey(SCENE, second),
+        RenderKey(SCENE, first, Clip(1.0)),
+        RenderKey(replace(SCENE), first),
+        RenderKey(SCENE, replace(first, width=80)),
+    )
+    assert all(key != other for other in others)
+
+
+@pytest.mark.parametrize("backend", ["opengl", "cpu"])
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_is_kept_gives_the_image_that_a_new_renderer_gives(gl, asked, name, backend):
+    kept, fresh = GlRenderer(gl, backend), GlRenderer(gl, backend)
+    canvas = Canvas(gl, kept)
+    canvas.update(asked.state, 0.0)
+    CHANGES[name](asked)
+    viewpoint.tick(asked, asked.clock + 10)
+    viewpoint.tick(asked, asked.clock + 10)
+    canvas.update(asked.state, 20.0)
+    canvas.update(asked.state, 30.0)
+    expected = fresh.read(asked.state.request())
+    np.testing.assert_array_equal(canvas.capture(asked.state.request()), expected)
+    kept.release()
+    fresh.release()
+
+
+# Panes.
+
+
+def test_the_second_pane_is_what_the_display_would_show_alone(opened):
+    ask(opened, "plant")
+    settings.set_display(opened, "rgb")
+    settings.compare_with(opened, "relevancy")
+    first, second = opened.state.panes()
+    assert (first.picture.display, second.picture.display) == ("rgb", "relevancy")
+    settings.show_one(opened)
+    settings.set_display(opened, "relevancy")
+    assert opened.state.panes() == (second,)
+
+
+def test_three_levels_of_latents_or_of_answers(opened):
+    settings.toggle_levels(opened)
+    assert [pane.label for pane in opened.state.panes()] == [
+        "Latent, subpart",
+        "Latent, part",
+        "Latent, whole",
+    ]
+    opened.state.size = (200, 90)
+    request = opened.state.request()
+    assert (request.camera.width, request.camera.height, request.size) == (66, 90, (200, 90))
+    ask(opened, "plant")
+    settings.set_display(opened, "segmentation")
+    result = opened.state.queries[0].result
+    panes, found = opened.state.panes(), Inputs().channels(opened.state.request())
+    assert [pane.picture.display for pane in panes] == ["relevancy"] * 3
+    for level, channel in enumerate(found):
+        np.testing.assert_array_equal(channel.values[:, 0], result.relevancy[level])
+    assert len({pane.ranges for pane in panes}) == 1  # they share one scale
+    settings.toggle_levels(opened)
+    assert [pane.label for pane in opened.state.panes()] == ["Segmentation"]
+
+
+def test_the_line_stays_within_reach(opened):
+    for at, kept in ((-3.0, AT_RANGE[0]), (0.3, 0.3), (2.0, AT_RANGE[1])):
+        settings.move_line(opened, at)
+        assert opened.state.settings.split.at == kept
+
+
+def test_without_a_field_levels_and_latents_are_refused(viewer):
+    viewer.state.scene = Scene(random_gaussians(5))
+    settings.toggle_levels(viewer)
+    settings.compare_with(viewer, "latent", 1)
+    assert viewer.state.settings.split.mode == "off"
+    assert len(errors(viewer)) == 1  # the same line is not said twice
+    (wipe,) = (command for command in COMMANDS if "V" in command.keys)
+    for mode in ("wipe", "off"):
+        wipe.act(viewer)
+        assert viewer.state.settings.split.mode == mode
+    assert len({compared_name(button) for button in BUTTONS}) == len(BUTTONS)
+
+
+@pytest.mark.parametrize(("u", "inside"), [(0.0, 0.0), (0.2, 0.6), (0.5, 0.5), (1.0, 1.0)])
+def test_a_place_in_a_column(u, inside):
+    assert Split("levels").within_pane(u) == pytest.approx(inside)
+    assert Split("wipe").within_pane(u) == u
+
+
+def test_panes_are_joined_as_they_are_shown():
+    dark, light = np.zeros((2, 10, 3), np.uint8), np.full((2, 10, 3), 9, np.uint8)
+    wiped = Split("wipe", at=0.3).joined([dark, light], 10)
+    assert wiped[0, :, 0].tolist() == [0] * 3 + [9] * 7
+    wide = Split("levels").joined([dark, dark, light], 32)  # two pixels are left over
+    assert wide[0, :, 0].tolist() == [0] * 20 + [9] * 12
+
+
+def test_colour_bars_end_where_the_image_does():
+    alone, own, weak = bar_colours(1, 1.0, True), bar_colours(1, 1.0, False), bar_colours(1, 0.5, False)
+    assert alone.shape == own.shape == (STEPS, 3)
+    assert not own[0].any()
+    np.testing.assert_allclose(weak[-1], 0.5 * own[-1])
+    assert alone[-1, 0] > alone[-1, 2]  # red is hot
+
+
+# The edited scene.
+
+
+def test_without_marks_it_is_the_scene_itself():
+    marks = unmarked(360)
+    edited = edited_scene(SCENE, marks)
+    assert edited.scene is SCENE
+    assert edited.rows is None
+    values = np.ones((360, 2))
+    assert edited.values(values) is values
+
+
+def test_hidden_and_deleted_ones_are_left_out_with_their_rows_of_the_layers():
+    edited = edited_scene(SCENE, Marks(NOTHING, blob("mug"), blob("plant")))
+    np.testing.assert_array_equal(edited.rows, np.flatnonzero(blob("book")))
+    np.testing.assert_array_equal(edited.scene.gaussians.means, SCENE.gaussians.means[blob("book")])
+    values = np.arange(720).reshape(360, 2)
+    np.testing.assert_array_equal(edited.values(values), values[blob("book")])
+    everything = np.ones(360, bool)
+    assert len(edited_scene(SCENE, Marks(NOTHING, everything, NOTHING)).scene.gaussians) == 0
+
+
+def test_only_the_selection_changes_its_colour_from_every_side():
+    source = replace(SCENE, gaussians=random_gaussians(360, sh_degree=2), language=None)
+    # Far from black, where colours are clamped and no longer linear.
+    source.gaussians.sh[:, 0] = np.abs(source.gaussians.sh[:, 0]) + 1
+    selected = blob("mug")
+    tinted = edited_scene(source, Marks(selected, NOTHING, NOTHING)).scene
+    for name in ("means", "log_scales", "quats_wxyz", "opacity_logits"):
+        np.testing.assert_array_equal(getattr(tinted.gaussians, name), getattr(source.gaussians, name))
+    np.testing.assert_array_equal(tinted.gaussians.sh[~selected], source.gaussians.sh[~selected])
+    assert tinted.antialiased == source.antialiased
+    for camera in cameras():
+        ones = [scene.gaussians.take(selected) for scene in (source, tinted)]
+        views = [load_rasterizer("reference").view(gaussians, camera) for gaussians in ones]
+        before, after = (
+            splat_colours(view, gaussians, camera) for view, gaussians in zip(views, ones, strict=True)
+        )
+        wanted = (1 - TINT_STRENGTH) * before.colours + TINT_STRENGTH * before.alpha[..., None] * TINT
+        np.testing.assert_allclose(after.colours, wanted, atol=2e-5)
+
+
+def test_colours_of_a_layer_are_tinted_alike_and_numbers_are_not():
+    edited = edited_scene(SCENE, Marks(blob("book"), blob("mug"), NOTHING))
+    colours = np.full((360, 3), 0.5, np.float32)
+    mixed = edited.values(colours, is_colour=True)
+    wanted = np.tile((1 - TINT_STRENGTH) * 0.5 + TINT_STRENGTH * TINT, (120, 1))
+    np.testing.assert_allclose(mixed[:120], wanted, rtol=1e-6)
+    np.testing.assert_array_equal(mixed[120:], 0.5)
+    np.testing.assert_array_equal(colours, 0.5)
+    np.testing.assert_array_equal(edited.values(colours), colours[:240])
+
+
+def test_nothing_is_made_twice():
+    marks = Marks(NOTHING, blob("mug"), NOTHING)
+    first = edited_scene(SCENE, marks)
+    assert edited_scene(SCENE, marks, first) is first
+    selected = edited_scene(SCENE, replace(marks, selected=blob("book")), first)
+    assert selected.untinted is first.scene
+    assert selected.scene is not first.scene
+    back = edited_scene(SCENE, replace(marks, selected=NOTHING), selected)
+    assert back.scene is first.scene
+    other = edited_scene(blob_scene(), marks, first)
+    assert other.source is not SCENE
+    assert other.scene is not first.scene
+
+
+@pytest.mark.parametrize("count", [0, 359])
+def test_marks_of_another_scene_count_as_none(count):
+    everything = np.ones(count, bool)
+    assert edited_scene(SCENE, Marks(everything, everything, everything)).scene is SCENE
+
+
+def test_splats_are_drawn_smaller_and_of_one_colour(opened):
+    scene = Scene(random_gaussians(40, sh_degree=3))
+    assert with_splats(scene, Splats()) is scene
+    drawn = with_splats(scene, Splats(0.25, 1)).gaussians
+    np.testing.assert_allclose(np.exp(drawn.log_scales), 0.25 * np.exp(scene.gaussians.log_scales), rtol=1e-5)
+    np.testing.assert_array_equal(drawn.sh, scene.gaussians.sh[:, :4])
+    assert with_splats(Scene(drawn), Splats(sh_degree=2)).gaussians is drawn  # it has no more
+    for wanted, kept in ((Splats(7.0, 9), Splats()), (Splats(0.0, -1), Splats(0.1, 0))):
+        settings.set_splats(opened, wanted)
+        assert opened.state.settings.splats == kept
+
+
+# Over the image: overlays and the ruler.
+
+
+def test_overlays_are_shown_and_remembered(opened, tmp_path):
+    for name in reversed(OVERLAYS):
+        settings.toggle_overlay(opened, name)
+    assert opened.state.preferences.overlays == OVERLAYS
+    save_preferences(tmp_path, opened.state.preferences)
+    assert load_preferences(tmp_path).overlays == OVERLAYS
+    settings.show_overlay(opened, "cube", False)
+    settings.show_overlay(opened, "cube", False)
+    assert opened.state.preferences.overlays == tuple(name for name in OVERLAYS if name != "cube")
+
+
+def test_every_overlay_has_a_command(opened):
+    for name, title in OVERLAY_TITLES.items():
+        (command,) = matching(title)
+        command.act(opened)
+        assert name in opened.state.preferences.overlays
+
+
+def test_the_colour_map_is_remembered(opened, tmp_path):
+    settings.set_colour_map(opened, "cividis")
+    assert opened.state.request().picture.colour_map == "cividis"
+    save_preferences(tmp_path, opened.state.preferences)
+    assert load_preferences(tmp_path).colour_map == "cividis"
+    (tmp_path / FILE_NAME).write_text('{"colour_map": "rainbow"}')
+    with pytest.raises(InputError, match=r"rainbow.*viridis"):
+        load_preferences(tmp_path)
+
+
+def test_two_clicks_measure_and_a_third_begins_anew(opened):
+    settings.toggle_measuring(opened)
+    assert opened.state.ruler.length is None
+    settings.measure_at(opened, 0.5, 0.5)
+    settings.measure_at(opened, 0.8, 0.1)  # the fake surface: (u - 0.5, v - 0.5, 0)
+    assert opened.state.ruler.length == pytest.approx(0.5)
+    settings.measure_at(opened, 0.6, 0.6)
+    assert opened.state.ruler.length is None
+    assert len(opened.state.ruler.points) == 1
+
+
+def test_a_click_beside_everything_is_said(opened):
+    settings.measure(opened, True)
+    settings.measure_at(opened, 0.95, 0.5)
+    assert opened.state.ruler.points == ()
+    assert "nothing under the cursor" in opened.state.messages[-1].text
+
+
+def test_measuring_ends_with_esc_and_with_another_scene(opened):
+    for end in (settings.escape, lambda viewer: opening.open_scene(viewer, Path("plain.ply"))):
+        settings.measure(opened, True)
+        settings.measure_at(opened, 0.5, 0.5)
+        end(opened)
+        settle(opened)
+        assert opened.state.ruler == Ruler()
