@@ -36,7 +36,7 @@ from langsplat_core.semantics.relevancy import FLOOR
 from langsplat_core.semantics.vocabulary import Bundled, bundled_vocabulary
 
 # Logits per spread of phrases' cosines with a meaning: a probability is then right about so often, with the
-# bundled encoder and with the geometry of CLIP (rooms 201 to 203, docs/describing.md).
+# bundled encoder and with the geometry of CLIP (rooms 201 to 203, docs/searching.md).
 WORD_SCALE = 6.0
 ATTRIBUTE_SCALE = 3.4
 NEAREST = 10  # meanings that make a word's hub, as in the paper

@@ -1,7 +1,7 @@
 """The bundled scene and encoder, asked as a user would ask, against the truth of the room.
 
 The views are ones that training held out; the truth comes from the room's geometry, which training never
-saw. The floors asserted are below the figures in docs/fresh_rooms.md by a margin for another machine's
+saw. The floors asserted are below the figures in docs/answers.md by a margin for another machine's
 rounding.
 """
 
