@@ -85,7 +85,7 @@ report: system  ## every report under docs/benchmarks, again: hours (ONLY="rooms
 # PYTHON may be that of a virtual environment: then --system-site-packages alone would not see its packages.
 GPU := .venv-gpu
 PURELIB := "import sysconfig; print(sysconfig.get_path('purelib'))"
-gpu:  ## on a machine with CUDA: run what never ran without, write docs/benchmarks/gpu (see docs/gpu.md)
+gpu:  ## on a machine with CUDA: run what never ran without, write docs/benchmarks/gpu (see docs/speed.md)
 	$(PYTHON) -m venv --clear $(if $(SITE),--system-site-packages) $(GPU)
 	$(if $(SITE),$(PYTHON) -c $(PURELIB) > $$($(GPU)/bin/python -c $(PURELIB))/site.pth)
 	$(GPU)/bin/pip install --quiet $(if $(WHEELS),--no-index --find-links $(WHEELS)) \

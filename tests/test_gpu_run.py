@@ -103,7 +103,7 @@ def test_without_a_gpu_it_says_so_in_one_line_and_writes_nothing(
     monkeypatch.setenv("PYTHONPATH", "")
     assert runner.main() == 2
     said = capsys.readouterr()
-    assert said.err == "gpu: nothing could be run (no CUDA device); see docs/gpu.md\n"
+    assert said.err == "gpu: nothing could be run (no CUDA device); see docs/speed.md\n"
     assert "gradients: skipped: no CUDA device" in said.out
     assert not out.exists()
 
@@ -154,7 +154,7 @@ def test_unusable_arguments(
 
 
 def test_every_section_has_a_function_and_a_row_in_the_docs(runner: ModuleType, sections: ModuleType) -> None:
-    page = (ROOT / "docs" / "gpu.md").read_text()
+    page = (ROOT / "docs" / "speed.md").read_text()
     for name, limit in runner.SECTIONS.items():
         assert callable(getattr(sections, f"measure_{name}"))
         assert f"| {name} | {limit} |" in page

@@ -22,7 +22,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.semantics.encoder import FILE, check_whole
 from langsplat_core.semantics.weights import CONFIG, SAFE, Weights
 
-# Of the text half. NumPy was the quicker one at 63 million too (docs/encoders.md); but checkpoints that large
+# Of the text half. NumPy was the quicker one at 63 million too; but checkpoints that large
 # come from elsewhere, and their tokenizers have not been compared with transformers' reading of them.
 MOST_WEIGHTS = 20_000_000
 TEMPERATURE = 10.0  # of LERF and LangSplat, whatever scale a checkpoint ended its training with

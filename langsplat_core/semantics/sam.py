@@ -342,7 +342,7 @@ VERSION = 2
 # Full-size masks of float logits held at one time: on a CPU 16 take twice as long as four times 4, since the
 # system gives and takes back large memory page by page.
 MASKS_AT_ONCE = 4
-HALF_ON = "cuda"  # where products are float16's: bfloat16's error is seven times as large (docs/encoders.md)
+HALF_ON = "cuda"  # where products are float16's: bfloat16's error is seven times as large
 
 
 def load_mask_source(config: MaskConfig, device: str = "auto") -> MaskSource:

@@ -84,7 +84,7 @@ def summary(outcomes: list[Outcome], head: str) -> str:
     lines = [
         "# On a machine with a GPU",
         "",
-        "Written by `make gpu`, see [gpu.md](../../gpu.md).",
+        "Written by `make gpu`, see [speed.md](../../speed.md#on-a-gpu).",
         "",
         head.strip(),
     ]
@@ -138,7 +138,7 @@ def main() -> int:
             print(f"{name}: {outcome.state}, {outcome.seconds:.0f} s", flush=True)
         if all(outcome.state.startswith("skipped") for outcome in outcomes):
             reasons = sorted({outcome.state.removeprefix("skipped: ") for outcome in outcomes})
-            print(f"gpu: nothing could be run ({'; '.join(reasons)}); see docs/gpu.md", file=sys.stderr)
+            print(f"gpu: nothing could be run ({'; '.join(reasons)}); see docs/speed.md", file=sys.stderr)
             return 2
         write(asked.out, outcomes, reports)
     print(f"wrote {asked.out}")
