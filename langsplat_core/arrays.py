@@ -56,7 +56,7 @@ def unit(vectors: Array, epsilon: float = 1e-6) -> Array:
 
 
 def mean_squared_error(a: Array, b: Array) -> float:
-    """Of two arrays of one shape."""
+    """Return the mean squared difference of two arrays of one shape."""
     return float(np.mean((a.astype(np.float64) - b) ** 2))
 
 

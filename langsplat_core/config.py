@@ -188,7 +188,7 @@ RASTER_PROFILES = {"inria": INRIA, "gsplat": GSPLAT}
 
 @dataclass(frozen=True)
 class DatasetConfig:
-    """How photographs are read."""
+    """Settings for reading photographs and their cameras."""
 
     max_side: Side = 800  # photographs are shrunk until their longer side has at most this many pixels
     test_every: CountOrZero = 8  # every n-th view, in name order, is held out from training; 0 holds out none
@@ -284,7 +284,7 @@ class CodebookConfig:
 
     @property
     def seconds(self) -> float:
-        """That the fit is expected to take on two cores."""
+        """Seconds that the fit is expected to take on two cores."""
         return 3 + 0.02 * min(self.size or 2_500, 4_096)
 
 
@@ -323,7 +323,7 @@ CODEC_CONFIGS: Mapping[str, type[CodebookConfig | AutoencoderConfig | LinearConf
 
 @dataclass(frozen=True)
 class LiftConfig:
-    """How mask vectors reach the Gaussians."""
+    """Settings for lifting mask vectors onto the Gaussians."""
 
     # median, mean: of the CLIP vectors of the masks a Gaussian belongs to, then encoded;
     # one-pass: the paper's latents, averaged as W^T H / W^T 1; gradient: trained by Adam, as in the paper
@@ -364,7 +364,7 @@ OPACITY_DECAY = 0.01  # of quick and good: few photographs gain a third of a dec
 
 
 def with_preset(config: TrainConfig, preset: TrainPreset) -> TrainConfig:
-    """How much is spent on a scene: "quick" takes minutes of a CPU, "full" is as published, for a GPU."""
+    """Return `config` with a preset's budget: "quick" takes minutes on a CPU, "full" is the published one."""
     if preset == "full":
         return config
     side, steps, most, size = (320, 500, 30_000, 512) if preset == "quick" else (480, 1_500, 60_000, 0)
@@ -385,7 +385,7 @@ TRAIN_PROFILES: Mapping[TrainProfile, TrainConfig] = MappingProxyType(
 
 @dataclass(frozen=True)
 class CompactConfig:
-    """How small a scene may be made (`langsplat compact`)."""
+    """Settings of `langsplat compact`: the error allowed, and the views it is measured on."""
 
     max_psnr_loss: Decibels = 0.1  # dB, mean over the measuring views; nothing that loses more is written
     views: SeveralCount = 96
@@ -403,7 +403,7 @@ LevelChoice = Literal["auto", "subpart", "part", "whole"]
 
 @dataclass(frozen=True)
 class PictureConfig:
-    """How channels become a picture; the window's shader and the NumPy twin follow the same list."""
+    """Settings for composing an image of channels, in the window's shader and in NumPy alike."""
 
     display: Display = "rgb"
     heat_opacity: Share = 0.85  # of the heat map over the colours where relevancy is high

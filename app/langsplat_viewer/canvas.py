@@ -234,12 +234,11 @@ class Canvas:
         return self._targets[key]
 
     def close(self) -> None:
-        """The window closes."""
+        """Stop the workers."""
         self._background.worker.close()
         self._merger.worker.close()
 
     def point_at(self, u: float, v: float) -> Array | None:
-        """See `viewer.Surface`."""
         if self._shown is None:
             return None
         camera = self._shown.drawn_camera
@@ -248,11 +247,9 @@ class Canvas:
         return None if depth is None else camera.unproject(pixel, depth)
 
     def depths(self) -> Array | None:
-        """See `viewer.Surface`."""
         return None if self._shown is None else self._renderer_of(self._shown).depth_map(self._shown)
 
     def capture(self, request: RenderRequest) -> Array:
-        """See `viewer.Surface`."""
         return self._fine.read(request)
 
 

@@ -93,7 +93,7 @@ def isolating(marks: Marks) -> Marks:
 
 
 def showing_all(marks: Marks) -> Marks:
-    """With nothing hidden."""
+    """Return the marks with nothing hidden."""
     return replace(marks, hidden=np.zeros_like(marks.hidden))
 
 

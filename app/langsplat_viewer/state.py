@@ -122,7 +122,7 @@ class Timing:
     comparison: Comparison | None = None  # the last one
 
     def add(self, name: str, milliseconds: float) -> None:
-        """Add one measurement."""
+        """Add one measurement of the step `name`."""
         self.laps.setdefault(name, deque(maxlen=KEPT)).append(milliseconds)
 
     def medians(self) -> list[tuple[str, float]]:
@@ -336,7 +336,7 @@ class ViewerState(SceneState):
         return [by_slot.get(slot) for slot in range(max(by_slot, default=-1) + 1)]
 
     def shown_results(self) -> tuple[QueryResult | None, ...]:
-        """Their answers."""
+        """Answers of the queries that are shown."""
         return tuple(None if query is None else query.result for query in self.shown())
 
     def panes(self) -> tuple[Pane, ...]:

@@ -83,7 +83,7 @@ def command(request: TrainingRequest) -> list[str]:
 
 
 class Training:
-    """One running process."""
+    """Training in a process of its own, and its progress."""
 
     def __init__(self, request: TrainingRequest, wake: Callable[[], None]) -> None:
         """`wake` is called from another thread when there is news. OSError where it cannot be started."""

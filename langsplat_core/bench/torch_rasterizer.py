@@ -32,7 +32,7 @@ _Used = list[tuple[Tensor, list[Tensor]]]  # rows of the tables that a step read
 
 
 class Footprints(NamedTuple):
-    """M projected Gaussians."""
+    """Footprints of M projected Gaussians on the image plane."""
 
     means_px: Tensor  # (M, 2) float64
     shapes: Tensor  # (M, 4) xx, xy, yy of the inverse covariance, 1/px^2, and log(opacity)
@@ -161,7 +161,6 @@ class TorchView:
             self._bins = _bin_tiles(self._footprints, camera)
 
     def splat(self, values: Array) -> tuple[Array, Array]:
-        """See `View.splat`."""
         channels = values.shape[1]
         lines = (len(self._bins.starts) - 1) // self._bins.columns
         picture = torch.zeros(lines * self._bins.columns, PIXELS, channels + 1, dtype=self._kind)
@@ -290,5 +289,4 @@ class TorchRasterizer:
         self._kind = kind
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> TorchView:
-        """See `Rasterizer.view`."""
         return TorchView(gaussians, camera, settings, self._kind)

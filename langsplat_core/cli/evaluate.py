@@ -62,7 +62,7 @@ class _EvalLabels(_Eval):
     masks: MaskConfig = field(default_factory=MaskConfig)
 
     def scene_and_data(self) -> tuple[Path | None, Path]:
-        """See `_Eval`; the scenes of --train are those in --out."""
+        """Return the scene (file or folder) and the benchmark's folder; with --train the scenes lie in --out."""
         if not self.train:
             return super().scene_and_data()
         if self.maps or len(self.paths) != 1:

@@ -312,8 +312,8 @@ Level = Literal["subpart", "part", "whole"]
 
 @dataclass(frozen=True)
 class Describe:
-    """What is here? The best words of a vocabulary for a pixel, a Gaussian or a thing that a phrase finds, or
-    the scene's inventory."""
+    """Name what is here: the best words of a vocabulary for a pixel, a Gaussian or an instance of a phrase,
+    or the scene's inventory."""
 
     scene: tyro.conf.Positional[Path]
     """A trained scene, *.ply with its language field beside it."""

@@ -1,4 +1,5 @@
-"""How every command ends: 0, or 2 with one line on stderr, or 130 (143) when interrupted (terminated).
+"""Running of commands, each of which exits with 0, with 2 and one line on stderr, or with 130 (143) when
+interrupted (terminated).
 
 A command is a dataclass whose fields are its arguments (tyro derives the parser) and whose `run` does
 the work. The viewer's program ends the same way and uses this module too.
@@ -49,7 +50,7 @@ _Flag = Annotated[
 
 @dataclass(frozen=True)
 class Verbosity:
-    """How much is said on standard error, beside the answer."""
+    """Options for the amount of messages on standard error."""
 
     quiet: Annotated[_Flag, tyro.conf.arg(aliases=["-q"])] = False
     """Errors alone: no progress, notes or warnings."""
@@ -58,12 +59,12 @@ class Verbosity:
 
     @property
     def level(self) -> int:
-        """Of the log; progress is shown below ERROR."""
+        """Level of the log; progress is shown below ERROR."""
         return logging.ERROR if self.quiet else logging.DEBUG if self.verbose else logging.INFO
 
 
 class _OneLine(logging.Formatter):
-    """What a warning quotes from a file is shown as an error's message is."""
+    """Formatter that prints a record as one line of printable characters, as errors are printed."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable_line(record.getMessage(), _LOG_LIMIT)
@@ -77,7 +78,7 @@ class Command(Protocol):
 
 
 def named(args: Sequence[str], option: str) -> str:
-    """What `args` give for an option, the last time they do; "" where they do not."""
+    """Return the last value that `args` give for an option; "" where they give none."""
     values = [
         after if word == option else word.partition("=")[2]
         for word, after in pairwise([*args, ""])
@@ -250,7 +251,7 @@ def _drop_standard_output() -> None:
 
 
 def _system_complaint(error: OSError) -> str:
-    """What the system said of a file, or of standard output."""
+    """Return the operating system's message, with the file's name where it has one."""
     reason = error.strerror or str(error) or type(error).__name__
     if isinstance(error.filename, str | bytes):
         remedy = f"; {_ROOM}" if error.errno in NO_ROOM else ""

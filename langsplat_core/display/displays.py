@@ -300,7 +300,7 @@ def _depth(sheet: _Sheet) -> Array:
 
 
 def _alpha(sheet: _Sheet) -> Array:
-    """Opaque."""
+    """Return alpha as an opaque (h, w, 4) grey image."""
     alpha = sheet.channels.alpha
     return np.stack([alpha, alpha, alpha, np.ones_like(alpha)], -1)
 

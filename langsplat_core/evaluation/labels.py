@@ -1,4 +1,4 @@
-"""What the benchmarks label: phrases in frames, and where they are true. Masks are drawn when asked for."""
+"""Labels of the benchmarks: phrases in frames, and the masks where they are true, drawn when asked for."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ SAME_SHAPE = 0.02  # relative difference of aspect up to which two sizes may be 
 
 
 class Truth(Protocol):
-    """Where something is in a frame."""
+    """True mask of a phrase in a frame."""
 
     def draw(self, size: Size) -> Array:
         """(H, W) bool on a grid of `size`; by the nearest pixel where that is not the label's own grid."""
@@ -31,7 +31,7 @@ class Outlines:
     polygons: tuple[Array, ...]  # (K, 2) float x, y each, K >= 3
 
     def draw(self, size: Size) -> Array:
-        """See `Truth`. Corners are cut to whole pixels and the outline belongs to the inside."""
+        """Fill the polygons; corners are cut to whole pixels and the outline belongs to the inside."""
         canvas = Image.new("L", self.size)
         brush = ImageDraw.Draw(canvas)
         for polygon in self.polygons:
@@ -46,7 +46,7 @@ class MaskFile:
     path: Path
 
     def draw(self, size: Size) -> Array:
-        """See `Truth`. Bright is above half of 255, or above 0 where the file holds no more than 0 and 1."""
+        """Read the bright pixels: above half of 255, or above 0 where the file holds no more than 0 and 1."""
         grey = read_grey(self.path)
         return resized(grey > (127 if grey.max(initial=0) > 1 else 0), size)
 
@@ -64,7 +64,7 @@ class Label:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A labelled view."""
+    """One labelled view of a scene."""
 
     name: str  # of its photograph, without extension; dots inside belong to it
     size: Size  # of the label's grid

@@ -168,7 +168,7 @@ def peak_pixels(maps: Array, rule: MapRule) -> Array:
 
 
 def _mean_inside(values: Array, threshold: float) -> float:
-    """Of what exceeds the threshold; below every relevancy where nothing does."""
+    """Return the mean of the values above the threshold; -1, below every relevancy, where there are none."""
     inside = values[values > threshold]
     return float(inside.mean()) if len(inside) else -1.0
 

@@ -22,7 +22,7 @@ COUNTED = "a query without an answer counts as wrong: IoU 0, no place"
 
 @dataclass(frozen=True)
 class Means:
-    """Of a set of queries, or of such means."""
+    """Mean scores of a set of queries, or means of such means."""
 
     queries: int
     iou: float
@@ -42,7 +42,7 @@ class BenchmarkReport:
 
     @property
     def queries(self) -> list[QueryScore]:
-        """Of all scenes."""
+        """Queries of all scenes."""
         return [query for scores in self.scenes.values() for query in scores.queries]
 
 
@@ -105,7 +105,7 @@ def table(report: BenchmarkReport) -> str:
 
 
 def notes(report: BenchmarkReport) -> list[str]:
-    """What the figures are of: lines of plain text."""
+    """Return lines of plain text on the protocol, the subject and the frames behind the figures."""
     queries = report.queries
     lines = [
         f"{report.benchmark}, protocol {report.profile.name}: {report.profile.source}",
@@ -176,7 +176,7 @@ N2F2          93.8  92.6   93.5  92.1  96.3
 
 
 def _rows(table: str) -> Mapping[str, Row]:
-    """Of a table as above."""
+    """Parse a table as above: method -> column -> pair of figures."""
     head, *lines = table.strip().splitlines()
     return {
         name.replace("_", " "): dict(zip(head.split(), map(_pair, cells), strict=True))

@@ -26,7 +26,7 @@ FULL_SIZE = 100_000  # px: photographs are read for their cameras alone and not 
 
 @dataclass(frozen=True)
 class Subject:
-    """Who is measured: exactly one of `scene` and `maps`."""
+    """Subject of a measurement: exactly one of `scene` and `maps` is set."""
 
     scene: Path | None = None  # a scene file, or a folder of <benchmark's scene>.ply
     maps: Path | None = None  # <view>/<phrase>..., or <benchmark's scene>/<view>/<phrase>...
@@ -151,7 +151,7 @@ def _other_cameras(
 
 
 def _dataset_cameras(folder: Path, progress: Progress) -> tuple[Camera, ...]:
-    """Of a dataset that came with cameras; none otherwise."""
+    """Return the cameras that came with a dataset; none where it has none."""
     if (folder / "transforms.json").is_file():
         return load_nerfstudio(folder / "transforms.json", FULL_SIZE, progress).cameras
     model = find_model(folder)

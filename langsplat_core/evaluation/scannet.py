@@ -72,7 +72,7 @@ class PointProfile:
 
 @dataclass(frozen=True, eq=False)
 class LabelledPoints:
-    """One scene's vertices."""
+    """Labelled vertices of one scene."""
 
     name: str
     positions: Array  # (V, 3) float32 world units
@@ -255,5 +255,5 @@ def point_table(report: PointReport) -> str:
 
 
 def save_point_json(path: Path, report: PointReport) -> None:
-    """All of it."""
+    """Write the whole report as JSON."""
     write_json(path, asdict(report))

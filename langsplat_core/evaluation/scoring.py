@@ -18,7 +18,7 @@ from langsplat_core.scene import LEVELS
 
 
 def intersection_over_union(found: Array, truth: Array) -> float:
-    """Of two (H, W) boolean masks; 1 where both are empty."""
+    """Return the intersection over union of two (H, W) boolean masks; 1 where both are empty."""
     union = np.logical_or(found, truth).sum()
     return float(np.logical_and(found, truth).sum() / union) if union else 1.0
 
@@ -144,8 +144,8 @@ def _score(
 
 
 def inside_any_box(peaks: Array, boxes: Array | None, size: Size, shape: tuple[int, ...]) -> bool:
-    """Whether any of the (P, 2) peaks, column and row on a grid of `shape` (rows, columns), lies in any of
-    the (B, 4) boxes on the label's grid of `size`, borders included."""
+    """Return True where any of the (P, 2) peaks, column and row on a grid of `shape` (rows, columns), lies in
+    any of the (B, 4) boxes on the label's grid of `size`, borders included."""
     if boxes is None or not len(peaks):
         return False
     scale = np.array([shape[1] / size[0], shape[0] / size[1]])

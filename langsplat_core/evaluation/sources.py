@@ -110,7 +110,7 @@ class Source(Protocol):
         """phrase -> the answer in the view `frame`, preferably drawn at `size`; or why there is none."""
 
     def trained_on(self, frame: str) -> bool | None:
-        """Whether the view was trained on; None: not known."""
+        """Return True where the view was trained on, False where it was not, None where that is not known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,11 +125,9 @@ class SceneSource:
     paper_order: bool = False  # blend latents and decode every pixel, instead of blending relevancies
 
     def trained_on(self, frame: str) -> bool | None:
-        """See `Source`."""
         return None if self.trained is None else frame in self.trained
 
     def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
-        """See `Source`."""
         if frame not in self.cameras:
             return dict.fromkeys(phrases, NO_VIEW)
         camera = self.cameras[frame]
@@ -186,11 +184,9 @@ class MapSource:
     rule: MapRule | SilhouetteRule
 
     def trained_on(self, frame: str) -> bool | None:
-        """See `Source`."""
         return None
 
     def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
-        """See `Source`; `size` is not read."""
         return {phrase: self._answer(self.folder / frame, phrase) for phrase in phrases}
 
     def _answer(self, folder: Path, phrase: str) -> Prediction | str:

@@ -39,7 +39,7 @@ class Features(Protocol):
 
     @property
     def dim(self) -> int:
-        """Numbers per vector."""
+        """Count of numbers per vector."""
 
     def rows(self, indices: Array) -> Array:
         """(n,) whole numbers below N -> (n, dim) float32 vectors of any length; zero for no features."""
@@ -252,7 +252,7 @@ class Centroids:
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """OpenGaussian's `cluster_lang.npz`."""
+    """Cluster vectors of OpenGaussian, `cluster_lang.npz`."""
 
     path: Path
     leaves: Leaves
@@ -260,7 +260,7 @@ class Clusters:
 
 @dataclass(frozen=True, eq=False)
 class Autoencoder:
-    """LangSplat's `best_ckpt.pth`."""
+    """Autoencoder of LangSplat, `best_ckpt.pth`."""
 
     path: Path
     codec: AutoencoderCodec

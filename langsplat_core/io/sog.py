@@ -179,7 +179,7 @@ class _Meta:
         return value
 
     def numbers(self, group: str, key: str, count: int) -> Array:
-        """(count,) finite float64."""
+        """Return the list under `group` and `key` as a (count,) array of finite float64."""
         value = self._at((group, key))
         if not isinstance(value, list) or len(value) != count or not all(map(_is_finite_number, value)):
             raise FormatError(f"{self.path}: {group}.{key} is not a list of {count} numbers")

@@ -130,7 +130,7 @@ def _read_one_stream(file: BinaryIO, limit: int, path: Path) -> Packed:
 
 
 def _read_to_the_end(file: BinaryIO, limit: int, path: Path) -> None:
-    """Where gzip has its checksum. Other programs' data may lie before it, of at most `limit` bytes."""
+    """Read to the end, where gzip checks its sum; at most `limit` bytes of other data may remain."""
     while piece := file.read(PIECE):
         limit -= len(piece)
         if limit < 0:

@@ -29,7 +29,7 @@ _CODE = re.compile(r"b1|[iu][1248]|f[248]|[SU][1-9]\d{0,3}", re.ASCII)  # no obj
 
 
 class _Kind:
-    """Stands for `numpy.dtype`."""
+    """Stand-in for `numpy.dtype`."""
 
     def __init__(self, code: Any, *_: Any) -> None:
         if not isinstance(code, str) or not _CODE.fullmatch(code):
@@ -54,7 +54,7 @@ class _Kind:
 
 
 class _Array:
-    """Stands for `numpy.ndarray`."""
+    """Stand-in for `numpy.ndarray`."""
 
     values: Array | None = None  # until the file has said what is in it
 

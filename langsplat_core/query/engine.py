@@ -110,12 +110,12 @@ class QueryEngine:
 
     @property
     def rule(self) -> AnswerRule:
-        """How answers are read."""
+        """Rule for answers: "regions" where the field has everyday phrases to compare with, else "peak"."""
         return "regions" if self.scale.everyday is not None else "peak"
 
     @property
     def scale(self) -> Scale:
-        """How cosines are read."""
+        """Scale that turns cosines into relevancies."""
         field = self.field
         return Scale(field.canonical, self._everyday, field.reading.temperature)
 

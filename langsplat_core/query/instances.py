@@ -129,7 +129,7 @@ class Instance:
 
     @property
     def count(self) -> int:
-        """How many Gaussians it has."""
+        """Count of its Gaussians."""
         return len(self.members)
 
     @cached_property

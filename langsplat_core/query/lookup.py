@@ -64,7 +64,6 @@ class SphereTable:
     resolution: int
 
     def relevancies(self, phrases: Array) -> Iterator[Array]:
-        """See `Lookup`."""
         grid = np.zeros(self.resolution**2, np.float32)
         for row in self.nodes.relevancies(phrases).T:
             grid[self.used] = row
@@ -129,7 +128,6 @@ class LatentLookup:
             self._zero[part], self._rate[part] = scale.of(cosines)
 
     def relevancies(self, phrases: Array) -> Iterator[Array]:
-        """See `Lookup`."""
         for first in range(0, len(phrases), TOGETHER):
             some = phrases[first : first + TOGETHER]
             values = np.zeros((len(some), len(self._latents) + 1), np.float32)  # the last: no meaning

@@ -144,7 +144,6 @@ class GsplatView(LiftingView):
         return drawn.image, drawn.alpha
 
     def splat(self, values: Array) -> tuple[Array, Array]:
-        """See `View.splat`; float32."""
         channels = check_array("values", values, (self.count, "C"))["C"]
         if len(self._rows) == 0:
             shape = (self.camera.height, self.camera.width)
@@ -154,7 +153,7 @@ class GsplatView(LiftingView):
         return image.cpu().numpy(), alpha.cpu().numpy()
 
     def gather(self, image: Array) -> Array:
-        """See `LiftingView.gather`: the derivative of <splat(values), image> by values; float32."""
+        """Return W^T image as the derivative of <splat(values), image> by values; (N, C) float32."""
         channels = check_array("image", image, (self.camera.height, self.camera.width, "C"))["C"]
         gathered = np.zeros((self.count, channels), np.float32)
         if len(self._rows) > 0:
@@ -164,7 +163,6 @@ class GsplatView(LiftingView):
         return gathered
 
     def depth(self) -> Array:
-        """See `View.depth`; float32."""
         both = np.ones((self.count, 2), np.float32)
         both[self._rows, 0] = self._depths
         sums, weights = np.moveaxis(self.splat(both)[0], -1, 0)
@@ -180,7 +178,7 @@ class GsplatRasterizer:
         require_device()
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> GsplatView:
-        """See `Rasterizer.view`. Only near, far, dilation and antialiased apply; gsplat fixes the rest.
+        """Project with gsplat, which honours near, far, dilation and antialiased and fixes the rest.
 
         Raises BackendError for other settings that are not the profiles'.
         """

@@ -230,7 +230,6 @@ class ReferenceView(LiftingView):
         return band
 
     def splat(self, values: Array) -> tuple[Array, Array]:
-        """See `View.splat`; float64."""
         check_array("values", np.asarray(values), (len(self.order), "C"))
         image = np.zeros((self.camera.height, self.camera.width, values.shape[1]))
         alpha = np.zeros((self.camera.height, self.camera.width))
@@ -240,7 +239,6 @@ class ReferenceView(LiftingView):
         return image, alpha
 
     def gather(self, image: Array) -> Array:
-        """See `LiftingView.gather`; float64."""
         check_array("image", np.asarray(image), (self.camera.height, self.camera.width, "C"))
         values = np.zeros((len(self.order), image.shape[2]))
         for step in self.steps():
@@ -248,12 +246,10 @@ class ReferenceView(LiftingView):
         return values
 
     def depth(self) -> Array:
-        """See `View.depth`; float64."""
         total, alpha = self.splat(self.footprints.depths[:, None])
         return np.where(alpha > 0, total[..., 0] / np.where(alpha > 0, alpha, 1), 0)
 
     def median_depth(self) -> Array:
-        """See `View.median_depth`; float64."""
         median = np.zeros((self.camera.height, self.camera.width))
         for step in self.steps():
             passed = (step.weights > 0) & (step.after <= 0.5)
@@ -268,6 +264,5 @@ class ReferenceRasterizer:
     name = "reference"
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> ReferenceView:
-        """See `Rasterizer.view`."""
         dropped = int(len(gaussians) - gaussians.valid().sum())
         return ReferenceView(project(gaussians, camera, settings), camera, settings, dropped)

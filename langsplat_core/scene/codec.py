@@ -34,12 +34,12 @@ class Codec(ABC):
     @property
     @abstractmethod
     def latent_dim(self) -> int:
-        """d"""
+        """Numbers per latent, d."""
 
     @property
     @abstractmethod
     def vector_dim(self) -> int:
-        """D"""
+        """Numbers per vector, D."""
 
     @property
     def size(self) -> int:

@@ -44,7 +44,7 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """0 to 3."""
+        """Degree of the spherical harmonics, 0 to 3."""
         return {count: degree for degree, count in SH_COUNTS.items()}[self.sh.shape[1]]
 
     def take(self, rows: Array) -> "Gaussians":

@@ -88,7 +88,7 @@ class Odds:
             raise ValueError(f"{self}: expected finite numbers, rising with fits, and found in [0.5, 1]")
 
     def probability(self, fits: Fits) -> float:
-        """That what is asked for is there, in (0, 1)."""
+        """Return the probability, in (0, 1), that what is asked for is there."""
         subpart, part, whole = fits
         logit = self.constant + self.whole * whole + self.finer * max(subpart, part)
         return float(sigmoid(np.array(logit)))
@@ -105,7 +105,7 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Reading:
-    """How cosines of one text encoder are read: other encoders have another scale."""
+    """Calibration of one text encoder's cosines, whose scale differs between encoders."""
 
     temperature: float = 10.0  # of the softmax; 10 in the public code of LERF and LangSplat, for CLIP
     found: float = 0.6  # peak relevancy, as published, from which a phrase counts as present

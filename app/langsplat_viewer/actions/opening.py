@@ -302,7 +302,7 @@ def photograph_here(state: ViewerState) -> Photograph | None:
 
 
 def fade_photograph(viewer: Viewer, fade: float) -> None:
-    """How much of the photograph is laid over the picture, 0 to 1."""
+    """Set the opacity of the photograph over the image, 0 to 1."""
     fade = min(max(fade, 0.0), 1.0)
     if fade != viewer.state.settings.fade:
         remember(viewer, "fade")
@@ -370,12 +370,12 @@ def ask_for_file(viewer: Viewer) -> None:
 
 
 def close_browser(viewer: Viewer) -> None:
-    """Choose nothing."""
+    """Close the browser without choosing a file."""
     viewer.state.browser = None
 
 
 def browse(viewer: Viewer, folder: Path) -> None:
-    """Show another folder."""
+    """Show another folder in the browser."""
     viewer.state.path_typed, viewer.state.browser = "", list_folder(folder)
 
 

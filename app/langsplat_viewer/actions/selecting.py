@@ -70,7 +70,7 @@ def select_all(viewer: Viewer) -> None:
 
 
 def select_none(viewer: Viewer) -> None:
-    """Select nothing."""
+    """Clear the selection."""
     if has_scene(viewer):
         take(viewer, np.zeros_like(viewer.state.selection.marks.selected), "replace")
 
@@ -88,7 +88,7 @@ def hide_selected(viewer: Viewer) -> None:
 
 
 def isolate_selected(viewer: Viewer) -> None:
-    """Hide everything else."""
+    """Hide everything that is not selected."""
     if has_selection(viewer):
         mark(viewer, marks.isolating(viewer.state.selection.marks))
 

@@ -164,7 +164,7 @@ def zoom_by(viewer: Viewer, factor: float) -> None:
 
 
 def set_fly_speed(viewer: Viewer, speed: float) -> None:
-    """How fast the keys fly, scene radii per second."""
+    """Set the speed of flying with keys, scene radii per second."""
     viewer.state.fly_speed = speed
 
 

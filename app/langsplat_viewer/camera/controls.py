@@ -86,13 +86,13 @@ def framing_eye(sample: Sample, rotation: Array, inner: Intrinsics, share: float
 
 
 def median_depth(sample: Sample, eye: Array, forward: Array) -> float:
-    """How far ahead of `eye` (3,) along the unit `forward` (3,) half of the weight lies, world units."""
+    """Return the depth from `eye` (3,) along the unit `forward` (3,) of half of the weight, world units."""
     return _quantile((sample.points - eye) @ forward, sample.weights, 0.5)
 
 
 def nearest_depth(sample: Sample, eye: Array, forward: Array) -> float:
-    """How far ahead of `eye` (3,) along the unit `forward` (3,) the scene begins but for `1 - SHARE` of its
-    weight, world units; negative behind it."""
+    """Return the depth from `eye` (3,) along the unit `forward` (3,) before which only `1 - SHARE` of the
+    weight lies, world units; negative behind it."""
     return _quantile((sample.points - eye) @ forward, sample.weights, 1 - SHARE)
 
 
@@ -325,7 +325,7 @@ class Extent:
 
 
 def extent_of(scene: Scene) -> Extent:
-    """Measure a scene."""
+    """Return the extent of a scene."""
     centre, radius = scene.bounds()
     rotation = scene.framing_camera((1000, 1000)).rotation
     sample = sample_of(scene.gaussians)

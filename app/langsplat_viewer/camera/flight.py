@@ -59,7 +59,7 @@ class Motion(Protocol):
 
     @property
     def seconds(self) -> float:
-        """How long it takes."""
+        """Duration of the motion in seconds."""
 
     @property
     def closed(self) -> bool:
@@ -93,7 +93,6 @@ class Flight:
         return _Curve(self.keyframes)
 
     def poses(self, seconds: Array) -> tuple[Pose, ...]:
-        """See `Motion`."""
         if len(self.keyframes) == 1:
             return (self.keyframes[0].pose,) * len(seconds)
         return self._curve.poses(np.asarray(seconds, np.float64))
@@ -110,7 +109,6 @@ class Turntable:
     closed: bool = True
 
     def poses(self, seconds: Array) -> tuple[Pose, ...]:
-        """See `Motion`."""
         angles = 2 * math.pi * np.clip(seconds, 0, self.seconds) / self.seconds
         turns = Rotation.from_rotvec(angles[:, None] * self.up).as_matrix()
         arm = self.start.position - self.centre

@@ -113,7 +113,7 @@ VIEWS_SIZE_LIMIT = 16_000_000  # bytes
 
 @dataclass(frozen=True, eq=False)
 class Bookmark:
-    """A view."""
+    """Named view of a flight."""
 
     name: str
     pose: Pose

@@ -23,7 +23,7 @@ Stamps = tuple[tuple[Path, Stamp], ...]
 
 
 def stamps(files: tuple[Path, ...]) -> Stamps:
-    """How `files` are now."""
+    """Return the present stamp of each file."""
     return tuple((file, _stamp(file)) for file in files)
 
 

@@ -235,7 +235,7 @@ def draw_timing(viewer: Viewer) -> None:
 
 
 def in_numbers(comparison: Comparison) -> str:
-    """One line."""
+    """Return the comparison's figures as one line."""
     width, height = comparison.size
     what = f"{comparison.backend} against the reference, {width} x {height}"
     if comparison.largest == 0:
@@ -319,7 +319,7 @@ class Column:
         self._wanted = self._given = 0.0  # width for these letters, and the one that there was room for
 
     def apply(self, viewer: Viewer) -> None:
-        """Once per frame."""
+        """Apply the layout and the scale of the interface; called once per frame."""
         scale = viewer.state.preferences.ui_scale
         before, self._scale = self._scale, scale
         node = _column() if before is not None and before != scale else None

@@ -86,7 +86,7 @@ def _titles(viewer: Viewer, area: Area) -> None:
 
 
 def shade_edge() -> float:
-    """How far the shade of `text_on_shade` reaches beyond the text, window units."""
+    """Return the margin of the shade of `text_on_shade` around its text, window units."""
     return float(hello_imgui.em_size(0.2))
 
 

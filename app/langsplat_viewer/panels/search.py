@@ -24,7 +24,7 @@ OFFER_LINES = 2  # more are scrolled to
 
 
 def _box(viewer: Viewer) -> None:
-    """Box, button, offers."""
+    """Draw the search box, its button and the suggestions."""
     queries.prepare_suggestions(viewer)
     button = imgui.calc_text_size("Search").x + 2 * imgui.get_style().frame_padding.x
     imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
@@ -233,7 +233,7 @@ CHOICES: tuple[LevelChoice, ...] = get_args(LevelChoice)
 
 
 def draw(viewer: Viewer) -> None:
-    """Box, level, list."""
+    """Draw the search box, the level and the list of queries."""
     scene = viewer.state.scene
     if scene is not None and scene.language is None:
         small_wrapped(no_field(scene), muted())

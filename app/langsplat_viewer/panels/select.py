@@ -80,7 +80,7 @@ def draw(viewer: Viewer) -> None:
 
 
 def counts(marks: Marks) -> str:
-    """How many are marked, in words."""
+    """Return the counts of selected, hidden and deleted Gaussians in words."""
     selected, hidden, deleted = (int(part.sum()) for part in (marks.selected, marks.hidden, marks.deleted))
     return f"{selected:,} of {len(marks.selected):,} selected, {hidden:,} hidden, {deleted:,} deleted"
 

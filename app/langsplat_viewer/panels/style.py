@@ -70,12 +70,12 @@ def good() -> ImVec4:
 
 
 def bad() -> ImVec4:
-    """Colour of errors."""
+    """Return the colour of errors."""
     return ImVec4(0.95, 0.58, 0.45, 1.0) if _is_dark() else ImVec4(0.70, 0.15, 0.05, 1.0)
 
 
 def muted() -> ImVec4:
-    """Colour of explanations."""
+    """Return the colour of explanations."""
     return ImVec4(0.62, 0.64, 0.67, 1.0) if _is_dark() else ImVec4(0.35, 0.36, 0.40, 1.0)
 
 

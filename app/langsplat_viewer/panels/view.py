@@ -48,7 +48,7 @@ def draw_display(viewer: Viewer) -> None:
 
 
 def _splats(viewer: Viewer) -> None:
-    """How the Gaussians are drawn."""
+    """Draw the settings of the Gaussians' appearance."""
     scene, splats = viewer.state.scene, viewer.state.settings.splats
     size = _slider("Splat size", splats.size, *SIZE_RANGE)
     tip("Smaller, every Gaussian can be seen; answers and files do not change")
@@ -259,7 +259,7 @@ def _training_cameras(viewer: Viewer) -> None:
 
 
 def _photograph(viewer: Viewer) -> None:
-    """How much of it is seen, and why it is not."""
+    """Draw the photograph's opacity, or why there is none."""
     state = viewer.state
     leave_room("Photograph", WIDTH_EM)
     flags = imgui.SliderFlags_.always_clamp

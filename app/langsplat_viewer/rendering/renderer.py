@@ -113,7 +113,7 @@ class LastView:
         self._kept: tuple[RenderKey, View] | None = None
 
     def of(self, key: RenderKey) -> View:
-        """The Gaussians projected."""
+        """Return the projected view of `key`, kept from the last call where it is equal."""
         if self._kept is None or self._kept[0] != key:
             self._kept = key, self._rasterizer.view(key.scene.gaussians, key.camera, key.settings())
         return self._kept[1]

@@ -401,7 +401,7 @@ class TileOperator(LiftingView):
         """(H, W, C) image -> fill (I, padded(C)) sums, one row per intersection."""
 
     def splat(self, values: Array) -> tuple[Array, Array]:
-        """See `View.splat`; float32. Values must be finite."""
+        """Blend (N, C) finite values into (H, W, C) and alpha (H, W), float32."""
         check_array("values", values, (self.count, "C"))
         ordered = values[self.order]
         height, width, channels = self.camera.height, self.camera.width, ordered.shape[1]
@@ -415,7 +415,7 @@ class TileOperator(LiftingView):
         return parts[0] if len(parts) == 1 else np.concatenate(parts, -1), alpha[..., 0]
 
     def gather(self, image: Array) -> Array:
-        """See `LiftingView.gather`; float32, summed in float64 over tiles."""
+        """Return W^T image, (N, C) float32, summed in float64 over tiles."""
         check_array("image", image, (self.camera.height, self.camera.width, "C"))
         channels = image.shape[2]
         values = np.zeros((self.count, channels), np.float32)

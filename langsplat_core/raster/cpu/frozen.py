@@ -186,11 +186,9 @@ class FrozenView(TileOperator):
         return self._weights.nbytes + self._firsts.nbytes + self.tiles.rows.nbytes + self._alpha.nbytes
 
     def depth(self) -> Array:
-        """See `View.depth`; float32."""
         return self._view.depth()
 
     def median_depth(self) -> Array:
-        """See `View.median_depth`; float32."""
         return self._view.median_depth()
 
     def _splat_part(self, values: Array, image: Array, alpha: Array) -> None:

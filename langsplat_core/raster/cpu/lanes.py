@@ -111,7 +111,7 @@ def where_at_least(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
 
 @intrinsic
 def smaller(typing: Any, a: Any, b: Any) -> Any:
-    """min(a, b)"""
+    """Return min(a, b), lane by lane."""
     return lanes16(a, b), lambda context, builder, sig, args: _select(builder, "<", *args, *args)
 
 
@@ -122,7 +122,7 @@ def _select(builder: Any, comparison: str, a: Any, b: Any, yes: Any, no: Any) ->
 
 @intrinsic
 def reciprocal(typing: Any, value: Any) -> Any:
-    """1 / value"""
+    """Return 1 / value, lane by lane."""
     return lanes16(value), lambda context, builder, sig, args: builder.fdiv(constant(1), args[0])
 
 

@@ -48,7 +48,7 @@ class Rows(NamedTuple):
 
 
 class Projected(NamedTuple):
-    """Result of `project`."""
+    """Gaussians projected onto the image plane, as `project` returns them."""
 
     geometry: Array  # (N, 8) float64, columns MEAN_X to HALF_HEIGHT; only where DRAWN
     depths: Array  # (N,) float64 camera z; only where DRAWN

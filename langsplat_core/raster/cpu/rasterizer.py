@@ -79,7 +79,6 @@ class CpuView(TileOperator):
         self._over_tiles(blend.gather, image, self._cutoffs, partial)
 
     def gather_labels(self, maps: Array, count: int, least: float = 0.0) -> sparse.csr_matrix:
-        """See `LiftingView.gather_labels`."""
         self.check_labels(maps, count)
 
         def run(kernel: Callable[..., None], *rest: Any) -> None:
@@ -138,13 +137,11 @@ class CpuView(TileOperator):
         self.workers.run(kernel, len(self.tiles.starts) - 1, self.tiles, self._geometry, *arguments)
 
     def median_depth(self) -> Array:
-        """See `View.median_depth`; float32."""
         median = np.empty((self.camera.height, self.camera.width, 1), np.float32)
         self._over_tiles(blend.median_depth, self._depths, self._cutoffs, median)
         return median[..., 0]
 
     def depth(self) -> Array:
-        """See `View.depth`; float32."""
         # Ones are blended along: alpha itself is 1 - T, which has no digits left where it is small.
         both = np.zeros((self.count, 2), np.float32)
         both[self.order] = np.stack([self._depths, np.ones_like(self._depths)], -1)
@@ -170,6 +167,6 @@ class CpuRasterizer:
         self.workers = shared_workers(threads)
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> CpuView:
-        """See `Rasterizer.view`. InputError for a picture that this machine's memory cannot hold."""
+        """Project on the CPU; InputError for an image that this machine's memory cannot hold."""
         check_picture(camera)
         return CpuView(gaussians, camera, settings, self.workers)

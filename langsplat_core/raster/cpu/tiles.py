@@ -263,7 +263,7 @@ def add_weighted(sums: Array, at: int, channels: int, weight: Lanes, x: Array) -
 
 @helper
 def write_tile(planes: Array, image: Array, tile: int, columns: int) -> None:
-    """That tile (of `columns` in a row of tiles) of (H, W, C) image <- planes[(row, channel, column)]."""
+    """Copy planes[(row, channel, column)] to tile `tile` (`columns` to a row) of the (H, W, C) image."""
     x0, y0 = tile % columns * TILE, tile // columns * TILE
     height, width, channels = image.shape
     lines = padded_inside(channels)

@@ -77,7 +77,7 @@ class GlRasterizer:
         self._targets: Targets | None = None
 
     def view(self, gaussians: Gaussians, camera: Camera, settings: RasterSettings = INRIA) -> "GlView":
-        """See `Rasterizer.view`. The order is kept when only the image plane changed."""
+        """Project with OpenGL; the order is kept when only the image plane changed."""
         limit = self.ctx.info["GL_MAX_TEXTURE_SIZE"]
         if limit == 0:  # what moderngl reads where no context is current
             raise BackendError(f"rasterizer 'opengl': {NOT_CURRENT}")
@@ -227,8 +227,7 @@ class GlRasterizer:
 
 
 class GlView(View):
-    """See `protocol.View`. Holds no device memory: its rasterizer projects it again when another view
-    was drawn in between."""
+    """View without device memory: its rasterizer projects it again when another was drawn in between."""
 
     def __init__(
         self,
@@ -245,7 +244,6 @@ class GlView(View):
         self.dropped = self.count - len(rasterizer.scene(gaussians).rows)
 
     def splat(self, values: Array) -> tuple[Array, Array]:
-        """See `View.splat`; float32."""
         values = np.asarray(values)
         channels = check_array("values", values, (len(self.gaussians), "C"))["C"]
         image = np.zeros((self.camera.height, self.camera.width, channels), np.float32)
@@ -275,7 +273,6 @@ class GlView(View):
         return flat.reshape(self.camera.height, self.camera.width, texture.components).astype(np.float32)
 
     def depth(self) -> Array:
-        """See `View.depth`; float32."""
         total, alpha = np.moveaxis(self._read(self.rasterizer.draw(self, [], with_depth=True)[0]), -1, 0)
         return np.where(alpha > 0, total / np.where(alpha > 0, alpha, 1), 0)
 

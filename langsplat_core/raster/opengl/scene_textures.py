@@ -376,7 +376,7 @@ class DrawOrder(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class CpuOrder:
-    """Sorted by NumPy."""
+    """Drawing order sorted by NumPy."""
 
     texels: Array  # (m,) int32, back to front
 

@@ -169,7 +169,7 @@ PAIR = np.dtype([("row", "<u4"), ("mask", "<u2"), ("level", "<u2"), ("weight", "
 
 @dataclass(frozen=True, eq=False)
 class MaskWeights:
-    """How strongly `count` Gaussians belong to the masks of all views."""
+    """Mask weights of `count` Gaussians in all views, W^T onehot(mask), sparse."""
 
     pairs: Sequence[Array]  # of each view, of type PAIR, by rising row: Gaussian, mask, its level, pixels
     count: int
