@@ -62,7 +62,7 @@ class _EvalLabels(_Eval):
     masks: MaskConfig = field(default_factory=MaskConfig)
 
     def scene_and_data(self) -> tuple[Path | None, Path]:
-        """Return the scene (file or folder) and the benchmark's folder; with --train the scenes lie in --out."""
+        """Return the scene, a file or folder, and the benchmark's folder; --train puts scenes into --out."""
         if not self.train:
             return super().scene_and_data()
         if self.maps or len(self.paths) != 1:
