@@ -18,6 +18,7 @@ from langsplat_core.query.answers import (
     Bars,
     Chance,
     QueryResult,
+    bars,
     by_peak,
     by_regions,
     chance_in,
@@ -217,14 +218,14 @@ class QueryEngine:
 
     @cached_property
     def _bars(self) -> Bars | None:
-        return None if self.chance is None else self.chance.bars()
+        return None if self.chance is None else bars(self.chance)
 
     def chance_among(self, members: Array) -> Bars:
         """The best fits of everyday phrases at the regions of some Gaussians, (N,) bool."""
         assert self.chance is not None
         everywhere = self.regions.everywhere[:, members]
         subpart, part, whole = (np.unique(row[row >= 0]) for row in everywhere)
-        return self.chance.bars((subpart, part, whole))
+        return bars(self.chance, (subpart, part, whole))
 
     def unknown_words(self, phrase: str) -> tuple[str, ...]:
         """Words for which `phrase` cannot be asked; none where the phrasebook has it. EncoderError as
