@@ -31,7 +31,7 @@ from langsplat_core.query.compose import check_phrase, joined, run_phrase
 from langsplat_core.query.describe import Describer, Entry, Words, look_at_pixel
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, no_field
 from langsplat_core.query.grammar import Atom
-from langsplat_core.query.instances import Instance, hulls
+from langsplat_core.query.instances import Instance, hull
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.selection import grow, of_rows, shrink
 from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
@@ -272,8 +272,11 @@ class Select:
             relevancy = answer.relevancy[answer.level][rows]
             return write_points(self.out, scene.gaussians.take(rows), {"relevancy": relevancy})
         if self.shape == "hull":
-            colours = base_colours(scene.gaussians)
-            meshes = hulls(engine.instances(answer), scene.gaussians, colours, " ".join(self.texts))
+            colours, name = base_colours(scene.gaussians), " ".join(self.texts)
+            meshes = [
+                hull(instance, scene.gaussians, colours, f"{name} {number}")
+                for number, instance in enumerate(engine.instances(answer), 1)
+            ]
             write_meshes(self.out, meshes)
             return len(meshes)
         save_scene(self.out, replace(scene.take(rows), path=self.out))

@@ -1,6 +1,5 @@
 """Instances of an answer: its Gaussians, taken apart where the surface is, with boxes, scores and hulls."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -227,11 +226,6 @@ class Mesh:
     vertices: Array  # (V, 3) float64 world units
     triangles: Array  # (T, 3) int32 numbers of vertices, counter-clockwise seen from outside
     colour: Array  # (3,) display values in [0, 1], of the whole
-
-
-def hulls(things: Sequence[Instance], gaussians: Gaussians, colours: Array, name: str) -> tuple[Mesh, ...]:
-    """One hull around each, named `name` and its number from 1 on. Arguments and errors as of `hull`."""
-    return tuple(hull(thing, gaussians, colours, f"{name} {k}") for k, thing in enumerate(things, 1))
 
 
 def hull(instance: Instance, gaussians: Gaussians, colours: Array, name: str) -> Mesh:

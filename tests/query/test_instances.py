@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull
 
 from langsplat_core.arrays import Array, logit, rotation_matrices, sigmoid
@@ -20,7 +19,6 @@ from langsplat_core.query.instances import (
     axis_aligned_box,
     find_instances,
     hull,
-    hulls,
     oriented_box,
 )
 from langsplat_core.query.surface import Surface, build_surface
@@ -53,22 +51,6 @@ def smoothed(surface: Surface, values: Array) -> Array:
     """(M,) float64: the weighted mean over each neighbourhood."""
     weights = surface.weights.astype(np.float64)[surface.neighbours]
     return (weights * values.astype(np.float64)[surface.rows][surface.neighbours]).sum(1) / weights.sum(1)
-
-
-def test_parts_are_the_connected_components():
-    surface = build_surface(random_gaussians(500))
-    numbers = np.flatnonzero(np.random.default_rng(0).uniform(size=len(surface.rows)) < 0.08)
-    parts = surface.parts(numbers)
-    count, labels = connected_components(surface.links[numbers][:, numbers], directed=False)
-    assert len(parts.starts) == count > 3
-    own = parts.labels[numbers]
-    for part in range(count):
-        assert len(set(labels[own == part])) == 1
-    assert sorted(parts.order) == numbers.tolist()
-    grouped = np.split(parts.order, parts.starts[1:])
-    assert all(set(parts.labels[group]) == {part} for part, group in enumerate(grouped))
-    assert (np.delete(parts.labels, numbers) < 0).all()
-    assert surface.parts(numbers[:0]).each() == []
 
 
 def test_every_ball_is_an_instance_with_the_figures_of_a_plain_account():
@@ -217,13 +199,9 @@ def test_no_more_than_the_quantiles_lie_outside():
     points = filled((1, 2, 3)) @ turned(2).T
     box = oriented_box(points)
     low, high = axis_aligned_box(points)
-    per_axis = 1 - INSIDE
-    assert 1 - 3 * per_axis - 0.01 <= box.contains(points).mean() < 1
-    assert ((points >= low) & (points <= high)).all(1).mean() >= 1 - 3 * per_axis - 0.01
+    for inside in (box.contains(points), ((points >= low) & (points <= high)).all(1)):
+        assert 1 - 3 * (1 - INSIDE) - 0.01 <= inside.mean() < 1
     assert box.contains(box.corners).all()
-    np.testing.assert_allclose(
-        np.sort(box.corners @ box.axes, axis=0)[-1] - box.centre @ box.axes, box.half_extents
-    )
 
 
 @pytest.mark.parametrize(
@@ -300,10 +278,10 @@ def test_the_hull_of_a_cloud_is_its_convex_hull_within_the_box():
 @pytest.mark.parametrize("flat", [[1, 1, 0], [1, 0, 0]], ids=["sheet", "line"])
 def test_sheets_and_lines_are_given_a_thickness(flat):
     instance, gaussians = thing(np.random.default_rng(0).uniform(size=(200, 3)) * flat)
-    meshes = hulls([instance, replace(instance)], gaussians, colours(200), "red mug")
-    assert [mesh.name for mesh in meshes] == ["red mug 1", "red mug 2"]
-    check_closed(meshes[0])
-    assert volume(meshes[0]) > 0
+    mesh = hull(instance, gaussians, colours(200), "red mug 1")
+    assert mesh.name == "red mug 1"
+    check_closed(mesh)
+    assert volume(mesh) > 0
 
 
 def test_four_points_are_enough_and_one_is_not():

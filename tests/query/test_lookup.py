@@ -10,8 +10,8 @@ from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.query.answers import peak_pixel
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import (
+    SphereTable,
     build_lookup,
-    build_table,
     decoded_relevancy,
     octahedral_to_sphere,
     sphere_to_octahedral,
@@ -157,27 +157,12 @@ def test_table_agrees_with_exact_decoding_and_improves_with_resolution():
     exact = latent_relevancy(codec, latents, phrases, canonical)
     errors = {}
     for resolution in (48, 192):
-        table = build_table(codec, latents, Scale(canonical, None, 10.0), resolution=resolution)
+        table = SphereTable(codec, latents, Scale(canonical, None, 10.0), resolution=resolution)
         got = np.stack(list(table.relevancies(phrases)), 1)
         errors[resolution] = np.abs(got - exact)
     assert errors[192].mean() < 3e-4
     assert errors[192].max() < 0.02  # at creases of the ReLU decoder
     assert errors[192].mean() < errors[48].mean() / 6  # bilinear: second order where smooth
-
-
-def test_a_table_decodes_only_what_latents_lie_between():
-    rng = np.random.default_rng(8)
-    codec, canonical = random_codec(rng), unit(rng.normal(size=(4, D)))
-    latents = np.repeat(unit(rng.normal(size=(5, 3))), 40, axis=0).astype(np.float32)
-    latents[:40] = 0  # no meaning
-    table = build_table(codec, latents, Scale(canonical, None, 10.0), resolution=64)
-    assert len(table.used) == len(table.nodes.vectors) <= 4 * 4
-    phrases = unit(rng.normal(size=(2, D)))
-    got = np.stack(list(table.relevancies(phrases)), 1)
-    np.testing.assert_allclose(got, latent_relevancy(codec, latents, phrases, canonical), atol=0.02)
-    assert (got[:40] == 0).all()
-    nothing = build_table(codec, np.zeros((7, 3), np.float32), Scale(canonical, None, 10.0))
-    assert (next(nothing.relevancies(phrases)) == 0).all()
 
 
 def test_both_orders_agree_inside_one_object_and_are_gated_outside():

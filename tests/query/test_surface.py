@@ -41,16 +41,20 @@ def test_smoothing_is_the_weighted_mean_of_the_nearest():
         np.testing.assert_allclose(smoothed[number], want, rtol=1e-5)
 
 
-def test_links_are_symmetric_and_walking_them_finds_the_connected_part():
-    gaussians = random_gaussians(400)
-    surface = build_surface(gaussians)
+def test_links_are_symmetric_and_parts_are_the_connected_components():
+    surface = build_surface(random_gaussians(500))
     assert (surface.links != surface.links.T).nnz == 0
-    inside = np.random.default_rng(1).uniform(size=len(surface.rows)) < 0.6
-    members = np.flatnonzero(inside)
-    _, labels = connected_components(surface.links[members][:, members], directed=False)
-    for number in (0, len(members) // 2, len(members) - 1):
-        want = members[labels == labels[number]]
-        assert sorted(surface.connected(inside, members[number])) == want.tolist()
+    numbers = np.flatnonzero(np.random.default_rng(0).uniform(size=len(surface.rows)) < 0.08)
+    parts = surface.parts(numbers)
+    count, labels = connected_components(surface.links[numbers][:, numbers], directed=False)
+    assert len(parts.starts) == count > 3
+    inside = np.isin(np.arange(len(surface.rows)), numbers)
+    for part in parts.each():
+        want = numbers[labels == labels[numbers.tolist().index(part[0])]]
+        assert part.tolist() == want.tolist() == sorted(surface.connected(inside, int(part[-1])))
+        assert len(set(parts.labels[part])) == 1
+    assert (parts.labels[~inside] < 0).all()
+    assert surface.parts(numbers[:0]).each() == []
 
 
 def test_the_far_side_of_a_gap_is_another_surface():
@@ -280,33 +284,19 @@ def scattered() -> tuple[Surface, Regions]:
     return surface, build_regions(surface, field)
 
 
-def test_means_of_regions_are_those_of_the_plain_way(scattered):
+def test_means_of_regions_and_what_is_spread_from_them(scattered):
+    """Faint Gaussians beside a region take its value; those near nothing keep their own."""
     surface, regions = scattered
     values = np.random.default_rng(5).uniform(size=(3, 3000)).astype(np.float32)
-    for got, want in zip(regions.means(values), plain_means(surface, regions, values), strict=True):
+    even, near = regions.even(values), surface.anchors >= 0
+    wanted = plain_means(surface, regions, values)
+    for level, (got, want) in enumerate(zip(regions.means(values), wanted, strict=True)):
         assert len(want) > 1
         np.testing.assert_allclose(got, want, rtol=1e-12)
-
-
-def test_what_is_spread_reaches_faint_ones_beside_a_region_and_no_others(scattered):
-    surface, regions = scattered
-    others = np.random.default_rng(6).uniform(size=3000).astype(np.float32)
-    for level, of in enumerate(regions.of):
-        values = np.arange(len(regions.sizes[level]), dtype=np.float32)
-        want = np.array(
-            [values[of[a]] if a >= 0 else o for a, o in zip(surface.anchors, others, strict=True)]
-        )
-        np.testing.assert_array_equal(regions.spread(level, values, others), want)
-    assert 0 < (surface.anchors < 0).sum() < 3000 / 3 < (regions.weights == 0).sum()
-
-
-def test_the_evened_map_is_the_mean_of_each_region(scattered):
-    surface, regions = scattered
-    relevancy = np.random.default_rng(7).uniform(size=(3, 3000)).astype(np.float32)
-    even = regions.even(relevancy)
-    for row, of, means in zip(even, regions.of, plain_means(surface, regions, relevancy), strict=True):
-        np.testing.assert_allclose(row[surface.rows], means[of], rtol=1e-6)
-    np.testing.assert_array_equal(even[:, surface.anchors < 0], relevancy[:, surface.anchors < 0])
+        of = regions.of[level][surface.anchors[near]]
+        np.testing.assert_allclose(even[level, near], want[of], rtol=1e-6)
+    np.testing.assert_array_equal(even[:, ~near], values[:, ~near])
+    assert 0 < (~near).sum() < 3000 / 3 < (regions.weights == 0).sum()
 
 
 @pytest.mark.parametrize("kind", KINDS)
