@@ -1,4 +1,4 @@
-"""Asking: encoders and phrasebooks, phrases together and one by one, and what an answer is said to stand on."""
+"""Asking: encoders and phrasebooks, phrases together and one by one, and the basis of answers."""
 
 from dataclasses import replace
 
