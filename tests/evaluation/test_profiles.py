@@ -1,6 +1,6 @@
 """The protocols' rules, against plain loops and by hand."""
 
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,12 +58,17 @@ def test_vote(vote):
     np.testing.assert_array_equal(voted(mask, vote, 7), looped_vote(mask, vote == "clipped"))
 
 
-def test_a_tie_is_outside():
+def test_ties_and_flat_maps():
     mask = np.zeros((8, 8), bool)
     mask[:, :4] = True
     assert not voted(mask, "inside", 40).any()  # the window is the whole picture: 32 of 64
     mask[0, 4] = True
     assert voted(mask, "inside", 40).all()
+    flat = np.zeros((1, 2, 3))
+    flat[0, 0, 1] = flat[0, 1, 2] = 0.5
+    assert peak_pixels(flat, replace(PLAIN, ties=True)).tolist() == [[1, 0], [2, 1]]
+    assert peak_pixels(flat, PLAIN).tolist() == [[1, 0]]
+    assert not read_maps(np.full((3, 40, 40), 0.55), CODE).mask.any()
 
 
 def test_the_code_cuts_the_blend_at_seven_tenths_of_its_range():
@@ -110,29 +115,9 @@ def test_3d_ovs_takes_the_level_that_is_highest_inside_its_mask():
     assert not read_maps(np.full((3, 5, 5), 0.4), rule).mask.any()
 
 
-def test_ties():
-    flat = np.zeros((1, 2, 3))
-    flat[0, 0, 1] = flat[0, 1, 2] = 0.5
-    assert peak_pixels(flat, replace(PLAIN, ties=True)).tolist() == [[1, 0], [2, 1]]
-    assert peak_pixels(flat, PLAIN).tolist() == [[1, 0]]
-
-
-def test_a_flat_map_is_an_empty_mask():
-    assert not read_maps(np.full((3, 40, 40), 0.55), CODE).mask.any()
-
-
 def test_silhouette():
     rule = SilhouetteRule()
     alpha = np.array([[0.7, 0.71, 1.0, 1.0]])
     grey = np.array([200, 200, 10, 11]) / 255
     colours = np.repeat(grey[None, :, None], 3, 2)
     assert read_silhouette(colours, alpha, rule).tolist() == [[False, True, False, True]]
-
-
-def test_profiles_are_frozen_and_named():
-    for profiles in (LERF_PROFILES, OVS_PROFILES):
-        for name, profile in profiles.items():
-            assert profile.name == name
-            assert profile.source
-            with pytest.raises(FrozenInstanceError):
-                profile.rule.threshold = 0.5

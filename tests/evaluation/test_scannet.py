@@ -10,8 +10,8 @@ from plyfile import PlyData, PlyElement
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.evaluation.run import Subject
 from langsplat_core.evaluation.scannet import (
+    CLASS_SETS,
     NYU40,
-    PointProfile,
     point_table,
     read_points,
     read_scannet,
@@ -68,13 +68,11 @@ def test_means_over_the_classes_that_are_there(labelled):
     assert "fixed before a label was read" in point_table(report)
 
 
-def test_json(labelled, tmp_path):
+def test_json_and_nested_class_sets(labelled, tmp_path):
     save_point_json(tmp_path / "out.json", run(labelled, np.full(10, 1)))
-    assert json.loads((tmp_path / "out.json").read_text())["scores"][0]["accuracy"] == pytest.approx(1 / 3)
-
-
-def test_class_sets_are_nested():
-    nineteen, fifteen, ten = (set(names) for names in PointProfile().class_sets)
+    said = json.loads((tmp_path / "out.json").read_text())
+    assert said["scores"][0]["accuracy"] == pytest.approx(1 / 3)
+    nineteen, fifteen, ten = (set(names) for names in CLASS_SETS)
     assert [len(nineteen), len(fifteen), len(ten)] == [19, 15, 10]
     assert ten < fifteen < nineteen
 
@@ -105,7 +103,7 @@ def test_words_that_the_encoder_lacks_are_wrong_everywhere(tmp_path):
 
     engine = QueryEngine(Scene(blobs(), language()), lambda _: Half())
     path = write_labels(tmp_path, CENTRES, [NYU40["bathtub"]] * 3)
-    found, unknown = scene_classes(engine, read_points(path, NAME), PointProfile())
+    found, unknown = scene_classes(engine, read_points(path, NAME))
     assert unknown == ("bathtub",)
     assert not any((ids == NYU40["bathtub"]).any() for ids in found)
 
