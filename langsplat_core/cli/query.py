@@ -498,9 +498,7 @@ class Unit:
 
 
 def _unit(scene: Scene, metres_per_unit: float | None = None) -> Unit:
-    """Metres by `metres_per_unit`, else by the scene's own, else world units. InputError unless above 0."""
-    if metres_per_unit is not None and not 0 < metres_per_unit < float("inf"):
-        raise InputError(f"--scale {metres_per_unit:g}: must be above 0, metres per unit")
+    """Metres by `metres_per_unit`, else by the scene's own, else world units."""
     metres = metres_per_unit or scene.metres_per_unit
     return Unit("units", 1.0) if metres is None else Unit("m", metres)
 

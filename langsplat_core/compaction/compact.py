@@ -28,8 +28,7 @@ from langsplat_core.io.summary import disk_bytes, memory_bytes
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.compose import upright
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_core.raster.protocol import LiftingRasterizer, Rasterizer
+from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
 from langsplat_core.raster.render import colours_seen, splat_colours
 from langsplat_core.scene import SH_COUNTS, Camera, Scene, look_at
 from langsplat_core.scene.language import phrase_key
@@ -202,28 +201,26 @@ class MeasuringView:
     photograph: Array | None = None  # (H, W, 3) float32 in [0, 1]
 
 
-def draw(rasterizer: Rasterizer, scene: Scene, camera: Camera) -> Array:
+def draw(scene: Scene, camera: Camera) -> Array:
     """The (H, W, 3) float32 image of a view in [0, 1], without background."""
-    view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
+    view = load_rasterizer("cpu").view(scene.gaussians, camera, scene.raster_settings())
     return np.clip(splat_colours(view, scene.gaussians, camera).colours, 0, 1)
 
 
 def measuring_views(
-    rasterizer: Rasterizer, scene: Scene, cameras: Sequence[Camera], photographs: Sequence[Array | None]
+    scene: Scene, cameras: Sequence[Camera], photographs: Sequence[Array | None]
 ) -> list[MeasuringView]:
     """Images of the original `scene`, with the (H, W, 3) uint8 photographs of the same cameras or None."""
     views = []
     for camera, photograph in zip(cameras, photographs, strict=True):
         truth = None if photograph is None else photograph.astype(np.float32) / 255
-        views.append(MeasuringView(camera, draw(rasterizer, scene, camera), truth))
+        views.append(MeasuringView(camera, draw(scene, camera), truth))
     return views
 
 
-def contributions(
-    rasterizer: LiftingRasterizer, scene: Scene, cameras: Sequence[Camera], progress: Progress = silent
-) -> Array:
+def contributions(scene: Scene, cameras: Sequence[Camera], progress: Progress = silent) -> Array:
     """(N,) float64 >= 0: the largest contribution of each Gaussian to any of `cameras` (see above)."""
-    largest = np.zeros(len(scene.gaussians))
+    rasterizer, largest = load_lifting_rasterizer("cpu"), np.zeros(len(scene.gaussians))
     for index, camera in enumerate(cameras):
         view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
         own = colours_seen(scene.gaussians, camera)
@@ -238,16 +235,14 @@ def contributions(
     return largest
 
 
-def psnr_losses(
-    rasterizer: Rasterizer, scene: Scene, views: Sequence[MeasuringView], assumed_psnr: float
-) -> Array:
+def psnr_losses(scene: Scene, views: Sequence[MeasuringView], assumed_psnr: float) -> Array:
     """(V,) dB lost by `scene` in each view; negative where it comes nearer to a photograph.
 
     `assumed_psnr` (dB) is the original's, used for views without a photograph.
     """
     losses = []
     for view in views:
-        image = draw(rasterizer, scene, view.camera)
+        image = draw(scene, view.camera)
         if view.photograph is None:
             change = mean_squared_error(image, view.original)
             losses.append(estimated_loss(change, assumed_psnr))
@@ -284,14 +279,6 @@ class Weight:
     psnr: float | None  # mean against the photographs, dB; None without
 
 
-@dataclass(frozen=True, eq=False)
-class Stored:
-    """A scene as the target format gives it back, and the size of its files."""
-
-    scene: Scene
-    disk_bytes: int
-
-
 def check_likeness(measured: Sequence[MeasuringView]) -> None:
     scores = [psnr(e.original, e.photograph) for e in measured if e.photograph is not None]
     if scores and np.mean(scores) < UNLIKE:
@@ -301,40 +288,28 @@ def check_likeness(measured: Sequence[MeasuringView]) -> None:
         )
 
 
-def stored(scene: Scene, out: Path) -> Stored:
-    """The scene after a journey through a file named like `out`."""
+def stored(scene: Scene, out: Path) -> tuple[Scene, int]:
+    """The scene after a journey through a file named like `out`, and the bytes that it took."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / out.name
         save_scene(path, replace(scene, path=path))
-        return Stored(load_scene(path), disk_bytes(path))
+        return load_scene(path), disk_bytes(path)
 
 
-def weigh(rasterizer: Rasterizer, stored: Stored, measured: Sequence[MeasuringView]) -> Weight:
+def weigh(scene: Scene, stored_bytes: int, measured: Sequence[MeasuringView]) -> Weight:
     return Weight(
-        gaussians=len(stored.scene.gaussians),
-        sh_degree=stored.scene.gaussians.sh_degree,
-        disk_bytes=stored.disk_bytes,
-        memory_bytes=memory_bytes(stored.scene),
-        psnr=mean_psnr(rasterizer, stored.scene, measured),
+        gaussians=len(scene.gaussians),
+        sh_degree=scene.gaussians.sh_degree,
+        disk_bytes=stored_bytes,
+        memory_bytes=memory_bytes(scene),
+        psnr=mean_psnr(scene, measured),
     )
 
 
-def worst_loss(
-    rasterizer: Rasterizer, before: Scene, after: Scene, views: Views, psnr_before: float
-) -> float:
-    """dB lost in the ranking view that loses most; one at a time, for their images may be many."""
-
-    def loss(camera: Camera) -> float:
-        measured = measuring_views(rasterizer, before, [camera], [None])
-        return float(psnr_losses(rasterizer, after, measured, psnr_before)[0])
-
-    return max(map(loss, views.ranking))
-
-
-def mean_psnr(rasterizer: Rasterizer, scene: Scene, measured: Sequence[MeasuringView]) -> float | None:
+def mean_psnr(scene: Scene, measured: Sequence[MeasuringView]) -> float | None:
     """Mean PSNR against the photographs, dB; None without."""
     pairs = [(view.camera, view.photograph) for view in measured if view.photograph is not None]
-    scores = [psnr(draw(rasterizer, scene, camera), photograph) for camera, photograph in pairs]
+    scores = [psnr(draw(scene, camera), photograph) for camera, photograph in pairs]
     return float(np.mean(scores)) if scores else None
 
 
@@ -359,7 +334,6 @@ class Selection:
 
 
 def select(
-    rasterizer: LiftingRasterizer,
     scene: Scene,
     views: Views,
     measured: Sequence[MeasuringView],
@@ -368,21 +342,21 @@ def select(
 ) -> Selection:
     """Select what of `scene` to keep; `measured` are those of ``views.measuring``. Raises InputError where
     nothing is visible, nothing fits the budget or nothing can be dropped."""
-    score = contributions(rasterizer, scene, views.ranking, progress)
+    score = contributions(scene, views.ranking, progress)
     if not score.any():
         raise InputError(f"no Gaussian of the scene is visible from {views.origin}")
     order = np.argsort(-score, kind="stable")  # ties by index
 
     def loss_of(choice: Choice) -> float:
         candidate = reduced(scene, np.sort(order[: choice.count]), choice.sh_degree)
-        return float(psnr_losses(rasterizer, candidate, measured, config.assumed_psnr).mean())
+        return float(psnr_losses(candidate, measured, config.assumed_psnr).mean())
 
     degree = scene.gaussians.sh_degree
     choice = smallest(Choice(len(order), degree), loss_of, config.max_psnr_loss, progress)
     if choice is None:
         raise InputError(f"the new file's format alone loses more than {config.max_psnr_loss} dB; allow more")
     threshold = float(score[order[choice.count - 1]])
-    keep = contributions(rasterizer, scene, views.measuring) > threshold
+    keep = contributions(scene, views.measuring) > threshold
     keep[order[: choice.count]] = True
     if keep.all() and choice.sh_degree == degree:
         raise InputError(f"nothing can be dropped within {config.max_psnr_loss} dB; allow more")
@@ -482,29 +456,31 @@ def compact_scene(
     if out.resolve() == source.resolve():
         raise InputError(f"{out}: would replace the original scene; choose another --out")
     scene = load_scene(source)
-    rasterizer = load_lifting_rasterizer("cpu")
     views = choose_views(scene, photos, config, progress)
-    measured = measuring_views(rasterizer, scene, views.measuring, views.photographs)
+    measured = measuring_views(scene, views.measuring, views.photographs)
     check_likeness(measured)
-    before = stored(scene, out)
-    selection = select(rasterizer, before.scene, views, measured, config, progress)
-    candidate = reduced(before.scene, selection.keep, selection.sh_degree)
-    after = stored(candidate, out)
-    losses = psnr_losses(rasterizer, after.scene, measured, config.assumed_psnr)
+    before, before_bytes = stored(scene, out)
+    selection = select(before, views, measured, config, progress)
+    candidate = reduced(before, selection.keep, selection.sh_degree)
+    after, after_bytes = stored(candidate, out)
+    losses = psnr_losses(after, measured, config.assumed_psnr)
     if not losses.mean() <= config.max_psnr_loss:
         raise InputError(f"{out}: as stored it would lose {losses.mean():.3f} dB; not written, allow more")
-    truth = mean_psnr(rasterizer, scene, measured) or config.assumed_psnr
+    truth = mean_psnr(scene, measured) or config.assumed_psnr
+    for camera in views.ranking:  # one at a time, for their images may be many
+        view = MeasuringView(camera, draw(scene, camera))
+        losses = np.append(losses, psnr_losses(after, [view], truth))
     report = CompactReport(
-        before=weigh(rasterizer, replace(before, scene=scene), measured),
-        after=weigh(rasterizer, after, measured),
+        before=weigh(scene, before_bytes, measured),
+        after=weigh(after, after_bytes, measured),
         budget=config.max_psnr_loss,
-        loss=float(losses.mean()),
-        worst_loss=max(float(losses.max()), worst_loss(rasterizer, scene, after.scene, views, truth)),
+        loss=float(losses[: len(measured)].mean()),
+        worst_loss=float(losses.max()),
         assumed_psnr=config.assumed_psnr if photos is None else None,
         ranking_views=len(views.ranking),
         measuring_views=len(views.measuring),
         views_from=views.origin,
-        answers=answer_changes(scene, after.scene, config.phrases),
+        answers=answer_changes(scene, after, config.phrases),
     )
     save_scene(out, replace(candidate, path=out))
     return report

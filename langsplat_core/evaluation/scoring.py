@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw
-from scipy.ndimage import binary_erosion, uniform_filter
+from scipy.ndimage import binary_erosion
 
 from langsplat_core.arrays import Array
 from langsplat_core.datasets.capture import read_photo
@@ -21,11 +21,6 @@ def intersection_over_union(found: Array, truth: Array) -> float:
     """Return the intersection over union of two (H, W) boolean masks; 1 where both are empty."""
     union = np.logical_or(found, truth).sum()
     return float(np.logical_and(found, truth).sum() / union) if union else 1.0
-
-
-def majority(mask: Array, window: int = 7) -> Array:
-    """(H, W) boolean mask after a `window` x `window` majority vote; a tie is False."""
-    return uniform_filter(mask.astype(np.float64), size=window, mode="nearest") > 0.5 + 1e-9
 
 
 # One picture per answer: photograph, mask that was found, the label's outline and boxes, the place.

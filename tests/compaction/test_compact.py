@@ -30,7 +30,6 @@ from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.progress import Progress, Report, silent
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Scene, look_at
 from tests.support.file_samples import random_field
@@ -75,7 +74,7 @@ def test_a_contribution_bounds_what_its_removal_changes():
     camera = cameras()[0].resized(32, 24)
     for one in alone:
         scene = Scene(one)
-        score = contributions(CpuRasterizer(), scene, [camera])[0]
+        score = contributions(scene, [camera])[0]
         view = ReferenceRasterizer().view(one, camera)
         weight = view.splat(np.ones((1, 1)))[0]
         colour = np.maximum(one.sh[0, 0].astype(float) * 0.28209479177387814 + 0.5, 0)
@@ -88,26 +87,25 @@ def test_a_contribution_bounds_what_its_removal_changes():
 
 def test_loss_without_photographs_is_that_of_uncorrelated_errors(scene):
     """Photographs made as the picture plus noise of known strength: measured and derived loss agree."""
-    rasterizer, view = CpuRasterizer(), scene.cameras[0].resized(256, 192)
+    view = scene.cameras[0].resized(256, 192)
     less = scene.take(np.arange(N) % 9 > 0)
-    picture = draw(rasterizer, scene, view)
+    picture = draw(scene, view)
     noise = np.random.default_rng(0).normal(0, 10 ** (-30 / 20), picture.shape)
-    truth = replace(measuring_views(rasterizer, scene, [view], [None])[0], photograph=picture + noise)
-    measured = psnr_losses(rasterizer, less, [truth], 30.0)[0]
-    derived = psnr_losses(rasterizer, less, measuring_views(rasterizer, scene, [view], [None]), 30.0)[0]
+    truth = replace(measuring_views(scene, [view], [None])[0], photograph=picture + noise)
+    measured = psnr_losses(less, [truth], 30.0)[0]
+    derived = psnr_losses(less, measuring_views(scene, [view], [None]), 30.0)[0]
     assert measured > 0.5
     assert derived == pytest.approx(measured, abs=0.1)  # the noise is finite: 147 000 numbers
     assert estimated_loss(1e-3, 30.0) == pytest.approx(10 * np.log10(2))
 
 
 def test_nothing_that_any_view_needs_is_dropped(scene):
-    rasterizer = CpuRasterizer()
     views = choose_views(scene, None, CONFIG, silent)
-    measured = measuring_views(rasterizer, scene, views.measuring, views.photographs)
-    selection = select(rasterizer, scene, views, measured, CONFIG)
+    measured = measuring_views(scene, views.measuring, views.photographs)
+    selection = select(scene, views, measured, CONFIG)
     every = (*views.ranking, *views.measuring)
-    score = contributions(rasterizer, scene, every)
-    each = [contributions(rasterizer, scene, [view]) for view in every]
+    score = contributions(scene, every)
+    each = [contributions(scene, [view]) for view in every]
     np.testing.assert_array_equal(score, np.max(each, axis=0))
     assert 0 < (~selection.keep).sum() < N
     assert score[~selection.keep].max() <= selection.threshold
@@ -136,9 +134,8 @@ def test_budget_companions_and_order_survive_the_file(scene, source, tmp_path):
     assert len(small.cameras) == len(scene.cameras)
     held = choose_views(scene, None, CONFIG, silent).measuring
     losses = psnr_losses(
-        CpuRasterizer(),
         small,
-        measuring_views(CpuRasterizer(), scene, held, [None] * len(held)),
+        measuring_views(scene, held, [None] * len(held)),
         CONFIG.assumed_psnr,
     )
     assert losses.mean() == pytest.approx(report.loss)
@@ -236,7 +233,7 @@ def test_photographs_held_out_from_training_measure(scene, source, tmp_path, mon
     """The dataset has two views more than the scene was trained on, and noise that the scene lacks."""
     rng = np.random.default_rng(0)
     shot = [replace(camera, name=f"v{i}") for i, camera in enumerate(scene.cameras)]
-    pictures = [draw(CpuRasterizer(), scene, camera) for camera in shot]
+    pictures = [draw(scene, camera) for camera in shot]
     noisy = [np.clip(255 * p + rng.normal(0, 12, p.shape), 0, 255).astype(np.uint8) for p in pictures]
     capture = Capture(tuple(shot), tuple(noisy), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     monkeypatch.setattr(compact, "load_capture", lambda *_: capture)
