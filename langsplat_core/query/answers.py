@@ -5,7 +5,7 @@ phrase is found is judged by what everyday phrases fit in the same scene, and ho
 region.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -118,10 +118,10 @@ class Bar:
 
 
 Bars = tuple[Bar, Bar, Bar, Bar]  # of each level, and of the better one of the finer two
-Chance = tuple[Array, Array, Array]  # (R, V) float32 of each level: fits of V everyday phrases at R regions
+Chance = tuple[Array, ...]  # (R, V) float32 of each level: fits of V everyday phrases at R regions
 
 
-def bars(chance: Chance, rows: tuple[Array, Array, Array] | None = None) -> Bars:
+def bars(chance: Chance, rows: Sequence[Array] | None = None) -> Bars:
     """The bars of a scene, or of some regions `rows` of each level alone."""
     chosen = [fits if rows is None else fits[rows[level]] for level, fits in enumerate(chance)]
     subpart, part, whole = (fits.max(0, initial=-np.inf) for fits in chosen)
@@ -164,7 +164,7 @@ def chance_in(field: LanguageField, surface: Surface, regions: Regions, scale: S
         means /= regions.totals[level][:, None]
         own, solid = scale.fit(means).astype(np.float32), regions.sizes[level] >= SMALLEST
         fits.append(np.where(solid[:, None], own, -np.inf) if solid.any() else own)  # as in `_best`
-    return fits[0], fits[1], fits[2]
+    return tuple(fits)
 
 
 # The answer by regions: its level, the regions that are it, and how good the best one is.

@@ -273,7 +273,7 @@ class Words:
     material: Word | None = None
 
 
-Levels = tuple[Words, Words, Words]  # of subpart, part and whole
+Levels = tuple[Words, ...]  # of subpart, part and whole
 
 
 class Describer:
@@ -321,8 +321,7 @@ class Describer:
         counted = self.areas[rows] if weights is None else np.asarray(weights, np.float64)
         if weights is None and not counted.any():  # without any surface they still mean something
             counted = np.ones(len(rows))
-        subpart, part, whole = (self._at_level(level, rows, counted, top) for level in range(len(LEVELS)))
-        return subpart, part, whole
+        return tuple(self._at_level(level, rows, counted, top) for level in range(len(LEVELS)))
 
     def inventory(self, progress: Progress = silent) -> list[Entry]:
         """Every word that is true in the scene, whole things first, then by surface. A word is listed once,

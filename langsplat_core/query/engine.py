@@ -224,8 +224,7 @@ class QueryEngine:
         """The best fits of everyday phrases at the regions of some Gaussians, (N,) bool."""
         assert self.chance is not None
         everywhere = self.regions.everywhere[:, members]
-        subpart, part, whole = (np.unique(row[row >= 0]) for row in everywhere)
-        return bars(self.chance, (subpart, part, whole))
+        return bars(self.chance, [np.unique(row[row >= 0]) for row in everywhere])
 
     def unknown_words(self, phrase: str) -> tuple[str, ...]:
         """Words for which `phrase` cannot be asked; none where the phrasebook has it. EncoderError as
