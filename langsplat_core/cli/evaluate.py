@@ -48,7 +48,7 @@ class _Eval:
 @dataclass(frozen=True)
 class _EvalLabels(_Eval):
     pictures: OutFolder | None = None
-    """Also write one picture per query into this folder."""
+    """Also write one image per query into this folder."""
     paper_order: bool = False
     """Blend latents and decode every pixel, as the paper does, not the relevancies; no codebook can."""
     train: bool = False

@@ -13,7 +13,7 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, opened, picture_size, read_json_file
 
 Size = tuple[int, int]  # width and height, pixels
-SAME_SHAPE = 0.02  # relative difference of aspect up to which two sizes may be of one picture
+SAME_SHAPE = 0.02  # relative difference of aspect up to which two sizes may be of one image
 
 
 class Truth(Protocol):
@@ -41,7 +41,7 @@ class Outlines:
 
 @dataclass(frozen=True)
 class MaskFile:
-    """A picture that is bright inside."""
+    """An image that is bright inside."""
 
     path: Path
 
@@ -57,9 +57,8 @@ class Label:
 
     phrase: str
     truth: Truth
-    boxes: (
-        Array | None
-    )  # (B, 4) left, top, right, bottom on the label's grid, inclusive; None: no place is scored
+    # (B, 4) left, top, right, bottom on the label's grid, inclusive; None: no place is scored
+    boxes: Array | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,27 +90,27 @@ class Benchmark:
 
 
 def read_grey(path: Path) -> Array:
-    """(H, W) uint8 brightness of a picture file; FormatError where it cannot be read."""
-    with opened(path) as picture:
-        return np.asarray(picture.convert("L"))
+    """(H, W) uint8 brightness of an image file; FormatError where it cannot be read."""
+    with opened(path) as image:
+        return np.asarray(image.convert("L"))
 
 
 def resized(mask: Array, size: Size) -> Array:
     """(H, W) bool on a grid of `size`, each pixel the nearest one's."""
     if mask.shape == (size[1], size[0]):
         return mask
-    picture = Image.fromarray(mask.astype(np.uint8))
-    return np.asarray(picture.resize(size, Image.Resampling.NEAREST)) > 0
+    image = Image.fromarray(mask.astype(np.uint8))
+    return np.asarray(image.resize(size, Image.Resampling.NEAREST)) > 0
 
 
-def check_same_picture(frame: str, drawn: Size, labelled: Size) -> None:
-    """InputError where a map or camera cannot show the labelled picture: another shape."""
+def check_same_image(frame: str, drawn: Size, labelled: Size) -> None:
+    """InputError where a map or camera cannot show the labelled image: another shape."""
     (columns, rows), (width, height) = drawn, labelled
     slack = max(SAME_SHAPE * width * rows, width, height, columns, rows)  # a pixel of rounding is allowed
     if abs(columns * height - width * rows) > slack:
         raise InputError(
             f"frame {frame}: the view is {columns}x{rows}, the labels are {width}x{height}: not of one "
-            "picture; use views and labels of the same photographs"
+            "image; use views and labels of the same photographs"
         )
 
 
@@ -129,8 +128,9 @@ def photograph_of(folder: Path, name: str) -> Path | None:
 
 # LERF-OVS as LangSplat released it: polygons in JSON files of the ISAT tool.
 #
-# lerf_ovs/label/<scene>/<frame>.json  info {name, width, height}, objects [{category, bbox [x1, y1, x2,
-# y2], segmentation [[x, y]...]}] lerf_ovs/label/<scene>/<frame>.jpg   the photograph again (not needed)
+# lerf_ovs/label/<scene>/<frame>.json  info {name, width, height}, objects [{category,
+#                                      bbox [x1, y1, x2, y2], segmentation [[x, y]...]}]
+# lerf_ovs/label/<scene>/<frame>.jpg   the photograph again (not needed)
 # lerf_ovs/<scene>/                    photographs and cameras
 #
 # An object has one polygon; a category that occurs several times in a frame is one query with all its
@@ -235,7 +235,7 @@ def _object(item: Any, where: str) -> tuple[str, Array]:
     except (TypeError, ValueError):
         raise FormatError(f'{where}: "segmentation" is not one polygon [[x, y], ...]') from None
     if not (np.abs(corners) <= 10 * MAX_SIDE).all():  # NaN fails too
-        raise FormatError(f'{where}: "segmentation" has corners far outside of any picture')
+        raise FormatError(f'{where}: "segmentation" has corners far outside of any image')
     return item["category"].strip(), corners
 
 
@@ -250,7 +250,7 @@ def _box(stored: Any, polygon: Array) -> Array:
     return np.concatenate([polygon.min(0), polygon.max(0)])
 
 
-# 3D-OVS (Liu et al. 2023): one mask picture per view and class.
+# 3D-OVS (Liu et al. 2023): one mask image per view and class.
 #
 # <scene>/segmentations/classes.txt           one class a line
 # <scene>/segmentations/<view>/<class>.png    bright inside, of any size
@@ -262,7 +262,7 @@ WANTED_PICTURES = "expected segmentations/classes.txt in it, or in folders of it
 def read_3d_ovs(folder: Path) -> Benchmark:
     """The labels in `folder`: one scene's, or several scenes' folders.
 
-    What a view has a picture of is asked there. Raises InputError for a folder of another layout and
+    What a view has an image of is asked there. Raises InputError for a folder of another layout and
     FormatError for a scene that breaks it.
     """
     if not folder.is_dir():

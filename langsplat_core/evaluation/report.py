@@ -46,7 +46,7 @@ class BenchmarkReport:
 
 
 def means(queries: Sequence[QueryScore]) -> Means:
-    """Over queries; zeros where there is none."""
+    """Mean scores over queries; zeros where there are none."""
     ious = np.array([query.iou for query in queries])
     hits = [query.hit for query in queries if query.hit is not None]
     if not len(ious):
@@ -91,7 +91,7 @@ def summary(report: BenchmarkReport) -> dict[str, Means]:
 
 
 def table(report: BenchmarkReport) -> str:
-    """Markdown, and below it what a reader has to know."""
+    """The means as a Markdown table, with notes below it."""
     lines = [
         "| | queries | mIoU % | localisation % | mAcc@0.25 % | mAcc@0.5 % |",
         "|---|---|---|---|---|---|",
@@ -130,7 +130,7 @@ def notes(report: BenchmarkReport) -> list[str]:
 
 
 def save_json(path: Path, report: BenchmarkReport) -> None:
-    """All of it: profile, means, every query."""
+    """Write profile, means and every query as JSON."""
     content = {
         "benchmark": report.benchmark,
         "protocol": asdict(report.profile),
@@ -144,6 +144,6 @@ def save_json(path: Path, report: BenchmarkReport) -> None:
 
 
 def write_json(path: Path, content: object) -> None:
-    """A value as a JSON file, whole or not at all."""
+    """Write a value as a JSON file, whole or not at all."""
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

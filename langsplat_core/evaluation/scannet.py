@@ -83,9 +83,8 @@ class PointScore:
     points: int  # vertices that are scored
     iou: float  # mean over the present classes
     accuracy: float  # mean over the present classes of the share of their vertices that is right
-    unknown: tuple[
-        str, ...
-    ] = ()  # present classes whose words the encoder was never taught: wrong everywhere
+    # present classes whose words the encoder was never taught: wrong everywhere
+    unknown: tuple[str, ...] = ()
 
 
 def read_scannet(folder: Path) -> dict[str, Path]:
@@ -210,7 +209,7 @@ def run_scannet(
 
 
 def point_table(report: PointReport) -> str:
-    """Markdown, and below it what a reader has to know."""
+    """The scores as a Markdown table, with notes below it."""
     lines = ["| | classes | of them present | vertices | mIoU % | mAcc % |", "|---|---|---|---|---|---|"]
     for s in report.scores:
         shares = f"{100 * s.iou:.1f} | {100 * s.accuracy:.1f}"

@@ -18,7 +18,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import FormatError
-from langsplat_core.evaluation.labels import Size, check_same_picture, read_grey
+from langsplat_core.evaluation.labels import Size, check_same_image, read_grey
 from langsplat_core.evaluation.profiles import (
     MapRule,
     OwnRule,
@@ -124,7 +124,7 @@ class SceneSource:
         if frame not in self.cameras:
             return dict.fromkeys(phrases, NO_VIEW)
         camera = self.cameras[frame]
-        check_same_picture(frame, (camera.width, camera.height), size)
+        check_same_image(frame, (camera.width, camera.height), size)
         camera = camera.resized(*size)
         found: dict[str, Prediction | str] = {}
         for phrase in phrases:

@@ -56,7 +56,7 @@ class QueryResult:
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict for people."""
+        """The verdict in words: "weak match" is what may be there, but was not found."""
         if self.found:
             return "found"
         if self.probability is not None:

@@ -128,7 +128,7 @@ class Instance:
 
     @property
     def count(self) -> int:
-        """Count of its Gaussians."""
+        """Number of its Gaussians."""
         return len(self.members)
 
     @cached_property
@@ -138,7 +138,7 @@ class Instance:
 
     @cached_property
     def oriented(self) -> OrientedBox:
-        """Along its own axes, likewise."""
+        """Box along its own axes, between the same quantiles."""
         return oriented_box(self.points)
 
     @property

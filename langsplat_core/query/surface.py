@@ -1,5 +1,5 @@
-"""The surface that Gaussians lie on, as the nearest neighbours of each: to smooth over it, and to walk
-along it."""
+"""The surface that Gaussians lie on, as the nearest neighbours of each: to smooth over it, to walk along it,
+and to divide it into regions that mean the same."""
 
 from dataclasses import dataclass
 

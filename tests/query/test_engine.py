@@ -212,7 +212,6 @@ def test_ways_to_an_answer_are_told_apart():
     guessed, published = scene_of(DEMO, Reading()), scene_of("lab/clip", Reading(), everyday=False)
     said = [QueryEngine(scene).basis for scene in (demo, clip, guessed, published)]
     assert len({basis.short for basis in said}) == len({basis.long for basis in said}) == 4
-    assert "lab/clip" in said[1].short
 
 
 class Speaker(FakeEncoder):
