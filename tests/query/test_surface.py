@@ -25,9 +25,9 @@ from langsplat_core.query.surface import (
     build_surface,
 )
 from langsplat_core.scene import NO_THING, Gaussians, LanguageField, look_at
+from tests.support.fakes import CENTRES, PER_BLOB, blob_scene
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_gaussians
-from tests.support.two_blobs import two_blob_scene
 
 
 def test_smoothing_is_the_weighted_mean_of_the_nearest():
@@ -395,14 +395,11 @@ def test_shrinking_undoes_growing_on_a_sheet_and_faint_ones_follow():
 
 
 def test_what_lies_nearest_to_a_point_is_selected_as_a_region():
-    scene, left, right = two_blob_scene()
-    surface = build_surface(scene.gaussians)
+    scene = blob_scene()
+    surface, blob = build_surface(scene.gaussians), np.repeat(np.arange(3), PER_BLOB)
     regions = build_regions(surface, scene.language)
-    for level in (1, 2):  # at which the two mean something
-        first = selection.at_point(surface, regions, level, left.mean(0))
-        assert first.tolist() == [True] * len(left) + [False] * len(right)
-        second = selection.at_point(surface, regions, level, right.mean(0) + [9.0, 0, 0])
-        assert (second == ~first).all()
+    for number, point in ((0, CENTRES[0]), (2, CENTRES[2] + [9.0, 0, 0])):
+        assert selection.at_point(surface, regions, 2, point).tolist() == (blob == number).tolist()
     nothing = scene.take(np.zeros(len(scene.gaussians), bool))
     surface = build_surface(nothing.gaussians)
     assert len(selection.at_point(surface, regions, 2, np.zeros(3))) == 0
