@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -16,13 +16,6 @@ Size = tuple[int, int]  # width and height, pixels
 SAME_SHAPE = 0.02  # relative difference of aspect up to which two sizes may be of one image
 
 
-class Truth(Protocol):
-    """True mask of a phrase in a frame."""
-
-    def draw(self, size: Size) -> Array:
-        """(H, W) bool on a grid of `size`; by the nearest pixel where that is not the label's own grid."""
-
-
 @dataclass(frozen=True, eq=False)
 class Outlines:
     """Polygons on the label's grid; several of one category in a frame are joined."""
@@ -31,7 +24,8 @@ class Outlines:
     polygons: tuple[Array, ...]  # (K, 2) float x, y each, K >= 3
 
     def draw(self, size: Size) -> Array:
-        """Fill the polygons; corners are cut to whole pixels and the outline belongs to the inside."""
+        """(H, W) bool on a grid of `size`: inside the polygons, whose corners are cut to whole pixels; outlines
+        belong to the inside."""
         canvas = Image.new("L", self.size)
         brush = ImageDraw.Draw(canvas)
         for polygon in self.polygons:
@@ -46,9 +40,13 @@ class MaskFile:
     path: Path
 
     def draw(self, size: Size) -> Array:
-        """Read the bright pixels: above half of 255, or above 0 where the file holds no more than 0 and 1."""
+        """(H, W) bool on a grid of `size`: above half of 255, or above 0 where the file holds no more than 0
+        and 1."""
         grey = read_grey(self.path)
         return resized(grey > (127 if grey.max(initial=0) > 1 else 0), size)
+
+
+Truth = Outlines | MaskFile  # true mask of a phrase in a frame
 
 
 @dataclass(frozen=True, eq=False)

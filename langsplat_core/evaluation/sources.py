@@ -11,7 +11,6 @@ phrase have one size; it need not be the labels', whose masks are then brought t
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -97,16 +96,6 @@ NO_MAP = "no map"
 TOGETHER = 10  # phrases splatted in one pass, three channels each
 
 
-class Source(Protocol):
-    """Answers phrases in views."""
-
-    def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
-        """phrase -> the answer in the view `frame`, preferably drawn at `size`; or why there is none."""
-
-    def trained_on(self, frame: str) -> bool | None:
-        """Return True where the view was trained on, False where it was not, None where that is not known."""
-
-
 @dataclass(frozen=True, eq=False)
 class SceneSource:
     """A scene of ours, drawn from the labelled views."""
@@ -118,9 +107,11 @@ class SceneSource:
     paper_order: bool = False  # blend latents and decode every pixel, instead of blending relevancies
 
     def trained_on(self, frame: str) -> bool | None:
+        """Return True where the view was trained on, False where it was not, None where that is not known."""
         return None if self.trained is None else frame in self.trained
 
     def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
+        """phrase -> the answer in the view `frame`, drawn at `size`; or why there is none."""
         if frame not in self.cameras:
             return dict.fromkeys(phrases, NO_VIEW)
         camera = self.cameras[frame]
@@ -180,6 +171,7 @@ class MapSource:
         return None
 
     def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
+        """phrase -> the answer by its map in the view `frame`, whatever its size; or why there is none."""
         return {phrase: self._answer(self.folder / frame, phrase) for phrase in phrases}
 
     def _answer(self, folder: Path, phrase: str) -> Prediction | str:
@@ -192,3 +184,6 @@ class MapSource:
         maps, levels = found
         answer = read_maps(maps, self.rule)
         return replace(answer, level=levels[answer.level or 0])
+
+
+Source = SceneSource | MapSource

@@ -251,7 +251,10 @@ class QueryEngine:
         if fresh:
             encoder = self.load_encoder(progress)
             with self._turn:
-                _check_words(encoder, fresh)
+                unknown = dict.fromkeys(word for key in fresh for word in encoder.unknown_words(key))
+                if unknown:
+                    near = {word: encoder.near_words(word) for word in unknown}
+                    raise UnknownWordError(near, "use other words, or a scene made with OpenCLIP weights")
                 self._encode(encoder, fresh)
         return self._vectors(keys)
 
@@ -366,10 +369,3 @@ class QueryEngine:
 
 def _enough(everyday: Array | None) -> Array | None:
     return None if everyday is None or len(everyday) < FEWEST else everyday
-
-
-def _check_words(encoder: TextEncoder, keys: Iterable[str]) -> None:
-    unknown = dict.fromkeys(word for key in keys for word in encoder.unknown_words(key))
-    if unknown:
-        near = {word: encoder.near_words(word) for word in unknown}
-        raise UnknownWordError(near, "use other words, or a scene made with OpenCLIP weights")
