@@ -24,8 +24,8 @@ class Outlines:
     polygons: tuple[Array, ...]  # (K, 2) float x, y each, K >= 3
 
     def draw(self, size: Size) -> Array:
-        """(H, W) bool on a grid of `size`: inside the polygons, whose corners are cut to whole pixels; outlines
-        belong to the inside."""
+        """(H, W) bool on a grid of `size`: inside the polygons. Corners are cut to whole pixels, and an
+        outline belongs to the inside."""
         canvas = Image.new("L", self.size)
         brush = ImageDraw.Draw(canvas)
         for polygon in self.polygons:
