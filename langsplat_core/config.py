@@ -1,9 +1,8 @@
-"""Ranges of settings: written beside the field that they bound, checked in one place before anything runs.
+"""Every setting a user can change, as frozen dataclasses from which the command line is derived, and their check.
 
-    steps: Annotated[int, Range(1, 1_000_000)] = 100
-
-`check_settings` walks a configuration with all configurations in it. A field may also hold several numbers,
-as pairs and lists do; every one of them must then lie in the range.
+A number's range is part of its field's type, ``steps: Annotated[int, Range(1, 1_000_000)] = 100``; a field with
+several numbers bounds each of them. `check_settings` walks a configuration with all configurations in it and
+refuses what lies outside.
 """
 
 import dataclasses
@@ -139,19 +138,10 @@ def _shown(value: Any) -> str:
 
 
 def _word(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:g}"
-    try:
-        return str(value)
-    except ValueError:  # Python writes no whole number of more than 4300 digits
-        return "a number of thousands of digits"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-# Every setting a user can change, as frozen dataclasses; the command line is derived from them.
-#
-# A number's range is part of its field's type; `ranges.check_settings` refuses what lies outside.
-
-# What a number may be: every field with numbers names one of these, or a range of its own.
+# Every field with numbers names one of these, or a range of its own.
 Count = Annotated[int, Range(1, 1_000_000_000)]
 SeveralCount = Annotated[int, Range(2, 1_000_000_000)]
 CountOrZero = Annotated[int, Range(0, 1_000_000_000)]
@@ -183,7 +173,6 @@ class RasterSettings:
 
 INRIA = RasterSettings()
 GSPLAT = replace(INRIA, near=0.01)
-RASTER_PROFILES = {"inria": INRIA, "gsplat": GSPLAT}
 
 
 @dataclass(frozen=True)
@@ -358,8 +347,6 @@ PAPER = TrainConfig(
 )
 TrainProfile = Literal["default", "paper"]
 TrainPreset = Literal["quick", "good", "full"]
-
-
 OPACITY_DECAY = 0.01  # of quick and good: few photographs gain a third of a decibel, see docs/photographs.md
 
 
@@ -376,11 +363,6 @@ def with_preset(config: TrainConfig, preset: TrainPreset) -> TrainConfig:
         ),
         codec=replace(config.codec, size=size) if config.codec.kind == "codebook" else config.codec,
     )
-
-
-TRAIN_PROFILES: Mapping[TrainProfile, TrainConfig] = MappingProxyType(
-    {"default": TrainConfig(), "paper": PAPER}
-)
 
 
 @dataclass(frozen=True)

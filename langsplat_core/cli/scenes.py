@@ -31,12 +31,7 @@ from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import load_text_encoder
 
 OPTIONAL = ("torch", "transformers", "pycolmap", "matplotlib", "gsplat")
-LIBRARIES = {
-    "EGL": "libegl1",
-    "GL": "libgl1",
-    "X11": "libx11-6",
-    "usb-1.0": "libusb-1.0-0",
-}  # Debian's packages
+LIBRARIES = {"EGL": "libegl1", "GL": "libgl1", "X11": "libx11-6", "usb-1.0": "libusb-1.0-0"}  # Debian's packages
 
 
 @dataclass(frozen=True)
@@ -72,6 +67,7 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
     low, high = (" ".join(f"{value:.3g}" for value in corner) for corner in a.bounds)
     median, most, largest = ("infinite" if ratio is None else f"{ratio:.3g}" for ratio in a.anisotropy)
     hidden, *shares = accumulate(a.opacity_shares)  # of the Gaussians below each edge
+    energy = " + ".join(f"{100 * share:.3g} %" for share in a.sh_energy)
     below = [f"{_percent(s)} < {edge:g}" for s, edge in zip(shares, OPACITY_EDGES[2:-1], strict=False)]
     lines = [
         ("in memory", f"{a.memory_bytes / 1e6:.2f} MB"),
@@ -81,10 +77,7 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
         ("bounds (1-99 %)", f"{low}  to  {high}"),
         ("opacity", ", ".join([f"{_percent(hidden)} never drawn", *below])),
         ("anisotropy", f"median {median}, 99 % {most}, largest {largest}; {a.needles} > {NEEDLE:g}"),
-        (
-            "SH degree",
-            f"{a.sh_degree}; energy by degree {' + '.join(f'{100 * e:.3g} %' for e in a.sh_energy)}",
-        ),
+        ("SH degree", f"{a.sh_degree}; energy by degree {energy}"),
         ("antialiased", "yes (Mip-Splatting)" if a.antialiased else "no"),
         ("scale", f"{a.metres_per_unit:g} m per unit" if a.metres_per_unit else "unknown: `langsplat scale`"),
         ("extra properties", ", ".join(a.extras) or "none"),
@@ -260,9 +253,7 @@ class Convert:
         from langsplat_core.pipeline.exporting import export_langsplat, export_occam
 
         check_output_folder(self.out)
-
-        scene = self._read()
-        scene = replace(scene, path=self.source)
+        scene = replace(self._read(), path=self.source)
         with TerminalProgress() as progress:
             if self.to == "langsplat":
                 written = export_langsplat(scene, self.out, self.source.stem)
