@@ -1,8 +1,8 @@
-"""Every setting a user can change, as frozen dataclasses from which the command line is derived, and their check.
+"""Every setting a user can change, as frozen dataclasses from which the command line is derived.
 
-A number's range is part of its field's type, ``steps: Annotated[int, Range(1, 1_000_000)] = 100``; a field with
-several numbers bounds each of them. `check_settings` walks a configuration with all configurations in it and
-refuses what lies outside.
+A number's range is part of its field's type, ``steps: Annotated[int, Range(1, 1_000_000)] = 100``, and bounds
+each number of a field with several. `check_settings` refuses what lies outside, in a configuration and in all
+that it holds.
 """
 
 import dataclasses

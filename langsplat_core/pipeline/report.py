@@ -1,4 +1,4 @@
-"""Report of a training, `report.json` in its work folder, and the quality warnings in it. Read without torch."""
+"""Report of a training, `report.json` in its work folder, and quality warnings; read without torch."""
 
 import json
 from collections.abc import Sequence

@@ -156,8 +156,8 @@ def _locked(folder: Path) -> io.FileIO:
 class ProcessGroup:
     """This process among those that share a training; alone by default.
 
-    `torchrun --nproc-per-node 2 -m langsplat_core train DATASET --out scene.ply` starts two. Results go through
-    the work folder, item by item, so that a process that is lost costs only what it had not finished.
+    `torchrun --nproc-per-node 2 -m langsplat_core train DATASET --out scene.ply` starts two. Results go
+    through the work folder, item by item, so that a lost process costs only what it had not finished.
     """
 
     rank: int = 0

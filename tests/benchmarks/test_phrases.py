@@ -11,8 +11,19 @@ from langsplat_core.query.compose import upright, viewpoint
 from langsplat_core.query.describe import Entry, Spot
 from langsplat_core.query.grammar import Atom, parse
 from langsplat_core.scene import look_at
-from tests.benchmarks.phrases import CONSTRUCTIONS, Case, PhraseScore, cases, phrase_table, things_in
-from tests.benchmarks.words import InventoryScore, LevelNames, RoomWords, score_inventory, word_table
+from tests.benchmarks.phrases import (
+    CONSTRUCTIONS,
+    Case,
+    InventoryScore,
+    LevelNames,
+    PhraseScore,
+    RoomWords,
+    cases,
+    phrase_table,
+    score_inventory,
+    things_in,
+    word_table,
+)
 
 UP = np.array([0.0, 0.0, 1.0])
 FRAME = upright(UP)

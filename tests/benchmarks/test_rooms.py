@@ -19,9 +19,8 @@ from langsplat_core.io.scenes import save_scene
 from langsplat_core.progress import silent
 from langsplat_core.scene import Scene
 from langsplat_core.semantics.masks import label_maps
-from tests.benchmarks import oracles, patches, scoring
+from tests.benchmarks import lifting, oracles, scoring
 from tests.benchmarks.__main__ import PROGRAM, parse
-from tests.benchmarks.files import KeptRows
 from tests.benchmarks.lifting import (
     OURS,
     PATCHES,
@@ -33,7 +32,7 @@ from tests.benchmarks.lifting import (
     plot,
 )
 from tests.benchmarks.phrases import Phrases
-from tests.benchmarks.room import HOLD_OUT, RoomSettings, Variant
+from tests.benchmarks.room import HOLD_OUT, KeptRows, RoomSettings, Variant
 from tests.benchmarks.rooms import Rooms, variants
 from tests.benchmarks.scoring import DirectScore, Measured, Score
 from tests.benchmarks.verdicts import measure_verdicts
@@ -199,7 +198,7 @@ LIFTING = Lifting(("separate",), (101,), SETTINGS, codec_steps=40, gradient_step
 
 @pytest.mark.long
 def test_methods_are_compared_in_one_room(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(patches, "SCALES", (0.3, 0.5))  # of the smallest there are thousands in every image
+    monkeypatch.setattr(lifting, "SCALES", (0.3, 0.5))  # of the smallest there are thousands in every image
     monkeypatch.setattr(oracles, "SIDES", (1 / 8, 1 / 4, 1 / 2))
     command = replace(
         LIFTING, only=("LERF", "trained", "d = 1", "codebook of 256", "all 512", "subpart alone", "squares")

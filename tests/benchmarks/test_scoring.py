@@ -19,6 +19,14 @@ from langsplat_core.semantics.relevancy import latent_relevancy, relevancy
 from langsplat_core.semantics.store import ImageFeatures
 from tests.benchmarks import scoring
 from tests.benchmarks.clip_geometry import OTHER, PROMPTS, ClipGeometry, read_geometry
+from tests.benchmarks.lifting import (
+    SCALES,
+    PatchField,
+    among_gaussians,
+    lift_patches,
+    patch_vectors,
+    pictures,
+)
 from tests.benchmarks.oracles import (
     SIDES,
     TileMasks,
@@ -26,14 +34,6 @@ from tests.benchmarks.oracles import (
     oracle_vectors,
     phrase_vectors,
     true_labels,
-)
-from tests.benchmarks.patches import (
-    SCALES,
-    PatchField,
-    among_gaussians,
-    lift_patches,
-    patch_vectors,
-    pictures,
 )
 from tests.benchmarks.scoring import (
     CUT_RULES,
