@@ -24,6 +24,7 @@ from tests.benchmarks.__main__ import PROGRAM, parse
 from tests.benchmarks.lifting import (
     OURS,
     PATCHES,
+    KeptRows,
     Lifting,
     MethodRow,
     measure_methods,
@@ -31,7 +32,7 @@ from tests.benchmarks.lifting import (
     plot,
 )
 from tests.benchmarks.phrases import Phrases
-from tests.benchmarks.room import HOLD_OUT, KeptRows, RoomSettings, Variant
+from tests.benchmarks.room import HOLD_OUT, RoomSettings, Variant
 from tests.benchmarks.rooms import Rooms, variants
 from tests.benchmarks.scoring import DirectScore, Measured, Score
 from tests.benchmarks.verdicts import measure_verdicts
