@@ -127,6 +127,8 @@ def test_a_checkpoint_of_gaussians_alone(tmp_path, capsys):
     assert run(path, tmp_path / "a.spz") == 0
     assert "20 Gaussians, without a language field" in capsys.readouterr().out
     assert np.abs(load_scene(tmp_path / "a.spz").gaussians.means - g.means).max() < 1e-3
+    assert run(tmp_path / "a.spz", tmp_path / "out", "--to", "langsplat") == 2
+    assert "has no language field" in capsys.readouterr().err
 
 
 def test_a_scene_of_an_autoencoder_becomes_langsplats(tmp_path):

@@ -62,18 +62,14 @@ OPTIONS = (
 )
 
 
-def test_every_item_is_shared_once():
+def test_every_item_is_shared_once(monkeypatch):
     items = list(range(11))
     shares = [ProcessGroup(rank, 3).share(items) for rank in range(3)]
     assert sorted(item for share in shares for item in share) == items
     assert max(map(len, shares)) - min(map(len, shares)) <= 1
     assert [ProcessGroup(rank, 3).is_main for rank in range(3)] == [True, False, False]
-
-
-def test_alone_without_a_launcher(monkeypatch):
     monkeypatch.delenv("WORLD_SIZE", raising=False)
-    assert join_processes() == ProcessGroup(0, 1)
-    assert ProcessGroup().once(lambda: 7) == 7
+    assert join_processes() == ProcessGroup(0, 1)  # without a launcher
 
 
 def test_a_lost_process_is_said_in_one_line(monkeypatch):
