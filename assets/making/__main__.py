@@ -11,8 +11,7 @@ from typing import Annotated
 import tyro
 
 from assets.making.config import EncoderConfig, LabelLayout, Size, Tier
-from langsplat_core.cli.checks import OutFile, OutFolder
-from langsplat_core.cli.run import Command, main, parsed
+from langsplat_core.cli.run import Command, OutFile, OutFolder, main, parsed
 from langsplat_core.config import Count, Seed
 from langsplat_core.progress import TerminalProgress
 

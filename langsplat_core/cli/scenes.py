@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from langsplat_core import __version__
-from langsplat_core.cli.checks import OutFile, OutputConsole
+from langsplat_core.cli.run import OutFile, OutputConsole
 from langsplat_core.config import CodebookConfig, CodecConfig, CompactConfig, Positive, Range
 from langsplat_core.errors import EXTRAS, BackendError, InputError, LangSplatError, remedy
 from langsplat_core.io.files import check_output_folder

@@ -12,8 +12,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from langsplat_core.cli.checks import OutFile, OutFolder
-from langsplat_core.cli.run import codec_settings, named, one_line
+from langsplat_core.cli.run import OutFile, OutFolder, codec_settings, named, one_line
 from langsplat_core.config import PAPER, TrainConfig, TrainPreset, TrainProfile, check_settings, with_preset
 from langsplat_core.errors import InputError
 from langsplat_core.progress import LineProgress, Progress, TerminalProgress, silent

@@ -30,7 +30,7 @@ from langsplat_core.bench import Size
 from langsplat_core.bench.measure import markdown
 from langsplat_core.bench.memory import peak_memory, resident_memory, restart_peak
 from langsplat_core.bench.query import repeated
-from langsplat_core.cli.checks import OutFolder
+from langsplat_core.cli.run import OutFolder
 from langsplat_core.config import Count, CountOrZero, Range, RasterSettings
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import load_scene

@@ -22,7 +22,7 @@ from assets.making.truth import Region
 from assets.making.vocabulary import part_words
 from langsplat_core.arrays import Array
 from langsplat_core.bench.measure import markdown
-from langsplat_core.cli.checks import OutFile
+from langsplat_core.cli.run import OutFile
 from langsplat_core.config import CodebookConfig, CodecConfig
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path

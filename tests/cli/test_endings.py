@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from langsplat_core.cli.app import parse
-from langsplat_core.cli.checks import Written
-from langsplat_core.cli.run import main
+from langsplat_core.cli.run import Written, main
 from langsplat_core.config import annotations, named_values
 from tests.support.another_user import bound_by_permissions
 
