@@ -45,8 +45,8 @@ from tests.benchmarks.scoring import (
     relevancy_maps,
     separation,
 )
+from tests.support.query_scenes import random_codec, two_blob_scene
 from tests.support.scenes import random_camera, random_gaussians
-from tests.support.two_blobs import random_codec, two_blob_scene
 
 THINGS = [3 * letter for letter in "abcdefghijklmnopqrtuvwxyz"]
 SIDE = 2  # px of a region

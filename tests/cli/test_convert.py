@@ -19,12 +19,11 @@ from langsplat_core.raster.render import render
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
-from tests.support.extras import random_extras
+from tests.support.comparing import assert_same_extras
 from tests.support.file_samples import random_field
+from tests.support.fixtures import Measure
 from tests.support.foreign_files import save_model, tensor
-from tests.support.measured import Measure
-from tests.support.same import assert_same_extras
-from tests.support.scenes import random_camera, random_gaussians
+from tests.support.scenes import random_camera, random_extras, random_gaussians
 
 DEMO = Path(str(files("langsplat_assets"))) / "demo" / "scene.ply"
 

@@ -13,7 +13,7 @@ import pytest
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import Written, main
 from langsplat_core.config import annotations, named_values
-from tests.support.another_user import bound_by_permissions
+from tests.support.processes import bound_by_permissions
 
 DEMO = str(files("langsplat_assets") / "demo" / "scene.ply")
 RUN = [sys.executable, "-m", "langsplat_core"]

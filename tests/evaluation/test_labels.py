@@ -8,7 +8,7 @@ from PIL import Image
 
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.evaluation.labels import read_3d_ovs, read_lerf_ovs, without_suffix
-from tests.support.label_files import SIZE, block, lerf_frame, ovs_view, rectangle
+from tests.support.photographs import SIZE, block, lerf_frame, ovs_view, rectangle
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ import pytest
 
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.progress import ALL_STAGES, Report
-from tests.support.photographed import colmap_reconstruction, poses, write_photos
+from tests.support.photographs import colmap_reconstruction, poses, write_photos
 from tests.support.tiny_clip import tiny_clip
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name == "nt", reason="no signal 9")]

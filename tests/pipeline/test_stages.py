@@ -16,7 +16,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.pipeline.stages import LOCK, ProcessGroup, join_processes, sole_use
 from langsplat_core.pipeline.train import StoredViews
 from langsplat_core.training.language import codec_fit
-from tests.support.lifting import make_views
+from tests.support.scenes import make_views
 from tests.support.tiny_room import tiny_room
 from tests.support.tiny_sam import tiny_sam
 

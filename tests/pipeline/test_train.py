@@ -35,9 +35,8 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics import store
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
 from langsplat_core.training.language.mask_weights import find_things
-from tests.support.another_user import bound_by_permissions
 from tests.support.fakes import blob_scene
-from tests.support.stops import stop_at
+from tests.support.processes import bound_by_permissions, stop_at
 from tests.support.tiny_room import tiny_room, tiny_settings
 
 pytestmark = pytest.mark.long

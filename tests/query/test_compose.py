@@ -22,7 +22,7 @@ from langsplat_core.query.compose import (
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.surface import build_surface
 from langsplat_core.scene import NO_THING, look_at
-from tests.support.laid_table import UP, PlainEncoder, front_camera, laid_table, meaning
+from tests.support.query_scenes import UP, PlainEncoder, front_camera, laid_table, meaning
 
 
 @pytest.fixture(scope="module")

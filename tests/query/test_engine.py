@@ -25,8 +25,8 @@ from langsplat_core.semantics.relevancy import FLOOR
 from langsplat_core.semantics.vocabulary import FEWEST
 from tests.support.fakes import DIM, WORDS, FakeEncoder, axis, blob_scene, named_scene
 from tests.support.file_samples import random_field
+from tests.support.query_scenes import D, two_blob_scene
 from tests.support.scenes import random_gaussians
-from tests.support.two_blobs import D, two_blob_scene
 
 
 def test_what_is_there_is_found_at_its_place_and_nothing_else_is():

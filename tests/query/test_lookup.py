@@ -31,7 +31,7 @@ from langsplat_core.semantics.relevancy import (
     relevancy_of,
 )
 from tests.support.file_samples import random_field
-from tests.support.two_blobs import D, random_codec, two_blob_scene
+from tests.support.query_scenes import D, random_codec, two_blob_scene
 
 TOLERANCE = {"codebook": 1e-6, "linear": 1e-5, "autoencoder": 0.05}  # the last interpolates in a table
 

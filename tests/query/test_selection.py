@@ -11,8 +11,8 @@ from langsplat_core.query import selection
 from langsplat_core.query.selection import Projected, in_polygon, in_rectangle, in_stroke, on_surface, project
 from langsplat_core.query.surface import Surface, build_regions, build_surface
 from langsplat_core.scene import Gaussians, look_at
+from tests.support.query_scenes import two_blob_scene
 from tests.support.scenes import random_gaussians
-from tests.support.two_blobs import two_blob_scene
 
 
 def sheet(side: int = 20, spacing: float = 0.1) -> Gaussians:

@@ -11,7 +11,7 @@ from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.raster.render import colours_seen
 from langsplat_core.scene import Camera, Gaussians
-from tests.support.close import BAND, assert_adjoint
+from tests.support.comparing import BAND, assert_adjoint
 from tests.support.golden import load_golden
 from tests.support.scenes import (
     covariances,
