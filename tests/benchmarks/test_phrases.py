@@ -15,14 +15,11 @@ from tests.benchmarks.phrases import (
     CONSTRUCTIONS,
     Case,
     InventoryScore,
-    LevelNames,
     PhraseScore,
-    RoomWords,
     cases,
     phrase_table,
     score_inventory,
     things_in,
-    word_table,
 )
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -128,10 +125,3 @@ def test_things_without_a_word_in_the_vocabulary_do_not_count():
     score = score_inventory([entry("mug", range(60))], LABELS, TRUTH, areas, ["mug"])
     assert (score.true, score.things, score.named) == (1, 1, 1)
     assert score_inventory([], LABELS, TRUTH, areas, []).named == 0
-
-
-def test_the_table_has_a_row_for_each_figure():
-    names = (LevelNames("plain cosine", "whole", 30, 0.5, 0.9, 0.7, 0.6),)
-    text = word_table([RoomWords(7, names, 0.93, InventoryScore(20, 0.8, 25, 0.6, 1.25))])
-    assert "| 7 | plain cosine | whole | 30 | 50 | 90 | 0.70 | 0.60 |" in text
-    assert "| 7 | 20 | 80 | 25 | 60 | 93 | 1.2 |" in text

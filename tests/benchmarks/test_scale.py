@@ -8,7 +8,6 @@ import pytest
 from langsplat_core.cli.run import main
 from langsplat_core.io.scenes import save_scene
 from tests.benchmarks.__main__ import PROGRAM, parse
-from tests.benchmarks.fresh import MEANINGS, RandomEncoder, RandomViews
 from tests.benchmarks.scale import COARSE, PROPERTIES
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import inria_names
@@ -71,13 +70,3 @@ def test_a_scene_without_meaning_or_cameras_is_refused(tmp_path, capsys):
             assert main(PROGRAM, lambda words=words: parse(words)) == 2
     said = capsys.readouterr().err
     assert said.count("no language field") == said.count("no cameras") == 2
-
-
-def test_views_are_the_same_whenever_they_are_looked_at():
-    views = RandomViews(3, (60, 40))
-    (first, again), (_, other) = (views[1], views[1]), (views[0], views[2])
-    assert (first[1].vectors == again[1].vectors).all()
-    assert first[1].vectors.shape == other[1].vectors.shape
-    assert first[1].vectors.shape[0] == 250 < MEANINGS
-    assert len(list(views)) == 3
-    assert RandomEncoder().encode_texts([]).shape == (0, 512)

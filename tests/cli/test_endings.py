@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from langsplat_core.cli.app import parse
-from langsplat_core.cli.run import Written, main
-from langsplat_core.config import annotations, named_values
+from langsplat_core.cli.run import main
 from tests.support.processes import bound_by_permissions
 
 DEMO = str(files("langsplat_assets") / "demo" / "scene.ply")
@@ -31,7 +30,6 @@ WRITING = [
     "bench raster --out {}",
     "bench query s.ply --out {}",
 ]
-NOT_MARKED = {"convert s.ply {}.ply", "convert s.ply {} --to langsplat"}
 
 
 @pytest.mark.parametrize("line", WRITING)
@@ -47,16 +45,6 @@ def test_every_command_that_writes_tries_the_place_first(
     (message,) = capsys.readouterr().err.splitlines()
     assert any(word in message for word in ("system's own", "is a file", "file system takes")), message
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "s.ply"]
-
-
-@pytest.mark.parametrize("line", [line for line in WRITING if line not in NOT_MARKED])
-def test_what_is_written_is_marked(line: str) -> None:
-    command = parse(line.format("out").split())
-    for option, _, hint in named_values(command):
-        if option in ("--out", "--work", "--fit", "--pictures") or (
-            option == "--json" and "Path" in str(hint)
-        ):
-            assert any(isinstance(part, Written) for part in annotations(hint)), option
 
 
 @pytest.mark.parametrize(

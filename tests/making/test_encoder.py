@@ -180,20 +180,6 @@ def test_training_in_miniature(monkeypatch, few_crops, tmp_path):
     assert size < 12e6
 
 
-def test_training_twice_gives_the_same_model(few_crops, tmp_path):
-    weights = []
-    for name, seed in (("one", 0), ("two", 0), ("other", 1)):
-        # The learning rate starts at a 300th of this: steps large enough to be seen in half precision.
-        config = EncoderConfig(steps=2, batch=8, phrases=8, lr=0.1, seed=seed)
-        train_encoder(tmp_path / name, config, silent)
-        tensors = load_file(tmp_path / name / "model.safetensors")
-        weights.append(np.concatenate([tensor.float().numpy().ravel() for tensor in tensors.values()]))
-    # Not all: sums in bfloat16 may be added in another order, and Adam enlarges gradients that are zero
-    # but for rounding (the biases of attention keys).
-    assert np.isclose(weights[0], weights[1], atol=1e-3).mean() > 0.97
-    assert np.isclose(weights[0], weights[2], atol=1e-3).mean() < 0.5
-
-
 def test_training_may_begin_from_an_earlier_encoder(few_crops, tmp_path):
     """Weights are taken over, and so is the vector of every token that the earlier vocabulary had."""
     train_encoder(tmp_path / "old", EncoderConfig(steps=1, batch=8, phrases=8), silent)

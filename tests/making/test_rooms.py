@@ -11,7 +11,7 @@ from assets.making import dataset, shapes
 from assets.making.__main__ import PROGRAM, parse
 from assets.making.dataset import MIN_PIXELS, outlines, write_dataset, write_labelled
 from assets.making.kit import COLOURS, colour_word, from_lch, random_colour, to_lch
-from assets.making.render import Light, Renderer, Tracer, bake
+from assets.making.render import Light, Renderer
 from assets.making.truth import read_truth
 from assets.making.world import apart, build_room, footprint, furnished
 from langsplat_core.cli.app import parse as parse_product
@@ -202,25 +202,6 @@ def test_tiers_grow_harder():
     alike = {word for word in set(words) if words.count(word) >= 3} - {"wall"}
     hues = {word: {x.colour for x in wholes["occlusion"] if x.word == word} for word in alike}
     assert sum(len(colours) >= 2 for colours in hues.values()) >= 3  # the same class in other colours
-
-
-def test_baked_light_agrees_with_what_it_is_made_of(world):
-    """An open table under the lamp: no bounce but the sky's; the lattice agrees with the vertices."""
-    light = Light(np.array([-0.9, -1.0, 1.7]))
-    tracer = Tracer(world)
-    coarse, fine = bake(tracer, world, light, 6, 0.0), bake(tracer, world, light, 6, 0.006)
-    np.testing.assert_array_equal(coarse.vertices, fine.vertices)
-    assert (coarse.cells == 0).all()
-    rows = np.flatnonzero(fine.cells > 0)
-    assert len(rows) > 500
-    n = fine.cells[rows]
-    corners = np.stack(
-        [fine.start[rows], fine.start[rows] + (n + 1) * (n + 2) // 2 - 1, fine.start[rows] + n], 1
-    )
-    # Corner order: first (0, 0), second (n, 0), third (0, n). The same points, gathered again.
-    np.testing.assert_allclose(fine.lattice[corners], fine.vertices[world.triangles[rows]], atol=1e-5)
-    assert fine.lattice.min() >= 0
-    assert fine.lattice[:, 3].max() <= 1.6
 
 
 @pytest.mark.parametrize("seed", range(8))
