@@ -146,7 +146,7 @@ class RandomEncoder:
     reading = Reading()
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
-        """None."""
+        """Return no words."""
         return ()
 
     def encode_texts(self, texts: Sequence[str]) -> Array:

@@ -307,9 +307,7 @@ class Measured:
     objects: int  # that were asked
     rejected: float  # share of absent objects that are answered with "not here"
     absent: int  # that were asked
-    separation: (
-        float  # chance that a present object's peak exceeds an absent one's: 1 where a threshold exists
-    )
+    separation: float  # chance that a present object's peak exceeds an absent one's
     peaks: dict[str, float]  # smoothed peak relevancy of every object that was asked, absent ones included
     unknown: tuple[str, ...]  # phrases left out, because the encoder was never taught their words
     query_ms: float  # median, from text to place
