@@ -121,7 +121,7 @@ class Loading:
 
 
 def measure_loading(command: Scale, progress: Progress = silent) -> list[Loading]:
-    """Write a binary PLY of degree 3 to a temporary folder, read it with both readers in turn, and remove it."""
+    """Write a binary PLY of degree 3 to a temporary folder, read it with both readers, and remove it."""
     runs: dict[str, list[dict[str, Any]]] = {"langsplat": [], "plyfile": []}
     with tempfile.TemporaryDirectory(prefix="langsplat_load_") as folder:
         path = Path(folder) / "scene.ply"

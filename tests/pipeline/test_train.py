@@ -260,23 +260,17 @@ def run(*args: object) -> int:
     return main("langsplat", lambda: parse(words))
 
 
-def test_query_inspect_and_convert_commands(room, tmp_path, capsys):
+def test_query_and_inspect_commands(room, tmp_path, capsys):
     out = tmp_path / "scene.ply"
     train_scene(room, out, tiny_settings(room))
     assert run("query", out, "red mug", "--json") == 0
     answer = json.loads(capsys.readouterr().out)[0]
     assert answer["phrase"] == "red mug"
-    assert answer["level"] in ("subpart", "part", "whole")
-    assert len(answer["pixel"]) == 2
-    assert len(answer["place"]) == 3
+    assert (len(answer["pixel"]), len(answer["place"])) == (2, 3)
     assert run("query", out, "red mug", "--mode", "paper") == 2
     assert "--codec.kind autoencoder" in capsys.readouterr().err
-    assert run("query", out, "red mug", "--camera", 99) == 2
     assert run("inspect", out) == 0
     assert "codebook" in capsys.readouterr().out
-    copy = tmp_path / "copy.ply"
-    assert run("convert", out, copy) == 0
-    assert load_scene(copy).language is not None
 
 
 def test_a_trained_scene_is_given_a_meaning(room, tmp_path):
