@@ -1,10 +1,9 @@
 """Phrases with structure that are true of a procedural room; names and inventories against its truth."""
 
-import json
-
 import numpy as np
 import pytest
 
+from assets.making.dataset import write_labels
 from assets.making.truth import Region, Truth, read_truth
 from assets.making.world import World, build_room
 from langsplat_core.query.compose import upright, viewpoint
@@ -31,15 +30,7 @@ def room(tmp_path_factory) -> tuple[World, Truth]:
     world = build_room(3, "separate")
     folder = tmp_path_factory.mktemp("room") / "truth"
     folder.mkdir()
-    names = ("subpart", "part", "whole")
-    items = {
-        str(number): {
-            **{key: getattr(label, key) for key in ("word", "thing", "colour", "phrase", "words")},
-            "level": names[label.level],
-        }
-        for number, label in enumerate(world.labels)
-    }
-    (folder / "labels.json").write_text(json.dumps(items))
+    write_labels(world, folder / "labels.json")
     return world, read_truth(folder.parent)
 
 
