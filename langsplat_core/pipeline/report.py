@@ -78,7 +78,7 @@ def stated_warnings(scene: Path, gaussians: int) -> tuple[str, ...]:
 
 
 def quality_warnings(scores: Sequence["ViewScore"], cameras: Sequence[Camera]) -> tuple[str, ...]:
-    """What speaks against a scene that was trained without an error, one sentence each, with the remedy.
+    """Return what speaks against a scene that was trained without an error, one sentence each, with a remedy.
 
     scores: of held-out views, or none; cameras: all that were trained on.
     """

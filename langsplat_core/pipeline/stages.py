@@ -1,4 +1,4 @@
-"""What every stage of a training shares: results kept under a key of settings and inputs, a lock on the work
+"""Base of all stages of a training: results kept under a key of settings and inputs, a lock on the work
 folder, and the group of processes that share the work."""
 
 import contextlib
