@@ -1,7 +1,7 @@
 """Tiny seeded scenes, answers and views with masks that many tests share."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -128,7 +128,7 @@ class Answer:
     heat_range: tuple[float, float] = (0.5, 0.9)
 
 
-def random_answer(count: int, seed: int, **changed) -> Answer:
+def random_answer(count: int, seed: int, **changed: Any) -> Answer:
     relevancy = np.stack([random_values(count, 1, seed + level)[:, 0] for level in range(3)])
     return Answer(relevancy, relevancy[2] > 0.5, **changed)
 
@@ -144,7 +144,7 @@ def random_scene(count: int = 150, sh_degree: int = 3) -> Scene:
 LIFTED_DIM = 12
 
 
-def make_views(count: int = 3):
+def make_views(count: int = 3) -> list[tuple[Camera, ImageFeatures]]:
     """Cameras with random labels at three levels; the subpart level has no masks at all."""
     views = []
     for seed in range(count):
@@ -158,6 +158,6 @@ def make_views(count: int = 3):
     return views
 
 
-def dense_weights(gaussians, camera) -> np.ndarray:
+def dense_weights(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """(H, W, N): column i is the splat of the i-th unit vector."""
     return ReferenceRasterizer().view(gaussians, camera).splat(np.eye(len(gaussians)))[0]
