@@ -1,9 +1,8 @@
-"""Ranges of settings: written beside the field that they bound, checked in one place before anything runs.
+"""Every setting a user can change, as frozen dataclasses from which the command line is derived.
 
-    steps: Annotated[int, Range(1, 1_000_000)] = 100
-
-`check_settings` walks a configuration with all configurations in it. A field may also hold several numbers,
-as pairs and lists do; every one of them must then lie in the range.
+A number's range is part of its field's type, ``steps: Annotated[int, Range(1, 1_000_000)] = 100``, and bounds
+each number of a field with several. `check_settings` refuses what lies outside, in a configuration and in all
+that it holds.
 """
 
 import dataclasses
@@ -139,24 +138,15 @@ def _shown(value: Any) -> str:
 
 
 def _word(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:g}"
-    try:
-        return str(value)
-    except ValueError:  # Python writes no whole number of more than 4300 digits
-        return "a number of thousands of digits"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-# Every setting a user can change, as frozen dataclasses; the command line is derived from them.
-#
-# A number's range is part of its field's type; `ranges.check_settings` refuses what lies outside.
-
-# What a number may be: every field with numbers names one of these, or a range of its own.
+# Every field with numbers names one of these, or a range of its own.
 Count = Annotated[int, Range(1, 1_000_000_000)]
 SeveralCount = Annotated[int, Range(2, 1_000_000_000)]
 CountOrZero = Annotated[int, Range(0, 1_000_000_000)]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
-Side = Annotated[int, Range(16, 65_536)]  # pixels of a picture's longer side
+Side = Annotated[int, Range(16, 65_536)]  # pixels of an image's longer side
 Share = Annotated[float, Range(0.0, 1.0)]
 Rate = Annotated[float, Range(0.0, 10.0, above=True)]  # a learning rate
 NotNegative = Annotated[float, Range(0.0, 1e9)]
@@ -183,7 +173,6 @@ class RasterSettings:
 
 INRIA = RasterSettings()
 GSPLAT = replace(INRIA, near=0.01)
-RASTER_PROFILES = {"inria": INRIA, "gsplat": GSPLAT}
 
 
 @dataclass(frozen=True)
@@ -193,7 +182,7 @@ class DatasetConfig:
     max_side: Side = 800  # photographs are shrunk until their longer side has at most this many pixels
     test_every: CountOrZero = 8  # every n-th view, in name order, is held out from training; 0 holds out none
     metres_per_unit: Positive | None = None
-    """Of the dataset's world; None: as transforms.json says, or else the photographs' places (GPS)."""
+    """Scale of the dataset's world; None: as transforms.json says, or else the photographs' places (GPS)."""
     # go on where fewer than half of the photographs, or fewer than three, have a camera
     allow_few_cameras: bool = False
 
@@ -229,7 +218,7 @@ class RadianceConfig:
     percent_dense: Share = 0.01  # of the extent: larger Gaussians split, smaller ones are cloned
     opacity_reset_every: Count = 3_000  # steps between two resets of all opacities to at most 0.01
     prune_opacity: Share = 5e-3  # fainter Gaussians are removed
-    coarse_fraction: Share = 1 / 3  # of the steps, at the start, on pictures of half the size; INRIA: 0
+    coarse_fraction: Share = 1 / 3  # of the steps, at the start, on images of half the size; INRIA: 0
     checkpoint_every: Count = 2_000  # steps of this run
     seed: Seed = 0  # of random numbers
 
@@ -241,7 +230,7 @@ class MaskConfig:
     source: Literal["auto", "sam", "graph"] = "auto"  # auto: sam when `sam` names weights, else graph
     # hub id, folder or file of SAM or SAM 2 weights, e.g. facebook/sam-vit-huge
     sam: str = ""
-    # layers of crops that SAM sees beside the whole picture, 2 x 2 in the first: 0 as the paper's text,
+    # layers of crops that SAM sees beside the whole image, 2 x 2 in the first: 0 as the paper's text,
     # 1 as its code, which takes five times as long
     crop_layers: Annotated[int, Range(0, 4)] = 0
     points_per_side: Annotated[int, Range(1, 1_024)] = 32  # of the grid that SAM is asked at
@@ -261,7 +250,7 @@ class ClipConfig:
     """The vision-language encoder: CLIP, SigLIP or SigLIP 2."""
 
     model: str = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"  # hub id, folder, or "demo" for the bundled one
-    batch: Count = 32  # pictures per forward pass
+    batch: Count = 32  # images per forward pass
     device: Literal["auto", "cpu", "cuda"] = "auto"  # where it runs
 
 
@@ -358,8 +347,6 @@ PAPER = TrainConfig(
 )
 TrainProfile = Literal["default", "paper"]
 TrainPreset = Literal["quick", "good", "full"]
-
-
 OPACITY_DECAY = 0.01  # of quick and good: few photographs gain a third of a decibel, see docs/photographs.md
 
 
@@ -378,11 +365,6 @@ def with_preset(config: TrainConfig, preset: TrainPreset) -> TrainConfig:
     )
 
 
-TRAIN_PROFILES: Mapping[TrainProfile, TrainConfig] = MappingProxyType(
-    {"default": TrainConfig(), "paper": PAPER}
-)
-
-
 @dataclass(frozen=True)
 class CompactConfig:
     """Settings of `langsplat compact`: the error allowed, and the views it is measured on."""
@@ -390,7 +372,7 @@ class CompactConfig:
     max_psnr_loss: Decibels = 0.1  # dB, mean over the measuring views; nothing that loses more is written
     views: SeveralCount = 96
     """At most, of the scene's cameras or photographs; a sixth of them measures the loss."""
-    max_side: Side = 800  # pictures are drawn with at most this many pixels on their longer side
+    max_side: Side = 800  # images are drawn with at most this many pixels on their longer side
     # dB that the scene is assumed to have where no photographs are given: higher is more cautious
     assumed_psnr: Annotated[float, Range(0.0, 200.0, above=True)] = 35.0
     phrases: tuple[str, ...] = ()  # asked before and after, beside those in the scene's phrasebook
@@ -413,4 +395,4 @@ class PictureConfig:
     threshold: Share = 0.5  # of a pixel's light from an answer's Gaussians from which it is segmented
     alpha_gate: Share = 0.3  # pixels with less alpha carry no relevancy
     background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)  # display values in [0, 1]
-    transparent: bool = False  # no background: the picture has a fourth channel, the scene's alpha
+    transparent: bool = False  # no background: the image has a fourth channel, the scene's alpha

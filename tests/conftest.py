@@ -13,8 +13,7 @@ import hypothesis
 import pytest
 
 from tests.support.backends import backend, fast_backend, gl_rasterizers, gsplat_twin
-from tests.support.gl_context import gl, gl_session
-from tests.support.measured import measured, print_measured
+from tests.support.fixtures import gl, gl_session, measured, print_measured
 
 __all__ = [
     "backend",

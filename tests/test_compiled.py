@@ -12,8 +12,7 @@ import pytest
 from langsplat_core import compiled
 from langsplat_core.compiled import Workers, digest_of_sources, kernel_folder
 from langsplat_core.raster.cpu import backward, blend, tiles
-from tests.support.another_user import bound_by_permissions
-from tests.support.full_disk import files_of_at_most
+from tests.support.processes import bound_by_permissions, files_of_at_most
 
 PACKAGE = Path(compiled.__file__).parent
 KERNEL = """

@@ -10,7 +10,7 @@ import pytest
 
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path, check_output_file, check_output_folder, name_max, shown
-from tests.support.another_user import bound_by_permissions
+from tests.support.processes import bound_by_permissions
 
 CHECKS = [check_output_file, check_output_folder]
 Check = Callable[[Path], None]

@@ -32,8 +32,8 @@ from langsplat_viewer.files.preferences import Preferences, save_preferences
 from langsplat_viewer.output.film import Film, write_film
 from langsplat_viewer.output.saving import save_png
 from tests.support.file_samples import random_codec, random_field
-from tests.support.flights import flight as some_flight
-from tests.support.full_disk import files_of_at_most
+from tests.support.marks_and_flights import flight as some_flight
+from tests.support.processes import files_of_at_most
 from tests.support.scenes import random_camera, random_gaussians
 
 GAUSSIANS = random_gaussians(40, 1, sh_degree=1)

@@ -6,13 +6,12 @@ The work is imported when it is done: torch and open3d take seconds that --help 
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from assets.making.config import EncoderConfig, LabelLayout, Size, Tier
-from langsplat_core.cli.checks import OutFile, OutFolder
-from langsplat_core.cli.run import Command, main, parsed
+from langsplat_core.cli.run import Command, OutFile, OutFolder, main, parsed
 from langsplat_core.config import Count, Seed
 from langsplat_core.progress import TerminalProgress
 
@@ -68,14 +67,6 @@ class Build:
 
     out: OutFile
     """The scene to write, *.ply."""
-    seed: Seed = 2
-    """Another seed is another room."""
-    tier: Tier = "clutter"
-    """How hard the room is: objects apart, cluttered, or packed with look-alikes."""
-    masks: Literal["truth", "graph"] = "truth"
-    """Outlines as a perfect segmenter would find them, or those of the weight-free segmenter."""
-    steps: Count = 6_000
-    """Steps of radiance training."""
     gaussians: Path | None = None
     """Keep the Gaussians of this scene of the same room, and make only their language field again."""
 
@@ -83,9 +74,7 @@ class Build:
         from assets.making.scene import build_scene
 
         with TerminalProgress() as progress:
-            made = build_scene(
-                self.out, self.seed, self.tier, self.masks, self.steps, self.gaussians, progress
-            )
+            made = build_scene(self.out, self.gaussians, progress)
         print(f"{self.out}: {made}")
 
 

@@ -80,7 +80,7 @@ def write_dataset(
         if not (truth / f"{camera.name}.npz").exists():
             _write_view(renderer, world, camera, out, naming.suffix)
         progress("rendering photographs", (done + 1) / views)
-    _write_labels(world, truth / "labels.json")
+    write_labels(world, truth / "labels.json")
     _write_points(world, renderer, seed, out / "points.ply")
     _write_transforms(cameras, naming.suffix, out / "transforms.json")
 
@@ -125,7 +125,8 @@ def _write_view(renderer: Renderer, world: World, camera: Camera, out: Path, suf
         np.savez_compressed(path, ids=truth_ids(world, picture), depth=picture.depth)
 
 
-def _write_labels(world: World, path: Path) -> None:
+def write_labels(world: World, path: Path) -> None:
+    """Write what every id stands for, as `write_dataset` says."""
     stated = ("word", "thing", "colour", "phrase", "words")
     rows = {
         str(number): {"level": LEVELS[label.level], **{name: getattr(label, name) for name in stated}}

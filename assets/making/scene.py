@@ -5,9 +5,7 @@ and parts. Their names and colours it never sees: those come from the encoder.
 """
 
 from pathlib import Path
-from typing import Literal
 
-from assets.making.config import Tier
 from assets.making.dataset import write_dataset
 from assets.making.truth import TruthMasks, read_truth
 from langsplat_core.compaction.compact import compact_scene
@@ -28,45 +26,32 @@ SIZE = (640, 480)
 MAX_LOSS = 0.25  # dB that compaction may cost
 
 
-def scene_config(steps: int) -> TrainConfig:
-    """Settings of the bundled scene: a low SH degree and a cap on the count keep the file small."""
-    return TrainConfig(
-        dataset=DatasetConfig(max_side=max(SIZE), test_every=9),
-        radiance=RadianceConfig(steps=steps, sh_degree=1, max_gaussians=110_000),
-        masks=MaskConfig(source="graph"),
-        clip=ClipConfig(model="demo"),
-    )
+# A low SH degree and a cap on the count keep the file small.
+CONFIG = TrainConfig(
+    dataset=DatasetConfig(max_side=max(SIZE), test_every=9),
+    radiance=RadianceConfig(steps=6_000, sh_degree=1, max_gaussians=110_000),
+    masks=MaskConfig(source="graph"),
+    clip=ClipConfig(model="demo"),
+)
 
 
-def build_scene(
-    out: Path,
-    seed: int = SEED,
-    tier: Tier = "clutter",
-    masks: Literal["truth", "graph"] = "truth",
-    steps: int = 6_000,
-    gaussians: Path | None = None,
-    progress: Progress = silent,
-) -> str:
-    """Render the room of `seed` and `tier`, train, and drop what the photographs do not miss; or, given
-    `gaussians`, a scene of that room, find only what those mean. What was made, in a line.
-
-    `masks`: "truth", the outlines that a perfect segmenter would find, or "graph", the weight-free one.
+def build_scene(out: Path, gaussians: Path | None = None, progress: Progress = silent) -> str:
+    """Render the room, train, and drop what the photographs do not miss; or, given `gaussians`, a scene of
+    that room, find only what those mean. Returns a line about what was made.
 
     Photographs and truth stay in `<out>.work/photographs`, the scene as trained in `<out>.work/trained.ply`.
     """
     work = out.with_name(out.stem + ".work")
     photographs, trained = work / "photographs", work / "trained.ply"
     if not (photographs / "transforms.json").exists():
-        write_dataset(photographs, seed, VIEWS, SIZE, progress, tier)
-    source = (lambda capture: TruthMasks(capture, read_truth(photographs))) if masks == "truth" else None
-    config = scene_config(steps)
+        write_dataset(photographs, SEED, VIEWS, SIZE, progress)
     made = train_scene(
         photographs,
         out if gaussians else trained,
-        config,
+        CONFIG,
         work,
         progress,
-        masks_of=source,
+        masks_of=lambda capture: TruthMasks(capture, read_truth(photographs)),
         gaussians_from=gaussians,
     )
     if gaussians:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from langsplat_core.bench import QueryBenchConfig, RasterBenchConfig
-from langsplat_core.cli.checks import OutFolder
+from langsplat_core.cli.run import OutFolder
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.scenes import load_scene

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from langsplat_core.cli.checks import OutFolder
+from langsplat_core.cli.run import OutFolder
 from langsplat_core.errors import LangSplatError
 
 # Name of a picture -> options of the viewer.

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from langsplat_core.cli.checks import OutFile, OutFolder
+from langsplat_core.cli.run import OutFile, OutFolder
 from langsplat_core.config import ClipConfig, MaskConfig, TrainConfig, TrainPreset, with_preset
 from langsplat_core.errors import InputError
 from langsplat_core.evaluation.profiles import LERF_PROFILES, OVS_PROFILES, LerfProtocol, OvsProtocol, Profile

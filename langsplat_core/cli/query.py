@@ -13,7 +13,7 @@ import tyro
 from rich.table import Table
 
 from langsplat_core.arrays import Array
-from langsplat_core.cli.checks import OutFile, OutputConsole
+from langsplat_core.cli.run import OutFile, OutputConsole
 from langsplat_core.config import Count, CountOrZero, LevelChoice, NotNegative, PictureConfig, Positive
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene

@@ -1,8 +1,8 @@
 """Running of commands, each of which exits with 0, with 2 and one line on stderr, or with 130 (143) when
 interrupted (terminated).
 
-A command is a dataclass whose fields are its arguments (tyro derives the parser) and whose `run` does
-the work. The viewer's program ends the same way and uses this module too.
+A command is a dataclass whose fields are its arguments (tyro derives the parser), checked before anything is
+done, and whose `run` does the work. The viewer's program ends the same way and uses this module too.
 """
 
 import contextlib
@@ -19,16 +19,17 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, dataclass, fields, make_dataclass
 from itertools import dropwhile, pairwise, takewhile
+from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import tyro
+from rich.console import Console
 
 from langsplat_core import __version__
-from langsplat_core.cli.checks import check_arguments
-from langsplat_core.config import CODEC_CONFIGS, CodecConfig
+from langsplat_core.config import CODEC_CONFIGS, CodecConfig, annotations, check_settings, named_values
 from langsplat_core.errors import InputError, LangSplatError, optional_imports, printable_line
-from langsplat_core.io.files import NO_ROOM, shown
+from langsplat_core.io.files import NO_ROOM, check_output_file, check_output_folder, shown
 from langsplat_core.progress import Terminated
 
 log = logging.getLogger("langsplat")
@@ -265,3 +266,43 @@ def _system_complaint(error: OSError) -> str:
 def _fail(program: str, message: str) -> int:
     print(f"{program}: {message}", file=sys.stderr)
     return 2
+
+
+class OutputConsole(Console):
+    """A console that leaves to `main` what happens when nobody reads any more; rich's own ends with 1."""
+
+    def on_broken_pipe(self) -> None:
+        """Raise BrokenPipeError, as `print` does."""
+        raise BrokenPipeError
+
+
+@dataclass(frozen=True)
+class Written:
+    """Marks an argument that names what is written, so that it can be tried before the work."""
+
+    kind: Literal["file", "folder"]
+
+
+OutFile = Annotated[Path, Written("file")]
+OutFolder = Annotated[Path, Written("folder")]
+
+
+def check_arguments(command: object) -> None:
+    """InputError, in one line, for the first argument of a command, a dataclass, that it cannot work with: a
+    number outside of its range, a text that is not UTF-8, a place that cannot be written to."""
+    check_settings(command)
+    for option, value, hint in named_values(command):
+        for text in value if isinstance(value, tuple) else (value,):
+            if isinstance(text, str):
+                _check_text(option, text)
+        written = next((part for part in annotations(hint) if isinstance(part, Written)), None)
+        if written is not None and value is not None:
+            (check_output_file if written.kind == "file" else check_output_folder)(value)
+
+
+def _check_text(option: str, text: str) -> None:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        plain = text[:40].encode("utf-8", "backslashreplace").decode()
+        raise InputError(f"{option} {plain}: is not UTF-8; use a terminal that is set to UTF-8") from None

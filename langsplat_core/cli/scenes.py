@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from langsplat_core import __version__
-from langsplat_core.cli.checks import OutFile, OutputConsole
+from langsplat_core.cli.run import OutFile, OutputConsole
 from langsplat_core.config import CodebookConfig, CodecConfig, CompactConfig, Positive, Range
 from langsplat_core.errors import EXTRAS, BackendError, InputError, LangSplatError, remedy
 from langsplat_core.io.files import check_output_folder
@@ -72,6 +72,7 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
     low, high = (" ".join(f"{value:.3g}" for value in corner) for corner in a.bounds)
     median, most, largest = ("infinite" if ratio is None else f"{ratio:.3g}" for ratio in a.anisotropy)
     hidden, *shares = accumulate(a.opacity_shares)  # of the Gaussians below each edge
+    energy = " + ".join(f"{100 * share:.3g} %" for share in a.sh_energy)
     below = [f"{_percent(s)} < {edge:g}" for s, edge in zip(shares, OPACITY_EDGES[2:-1], strict=False)]
     lines = [
         ("in memory", f"{a.memory_bytes / 1e6:.2f} MB"),
@@ -81,10 +82,7 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
         ("bounds (1-99 %)", f"{low}  to  {high}"),
         ("opacity", ", ".join([f"{_percent(hidden)} never drawn", *below])),
         ("anisotropy", f"median {median}, 99 % {most}, largest {largest}; {a.needles} > {NEEDLE:g}"),
-        (
-            "SH degree",
-            f"{a.sh_degree}; energy by degree {' + '.join(f'{100 * e:.3g} %' for e in a.sh_energy)}",
-        ),
+        ("SH degree", f"{a.sh_degree}; energy by degree {energy}"),
         ("antialiased", "yes (Mip-Splatting)" if a.antialiased else "no"),
         ("scale", f"{a.metres_per_unit:g} m per unit" if a.metres_per_unit else "unknown: `langsplat scale`"),
         ("extra properties", ", ".join(a.extras) or "none"),
@@ -260,9 +258,7 @@ class Convert:
         from langsplat_core.pipeline.exporting import export_langsplat, export_occam
 
         check_output_folder(self.out)
-
-        scene = self._read()
-        scene = replace(scene, path=self.source)
+        scene = replace(self._read(), path=self.source)
         with TerminalProgress() as progress:
             if self.to == "langsplat":
                 written = export_langsplat(scene, self.out, self.source.stem)

@@ -12,16 +12,8 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from langsplat_core.cli.checks import OutFile, OutFolder
-from langsplat_core.cli.run import codec_settings, named, one_line
-from langsplat_core.config import (
-    TRAIN_PROFILES,
-    TrainConfig,
-    TrainPreset,
-    TrainProfile,
-    check_settings,
-    with_preset,
-)
+from langsplat_core.cli.run import OutFile, OutFolder, codec_settings, named, one_line
+from langsplat_core.config import PAPER, TrainConfig, TrainPreset, TrainProfile, check_settings, with_preset
 from langsplat_core.errors import InputError
 from langsplat_core.progress import LineProgress, Progress, TerminalProgress, silent
 
@@ -94,7 +86,7 @@ class Train:
 def train_command(args: Sequence[str]) -> type[Train]:
     """`Train` with the settings of the profile and preset that `args` name as defaults."""
     profile, preset = named(args, "--profile"), named(args, "--preset")
-    config = next((TRAIN_PROFILES[name] for name in TRAIN_PROFILES if name == profile), TrainConfig())
+    config = PAPER if profile == "paper" else TrainConfig()
     config = replace(config, codec=codec_settings(args, config.codec))
     for known in get_args(TrainPreset):
         if known == preset:

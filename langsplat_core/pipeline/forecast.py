@@ -81,7 +81,7 @@ def plan(
 def _mask_seconds(masks: MaskConfig, megapixels: float, speed: float) -> float:
     if not masks.sam or masks.source == "graph":
         return 0.4 + megapixels
-    of_million = 0.14 if "sam2" in masks.sam.lower() else 0.24  # seconds of seeing a picture
+    of_million = 0.14 if "sam2" in masks.sam.lower() else 0.24  # seconds of seeing an image
     crops = sum(4**layer for layer in range(masks.crop_layers + 1))
     seeing, asking = of_million * _millions(masks.sam), POINT * masks.points_per_side**2
     return megapixels + crops * (seeing + asking) * speed
@@ -114,7 +114,7 @@ def count_photographs(dataset: Path) -> tuple[int, Given]:
 
 
 def _given(folder: Path) -> Given:
-    """COLMAP's models have points as a rule; a transforms.json has cameras, and may name a file of points."""
+    # COLMAP's models have points as a rule; a transforms.json has cameras, and may name a file of points.
     frames = folder / "transforms.json"
     if frames.is_file():
         return "points" if b'"ply_file_path"' in frames.read_bytes() else "cameras"

@@ -5,7 +5,6 @@ sample of them, a codebook unless asked otherwise; clusters that have a vector e
 Vectors are read a block of Gaussians at a time: all of them may be more than memory holds.
 """
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,13 +16,7 @@ from langsplat_core.io.foreign import ForeignScene
 from langsplat_core.io.foreign_language import Leaves
 from langsplat_core.pipeline.language import encoded_phrases
 from langsplat_core.progress import Progress, silent
-from langsplat_core.scene import (
-    CANONICAL_PHRASES,
-    LEVELS,
-    Codec,
-    LanguageField,
-    Scene,
-)
+from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Codec, LanguageField, Scene
 from langsplat_core.scene.codec import LARGEST, SHORTEST
 from langsplat_core.semantics.encoder import OPEN_MODEL
 from langsplat_core.semantics.encoders import load_text_encoder
@@ -91,8 +84,8 @@ def import_scene(
         everyday=everyday_vectors(encoder),
     )
     subpart, part, whole = confidence.mean(1).tolist() if confidence.size else (0.0, 0.0, 0.0)
-    size = codec.size
-    report = ImportReport(foreign.method, codec.kind, size, (subpart, part, whole), loss, foreign.notes)
+    shares = (subpart, part, whole)
+    report = ImportReport(foreign.method, codec.kind, codec.size, shares, loss, foreign.notes)
     return replace(foreign.scene, language=field), report
 
 
@@ -107,10 +100,10 @@ def _codec(
     if foreign.codec is not None:
         return foreign.codec, None
     clusters = foreign.levels[-1]
-    small = isinstance(clusters, Leaves) and len(clusters.vectors) <= LARGEST
-    exact = _cluster_codec(clusters, config) if isinstance(clusters, Leaves) and small else None
-    if exact is not None:
-        return exact, None
+    if isinstance(clusters, Leaves) and len(clusters.vectors) <= LARGEST:
+        exact = _cluster_codec(clusters, config)
+        if exact is not None:
+            return exact, None
     fitted, judged = _samples(foreign, config.seed)
     codec = fit_codec(fitted, config, vocabulary, progress)
     return codec, codec_report(codec, judged if len(judged) else fitted, vocabulary)
@@ -119,16 +112,12 @@ def _codec(
 def _cluster_codec(clusters: Leaves, config: CodecConfig) -> Codec | None:
     """The codec of the vectors of all clusters with a meaning that Gaussians belong to, in their order; None
     for a kind that keeps no vectors as they are."""
-    counts = np.bincount(clusters.index[_named(clusters)], minlength=len(clusters.vectors))
+    named = (clusters.index >= 0) & (clusters.index < len(clusters.vectors))
+    counts = np.bincount(clusters.index[named], minlength=len(clusters.vectors))
     used = np.flatnonzero((counts > 0) & _has_meaning(clusters.vectors))
     if len(used) == 0:
         raise InputError("no cluster that Gaussians belong to has a meaning; there is nothing to search")
     return exact_codec(unit(clusters.vectors[used]), counts[used].astype(np.float64), config)
-
-
-def _named(clusters: Leaves) -> Array:
-    named: Array = (clusters.index >= 0) & (clusters.index < len(clusters.vectors))
-    return named
 
 
 def _samples(foreign: ForeignScene, seed: int) -> tuple[Array, Array]:
@@ -166,16 +155,12 @@ def _latents(foreign: ForeignScene, codec: Codec, progress: Progress) -> tuple[A
     latents = np.zeros((len(LEVELS), count, codec.latent_dim), codec.dtype)
     confidence = np.zeros((len(LEVELS), count), np.float32)
     told = _told(foreign)
-    for done, (level, rows) in enumerate(_blocks(told, count)):
-        values, known = _unit_rows(foreign, level, rows)
-        made = values if foreign.codec is not None else codec.encode(values)
-        latents[level, rows[known]] = made[known]
-        confidence[level, rows] = known
-        progress("reading features", (done + 1) / (len(told) * -(-count // BLOCK)))
-    return latents, confidence
-
-
-def _blocks(levels: Sequence[int], count: int) -> Iterator[tuple[int, Array]]:
-    for level in levels:
+    for done, level in enumerate(told):
         for start in range(0, count, BLOCK):
-            yield level, np.arange(start, min(start + BLOCK, count))
+            rows = np.arange(start, min(start + BLOCK, count))
+            values, known = _unit_rows(foreign, level, rows)
+            made = values if foreign.codec is not None else codec.encode(values)
+            latents[level, rows[known]] = made[known]
+            confidence[level, rows] = known
+            progress("reading features", (done + (start + len(rows)) / count) / len(told))
+    return latents, confidence

@@ -1,6 +1,6 @@
-"""From masks with vectors to a language field: mask_weights, groups of masks, codec, latents.
+"""From masks with vectors to a language field: mask weights, groups of masks, codec, latents.
 
-Each is kept in the work folder. MaskWeights are kept view by view and latents block by block, so that an
+Each is kept in the work folder. Mask weights are kept view by view and latents block by block, so that an
 interrupted run, or one that is shared by several processes, repeats little, and so that what is held in
 memory depends on a block of Gaussians and not on all of them times all photographs.
 """
@@ -67,6 +67,7 @@ from langsplat_core.training.language.mask_weights import (
 Views = Sequence[tuple[Camera, ImageFeatures]]  # read when needed: they may be more than memory holds
 Latents = tuple[Array, Array]  # (3, N, d) of the codec's type, (3, N) float32
 FITTED, JUDGED = 12_000, 2_000  # Gaussians whose lifted vectors a codec is fitted to, and judged on
+LATENT_LIFTS = frozenset({"one-pass", "gradient"})  # modes that average latents, of a codec fitted to masks
 MOST_CONFIDENCE = 65_504.0  # pixels; the largest number that float16 holds
 
 
@@ -139,7 +140,7 @@ class _Stages:
         self._vectors, digests = [], []
         for _, features in views:
             self._vectors.append(features.vectors)
-            digests.append(features_digest([features]))
+            digests.append(features_digest(features))
         self._inputs = (gaussians_digest(gaussians), digests)
         self._made: tuple[MaskWeights, MaskGroups] | None = None
 
@@ -237,12 +238,12 @@ class _Stages:
                 self._progress("lifting masks onto the Gaussians", (index + 1) / len(self._views))
             self._processes.barrier()
             pairs = [open_array(path) for path in files]
-            groups = self._processes.once(lambda: self._groups(folder / "groups.npz"))
+            path = folder / "groups.npz"
+            groups = self._processes.once(
+                lambda: kept(path, lambda: group_masks(self._vectors), _pack_groups, self._unpack_groups)
+            )
             self._made = MaskWeights(pairs, len(self._gaussians)), groups
         return self._made
-
-    def _groups(self, path: Path) -> MaskGroups:
-        return kept(path, lambda: group_masks(self._vectors), _pack_groups, self._unpack_groups)
 
     def _pairs(self, rasterizer: LiftingRasterizer, index: int) -> Array:
         camera, features = self._views[index]
@@ -261,10 +262,6 @@ def _what_matters(config: LiftConfig) -> LiftConfig:
     if config.mode != "gradient":
         return LiftConfig(mode=config.mode)
     return replace(config, backend="auto")
-
-
-# Modes that lift latents of a codec that is fitted to the masks' vectors alone.
-LATENT_LIFTS = frozenset({"one-pass", "gradient"})
 
 
 def _encoded(codec: Codec, lifted: Lifted) -> Latents:

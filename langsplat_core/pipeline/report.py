@@ -1,4 +1,4 @@
-"""Report of a training, `report.json` in its work folder; read without torch."""
+"""Report of a training, `report.json` in its work folder, and quality warnings; read without torch."""
 
 import json
 from collections.abc import Sequence
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 REPORT = "report.json"
 LIMIT = 1_000_000  # bytes; a report has about a thousand
 MOST_WARNINGS = 5  # that are taken from a file
+LEAST_PSNR = 16.0  # dB: below, held-out photographs are hardly recognised
+LEAST_COVERED = 0.5  # of an image's pixels
+APART = 10.0  # times the median step to a neighbouring camera; captures that went well have at most 5
 
 
 @dataclass(frozen=True)
@@ -74,16 +77,8 @@ def stated_warnings(scene: Path, gaussians: int) -> tuple[str, ...]:
     return tuple(printable_line(line, 300) for line in lines if isinstance(line, str))
 
 
-# What speaks against a trained scene: a run that ends without an error may still have made one that nobody
-# wants to see, and then it says so.
-
-LEAST_PSNR = 16.0  # dB: below, held-out photographs are hardly recognised
-LEAST_COVERED = 0.5  # of a picture's pixels
-APART = 10.0  # times the median step to a neighbouring camera; captures that went well have at most 5
-
-
 def quality_warnings(scores: Sequence["ViewScore"], cameras: Sequence[Camera]) -> tuple[str, ...]:
-    """One sentence each, with the remedy; none where nothing speaks against the scene.
+    """Return what speaks against a scene that was trained without an error, one sentence each, with a remedy.
 
     scores: of held-out views, or none; cameras: all that were trained on.
     """

@@ -1,4 +1,5 @@
-"""Stages that remember: a result is stored under a key made of its settings and inputs."""
+"""Base of all stages of a training: results kept under a key of settings and inputs, a lock on the work
+folder, and the group of processes that share the work."""
 
 import contextlib
 import hashlib
@@ -25,7 +26,14 @@ from langsplat_core.io.hostile import write_npy
 from langsplat_core.scene import Gaussians
 from langsplat_core.semantics.store import ImageFeatures
 
+try:
+    import fcntl
+except ImportError:  # Windows; there two trainings in one folder are the user's to avoid
+    fcntl = None  # type: ignore[assignment]
+
 log = logging.getLogger("langsplat")
+LOCK = "in-use.lock"  # in the work folder, where it stays: only the system's lock on it counts
+PATIENCE = timedelta(days=7)  # radiance training is one process's work, and the others wait for it
 T = TypeVar("T")
 Arrays = Mapping[str, Array]
 
@@ -84,9 +92,9 @@ def gaussians_digest(gaussians: Gaussians) -> str:
     return _digest(*(getattr(gaussians, field.name) for field in fields(gaussians)))
 
 
-def features_digest(features: list[ImageFeatures]) -> str:
-    """Digest of the masks and vectors of photographs, in their order."""
-    return _digest(*(array for item in features for array in (item.labels, item.vectors)))
+def features_digest(features: ImageFeatures) -> str:
+    """Digest of the masks and vectors of a photograph."""
+    return _digest(features.labels, features.vectors)
 
 
 def _digest(*arrays: Array) -> str:
@@ -97,19 +105,10 @@ def _digest(*arrays: Array) -> str:
     return digest.hexdigest()
 
 
-# One training at a time in a work folder: two would write each other's stages.
-
-try:
-    import fcntl
-except ImportError:  # Windows; there two trainings in one folder are the user's to avoid
-    fcntl = None  # type: ignore[assignment]
-
-LOCK = "in-use.lock"  # in the work folder, where it stays: only the system's lock on it counts
-
-
 @contextmanager
 def sole_use(folder: Path) -> Iterator[None]:
-    """Hold `folder`, made if it is missing, for this process alone; removed again if nothing came into it.
+    """Hold `folder` for one training, as two would write each other's stages; make it if it is missing, and
+    remove it again if nothing came into it.
 
     The lock is the operating system's: it ends with its process, however that ends, so that none is ever left
     by a dead one. On file systems without locks nothing is held. Raises InputError where another process, or
@@ -153,19 +152,13 @@ def _locked(folder: Path) -> io.FileIO:
         file.close()  # who held it has removed it meanwhile: this is a lock on nothing
 
 
-# Processes that share one work: on several cores, GPUs or machines that see the same work folder.
-#
-#     torchrun --nproc-per-node 2 -m langsplat_core train DATASET --out scene.ply
-#
-# What is made goes through the work folder, item by item, so that a process that is lost costs only what it
-# had not finished; here is only who does what, and where all wait for each other.
-
-PATIENCE = timedelta(days=7)  # radiance training is one process's work, and the others wait for it
-
-
 @dataclass(frozen=True)
 class ProcessGroup:
-    """This process among all of them; alone by default."""
+    """This process among those that share a training; alone by default.
+
+    `torchrun --nproc-per-node 2 -m langsplat_core train DATASET --out scene.ply` starts two. Results go
+    through the work folder, item by item, so that a lost process costs only what it had not finished.
+    """
 
     rank: int = 0
     size: int = 1

@@ -18,7 +18,7 @@ from langsplat_core.cli.bench import write_report
 from langsplat_core.config import INRIA
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
-from tests.support.close import BAND, assert_close_off_cuts, assert_gradient
+from tests.support.comparing import BAND, assert_close_off_cuts, assert_gradient
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
 pytestmark = pytest.mark.long

@@ -52,9 +52,8 @@ class ClipGeometry:
 
     own: float  # cosine of a picture with the words that are true of it
     alike: float = 0.65  # cosine of pictures of different things
-    vectors: Path | None = (
-        None  # (V, 512) or (512, V) .npy of text vectors; names in a .txt beside it that begins alike
-    )
+    # (V, 512) or (512, V) .npy of text vectors; names in a .txt beside it that begins alike
+    vectors: Path | None = None
     reading: Reading = field(default_factory=Reading)
     image_size: int = 8  # of pictures that nobody looks at
 
@@ -68,12 +67,12 @@ class ClipGeometry:
 
     @property
     def id(self) -> str:
-        """As it is asked for."""
+        """Name by which it is asked for."""
         return f"{PREFIX}{self.own:g},{self.alike:g}"
 
     @property
     def digest(self) -> str:
-        """Of everything that its vectors depend on."""
+        """Digest of everything that its vectors depend on."""
         texts = self.vectors.read_bytes() if self.vectors else b""
         stated = f"{VERSION} {self.id} {hashlib.sha256(texts).hexdigest()}"
         return hashlib.sha256(stated.encode()).hexdigest()[:12]
@@ -85,7 +84,7 @@ class ClipGeometry:
 
     @property
     def temperature(self) -> float:
-        """Of relevancy: CLIP's."""
+        """Temperature of relevancy, CLIP's."""
         return self.reading.temperature
 
     @property
@@ -94,11 +93,11 @@ class ClipGeometry:
         return (self.own - OTHER) / float(np.sqrt(1 - PROMPTS))
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
-        """None: CLIP reads everything."""
+        """Return no words, since CLIP reads everything."""
         return ()
 
     def near_words(self, word: str) -> tuple[str, ...]:
-        """None, since none is unknown."""
+        """Return no words, since none is unknown."""
         return ()
 
     def encode_images(self, crops: Array | Sequence[Array]) -> Array:
@@ -169,7 +168,7 @@ class ClipGeometry:
 
     @cached_property
     def _middle(self) -> Array:
-        """m."""
+        """m, the common direction of texts."""
         names, vectors = self._file
         return np.asarray(unit(vectors.mean(0)) if names else unit(_drawn("middle")))
 

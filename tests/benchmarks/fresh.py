@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
@@ -114,15 +114,8 @@ class RandomViews(Sequence[tuple[Camera, ImageFeatures]]):
     def __len__(self) -> int:
         return self._count
 
-    @overload
-    def __getitem__(self, index: int) -> tuple[Camera, ImageFeatures]: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> "RandomViews": ...
-
-    def __getitem__(self, index: int | slice) -> "tuple[Camera, ImageFeatures] | RandomViews":
-        if isinstance(index, slice):
-            raise TypeError("views are looked at one by one")
+    def __getitem__(self, index: Any) -> Any:
+        """View `index`, a number; slices are not supported."""
         if not 0 <= index < self._count:
             raise IndexError(index)
         angle = 2 * np.pi * index / self._count
@@ -153,7 +146,7 @@ class RandomEncoder:
     reading = Reading()
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
-        """None."""
+        """Return no words."""
         return ()
 
     def encode_texts(self, texts: Sequence[str]) -> Array:

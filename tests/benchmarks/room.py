@@ -1,15 +1,17 @@
 """One procedural room: photographs, Gaussians, masks, language fields and answers, each made once, by the
-ordinary pipeline, and compared with the truth."""
+ordinary pipeline, and compared with the truth; and the options and files that all reports share."""
 
 import hashlib
+import shlex
 import statistics
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 import tyro
@@ -20,7 +22,8 @@ from assets.making.objects import EVERYTHING
 from assets.making.scene import SEED
 from assets.making.truth import Truth, TruthMasks, read_truth
 from langsplat_core.arrays import Array
-from langsplat_core.cli.checks import OutFolder
+from langsplat_core.cli.bench import write_report
+from langsplat_core.cli.run import OutFolder
 from langsplat_core.config import (
     AutoencoderConfig,
     ClipConfig,
@@ -75,7 +78,6 @@ from tests.benchmarks.scoring import (
     MaskRule,
     Measured,
     ask,
-    codec_name,
     evaluate,
     evaluate_direct,
     measured,
@@ -245,7 +247,9 @@ class Room:
     def views(self, variant: Variant) -> Views:
         """The training views with masks and vectors."""
         outlines = "truth" if variant.masks == "wrong" else variant.masks
-        source = self._masks(outlines)
+        source: MaskSource = TruthMasks(self.capture, self.truth)
+        if outlines in ("graph", "tiles"):
+            source = load_mask_source(MaskConfig(source="graph")) if outlines == "graph" else TileMasks()
         train, _ = self.capture.split(HOLD_OUT)
         cameras = [self.capture.cameras[i] for i in train]
         start = time.perf_counter()
@@ -274,11 +278,6 @@ class Room:
             features = moved_to_pictures(told, features)
         return list(zip(cameras, features, strict=True))
 
-    def _masks(self, outlines: MaskOrigin) -> MaskSource:
-        if outlines == "graph":
-            return load_mask_source(MaskConfig(source="graph"))
-        return TileMasks() if outlines == "tiles" else TruthMasks(self.capture, self.truth)
-
     def field(self, variant: Variant, fresh: bool = False) -> tuple[LanguageField, CodecReport, float]:
         """The language field, what its codec loses, and seconds; `fresh` takes nothing that was kept."""
         views, start = self.views(variant), time.perf_counter()
@@ -293,26 +292,20 @@ class Room:
     def measure(self, variant: Variant, fresh: bool = False) -> Measured:
         """Ask everything of a variant's field. fresh: take nothing that was kept, so that seconds count."""
         field, loss, seconds = self.field(variant, fresh)
-        return replace(self.measure_field(field, variant), codec_loss=loss, fit_seconds=seconds)
-
-    def rule(self, variant: Variant) -> AnswerRule:
-        """How the engine answers; the paper's own order by the peak."""
-        return "regions" if self.config.cut == "regions" and variant.query != "paper" else "peak"
-
-    def measure_field(self, field: LanguageField, variant: Variant) -> Measured:
-        """Ask everything of a language field."""
         start = time.perf_counter()
+        by_regions = self.config.cut == "regions" and variant.query != "paper"
+        rule: AnswerRule = "regions" if by_regions else "peak"
         # What is no codec has its numbers at hand; going through a codec's interface takes seconds a phrase.
         whole = field.codec.latent_dim == field.codec.vector_dim
-        engine = QueryEngine(
-            Scene(self.gaussians, field), lambda _: self.encoder, exact=whole, rule=self.rule(variant)
-        )
+        engine = QueryEngine(Scene(self.gaussians, field), lambda _: self.encoder, exact=whole, rule=rule)
         asked = ask(engine, self.texts, variant.level)
         self._lap(f"queries ({variant.name})", start)
         frame_ms = 1000 * median_seconds(lambda: self._frame(asked, variant))
         return replace(
             self.measure_asked(asked, variant),
-            codec=codec_name(field.codec),
+            codec=f"{field.codec.kind} {field.codec.size}",
+            codec_loss=loss,
+            fit_seconds=seconds,
             bytes_per_gaussian=field.latents.nbytes / max(len(field), 1),
             frame_ms=frame_ms,
         )
@@ -344,15 +337,13 @@ class Room:
     def _frame(self, asked: Asked, variant: Variant) -> None:
         """Project one held-out view and draw one phrase into it; in the paper's order its best level of
         three, which takes all three of them."""
-        view = CpuRasterizer().view(self.gaussians, self.held_out[0])
+        view, gate = CpuRasterizer().view(self.gaussians, self.held_out[0]), PictureConfig().alpha_gate
         answer = next(iter(asked.answers.values()))
         if variant.query != "paper":
-            splatted_relevancy(view, answer.values[:, None], PictureConfig().alpha_gate)
+            splatted_relevancy(view, answer.values[:, None], gate)
             return
         for level in range(len(LEVELS)):
-            decoded_relevancy(
-                view, asked.engine.field, level, answer.vector[None], PictureConfig().alpha_gate
-            )
+            decoded_relevancy(view, asked.engine.field, level, answer.vector[None], gate)
 
     def _lap(self, name: str, start: float) -> None:
         self.seconds[name] = round(self.seconds.get(name, 0.0) + time.perf_counter() - start, 1)
@@ -371,3 +362,19 @@ def median_seconds(work: Callable[[], object]) -> float:
         work()
         times.append(time.perf_counter() - start)
     return statistics.median(times)
+
+
+def publish(
+    command: Any,
+    name: str,
+    title: str,
+    text: str,
+    rows: Sequence[Any],
+    plot: Callable[[Path], None] | None = None,
+) -> None:
+    """Print a report's tables, and write them with title and command line into `command.out`, beside all
+    figures of its rows, dataclasses, and the settings of its command, another one."""
+    line = f"python -m tests.benchmarks {shlex.join(sys.argv[1:])}"
+    figures = {"settings": asdict(command), "rows": [asdict(row) for row in rows]}
+    write_report(command.out, name, f"# {title}\n\n    {line}\n\n{text}", figures, plot)
+    print(text)

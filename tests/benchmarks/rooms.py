@@ -20,7 +20,6 @@ from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.training.radiance.train import evaluate_views
-from tests.benchmarks.files import publish
 from tests.benchmarks.room import (
     HOLD_OUT,
     InRooms,
@@ -30,6 +29,7 @@ from tests.benchmarks.room import (
     Variant,
     autoencoder,
     ceiling,
+    publish,
 )
 from tests.benchmarks.scoring import (
     MaskRule,
@@ -58,7 +58,6 @@ class Rooms(InRooms):
     masks: MaskOrigin = "truth"  # where outlines come from
     codec: CodecConfig = field(default_factory=CodebookConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
-    ceiling: bool = False  # also keep all of the encoder's numbers, by which a codec is judged
     budget: bool = False  # also swap one stage at a time for one that makes no mistake
     codec_steps: Count = 4_000  # of training the autoencoder of --budget
     scene: Path | None = None
@@ -82,7 +81,7 @@ class Rooms(InRooms):
                 )
             reports = [room_report(room, variants(self, room.encoder.dim)) for room in self.rooms(progress)]
         tables = [score_table(reports), room_table(reports)]
-        if self.budget or self.ceiling:
+        if self.budget:
             tables.append(budget_table(reports))
         unknown = sum(len(report.measured[0].unknown) for report in reports)
         if unknown:
@@ -107,11 +106,11 @@ class RoomReport:
 
 
 def variants(command: Rooms, dim: int) -> list[Variant]:
-    """The method first; then the ceiling of codecs, or, with --budget, one variant per stage, which differs
-    in that stage alone. dim: numbers of the encoder's vectors."""
+    """The method first; then, with --budget, one variant per stage, which differs in that stage alone.
+    dim: numbers of the encoder's vectors."""
     method = Variant("the method", command.masks, codec=command.codec, lift=command.lift)
     if not command.budget:
-        return [method, replace(method, name="no codec", codec=ceiling(dim))][: 1 + command.ceiling]
+        return [method]
     perfect = [replace(method, name="perfect masks", masks="truth")] if command.masks != "truth" else []
     decoded = replace(method, name="autoencoder, d = 3", codec=autoencoder(steps=command.codec_steps))
     return [

@@ -24,7 +24,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.surface import Regions
 from langsplat_core.raster.protocol import Rasterizer, View
-from langsplat_core.scene import Camera, Codec
+from langsplat_core.scene import Camera
 from langsplat_core.semantics.relevancy import FLOOR
 from langsplat_core.training.language.codec_fit import CodecReport
 
@@ -313,9 +313,7 @@ class Measured:
     objects: int  # that were asked
     rejected: float  # share of absent objects that are answered with "not here"
     absent: int  # that were asked
-    separation: (
-        float  # chance that a present object's peak exceeds an absent one's: 1 where a threshold exists
-    )
+    separation: float  # chance that a present object's peak exceeds an absent one's
     peaks: dict[str, float]  # smoothed peak relevancy of every object that was asked, absent ones included
     unknown: tuple[str, ...]  # phrases left out, because the encoder was never taught their words
     query_ms: float  # median, from text to place
@@ -356,11 +354,6 @@ def measured(
     )
 
 
-def codec_name(codec: Codec) -> str:
-    """Such as "codebook 512" or "autoencoder 3"."""
-    return f"{codec.kind} {codec.size}"
-
-
 def separation(present: Array, absent: Array) -> float:
     """Chance that one of `present` (P,) exceeds one of `absent` (A,), ties half; 1 without either."""
     if len(present) == 0 or len(absent) == 0:
@@ -369,20 +362,14 @@ def separation(present: Array, absent: Array) -> float:
     return float(above)
 
 
-def pooled(scores: Iterable[Score]) -> tuple[int, float, float]:
-    """Number of queries, mean IoU and localisation over all of them; 0 where nothing was asked."""
-    rows = list(scores)
+def of_kind(measured: Measured, kind: str) -> tuple[int, float, float, float]:
+    """Queries, mean IoU, localisation and 3-D IoU of one kind of phrase, or of all; 0 of nothing."""
+    rows = [score for score in measured.scores if kind in (score.kind, "all")]
     count = sum(score.queries for score in rows)
     weights = [score.queries / max(count, 1) for score in rows]
-    iou = float(np.dot(weights, [score.mean_iou for score in rows])) if rows else 0.0
-    localisation = float(np.dot(weights, [score.localisation for score in rows])) if rows else 0.0
-    return count, iou, localisation
-
-
-def of_kind(measured: Measured, kind: str) -> tuple[int, float, float, float]:
-    """Queries, mean IoU, localisation and 3-D IoU of one kind of phrase, or of all."""
-    direct = direct_share(measured, kind, "mean_iou")
-    return (*pooled(s for s in measured.scores if kind in (s.kind, "all")), direct)
+    iou = float(np.dot(weights, [score.mean_iou for score in rows]))
+    localisation = float(np.dot(weights, [score.localisation for score in rows]))
+    return count, iou, localisation, direct_share(measured, kind, "mean_iou")
 
 
 def loss_cells(measured: Sequence[Measured]) -> tuple[str, str, str]:

@@ -8,8 +8,7 @@ import pytest
 from langsplat_core.cli.run import main
 from langsplat_core.io.scenes import save_scene
 from tests.benchmarks.__main__ import PROGRAM, parse
-from tests.benchmarks.fresh import MEANINGS, RandomEncoder, RandomViews
-from tests.benchmarks.scale import COARSE, PARTS, PROPERTIES, parts
+from tests.benchmarks.scale import COARSE, PROPERTIES
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import inria_names
 
@@ -71,26 +70,3 @@ def test_a_scene_without_meaning_or_cameras_is_refused(tmp_path, capsys):
             assert main(PROGRAM, lambda words=words: parse(words)) == 2
     said = capsys.readouterr().err
     assert said.count("no language field") == said.count("no cameras") == 2
-
-
-def test_parts_have_everything_once():
-    done: list[int] = []
-    for count in (1, 3, 4, 10):
-        made = parts([lambda number=number: done.append(number) for number in range(count)])
-        assert 0 < len(made) <= PARTS
-        done.clear()
-        for part in made:
-            assert part
-            for do in part:
-                do()
-        assert done == list(range(count))
-
-
-def test_views_are_the_same_whenever_they_are_looked_at():
-    views = RandomViews(3, (60, 40))
-    (first, again), (_, other) = (views[1], views[1]), (views[0], views[2])
-    assert (first[1].vectors == again[1].vectors).all()
-    assert first[1].vectors.shape == other[1].vectors.shape
-    assert first[1].vectors.shape[0] == 250 < MEANINGS
-    assert len(list(views)) == 3
-    assert RandomEncoder().encode_texts([]).shape == (0, 512)

@@ -22,7 +22,7 @@ from assets.making.truth import Region
 from assets.making.vocabulary import part_words
 from langsplat_core.arrays import Array
 from langsplat_core.bench.measure import markdown
-from langsplat_core.cli.checks import OutFile
+from langsplat_core.cli.run import OutFile
 from langsplat_core.config import CodebookConfig, CodecConfig
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path
@@ -32,8 +32,7 @@ from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import PARTS, forms, is_part
 from langsplat_core.scene import Calibration, Fits, Odds, Scene
-from tests.benchmarks.files import publish
-from tests.benchmarks.room import InRooms, MaskOrigin, Room, Variant
+from tests.benchmarks.room import InRooms, MaskOrigin, Room, Variant, publish
 from tests.benchmarks.scoring import MIN_GAUSSIANS, separation
 
 REJECTED = 0.95  # of what is absent, in the rooms that a calibration is fitted to

@@ -10,12 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from langsplat_core.cli.app import COMMANDS, GROUPS, parse
-from langsplat_core.cli.checks import Written
+from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
-from langsplat_core.config import annotations, named_values
-from tests.support.another_user import bound_by_permissions
-from tests.support.sinks import SINKS, Case, Ended, run_all
+from tests.support.processes import bound_by_permissions
 
 DEMO = str(files("langsplat_assets") / "demo" / "scene.ply")
 RUN = [sys.executable, "-m", "langsplat_core"]
@@ -33,7 +30,6 @@ WRITING = [
     "bench raster --out {}",
     "bench query s.ply --out {}",
 ]
-NOT_MARKED = {"convert s.ply {}.ply", "convert s.ply {} --to langsplat"}
 
 
 @pytest.mark.parametrize("line", WRITING)
@@ -49,16 +45,6 @@ def test_every_command_that_writes_tries_the_place_first(
     (message,) = capsys.readouterr().err.splitlines()
     assert any(word in message for word in ("system's own", "is a file", "file system takes")), message
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "s.ply"]
-
-
-@pytest.mark.parametrize("line", [line for line in WRITING if line not in NOT_MARKED])
-def test_what_is_written_is_marked(line: str) -> None:
-    command = parse(line.format("out").split())
-    for option, _, hint in named_values(command):
-        if option in ("--out", "--work", "--fit", "--pictures") or (
-            option == "--json" and "Path" in str(hint)
-        ):
-            assert any(isinstance(part, Written) for part in annotations(hint)), option
 
 
 @pytest.mark.parametrize(
@@ -89,105 +75,73 @@ def test_names_that_cannot_be_read(
         assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-LINES = [
-    "langsplat",
-    "langsplat --version",
-    "langsplat bench",
-    "langsplat query",
-    "langsplat scale absent.ply",
-    f"langsplat scale {DEMO}",
-    f"langsplat inspect {DEMO} --json",
-    "langsplat-viewer --help",
-    "langsplat-viewer --version",
-    "langsplat-viewer --tyro-print-completion zsh",
-    "langsplat-viewer absent.ply",
-    "reports",
-    "reports -q",
-]
-HELP = [
-    f"langsplat {name} --help"
-    for name in (
-        "",
-        *COMMANDS,
-        *GROUPS,
-        *(f"{group} {name}" for group in GROUPS for name in GROUPS[group][1]),
-    )
-]
+REPORTS = """
+import logging, sys
+from dataclasses import dataclass
+from langsplat_core.cli.run import main, parsed
+from langsplat_core.progress import LineProgress, TerminalProgress
+@dataclass(frozen=True)
+class Reports:
+    def run(self):
+        for progress in (LineProgress(), TerminalProgress()):
+            with progress as report:
+                report("working", 0.5)
+        logging.getLogger("langsplat").warning("a warning")
+        logging.getLogger("langsplat").debug("a detail")
+        print("the answer")
+sys.exit(main("reports", lambda: parsed("reports", Reports, sys.argv[1:])))
+"""
+SHELL = f"""
+set -o pipefail
+langsplat() {{ "{sys.executable}" -m langsplat_core "$@"; }}
+langsplat-viewer() {{ "{sys.executable}" -m langsplat_viewer "$@"; }}
+reports() {{ "{sys.executable}" -c "$REPORTS" "$@"; }}
+"""
 
 
-@pytest.fixture(scope="module")
-def ended() -> dict[Case, Ended]:
-    cases = [Case(tuple(line.split()), out=sink) for line in LINES for sink in SINKS]
-    cases += [Case(tuple(line.split()), err=sink) for line in LINES for sink in SINKS[1:]]
-    cases += [Case(tuple(line.split()), out=sink) for line in HELP for sink in SINKS[1:3]]
-    return run_all([*cases, Case(("reports", "-v"))])
-
-
-def is_refusal(code: int, said: str) -> bool:
-    return code == 2 and said.count("\n") == 1 and "standard output cannot be written" in said
+def in_a_shell(line: str) -> subprocess.CompletedProcess[str]:
+    surroundings = os.environ | {"REPORTS": REPORTS}
+    words = ["bash", "-c", SHELL + line]
+    return subprocess.run(words, capture_output=True, text=True, check=False, env=surroundings)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("line", LINES)
-def test_output_that_nobody_takes(line: str, ended: dict[Case, Ended]) -> None:
-    words = tuple(line.split())
-    plain = ended[Case(words)]
-    assert plain.out or plain.err
-    for sink in SINKS[1:]:
-        lost = ended[Case(words, out=sink)]
-        assert lost.out == ""
-        if not plain.out:
-            assert lost == plain
-        elif sink == "closed pipe":
-            assert lost == Ended(0, "", plain.err)
-        else:
-            assert is_refusal(lost.code, lost.err.removeprefix(plain.err))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("line", LINES)
-def test_errors_that_nobody_takes_change_nothing_else(line: str, ended: dict[Case, Ended]) -> None:
-    words = tuple(line.split())
-    plain = ended[Case(words)]
-    for sink in SINKS[1:]:
-        assert ended[Case(words, err=sink)] == Ended(plain.code, plain.out, "")
-
-
-@pytest.mark.long
-def test_how_much_is_said(ended: dict[Case, Ended]) -> None:
-    quiet, plain, verbose = (ended[Case(("reports", *flags))] for flags in (["-q"], [], ["-v"]))
-    assert {how.out for how in (quiet, plain, verbose)} == {"the answer\n"}
-    assert quiet.err == ""
-    assert '"fraction"' in plain.err
-    assert "50%" in plain.err
-    assert plain.err.endswith("\na warning\n")
-    assert "a warning\na detail\nreports " in verbose.err
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("line", HELP)
-def test_help_that_nobody_takes(line: str, ended: dict[Case, Ended]) -> None:
-    words = tuple(line.split())
-    assert ended[Case(words, out="closed pipe")] == Ended(0, "", "")
-    full = ended[Case(words, out="full device")]
-    assert is_refusal(full.code, full.err)
-
-
 @pytest.mark.parametrize(
-    ("command", "code", "lines"),
+    ("line", "code", "printed", "said"),
     [
-        ("langsplat bench --help | head -1 >/dev/null", 0, 0),
-        (f"langsplat scale {DEMO} | true", 0, 0),
-        ("langsplat train --help >/dev/full", 2, 1),
-        ("langsplat --version >&-", 2, 1),
-        ("langsplat query 2>&-", 2, 0),
-        ("langsplat query 2>/dev/full", 2, 0),
+        ("langsplat bench --help | head -1 >/dev/null", 0, 0, 0),
+        (f"langsplat scale {DEMO} | true", 0, 0, 0),
+        (f"langsplat inspect {DEMO} --json | true", 0, 0, 0),
+        ("langsplat-viewer --tyro-print-completion zsh | true", 0, 0, 0),
+        (f"langsplat inspect {DEMO} >/dev/full", 2, 0, 1),
+        ("langsplat train --help >/dev/full", 2, 0, 1),
+        ("langsplat-viewer --help >/dev/full", 2, 0, 1),
+        ("langsplat --version >&-", 2, 0, 1),
+        ("langsplat-viewer --version >&-", 2, 0, 1),
+        ("langsplat query 2>&-", 2, 0, 0),
+        ("langsplat query 2>/dev/full", 2, 0, 0),
+        ("langsplat-viewer absent.ply 2>/dev/full", 2, 0, 0),
+        (f"langsplat scale {DEMO} 2>&-", 0, 1, 0),
+        ("reports -v 2>/dev/full", 0, 1, 0),
+        ("reports -v 2>&-", 0, 1, 0),
+        ("reports -q >/dev/full", 2, 0, 1),
     ],
 )
-def test_a_shell_sees_the_same(command: str, code: int, lines: int) -> None:
-    function = f'langsplat() {{ "{sys.executable}" -m langsplat_core "$@"; }}; set -o pipefail; '
-    done = subprocess.run(["bash", "-c", function + command], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (code, "", lines)
+def test_output_that_nobody_takes(line: str, code: int, printed: int, said: int) -> None:
+    done = in_a_shell(line)
+    assert (done.returncode, done.stdout.count("\n"), done.stderr.count("\n")) == (code, printed, said)
+    assert not said or "standard output cannot be written" in done.stderr
+
+
+@pytest.mark.long
+def test_how_much_is_said() -> None:
+    quiet, plain, verbose = (in_a_shell(f"reports {flag}") for flag in ("-q", "", "-v"))
+    assert {how.stdout for how in (quiet, plain, verbose)} == {"the answer\n"}
+    assert quiet.stderr == ""
+    assert '"fraction"' in plain.stderr
+    assert "50%" in plain.stderr
+    assert plain.stderr.endswith("\na warning\n")
+    assert "a warning\na detail\nreports " in verbose.stderr
 
 
 @pytest.mark.parametrize(("number", "said"), [(signal.SIGTERM, "terminated"), (signal.SIGINT, "interrupted")])

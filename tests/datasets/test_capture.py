@@ -26,9 +26,16 @@ from langsplat_core.datasets.capture import (
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics
 from langsplat_core.datasets.known_poses import inside, look_distance, random_points
 from langsplat_core.scene import Camera, look_at
-from tests.support.full_disk import files_of_at_most
-from tests.support.photographed import colmap_reconstruction, poses, write_photos
-from tests.support.small_datasets import CONFIG, refuse, write_colmap, write_picture
+from tests.support.photographs import (
+    CONFIG,
+    colmap_reconstruction,
+    poses,
+    refuse,
+    write_colmap,
+    write_photos,
+    write_picture,
+)
+from tests.support.processes import files_of_at_most
 
 
 def captured(error: float = 0.0) -> Capture:

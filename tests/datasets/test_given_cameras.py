@@ -20,19 +20,17 @@ from langsplat_core.datasets.intrinsics import BrownDistortion, FisheyeDistortio
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.progress import Progress, silent
-from tests.support.photographed import (
+from tests.support.photographs import (
+    CONFIG,
     colmap_reconstruction,
     photograph,
     pinhole_picture,
     poses,
     psnr,
-    write_photos,
-)
-from tests.support.small_datasets import (
-    CONFIG,
     refuse,
     write_colmap,
     write_nerfstudio,
+    write_photos,
     write_picture,
 )
 

@@ -17,7 +17,7 @@ from langsplat_core.datasets.intrinsics import (
     undistorted_points,
 )
 from langsplat_core.errors import InputError
-from tests.support.photographed import photograph, pinhole_picture, poses, psnr
+from tests.support.photographs import photograph, pinhole_picture, poses, psnr
 
 pytestmark = pytest.mark.long
 

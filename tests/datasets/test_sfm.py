@@ -27,15 +27,14 @@ from langsplat_core.datasets.sfm import optics, pairs_by_name
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Cancelled, Progress, Report, silent
 from langsplat_core.scene import Camera, look_at
-from tests.support.full_disk import files_of_at_most
-from tests.support.photographed import (
+from tests.support.photographs import (
     colmap_reconstruction,
     distance_to_room,
     photograph,
     poses,
     write_photos,
 )
-from tests.support.stops import stop_at
+from tests.support.processes import files_of_at_most, stop_at
 
 LENGTH, HALF_WIDTH, HEIGHT = 40.0, 3.0, 4.0  # world units; one walks along y at x = 0 and looks along it
 TEXELS = 24  # per unit

@@ -28,7 +28,7 @@ from langsplat_core.display.displays import (
     relevancies,
 )
 from langsplat_core.scene import LanguageField, LinearCodec
-from tests.support.answers import random_answer
+from tests.support.scenes import random_answer
 
 PICTURE = PictureConfig()
 HEAT = PictureConfig(display="relevancy", heat_opacity=1.0)

@@ -25,7 +25,7 @@ from langsplat_core.io.scenes import save_scene
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
 from tests.support.fakes import CENTRES, axis, blobs, language
-from tests.support.label_files import SIZE, block, lerf_frame, ovs_view, rectangle
+from tests.support.photographs import SIZE, block, lerf_frame, ovs_view, rectangle
 
 
 @pytest.fixture

@@ -32,15 +32,7 @@ from langsplat_core.io.scenes import save_scene
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Scene
 from tests.support.fakes import PER_BLOB, WORDS, FakeEncoder, blob_scene, cameras
-from tests.support.label_files import (
-    SIZE,
-    block,
-    lerf_frame,
-    mask_map,
-    ovs_view,
-    rectangle,
-    silhouette,
-)
+from tests.support.photographs import SIZE, block, lerf_frame, mask_map, ovs_view, rectangle, silhouette
 from tests.support.tiny_room import tiny_room, tiny_settings
 
 CODE_RULE = LERF_PROFILES["langsplat-code"].rule

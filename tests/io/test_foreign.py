@@ -15,8 +15,8 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.foreign import ForeignScene, read_foreign
 from langsplat_core.io.ply import write_ply
 from langsplat_core.scene import Gaussians
+from tests.support.comparing import assert_same
 from tests.support.foreign_files import autoencoder, faiss_index, geometry, save_model, tensor, training_state
-from tests.support.same import assert_same
 from tests.support.scenes import random_gaussians
 
 N, D = 20, 24

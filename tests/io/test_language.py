@@ -23,8 +23,8 @@ from langsplat_core.io.language import (
     write_language,
 )
 from langsplat_core.scene import NO_THING, Calibration, CodebookCodec, LanguageField, Odds, Reading
+from tests.support.comparing import assert_same_field
 from tests.support.file_samples import random_field
-from tests.support.same import assert_same_field
 from tests.support.scenes import random_gaussians
 
 N = 60

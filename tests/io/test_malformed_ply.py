@@ -7,8 +7,8 @@ import pytest
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.ply import read_ply
 from langsplat_core.scene import Gaussians
+from tests.support.comparing import assert_same
 from tests.support.file_samples import ascii_ply, compressed_ply, inria_names, mixed_ply, plain_ply, ply_bytes
-from tests.support.same import assert_same
 from tests.support.scenes import random_gaussians
 
 

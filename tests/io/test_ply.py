@@ -21,7 +21,7 @@ from langsplat_core.io.ply import (
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.io.sog import read_sog_scene
 from langsplat_core.scene import Scene
-from tests.support.extras import random_extras
+from tests.support.comparing import assert_same, assert_same_extras
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import (
     C0,
@@ -36,8 +36,7 @@ from tests.support.file_samples import (
     vertex_table,
     write_folder,
 )
-from tests.support.same import assert_same, assert_same_extras
-from tests.support.scenes import random_gaussians
+from tests.support.scenes import random_extras, random_gaussians
 
 
 @pytest.fixture

@@ -30,11 +30,10 @@ from langsplat_core.io.shapes import base_colours, write_meshes, write_points
 from langsplat_core.io.summary import disk_bytes, duplicates, summarise
 from langsplat_core.query.engine import NO_FIELD, QueryEngine
 from langsplat_core.scene import NO_THING, Calibration, Gaussians, Odds, Reading, Scene
-from tests.support.extras import random_extras
+from tests.support.comparing import assert_same_extras, assert_same_field
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import compressed_ply, random_field, sog_files, write_folder
-from tests.support.same import assert_same_extras, assert_same_field
-from tests.support.scenes import random_camera, random_gaussians
+from tests.support.scenes import random_camera, random_extras, random_gaussians
 
 N = 60
 

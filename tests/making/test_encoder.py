@@ -67,30 +67,21 @@ def fit(book, label, phrase):
         (MUG, "something red", 1),
         (MUG, "blue mug", 0),
         (MUG, "handle", 0),
-        (MUG, "object", 0),
         (MUG, "white", -1),  # its rim is white: the word is neither right nor wrong
-        (MUG, "mug body", -1),
         (BODY, "red mug", -1),  # the body may pass for the mug
         (BODY, "mug body", 1),
         (HANDLE, "mug", 0),
         (HANDLE, "handle of the red mug", 1),
         (RIM, "white rim", 1),
-        (RIM, "rim of the red mug", 1),
-        (RIM, "red", 0),
         (CLUTTER, "stuff", 1),
-        (CLUTTER, "mug", 0),
         (CLUTTER, "red", -1),
         (GREEN, "green thing", 1),
         (GREEN, "wooden thing", -1),  # a patch of colour may be of anything
         (LEG, "wooden leg", 1),
         (LEG, "wooden chair leg", 1),
-        (LEG, "something wooden", 1),
-        (LEG, "metal", 0),
         (CHAIR, "wooden chair", 1),
-        (CHAIR, "furniture", 1),
         (CHAIR, "cloth", -1),  # its cushion is
         (MUG, "wooden", -1),  # not known what it is made of
-        (GREEN, "red", 0),
     ],
 )
 def test_which_phrases_are_right(book, label, phrase, expected):
@@ -110,19 +101,13 @@ def test_every_word_is_one_token_and_reloads(book, tmp_path):
         assert tokens[-1] == [tokenizer.bos_token_id, *tokens[-1][1:-1], tokenizer.eos_token_id]
         assert len(tokens[-1]) > 3  # an unknown word is spelled out
     assert (tmp_path / "vocabulary.txt").read_text().split() == words
-
-
-def test_token_numbers_depend_on_the_words_alone(book, tmp_path):
-    """A resumed training must find its embeddings where they were."""
-    for name in ("one", "two"):
-        write_tokenizer(word_list(book), tmp_path / name)
-    assert (tmp_path / "one" / "tokenizer.json").read_bytes() == (
-        tmp_path / "two" / "tokenizer.json"
-    ).read_bytes()
+    write_tokenizer(words, tmp_path / "again")  # a resumed training must find its embeddings where they were
+    files = (folder / "tokenizer.json" for folder in (tmp_path, tmp_path / "again"))
+    assert len({file.read_bytes() for file in files}) == 1
     assert word_merges(["aba", "ab"]) == [("a", "b"), ("a", "b</w>"), ("ab", "a</w>")]
 
 
-def test_loss_wants_right_above_canonical_above_wrong():
+def test_loss_wants_right_above_canonical_above_wrong_and_ignores_the_rest():
     fits = torch.tensor([[0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]], dtype=torch.int8)
     nameable = torch.tensor([True, True])
     good = torch.tensor([[CANONICAL_COSINE] * 4 + [0.9, -0.2], [CANONICAL_COSINE] * 4 + [-0.2, 0.9]])
@@ -133,15 +118,10 @@ def test_loss_wants_right_above_canonical_above_wrong():
     assert best < 0.05
     assert loss_of(swapped, fits, nameable) > 5
     assert loss_of(loud, fits, nameable) > best + 1
-
-
-def test_loss_ignores_pairs_that_are_neither():
-    fits = torch.tensor([[0, 0, 0, 0, 1, -1]], dtype=torch.int8)
-    cosines = torch.full((1, 6), CANONICAL_COSINE)
-    other = cosines.clone()
+    other = good.clone()
     other[0, 5] = 0.9
-    nameable = torch.tensor([True])
-    assert loss_of(cosines, fits, nameable) == loss_of(other, fits, nameable)
+    fits[0, 5] = -1  # neither right nor wrong
+    assert loss_of(other, fits, nameable) == loss_of(good, fits, nameable)
 
 
 def test_crops_of_a_room(unseen_room, tmp_path):
@@ -198,20 +178,6 @@ def test_training_in_miniature(monkeypatch, few_crops, tmp_path):
         encoder.encode_texts(["red xylophone"])
     size = sum(path.stat().st_size for path in tmp_path.iterdir() if path.is_file())
     assert size < 12e6
-
-
-def test_training_twice_gives_the_same_model(few_crops, tmp_path):
-    weights = []
-    for name, seed in (("one", 0), ("two", 0), ("other", 1)):
-        # The learning rate starts at a 300th of this: steps large enough to be seen in half precision.
-        config = EncoderConfig(steps=2, batch=8, phrases=8, lr=0.1, seed=seed)
-        train_encoder(tmp_path / name, config, silent)
-        tensors = load_file(tmp_path / name / "model.safetensors")
-        weights.append(np.concatenate([tensor.float().numpy().ravel() for tensor in tensors.values()]))
-    # Not all: sums in bfloat16 may be added in another order, and Adam enlarges gradients that are zero
-    # but for rounding (the biases of attention keys).
-    assert np.isclose(weights[0], weights[1], atol=1e-3).mean() > 0.97
-    assert np.isclose(weights[0], weights[2], atol=1e-3).mean() < 0.5
 
 
 def test_training_may_begin_from_an_earlier_encoder(few_crops, tmp_path):

@@ -15,6 +15,7 @@ from assets.making.dataset import LIGHT, orbit_cameras, photographed_room, truth
 from assets.making.render import Renderer
 from assets.making.scene import SEED, SIZE, VIEWS
 from langsplat_core.config import PictureConfig
+from langsplat_core.errors import EncoderError
 from langsplat_core.evaluation.scoring import intersection_over_union
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.query.answers import peak_pixel
@@ -50,12 +51,9 @@ def held_out(scene: Scene) -> list[tuple[Camera, np.ndarray]]:
     return [(camera, truth_ids(world, renderer.picture(camera, oversample=1))) for camera in cameras]
 
 
-def test_it_is_small_enough_to_ship():
+def test_it_is_small_enough_to_ship_and_has_everything_a_query_needs(scene):
     size = sum(path.stat().st_size for path in ASSETS.rglob("*") if path.is_file())
     assert size < 21e6
-
-
-def test_it_has_everything_a_query_needs(scene):
     assert scene.language is not None
     assert scene.language.encoder_id == "demo"
     assert scene.gaussians.valid().all()
@@ -118,7 +116,5 @@ def test_place_is_where_the_thing_is(engine):
 
 
 def test_an_unknown_word_is_named(engine):
-    from langsplat_core.errors import EncoderError
-
     with pytest.raises(EncoderError, match="'zebra'"):
         engine.run("zebra")

@@ -1,4 +1,4 @@
-"""A scene that nobody wants to see is said to be one."""
+"""Quality warnings of a trained scene, and the forecast of what a training costs."""
 
 import json
 from dataclasses import replace
@@ -70,11 +70,8 @@ def test_a_wide_step_is_not_yet_a_gap(factor):
     assert camera_groups(line) == (20,)
     line[10:, 0] += APART
     assert camera_groups(line) == (10, 10)
-
-
-@pytest.mark.parametrize("positions", [np.zeros((0, 3)), np.zeros((1, 3)), np.ones((7, 3)), np.eye(3) * 1e9])
-def test_positions_that_say_nothing(positions):
-    assert camera_groups(positions) == (len(positions),)
+    for positions in (np.zeros((0, 3)), np.zeros((1, 3)), np.ones((7, 3)), np.eye(3) * 1e9):
+        assert camera_groups(positions) == (len(positions),)
 
 
 def test_a_report_beside_a_scene_says_its_doubts_and_a_strange_one_nothing(tmp_path: Path) -> None:
@@ -87,14 +84,8 @@ def test_a_report_beside_a_scene_says_its_doubts_and_a_strange_one_nothing(tmp_p
     report.write_text(json.dumps({"gaussians": 3, "doubts": ["of an earlier version"]}))
     assert stated_warnings(scene, 3) == ("of an earlier version",)
     assert stated_warnings(scene, 4) == ()  # of another scene
-    for text in (
-        "[]",
-        "{",
-        '{"gaussians": 3}',
-        '{"gaussians": 3, "warnings": "all"}',
-        "\udcff",
-        "[" * 10_000,
-    ):
+    wrong = ("[]", "{", '{"gaussians": 3}', '{"gaussians": 3, "warnings": "all"}', "\udcff", "[" * 10_000)
+    for text in wrong:
         report.write_bytes(text.encode("utf-8", "surrogateescape"))
         assert stated_warnings(scene, 3) == ()
 
@@ -148,16 +139,11 @@ def test_what_was_slower_makes_the_rest_slower():
     assert run.at(60, "training Gaussians", 0.0)[0] == 120  # 70 s, twice
 
 
-def test_what_was_kept_from_before_takes_nothing_and_breaks_nothing():
+def test_kept_stages_take_nothing_and_none_goes_back():
     run = Run()
     assert run.at(0, "training Gaussians", 0.5)[1] >= 0
     assert run.at(0.001, "finding things", 0.5)[1] <= 1
     assert all(0 <= report.fraction <= 1 for report in run.said)
-
-
-def test_stages_never_go_back():
-    run = Run()
-    run.at(0, "masks and vectors", 0.5)
     run.progress("reading photographs", 1.0)
     assert run.said[-1] == Report("reading photographs", 1.0)  # nothing new of the whole
 
@@ -222,9 +208,7 @@ def test_what_was_measured_is_foretold_within_a_third():
     """Sixteen photographs of bananas without cameras, quick: 120 s of the processor (docs/photographs.md)."""
     quick = with_preset(TrainConfig(), "quick")
     bananas = replace(quick, clip=replace(quick.clip, model="demo"))
-    assert sum(stage.seconds for stage in plan(bananas, 16, "nothing", False)) == pytest.approx(
-        120, rel=1 / 3
-    )
     stages = {stage.name: stage.seconds for stage in plan(bananas, 16, "nothing", False)}
+    assert sum(stages.values()) == pytest.approx(120, rel=1 / 3)
     for name, seconds in (("photographs", 75), ("Gaussians", 22), ("language field", 17)):
         assert stages[name] == pytest.approx(seconds, rel=1 / 3)

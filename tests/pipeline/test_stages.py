@@ -16,7 +16,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.pipeline.stages import LOCK, ProcessGroup, join_processes, sole_use
 from langsplat_core.pipeline.train import StoredViews
 from langsplat_core.training.language import codec_fit
-from tests.support.lifting import make_views
+from tests.support.scenes import make_views
 from tests.support.tiny_room import tiny_room
 from tests.support.tiny_sam import tiny_sam
 
@@ -62,18 +62,14 @@ OPTIONS = (
 )
 
 
-def test_every_item_is_shared_once():
+def test_every_item_is_shared_once(monkeypatch):
     items = list(range(11))
     shares = [ProcessGroup(rank, 3).share(items) for rank in range(3)]
     assert sorted(item for share in shares for item in share) == items
     assert max(map(len, shares)) - min(map(len, shares)) <= 1
     assert [ProcessGroup(rank, 3).is_main for rank in range(3)] == [True, False, False]
-
-
-def test_alone_without_a_launcher(monkeypatch):
     monkeypatch.delenv("WORLD_SIZE", raising=False)
-    assert join_processes() == ProcessGroup(0, 1)
-    assert ProcessGroup().once(lambda: 7) == 7
+    assert join_processes() == ProcessGroup(0, 1)  # without a launcher
 
 
 def test_a_lost_process_is_said_in_one_line(monkeypatch):

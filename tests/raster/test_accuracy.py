@@ -18,8 +18,8 @@ from langsplat_core.io.scenes import load_scene
 from langsplat_core.raster.reference import ReferenceRasterizer, ReferenceView
 from langsplat_core.scene import Camera, Gaussians, Scene
 from tests.support.backends import Backend
-from tests.support.close import assert_adjoint
-from tests.support.measured import Measure
+from tests.support.comparing import assert_adjoint
+from tests.support.fixtures import Measure
 from tests.support.scenes import random_camera, random_gaussians, random_values
 
 pytestmark = pytest.mark.long

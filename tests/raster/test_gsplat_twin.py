@@ -21,8 +21,7 @@ from langsplat_core.training.radiance.differentiable import CpuRenderer, CudaRen
 from langsplat_core.training.radiance.state import PARAMETERS, start
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
 from tests.support import gsplat_twin as twin
-from tests.support.lifting import make_views
-from tests.support.scenes import random_camera, random_gaussians, without_perspective
+from tests.support.scenes import make_views, random_camera, random_gaussians, without_perspective
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("gsplat_twin")]
 

@@ -1,18 +1,19 @@
 """The reference against closed forms: what a rasterizer must do where the answer is known."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file
 
-from langsplat_core.arrays import logit
+from langsplat_core.arrays import Array, logit
 from langsplat_core.config import GSPLAT, INRIA
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.raster.render import colours_seen
 from langsplat_core.scene import Camera, Gaussians
-from tests.support.close import BAND, assert_adjoint
-from tests.support.golden import load_golden
+from tests.support.comparing import BAND, assert_adjoint
 from tests.support.scenes import (
     covariances,
     random_camera,
@@ -165,6 +166,17 @@ def test_antialiasing_lowers_the_opacity_of_small_footprints_only():
     variance = (30.0 * 0.005 / 3.0) ** 2
     np.testing.assert_allclose(small.opacities, 0.8 * variance / (variance + 0.3), rtol=1e-6)
     np.testing.assert_allclose(large.opacities, 0.8, rtol=1e-3)
+
+
+def load_golden(path: Path) -> tuple[Gaussians, Camera, Array]:
+    """Gaussians, camera and (H, W, 4) image on black; the camera is the one the image was made with."""
+    data = load_file(path)
+    gaussians = Gaussians(data["means"], data["scales"], data["quats"], data["opacities"], data["coeffs"])
+    height, width, _ = data["out_img"].shape
+    matrix = np.eye(4)
+    matrix[:3, 3] = (-0.123, -0.456, 8.0)
+    camera = Camera(width, height, width / 2, width / 2, width / 2, height / 2, matrix)
+    return gaussians, camera, data["out_img"]
 
 
 @pytest.mark.parametrize("case", ["tiny_case", "basic_case"])

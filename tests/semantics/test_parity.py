@@ -31,7 +31,7 @@ from langsplat_core.semantics.encoders import load_encoder
 from langsplat_core.semantics.masks import label_maps
 from langsplat_core.semantics.sam import LEVELS, Look, SamMasks, load_mask_source, load_sam, load_segmenter
 from langsplat_core.semantics.store import masked_crop
-from tests.support.measured import Measure
+from tests.support.fixtures import Measure
 
 NAMES = ("torchvision", "open_clip", "segment_anything", "sam2", "cv2")
 ENDS = {"<start_of_text>": "<|startoftext|>", "<end_of_text>": "<|endoftext|>"}  # as the hub names them

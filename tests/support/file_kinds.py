@@ -33,8 +33,8 @@ from tests.support.file_samples import (
     zipped,
 )
 from tests.support.mutation import Mutation, in_gzip, in_ply_header, in_png, in_zip, mutant
+from tests.support.photographs import write_colmap, write_nerfstudio
 from tests.support.scenes import random_camera, random_gaussians
-from tests.support.small_datasets import write_colmap, write_nerfstudio
 
 SCENE = random_gaussians(20, sh_degree=1)
 PLAIN = random_gaussians(300, seed=1)

@@ -1,11 +1,14 @@
-"""Tiny seeded scenes that many tests share."""
+"""Tiny seeded scenes, answers and views with masks that many tests share."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 
-from langsplat_core.arrays import Array, logit, rotation_matrices
-from langsplat_core.scene import SH_COUNTS, Camera, Gaussians, look_at
+from langsplat_core.arrays import Array, logit, rotation_matrices, unit
+from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.scene import SH_COUNTS, Camera, Gaussians, LanguageField, LinearCodec, Scene, look_at
+from langsplat_core.semantics.store import ImageFeatures
 
 
 def random_gaussians(
@@ -86,3 +89,75 @@ def shifted(gaussians: Gaussians, camera: Camera, offset: Array) -> tuple[Gaussi
     matrix = camera.world_to_camera.copy()
     matrix[:3, 3] -= camera.rotation @ np.asarray(offset, np.float64)
     return moved, replace(camera, world_to_camera=matrix)
+
+
+PLY_TYPES = {
+    "i1": "char",
+    "u1": "uchar",
+    "i2": "short",
+    "u2": "ushort",
+    "i4": "int",
+    "u4": "uint",
+    "f4": "float",
+    "f8": "double",
+}
+
+
+def random_extras(count: int = 40) -> dict[str, Array]:
+    """One property of every PLY type, each with its extremes in the first rows."""
+    rng = np.random.default_rng(3)
+    extras = {}
+    for code in PLY_TYPES:
+        dtype = np.dtype(code)
+        values = rng.integers(0, 100, size=count).astype(dtype)
+        limits = np.finfo(dtype) if dtype.kind == "f" else np.iinfo(dtype)
+        values[:2] = limits.min, limits.max
+        extras[f"extra_{code}"] = values
+    extras["extra_f4"][2:4] = np.nan, np.inf
+    return extras
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The part of a query's result that displays show."""
+
+    relevancy: Array  # (3, N)
+    members: Array  # (N,) bool
+    level: int = 2
+    verdict: Literal["found", "weak match", "not here"] = "found"
+    heat_range: tuple[float, float] = (0.5, 0.9)
+
+
+def random_answer(count: int, seed: int, **changed: Any) -> Answer:
+    relevancy = np.stack([random_values(count, 1, seed + level)[:, 0] for level in range(3)])
+    return Answer(relevancy, relevancy[2] > 0.5, **changed)
+
+
+def random_scene(count: int = 150, sh_degree: int = 3) -> Scene:
+    """Random Gaussians, each with random latents of 3 numbers."""
+    latents = np.random.default_rng(count).normal(size=(3, count, 3)).astype(np.float32)
+    axes = np.eye(12, dtype=np.float32)
+    field = LanguageField(latents, np.ones((3, count), np.float32), LinearCodec(axes[:3]), axes[:4], "none")
+    return Scene(random_gaussians(count, sh_degree=sh_degree), field)
+
+
+LIFTED_DIM = 12
+
+
+def make_views(count: int = 3) -> list[tuple[Camera, ImageFeatures]]:
+    """Cameras with random labels at three levels; the subpart level has no masks at all."""
+    views = []
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        camera = random_camera(seed, 24, 18)
+        labels = np.full((3, 18, 24), -1, np.int32)
+        labels[1] = rng.integers(-1, 4, (18, 24))
+        labels[2] = rng.integers(4, 7, (18, 24))
+        vectors = unit(rng.normal(size=(7, LIFTED_DIM))).astype(np.float32)
+        views.append((camera, ImageFeatures(labels, vectors)))
+    return views
+
+
+def dense_weights(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """(H, W, N): column i is the splat of the i-th unit vector."""
+    return ReferenceRasterizer().view(gaussians, camera).splat(np.eye(len(gaussians)))[0]

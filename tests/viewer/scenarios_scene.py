@@ -21,7 +21,7 @@ from langsplat_viewer.panels.style import Area, scene_area
 from langsplat_viewer.rendering.renderer import ArrayChannels
 from langsplat_viewer.rendering.request import TINT
 from tests.support.fakes import CENTRES
-from tests.support.selected import marked
+from tests.support.marks_and_flights import marked
 
 MUG, BOOK, PLANT = CENTRES
 

@@ -17,7 +17,7 @@ from langsplat_viewer.rendering.depth import UNCLIPPED, Clip, depth_range, image
 from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.rendering.request import plain_request
 from tests.support.fakes import CENTRES, blob_scene
-from tests.support.selected import marked
+from tests.support.marks_and_flights import marked
 from tests.support.windowless import rest, settle
 
 SIZE = (160, 120)

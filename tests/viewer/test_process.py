@@ -14,7 +14,7 @@ import pytest
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
 from tests.support.fakes import blob_scene
-from tests.support.measured import Measure
+from tests.support.fixtures import Measure
 from tests.support.on_display import play
 
 ROOT = Path(__file__).parents[2]

@@ -29,10 +29,9 @@ from langsplat_viewer.rendering.renderer import (
     suits_opengl,
 )
 from langsplat_viewer.rendering.request import RenderKey, RenderRequest, Split, plain_request
-from tests.support.answers import random_answer, random_scene
 from tests.support.fakes import blob_scene
-from tests.support.gl_context import gl_state
-from tests.support.scenes import random_camera, random_gaussians
+from tests.support.fixtures import gl_state
+from tests.support.scenes import random_answer, random_camera, random_gaussians, random_scene
 
 COUNT = 150
 SCENE = random_scene(COUNT)

@@ -16,7 +16,7 @@ from langsplat_viewer.camera.controls import from_camera
 from langsplat_viewer.marks import Drawn, Stroke, outlines
 from langsplat_viewer.rendering.depth import Clip
 from tests.support.fakes import CENTRES, COLOURS, PER_BLOB
-from tests.support.selected import blob, marked, marks_of
+from tests.support.marks_and_flights import blob, marked, marks_of
 from tests.support.windowless import SCENES, FakeSurface, errors, settle
 
 

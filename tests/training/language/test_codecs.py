@@ -10,9 +10,11 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.config import CODEC_CONFIGS, AutoencoderConfig, CodebookConfig, LinearConfig
 from langsplat_core.scene import AutoencoderCodec, Codec, LinearCodec, codec_from_tensors
 from langsplat_core.scene.codec import KINDS
+from langsplat_core.semantics.relevancy import Scale
 from langsplat_core.training.language import codec_fit
 from langsplat_core.training.language.codec_fit import (
     FITTERS,
+    Vocabulary,
     codebook_error,
     codec_report,
     exact_codec,
@@ -24,9 +26,15 @@ from langsplat_core.training.language.codec_fit import (
     rounded,
 )
 from langsplat_core.training.language.mask_weights import nearest_centres, spherical_kmeans
-from tests.support.vocabulary import random_vocabulary
 
 pytestmark = pytest.mark.long
+
+
+def random_vocabulary(dim: int, phrases: int = 20, seed: int = 9) -> Vocabulary:
+    rng = np.random.default_rng(seed)
+    made = unit(rng.normal(size=(phrases + 4, dim))).astype(np.float32)
+    return Vocabulary(made[4:], Scale(made[:4], made[4:], 10.0))
+
 
 D = 48
 WORDS = random_vocabulary(D)

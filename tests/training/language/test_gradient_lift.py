@@ -18,8 +18,8 @@ from langsplat_core.training.language.lift import (
     lift_by_gradient,
     lift_latents,
 )
+from tests.support.processes import stop_at
 from tests.support.scenes import random_camera, random_gaussians
-from tests.support.stops import stop_at
 
 pytestmark = pytest.mark.long
 

@@ -11,8 +11,7 @@ from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language import mask_weights as blocks
 from langsplat_core.training.language.lift import lift_block, lift_latents, lift_sample, lift_weights
 from langsplat_core.training.language.mask_weights import find_mask_weights, group_masks
-from tests.support.lifting import D, dense_weights, make_views
-from tests.support.scenes import random_camera, random_gaussians
+from tests.support.scenes import LIFTED_DIM, dense_weights, make_views, random_camera, random_gaussians
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +29,10 @@ def lifting(gaussians):
 
 def test_mean_and_confidence(gaussians, lifting):
     lifted = lift_block(*lifting, 0, robust=False)
-    assert lifted.vectors.shape == (3, 25, D)
+    assert lifted.vectors.shape == (3, 25, LIFTED_DIM)
     assert (lifted.vectors[0] == 0).all()
     assert (lifted.confidence[0] == 0).all()
-    total, weight = np.zeros((25, D)), np.zeros(25)
+    total, weight = np.zeros((25, LIFTED_DIM)), np.zeros(25)
     for camera, features in make_views():
         dense = dense_weights(gaussians, camera)
         for row in range(4, 7):
@@ -54,7 +53,7 @@ def test_a_sample_is_some_of_the_rows(lifting, monkeypatch):
     some = lift_sample(again, groups, rows, robust=True)
     np.testing.assert_allclose(some.vectors, whole.vectors[:, rows], atol=1e-6)
     np.testing.assert_allclose(some.confidence, whole.confidence[:, rows], rtol=1e-6)
-    assert lift_sample(again, groups, rows[:0], robust=True).vectors.shape == (3, 0, D)
+    assert lift_sample(again, groups, rows[:0], robust=True).vectors.shape == (3, 0, LIFTED_DIM)
 
 
 def reference_median(weights: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -68,8 +67,8 @@ def reference_median(weights: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 def test_median_outvotes_a_wrong_mask_that_the_mean_follows():
     rng = np.random.default_rng(0)
-    good, bad = unit(rng.normal(size=(2, D)))
-    noise = 0.05 * rng.normal(size=(10, D))
+    good, bad = unit(rng.normal(size=(2, LIFTED_DIM)))
+    noise = 0.05 * rng.normal(size=(10, LIFTED_DIM))
     vectors = unit(np.concatenate([np.tile(good, (7, 1)), np.tile(bad, (3, 1))]) + noise).astype(np.float32)
     weights = csr_matrix(
         np.repeat([[0, 0, 1]], 10, 1).astype(np.float32)
@@ -83,10 +82,10 @@ def test_median_outvotes_a_wrong_mask_that_the_mean_follows():
 
 
 def test_no_masks_anywhere(gaussians):
-    empty = ImageFeatures(np.full((3, 6, 8), -1, np.int32), np.zeros((0, D), np.float32))
+    empty = ImageFeatures(np.full((3, 6, 8), -1, np.int32), np.zeros((0, LIFTED_DIM), np.float32))
     mask_weights = find_mask_weights(ReferenceRasterizer(), gaussians, [(random_camera(0, 8, 6), empty)])
     lifted = lift_block(mask_weights, group_masks([empty.vectors]), 0, robust=True)
-    assert lifted.vectors.shape == (3, 25, D)
+    assert lifted.vectors.shape == (3, 25, LIFTED_DIM)
     assert not lifted.vectors.any()
     assert not lifted.confidence.any()
 
@@ -97,7 +96,7 @@ def test_no_masks_anywhere(gaussians):
 def test_one_pass_is_the_weighted_mean_of_latents():
     gaussians = random_gaussians(25, 3)
     views = make_views()
-    codec = LinearCodec(np.eye(D, dtype=np.float32)[:4])
+    codec = LinearCodec(np.eye(LIFTED_DIM, dtype=np.float32)[:4])
     latents, confidence = lift_latents(ReferenceRasterizer(), gaussians, views, codec)
     total, weight = np.zeros((25, 4)), np.zeros(25)
     for camera, features in views:

@@ -22,8 +22,7 @@ from langsplat_core.training.language.mask_weights import (
     masks_of_things,
     view_pairs,
 )
-from tests.support.lifting import D, dense_weights, make_views
-from tests.support.scenes import random_camera, random_gaussians
+from tests.support.scenes import LIFTED_DIM, dense_weights, make_views, random_camera, random_gaussians
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +69,7 @@ def test_masks_of_one_group_are_one_column(gaussians):
     views = make_views()
     mask_weights = find_mask_weights(ReferenceRasterizer(), gaussians, views)
     groups = group_masks([features.vectors for _, features in views], groups=4)
-    assert groups.vectors.shape == (4, D)
+    assert groups.vectors.shape == (4, LIFTED_DIM)
     apart = mask_weights.block(0, ungrouped(views)).toarray().reshape(25, 3, 21)
     together = np.zeros((25, 3, 4))
     for column, group in enumerate(np.concatenate(groups.of_mask)):
@@ -80,9 +79,9 @@ def test_masks_of_one_group_are_one_column(gaussians):
 
 def test_groups_hold_what_says_the_same():
     rng = np.random.default_rng(0)
-    centres = unit(rng.normal(size=(6, D)))
+    centres = unit(rng.normal(size=(6, LIFTED_DIM)))
     labels = rng.integers(6, size=300)
-    vectors = unit(centres[labels] + 0.02 * rng.normal(size=(300, D))).astype(np.float32)
+    vectors = unit(centres[labels] + 0.02 * rng.normal(size=(300, LIFTED_DIM))).astype(np.float32)
     groups = group_masks(np.split(vectors, [100, 100, 250]), groups=6)  # the second view has no masks
     assert [len(view) for view in groups.of_mask] == [100, 0, 150, 50]
     found = np.concatenate(groups.of_mask)
@@ -91,7 +90,7 @@ def test_groups_hold_what_says_the_same():
 
 
 def test_a_view_without_masks_has_no_pairs(gaussians):
-    empty = ImageFeatures(np.full((3, 6, 8), -1, np.int32), np.zeros((0, D), np.float32))
+    empty = ImageFeatures(np.full((3, 6, 8), -1, np.int32), np.zeros((0, LIFTED_DIM), np.float32))
     pairs = view_pairs(ReferenceRasterizer(), gaussians, random_camera(0, 8, 6), empty)
     assert (len(pairs), pairs.dtype) == (0, PAIR)
 

@@ -39,7 +39,7 @@ from langsplat_core.training.radiance.state import (
     start,
 )
 from langsplat_core.training.radiance.train import evaluate_views, schedule_for, train_radiance
-from tests.support.stops import stop_at
+from tests.support.processes import stop_at
 
 
 def pictures(seed: int, shape: tuple[int, int, int] = (31, 40, 3)) -> tuple[torch.Tensor, torch.Tensor]:

@@ -1,16 +1,22 @@
-"""A small textured world that can be photographed through any lens: the ground truth of dataset tests."""
+"""Photographs of a small textured world, tiny datasets that tests spoil, and label folders."""
 
+import json
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from langsplat_core import arrays
 from langsplat_core.arrays import Array
+from langsplat_core.config import DatasetConfig
+from langsplat_core.datasets import load_capture
 from langsplat_core.datasets.intrinsics import PhotoIntrinsics, undistorted_points
+from langsplat_core.errors import InputError
 from langsplat_core.scene import Camera, look_at
 
 ROOM = 4.0  # world units; the floor is z = 0, the walls are x = ROOM and y = ROOM, all seen from inside
@@ -120,3 +126,104 @@ def colmap_reconstruction(
         image = pycolmap.Image(name=name, camera_id=1, image_id=index)
         result.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.ascontiguousarray(matrix[:3])))
     return result
+
+
+CONFIG = DatasetConfig(max_side=64)
+IDENTITY = np.eye(4).tolist()
+
+
+def refuse(path: Path, work: Path) -> str:
+    """The one line with which `path` is refused."""
+    with pytest.raises(InputError) as caught:
+        load_capture(path, CONFIG, work)
+    message = str(caught.value)
+    assert message
+    assert "\n" not in message
+    return message
+
+
+def write_picture(path: Path, size: tuple[int, int] = (40, 30), seed: int = 0) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(path)
+
+
+def write_colmap(folder: Path, form: str = "bin") -> Path:
+    """Two photographs and a model with three points; returns the model's folder."""
+    names = ["a.png", "b.png"]
+    for name in names:
+        write_picture(folder / "images" / name)
+    model = colmap_reconstruction("PINHOLE", (40, 30), [50.0, 50, 20, 15], names, [np.eye(4)] * 2)
+    for x in range(3):
+        model.add_point3D(np.array([x, 0, 3.0]), pycolmap.Track(), np.array([1, 2, 3], np.uint8))
+    out = folder / "sparse" / "0"
+    out.mkdir(parents=True)
+    (model.write_binary if form == "bin" else model.write_text)(out)
+    return out
+
+
+def write_nerfstudio(folder: Path, **top: object) -> None:
+    write_picture(folder / "a.png")
+    frame = {"file_path": "a.png", "transform_matrix": IDENTITY}
+    text = json.dumps({"fl_x": 50.0, "frames": [frame], **top})
+    (folder / "transforms.json").write_text(text, encoding="utf-8-sig")  # some editors add the mark
+
+
+Polygon = list[list[float]]
+SIZE = (40, 30)  # width and height, pixels
+
+
+def rectangle(left: int, top: int, right: int, bottom: int) -> Polygon:
+    """Corners, all of them inside the mask."""
+    return [[left, top], [right, top], [right, bottom], [left, bottom]]
+
+
+def block(left: int, top: int, right: int, bottom: int, size: tuple[int, int] = SIZE) -> Array:
+    """The mask of `rectangle`."""
+    mask = np.zeros((size[1], size[0]), bool)
+    mask[top : bottom + 1, left : right + 1] = True
+    return mask
+
+
+def lerf_frame(
+    folder: Path, name: str, objects: Sequence[tuple[str, Polygon]], size: tuple[int, int] = SIZE
+) -> Path:
+    """label file `name`.json in `folder`; boxes are the polygons' own."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for category, polygon in objects:
+        corners = np.array(polygon or [[0, 0]])
+        box = [*corners.min(0).tolist(), *corners.max(0).tolist()]
+        rows.append({"category": category, "bbox": box, "segmentation": polygon, "group": 1})
+    path = folder / f"{name}.json"
+    info = {"name": f"{name}.jpg", "width": size[0], "height": size[1], "depth": 3, "note": ""}
+    path.write_text(json.dumps({"info": info, "objects": rows}))
+    return path
+
+
+def ovs_view(
+    scene: Path, name: str, masks: Mapping[str, Array], photo: tuple[int, int] | None = SIZE
+) -> None:
+    """segmentations/`name`/<class>.png and images/`name`.jpg; classes.txt is extended by what is new."""
+    folder = scene / "segmentations" / name
+    folder.mkdir(parents=True, exist_ok=True)
+    for phrase, mask in masks.items():
+        Image.fromarray((255 * mask).astype(np.uint8)).save(folder / f"{phrase}.png")
+    listed = scene / "segmentations" / "classes.txt"
+    known = listed.read_text().splitlines() if listed.exists() else []
+    listed.write_text("\n".join([*known, *(phrase for phrase in masks if phrase not in known)]) + "\n")
+    if photo is not None:
+        (scene / "images").mkdir(exist_ok=True)
+        Image.new("RGB", photo).save(scene / "images" / f"{name}.jpg")
+
+
+def mask_map(folder: Path, phrase: str, mask: Array) -> None:
+    """A relevancy map that is 1 in the mask and 0 outside, as another system might have rendered it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    np.save(folder / f"{phrase}.npy", mask.astype(np.float32))
+
+
+def silhouette(folder: Path, phrase: str, mask: Array) -> None:
+    """The drawn selection, white on black."""
+    folder.mkdir(parents=True, exist_ok=True)
+    Image.fromarray((255 * mask).astype(np.uint8)).save(folder / f"{phrase}.png")

@@ -1,0 +1,86 @@
+"""Comparisons: of a fast rasterizer with the reference, of gradients, and bit for bit of scenes.
+
+Image formation has steps: an alpha of just 1/255 counts or does not, a transmittance of just 1e-4 stops a
+pixel or does not. Pixels where rounding may decide are the *band*: a counted allowance of them may differ.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.scene import Gaussians, LanguageField
+
+BAND = 1e-4  # relative distance to a cut-off; float32 kernels are within about 1e-6 of it
+
+
+def assert_close_off_cuts(got: Array, want: Array, band: Array, atol: float = 2e-5) -> None:
+    """`got` equals `want` within `atol` outside the band; in the band at most half the pixels are off.
+
+    The band must be small (under 2 % of the pixels), or the comparison would say little.
+    """
+    assert got.shape == want.shape
+    assert np.isfinite(got).all()
+    error = np.abs(got - want).reshape(*band.shape, -1).max(-1)
+    assert band.mean() < 0.02, f"{band.sum()} of {band.size} pixels lie at a cut-off: change the scene"
+    worst = float(error[~band].max(initial=0))
+    assert worst <= atol, f"off by {worst:.2e} in {(error[~band] > atol).sum()} pixels away from cut-offs"
+    flipped = error[band] > atol
+    assert flipped.sum() <= max(0.5 * band.sum(), 1), f"{flipped.sum()} of {band.sum()} band pixels flipped"
+
+
+def assert_adjoint(
+    splat: Callable[[Array], Array], gather: Callable[[Array], Array], x: Array, y: Array, rtol: float = 1e-5
+) -> None:
+    """<W x, y> = <x, W^T y>, relative to |W x| |y|."""
+    image = splat(x).astype(np.float64)
+    left, right = np.vdot(image, y), np.vdot(x.astype(np.float64), gather(y))
+    scale = np.linalg.norm(image) * np.linalg.norm(y)
+    assert abs(left - right) <= rtol * scale, f"{left} against {right}, scale {scale}"
+
+
+def assert_gradient(name: str, got: Array, want: Array, rtol: float = 1e-3) -> None:
+    """Equal within `rtol` of each entry, plus 1e-5 of the largest one for float32 sums."""
+    allowed = rtol * np.abs(want) + 1e-5 * np.abs(want).max()
+    off = np.abs(got - want) > allowed
+    assert not off.any(), f"{name}: {off.sum()} of {off.size} off, worst {np.abs(got - want).max():.2e}"
+
+
+FIELDS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh")
+
+
+def assert_same(got: Gaussians, want: Gaussians) -> None:
+    """Bit for bit, NaN included."""
+    for field in FIELDS:
+        a, b = getattr(got, field), getattr(want, field)
+        assert a.dtype == np.float32
+        np.testing.assert_array_equal(a.view(np.uint32), b.view(np.uint32), field)
+
+
+def assert_same_extras(got, want) -> None:
+    assert list(got) == list(want)
+    for name, values in want.items():
+        assert got[name].dtype == values.dtype
+        np.testing.assert_array_equal(got[name], values, name)
+
+
+def assert_same_field(got: LanguageField, want: LanguageField) -> None:
+    """Bit for bit: a saved scene must answer exactly like the one in memory."""
+    for name in ("latents", "confidence", "canonical"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(want, name), name)
+    assert (got.things is None) == (want.things is None)
+    if want.things is not None:
+        np.testing.assert_array_equal(got.things, want.things)
+        assert got.things.dtype == np.uint16
+    assert (got.everyday is None) == (want.everyday is None)
+    if want.everyday is not None:
+        np.testing.assert_array_equal(got.everyday, want.everyday)
+    assert got.encoder_id == want.encoder_id
+    assert got.reading == want.reading
+    assert got.codec.kind == want.codec.kind
+    assert got.codec.tensors().keys() == want.codec.tensors().keys()
+    for name, tensor in want.codec.tensors().items():
+        np.testing.assert_array_equal(got.codec.tensors()[name], tensor, name)
+    assert list(got.phrasebook) == list(want.phrasebook)
+    for phrase, vector in want.phrasebook.items():
+        np.testing.assert_array_equal(got.phrasebook[phrase], vector)
