@@ -1,4 +1,5 @@
-"""Names and places that cannot be written to are told of beforehand; temporary names always fit."""
+"""Names and places that cannot be written to are told of beforehand; a full disk is one line, for every kind
+of file, and what was there stays."""
 
 import os
 import shutil
@@ -43,11 +44,9 @@ Check = Callable[[Path], None]
 
 def refusal(check: Check, path: Path) -> str:
     """The one line that a path is refused with."""
-    before = sorted(path.anchor)
     with pytest.raises(InputError) as caught:
         check(path)
     message = str(caught.value)
-    assert sorted(path.anchor) == before
     assert message.isprintable()
     assert len(message) < 300
     return message
