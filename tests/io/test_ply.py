@@ -41,16 +41,6 @@ from tests.support.file_samples import (
 from tests.support.scenes import random_extras, random_gaussians
 
 
-@pytest.fixture
-def put(tmp_path):
-    def write(content: bytes):
-        path = tmp_path / "scene.ply"
-        path.write_bytes(content)
-        return path
-
-    return write
-
-
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("count", [0, 1, 50])
 def test_what_is_written_is_read_back_bit_for_bit(tmp_path, degree, count):

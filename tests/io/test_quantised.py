@@ -28,17 +28,6 @@ from tests.support.file_samples import (
 )
 from tests.support.scenes import covariances, random_gaussians
 
-
-@pytest.fixture
-def put(tmp_path):
-    def write(content: bytes, name: str = "a.spz"):
-        path = tmp_path / name
-        path.write_bytes(content)
-        return path
-
-    return write
-
-
 # ---- .splat and .ksplat ----
 
 
