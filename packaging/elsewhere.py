@@ -24,7 +24,7 @@ COMPUTING = (
     "raster scene query training semantics display compaction evaluation datasets making benchmarks bench io "
     "pipeline/test_train.py pipeline/test_importing.py test_arrays.py test_compiled.py"
 )
-WRITING = "cli datasets formats parsing pipeline scene semantics test_files.py viewer/test_preferences.py"
+WRITING = "cli datasets io pipeline scene semantics test_writing.py"
 HEAD = """# The tests on other machines
 
 `make elsewhere` on {machine}; one row by `make elsewhere ONLY=avx2`. Two workers of pytest. Minutes are

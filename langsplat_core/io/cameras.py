@@ -22,14 +22,13 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import read_json_file
+from langsplat_core.io.hostile import PHOTO_SUFFIXES, read_json_file
 from langsplat_core.scene import FARTHEST, Camera
 
 SUFFIX = ".cameras.json"
 SIZE_LIMIT = 64 * 1024 * 1024  # bytes; a camera takes about 500
 MAX_PIXELS = 1 << 16  # a side of the image; beyond it a renderer would be asked for gigabytes
 ROTATION_TOLERANCE = 1e-3  # of R R^T against the identity; files written in float32 keep 1e-6
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic")
 
 
 def read_cameras(path: Path | str) -> tuple[Camera, ...]:
@@ -107,8 +106,7 @@ def is_rotation(matrix: Array) -> bool:
 
 def _without_image_suffix(name: str) -> str:
     """Newer INRIA files keep the suffix; a name such as "frame.01" must keep its own dot."""
-    lower = name.lower()
-    ending = next((suffix for suffix in IMAGE_SUFFIXES if lower.endswith(suffix)), "")
+    ending = next((suffix for suffix in PHOTO_SUFFIXES if name.lower().endswith(suffix)), "")
     return name[: len(name) - len(ending)]
 
 

@@ -68,7 +68,10 @@ def _no_room(error: Exception, temporary: Path) -> OSError | None:
 
 def name_max(folder: Path) -> int:
     """Bytes that the file system of an existing `folder` takes for one name."""
-    return _limit(folder, "PC_NAME_MAX", NAME_MAX)
+    try:
+        return os.pathconf(folder, "PC_NAME_MAX")
+    except (AttributeError, OSError, ValueError):  # Windows has none; not every file system answers
+        return NAME_MAX
 
 
 def check_output_file(path: Path | str) -> None:
@@ -148,10 +151,3 @@ def _try_writing(target: Path, folder: Path) -> None:
 
 def _below(path: str, folder: str) -> bool:
     return path == folder or path.startswith(folder + os.sep)
-
-
-def _limit(folder: Path, name: str, default: int) -> int:
-    try:
-        return os.pathconf(folder, name)
-    except (AttributeError, OSError, ValueError):  # Windows has none; not every file system answers
-        return default

@@ -5,7 +5,7 @@ each method and what becomes of it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -54,7 +54,7 @@ class ForeignScene:
     levels: tuple[Features | None, ...] = (None, None, None)  # of subpart, part and whole, each for all N
     paths: tuple[Path | None, ...] = (None, None, None)  # the files that these come from
     codec: AutoencoderCodec | None = None  # that the features are latents of; None where they are vectors
-    notes: tuple[str, ...] = field(default=())  # what was taken for granted, for people
+    notes: tuple[str, ...] = ()  # what was taken for granted, for people
 
     @property
     def dim(self) -> int:

@@ -138,7 +138,19 @@ def write_ply(
         for start in range(0, len(gaussians), CHUNK_ROWS):
             part = np.arange(start, min(start + CHUNK_ROWS, len(gaussians)))
             rows = np.empty(len(part), dtype)
-            rows[LAYOUT] = _rows(gaussians.take(part))
+            drawn = gaussians.take(part)
+            rows[LAYOUT] = np.concatenate(
+                [
+                    drawn.means,
+                    np.zeros((len(part), 3), np.float32),
+                    drawn.sh[:, 0],
+                    drawn.sh[:, 1:].transpose(0, 2, 1).reshape(len(part), rest_count),
+                    drawn.opacity_logits[:, None],
+                    drawn.log_scales,
+                    drawn.quats_wxyz,
+                ],
+                axis=1,
+            )
             for name, values in extras.items():
                 rows[name] = values[part]
             file.write(rows.tobytes())
@@ -152,30 +164,10 @@ def _check_extras(extras: Mapping[str, Array], names: tuple[str, ...]) -> None:
             raise InputError(f"extra property {name!r} is of type {values.dtype}, which no PLY can hold")
 
 
-def _rows(part: Gaussians) -> Array:
-    """(N, properties) float32 in the order of the file."""
-    count = len(part)
-    table = [
-        part.means,
-        np.zeros((count, 3), np.float32),
-        part.sh[:, 0],
-        sh_to_channel_major(part.sh),
-        part.opacity_logits[:, None],
-        part.log_scales,
-        part.quats_wxyz,
-    ]
-    return np.concatenate(table, axis=1)
-
-
 def sh_from_channel_major(base: Array, rest: Array) -> Array:
     """(N, 3) base colours and (N, 3 (K - 1)) channel-major coefficients -> (N, K, 3)."""
     by_channel = rest.reshape(len(rest), 3, rest.shape[1] // 3)
     return np.concatenate([base[:, None], by_channel.transpose(0, 2, 1)], axis=1)
-
-
-def sh_to_channel_major(sh: Array) -> Array:
-    """(N, K, 3) -> (N, 3 (K - 1)): the `f_rest_*` columns."""
-    return sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), 3 * (sh.shape[1] - 1))
 
 
 def check_gaussian_properties(vertex: PlyElement, path: Path) -> tuple[str, ...]:

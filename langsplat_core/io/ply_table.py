@@ -1,6 +1,7 @@
 """Tables of a PLY file: its header, the rows of an element in any encoding, clouds of coloured points."""
 
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -155,11 +156,9 @@ def _property(words: list[str], line: str, path: Path) -> PlyProperty:
 
 
 def _require_unique(names: list[str], what: str, path: Path) -> None:
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
-            raise FormatError(f"{path}: {what} {quoted(name, 40)} is declared twice")
-        seen.add(name)
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise FormatError(f"{path}: {what} {quoted(twice[0], 40)} is declared twice")
 
 
 # ---- rows ----

@@ -75,7 +75,6 @@ def _archive_reader(archive: Archive) -> Fetch:
 def _decode(fetch: Fetch, meta_path: Path) -> Scene:
     """`meta_path` is for messages; the name of the meta file is its last part."""
     meta = _Meta(parse_json(fetch(meta_path.name, META_LIMIT), meta_path), meta_path)
-    meta.check_version()
     return Scene(_gaussians(fetch, meta), antialiased=meta.antialiased())
 
 
@@ -160,14 +159,12 @@ class _Meta:
     def __init__(self, content: Any, path: Path) -> None:
         if not isinstance(content, dict):
             raise FormatError(f"{path}: expected a JSON object")
-        self.content, self.path = content, path
-
-    def check_version(self) -> None:
-        version = self.content.get("version", 1)
+        version = content.get("version", 1)
         if version != 2:
             raise FormatError(
-                f"{self.path}: SOG version {quoted(version)}; only 2 is read, export the scene again"
+                f"{path}: SOG version {quoted(version)}; only 2 is read, export the scene again"
             )
+        self.content, self.path = content, path
 
     def antialiased(self) -> bool:
         return self.content.get("model") == "antialiased" or self.content.get("antialias") is True

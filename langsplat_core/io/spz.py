@@ -150,7 +150,10 @@ def _read_streams(file: BinaryIO, file_size: int, path: Path) -> Packed:
     records = file.read(records_size)
     sizes = [header.count * width for width in widths(4, header.sh_degree).values()]
     stored = [size for size in sizes if size]  # blocks without a byte have no stream
-    table = np.frombuffer(_exactly(file, 16 * header.streams, path), "<u8").reshape(-1, 2).tolist()
+    data = file.read(16 * header.streams)
+    if len(data) < 16 * header.streams:
+        raise FormatError(f"{path}: truncated: {16 * header.streams - len(data)} bytes are missing")
+    table = np.frombuffer(data, "<u8").reshape(-1, 2).tolist()
     if [whole for _, whole in table if whole] != stored:
         raise FormatError(f"{path}: the sizes in its table are not those of {header.count} Gaussians")
     if sum(stored) > BYTES_PER_BYTE * file_size + SLACK:
@@ -161,13 +164,6 @@ def _read_streams(file: BinaryIO, file_size: int, path: Path) -> Packed:
     streams = iter([_unpacked(file.read(zipped), whole, path) for zipped, whole in table if whole])
     blocks = [next(streams) if size else b"" for size in sizes]
     return header.packed(_axes(records if header.flags & EXTENDED else b"", path), blocks)
-
-
-def _exactly(file: BinaryIO, size: int, path: Path) -> bytes:
-    data = file.read(size)
-    if len(data) < size:
-        raise FormatError(f"{path}: truncated: {size - len(data)} bytes are missing")
-    return data
 
 
 def _unpacked(data: bytes, size: int, path: Path) -> bytes:
@@ -197,17 +193,6 @@ def _axes(records: bytes, path: Path) -> int:
             return axes
         at += 8 + length
     return AXES_RUB
-
-
-def write_packed(path: Path | str, packed: Packed) -> None:
-    """Write version 2 or 3, atomically, without extensions: axes RUB."""
-    count = len(packed.blocks["alphas"])
-    flags = ANTIALIASED if packed.antialiased else 0
-    numbers = (packed.version, count, packed.sh_degree, packed.fractional_bits, flags, 0)
-    blocks = [packed.blocks[name].tobytes() for name in widths(packed.version, packed.sh_degree)]
-    content = b"".join([MAGIC, struct.pack("<IIBBBB", *numbers), *blocks])
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(gzip.compress(content, mtime=0))  # mtime: the same scene, the same bytes
 
 
 # ---- quantised Gaussians, about ten times smaller than the PLY ----
@@ -289,10 +274,16 @@ def write_spz(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
         "rotations": _rotation_codes(drawn.quats_wxyz * _quaternion_signs(signs)),
         "sh": to_bytes(rest.reshape(len(rest), 3 * rest.shape[1]) * 128 + 128),
     }
-    blocks = {name: np.zeros((len(valid), code.shape[1]), np.uint8) for name, code in coded.items()}
-    for name, code in coded.items():
-        blocks[name][valid] = code
-    write_packed(path, Packed(3, gaussians.sh_degree, bits, antialiased, AXES_RUB, blocks))
+    numbers = (3, len(valid), gaussians.sh_degree, bits, ANTIALIASED if antialiased else 0, 0)
+    content = [MAGIC, struct.pack("<IIBBBB", *numbers)]
+    for name in widths(3, gaussians.sh_degree):
+        block = np.zeros((len(valid), coded[name].shape[1]), np.uint8)
+        block[valid] = coded[name]
+        content.append(block.tobytes())
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(
+            gzip.compress(b"".join(content), mtime=0)
+        )  # mtime: the same scene, the same bytes
 
 
 def _fractional_bits(drawn: Gaussians, path: Path) -> int:

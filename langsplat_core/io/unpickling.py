@@ -29,7 +29,7 @@ _CODE = re.compile(r"b1|[iu][1248]|f[248]|[SU][1-9]\d{0,3}", re.ASCII)  # no obj
 
 
 class _Kind:
-    """Stand-in for `numpy.dtype`."""
+    """Stand-in for `numpy.dtype`: plain numbers and texts alone."""
 
     def __init__(self, code: Any, *_: Any) -> None:
         if not isinstance(code, str) or not _CODE.fullmatch(code):
@@ -54,7 +54,7 @@ class _Kind:
 
 
 class _Array:
-    """Stand-in for `numpy.ndarray`."""
+    """Stand-in for `numpy.ndarray`, filled by the state that a file states."""
 
     values: Array | None = None  # until the file has said what is in it
 

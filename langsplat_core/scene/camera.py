@@ -1,4 +1,4 @@
-"""Intrinsics: the inner geometry of a pinhole camera, on a pixel grid of a certain size."""
+"""Cameras: their intrinsics on a pixel grid, their pose, and what they project where."""
 
 import math
 from dataclasses import dataclass, replace

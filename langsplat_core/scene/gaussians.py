@@ -1,4 +1,5 @@
-"""The Gaussians of a scene, stored as the INRIA PLY stores them: raw, not activated."""
+"""The Gaussians of a scene, stored as the INRIA PLY stores them: raw, not activated; and fewer, larger ones
+that look much the same."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields

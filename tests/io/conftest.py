@@ -18,3 +18,15 @@ def bounded():
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
     assert peak < MEMORY, f"{peak / 1e6:.0f} MB"
+
+
+@pytest.fixture
+def put(tmp_path):
+    """Writes a file with the given content and returns its path."""
+
+    def write(content: bytes, name: str = "scene"):
+        path = tmp_path / name
+        path.write_bytes(content)
+        return path
+
+    return write

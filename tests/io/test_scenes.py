@@ -204,17 +204,6 @@ def test_what_is_not_a_scene(tmp_path):
         load_scene(tmp_path / "empty")
 
 
-def test_an_unusable_companion_is_left_out_with_its_reason(tmp_path):
-    save_scene(tmp_path / "scene.ply", full_scene())
-    write_ply(tmp_path / "scene.ply", random_gaussians(N - 1))
-    (reason,) = load_scene(tmp_path / "scene.ply").unread
-    assert "made for 60 Gaussians, the scene has 59" in reason
-    (tmp_path / "scene.langsplat.safetensors").unlink()
-    (tmp_path / "scene.cameras.json").write_text("[")
-    (reason,) = load_scene(tmp_path / "scene.ply").unread
-    assert "scene.cameras.json: not readable as JSON" in reason
-
-
 def test_a_scene_of_which_most_cannot_be_drawn_says_so(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
