@@ -308,7 +308,7 @@ def measure_gradients(plan: Plan) -> Iterator[str]:
     image[band] = 0
     exact = exact_gradients(case, values, image, settings)
     on_cpu = load_lifting_rasterizer("cpu").view(case.gaussians, case.camera, settings)
-    cpu = vars(on_cpu.backward(values, image))  # type: ignore[attr-defined]
+    cpu = on_cpu.backward(values, image)._asdict()  # type: ignore[attr-defined]
     cuda = gradients(case, values, image)
     rows = [(name, _error(cpu[name], exact[name]), _error(cuda[name], exact[name])) for name in NAMES]
     yield f"# Gradients: {count} Gaussians at {size[0]}x{size[1]}\n"
