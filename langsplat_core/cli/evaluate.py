@@ -48,7 +48,7 @@ class _Eval:
 @dataclass(frozen=True)
 class _EvalLabels(_Eval):
     pictures: OutFolder | None = None
-    """Also write one picture per query into this folder."""
+    """Also write one image per query into this folder."""
     paper_order: bool = False
     """Blend latents and decode every pixel, as the paper does, not the relevancies; no codebook can."""
     train: bool = False
@@ -71,7 +71,7 @@ class _EvalLabels(_Eval):
 
     def evaluate(self, benchmark: "Benchmark", profile: Profile) -> None:
         """Train where that is asked for, score, print the tables, write what was asked for."""
-        from langsplat_core.evaluation.report import beside_published, save_json, table
+        from langsplat_core.evaluation.report import save_json, table
         from langsplat_core.evaluation.run import Subject, run_benchmark
         from langsplat_core.semantics.encoders import load_text_encoder
 
@@ -86,9 +86,6 @@ class _EvalLabels(_Eval):
                 benchmark, profile, subject, load_text_encoder, only, self.pictures, progress
             )
         print(table(report))
-        published = beside_published(report)
-        if published:
-            print(f"\n{published}")
         if self.json is not None:
             save_json(self.json, report)
         if failed:

@@ -27,11 +27,11 @@ from langsplat_core.io.shapes import (
 )
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.answers import QueryResult, peak_pixel
-from langsplat_core.query.compose import Combination, check_phrase, combine, run_phrase
-from langsplat_core.query.describe import Describer, Entry, Words
+from langsplat_core.query.compose import check_phrase, joined, run_phrase
+from langsplat_core.query.describe import Describer, Entry, Words, look_at_pixel
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, no_field
 from langsplat_core.query.grammar import Atom
-from langsplat_core.query.instances import Instance, hulls
+from langsplat_core.query.instances import Instance, hull
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.selection import grow, of_rows, shrink
 from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
@@ -105,24 +105,21 @@ class QueryScene:
         """The phrases that can be asked; the others are named on stderr with the reason, before anything is
         searched. Raises that reason where none is left."""
         phrases = [phrase for text in self.texts for phrase in split_phrases(text) or [text]]
-        problems: dict[str, LangSplatError] = {}
-        for phrase in phrases:
+        reasons: dict[str, list[str]] = {}  # why not -> these phrases
+        for phrase in dict.fromkeys(phrases):
             try:
                 if self._plainly:
                     engine.text_vector(phrase)
                 else:
                     check_phrase(engine, phrase, camera)
             except LangSplatError as error:
-                problems[phrase] = error
-        reasons = {
-            str(error): [p for p, e in problems.items() if str(e) == str(error)]
-            for error in problems.values()
-        }
-        if len(problems) == len(dict.fromkeys(phrases)):
+                reasons.setdefault(str(error), []).append(phrase)
+        unasked = {phrase for same in reasons.values() for phrase in same}
+        if unasked.issuperset(phrases):
             raise InputError("; ".join(reasons))
-        for reason, unasked in reasons.items():
-            print(f"langsplat: not asked: {', '.join(map(repr, unasked))}: {reason}", file=sys.stderr)
-        return [phrase for phrase in phrases if phrase not in problems]
+        for reason, same in reasons.items():
+            print(f"langsplat: not asked: {', '.join(map(repr, same))}: {reason}", file=sys.stderr)
+        return [phrase for phrase in phrases if phrase not in unasked]
 
     @property
     def _plainly(self) -> bool:
@@ -202,13 +199,11 @@ class Select:
     scene: tyro.conf.Positional[Path]
     """A trained scene, *.ply with its language field beside it."""
     texts: tyro.conf.Positional[tuple[str, ...]]
-    """Phrases, each in quotes if it has several words."""
+    """Phrases, each in quotes if it has several words; what any of them names is taken."""
     out: OutFile
     """File to write: .ply, .spz or .splat for a scene, .ply for points, .ply or .obj for hulls."""
     remove: bool = False
     """Write everything else instead."""
-    combine: Combination = "union"
-    """What several phrases make: what any of them names, what all name, or the first without the others."""
     level: LevelChoice = "auto"
     """Semantic level; auto takes for each phrase the one with the highest score."""
     instance: tuple[Count, ...] = ()
@@ -231,7 +226,8 @@ class Select:
         scene = _searchable(self.scene)
         unit = _unit(scene, self.scale)
         engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
-        answer = combine([run_phrase(engine, text, self.level).answer for text in self.texts], self.combine)
+        answers = [_found(engine, text, self.level) for text in self.texts]
+        answer = answers[0] if len(answers) == 1 else joined(answers, all_needed=True)
         found = engine.instances(answer)
         rows = np.concatenate([instance.members for instance in _chosen(found, self.instance)])
         selected = self._reshaped(engine, of_rows(rows, len(answer.members)), unit)
@@ -276,8 +272,11 @@ class Select:
             relevancy = answer.relevancy[answer.level][rows]
             return write_points(self.out, scene.gaussians.take(rows), {"relevancy": relevancy})
         if self.shape == "hull":
-            colours = base_colours(scene.gaussians)
-            meshes = hulls(engine.instances(answer), scene.gaussians, colours, " ".join(self.texts))
+            colours, name = base_colours(scene.gaussians), " ".join(self.texts)
+            meshes = [
+                hull(instance, scene.gaussians, colours, f"{name} {number}")
+                for number, instance in enumerate(engine.instances(answer), 1)
+            ]
             write_meshes(self.out, meshes)
             return len(meshes)
         save_scene(self.out, replace(scene.take(rows), path=self.out))
@@ -287,7 +286,6 @@ class Select:
         if self.json:
             content = {
                 "phrases": list(self.texts),
-                "combine": self.combine,
                 "metres_per_unit": unit.metres,
                 **_listed(found),
                 "taken": list(self.instance) or list(range(1, len(found) + 1)),
@@ -400,11 +398,12 @@ class Describe:
         place: dict[str, Any] = {}
         if self.pixel is not None:
             camera = engine.scene.cameras[self.camera]
-            found = describer.at_pixel(load_lifting_rasterizer("cpu"), camera, self.pixel, self.top)
+            at = look_at_pixel(load_lifting_rasterizer("cpu"), describer, camera, self.pixel, top=self.top)
+            found = describer.at_gaussians(np.zeros(0, np.int64)) if at is None else at.words
             place = {"camera": self.camera, "view": camera.name, "pixel": list(self.pixel)}
         elif self.phrase is not None:
-            answer = combine([run_phrase(engine, self.phrase).answer], "union")
-            thing = _chosen(engine.instances(answer), [self.instance])[0]
+            instances = engine.instances(_found(engine, self.phrase, "auto"))
+            thing = _chosen(instances, [self.instance])[0]
             found = describer.at_gaussians(thing.members, top=self.top)
             place = {"phrase": self.phrase, "thing": _instance(thing, self.instance)}
         elif self.gaussian is not None:
@@ -499,9 +498,7 @@ class Unit:
 
 
 def _unit(scene: Scene, metres_per_unit: float | None = None) -> Unit:
-    """Metres by `metres_per_unit`, else by the scene's own, else world units. InputError unless above 0."""
-    if metres_per_unit is not None and not 0 < metres_per_unit < float("inf"):
-        raise InputError(f"--scale {metres_per_unit:g}: must be above 0, metres per unit")
+    """Metres by `metres_per_unit`, else by the scene's own, else world units."""
     metres = metres_per_unit or scene.metres_per_unit
     return Unit("units", 1.0) if metres is None else Unit("m", metres)
 
@@ -550,6 +547,17 @@ def _instance(instance: Instance, number: int) -> dict[str, Any]:
             "half_extents": box.half_extents.tolist(),
         },
     }
+
+
+def _found(engine: QueryEngine, text: str, level: LevelChoice) -> QueryResult:
+    """The answer to a phrase; InputError where it was not found."""
+    answer = run_phrase(engine, text, level).answer
+    if not answer.found or not answer.members.any():
+        raise InputError(
+            f"'{answer.phrase}' was not found (score {answer.peak:.3f}): nothing to select; ask in other "
+            "words, or at another --level"
+        )
+    return answer
 
 
 def _chosen(found: Sequence[Instance], numbers: Sequence[int]) -> Sequence[Instance]:

@@ -335,7 +335,6 @@ def _table(report: "CompactReport") -> Table:
     table.add_row("SH degree", str(before.sh_degree), str(after.sh_degree), "")
     row("on disk, MB", before.disk_bytes, after.disk_bytes, ".2f", 1e-6)
     row("in memory, MB", before.memory_bytes, after.memory_bytes, ".2f", 1e-6)
-    row("render, ms (CPU)", before.render_ms, after.render_ms, ".1f")
     if before.psnr is not None and after.psnr is not None:
         table.add_row("PSNR, dB", f"{before.psnr:.2f}", f"{after.psnr:.2f}", "")
     return table
@@ -348,25 +347,14 @@ def _notes(report: "CompactReport") -> list[str]:
         else f"derived from the change, if the scene has {report.assumed_psnr:g} dB"
     )
     lines = [
-        f"loss: {report.loss:.3f} dB of {report.budget:g} allowed, worst view {report.worst_loss:.2f} dB; "
-        f"{report.unseen_loss:.3f} dB before the measuring views had a say ({how})",
-        f"pictures: PSNR {report.likeness:.1f} dB against those of the original",
+        f"loss: {report.loss:.3f} dB of {report.budget:g} allowed, worst view "
+        f"{report.worst_loss:.2f} dB ({how})",
         f"views: {report.ranking_views} ranked the Gaussians, {report.measuring_views} others measured; "
         f"{report.views_from}",
     ]
-    if abs(report.source_bytes - report.before.disk_bytes) > 0.01 * report.before.disk_bytes:
-        lines.append(
-            f"as given: {report.source_bytes / 1e6:.2f} MB on disk; "
-            "'before' is that scene in the new file's format"
-        )
-    if report.language is not None:
-        lines.append(f"meaning: latents change by {report.language.latents:.1e} on average")
-        for answer in report.language.answers:
-            place = "no place" if answer.moved is None else f"place moved by {answer.moved:.3g}"
-            verdict = "same answer" if answer.same else "ANOTHER ANSWER"
-            lines.append(
-                f"  {answer.phrase}: {verdict}, {place}, relevancy changes by {answer.relevancy:.1e}"
-            )
+    for answer in report.answers:
+        place = "no place" if answer.moved is None else f"place moved by {answer.moved:.3g}"
+        lines.append(f"{answer.phrase}: {'same answer' if answer.same else 'ANOTHER ANSWER'}, {place}")
     return lines
 
 

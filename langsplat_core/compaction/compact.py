@@ -1,7 +1,7 @@
 """Scenes made as small as an error budget allows: fewer Gaussians, a lower SH degree, no training.
 
 Gaussians are ranked by their contribution to one group of views (`contributions`). A second group, which
-had no say in that order, measures what the pictures lose. For every SH degree that the budget allows by
+had no say in that order, measures what the images lose. For every SH degree that the budget allows by
 itself, from the scene's own downward, the smallest number of Gaussians within the budget is found by
 bisection; the degree with the fewest numbers wins. The contribution of the last Gaussian kept becomes a
 threshold, and only now the second group has a say too: whatever contributes more than that to any of its
@@ -11,7 +11,6 @@ is read back and measured before it takes its name.
 
 import logging
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -21,19 +20,17 @@ from typing import TypeVar
 import numpy as np
 
 from langsplat_core.arrays import Array, mean_squared_error, psnr
-from langsplat_core.config import CompactConfig, DatasetConfig, PictureConfig, check_settings
+from langsplat_core.config import CompactConfig, DatasetConfig, check_settings
 from langsplat_core.datasets import load_capture
-from langsplat_core.display.displays import gated_mean
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.io.summary import disk_bytes, memory_bytes
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import QueryResult
-from langsplat_core.query.engine import LoadEncoder, QueryEngine
-from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_core.raster.protocol import LiftingRasterizer, Rasterizer
+from langsplat_core.query.compose import upright
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
 from langsplat_core.raster.render import colours_seen, splat_colours
-from langsplat_core.scene import SH_COUNTS, Camera, LanguageField, Scene, look_at
+from langsplat_core.scene import SH_COUNTS, Camera, Scene, look_at
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.semantics.encoders import load_text_encoder
 
@@ -71,11 +68,11 @@ def choose_views(scene: Scene, photos: Path | None, config: CompactConfig, progr
     if photos is not None:
         return _photographed(scene, photos, config, progress)
     if len(scene.cameras) >= 2:
-        cameras = [_limited(camera, config.max_side) for camera in _thinned(scene.cameras, config.views)]
-        origin = "the scene's cameras"
+        cameras, origin = _thinned(scene.cameras, config.views), "the scene's cameras"
     else:
-        cameras = [_limited(camera, config.max_side) for camera in ring_cameras(scene, min(config.views, 48))]
+        cameras = ring_cameras(scene, min(config.views, 48))
         origin = "a ring around the scene (it has no cameras): what lies inside may be judged invisible"
+    cameras = [_limited(camera, config.max_side) for camera in cameras]
     held = _every(len(cameras))
     return Views(
         tuple(camera for i, camera in enumerate(cameras) if i not in held),
@@ -88,10 +85,7 @@ def choose_views(scene: Scene, photos: Path | None, config: CompactConfig, progr
 def ring_cameras(scene: Scene, count: int) -> list[Camera]:
     """`count` cameras on a spiral around the scene's bounds that look at its centre, upright."""
     centre, radius = scene.bounds()
-    up = scene.up()
-    east = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    east /= np.linalg.norm(east)
-    north = np.cross(up, east)
+    east, north, up = upright(scene.up())
     golden = np.pi * (3 - np.sqrt(5))
     cameras = []
     for index in range(count):
@@ -157,7 +151,7 @@ def _thinned(items: Sequence[T], most: int) -> list[T]:
 
 
 def _every(count: int) -> set[int]:
-    """Indices of the measuring ones among `count` views."""
+    """Indices of the measuring views among `count`."""
     step = HOLD_OUT if count >= FEW else 2
     return set(range(step // 2, count, step))
 
@@ -169,10 +163,10 @@ def _limited(camera: Camera, max_side: int) -> Camera:
     return camera.resized(max(round(camera.width * factor), 1), max(round(camera.height * factor), 1))
 
 
-# What each Gaussian contributes to the pictures of a scene, and what pictures lose without some of them.
+# What each Gaussian contributes to the images of a scene, and what images lose without some of them.
 #
 # **Contribution.** In a view with blending weights w (a row of W per pixel p), taking Gaussian i of colour
-# c_i away changes pixel p by about w_pi (c_i - C_p): its weight times its distance from the picture C. The
+# c_i away changes pixel p by about w_pi (c_i - C_p): its weight times its distance from the image C. The
 # adjoint sums this over pixels without ever listing them: with one gather of [1, C, |C|^2],
 #
 #     W_i = sum_p w_pi,    E_i = sum_p w_pi |c_i - C_p|^2 = |c_i|^2 W_i - 2 c_i . (W^T C)_i + (W^T |C|^2)_i,
@@ -180,12 +174,12 @@ def _limited(camera: Camera, max_side: int) -> Camera:
 # and by Cauchy-Schwarz sum_p w_pi |c_i - C_p| <= sqrt(W_i E_i), an upper bound of the total change in display
 # values times pixels. That is of one Gaussian taken away alone. Many of one colour hold a white wall up
 # together, though each has nothing but its like behind it; so every Gaussian counts as at least `ALONE` away
-# from the picture: its contribution is sqrt(W_i (E_i + ALONE^2 W_i)). Over views the largest counts, so that
+# from the image: its contribution is sqrt(W_i (E_i + ALONE^2 W_i)). Over views the largest counts, so that
 # what only one view shows is not averaged away. On the bundled scene, at 77 % of the Gaussians, the mean loss
 # (the worst view's) is 0.21 (1.3) dB; ranked by W_i it is 0.42 (1.3), by sqrt(W_i E_i) 0.30 (3.4).
 #
 # **Loss.** With photographs, the loss in PSNR is measured on them. Without, it is derived from how far the
-# compact picture lies from the original one: removing something from a trained scene is, to first order,
+# compact image lies from the original one: removing something from a trained scene is, to first order,
 # uncorrelated with what the scene already gets wrong (at a minimum of the training loss no direction helps),
 # so squared errors add. A view that the original shows with mean squared error e and that changes by d loses
 #
@@ -203,38 +197,35 @@ class MeasuringView:
     """One view on which the loss is measured."""
 
     camera: Camera
-    original: Array  # (H, W, 3) float32 in [0, 1], the picture of the original scene
+    original: Array  # (H, W, 3) float32 in [0, 1], the image of the original scene
     photograph: Array | None = None  # (H, W, 3) float32 in [0, 1]
 
 
-def draw(rasterizer: Rasterizer, scene: Scene, camera: Camera) -> Array:
+def draw(scene: Scene, camera: Camera) -> Array:
     """The (H, W, 3) float32 image of a view in [0, 1], without background."""
-    view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
+    view = load_rasterizer("cpu").view(scene.gaussians, camera, scene.raster_settings())
     return np.clip(splat_colours(view, scene.gaussians, camera).colours, 0, 1)
 
 
 def measuring_views(
-    rasterizer: Rasterizer, scene: Scene, cameras: Sequence[Camera], photographs: Sequence[Array | None]
+    scene: Scene, cameras: Sequence[Camera], photographs: Sequence[Array | None]
 ) -> list[MeasuringView]:
-    """Pictures of the original `scene`, with the (H, W, 3) uint8 photographs of the same cameras or None."""
+    """Images of the original `scene`, with the (H, W, 3) uint8 photographs of the same cameras or None."""
     views = []
     for camera, photograph in zip(cameras, photographs, strict=True):
         truth = None if photograph is None else photograph.astype(np.float32) / 255
-        picture = draw(rasterizer, scene, camera)
-        views.append(MeasuringView(camera, picture, truth))
+        views.append(MeasuringView(camera, draw(scene, camera), truth))
     return views
 
 
-def contributions(
-    rasterizer: LiftingRasterizer, scene: Scene, cameras: Sequence[Camera], progress: Progress = silent
-) -> Array:
+def contributions(scene: Scene, cameras: Sequence[Camera], progress: Progress = silent) -> Array:
     """(N,) float64 >= 0: the largest contribution of each Gaussian to any of `cameras` (see above)."""
-    largest = np.zeros(len(scene.gaussians))
+    rasterizer, largest = load_lifting_rasterizer("cpu"), np.zeros(len(scene.gaussians))
     for index, camera in enumerate(cameras):
         view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
         own = colours_seen(scene.gaussians, camera)
-        picture = view.splat(own)[0]
-        stacked = [np.ones_like(picture[..., :1]), picture, (picture**2).sum(-1, keepdims=True)]
+        image = view.splat(own)[0]
+        stacked = [np.ones_like(image[..., :1]), image, (image**2).sum(-1, keepdims=True)]
         sums = view.gather(np.concatenate(stacked, -1)).astype(np.float64)
         weight, own = sums[:, 0], own.astype(np.float64)
         error = (own**2).sum(1) * weight - 2 * (own * sums[:, 1:4]).sum(1) + sums[:, 4]
@@ -244,22 +235,19 @@ def contributions(
     return largest
 
 
-def psnr_losses(
-    rasterizer: Rasterizer, scene: Scene, views: Sequence[MeasuringView], assumed_psnr: float
-) -> Array:
+def psnr_losses(scene: Scene, views: Sequence[MeasuringView], assumed_psnr: float) -> Array:
     """(V,) dB lost by `scene` in each view; negative where it comes nearer to a photograph.
 
     `assumed_psnr` (dB) is the original's, used for views without a photograph.
     """
     losses = []
     for view in views:
-        picture = draw(rasterizer, scene, view.camera)
+        image = draw(scene, view.camera)
         if view.photograph is None:
-            change = mean_squared_error(picture, view.original)
+            change = mean_squared_error(image, view.original)
             losses.append(estimated_loss(change, assumed_psnr))
         else:
-            before, after = (psnr(image, view.photograph) for image in (view.original, picture))
-            losses.append(before - after)
+            losses.append(psnr(view.original, view.photograph) - psnr(image, view.photograph))
     return np.array(losses)
 
 
@@ -275,9 +263,8 @@ def reduced(scene: Scene, rows: Array, sh_degree: int) -> Scene:
     return replace(kept, gaussians=replace(kept.gaussians, sh=kept.gaussians.sh[:, :count]))
 
 
-# What a scene costs, and what it is worth: bytes, milliseconds, decibels.
+# What a scene costs and what it is worth: bytes and decibels.
 
-ROUNDS = 3  # timed pictures of every measuring view
 UNLIKE = 10.0  # dB: a scene that is this far from the photographs does not show what they show
 
 
@@ -289,16 +276,7 @@ class Weight:
     sh_degree: int
     disk_bytes: int  # in the target format, with language field and cameras
     memory_bytes: int  # arrays of the Gaussians, extra properties and language field
-    render_ms: float  # mean over the measuring views, CPU backend; before and after drawn in turn
     psnr: float | None  # mean against the photographs, dB; None without
-
-
-@dataclass(frozen=True, eq=False)
-class Stored:
-    """A scene as the target format gives it back, and the size of its files."""
-
-    scene: Scene
-    disk_bytes: int
 
 
 def check_likeness(measured: Sequence[MeasuringView]) -> None:
@@ -310,69 +288,29 @@ def check_likeness(measured: Sequence[MeasuringView]) -> None:
         )
 
 
-def stored(scene: Scene, out: Path) -> Stored:
-    """The scene after a journey through a file named like `out`."""
+def stored(scene: Scene, out: Path) -> tuple[Scene, int]:
+    """The scene after a journey through a file named like `out`, and the bytes that it took."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / out.name
         save_scene(path, replace(scene, path=path))
-        return Stored(load_scene(path), disk_bytes(path))
+        return load_scene(path), disk_bytes(path)
 
 
-def weigh(
-    rasterizer: Rasterizer, pair: tuple[Stored, Stored], measured: Sequence[MeasuringView]
-) -> list[Weight]:
-    times = _render_times(rasterizer, (pair[0].scene, pair[1].scene), measured)
-    return [
-        Weight(
-            gaussians=len(stored.scene.gaussians),
-            sh_degree=stored.scene.gaussians.sh_degree,
-            disk_bytes=stored.disk_bytes,
-            memory_bytes=memory_bytes(stored.scene),
-            render_ms=milliseconds,
-            psnr=mean_psnr(rasterizer, stored.scene, measured),
-        )
-        for stored, milliseconds in zip(pair, times, strict=True)
-    ]
+def weigh(scene: Scene, stored_bytes: int, measured: Sequence[MeasuringView]) -> Weight:
+    return Weight(
+        gaussians=len(scene.gaussians),
+        sh_degree=scene.gaussians.sh_degree,
+        disk_bytes=stored_bytes,
+        memory_bytes=memory_bytes(scene),
+        psnr=mean_psnr(scene, measured),
+    )
 
 
-def worst_loss(
-    rasterizer: Rasterizer, before: Scene, after: Scene, views: Views, psnr_before: float
-) -> float:
-    """dB lost in the ranking view that loses most; one at a time, for their pictures may be many."""
-
-    def loss(camera: Camera) -> float:
-        measured = measuring_views(rasterizer, before, [camera], [None])
-        return float(psnr_losses(rasterizer, after, measured, psnr_before)[0])
-
-    return max(map(loss, views.ranking))
-
-
-def likeness(rasterizer: Rasterizer, scene: Scene, measured: Sequence[MeasuringView]) -> float:
-    """Mean PSNR against the images of the original scene, dB."""
-    return float(np.mean([psnr(draw(rasterizer, scene, view.camera), view.original) for view in measured]))
-
-
-def mean_psnr(rasterizer: Rasterizer, scene: Scene, measured: Sequence[MeasuringView]) -> float | None:
+def mean_psnr(scene: Scene, measured: Sequence[MeasuringView]) -> float | None:
     """Mean PSNR against the photographs, dB; None without."""
     pairs = [(view.camera, view.photograph) for view in measured if view.photograph is not None]
-    scores = [psnr(draw(rasterizer, scene, camera), photograph) for camera, photograph in pairs]
+    scores = [psnr(draw(scene, camera), photograph) for camera, photograph in pairs]
     return float(np.mean(scores)) if scores else None
-
-
-def _render_times(
-    rasterizer: Rasterizer, scenes: tuple[Scene, Scene], measured: Sequence[MeasuringView]
-) -> tuple[float, float]:
-    """Milliseconds of a picture of each scene (projection, colours and blending): the best of `ROUNDS` per
-    view, averaged over views. Drawn in turn, so that another program's load falls on both."""
-    seconds = np.full((len(measured), 2), np.inf)
-    for _ in range(ROUNDS):
-        for best, view in zip(seconds, measured, strict=True):
-            for which, scene in enumerate(scenes):
-                start = time.perf_counter()
-                draw(rasterizer, scene, view.camera)
-                best[which] = min(best[which], time.perf_counter() - start)
-    before, after = 1e3 * seconds.mean(0)
-    return float(before), float(after)
 
 
 RESOLUTION = 256  # the number of Gaussians is found to this fraction of the whole
@@ -393,11 +331,9 @@ class Selection:
     keep: Array  # (N,) bool
     sh_degree: int
     threshold: float  # no other Gaussian contributes more to any view
-    unseen_loss: float  # dB, mean over the measuring views, before these had a say
 
 
 def select(
-    rasterizer: LiftingRasterizer,
     scene: Scene,
     views: Views,
     measured: Sequence[MeasuringView],
@@ -406,25 +342,25 @@ def select(
 ) -> Selection:
     """Select what of `scene` to keep; `measured` are those of ``views.measuring``. Raises InputError where
     nothing is visible, nothing fits the budget or nothing can be dropped."""
-    score = contributions(rasterizer, scene, views.ranking, progress)
+    score = contributions(scene, views.ranking, progress)
     if not score.any():
         raise InputError(f"no Gaussian of the scene is visible from {views.origin}")
     order = np.argsort(-score, kind="stable")  # ties by index
 
     def loss_of(choice: Choice) -> float:
         candidate = reduced(scene, np.sort(order[: choice.count]), choice.sh_degree)
-        return float(psnr_losses(rasterizer, candidate, measured, config.assumed_psnr).mean())
+        return float(psnr_losses(candidate, measured, config.assumed_psnr).mean())
 
     degree = scene.gaussians.sh_degree
     choice = smallest(Choice(len(order), degree), loss_of, config.max_psnr_loss, progress)
     if choice is None:
         raise InputError(f"the new file's format alone loses more than {config.max_psnr_loss} dB; allow more")
     threshold = float(score[order[choice.count - 1]])
-    keep = contributions(rasterizer, scene, views.measuring) > threshold
+    keep = contributions(scene, views.measuring) > threshold
     keep[order[: choice.count]] = True
     if keep.all() and choice.sh_degree == degree:
         raise InputError(f"nothing can be dropped within {config.max_psnr_loss} dB; allow more")
-    return Selection(keep, choice.sh_degree, threshold, loss_of(choice))
+    return Selection(keep, choice.sh_degree, threshold)
 
 
 def smallest(
@@ -459,9 +395,9 @@ def _numbers(sh_degree: int) -> int:
     return 11 + 3 * SH_COUNTS[sh_degree]
 
 
-# How far two versions of a scene differ in what they mean: latents, relevancy, answers.
+# Whether both versions of a scene answer phrases alike.
 
-GATE = PictureConfig().alpha_gate
+PHRASES = 8  # at most, of the phrasebook, asked before and after
 
 
 @dataclass(frozen=True)
@@ -469,75 +405,26 @@ class AnswerChange:
     """One phrase, asked before and after."""
 
     phrase: str
-    relevancy: float  # mean absolute change of the rendered relevancy, over covered pixels and levels
     same: bool  # found or not, and the level, as before
     moved: float | None  # distance between the two places, world units; None where either has none
 
 
-@dataclass(frozen=True)
-class LanguageChange:
-    """Over the pixels that the original scene covers."""
+def answer_changes(before: Scene, after: Scene, more: Sequence[str]) -> tuple[AnswerChange, ...]:
+    """Compare the answers to some phrases of the phrasebook and to `more`; none without a language field.
 
-    latents: float  # mean absolute change of a rendered latent's numbers
-    answers: tuple[AnswerChange, ...]
-
-
-def language_change(
-    rasterizer: Rasterizer,
-    scenes: tuple[Scene, Scene],
-    cameras: Sequence[Camera],
-    phrases: Sequence[str],
-    load_encoder: LoadEncoder | None = None,
-) -> LanguageChange | None:
-    """Compare `scenes` (before, after) in the views of `cameras`; None where either has no language field.
-
-    load_encoder: of a phrase outside the phrasebook, see `QueryEngine`; EncoderError where one needs it.
+    Raises EncoderError where a phrase needs the text encoder and that cannot be loaded.
     """
-    before, after = scenes
     if before.language is None or after.language is None:
-        return None
-    load = None if load_encoder is None else cache(load_encoder)  # once for both
-    engines = [QueryEngine(scene, load) for scene in scenes]
-    results = [tuple(engine.run_many(phrases)) for engine in engines]
-    channels = [
-        _channels(scene.language, found)
-        for scene, found in zip((before, after), results, strict=True)
-        if scene.language is not None
-    ]
-    latent_count = channels[0].shape[1] - 3 * len(phrases)
-    totals, covered = np.zeros(channels[0].shape[1]), 0
-    for camera in cameras:
-        images = []
-        for scene, values in zip(scenes, channels, strict=True):
-            view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
-            total, alpha = view.splat(values)
-            images.append((gated_mean(total, alpha, GATE), alpha))
-        visible = images[0][1] > GATE
-        totals += np.abs(images[0][0] - images[1][0])[visible].sum(0, dtype=np.float64)
-        covered += int(visible.sum())
-    means = totals / max(covered, 1)
-    answers = tuple(
-        _answer(old, new, float(means[latent_count + 3 * j :][:3].mean()))
-        for j, (old, new) in enumerate(zip(*results, strict=True))
-    )
-    return LanguageChange(float(means[:latent_count].mean()), answers)
-
-
-def _channels(field: LanguageField, results: Sequence[QueryResult]) -> Array:
-    """(N, 3 c + 3 Q) float32: the latents of every level as what can be blended, then all relevancies."""
-    latents = [field.codec.blendable(level) for level in field.latents]
-    parts = [*latents, *(result.relevancy.T for result in results)]
-    return np.concatenate(parts, axis=1).astype(np.float32)
-
-
-def _answer(old: QueryResult, new: QueryResult, relevancy: float) -> AnswerChange:
-    moved = None
-    if old.place is not None and new.place is not None:
-        moved = float(np.linalg.norm(old.place - new.place))
-    return AnswerChange(old.phrase, relevancy, (old.found, old.level) == (new.found, new.level), moved)
-
-
-PHRASES = 8  # at most, of the phrasebook, asked before and after
+        return ()
+    phrases = list(dict.fromkeys([*map(phrase_key, more), *list(before.language.phrasebook)[:PHRASES]]))
+    load = cache(load_text_encoder)  # once for both
+    pairs = zip(*(QueryEngine(scene, load).run_many(phrases) for scene in (before, after)), strict=True)
+    changes = []
+    for old, new in pairs:
+        known = old.place is not None and new.place is not None
+        moved = float(np.linalg.norm(old.place - new.place)) if known else None
+        changes.append(AnswerChange(old.phrase, (old.found, old.level) == (new.found, new.level), moved))
+    return tuple(changes)
 
 
 @dataclass(frozen=True)
@@ -546,18 +433,14 @@ class CompactReport:
 
     before: Weight
     after: Weight
-    source_bytes: int  # the scene as given, in its own format
     budget: float
-    unseen_loss: float  # mean, of what the ranking views alone chose: a guess for any other view
     loss: float  # mean, of the file
     worst_loss: float  # of any one view, ranking ones included, of the file
     assumed_psnr: float | None  # None: measured against photographs
-    likeness: float  # PSNR of the compact pictures against the original ones, mean, at most 100
-    threshold: float  # no dropped Gaussian contributes more to any view, display values times pixels
     ranking_views: int
     measuring_views: int
     views_from: str
-    language: LanguageChange | None
+    answers: tuple[AnswerChange, ...]
 
 
 def compact_scene(
@@ -565,57 +448,39 @@ def compact_scene(
 ) -> CompactReport:
     """Write the scene `source` to `out` as small as ``config.max_psnr_loss`` allows.
 
-    `photos` is the dataset it was trained on; without, the loss is derived from the change of the pictures.
+    `photos` is the dataset it was trained on; without, the loss is derived from the change of the images.
     Raises InputError, and leaves `out` as it was, where the budget cannot be kept or nothing can be dropped.
     """
-    _check(source, out, config)
-    scene = load_scene(source)
-    rasterizer = load_lifting_rasterizer("cpu")
-    views = choose_views(scene, photos, config, progress)
-    measured = measuring_views(rasterizer, scene, views.measuring, views.photographs)
-    check_likeness(measured)
-    before = stored(scene, out)
-    selection = select(rasterizer, before.scene, views, measured, config, progress)
-    candidate = reduced(before.scene, selection.keep, selection.sh_degree)
-    after = stored(candidate, out)
-    losses = psnr_losses(rasterizer, after.scene, measured, config.assumed_psnr)
-    if not losses.mean() <= config.max_psnr_loss:
-        raise InputError(f"{out}: as stored it would lose {losses.mean():.3f} dB; not written, allow more")
-    truth = mean_psnr(rasterizer, scene, measured) or config.assumed_psnr
-    weighed = weigh(rasterizer, (replace(before, scene=scene), after), measured)
-    report = CompactReport(
-        before=weighed[0],
-        after=weighed[1],
-        source_bytes=disk_bytes(source),
-        budget=config.max_psnr_loss,
-        unseen_loss=selection.unseen_loss,
-        loss=float(losses.mean()),
-        worst_loss=max(float(losses.max()), worst_loss(rasterizer, scene, after.scene, views, truth)),
-        assumed_psnr=config.assumed_psnr if photos is None else None,
-        likeness=likeness(rasterizer, after.scene, measured),
-        threshold=selection.threshold,
-        ranking_views=len(views.ranking),
-        measuring_views=len(views.measuring),
-        views_from=views.origin,
-        language=_language(rasterizer, (scene, after.scene), views, config.phrases),
-    )
-    save_scene(out, replace(candidate, path=out))
-    return report
-
-
-def _check(source: Path, out: Path, config: CompactConfig) -> None:
     check_writable(out)
     check_settings(config)
     if out.resolve() == source.resolve():
         raise InputError(f"{out}: would replace the original scene; choose another --out")
-
-
-def _language(
-    rasterizer: Rasterizer, scenes: tuple[Scene, Scene], views: Views, more: Sequence[str]
-) -> LanguageChange | None:
-    field = scenes[0].language
-    if field is None:
-        return None
-    stored = list(field.phrasebook)[:PHRASES]
-    phrases = list(dict.fromkeys([*map(phrase_key, more), *stored]))
-    return language_change(rasterizer, scenes, views.measuring, phrases, load_text_encoder)
+    scene = load_scene(source)
+    views = choose_views(scene, photos, config, progress)
+    measured = measuring_views(scene, views.measuring, views.photographs)
+    check_likeness(measured)
+    before, before_bytes = stored(scene, out)
+    selection = select(before, views, measured, config, progress)
+    candidate = reduced(before, selection.keep, selection.sh_degree)
+    after, after_bytes = stored(candidate, out)
+    losses = psnr_losses(after, measured, config.assumed_psnr)
+    if not losses.mean() <= config.max_psnr_loss:
+        raise InputError(f"{out}: as stored it would lose {losses.mean():.3f} dB; not written, allow more")
+    truth = mean_psnr(scene, measured) or config.assumed_psnr
+    for camera in views.ranking:  # one at a time, for their images may be many
+        view = MeasuringView(camera, draw(scene, camera))
+        losses = np.append(losses, psnr_losses(after, [view], truth))
+    report = CompactReport(
+        before=weigh(scene, before_bytes, measured),
+        after=weigh(after, after_bytes, measured),
+        budget=config.max_psnr_loss,
+        loss=float(losses[: len(measured)].mean()),
+        worst_loss=float(losses.max()),
+        assumed_psnr=config.assumed_psnr if photos is None else None,
+        ranking_views=len(views.ranking),
+        measuring_views=len(views.measuring),
+        views_from=views.origin,
+        answers=answer_changes(scene, after, config.phrases),
+    )
+    save_scene(out, replace(candidate, path=out))
+    return report

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -13,14 +13,7 @@ from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.hostile import PHOTO_SUFFIXES, opened, picture_size, read_json_file
 
 Size = tuple[int, int]  # width and height, pixels
-SAME_SHAPE = 0.02  # relative difference of aspect up to which two sizes may be of one picture
-
-
-class Truth(Protocol):
-    """True mask of a phrase in a frame."""
-
-    def draw(self, size: Size) -> Array:
-        """(H, W) bool on a grid of `size`; by the nearest pixel where that is not the label's own grid."""
+SAME_SHAPE = 0.02  # relative difference of aspect up to which two sizes may be of one image
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +24,8 @@ class Outlines:
     polygons: tuple[Array, ...]  # (K, 2) float x, y each, K >= 3
 
     def draw(self, size: Size) -> Array:
-        """Fill the polygons; corners are cut to whole pixels and the outline belongs to the inside."""
+        """(H, W) bool on a grid of `size`: inside the polygons. Corners are cut to whole pixels, and an
+        outline belongs to the inside."""
         canvas = Image.new("L", self.size)
         brush = ImageDraw.Draw(canvas)
         for polygon in self.polygons:
@@ -41,14 +35,18 @@ class Outlines:
 
 @dataclass(frozen=True)
 class MaskFile:
-    """A picture that is bright inside."""
+    """An image that is bright inside."""
 
     path: Path
 
     def draw(self, size: Size) -> Array:
-        """Read the bright pixels: above half of 255, or above 0 where the file holds no more than 0 and 1."""
+        """(H, W) bool on a grid of `size`: above half of 255, or above 0 where the file holds no more than 0
+        and 1."""
         grey = read_grey(self.path)
         return resized(grey > (127 if grey.max(initial=0) > 1 else 0), size)
+
+
+Truth = Outlines | MaskFile  # true mask of a phrase in a frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +55,8 @@ class Label:
 
     phrase: str
     truth: Truth
-    boxes: (
-        Array | None
-    )  # (B, 4) left, top, right, bottom on the label's grid, inclusive; None: no place is scored
+    # (B, 4) left, top, right, bottom on the label's grid, inclusive; None: no place is scored
+    boxes: Array | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,27 +88,27 @@ class Benchmark:
 
 
 def read_grey(path: Path) -> Array:
-    """(H, W) uint8 brightness of a picture file; FormatError where it cannot be read."""
-    with opened(path) as picture:
-        return np.asarray(picture.convert("L"))
+    """(H, W) uint8 brightness of an image file; FormatError where it cannot be read."""
+    with opened(path) as image:
+        return np.asarray(image.convert("L"))
 
 
 def resized(mask: Array, size: Size) -> Array:
     """(H, W) bool on a grid of `size`, each pixel the nearest one's."""
     if mask.shape == (size[1], size[0]):
         return mask
-    picture = Image.fromarray(mask.astype(np.uint8))
-    return np.asarray(picture.resize(size, Image.Resampling.NEAREST)) > 0
+    image = Image.fromarray(mask.astype(np.uint8))
+    return np.asarray(image.resize(size, Image.Resampling.NEAREST)) > 0
 
 
-def check_same_picture(frame: str, drawn: Size, labelled: Size) -> None:
-    """InputError where a map or camera cannot show the labelled picture: another shape."""
+def check_same_image(frame: str, drawn: Size, labelled: Size) -> None:
+    """InputError where a map or camera cannot show the labelled image: another shape."""
     (columns, rows), (width, height) = drawn, labelled
     slack = max(SAME_SHAPE * width * rows, width, height, columns, rows)  # a pixel of rounding is allowed
     if abs(columns * height - width * rows) > slack:
         raise InputError(
             f"frame {frame}: the view is {columns}x{rows}, the labels are {width}x{height}: not of one "
-            "picture; use views and labels of the same photographs"
+            "image; use views and labels of the same photographs"
         )
 
 
@@ -129,8 +126,9 @@ def photograph_of(folder: Path, name: str) -> Path | None:
 
 # LERF-OVS as LangSplat released it: polygons in JSON files of the ISAT tool.
 #
-# lerf_ovs/label/<scene>/<frame>.json  info {name, width, height}, objects [{category, bbox [x1, y1, x2,
-# y2], segmentation [[x, y]...]}] lerf_ovs/label/<scene>/<frame>.jpg   the photograph again (not needed)
+# lerf_ovs/label/<scene>/<frame>.json  info {name, width, height}, objects [{category,
+#                                      bbox [x1, y1, x2, y2], segmentation [[x, y]...]}]
+# lerf_ovs/label/<scene>/<frame>.jpg   the photograph again (not needed)
 # lerf_ovs/<scene>/                    photographs and cameras
 #
 # An object has one polygon; a category that occurs several times in a frame is one query with all its
@@ -235,7 +233,7 @@ def _object(item: Any, where: str) -> tuple[str, Array]:
     except (TypeError, ValueError):
         raise FormatError(f'{where}: "segmentation" is not one polygon [[x, y], ...]') from None
     if not (np.abs(corners) <= 10 * MAX_SIDE).all():  # NaN fails too
-        raise FormatError(f'{where}: "segmentation" has corners far outside of any picture')
+        raise FormatError(f'{where}: "segmentation" has corners far outside of any image')
     return item["category"].strip(), corners
 
 
@@ -250,7 +248,7 @@ def _box(stored: Any, polygon: Array) -> Array:
     return np.concatenate([polygon.min(0), polygon.max(0)])
 
 
-# 3D-OVS (Liu et al. 2023): one mask picture per view and class.
+# 3D-OVS (Liu et al. 2023): one mask image per view and class.
 #
 # <scene>/segmentations/classes.txt           one class a line
 # <scene>/segmentations/<view>/<class>.png    bright inside, of any size
@@ -262,7 +260,7 @@ WANTED_PICTURES = "expected segmentations/classes.txt in it, or in folders of it
 def read_3d_ovs(folder: Path) -> Benchmark:
     """The labels in `folder`: one scene's, or several scenes' folders.
 
-    What a view has a picture of is asked there. Raises InputError for a folder of another layout and
+    What a view has an image of is asked there. Raises InputError for a folder of another layout and
     FormatError for a scene that breaks it.
     """
     if not folder.is_dir():

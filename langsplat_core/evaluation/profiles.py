@@ -1,4 +1,5 @@
-"""The protocols, each one frozen value that pins every constant, and where it is from.
+"""The protocols, each one frozen value that pins every constant and says where it is from, and how each turns
+maps, drawn selections or the engine's own answer into a mask and a place.
 
 Figures of one benchmark differ by ten points between protocols, so a figure belongs to a profile. Nothing
 here depends on a label: a profile is chosen by name, and no threshold is searched.
@@ -18,11 +19,10 @@ from langsplat_core.query.answers import QueryResult, peak_pixel
 from langsplat_core.query.lookup import splatted_relevancy
 from langsplat_core.raster.protocol import View
 
-Border = Literal["mirror", "inside"]  # cv2's reflect101; the mean of what lies inside the picture
+Border = Literal["mirror", "inside"]  # cv2's reflect101; the mean of what lies inside the image
 LevelRule = Literal["peak", "inside"]  # the highest map; the highest mean inside its own mask
-Vote = Literal[
-    "none", "clipped", "inside"
-]  # LangSplat's loop, which never counts the last row and column; V2's
+# "clipped": LangSplat's loop, which never counts the last row and column; "inside": V2's.
+Vote = Literal["none", "clipped", "inside"]
 Benchmark = Literal["lerf-ovs", "3d-ovs"]
 LerfProtocol = Literal["langsplat-code", "langsplat-paper", "langsplat-v2", "direct-3d", "ours"]
 OvsProtocol = Literal["langsplat-paper", "direct-3d", "ours"]
@@ -46,7 +46,7 @@ class MapRule:
 
 @dataclass(frozen=True)
 class SilhouetteRule:
-    """From the picture of the selected Gaussians alone to a mask; no place is scored."""
+    """From the image of the selected Gaussians alone to a mask; no place is scored."""
 
     alpha: float = 0.7  # strictly above, else the pixel is black
     grey: int = 10  # of 255, strictly above belongs to the mask
@@ -54,10 +54,10 @@ class SilhouetteRule:
 
 @dataclass(frozen=True)
 class OwnRule:
-    """From the engine's own answer to a mask and a peak (see `own_rule.own_prediction`)."""
+    """From the engine's own answer to a mask and a peak (see `own_prediction`)."""
 
     share: float = 0.5  # of a pixel's light that comes from members, strictly above
-    peak_window: int = 20  # px of a picture of `rows` rows, as the paper's; in proportion for others
+    peak_window: int = 20  # px of an image of `rows` rows, as the paper's; in proportion for others
     rows: int = 731
 
 
@@ -68,7 +68,7 @@ class Profile:
     name: str
     source: str  # what pins the constants, and what had to be filled in
     rule: MapRule | SilhouetteRule | OwnRule
-    max_rows: int = 1080  # higher pictures are scored at this height, as LangSplat's loader shrinks them
+    max_rows: int = 1080  # higher images are scored at this height, as LangSplat's loader shrinks them
 
 
 _CODE = MapRule(30, 0.5, "mirror", "peak", True, 0.7, "clipped", 7, 30, True)
@@ -76,7 +76,7 @@ _LERF_PAPER = MapRule(20, 0.0, "mirror", "peak", True, 0.7, "none", 1, 20, False
 _OVS_PAPER = MapRule(1, 1.0, "mirror", "inside", False, 0.4, "none", 1, 20, False)
 _DIRECT = Profile(
     "direct-3d",
-    "OpenGaussian's protocol: Gaussians are selected by the phrase, drawn alone, and the picture is cut; of "
+    "OpenGaussian's protocol: Gaussians are selected by the phrase, drawn alone, and the image is cut; of "
     "a scene, the members of the engine's answer; how often a Gaussian was seen is not kept and not asked",
     SilhouetteRule(),
 )
@@ -100,7 +100,7 @@ LERF_PROFILES: Mapping[LerfProtocol, Profile] = MappingProxyType(
         ),
         "langsplat-v2": Profile(
             "langsplat-v2",
-            "LangSplatV2's public evaluator: 29x29 mean of what lies inside the picture, the same blend and "
+            "LangSplatV2's public evaluator: 29x29 mean of what lies inside the image, the same blend and "
             "cut, 7x7 mean above one half; place as in LangSplat's code",
             MapRule(29, 0.5, "inside", "peak", True, 0.7, "inside", 7, 29, True),
         ),
@@ -122,7 +122,7 @@ OVS_PROFILES: Mapping[OvsProtocol, Profile] = MappingProxyType(
 )
 
 
-# From relevancy maps or pictures of selected Gaussians to a mask and a place, as a profile says.
+# From relevancy maps or images of selected Gaussians to a mask and a place, as a profile says.
 #
 # Everything here is given maps and constants, never a label.
 
@@ -186,9 +186,9 @@ def mean_filtered(values: Array, window: int, border: Border) -> Array:
 
 
 def voted(mask: Array, vote: Vote, window: int) -> Array:
-    """(H, W) bool after a majority vote over `window` x `window` pixels inside the picture; a tie is False.
+    """(H, W) bool after a majority vote over `window` x `window` pixels inside the image; a tie is False.
 
-    "clipped": the picture's last row and column are never counted, as in LangSplat's code.
+    "clipped": the image's last row and column are never counted, as in LangSplat's code.
     """
     if vote == "none" or window <= 1:
         return mask

@@ -13,11 +13,11 @@ from langsplat_core.evaluation.labels import Benchmark, LabelledScene, without_s
 from langsplat_core.evaluation.profiles import MapRule, OwnRule, Profile
 from langsplat_core.evaluation.report import BenchmarkReport
 from langsplat_core.evaluation.scoring import score_scene
-from langsplat_core.evaluation.sources import MapSource, SceneSource, Source
+from langsplat_core.evaluation.sources import MapSource, SceneSource
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, silent
+from langsplat_core.query.answers import AnswerRule
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, no_field
-from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Camera
 
 log = logging.getLogger("langsplat")
@@ -52,67 +52,61 @@ def run_benchmark(
         raise InputError(
             "--paper-order is for a scene under a protocol that reads relevancy maps; leave it out"
         )
-    scenes = _chosen(benchmark, only, subject)
+    names = chosen_scenes(list(benchmark.scenes), only, subject)
     scores = {}
-    for name, labelled in scenes.items():
-        source = _source(labelled, len(scenes), profile, subject, load_encoder, progress)
+    for name in names:
+        labelled = benchmark.scenes[name]
+        source = (
+            _map_source(labelled, len(names), profile, subject.maps)
+            if subject.maps is not None
+            else _scene_source(labelled, profile, subject, load_encoder, progress)
+        )
         scores[name] = score_scene(labelled, source, profile, pictures, progress)
     order = ", latents blended and every pixel decoded (the paper's order)" if subject.paper_order else ""
     return BenchmarkReport(benchmark.name, profile, f"{subject.scene or subject.maps}{order}", scores)
 
 
-def _chosen(benchmark: Benchmark, only: Sequence[str], subject: Subject) -> Mapping[str, LabelledScene]:
-    scenes = dict(benchmark.scenes)
-    wrong = [name for name in only if name not in scenes]
+def chosen_scenes(labelled: Sequence[str], only: Sequence[str], subject: Subject) -> list[str]:
+    """Names of the `labelled` scenes to score: `only` these, else the one that a scene file is named after
+    where several could be meant. Raises InputError for a name that is not labelled."""
+    wrong = [name for name in only if name not in labelled]
     if wrong:
-        raise InputError(f"--only {wrong[0]}: no such labelled scene; there are {', '.join(scenes)}")
-    if only:
-        return {name: scenes[name] for name in only}
-    if subject.scene is not None and not subject.scene.is_dir() and len(scenes) > 1:
-        if subject.scene.stem not in scenes:
-            raise InputError(
-                f"{subject.scene} could be any labelled scene of {', '.join(scenes)}; say which with --only"
-            )
-        return {subject.scene.stem: scenes[subject.scene.stem]}
-    return scenes
-
-
-def _source(
-    labelled: LabelledScene,
-    count: int,
-    profile: Profile,
-    subject: Subject,
-    load_encoder: LoadEncoder,
-    progress: Progress,
-) -> Source:
-    if subject.maps is not None:
-        return _map_source(labelled, count, profile, subject.maps)
-    assert subject.scene is not None
-    path = subject.scene / f"{labelled.name}.ply" if subject.scene.is_dir() else subject.scene
-    if not path.exists():
+        raise InputError(f"--only {wrong[0]}: no such labelled scene; there are {', '.join(labelled)}")
+    if only or subject.scene is None or subject.scene.is_dir() or len(labelled) == 1:
+        return list(only or labelled)
+    if subject.scene.stem not in labelled:
         raise InputError(
-            f"{path}: no such scene; leave {labelled.name} out with --only, or name the right folder"
+            f"{subject.scene} could be any labelled scene of {', '.join(labelled)}; say which with --only"
         )
+    return [subject.scene.stem]
+
+
+def open_scene(
+    subject: Subject, name: str, load_encoder: LoadEncoder, rule: AnswerRule = "regions"
+) -> QueryEngine:
+    """The scene of `subject` that belongs to the labelled scene `name`, to be asked."""
+    assert subject.scene is not None
+    path = subject.scene / f"{name}.ply" if subject.scene.is_dir() else subject.scene
+    if not path.exists():
+        raise InputError(f"{path}: no such scene; leave {name} out with --only, or name the right folder")
     scene = load_scene(path)
     if scene.language is None:
         raise InputError(f"{path}: {no_field(scene)}")
-    own = {without_suffix(camera.name): camera for camera in scene.cameras}
-    others = _other_cameras(own, labelled, path, progress)
+    return QueryEngine(scene, load_encoder, encoder_id=subject.encoder, rule=rule)
+
+
+def _scene_source(
+    labelled: LabelledScene, profile: Profile, subject: Subject, load_encoder: LoadEncoder, progress: Progress
+) -> SceneSource:
+    # Published maps are read as published.
+    rule: AnswerRule = "peak" if isinstance(profile.rule, MapRule) else "regions"
+    engine = open_scene(subject, labelled.name, load_encoder, rule)
+    own = {without_suffix(camera.name): camera for camera in engine.scene.cameras}
+    others = _other_cameras(own, labelled, progress)
     # With no name in common the scene's views are named by another rule: nothing is known of training.
     related = not own.keys().isdisjoint([*others, *(frame.name for frame in labelled.frames)])
-    return SceneSource(
-        QueryEngine(
-            scene,
-            load_encoder,
-            encoder_id=subject.encoder,
-            rule="peak" if isinstance(profile.rule, MapRule) else "regions",  # published maps as published
-        ),
-        load_rasterizer("cpu"),
-        {**others, **own},
-        frozenset(own) if related else None,
-        profile,
-        subject.paper_order,
-    )
+    trained = frozenset(own) if related else None
+    return SceneSource(engine, {**others, **own}, trained, profile, subject.paper_order)
 
 
 def _map_source(labelled: LabelledScene, count: int, profile: Profile, maps: Path) -> MapSource:
@@ -130,7 +124,7 @@ def _map_source(labelled: LabelledScene, count: int, profile: Profile, maps: Pat
 
 
 def _other_cameras(
-    own: Mapping[str, Camera], labelled: LabelledScene, path: Path, progress: Progress
+    own: Mapping[str, Camera], labelled: LabelledScene, progress: Progress
 ) -> Mapping[str, Camera]:
     """The dataset's views by name, read where the scene lacks a labelled one; they share its world.
     InputError where no labelled frame is among either."""
@@ -141,9 +135,9 @@ def _other_cameras(
     missing = [name for name in wanted if name not in own and name not in others]
     if len(missing) == len(wanted):
         raise InputError(
-            f"{path}: none of its views ({shortened(own, 3) or 'it has none'}) is a labelled frame "
-            f"({shortened(wanted, 3)}); views are matched by name, never by number; put the photographs with "
-            f"their cameras into {labelled.dataset}"
+            f"{labelled.name}: none of the scene's views ({shortened(own, 3) or 'it has none'}) is a "
+            f"labelled frame ({shortened(wanted, 3)}); views are matched by name, never by number; put the "
+            f"photographs with their cameras into {labelled.dataset}"
         )
     if missing:
         log.warning("%d labelled frames have no camera: %s", len(missing), shortened(missing))

@@ -17,12 +17,11 @@ from scipy.spatial import cKDTree
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.evaluation.report import FIXED, write_json
-from langsplat_core.evaluation.run import Subject
+from langsplat_core.evaluation.run import Subject, chosen_scenes, open_scene
 from langsplat_core.io.hostile import open_for_reading, read_npy
 from langsplat_core.io.ply_table import fill_columns, iterate_rows, read_ply_header
-from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.engine import LoadEncoder, QueryEngine, no_field
+from langsplat_core.query.engine import LoadEncoder, QueryEngine
 
 ENDING = "_vh_clean_2.labels.ply"
 WANTED = f"expected <scene>/<scene>{ENDING} in it, one scene's folder, or such a file"
@@ -53,21 +52,16 @@ _NOT_IN_15 = ("picture", "refrigerator", "shower curtain", "bathtub")
 _NOT_IN_10 = (*_NOT_IN_15, "cabinet", "counter", "desk", "curtain", "sink")
 
 
-@dataclass(frozen=True)
-class PointProfile:
-    """The constants of the protocol."""
-
-    name: str = "direct-3d"
-    source: str = (
-        "OpenGaussian's task, as VALA and others report it: argmax over the class names per Gaussian, the "
-        "highest of its levels; a vertex takes the nearest Gaussian that has a meaning, since ours do not "
-        "stay on the vertices"
-    )
-    class_sets: tuple[tuple[str, ...], ...] = (
-        tuple(NYU40),
-        tuple(name for name in NYU40 if name not in _NOT_IN_15),
-        tuple(name for name in NYU40 if name not in _NOT_IN_10),
-    )
+CLASS_SETS = (
+    tuple(NYU40),
+    tuple(name for name in NYU40 if name not in _NOT_IN_15),
+    tuple(name for name in NYU40 if name not in _NOT_IN_10),
+)
+SOURCE = (
+    "OpenGaussian's task, as VALA and others report it: argmax over the class names per Gaussian, the "
+    "highest of its levels; a vertex takes the nearest Gaussian that has a meaning, since ours do not stay "
+    "on the vertices"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,9 +83,8 @@ class PointScore:
     points: int  # vertices that are scored
     iou: float  # mean over the present classes
     accuracy: float  # mean over the present classes of the share of their vertices that is right
-    unknown: tuple[
-        str, ...
-    ] = ()  # present classes whose words the encoder was never taught: wrong everywhere
+    # present classes whose words the encoder was never taught: wrong everywhere
+    unknown: tuple[str, ...] = ()
 
 
 def read_scannet(folder: Path) -> dict[str, Path]:
@@ -123,9 +116,7 @@ def read_points(path: Path, name: str) -> LabelledPoints:
     return LabelledPoints(name, positions, labels)
 
 
-def scene_classes(
-    engine: QueryEngine, points: LabelledPoints, profile: PointProfile
-) -> tuple[list[Array], tuple[str, ...]]:
+def scene_classes(engine: QueryEngine, points: LabelledPoints) -> tuple[list[Array], tuple[str, ...]]:
     """Per set of classes (V,) int32 the id that every vertex is given, 0 for none, without a look at the
     labels; and the class names with words that the encoder was never taught."""
     field, gaussians = engine.field, engine.scene.gaussians
@@ -133,14 +124,14 @@ def scene_classes(
     if not len(rows):
         raise InputError("no Gaussian of the scene has a meaning; make its language field again")
     _, nearest = cKDTree(gaussians.means[rows]).query(points.positions)
-    names = sorted({name for names in profile.class_sets for name in names}, key=list(NYU40).index)
+    names = sorted({name for names in CLASS_SETS for name in names}, key=list(NYU40).index)
     unknown = tuple(name for name in names if engine.unknown_words(name))
     values = np.full((len(names), len(rows)), -1.0, np.float32)
     for row, name in enumerate(names):
         if name not in unknown:
             values[row] = engine.relevancy(engine.text_vector(name)).max(0)[rows]
     found = []
-    for chosen in profile.class_sets:
+    for chosen in CLASS_SETS:
         part = [names.index(name) for name in chosen]
         ids = np.array([NYU40[name] for name in chosen], np.int32)
         best = values[part].argmax(0)
@@ -148,12 +139,12 @@ def scene_classes(
     return found, unknown
 
 
-def map_classes(folder: Path, points: LabelledPoints, profile: PointProfile) -> list[Array]:
+def map_classes(folder: Path, points: LabelledPoints) -> list[Array]:
     """Another system's answer, `folder`/<scene>.npy: (V,) whole ids of NYU40 in the vertices' order, or
     (S, V) with one row per set of classes."""
     path = folder / f"{points.name}.npy"
     ids = read_npy(path)
-    count = len(profile.class_sets)
+    count = len(CLASS_SETS)
     if ids.dtype.kind not in "iu" or ids.shape not in ((len(points.labels),), (count, len(points.labels))):
         raise FormatError(
             f"{path}: {ids.dtype} {ids.shape}; expected whole numbers of shape ({len(points.labels)},), one "
@@ -163,11 +154,11 @@ def map_classes(folder: Path, points: LabelledPoints, profile: PointProfile) -> 
 
 
 def score_points(
-    points: LabelledPoints, found: list[Array], profile: PointProfile, unknown: tuple[str, ...] = ()
+    points: LabelledPoints, found: list[Array], unknown: tuple[str, ...] = ()
 ) -> list[PointScore]:
     """One score per set of classes."""
     scores = []
-    for names, ids in zip(profile.class_sets, found, strict=True):
+    for names, ids in zip(CLASS_SETS, found, strict=True):
         counted = np.isin(points.labels, [NYU40[name] for name in names])
         truth, given = points.labels[counted], ids[counted]
         present = [name for name in names if (truth == NYU40[name]).any()]
@@ -190,7 +181,6 @@ def score_points(
 class PointReport:
     """One system on ScanNet."""
 
-    profile: PointProfile
     subject: str
     scores: tuple[PointScore, ...]
 
@@ -204,35 +194,22 @@ def run_scannet(
 ) -> PointReport:
     """Score `subject` on the scenes whose label files are given, or those named by `only`. Raises InputError
     for a scene or maps that do not belong to them."""
-    profile = PointProfile()
-    wrong = [name for name in only if name not in files]
-    if wrong:
-        raise InputError(f"--only {wrong[0]}: no such labelled scene; there are {', '.join(files)}")
-    names = list(only or files)
-    if subject.scene is not None and not subject.scene.is_dir() and len(names) > 1:
-        names = [name for name in names if name == subject.scene.stem]
-        if not names:
-            raise InputError(f"{subject.scene} could be any labelled scene; say which with --only")
+    names = chosen_scenes(list(files), only, subject)
     scores: list[PointScore] = []
     for done, name in enumerate(names):
         points = read_points(files[name], name)
         if subject.maps is not None:
-            scores += score_points(points, map_classes(subject.maps, points, profile), profile)
+            scores += score_points(points, map_classes(subject.maps, points))
         else:
-            assert subject.scene is not None
-            path = subject.scene / f"{name}.ply" if subject.scene.is_dir() else subject.scene
-            scene = load_scene(path)
-            if scene.language is None:
-                raise InputError(f"{path}: {no_field(scene)}")
-            engine = QueryEngine(scene, load_encoder, encoder_id=subject.encoder)
-            found, unknown = scene_classes(engine, points, profile)
-            scores += score_points(points, found, profile, unknown)
+            engine = open_scene(subject, name, load_encoder)
+            found, unknown = scene_classes(engine, points)
+            scores += score_points(points, found, unknown)
         progress("asking classes", (done + 1) / len(names))
-    return PointReport(profile, str(subject.scene or subject.maps), tuple(scores))
+    return PointReport(str(subject.scene or subject.maps), tuple(scores))
 
 
 def point_table(report: PointReport) -> str:
-    """Markdown, and below it what a reader has to know."""
+    """The scores as a Markdown table, with notes below it."""
     lines = ["| | classes | of them present | vertices | mIoU % | mAcc % |", "|---|---|---|---|---|---|"]
     for s in report.scores:
         shares = f"{100 * s.iou:.1f} | {100 * s.accuracy:.1f}"
@@ -244,7 +221,7 @@ def point_table(report: PointReport) -> str:
         )
         total = sum(score.points for score in rows)
         lines.append(f"| macro, mean of scenes | {classes} | | {total} | {shares} |")
-    lines += ["", f"scannet, protocol {report.profile.name}: {report.profile.source}"]
+    lines += ["", f"scannet, protocol direct-3d: {SOURCE}"]
     lines += [f"scored: {report.subject}", FIXED]
     unknown = dict.fromkeys(name for score in report.scores for name in score.unknown)
     if unknown:
@@ -256,4 +233,5 @@ def point_table(report: PointReport) -> str:
 
 def save_point_json(path: Path, report: PointReport) -> None:
     """Write the whole report as JSON."""
-    write_json(path, asdict(report))
+    profile = {"name": "direct-3d", "source": SOURCE, "class_sets": CLASS_SETS}
+    write_json(path, {"profile": profile, **asdict(report)})

@@ -1,15 +1,15 @@
-"""Scores of masks and of peaks."""
+"""Answers scored against labels, query by query, and images of both."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw
-from scipy.ndimage import binary_erosion, uniform_filter
+from scipy.ndimage import binary_erosion
 
 from langsplat_core.arrays import Array
 from langsplat_core.datasets.capture import read_photo
-from langsplat_core.evaluation.labels import Frame, Label, LabelledScene, Size, check_same_picture
+from langsplat_core.evaluation.labels import Frame, Label, LabelledScene, Size, check_same_image
 from langsplat_core.evaluation.profiles import Prediction, Profile, SilhouetteRule
 from langsplat_core.evaluation.sources import Source, file_name
 from langsplat_core.io.files import atomic_path
@@ -23,12 +23,7 @@ def intersection_over_union(found: Array, truth: Array) -> float:
     return float(np.logical_and(found, truth).sum() / union) if union else 1.0
 
 
-def majority(mask: Array, window: int = 7) -> Array:
-    """(H, W) boolean mask after a `window` x `window` majority vote; a tie is False."""
-    return uniform_filter(mask.astype(np.float64), size=window, mode="nearest") > 0.5 + 1e-9
-
-
-# One picture per answer: photograph, mask that was found, the label's outline and boxes, the place.
+# One image per answer: photograph, mask that was found, the label's outline and boxes, the place.
 
 FOUND = np.array([250, 115, 25])  # tint of the mask
 TRUTH = (60, 220, 90)  # the label's outline and boxes
@@ -37,7 +32,7 @@ OPACITY = 0.55
 MAX_MARKS = 100  # of a flat map every pixel is a peak
 
 
-def write_picture(folder: Path, frame: Frame, label: Label, answer: Prediction, truth: Array) -> None:
+def write_image(folder: Path, frame: Frame, label: Label, answer: Prediction, truth: Array) -> None:
     """`folder`/<frame>/<phrase>.png on the scored grid; over black where the photograph is not there."""
     rows, columns = answer.mask.shape
     photo = np.zeros((rows, columns, 3))
@@ -90,10 +85,10 @@ def score_scene(
     pictures: Path | None = None,
     progress: Progress = silent,
 ) -> SceneScores:
-    """Score every query of a scene; `pictures`: a folder for one picture per answer.
+    """Score every query of a scene; `pictures`: a folder for one image per answer.
 
     A frame's answers are complete, cut and all, before any mask of it is drawn. Raises InputError where a map
-    has another shape than the labelled picture.
+    has another shape than the labelled image.
     """
     scores: list[QueryScore] = []
     left_out = list(labelled.left_out)
@@ -111,7 +106,7 @@ def score_scene(
             score = _score(labelled.name, frame, label, answer, truth, profile)
             scores.append(replace(score, trained_on=source.trained_on(frame.name), grid=size))
             if pictures is not None and not isinstance(answer, str):
-                write_picture(pictures / labelled.name, frame, label, answer, truth)
+                write_image(pictures / labelled.name, frame, label, answer, truth)
         progress("asking phrases", (done + 1) / len(labelled.frames), labelled.name)
     return SceneScores(tuple(scores), tuple(left_out))
 
@@ -126,7 +121,7 @@ def _grid(answer: Prediction | str, frame: Frame) -> Size:
     if isinstance(answer, str):
         return frame.size
     rows, columns = answer.mask.shape
-    check_same_picture(frame.name, (columns, rows), frame.size)
+    check_same_image(frame.name, (columns, rows), frame.size)
     return columns, rows
 
 

@@ -1,4 +1,4 @@
-"""Relevancy maps and masks that another system rendered, as files.
+"""What is scored: a scene of ours, or relevancy maps and masks that another system rendered, as files.
 
     <view>/<phrase>.npy                  float (L, H, W) or (H, W) relevancy; L levels, at most three
     <view>/<phrase>.<level>.npy|.png     or one file per level: subpart, part, whole; any of them
@@ -9,16 +9,15 @@ phrase have one size; it need not be the labels', whose masks are then brought t
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from langsplat_core.arrays import Array
 from langsplat_core.config import PictureConfig
 from langsplat_core.errors import FormatError
-from langsplat_core.evaluation.labels import Size, check_same_picture, read_grey
+from langsplat_core.evaluation.labels import Size, check_same_image, read_grey
 from langsplat_core.evaluation.profiles import (
     MapRule,
     OwnRule,
@@ -33,17 +32,10 @@ from langsplat_core.io.hostile import opened, read_npy
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
-from langsplat_core.raster.protocol import Rasterizer, View
+from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.protocol import View
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import LEVELS, Camera
-
-
-@dataclass(frozen=True, eq=False)
-class RelevancyMaps:
-    """One phrase in one view."""
-
-    maps: Array  # (L, H, W) float64, finite
-    levels: tuple[int, ...]  # (L,) indices into LEVELS
 
 
 def file_name(phrase: str) -> str:
@@ -51,14 +43,15 @@ def file_name(phrase: str) -> str:
     return phrase.replace("/", "_")
 
 
-def read_relevancy(folder: Path, phrase: str) -> RelevancyMaps | None:
-    """The maps of `phrase` in a view's `folder`; None where there is none. FormatError for a damaged one."""
+def read_relevancy(folder: Path, phrase: str) -> tuple[Array, tuple[int, ...]] | None:
+    """The (L, H, W) float64 maps of `phrase` in a view's `folder` and their levels, indices into LEVELS; None
+    where there is none. FormatError for a damaged one."""
     name = file_name(phrase)
     whole = _existing(folder, name)
     if whole is not None:
         maps = _read(whole)
         maps = maps[None] if maps.ndim == 2 else maps
-        return RelevancyMaps(maps, tuple(range(len(maps))))
+        return maps, tuple(range(len(maps)))
     files = {level: _existing(folder, f"{name}.{word}") for level, word in enumerate(LEVELS)}
     there = {level: path for level, path in files.items() if path is not None}
     if not there:
@@ -70,7 +63,7 @@ def read_relevancy(folder: Path, phrase: str) -> RelevancyMaps | None:
             raise FormatError(
                 f"{path}: shape {values.shape}; the levels of one phrase are (H, W) of one size"
             )
-    return RelevancyMaps(np.stack(list(singles.values())), tuple(there))
+    return np.stack(list(singles.values())), tuple(there)
 
 
 def _existing(folder: Path, name: str) -> Path | None:
@@ -78,7 +71,7 @@ def _existing(folder: Path, name: str) -> Path | None:
 
 
 def _read(path: Path) -> Array:
-    values = read_npy(path) if path.suffix == ".npy" else _picture(path)
+    values = read_npy(path) if path.suffix == ".npy" else _image(path)
     if values.ndim not in (2, 3) or 0 in values.shape or (values.ndim == 3 and len(values) > len(LEVELS)):
         raise FormatError(
             f"{path}: shape {values.shape}; expected (H, W), or (L, H, W) with at most 3 levels"
@@ -88,12 +81,12 @@ def _read(path: Path) -> Array:
     return values.astype(np.float64)
 
 
-def _picture(path: Path) -> Array:
+def _image(path: Path) -> Array:
     """(H, W) in [0, 1]."""
-    with opened(path) as picture:
-        if picture.mode.startswith("I"):
-            return np.asarray(picture, np.float64) / 65535
-        return np.asarray(picture.convert("L"), np.float64) / 255
+    with opened(path) as image:
+        if image.mode.startswith("I"):
+            return np.asarray(image, np.float64) / 65535
+        return np.asarray(image.convert("L"), np.float64) / 255
 
 
 # Who answers: a scene of ours, or a folder of maps that another system rendered. Neither sees a label.
@@ -103,35 +96,26 @@ NO_MAP = "no map"
 TOGETHER = 10  # phrases splatted in one pass, three channels each
 
 
-class Source(Protocol):
-    """Answers phrases in views."""
-
-    def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
-        """phrase -> the answer in the view `frame`, preferably drawn at `size`; or why there is none."""
-
-    def trained_on(self, frame: str) -> bool | None:
-        """Return True where the view was trained on, False where it was not, None where that is not known."""
-
-
 @dataclass(frozen=True, eq=False)
 class SceneSource:
     """A scene of ours, drawn from the labelled views."""
 
     engine: QueryEngine
-    rasterizer: Rasterizer
     cameras: Mapping[str, Camera]  # by name without extension
     trained: frozenset[str] | None  # names of the training views; None: they are not the dataset's names
     profile: Profile
     paper_order: bool = False  # blend latents and decode every pixel, instead of blending relevancies
 
     def trained_on(self, frame: str) -> bool | None:
+        """Return True where the view was trained on, False where it was not, None where that is not known."""
         return None if self.trained is None else frame in self.trained
 
     def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
+        """phrase -> the answer in the view `frame`, drawn at `size`; or why there is none."""
         if frame not in self.cameras:
             return dict.fromkeys(phrases, NO_VIEW)
         camera = self.cameras[frame]
-        check_same_picture(frame, (camera.width, camera.height), size)
+        check_same_image(frame, (camera.width, camera.height), size)
         camera = camera.resized(*size)
         found: dict[str, Prediction | str] = {}
         for phrase in phrases:
@@ -146,7 +130,7 @@ class SceneSource:
 
     def _predictions(self, camera: Camera, phrases: Sequence[str]) -> list[Prediction]:
         rule, scene = self.profile.rule, self.engine.scene
-        view = self.rasterizer.view(scene.gaussians, camera, scene.raster_settings())
+        view = load_rasterizer("cpu").view(scene.gaussians, camera, scene.raster_settings())
         if isinstance(rule, MapRule) and self.paper_order:
             return [read_maps(maps, rule) for maps in self._decoded(view, phrases)]
         results = self.engine.run_many(phrases)
@@ -171,7 +155,7 @@ class SceneSource:
         if not result.members.any():
             return np.zeros((camera.height, camera.width), bool)
         chosen = scene.gaussians.take(result.members)
-        view = self.rasterizer.view(chosen, camera, scene.raster_settings())
+        view = load_rasterizer("cpu").view(chosen, camera, scene.raster_settings())
         drawn = splat_colours(view, chosen, camera)
         return read_silhouette(drawn.colours, drawn.alpha, rule)
 
@@ -187,6 +171,7 @@ class MapSource:
         return None
 
     def answers(self, frame: str, size: Size, phrases: Sequence[str]) -> Mapping[str, Prediction | str]:
+        """phrase -> the answer by its map in the view `frame`, whatever its size; or why there is none."""
         return {phrase: self._answer(self.folder / frame, phrase) for phrase in phrases}
 
     def _answer(self, folder: Path, phrase: str) -> Prediction | str:
@@ -196,7 +181,9 @@ class MapSource:
         found = read_relevancy(folder, phrase)
         if found is None:
             return NO_MAP
-        answer = read_maps(found.maps, self.rule)
-        return Prediction(
-            answer.mask, None if answer.level is None else found.levels[answer.level], answer.peaks
-        )
+        maps, levels = found
+        answer = read_maps(maps, self.rule)
+        return replace(answer, level=levels[answer.level or 0])
+
+
+Source = SceneSource | MapSource

@@ -5,7 +5,7 @@ phrase is found is judged by what everyday phrases fit in the same scene, and ho
 region.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,7 +18,7 @@ from langsplat_core.config import LevelChoice
 from langsplat_core.query.grammar import Named, named
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.surface import SMALLEST, Regions, Surface
-from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField, Odds
+from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, Scale, relevancy_of
 
 Triple = tuple[float, float, float]  # one number a level
@@ -56,7 +56,7 @@ class QueryResult:
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict for people."""
+        """The verdict in words: "weak match" is what may be there, but was not found."""
         if self.found:
             return "found"
         if self.probability is not None:
@@ -75,8 +75,8 @@ class QueryResult:
 
 
 def recut(result: QueryResult, cut: float) -> QueryResult:
-    """The same answer with everything as a member whose relevancy, that of its region where it has one, is
-    at least `cut`. Place, box and verdict stay: they are of the best, wherever the answer ends."""
+    """Return the answer with everything as a member whose relevancy (of its region, where it has one) is at
+    least `cut`. Place, box and verdict stay: they are of the best, wherever the answer ends."""
     return replace(result, own_cut=cut, members=result.even >= np.float32(cut))
 
 
@@ -118,19 +118,14 @@ class Bar:
 
 
 Bars = tuple[Bar, Bar, Bar, Bar]  # of each level, and of the better one of the finer two
+Chance = tuple[Array, ...]  # (R, V) float32 of each level: fits of V everyday phrases at R regions
 
 
-@dataclass(frozen=True, eq=False)
-class Chance:
-    """Fits of V everyday phrases at all regions of a scene."""
-
-    fits: tuple[Array, Array, Array]  # (R, V) float32 of each level
-
-    def bars(self, rows: tuple[Array, Array, Array] | None = None) -> Bars:
-        """The bars of the scene, or of some regions `rows` of each level alone."""
-        chosen = [f if rows is None else f[rows[level]] for level, f in enumerate(self.fits)]
-        subpart, part, whole = (fits.max(0, initial=-np.inf) for fits in chosen)
-        return _bar(subpart), _bar(part), _bar(whole), _bar(np.maximum(subpart, part))
+def bars(chance: Chance, rows: Sequence[Array] | None = None) -> Bars:
+    """The bars of a scene, or of some regions `rows` of each level alone."""
+    chosen = [fits if rows is None else fits[rows[level]] for level, fits in enumerate(chance)]
+    subpart, part, whole = (fits.max(0, initial=-np.inf) for fits in chosen)
+    return _bar(subpart), _bar(part), _bar(whole), _bar(np.maximum(subpart, part))
 
 
 def _bar(best: Array) -> Bar:
@@ -167,21 +162,16 @@ def chance_in(field: LanguageField, surface: Surface, regions: Regions, scale: S
             everyday = cosines[:, len(scale.canonical) :]
             means += shares[:, part] @ relevancy_of(everyday, zero[:, None], rate[:, None])
         means /= regions.totals[level][:, None]
-        fits.append(_solid(scale.fit(means).astype(np.float32), regions.sizes[level]))
-    return Chance((fits[0], fits[1], fits[2]))
+        own, solid = scale.fit(means).astype(np.float32), regions.sizes[level] >= SMALLEST
+        fits.append(np.where(solid[:, None], own, -np.inf) if solid.any() else own)  # as in `_best`
+    return tuple(fits)
 
 
-def _solid(fits: Array, sizes: Array) -> Array:
-    """Crumbs do not count where there are others, as in `extent`."""
-    solid = sizes >= SMALLEST
-    return np.where(solid[:, None], fits, -np.inf) if solid.any() else fits
-
-
-# Extent: the level of an answer, the regions that are it, and how good the best one is.
+# The answer by regions: its level, the regions that are it, and how good the best one is.
 #
-# Everything is judged by the fit of a region, in spreads of what phrases fit by chance (`chance`), so that
-# one rule serves all encoders. The numbers were chosen on rooms 201 to 203, with the bundled encoder and
-# with the geometry of CLIP, never on rooms that measure.
+# Everything is judged by the fit of a region, in spreads of what phrases fit by chance, so that one rule
+# serves all encoders. The numbers were chosen on rooms 201 to 203, with the bundled encoder and with the
+# geometry of CLIP, never on rooms that measure.
 
 # Spreads that each level is given before the best is chosen, by what a phrase names. A thing is one whole,
 # whatever some part of it looks like; a part is rather too fine than too coarse.
@@ -192,39 +182,6 @@ ADVANTAGE: Mapping[Named, tuple[float, float, float]] = {
 }
 REACH = 0.4  # of the best fit: what fits less by no more than this, and by `NEAREST` to `FARTHEST`, is it too
 NEAREST, FARTHEST = 0.15, 1.0  # spreads
-
-
-@dataclass(frozen=True, eq=False)
-class Extent:
-    """The part of a surface that answers a phrase: some of the R regions of a level."""
-
-    level: int  # index into LEVELS
-    fits: Fits  # of the best region of each level
-    peaks: Triple  # relevancy of the best region of each level
-    even: Array  # (R,) float32 relevancy, the same all over a region
-    inside: Array  # (R,) bool
-
-
-def find_extent(
-    relevancy: Array,
-    regions: Regions,
-    scale: Scale,
-    level: LevelChoice = "auto",
-    named: Named = "thing",
-) -> Extent:
-    """The extent by the (3, N) relevancy of a phrase. level: "auto", which depends on what is `named`, or the
-    one that is wanted."""
-    means = regions.means(relevancy)
-    peaks = [_best(values, sizes) for values, sizes in zip(means, regions.sizes, strict=True)]
-    best = scale.fit(np.array(peaks))
-    chosen = _level(best, named) if level == "auto" else LEVELS.index(level)
-    return Extent(
-        level=chosen,
-        fits=triple(best),
-        peaks=triple(peaks),
-        even=means[chosen].astype(np.float32),
-        inside=scale.fit(means[chosen]) >= lowest(float(best[chosen])),
-    )
 
 
 def lowest(best: float, share: float = 1.0) -> float:
@@ -245,9 +202,6 @@ def _level(best: Array, named: Named) -> int:
     return int(np.flatnonzero(given == given.max())[-1])
 
 
-# The answer by regions.
-
-
 def by_regions(
     phrase: str,
     relevancy: Array,
@@ -258,44 +212,40 @@ def by_regions(
     calibration: Calibration | None,
     level: LevelChoice,
 ) -> QueryResult:
-    """The answer of whole regions that fit nearly as well as the best one (`find_extent`)."""
-    extent = find_extent(relevancy, regions, scale, level, named(phrase))
-    even = regions.spread(extent.level, extent.even, relevancy[extent.level])
-    peak = extent.peaks[extent.level]
-    lowest = float(extent.even[extent.inside].min(initial=1.0))
-    odds, probability, above = _odds(phrase, calibration), None, None
-    if odds is None:
-        above = excess(extent.fits, bars, named(phrase), level)
+    """The answer of whole regions that fit nearly as well as the best one."""
+    kind, means = named(phrase), regions.means(relevancy)
+    peaks = triple(_best(values, sizes) for values, sizes in zip(means, regions.sizes, strict=True))
+    best = scale.fit(np.array(peaks))
+    chosen = _level(best, kind) if level == "auto" else LEVELS.index(level)
+    inside = scale.fit(means[chosen]) >= lowest(float(best[chosen]))  # (R,) bool
+    values, peak, fits = means[chosen].astype(np.float32), peaks[chosen], triple(best)
+    probability = above = None
+    if calibration is None:
+        above = excess(fits, bars, kind, level)
         found = above >= 0
-    else:  # it may be there, but what the wanted level shows is nearer to other phrases
-        fits = level == "auto" or extent.fits[LEVELS.index(level)] >= 0
-        probability = odds.probability(extent.fits)
-        found = fits and probability >= odds.found
-    solid = np.where(extent.even > np.float32(peak), 0, extent.even)  # what is above the best is a crumb
-    reached = np.nextafter(np.float32(lowest), np.float32(0))
-    place, box = locate(surface, solid[regions.of[extent.level]], reached)
+    else:  # a part that is asked for alone answers at the finer levels, where fits are others
+        odds = calibration.thing if kind == "thing" else calibration.part
+        probability = odds.probability(fits)
+        # It may be there, but what the wanted level shows is nearer to other phrases.
+        found = (level == "auto" or fits[chosen] >= 0) and probability >= odds.found
+    solid = np.where(values > np.float32(peak), 0, values)  # what is above the best is a crumb
+    reached = np.nextafter(values[inside].min(initial=np.float32(1)), np.float32(0))
+    place, box = locate(surface, solid[regions.of[chosen]], reached)
     return QueryResult(
         phrase=phrase,
-        level=extent.level,
-        scores=extent.peaks,
+        level=chosen,
+        scores=peaks,
         relevancy=relevancy,
-        even=even,
+        even=regions.spread(chosen, values, relevancy[chosen]),
         peak=peak,
-        fits=extent.fits,
+        fits=fits,
         probability=probability,
         excess=above,
         found=found,
-        members=regions.spread(extent.level, extent.inside, np.zeros(relevancy.shape[1], bool)),
+        members=regions.spread(chosen, inside, np.zeros(relevancy.shape[1], bool)),
         place=place,
         box=box,
     )
-
-
-def _odds(phrase: str, calibration: Calibration | None) -> Odds | None:
-    """The odds for a phrase: a part asked for alone answers at the finer levels, where fits are others."""
-    if calibration is None:
-        return None
-    return calibration.thing if named(phrase) == "thing" else calibration.part
 
 
 # The answer as published, by the peak alone.

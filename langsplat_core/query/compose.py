@@ -6,7 +6,6 @@ How things stand to each other is measured in their own sizes, so that a scene n
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -224,8 +223,6 @@ def _measure(kind: Extreme, thing: Body, anchors: list[Body], seen_by: Viewpoint
 # The relevancy of a combined answer is zero wherever it does not hold, and the same at every level where it
 # has parts of several; its peak is that of its weakest necessary part.
 
-Combination = Literal["union", "intersection", "difference"]
-
 WHOLE = LEVELS.index("whole")
 SHARE = 0.6  # of the way from what is typical of a thing's least fitting surface to the part's peak on it
 LEAST = 0.05  # quantile of a part's relevancy on its thing that stands for "not this part"
@@ -338,26 +335,6 @@ def restricted(answer: QueryResult, keep: Array, needed: QueryResult) -> QueryRe
         found=bool(members.any() and answer.found and needed.found),
         members=members,
     )
-
-
-def combine(answers: Sequence[QueryResult], how: Combination) -> QueryResult:
-    """One or more answers in one, as "and", "without" and what is in all of them: the same members, without a
-    place. Raises InputError where one was not found, or nothing is left."""
-    for answer in answers:
-        if not answer.found or not answer.members.any():
-            raise InputError(
-                f"'{answer.phrase}' was not found (score {answer.peak:.3f}): nothing to select; ask in other "
-                "words, or at another --level"
-            )
-    result, *others = answers
-    if how == "union":
-        return joined(answers, all_needed=True) if others else result
-    for other in others:
-        result = without(result, other) if how == "difference" else restricted(result, other.members, other)
-    if not result.members.any():
-        phrases = ", ".join(f"'{answer.phrase}'" for answer in answers)
-        raise InputError(f"the {how} of {phrases} is empty: nothing to select; try another --combine")
-    return result
 
 
 def placed(surface: Surface, answer: QueryResult) -> QueryResult:

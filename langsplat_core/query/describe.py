@@ -1,9 +1,9 @@
-"""Reverse queries: which words of a vocabulary say best what a vector of CLIP's space means.
+"""Reverse queries: words for a place, the inventory of a scene, and suggestions of what to ask.
 
     p(word | x)  =  softmax over words of  scale * (cos(x, word) - hub(word) / 2)
 
 The hub of a word is its mean cosine with the meanings of the scene that are nearest to it. Some words lie
-near every picture and would be the answer everywhere ("hubs"); what is left of the cosine says how much
+near every image and would be the answer everywhere ("hubs"); what is left of the cosine says how much
 better a word fits here than where it fits anyway. It is cross-domain similarity local scaling ("Word
 translation without parallel data", Conneau et al. 2018, equation 3): 2 cos(x, w) - hub(w) - hub(x), halved,
 and without hub(x), which all words have in common.
@@ -152,13 +152,6 @@ def hubs(vectors: Array, bank: Array) -> Array:
     return found
 
 
-def certain(words: WordScores, codec: Codec, latents: Array, weights: Array) -> Word | None:
-    """The attribute of (M, d) latents with a meaning, weighted by (M,), where it is probable enough."""
-    shares = words.mixture(codec, latents, weights)
-    best = int(shares.argmax())
-    return Word(words.phrases[best], float(shares[best])) if shares[best] >= CERTAIN else None
-
-
 # The inventory of a scene: every word that is true in it, where, how sure.
 #
 # Every meaning of the scene has its best word, and so every Gaussian. Words that cover enough of the surface
@@ -201,19 +194,6 @@ class Entry:
 
 
 @dataclass(frozen=True, eq=False)
-class Meanings:
-    """The M different meanings of a field, and who has which."""
-
-    latents: Array  # (M, d)
-    of: Array  # (3, N) int64 number of each Gaussian's meaning, -1 for none
-
-    def surface(self, level: int, areas: Array) -> Array:
-        """(N,) areas -> (M,) the area of each meaning at a level."""
-        has = self.of[level] >= 0
-        return np.bincount(self.of[level][has], areas[has], minlength=len(self.latents))
-
-
-@dataclass(frozen=True, eq=False)
 class _Claim:
     """A group of words that claim the same meanings at one level."""
 
@@ -223,22 +203,18 @@ class _Claim:
     probability: float
 
 
-def field_meanings(field: LanguageField) -> Meanings:
-    """The distinct latents of the field's Gaussians."""
-    known = field.known
-    of = np.full(known.shape, -1, np.int64)
-    latents, of[known] = field.codec.unique(field.latents[known])
-    return Meanings(latents, of)
-
-
 def _claims(
-    field: LanguageField, held: Meanings, words: WordScores, level: int, areas: Array
+    codec: Codec, latents: Array, of: Array, words: WordScores, level: int, areas: Array
 ) -> Iterator[_Claim]:
-    """Groups of words at a level, those that cover most first."""
-    best, shares = words.best(field.codec, held.latents, RUNNERS_UP)
+    """Groups of words at a level, those that cover most first.
+
+    latents: (M, d) the distinct ones of the field; of: (N,) int64 number of each Gaussian's, -1 for none.
+    """
+    best, shares = words.best(codec, latents, RUNNERS_UP)
     if best.size == 0:  # no words, or nothing that means anything
         return
-    surface = held.surface(level, areas)
+    has = of >= 0
+    surface = np.bincount(of[has], areas[has], minlength=len(latents))
     least = LEAST_SHARE * max(float(areas.sum()), 1e-300)
     mass = np.bincount(best.ravel(), (surface[:, None] * shares).ravel())
     order = np.argsort(-mass, kind="stable")[:MOST]
@@ -255,8 +231,7 @@ def _claims(
         probability = float(weight @ names[winners][:, group].sum(1)) / float(weight.sum())
         if probability < LIKELY:
             continue
-        of = held.of[level]
-        rows = np.flatnonzero((of >= 0) & winners[np.maximum(of, 0)])
+        rows = np.flatnonzero(has & winners[np.maximum(of, 0)])
         yield _Claim(level, tuple(words.phrases[number] for number in numbers), rows, probability)
 
 
@@ -294,11 +269,11 @@ class Words:
     words: tuple[Word, ...]  # the most probable first; none where nothing is known
     other: float  # probability that no word of the vocabulary fits
     known: float  # share of the place that has a meaning at this level, in [0, 1]
-    colour: Word | None = None  # where one is certain enough, see `words.certain`
+    colour: Word | None = None  # where one is `CERTAIN` enough
     material: Word | None = None
 
 
-Levels = tuple[Words, Words, Words]  # of subpart, part and whole
+Levels = tuple[Words, ...]  # of subpart, part and whole
 
 
 class Describer:
@@ -318,7 +293,7 @@ class Describer:
         parts = () if vocabulary is not None else bundled_vocabulary("parts")
         phrases = (*things, *parts)
         field = engine.field
-        self.engine = engine
+        self.engine, self._known = engine, engine.field.known
         known, vectors = engine.known_vectors(phrases, progress)
         self.left_out: tuple[str, ...] = tuple(sorted(set(phrases) - set(known)))
         if not known:
@@ -329,64 +304,35 @@ class Describer:
         whole = np.isin(known, things)
         every = build_words(field, known, vectors)
         self.words: tuple[WordScores, WordScores, WordScores] = (every, every, every.take(whole))
-        self._attributes = [self._attribute(name, progress) for name in ATTRIBUTES]
-
-    def _attribute(self, name: Bundled, progress: Progress) -> WordScores | None:
-        known, vectors = self.engine.known_vectors(bundled_vocabulary(name), progress)
-        return build_attributes(self.engine.field, known, vectors) if known else None
+        taught = [engine.known_vectors(bundled_vocabulary(name), progress) for name in ATTRIBUTES]
+        self._attributes = [build_attributes(field, *pair) if pair[0] else None for pair in taught]
 
     @cached_property
     def areas(self) -> Array:
         """(N,) float64 surface of every Gaussian, see `surface_areas`."""
         return surface_areas(self.engine.scene.gaussians)
 
-    @cached_property
-    def _known(self) -> Array:
-        return self.engine.field.known
-
     def at_gaussians(self, rows: Array, weights: Array | None = None, top: int = 5) -> Levels:
-        """Words for the Gaussians at `rows` (indices, or a boolean mask of length N) taken together.
+        """Words for the Gaussians at `rows` (M indices, or a boolean mask of length N) taken together.
 
         weights: (M,) >= 0, how much each counts; by default its surface.
-        Raises InputError for a number that no Gaussian has.
         """
-        count = len(self.engine.field)
-        numbers = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows, np.int64)
-        outside = numbers[(numbers < 0) | (numbers >= count)]
-        if len(outside):
-            worst = outside[0]
-            raise InputError(f"Gaussian {worst}: the scene has Gaussians 0 to {count - 1}")
-        counted = self.areas[numbers] if weights is None else np.asarray(weights, np.float64)
+        rows = np.flatnonzero(rows) if rows.dtype == bool else rows
+        counted = self.areas[rows] if weights is None else np.asarray(weights, np.float64)
         if weights is None and not counted.any():  # without any surface they still mean something
-            counted = np.ones(len(numbers))
-        subpart, part, whole = (self._at_level(level, numbers, counted, top) for level in range(len(LEVELS)))
-        return subpart, part, whole
-
-    def at_pixel(
-        self, rasterizer: LiftingRasterizer, camera: Camera, pixel: tuple[int, int], top: int = 5
-    ) -> Levels:
-        """Words for what `camera` sees at `pixel` (column, row), see `look_at_pixel`. A pixel that is mostly
-        empty has none.
-
-        Raises InputError for a pixel outside the image.
-        """
-        column, row = pixel
-        if not (0 <= column < camera.width and 0 <= row < camera.height):
-            raise InputError(
-                f"pixel {column} {row}: the image has columns 0 to {camera.width - 1} and rows 0 to "
-                f"{camera.height - 1}"
-            )
-        found = look_at_pixel(rasterizer, self, camera, pixel, top=top)
-        return self.at_gaussians(np.zeros(0, np.int64)) if found is None else found.words
+            counted = np.ones(len(rows))
+        return tuple(self._at_level(level, rows, counted, top) for level in range(len(LEVELS)))
 
     def inventory(self, progress: Progress = silent) -> list[Entry]:
         """Every word that is true in the scene, whole things first, then by surface. A word is listed once,
         at the coarsest level where it is claimed and found."""
-        held = field_meanings(self.engine.field)
+        field = self.engine.field
+        of = np.full(self._known.shape, -1, np.int64)
+        latents, of[self._known] = field.codec.unique(field.latents[self._known])
         entries: list[Entry] = []
         named: set[str] = set()
         for level in reversed(range(len(LEVELS))):
-            claims = list(_claims(self.engine.field, held, self.words[level], level, self.areas))
+            claims = list(_claims(field.codec, latents, of[level], self.words[level], level, self.areas))
             for done, claim in enumerate(claims):
                 progress("checking words", done / len(claims), LEVELS[level])
                 if named.isdisjoint(claim.phrases):
@@ -436,12 +382,16 @@ class Describer:
         )
 
     def _looks(self, latents: Array, weights: Array) -> tuple[Word | None, Word | None]:
-        """Colour and material of (M, d) latents with a meaning, weighted by (M,)."""
-        codec = self.engine.field.codec
-        colour, material = (
-            None if words is None else certain(words, codec, latents, weights) for words in self._attributes
-        )
+        """Colour and material of (M, d) latents with a meaning, weighted by (M,), where one is certain."""
+        colour, material = (self._certain(words, latents, weights) for words in self._attributes)
         return colour, material
+
+    def _certain(self, words: WordScores | None, latents: Array, weights: Array) -> Word | None:
+        if words is None:
+            return None
+        shares = words.mixture(self.engine.field.codec, latents, weights)
+        best = int(shares.argmax())
+        return Word(words.phrases[best], float(shares[best])) if shares[best] >= CERTAIN else None
 
     def _at_level(self, level: int, rows: Array, weights: Array, top: int) -> Words:
         field = self.engine.field

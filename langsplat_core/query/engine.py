@@ -18,6 +18,7 @@ from langsplat_core.query.answers import (
     Bars,
     Chance,
     QueryResult,
+    bars,
     by_peak,
     by_regions,
     chance_in,
@@ -217,14 +218,13 @@ class QueryEngine:
 
     @cached_property
     def _bars(self) -> Bars | None:
-        return None if self.chance is None else self.chance.bars()
+        return None if self.chance is None else bars(self.chance)
 
     def chance_among(self, members: Array) -> Bars:
         """The best fits of everyday phrases at the regions of some Gaussians, (N,) bool."""
         assert self.chance is not None
         everywhere = self.regions.everywhere[:, members]
-        subpart, part, whole = (np.unique(row[row >= 0]) for row in everywhere)
-        return self.chance.bars((subpart, part, whole))
+        return bars(self.chance, [np.unique(row[row >= 0]) for row in everywhere])
 
     def unknown_words(self, phrase: str) -> tuple[str, ...]:
         """Words for which `phrase` cannot be asked; none where the phrasebook has it. EncoderError as
@@ -251,7 +251,10 @@ class QueryEngine:
         if fresh:
             encoder = self.load_encoder(progress)
             with self._turn:
-                _check_words(encoder, fresh)
+                unknown = dict.fromkeys(word for key in fresh for word in encoder.unknown_words(key))
+                if unknown:
+                    near = {word: encoder.near_words(word) for word in unknown}
+                    raise UnknownWordError(near, "use other words, or a scene made with OpenCLIP weights")
                 self._encode(encoder, fresh)
         return self._vectors(keys)
 
@@ -366,10 +369,3 @@ class QueryEngine:
 
 def _enough(everyday: Array | None) -> Array | None:
     return None if everyday is None or len(everyday) < FEWEST else everyday
-
-
-def _check_words(encoder: TextEncoder, keys: Iterable[str]) -> None:
-    unknown = dict.fromkeys(word for key in keys for word in encoder.unknown_words(key))
-    if unknown:
-        near = {word: encoder.near_words(word) for word in unknown}
-        raise UnknownWordError(near, "use other words, or a scene made with OpenCLIP weights")

@@ -235,9 +235,12 @@ def check_names(words: Sequence[str]) -> None:
 
 MAX_CHARACTERS = 400
 MAX_ATOMS = 12  # each is asked for itself
-_SUPERLATIVES: dict[str, Extreme] = {
-    "biggest": "biggest", "largest": "biggest", "smallest": "smallest", "tiniest": "smallest",
+_DISTANCES: dict[str, Literal["nearest", "farthest"]] = {
     "nearest": "nearest", "closest": "nearest", "farthest": "farthest", "furthest": "farthest",
+}  # fmt: skip
+_SUPERLATIVES: dict[str, Extreme] = {
+    **_DISTANCES,
+    "biggest": "biggest", "largest": "biggest", "smallest": "smallest", "tiniest": "smallest",
     "highest": "highest", "topmost": "highest", "uppermost": "highest", "lowest": "lowest",
     "bottommost": "lowest", "leftmost": "leftmost", "rightmost": "rightmost",
 }  # fmt: skip
@@ -251,14 +254,9 @@ _SIDES: dict[str, Side] = {
     "above": "above", "over": "above", "below": "below", "under": "below", "underneath": "below",
     "beneath": "below", "behind": "behind", "in back of": "behind", "in front of": "in front of",
 }  # fmt: skip
-_PREPOSITIONS: dict[tuple[str, ...], Side | Extreme | Literal["of"]] = {
+_PREPOSITIONS: dict[tuple[str, ...], Side | Literal["nearest", "farthest", "of"]] = {
     ("of",): "of",
-    **{
-        (word, to): kind
-        for word, kind in _SUPERLATIVES.items()
-        if kind in ("nearest", "farthest")
-        for to in ("to", "from")
-    },
+    **{(word, to): kind for word, kind in _DISTANCES.items() for to in ("to", "from")},
     **{tuple(text.split()): kind for text, kind in _SIDES.items()},
 }
 _EMPTY = STOP_WORDS | ADJECTIVES
@@ -385,21 +383,17 @@ def _related(tokens: list[str]) -> Tree:
             before, after = tokens[:at], tokens[at + length :]
             named = _names(before) or (kind == "of" and is_part(before[-1]))
             if kind and named and _names(after) and not (kind == "of" and _holds(before)):
-                return _relate(kind, _thing(before), _clause(after))
+                what, anchor = _thing(before), _clause(after)
+                if kind == "of":
+                    return Inside(what, anchor)
+                if kind == "nearest" or kind == "farthest":
+                    return Superlative(kind, what, anchor)
+                return Relation(kind, what, anchor)
     return _thing(tokens)
 
 
 def _holds(tokens: list[str]) -> bool:
     return is_measure(tokens[-1]) and only(_EMPTY, tokens[:-1])
-
-
-def _relate(kind: Side | Extreme | Literal["of"], what: Tree, anchor: Tree) -> Tree:
-    if kind == "of":
-        return Inside(what, anchor)
-    if kind == "nearest" or kind == "farthest":
-        return Superlative(kind, what, anchor)
-    side = next(side for side in SIDES if side == kind)
-    return Relation(side, what, anchor)
 
 
 def _thing(tokens: list[str]) -> Tree:

@@ -1,6 +1,5 @@
 """Instances of an answer: its Gaussians, taken apart where the surface is, with boxes, scores and hulls."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -129,7 +128,7 @@ class Instance:
 
     @property
     def count(self) -> int:
-        """Count of its Gaussians."""
+        """Number of its Gaussians."""
         return len(self.members)
 
     @cached_property
@@ -139,7 +138,7 @@ class Instance:
 
     @cached_property
     def oriented(self) -> OrientedBox:
-        """Along its own axes, likewise."""
+        """Box along its own axes, between the same quantiles."""
         return oriented_box(self.points)
 
     @property
@@ -227,11 +226,6 @@ class Mesh:
     vertices: Array  # (V, 3) float64 world units
     triangles: Array  # (T, 3) int32 numbers of vertices, counter-clockwise seen from outside
     colour: Array  # (3,) display values in [0, 1], of the whole
-
-
-def hulls(things: Sequence[Instance], gaussians: Gaussians, colours: Array, name: str) -> tuple[Mesh, ...]:
-    """One hull around each, named `name` and its number from 1 on. Arguments and errors as of `hull`."""
-    return tuple(hull(thing, gaussians, colours, f"{name} {k}") for k, thing in enumerate(things, 1))
 
 
 def hull(instance: Instance, gaussians: Gaussians, colours: Array, name: str) -> Mesh:

@@ -7,8 +7,6 @@ matrix-vector product, and every Gaussian a bilinear interpolation at a place co
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -25,73 +23,37 @@ TOGETHER = 16  # phrases compared with every latent at a time: 4 bytes each per 
 CHUNK = 16_384  # latents that are compared with texts at a time
 
 
-class Lookup(Protocol):
-    """Everything about a language field that does not depend on the phrase."""
-
-    def relevancies(self, phrases: Array) -> Iterator[Array]:
-        """(Q, D) unit phrase vectors -> of each in turn (3 N,) float32 relevancy; 0 where a Gaussian has no
-        meaning. What can be computed for all phrases together is."""
-
-
-def build_lookup(field: LanguageField, scale: Scale, exact: bool = False) -> Lookup:
-    """The fastest lookup for `field`; with `exact` none that interpolates, to measure a table by."""
-    if field.codec.spherical and not exact:
-        latents = np.where(field.known[..., None], field.latents, 0)
-        return build_table(field.codec, latents.reshape(-1, 3), scale)
-    return LatentLookup(field, scale)
-
-
-class Vectors:
-    """K unit vectors of meanings, with the zero and rate of relevancy at each."""
-
-    def __init__(self, vectors: Array, scale: Scale) -> None:
-        self.vectors = vectors  # (K, D) float32
-        self._zero, self._rate = scale.of(vectors @ scale.texts.T)
-
-    def relevancies(self, phrases: Array) -> Array:
-        """(Q, D) unit phrase vectors -> (K, Q) in (0, 1)."""
-        return relevancy_of(self.vectors @ phrases.T, self._zero[:, None], self._rate[:, None])
-
-
-@dataclass(frozen=True, eq=False)
 class SphereTable:
-    """Decoded vectors at the U nodes of R x R that are needed, and where M latents lie between them."""
+    """Unit latents of three numbers: decoded once at the nodes of a grid, then interpolated between them."""
 
-    used: Array  # (U,) int64 index of each node in the grid, row-major
-    nodes: Vectors  # of what they decode to
-    corner: Array  # (M,) int32 index of the lower left node; -1 for a latent without meaning
-    fraction: Array  # (M, 2) float32 position inside the cell, in [0, 1]
-    resolution: int
+    def __init__(self, codec: Codec, latents: Array, scale: Scale, resolution: int = RESOLUTION) -> None:
+        """latents: (M, 3) float; those of no length have no meaning."""
+        known = codec.known(latents)
+        safe = np.where(known[:, None], latents, (0.0, 0.0, 1.0)).astype(np.float64)
+        position = sphere_to_octahedral(safe) * (resolution - 1)
+        cell = np.clip(np.floor(position), 0, resolution - 2).astype(np.int64)
+        corner = cell[:, 1] * resolution + cell[:, 0]  # row-major: first coordinate fastest
+        needed = np.zeros(resolution**2, bool)
+        for step in (0, 1, resolution, resolution + 1):
+            needed[corner[known] + step] = True
+        self._resolution = resolution
+        self._corner = np.where(known, corner, -1).astype(np.int32)  # (M,) lower left node
+        self._fraction = (position - cell).astype(np.float32)  # (M, 2) place inside the cell, in [0, 1]
+        self.used = np.flatnonzero(needed)  # (U,) nodes that some latent lies next to
+        grid = np.stack([self.used % resolution, self.used // resolution], 1) / (resolution - 1)
+        self._vectors = codec.decode(octahedral_to_sphere(grid).astype(np.float32))
+        self._zero, self._rate = scale.of(self._vectors @ scale.texts.T)
 
     def relevancies(self, phrases: Array) -> Iterator[Array]:
-        grid = np.zeros(self.resolution**2, np.float32)
-        for row in self.nodes.relevancies(phrases).T:
+        """(Q, D) unit phrase vectors -> of each in turn (M,) float32 relevancy; 0 for no meaning."""
+        values = relevancy_of(self._vectors @ phrases.T, self._zero[:, None], self._rate[:, None])
+        grid = np.zeros(self._resolution**2, np.float32)
+        for row in values.T:
             grid[self.used] = row
-            found = np.empty(len(self.corner), np.float32)
-            arguments = grid, self.corner, self.fraction, self.resolution, found
+            found = np.empty(len(self._corner), np.float32)
+            arguments = grid, self._corner, self._fraction, self._resolution, found
             shared_workers().run(_interpolate, len(found), *arguments)
             yield found
-
-
-def build_table(codec: Codec, latents: Array, scale: Scale, resolution: int = RESOLUTION) -> SphereTable:
-    """Tabulate a `codec` of unit latents for (M, 3) latents; those of no length have no meaning."""
-    known = codec.known(latents)
-    safe = np.where(known[:, None], latents, (0.0, 0.0, 1.0)).astype(np.float64)
-    position = sphere_to_octahedral(safe) * (resolution - 1)
-    cell = np.clip(np.floor(position), 0, resolution - 2).astype(np.int64)
-    corner = cell[:, 1] * resolution + cell[:, 0]  # row-major: first coordinate fastest
-    needed = np.zeros(resolution**2, bool)
-    for step in (0, 1, resolution, resolution + 1):
-        needed[corner[known] + step] = True
-    used = np.flatnonzero(needed)
-    grid = np.stack([used % resolution, used // resolution], 1) / (resolution - 1)
-    return SphereTable(
-        used=used,
-        nodes=Vectors(codec.decode(octahedral_to_sphere(grid).astype(np.float32)), scale),
-        corner=np.where(known, corner, -1).astype(np.int32),
-        fraction=(position - cell).astype(np.float32),
-        resolution=resolution,
-    )
 
 
 def octahedral_to_sphere(uv: Array) -> Array:
@@ -113,7 +75,7 @@ def _folded(xy: Array, z: Array) -> Array:
     return np.where((z < 0)[..., None], (1 - np.abs(xy[..., ::-1])) * np.where(xy >= 0, 1, -1), xy)
 
 
-class LatentLookup:
+class ExactLookup:
     """Every distinct latent compared, and a fetch per Gaussian: exact, in bounded memory."""
 
     def __init__(self, field: LanguageField, scale: Scale) -> None:
@@ -128,6 +90,7 @@ class LatentLookup:
             self._zero[part], self._rate[part] = scale.of(cosines)
 
     def relevancies(self, phrases: Array) -> Iterator[Array]:
+        """(Q, D) unit phrase vectors -> of each in turn (3 N,) float32 relevancy; 0 for no meaning."""
         for first in range(0, len(phrases), TOGETHER):
             some = phrases[first : first + TOGETHER]
             values = np.zeros((len(some), len(self._latents) + 1), np.float32)  # the last: no meaning
@@ -143,6 +106,17 @@ class LatentLookup:
     def _parts(self) -> Iterator[slice]:
         for start in range(0, len(self._latents), CHUNK):
             yield slice(start, min(start + CHUNK, len(self._latents)))
+
+
+Lookup = SphereTable | ExactLookup  # what of a language field does not depend on the phrase
+
+
+def build_lookup(field: LanguageField, scale: Scale, exact: bool = False) -> Lookup:
+    """The fastest lookup for `field`; with `exact` none that interpolates, to measure a table by."""
+    if field.codec.spherical and not exact:
+        latents = np.where(field.known[..., None], field.latents, 0)
+        return SphereTable(field.codec, latents.reshape(-1, 3), scale)
+    return ExactLookup(field, scale)
 
 
 @kernel

@@ -1,5 +1,5 @@
-"""The surface that Gaussians lie on, as the nearest neighbours of each: to smooth over it, and to walk
-along it."""
+"""The surface that Gaussians lie on, as the nearest neighbours of each: to smooth over it, to walk along it,
+and to divide it into regions that mean the same."""
 
 from dataclasses import dataclass
 
@@ -9,12 +9,11 @@ from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.compiled import kernel, plain, shared_workers
-from langsplat_core.scene import LEVELS, NO_THING, Gaussians, LanguageField
+from langsplat_core.scene import LEVELS, NO_THING, Codec, Gaussians, LanguageField
 
 NEIGHBOURS = 16
 FAINTEST = 1e-3  # weight of a Gaussian whose opacity is less, so that no mean divides by nothing
 REACH = 4.0  # times the median distance of a Gaussian's neighbours: what is farther is another surface
-
 
 _OUTSIDE, _WAITING = -1, -2  # labels that are no part
 
@@ -188,12 +187,12 @@ class Regions:
     """Regions of the M Gaussians of a surface, and of the N of its scene."""
 
     of: Array  # (3, M) int32 number of the region at each level, from 0
-    sizes: tuple[Array, Array, Array]  # (R,) Gaussians in each region of a level
+    sizes: tuple[Array, ...]  # (R,) Gaussians in each region of a level
     everywhere: Array  # (3, N) int32 the same of all Gaussians, faint ones with the nearest; -1: none is near
     weights: Array  # (N,) float32 opacity of the surface's Gaussians, 0 for all others
-    totals: tuple[Array, Array, Array]  # (R,) float64 sums of these weights
+    totals: tuple[Array, ...]  # (R,) float64 sums of these weights
 
-    def means(self, values: Array) -> tuple[Array, Array, Array]:
+    def means(self, values: Array) -> tuple[Array, ...]:
         """(3, N) values of all Gaussians -> of every level the (R,) float64 opacity-weighted means.
 
         In the order of the Gaussians and not of the surface: memory is read from front to back.
@@ -203,8 +202,7 @@ class Regions:
         workers = shared_workers()
         workers.run(_sum_pieces, len(sums), plain(values), self.everywhere, self.weights, sums)
         levels = sums.reshape(len(LEVELS), PIECES, longest).sum(1)
-        made = [row[: len(total)] / total for row, total in zip(levels, self.totals, strict=True)]
-        return made[0], made[1], made[2]
+        return tuple(row[: len(total)] / total for row, total in zip(levels, self.totals, strict=True))
 
     def spread(self, level: int, values: Array, others: Array) -> Array:
         """(R,) values of a level's regions -> (N,) of all Gaussians: of a faint one what is next to it, and
@@ -226,9 +224,11 @@ def build_regions(surface: Surface, field: LanguageField) -> Regions:
     once = links.row < links.col
     ends = links.row[once].astype(np.int32), links.col[once].astype(np.int32)
     of = []
-    for level in range(len(LEVELS)):
-        steps = _steps(field, level, surface.rows, ends)
-        typical = _typical_step(field, level, surface.rows)
+    for level, known in enumerate(field.known[:, surface.rows]):
+        latents = field.latents[level, surface.rows]
+        steps = _steps(field.codec, latents, known, ends)
+        # Between two Gaussians drawn by chance, on average: what is far in this encoder's space.
+        typical = field.codec.spread(latents[known]) if known.any() else 1.0
         if level == len(LEVELS) - 1 and field.things is not None:
             steps = _along_things(steps, field.things[surface.rows], ends, BORDER * typical)
         ranks = np.round(steps * STEPS).astype(np.uint16)
@@ -245,24 +245,16 @@ def regions_from(surface: Surface, of: Array) -> Regions:
     everywhere[:, near] = of[:, surface.anchors[near]]
     weights = np.zeros(len(surface.anchors), np.float32)
     weights[surface.rows] = surface.weights
-    sizes = [np.bincount(row) for row in of]
-    totals = [np.bincount(row, surface.weights) for row in of]
-    return Regions(of, (sizes[0], sizes[1], sizes[2]), everywhere, weights, (totals[0], totals[1], totals[2]))
+    totals = tuple(np.bincount(row, surface.weights) for row in of)
+    return Regions(of, tuple(map(np.bincount, of)), everywhere, weights, totals)
 
 
-def _steps(field: LanguageField, level: int, rows: Array, ends: tuple[Array, Array]) -> Array:
+def _steps(codec: Codec, latents: Array, known: Array, ends: tuple[Array, Array]) -> Array:
     """(E,) 1 - cosine between what the two ends of each link mean, in [0, 2]."""
-    known, latents = field.known[level][rows], field.latents[level][rows]
     a, b = ends
-    steps = field.codec.distances(latents, a, b)
+    steps = codec.distances(latents, a, b)
     both, neither = known[a] & known[b], ~known[a] & ~known[b]
     return np.asarray(np.where(both, steps, np.where(neither, 0.0, UNKNOWN)).clip(0, UNKNOWN))
-
-
-def _typical_step(field: LanguageField, level: int, rows: Array) -> float:
-    """The mean of 1 - cosine between two Gaussians drawn by chance: what is far in this encoder's space."""
-    latents = field.latents[level][rows[field.known[level][rows]]]
-    return field.codec.spread(latents) if len(latents) else 1.0
 
 
 def _along_things(steps: Array, things: Array, ends: tuple[Array, Array], border: float) -> Array:

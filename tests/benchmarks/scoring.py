@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 from assets.making.dataset import MIN_PIXELS
 from assets.making.truth import PHRASE_KINDS, Phrase, Truth
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice, PictureConfig
-from langsplat_core.evaluation.scoring import intersection_over_union, majority
+from langsplat_core.evaluation.scoring import intersection_over_union
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import SPAN, QueryResult, peak_pixel
 from langsplat_core.query.engine import QueryEngine
@@ -239,6 +240,11 @@ def masks_of_maps(maps: Iterable[Array]) -> Iterator[tuple[Array, tuple[int, int
     for relevancy in maps:
         cut = cut_level("floor", relevancy, float(relevancy.max()), FLOOR)
         yield _smoothed_mask(relevancy > cut), _peak(relevancy)
+
+
+def majority(mask: Array, window: int = 7) -> Array:
+    """(H, W) boolean mask after a `window` x `window` majority vote; a tie is False."""
+    return uniform_filter(mask.astype(np.float64), size=window, mode="nearest") > 0.5 + 1e-9
 
 
 def _smoothed_mask(mask: Array) -> Array:

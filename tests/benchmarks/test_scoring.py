@@ -12,7 +12,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.progress import silent
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
-from langsplat_core.scene import CANONICAL_PHRASES, LanguageField, Scene
+from langsplat_core.scene import LanguageField, Scene
 from langsplat_core.semantics.masks import label_maps
 from langsplat_core.semantics.relevancy import latent_relevancy, relevancy
 from langsplat_core.semantics.store import ImageFeatures
@@ -38,7 +38,8 @@ from tests.benchmarks.scoring import (
     evaluate_direct,
     found_rate,
 )
-from tests.support.query_scenes import random_codec, two_blob_scene
+from tests.support.fakes import PER_BLOB, FakeEncoder, blob_scene, blobs, cameras
+from tests.support.file_samples import random_codec
 from tests.support.scenes import random_camera, random_gaussians
 
 THINGS = [3 * letter for letter in "abcdefghijklmnopqrtuvwxyz"]
@@ -98,13 +99,7 @@ def test_absent_things_have_no_other_name_in_the_room():
 
 
 def test_unknown_phrases_are_named_not_asked():
-    scene, *_ = two_blob_scene()
-    rows = {text: 8 + row for row, text in enumerate(CANONICAL_PHRASES)}  # as the scene has them
-    axes = SimpleNamespace(
-        encode_texts=lambda texts: np.eye(16, dtype=np.float32)[[rows.get(text, 0) for text in texts]],
-        unknown_words=lambda text: tuple(word for word in text.split() if word == "cactus"),
-    )
-    asked = ask(QueryEngine(scene, lambda _: axes), ["mug", "red cactus", "mug"])
+    asked = ask(QueryEngine(blob_scene(), lambda _: FakeEncoder()), ["mug", "red cactus", "mug"])
     assert asked.unknown == ("red cactus",)
     assert found_rate(asked, ["mug", "red cactus"]) == (1.0, 1)
 
@@ -116,7 +111,7 @@ def random_scene() -> Scene:
     gaussians = random_gaussians(400, 3)
     latents = unit(rng.normal(size=(3, 400, 3))).astype(np.float32)
     canonical = unit(rng.normal(size=(4, 16))).astype(np.float32)
-    field = LanguageField(latents, np.ones((3, 400), np.float32), random_codec(rng), canonical, "x")
+    field = LanguageField(latents, np.ones((3, 400), np.float32), random_codec("autoencoder"), canonical, "x")
     return Scene(gaussians, field)
 
 
@@ -166,15 +161,16 @@ def test_perfect_embeddings_are_text_vectors_of_the_true_words():
 
 
 def test_a_gaussian_is_what_it_shows_most_of():
-    scene, *_ = two_blob_scene()  # 60 Gaussians around x = -1, then 60 around x = 1, at z = 4
-    camera = replace(random_camera(0, 64, 48, off_centre=False), world_to_camera=np.eye(4))
-    alpha = CpuRasterizer().view(scene.gaussians, camera).splat(np.ones((120, 1), np.float32))[1]
+    count, gaussians = PER_BLOB, blobs().take(np.arange(3 * PER_BLOB) // PER_BLOB != 1)  # left and right
+    gaussians.opacity_logits[:] = -1  # so that none is hidden
+    camera = cameras()[1].resized(64, 48)
+    alpha = CpuRasterizer().view(gaussians, camera).splat(np.ones((2 * count, 1), np.float32))[1]
     ids = np.full((3, 48, 64), -1)
     columns = np.arange(64)[None].repeat(48, 0)
-    ids[2] = np.where(alpha > 0.02, np.where(columns < camera.cx, 7, 9), -1)
-    got = true_labels(CpuRasterizer(), scene.gaussians, [(camera, ids)] * 2)
-    assert (got[2][:60] == 7).all()
-    assert (got[2][60:] == 9).all()
+    ids[2] = np.where(alpha > 0, np.where(columns < camera.cx, 7, 9), -1)
+    got = true_labels(CpuRasterizer(), gaussians, [(camera, ids)] * 2)
+    assert (got[2][:count] == 7).all()
+    assert (got[2][count:] == 9).all()
     assert (got[:2] == -1).all()
 
 

@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from langsplat_core.arrays import Array
 from langsplat_core.cli import query
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.cli.scenes import Scale
-from langsplat_core.config import INRIA
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query.engine import QueryEngine
@@ -110,7 +108,7 @@ def test_queries_draw_as_the_file_says(folder, monkeypatch, antialiased):
     seen = []
 
     class Recorder:
-        def view(self, gaussians, camera, settings=INRIA):
+        def view(self, gaussians, camera, settings):
             seen.append(settings.antialiased)
             return load_rasterizer("cpu").view(gaussians, camera, settings)
 
@@ -131,7 +129,7 @@ def test_another_phrase_is_answered_by_the_encoder_named(folder, monkeypatch, ca
     assert loaded == ["mine", "fake"]
 
 
-def test_what_cannot_be_asked_is_said_first_and_the_rest_is_answered(folder, capsys):
+def test_what_cannot_be_asked_is_said_before_anything_is_searched(folder, monkeypatch, capsys):
     assert run("query", "a.ply", "mug", "plamt", "the", "book or sofa", '"book"', "--json") == 0
     out, err = capsys.readouterr()
     assert [answer["phrase"] for answer in json.loads(out)] == ["mug", "book"]
@@ -141,14 +139,10 @@ def test_what_cannot_be_asked_is_said_first_and_the_rest_is_answered(folder, cap
     )
     assert "'the' names nothing" in the
     assert "'book or sofa': the encoder does not know 'sofa';" in sofa
-
-
-def test_nothing_is_searched_before_all_is_checked(folder, monkeypatch, capsys):
     monkeypatch.setattr(QueryEngine, "relevancy", lambda *_: pytest.fail("searched"))
-    for texts in (("sofa",), ("sofa", "the"), ("sofa; ?",)):
-        assert run("query", "a.ply", *texts) == 2
-        out, err = capsys.readouterr()
-        assert (out, "does not know 'sofa'" in err) == ("", True)
+    assert run("query", "a.ply", "sofa; ?", "the") == 2
+    out, err = capsys.readouterr()
+    assert (out, "does not know 'sofa'" in err) == ("", True)
 
 
 def test_an_encoder_that_cannot_be_loaded_is_tried_once(folder, monkeypatch, capsys):
@@ -244,42 +238,28 @@ def blob_of(scene: Scene) -> list[int]:
     return np.bincount(nearest, minlength=3).tolist()
 
 
-def labels(scene: Scene) -> Array:
-    return scene.extras["label"]
-
-
-def test_a_thing_is_a_scene_of_its_own(folder, capsys):
+def test_a_thing_is_a_scene_of_its_own_and_removing_is_the_complement(folder, capsys):
     assert run("select", "a.ply", "mug", "--out", "mug.ply") == 0
+    assert "size, m" in capsys.readouterr().out
     whole, mug = load_scene("a.ply"), load_scene("mug.ply")
     assert blob_of(mug)[1:] == [0, 0]
     assert 0.9 * PER_BLOB < len(mug.gaussians) <= PER_BLOB
-    rows = labels(mug)
+    rows = mug.extras["label"]
     np.testing.assert_array_equal(mug.gaussians.sh, whole.gaussians.sh[rows])
-    assert mug.language is not None
-    assert whole.language is not None
     np.testing.assert_array_equal(mug.language.latents, whole.language.latents[:, rows])
     assert set(mug.language.phrasebook) == {"book", "pair", "void"}
-    assert len(mug.cameras) == len(whole.cameras)
-    assert mug.metres_per_unit == 0.5
+    assert (len(mug.cameras), mug.metres_per_unit) == (len(whole.cameras), 0.5)
     assert QueryEngine(mug, lambda name: FakeEncoder()).run("mug").found
-    assert "size, m" in capsys.readouterr().out
+    assert run("select", "a.ply", "mug", "--out", "rest.ply", "--remove") == 0
+    rest = load_scene("rest.ply")
+    assert sorted([*rows, *rest.extras["label"]]) == list(range(3 * PER_BLOB))
+    assert not QueryEngine(rest, lambda name: FakeEncoder()).run("mug").found
 
 
-def test_removing_is_the_complement(folder):
-    for words in ((), ("--remove",)):
-        assert run("select", "a.ply", "book", "--out", f"{len(words)}.ply", *words) == 0
-    with_it, without = (labels(load_scene(f"{k}.ply")) for k in (0, 1))
-    assert sorted([*with_it, *without]) == list(range(3 * PER_BLOB))
-    assert not QueryEngine(load_scene("1.ply")).run("book").found
-
-
-@pytest.mark.parametrize(
-    ("how", "want"), [("union", [1, 1, 0]), ("intersection", [1, 0, 0]), ("difference", [0, 0, 1])]
-)
-def test_several_phrases(folder, how, want):
-    phrases = {"union": ("mug", "book"), "intersection": ("mug", "pair"), "difference": ("pair", "mug")}[how]
-    assert run("select", "a.ply", *phrases, "--combine", how, "--out", "b.ply") == 0
-    assert [count > 0.8 * PER_BLOB for count in blob_of(load_scene("b.ply"))] == [bool(k) for k in want]
+def test_several_phrases_and_one_with_structure(folder):
+    for phrases, want in ((("mug", "book"), [1, 1, 0]), (("pair, not mug",), [0, 0, 1])):
+        assert run("select", "a.ply", *phrases, "--out", "b.ply") == 0
+        assert [count > 0.8 * PER_BLOB for count in blob_of(load_scene("b.ply"))] == [bool(k) for k in want]
 
 
 def test_one_of_several_things(folder, capsys):
@@ -337,9 +317,7 @@ def test_a_known_length_gives_the_scale(folder, capsys):
     ("given", "message"),
     [
         ({"metres": 1.0}, "belong together"),
-        ({"between": (0, 0, 0, 1, 0, 0)}, "belong together"),
         ({"metres": 1.0, "between": (0, 0, 0, 0, 0, 0)}, "both must be above 0"),
-        ({"metres": -1.0, "between": (0, 0, 0, 1, 0, 0)}, "both must be above 0"),
         ({"metres": 1.0, "between": (0, 0, 0, 1, 0, 0), "metres_per_unit": 1.0}, "give either"),
         ({"metres_per_unit": 0.0}, "must be above 0"),
     ],
@@ -348,9 +326,6 @@ def test_a_scale_that_is_none(folder, given, message):
     with pytest.raises(InputError, match=message):
         Scale(folder / "a.ply", **given).run()
     assert load_scene("a.ply").metres_per_unit == 0.5
-
-
-# `langsplat describe`.
 
 
 # `langsplat describe`.
@@ -370,24 +345,20 @@ def described(folder: Path) -> Path:
     return folder
 
 
-def test_the_inventory_as_a_table_and_what_was_left_out(described, capsys):
-    said = "\n".join(lines(capsys, "describe", "named.ply", "--vocabulary", "list.txt"))
+def test_the_inventory_as_a_table_and_as_json(described, capsys):
+    words = ("describe", "named.ply", "--vocabulary", "list.txt")
+    said = "\n".join(lines(capsys, *words))
     assert all(word in said for word in ("mug", "book", "plant", "sofa"))
     assert "wall" not in said
     assert "4 phrases were compared; 1 were left out" in said
-
-
-def test_the_inventory_as_json(described, capsys):
-    found = answers(capsys, "describe", "named.ply", "--vocabulary", "list.txt")
+    found = answers(capsys, *words)
     assert (found["asked"], found["left_out"]) == (4, 1)
     assert {entry["phrase"] for entry in found["inventory"]} == {"mug", "book", "plant"}
     for entry in found["inventory"]:
-        assert entry["level"] == "whole"
+        assert (entry["level"], entry["probability"]) == ("whole", None)
         assert 0 < entry["softmax"] <= 1
-        assert entry["probability"] is None
         assert all(len(spot["centre"]) == 3 for spot in entry["spots"])
-    finer = answers(capsys, "describe", "named.ply", "--vocabulary", "list.txt", "--level", "subpart")
-    assert finer["inventory"] == []
+    assert answers(capsys, *words, "--level", "subpart")["inventory"] == []
 
 
 def test_words_for_a_gaussian_a_thing_and_a_pixel(described, capsys):
@@ -412,19 +383,12 @@ def test_words_for_a_gaussian_a_thing_and_a_pixel(described, capsys):
     ("words", "message"),
     [
         ("query a.ply", "no phrase given"),
-        ("query a.ply pair --scale -1", "--scale -1"),
         ("query a.ply book --camera 9", "--camera 9: the scene has cameras 0 to 2"),
-        ("query plain.ply mug", "no language field"),
         ("select a.ply void", "'void' was not found"),
-        ("select a.ply mug void", "'void' was not found"),
         ("select a.ply spoon", "does not know 'spoon'"),
-        ("select a.ply ?", "empty"),
         ("select a.ply", "no phrase given"),
-        ("select a.ply mug book --combine intersection", "the intersection of 'mug', 'book' is empty"),
         ("select a.ply mug --instance 2", "--instance 2: there are 1, numbered from 1"),
-        ("select a.ply mug --instance 0", "--instance 0"),
         ("select a.ply mug --grow -1", "--grow -1: must be 0 to 1e+09"),
-        ("select a.ply mug --shrink nan", "--shrink nan"),
         ("select a.ply pair --shrink 9", "nothing is left; shrink by less"),
         ("select a.ply mug book plant --grow 99 --remove", "the whole scene"),
         ("select a.ply mug --as hull --remove", "--as hull"),
@@ -436,27 +400,18 @@ def test_words_for_a_gaussian_a_thing_and_a_pixel(described, capsys):
         ("select a.ply mug --scale 0", "--scale 0"),
         ("select plain.ply mug", "no language field"),
         ("describe named.ply --camera 3 --pixel 1 1", "--camera 3: the scene has cameras 0 to 2"),
-        (
-            "describe named.ply --pixel 160 1",
-            "--pixel 160 1: camera 0 has columns 0 to 159",
-        ),
-        ("describe named.ply --pixel -1 1", "--pixel -1 1"),
+        ("describe named.ply --pixel 160 1", "--pixel 160 1: camera 0 has columns 0 to 159"),
         ("describe named.ply --gaussian 360", "--gaussian 360: the scene has Gaussians 0 to 359"),
-        ("describe named.ply --gaussian 1 --pixel 1 1", "ask one of them"),
         ("describe named.ply --phrase mug --pixel 1 1", "ask one of them"),
         ("describe named.ply --instance 2", "--instance 2 needs a --phrase"),
         ("describe named.ply --phrase mug --instance 9", "--instance 9: there are 1"),
         ("describe named.ply --phrase wall", "'wall' was not found"),
         ("describe named.ply --camera 1", "needs a --pixel X Y"),
-        ("describe named.ply --top 0", "--top 0"),
         ("describe named.ply --vocabulary empty.txt", "empty.txt: the vocabulary is empty"),
         ("describe named.ply --vocabulary bad.txt", "bad.txt, line 2"),
         ("describe named.ply --vocabulary sofas.txt", "knows none of the vocabulary's 1 phrases"),
         ("describe named.ply --vocabulary none.txt", "none.txt: the vocabulary cannot be read"),
-        ("describe plain.ply", "no language field"),
         ("describe blind.ply --pixel 1 1", "has no cameras"),
-        ("describe nowhere.ply", "nowhere.ply"),
-        ("describe named.ply --level thing", "level"),
     ],
 )
 def test_bad_input_is_one_line_and_nothing_is_written(described, capsys, words, message):

@@ -1,13 +1,30 @@
-"""Label folders, with what goes wrong in them."""
+"""Label folders and ScanNet's vertices, with what goes wrong in them."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
+from plyfile import PlyData, PlyElement
 
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.evaluation.labels import read_3d_ovs, read_lerf_ovs, without_suffix
+from langsplat_core.evaluation.run import Subject
+from langsplat_core.evaluation.scannet import (
+    CLASS_SETS,
+    NYU40,
+    point_table,
+    read_points,
+    read_scannet,
+    run_scannet,
+    save_point_json,
+    scene_classes,
+)
+from langsplat_core.io.scenes import save_scene
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.scene import Scene
+from tests.support.fakes import CENTRES, axis, blobs, language
 from tests.support.photographs import SIZE, block, lerf_frame, ovs_view, rectangle
 
 
@@ -26,28 +43,17 @@ def only_scene(benchmark):
     return scene
 
 
-def test_polygons_of_one_category_are_joined(lerf):
-    frame = only_scene(read_lerf_ovs(lerf)).frames[1]
-    mug, camera = frame.labels
-    assert (frame.name, frame.size, mug.phrase, camera.phrase) == ("frame_00002", SIZE, "mug", "old camera")
-    np.testing.assert_array_equal(mug.truth.draw(SIZE), block(1, 2, 5, 6) | block(20, 10, 29, 19))
+def test_polygons_of_one_category_are_joined_and_dots_belong_to_names(lerf):
+    scene = only_scene(read_lerf_ovs(lerf))
+    assert [frame.name for frame in scene.frames] == ["frame.00041", "frame_00002"]
+    assert scene.left_out == ("frame_00002: nothing (no outline)",)
+    mug, camera = scene.frames[1].labels
+    assert (scene.frames[1].size, mug.phrase, camera.phrase) == (SIZE, "mug", "old camera")
+    mask = mug.truth.draw(SIZE)
+    np.testing.assert_array_equal(mask, block(1, 2, 5, 6) | block(20, 10, 29, 19))
     assert mug.boxes.tolist() == [[1, 2, 5, 6], [20, 10, 29, 19]]
-
-
-def test_a_label_without_extent_is_named(lerf):
-    assert only_scene(read_lerf_ovs(lerf)).left_out == ("frame_00002: nothing (no outline)",)
-
-
-def test_dots_belong_to_names(lerf):
-    assert only_scene(read_lerf_ovs(lerf)).frames[0].name == "frame.00041"
-    assert without_suffix("frame.00041") == "frame.00041"
-    assert without_suffix("frame.00041.JPG") == "frame.00041"
-
-
-def test_masks_on_another_grid(lerf):
-    mug = only_scene(read_lerf_ovs(lerf)).frames[1].labels[0]
-    double = mug.truth.draw((80, 60))
-    np.testing.assert_array_equal(double, np.kron(mug.truth.draw(SIZE), np.ones((2, 2), bool)))
+    np.testing.assert_array_equal(mug.truth.draw((80, 60)), np.kron(mask, np.ones((2, 2), bool)))
+    assert without_suffix("frame.00041") == without_suffix("frame.00041.JPG") == "frame.00041"
 
 
 def test_every_folder_of_the_benchmark_will_do(lerf):
@@ -76,6 +82,7 @@ def test_a_polygon_of_fractions_and_one_that_leaves_the_picture(tmp_path):
         (lambda c: c["objects"][0].update(segmentation="here"), "polygon"),
         (lambda c: c["objects"][0].update(segmentation=[[1, 2], [float("nan"), 3], [4, 4]]), "corners"),
         (lambda c: c.update(objects={}), "objects"),
+        (lambda c: c.update(objects=[]), "label nothing"),
     ],
 )
 def test_a_broken_label_file_is_named(tmp_path, change, message):
@@ -85,14 +92,7 @@ def test_a_broken_label_file_is_named(tmp_path, change, message):
     path.write_text(json.dumps(content))
     with pytest.raises(FormatError, match=message) as error:
         read_lerf_ovs(tmp_path)
-    assert str(path) in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def test_labels_of_nothing(tmp_path):
-    lerf_frame(tmp_path / "label" / "a", "b", [("mug", [])])
-    with pytest.raises(FormatError, match="label nothing"):
-        read_lerf_ovs(tmp_path)
+    assert str(path.parent) in str(error.value)
 
 
 def test_3d_ovs(tmp_path):
@@ -109,33 +109,21 @@ def test_3d_ovs(tmp_path):
     assert only_scene(read_3d_ovs(scene)).name == found.name == "bench"
 
 
-def test_masks_of_another_size_than_the_photograph(tmp_path):
+def test_masks_of_another_size_of_zeros_and_ones_unlisted_and_broken(tmp_path):
     big = np.kron(block(4, 5, 11, 20), np.ones((3, 3), bool))
-    ovs_view(tmp_path / "bench", "00", {"cup": big})
-    frame = only_scene(read_3d_ovs(tmp_path)).frames[0]
-    assert frame.size == SIZE
-    np.testing.assert_array_equal(frame.labels[0].truth.draw(SIZE), block(4, 5, 11, 20))
-
-
-def test_masks_of_zeros_and_ones(tmp_path):
-    ovs_view(tmp_path, "00", {"cup": block(1, 1, 2, 2)})
-    Image.fromarray(block(5, 5, 6, 6).astype(np.uint8)).save(tmp_path / "segmentations" / "00" / "cup.png")
-    label = only_scene(read_3d_ovs(tmp_path)).frames[0].labels[0]
-    np.testing.assert_array_equal(label.truth.draw(SIZE), block(5, 5, 6, 6))
-
-
-def test_a_mask_that_no_class_lists_is_left_out(tmp_path):
-    ovs_view(tmp_path, "00", {"cup": block(1, 1, 2, 2)})
-    Image.new("L", SIZE).save(tmp_path / "segmentations" / "00" / "cpu.png")
-    assert only_scene(read_3d_ovs(tmp_path)).left_out == ("00: cpu (not in classes.txt)",)
-
-
-def test_a_broken_mask_is_named(tmp_path):
-    ovs_view(tmp_path, "00", {"cup": block(1, 1, 2, 2)})
-    (tmp_path / "segmentations" / "00" / "cup.png").write_bytes(b"no picture")
-    label = only_scene(read_3d_ovs(tmp_path)).frames[0].labels[0]
-    with pytest.raises(FormatError, match=r"cup\.png"):
-        label.truth.draw(SIZE)
+    ovs_view(tmp_path, "00", {"cup": big, "jar": big, "pot": big})
+    folder = tmp_path / "segmentations" / "00"
+    Image.fromarray(block(5, 5, 6, 6).astype(np.uint8)).save(folder / "jar.png")
+    Image.new("L", SIZE).save(folder / "cpu.png")
+    (folder / "pot.png").write_bytes(b"no picture")
+    scene = only_scene(read_3d_ovs(tmp_path))
+    assert scene.left_out == ("00: cpu (not in classes.txt)",)
+    cup, jar, pot = scene.frames[0].labels
+    assert scene.frames[0].size == SIZE  # the photograph's
+    np.testing.assert_array_equal(cup.truth.draw(SIZE), block(4, 5, 11, 20))
+    np.testing.assert_array_equal(jar.truth.draw(SIZE), block(5, 5, 6, 6))
+    with pytest.raises(FormatError, match=r"pot\.png"):
+        pot.truth.draw(SIZE)
 
 
 @pytest.mark.parametrize("content", [b"", b"\n  \n", b"\xff\xfe\x00"])
@@ -162,3 +150,109 @@ def test_no_layout_at_all(read, tmp_path):
     (tmp_path / "transforms.json").write_text("{}")
     with pytest.raises(InputError, match="not in the layout"):
         read(tmp_path)
+
+
+# ScanNet's labelled vertices, and answers whose scores are known by construction.
+
+NAME = "scene0000_00"
+
+
+def write_labels(folder, positions, labels):
+    folder.mkdir(parents=True, exist_ok=True)
+    table = np.empty(len(labels), [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("label", "u2")])
+    for column, name in enumerate("xyz"):
+        table[name] = np.asarray(positions)[:, column]
+    table["label"], table["red"] = labels, 0
+    path = folder / f"{NAME}_vh_clean_2.labels.ply"
+    PlyData([PlyElement.describe(table, "vertex")]).write(str(path))
+    return path
+
+
+@pytest.fixture
+def labelled(tmp_path):
+    """Ten vertices: 4 walls, 3 beds, 2 pictures, and one that nobody labelled."""
+    labels = [NYU40["wall"]] * 4 + [NYU40["bed"]] * 3 + [NYU40["picture"]] * 2 + [0]
+    write_labels(tmp_path / "data" / NAME, np.zeros((10, 3)), labels)
+    return tmp_path
+
+
+def run(tmp_path, ids, **more):
+    (tmp_path / "maps").mkdir(exist_ok=True)
+    np.save(tmp_path / "maps" / f"{NAME}.npy", np.asarray(ids))
+    return run_scannet(read_scannet(tmp_path / "data"), Subject(maps=tmp_path / "maps"), None, **more)
+
+
+def test_means_over_the_classes_that_are_there(labelled):
+    wall, bed, picture = (NYU40[name] for name in ("wall", "bed", "picture"))
+    # 3 of 4 walls right, all beds, one of which more on a wall; 1 of 2 pictures; the unlabelled one anything
+    report = run(labelled, [wall, wall, wall, bed, bed, bed, bed, picture, 0, wall])
+    nineteen, fifteen, ten = report.scores
+    assert (nineteen.classes, nineteen.present, nineteen.points) == (19, 3, 9)
+    assert nineteen.iou == pytest.approx((3 / 4 + 3 / 4 + 1 / 2) / 3)
+    assert nineteen.accuracy == pytest.approx((3 / 4 + 1 + 1 / 2) / 3)
+    for score, classes in ((fifteen, 15), (ten, 10)):  # without pictures
+        assert (score.classes, score.present, score.points) == (classes, 2, 7)
+        assert score.iou == pytest.approx(3 / 4)
+        assert score.accuracy == pytest.approx(7 / 8)
+    assert "| macro, mean of scenes | 19 |" in point_table(report)
+    assert "fixed before a label was read" in point_table(report)
+
+
+def test_json_and_nested_class_sets(labelled, tmp_path):
+    save_point_json(tmp_path / "out.json", run(labelled, np.full(10, 1)))
+    said = json.loads((tmp_path / "out.json").read_text())
+    assert said["scores"][0]["accuracy"] == pytest.approx(1 / 3)
+    nineteen, fifteen, ten = (set(names) for names in CLASS_SETS)
+    assert [len(nineteen), len(fifteen), len(ten)] == [19, 15, 10]
+    assert ten < fifteen < nineteen
+
+
+def test_vertices_take_the_nearest_meaning(tmp_path):
+    """The blobs are called wall, floor and bed; vertices stand near their middles."""
+    known = {name: axis(3) for name in NYU40} | {"wall": axis(0), "floor": axis(1), "bed": axis(2)}
+    field = language()
+    confidence = field.confidence.copy()
+    confidence[1] = 0  # at part level all blobs are alike
+    field = replace(field, phrasebook=known, confidence=confidence)
+    save_scene(tmp_path / f"{NAME}.ply", Scene(blobs(), field))
+    positions = np.repeat(CENTRES, 2, 0) + 0.01
+    names = ["wall", "wall", "floor", "floor", "bed", "sofa"]  # the last is called bed
+    write_labels(tmp_path / "data", positions, [NYU40[name] for name in names])
+    report = run_scannet(read_scannet(tmp_path / "data"), Subject(scene=tmp_path), None)
+    assert report.scores[0].iou == pytest.approx((1 + 1 + 1 / 2 + 0) / 4)
+    assert report.scores[0].accuracy == pytest.approx(3 / 4)
+
+
+def test_words_that_the_encoder_lacks_are_wrong_everywhere(tmp_path):
+    class Half:
+        def encode_texts(self, texts):
+            return np.stack([axis(3) for _ in texts])
+
+        def unknown_words(self, text):
+            return ("bathtub",) if text == "bathtub" else ()
+
+    engine = QueryEngine(Scene(blobs(), language()), lambda _: Half())
+    path = write_labels(tmp_path, CENTRES, [NYU40["bathtub"]] * 3)
+    found, unknown = scene_classes(engine, read_points(path, NAME))
+    assert unknown == ("bathtub",)
+    assert not any((ids == NYU40["bathtub"]).any() for ids in found)
+
+
+@pytest.mark.parametrize("ids", [np.zeros(9, int), np.zeros(10), np.zeros((2, 10), int)])
+def test_maps_of_another_length(labelled, ids):
+    with pytest.raises(FormatError, match="one per vertex"):
+        run(labelled, ids)
+
+
+def test_other_layouts(labelled, tmp_path):
+    with pytest.raises(InputError, match="not in the layout of ScanNet"):
+        read_scannet(tmp_path / "absent")
+    path = tmp_path / f"{NAME}_vh_clean_2.labels.ply"
+    table = np.zeros(3, [("x", "f4"), ("y", "f4"), ("z", "f4")])
+    PlyData([PlyElement.describe(table, "vertex")]).write(str(path))
+    with pytest.raises(FormatError, match="lack x, y, z or label"):
+        read_points(path, NAME)
+    with pytest.raises(InputError, match="--only other"):
+        run(labelled, np.zeros(10, int), only=("other",))
+    with pytest.raises(InputError, match="no such file"):
+        run_scannet(read_scannet(labelled / "data"), Subject(maps=tmp_path / "nothing"), None)

@@ -1,17 +1,15 @@
-"""Phrases with structure on a laid table, where every Gaussian's meaning is known."""
-
-from dataclasses import replace
+"""Phrases with structure: what the grammar reads, and what is found on a table whose meanings are known."""
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from langsplat_core.arrays import Array
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.query.compose import (
     Body,
     body,
-    combine,
-    gap,
     most,
     run_phrase,
     separate,
@@ -20,9 +18,144 @@ from langsplat_core.query.compose import (
     viewpoint,
 )
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.grammar import (
+    MAX_ATOMS,
+    MAX_CHARACTERS,
+    Atom,
+    Both,
+    Inside,
+    Relation,
+    Superlative,
+    Union,
+    Without,
+    atoms,
+    named,
+    parse,
+    unparse,
+)
 from langsplat_core.query.surface import build_surface
 from langsplat_core.scene import NO_THING, look_at
+from langsplat_core.scene.language import split_phrases
 from tests.support.query_scenes import UP, PlainEncoder, front_camera, laid_table, meaning
+
+MUG, BOOK, DESK = Atom("mug"), Atom("book"), Atom("table")
+HANDLE = Atom("handle")
+READ = {
+    "mug": MUG,
+    "  the 'red mug'! ": Atom("red mug"),
+    "handle of the red mug": Inside(HANDLE, Atom("red mug")),
+    "mug's handle": Inside(HANDLE, MUG),
+    "the mug\u2019s handle": Inside(HANDLE, MUG),
+    "mug 's handle": Inside(HANDLE, MUG),
+    "the dogs' tails": Inside(Atom("tails"), Atom("dogs")),
+    "red mug handle": Inside(HANDLE, Atom("red mug")),
+    "coffee table legs": Inside(Atom("legs"), Atom("coffee table")),
+    "wing of the airplane's tail": Inside(Atom("wing"), Inside(Atom("tail"), Atom("airplane"))),
+    "back of the chair": Inside(Atom("back"), Atom("chair")),
+    "mug on the table": Relation("on", MUG, DESK),
+    "mug on top of the table": Relation("on", MUG, DESK),
+    "a mug to the left of my book": Relation("left of", MUG, BOOK),
+    "handle of the mug on the table": Inside(HANDLE, Relation("on", MUG, DESK)),
+    "mug and the book": Both((MUG, BOOK)),
+    "mug as well as book & table": Both((MUG, BOOK, DESK)),
+    "mug or book and table": Union((MUG, Both((BOOK, DESK)))),
+    "mug, book or table": Union((MUG, BOOK, DESK)),  # where nobody has separated them
+    "mug, book, or table": Union((MUG, BOOK, DESK)),
+    "mug and glass": Both((MUG, Atom("glass"))),
+    "mug, not red mug": Without(MUG, Atom("red mug")),
+    "mug but not the book": Without(MUG, BOOK),
+    "mug, not red mug, not blue mug": Without(MUG, Union((Atom("red mug"), Atom("blue mug")))),
+    "mug without its handle": Without(MUG, Inside(HANDLE, MUG)),
+    "the biggest mug on the table": Superlative("biggest", Relation("on", MUG, DESK)),
+    "nearest mug to the book": Superlative("nearest", MUG, BOOK),
+    "mug closest to the book": Superlative("nearest", MUG, BOOK),
+    "the mug on the left": Superlative("leftmost", MUG),
+    "handle of the smallest mug": Inside(HANDLE, Superlative("smallest", MUG)),
+}
+WHOLE = (
+    *(
+        "red handle",
+        "wooden leg",
+        "glass lid",
+        "cup of tea",
+        "pair of scissors",
+        "children's book",
+        "t-shirt",
+    ),
+    *("red and blue ball", "on the table", "mug on", "mug and", "mug without", "biggest", "handle", "orange"),
+    *("杯子", "красная кружка", "κούπα", "كوب أحمر", "☕"),
+)
+
+
+@pytest.mark.parametrize("text", READ)
+def test_what_is_read(text):
+    assert parse(text) == READ[text]
+
+
+@pytest.mark.parametrize("text", WHOLE)
+def test_what_is_asked_whole(text):
+    assert parse(text) == Atom(text)
+
+
+@pytest.mark.parametrize("text", ["", " \n\t", "'?!'", "the", "of the", "and", "\u200b", "\x00"])
+def test_what_names_nothing_is_refused_in_one_line(text):
+    with pytest.raises(InputError) as refused:
+        parse(text)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("text", ["not cup", "not", "without the mug", ", not red", "except the mug"])
+def test_a_negative_phrase_needs_a_positive(text):
+    with pytest.raises(InputError, match="what not to look for"):
+        parse(text)
+
+
+def test_a_text_without_end_is_refused():
+    with pytest.raises(InputError, match=f"10000 characters; use at most {MAX_CHARACTERS}"):
+        parse("mug " * 2500)
+    with pytest.raises(InputError, match=f"at most {MAX_ATOMS}"):
+        parse(" and ".join(["mug"] * (MAX_ATOMS + 1)))
+
+
+def test_readings_show_the_structure():
+    assert unparse(parse("red mug handle")) == "handle  inside  red mug"
+    assert unparse(parse("biggest mug on the table")) == "biggest  (mug  on  table)"
+    assert unparse(parse("mug nearest to the book")) == "nearest  mug  from  book"
+    assert unparse(parse("mug or cup, not red cup")) == "(mug  or  cup)  without  red cup"
+
+
+WORDS = st.sampled_from(
+    ["mug", "red", "handle", "of", "the", "and", "or", "not", "without", "but", ",", "'", "'s", "on", "in",
+     "left", "to", "biggest", "nearest", "from", "a", "orange,", "&", "on;", "mug's", "dogs'", "near", "as",
+     "well", "top"]
+)  # fmt: skip
+
+
+@settings(max_examples=400)
+@given(st.one_of(st.text(max_size=60), st.lists(WORDS, max_size=14).map(" ".join)))
+def test_every_text_is_read_or_refused(text):
+    """Nothing but InputError is raised, every phrase of a tree says something, and a reading shows it."""
+    for query in [text, *split_phrases(text)]:
+        try:
+            tree = parse(query)
+        except InputError:
+            continue
+        assert all(atom.text.strip() and atom.text in unparse(tree) for atom in atoms(tree))
+
+
+NAMED = {
+    "thing": ("", "mug", "red mug", "handle of", "handle mug"),
+    "part": ("handle", "Handles", "the red handle"),
+    "part of a thing": ("mug handle", "the red mug handles", "lamp shade"),
+}
+
+
+@pytest.mark.parametrize("what", NAMED)
+def test_a_part_word_at_the_end_names_a_part_and_a_thing_before_it_whose(what):
+    assert {named(phrase) for phrase in NAMED[what]} == {what}
+
+
+# Phrases with structure on a laid table, where every Gaussian's meaning is known.
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +172,7 @@ ANSWERS = {  # phrase -> blocks that answer it
     "mug below the table": ["far mug"],
     "mug near the book": ["red mug", "red handle"],
     "book and table": ["book", "table"],
+    "book or table": ["book", "table"],
     "mug, not red mug": ["blue mug", "blue handle", "far mug"],
     "mug without its handle": ["red mug", "blue mug", "far mug"],
     "the biggest mug": ["far mug"],
@@ -96,20 +230,6 @@ def test_a_phrase_without_structure_is_asked_whole(table):
     assert (got.answer.peak, got.answer.level, got.answer.found) == (want.peak, want.level, want.found)
 
 
-def test_the_reading_and_its_phrases_are_shown(table):
-    result = run_phrase(table[0], "handle of the red mug")
-    assert result.reading == "handle  inside  red mug"
-    assert result.answer.phrase == "handle of the red mug"
-
-
-def test_alternatives_are_whichever_is_there(table):
-    engine, blocks = table
-    with pytest.raises(EncoderError, match="spoon"):
-        run_phrase(engine, "book or spoon")
-    answer = run_phrase(engine, "book or table").answer
-    assert overlap(answer.members, blocks, ["book", "table"]) > 0.9
-
-
 def test_a_phrasebook_that_has_only_the_whole_phrase_is_asked_for_it():
     scene, blocks = laid_table({"handle of the mug": meaning("handle"), "mug": meaning("mug")})
     engine = QueryEngine(scene)
@@ -121,9 +241,12 @@ def test_a_phrasebook_that_has_only_the_whole_phrase_is_asked_for_it():
 
 
 def test_a_part_is_cut_inside_at_the_level_that_is_asked_for(table):
-    engine, _ = table
-    assert run_phrase(engine, "handle of the red mug").answer.level == 1
-    assert run_phrase(engine, "handle of the red mug", "whole").answer.level == 2
+    result = run_phrase(table[0], "handle of the red mug")
+    assert (result.answer.level, result.answer.phrase) == (1, "handle of the red mug")
+    assert result.reading == "handle  inside  red mug"
+    assert run_phrase(table[0], "handle of the red mug", "whole").answer.level == 2
+    with pytest.raises(EncoderError, match="spoon"):
+        run_phrase(table[0], "book or spoon")
 
 
 # How boxes of points stand to each other, and which things there are.
@@ -200,17 +323,11 @@ def test_the_most_extreme_thing():
     assert most("nearest", things, [FRUIT], None) == 1
 
 
-def test_a_gap_is_the_least_distance():
-    distances = np.linalg.norm(CUP.points[:, None] - BOWL.points, axis=-1)
-    assert gap(CUP, BOWL) == pytest.approx(distances.min())
-
-
 def test_single_things_are_connected_and_no_specks():
     scene, blocks = laid_table()
     surface = build_surface(scene.gaussians)
     inside: Array = (blocks["far mug"] | blocks["book"])[surface.rows]
-    speck = np.flatnonzero(blocks["table"][surface.rows])[:3]
-    inside[speck] = True
+    inside[np.flatnonzero(blocks["table"][surface.rows])[:3]] = True
     parts = separate(surface, inside)
     assert [len(part) for part in parts] == [blocks["far mug"].sum()]  # the book has less than a tenth of it
     assert separate(surface, np.zeros(len(surface.rows), bool)) == []
@@ -230,21 +347,3 @@ def test_what_is_known_of_things_tells_apart_what_touches_and_keeps_together_wha
     apart = separate(surface, mugs[surface.rows], np.full(len(things), NO_THING, np.uint16))
     assert [list(part) for part in apart] == [list(part) for part in separate(surface, mugs[surface.rows])]
     assert len(apart) == 2
-
-
-@pytest.mark.parametrize("how", ["union", "intersection", "difference"])
-def test_answers_are_combined_as_their_members_are(table, how):
-    engine, _ = table
-    mug, red = engine.run("mug", "whole"), engine.run("red mug", "whole")
-    want = {
-        "union": mug.members | red.members,
-        "intersection": mug.members & red.members,
-        "difference": mug.members & ~red.members,
-    }[how]
-    np.testing.assert_array_equal(combine([mug, red], how).members, want)
-    assert combine([mug], how) is mug
-    if how == "union":
-        same = run_phrase(engine, "mug and red mug", "whole").answer
-        np.testing.assert_array_equal(same.members, want)
-    with pytest.raises(InputError, match="'plant' was not found"):
-        combine([mug, replace(red, phrase="plant", found=False)], how)
