@@ -71,7 +71,7 @@ class _EvalLabels(_Eval):
 
     def evaluate(self, benchmark: "Benchmark", profile: Profile) -> None:
         """Train where that is asked for, score, print the tables, write what was asked for."""
-        from langsplat_core.evaluation.report import save_json, table
+        from langsplat_core.evaluation.report import beside_published, save_json, table
         from langsplat_core.evaluation.run import Subject, run_benchmark
         from langsplat_core.semantics.encoders import load_text_encoder
 
@@ -86,6 +86,9 @@ class _EvalLabels(_Eval):
                 benchmark, profile, subject, load_text_encoder, only, self.pictures, progress
             )
         print(table(report))
+        published = beside_published(report)
+        if published:
+            print(f"\n{published}")
         if self.json is not None:
             save_json(self.json, report)
         if failed:
