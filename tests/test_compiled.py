@@ -30,16 +30,22 @@ HELPER = (
 CALL = "import numpy as np; from langsplat_core.running import run; x = np.zeros(3); run(0, 3, x); print(x)"
 
 
-@pytest.mark.long
-def test_processes_that_begin_at_once_compile_once_and_see_a_change_in_another_files_helper(
-    tmp_path: Path,
-) -> None:
-    package = tmp_path / "langsplat_core"
+def small_package(folder: Path) -> Path:
+    """A package with one kernel, whose helper in `adding.py` is still to be written."""
+    package = folder / "langsplat_core"
     package.mkdir()
     (package / "__init__.py").touch()
     for name in ("arrays.py", "compiled.py", "errors.py"):
         shutil.copy(PACKAGE / name, package / name)
     (package / "running.py").write_text(KERNEL)
+    return package
+
+
+@pytest.mark.long
+def test_processes_that_begin_at_once_compile_once_and_see_a_change_in_another_files_helper(
+    tmp_path: Path,
+) -> None:
+    package = small_package(tmp_path)
     environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
     environment["PYTHONPATH"] = str(tmp_path)
     for step, said in ((1, "[1. 2. 3.]"), (5, "[5. 6. 7.]")):
@@ -75,13 +81,8 @@ def test_the_key_follows_imports_and_nothing_else(tmp_path: Path) -> None:
 @pytest.mark.parametrize("home", ["/proc", "closed"])
 def test_without_a_place_to_keep_them_kernels_are_compiled_for_the_run(home: str, tmp_path: Path) -> None:
     """With neither the package's folder nor a home to write to."""
-    package, closed = tmp_path / "langsplat_core", tmp_path / "closed"
-    package.mkdir()
+    package, closed = small_package(tmp_path), tmp_path / "closed"
     closed.mkdir()
-    (package / "__init__.py").touch()
-    for name in ("arrays.py", "compiled.py", "errors.py"):
-        shutil.copy(PACKAGE / name, package / name)
-    (package / "running.py").write_text(KERNEL)
     (package / "adding.py").write_text(HELPER.format(step=2))
     for folder in (package, closed):
         folder.chmod(0o555)

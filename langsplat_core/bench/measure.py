@@ -85,8 +85,7 @@ class Measurement:
     fastest: float | None = None  # milliseconds
     calls: int = 0
     peak_mib: float | None = None  # rise of the resident set; None: unknown
-    # None: not compared. Of "backward": relative to each gradient's largest entry.
-    largest_error: float | None = None
+    largest_error: float | None = None  # None: not compared
     error_off_cuts: float | None = None  # away from cut-offs
     flips: int | None = None  # pixels near a cut-off that came out on its other side
     note: str = ""
@@ -184,10 +183,7 @@ def operations(
     view: Any = backend.view(case.gaussians, case.camera)
     yield from _linear(view, values, image, exact, "")
     if hasattr(view, "backward"):
-        wrong = (
-            None if exact is None else lambda: _gradient_error(view, case, values, exact.masked(image), exact)
-        )
-        yield Operation("backward", lambda: view.backward(values, image), wrong)
+        yield Operation("backward", lambda: view.backward(values, image))
     if isinstance(view, LiftingView):
         yield _labels(view, case.camera, exact)
     if isinstance(view, LiftingView) and view.frozen() is not view:
@@ -253,25 +249,6 @@ def _two_cameras(camera: Camera) -> tuple[Camera, Camera]:
     return camera, replace(camera, world_to_camera=moved)
 
 
-def _gradient_error(view: Any, case: Case, values: Array, masked: Array, exact: "ReferenceWindows") -> Error:
-    """Largest error of `backward`'s gradients, each relative to its greatest entry, against float64 autograd
-    through the PyTorch baseline, which knows nothing of the CPU's derivatives."""
-    import torch
-
-    from langsplat_core.bench.torch_rasterizer import TorchRasterizer
-
-    got = view.backward(values, masked)
-    drawn = TorchRasterizer(torch.float64).view(case.gaussians.take(exact.rows), case.camera)
-    want = drawn.backward(values[exact.rows], masked)
-    worst = 0.0
-    for name in ("means", "log_scales", "quats_wxyz", "opacity_logits", "values", "means_px"):
-        right = np.zeros(getattr(got, name).shape)
-        right[exact.rows] = getattr(want, name)
-        difference = np.abs(getattr(got, name) - right).max(initial=0)
-        worst = max(worst, float(difference / max(np.abs(right).max(initial=0), 1e-30)))
-    return Error(worst, worst, 0)
-
-
 def _timed(call: Callable[[], Any]) -> tuple[list[float], float | None]:
     """Seconds of each call, and the first call's rise of the resident set in MiB."""
     before = restart_peak()
@@ -335,8 +312,8 @@ class ReferenceWindows:
         return Error(max(float(error.max()) for error in errors), off, flips)
 
     def masked(self, image: Array) -> Array:
-        """`image` with 0 outside the windows and in their bands: what a backend must gather or pull back
-        to be compared, as a window knows nothing of the pixels outside."""
+        """`image` with 0 outside the windows and in their bands: what a backend must gather to be
+        compared, as a window knows nothing of the pixels outside."""
         kept = np.zeros_like(image)
         for window in self.windows:
             kept[window.at] = image[window.at] * ~window.band[..., None]

@@ -22,7 +22,6 @@ from langsplat_core.bench.measure import (
     reference_windows,
     warm_up,
 )
-from langsplat_core.bench.torch_rasterizer import TorchRasterizer
 from langsplat_core.errors import BackendError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import Progress, silent
@@ -35,8 +34,6 @@ _LARGE, _SMALL = (200_000, (960, 720)), (31_000, (320, 240))
 _PROMISES = (  # scene; backend, operation, channels above and below the line; target; whether it is the least
     (_LARGE, ("opengl half", "frame", 12), ("cpu", "frame", 12), 3.0, True),
     (_LARGE, ("opengl half", "splat", 12), ("cpu", "splat", 12), 3.0, True),
-    (_SMALL, ("pytorch", "frame", 3), ("cpu", "frame", 3), 50.0, True),
-    (_SMALL, ("pytorch", "backward", 3), ("cpu", "backward", 3), 10.0, True),
     (_SMALL, ("cpu", "gather", 3), ("cpu", "splat", 3), 1.5, False),
     (_LARGE, ("cpu", "splat", 12), ("cpu", "splat", 3), 1.6, False),
     (_LARGE, ("cpu", "frame", 12), ("cpu", "frame", 3), 1.6, False),
@@ -44,15 +41,15 @@ _PROMISES = (  # scene; backend, operation, channels above and below the line; t
     (_SMALL, ("cpu", "splat", 3), ("cpu", "frozen splat", 3), 4.0, True),
     (_SMALL, ("cpu", "gather", 3), ("cpu", "frozen gather", 3), 4.0, True),
 )
-_NOTES = """- ms: median of the calls after the first.
+_NOTES = """- The size with most scenes and the most channels; every other measurement is in raster.json.
+- ms: median of the calls after the first.
 - frame: project + splat with a camera that has moved since the last frame.
 - labels: W^T onehot of label maps with 252 regions at three levels; `channels` plays no part.
 - MiB: rise of the process's resident set at its highest during the first call.
-- Errors: against the float64 reference on three windows of 64x64 pixels, values in [0, 1); those of backward
-  are relative to each gradient's greatest entry, against float64 autograd.
+- Errors: against the float64 reference on three windows of 64x64 pixels, values in [0, 1).
 - Cut-offs are an alpha of 1/255 and a transmittance of 1e-4. A pixel within 0.1 % of one may come out on its
-  other side: a flip, counted where its error exceeds all others. gather and backward are compared without
-  such pixels.
+  other side: a flip, counted where its error exceeds all others. gather is compared without such
+  pixels.
 """
 
 
@@ -65,18 +62,6 @@ def quick_plan(plan: RasterBenchConfig) -> RasterBenchConfig:
         pivot=10_000,
         limit=min(plan.limit, 3.0),
     )
-
-
-@dataclass(frozen=True)
-class Growth:
-    """milliseconds ~ size^exponent, fitted over the random scenes."""
-
-    backend: str
-    operation: str
-    channels: int
-    by: str  # "Gaussians" or "pixels"
-    exponent: float
-    points: int
 
 
 @dataclass(frozen=True)
@@ -98,14 +83,12 @@ class Report:
 
     @property
     def text(self) -> str:
-        """All tables, as Markdown."""
+        """The machine, a selection of the measurements and the promised ratios, as Markdown."""
         return "\n".join([
             "# Rasterizers: time against error\n",
             "\n".join(f"- {name}: {value}" for name, value in self.machine.items()) + "\n",
-            table(self.rows),
+            table(_selection(self.rows)),
             _NOTES,
-            "## Growth: exponent of the time\n",
-            growth_table(growth(self.rows)),
             "## Promised ratios\n",
             ratio_table(ratios(self.rows)),
         ])  # fmt: skip
@@ -116,7 +99,6 @@ class Report:
         return {
             "machine": self.machine,
             "measurements": [asdict(row) for row in self.rows],
-            "growth": [asdict(row) for row in growth(self.rows)],
             "ratios": [asdict(row) for row in ratios(self.rows)],
         }
 
@@ -127,8 +109,7 @@ def run_plan(
     """Measure; a few minutes for the default plan. `keep` is given what there is after every scene and size,
     so that an interrupted run leaves that."""
     machine = describe_machine()
-    baseline: Any = TorchRasterizer()  # a `Rasterizer` whose views have no depth
-    backends: list[Rasterizer] = [*_backends(machine), baseline]
+    backends = _backends(machine)
     progress("bench: compiling", 0.0)
     warm_up(backends, plan.channels)
     foresight = Foresight(plan.limit)
@@ -228,30 +209,6 @@ def ratios(rows: Sequence[Measurement]) -> list[Ratio]:
     return found
 
 
-def fit_exponent(sizes: Sequence[float], milliseconds: Sequence[float]) -> float:
-    """Least-squares slope of log(milliseconds) over log(size)."""
-    x, y = np.log(np.asarray(sizes, float)), np.log(np.asarray(milliseconds, float))
-    return float(np.polyfit(x, y, 1)[0])
-
-
-def growth(rows: Sequence[Measurement]) -> list[Growth]:
-    """Exponents in Gaussians at one size, and in pixels at one count, where at least three points lie."""
-    found = []
-    for by in ("Gaussians", "pixels"):
-        groups: dict[tuple[str, str, int, object], list[tuple[float, float]]] = {}
-        for r in rows:
-            if r.scene == "random" and r.milliseconds is not None:
-                sizes = (r.gaussians, r.width * r.height)
-                size, fixed = sizes if by == "Gaussians" else sizes[::-1]
-                group = groups.setdefault((r.backend, r.operation, r.channels, fixed), [])
-                group.append((size, r.milliseconds))
-        for (backend, operation, channels, _), points in groups.items():
-            if len({x for x, _ in points}) >= 3:
-                exponent = fit_exponent(*zip(*points, strict=True))
-                found.append(Growth(backend, operation, channels, by, exponent, len(points)))
-    return found
-
-
 def table(rows: Sequence[Measurement]) -> str:
     """The measurements as Markdown."""
     head = ("scene", "Gaussians", "size", "channels", "operation", "backend", "ms", "MiB")
@@ -266,15 +223,10 @@ def table(rows: Sequence[Measurement]) -> str:
     )
 
 
-def growth_table(found: Sequence[Growth]) -> str:
-    """Exponents as Markdown: one row per backend and operation."""
-    columns = sorted({(g.by, g.channels) for g in found})
-    of = {(g.backend, g.operation, g.by, g.channels): g.exponent for g in found}
-    rows = [
-        (*pair, *(_cell(of.get((*pair, *column)), ".2f") for column in columns))
-        for pair in dict.fromkeys((g.backend, g.operation) for g in found)
-    ]
-    return markdown(("backend", "operation", *(f"{by}, {c} ch" for by, c in columns)), rows)
+def _selection(rows: Sequence[Measurement]) -> list[Measurement]:
+    """The rows of the size with most scenes and the most channels."""
+    size, channels = _busiest(rows), max((r.channels for r in rows), default=0)
+    return [r for r in rows if (r.width, r.height) == size and r.channels == channels]
 
 
 def ratio_table(found: Sequence[Ratio]) -> str:
@@ -288,11 +240,10 @@ def _cell(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
 
 
-_COLOURS = {"cpu": "#0072b2", "opengl half": "#d55e00", "opengl single": "#e69f00", "pytorch": "#666666"}
+_COLOURS = {"cpu": "#0072b2", "opengl half": "#d55e00", "opengl single": "#e69f00"}
 _COMPARED = {
     "splat": "splat: pixels",
     "gather": "gather: values",
-    "backward": "backward: relative",
     "frozen": "frozen (triangles: gathered)",
 }
 _ORDER = ("project", "frame", "splat", "gather", "backward", "freeze", "frozen splat", "frozen gather")
@@ -322,8 +273,9 @@ def plot(rows: Sequence[Measurement], path: Path) -> None:
     for panel, operation in zip(panels, operations, strict=False):
         _times(panel, [r for r in here if r.operation == operation], colours, styles)
         panel.set_title(operation)
-    for panel, kind in zip(grid[2], _COMPARED, strict=True):
+    for panel, kind in zip(grid[2], _COMPARED, strict=False):
         _errors(panel, kind, rows, colours)
+    grid[2][-1].axis("off")
     handles = [Line2D([], [], color=colours[name], marker="o", label=name) for name in backends]
     handles += [Line2D([], [], color="black", ls=s, label=f"{c} channels") for c, s in styles.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)

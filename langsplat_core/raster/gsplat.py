@@ -18,7 +18,7 @@ from torch import Tensor
 from langsplat_core.arrays import Array, check_array
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.errors import BackendError
-from langsplat_core.raster.protocol import LiftingView, farthest
+from langsplat_core.raster.protocol import LiftingView, farthest, mean_depth
 from langsplat_core.scene import Camera, Gaussians, look_at
 
 DEVICE = "cuda"
@@ -166,7 +166,7 @@ class GsplatView(LiftingView):
         both = np.ones((self.count, 2), np.float32)
         both[self._rows, 0] = self._depths
         sums, weights = np.moveaxis(self.splat(both)[0], -1, 0)
-        return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), 0)
+        return mean_depth(sums, weights)
 
 
 class GsplatRasterizer:

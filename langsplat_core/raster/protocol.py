@@ -114,6 +114,11 @@ def farthest(settings: RasterSettings) -> float:
     return math.inf if settings.far is None else settings.far
 
 
+def mean_depth(sums: Array, weights: Array) -> Array:
+    """(H, W) blended depths and their weights -> mean depth, 0 where nothing is drawn."""
+    return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), 0)
+
+
 def tangent_limits(camera: Camera, settings: RasterSettings) -> tuple[float, float, float, float]:
     """Limits of |x/z| and |y/z| at which the Jacobian is taken: left, top, right, bottom of the axis."""
     margin_x = (settings.fov_clamp - 1) * 0.5 * camera.width / camera.fx

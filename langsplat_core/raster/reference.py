@@ -7,7 +7,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array, rotation_matrices, sigmoid, unit
 from langsplat_core.config import INRIA, RasterSettings
-from langsplat_core.raster.protocol import LiftingView, farthest, tangent_limits
+from langsplat_core.raster.protocol import LiftingView, farthest, mean_depth, tangent_limits
 from langsplat_core.scene import Camera, Gaussians
 
 C0 = 0.28209479177387814  # 1 / (2 sqrt(pi))
@@ -247,7 +247,7 @@ class ReferenceView(LiftingView):
 
     def depth(self) -> Array:
         total, alpha = self.splat(self.footprints.depths[:, None])
-        return np.where(alpha > 0, total[..., 0] / np.where(alpha > 0, alpha, 1), 0)
+        return mean_depth(total[..., 0], alpha)
 
     def median_depth(self) -> Array:
         median = np.zeros((self.camera.height, self.camera.width))

@@ -12,6 +12,7 @@ machine lacks what the section is about.
 import os
 import platform
 import shutil
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -43,8 +44,7 @@ from langsplat_core.bench.measure import (
 from langsplat_core.bench.measure import measure as measure_backend
 from langsplat_core.bench.raster import describe_machine
 from langsplat_core.bench.raster import table as speed_table
-from langsplat_core.bench.torch_rasterizer import TorchRasterizer
-from langsplat_core.config import INRIA, RadianceConfig
+from langsplat_core.config import INRIA, RadianceConfig, RasterSettings
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError
 from langsplat_core.io.files import atomic_path
@@ -58,6 +58,7 @@ from langsplat_core.semantics.sam import grid_points, load_segmenter
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language.mask_weights import find_mask_weights
 from langsplat_core.training.radiance.train import evaluate_views, train_radiance
+from tests.support import torch_reference
 
 
 class Missing(Exception):
@@ -127,17 +128,12 @@ def _cell(value: object) -> str:
 
 def need_cuda() -> None:
     """Raises Missing unless gsplat has its device."""
-    from langsplat_core.raster.gsplat import has_device
-
-    if not has_device():
+    if not gsplat.has_device():
         raise Missing("no CUDA device")
 
 
 def milliseconds(call: Callable[[], object], times: int = 10) -> float:
     """Median of `times` calls after one that does not count; the device has finished at both ends of each."""
-    import statistics
-    import time
-
     found = []
     for _ in range(times + 1):
         wait()
@@ -151,16 +147,12 @@ def milliseconds(call: Callable[[], object], times: int = 10) -> float:
 
 def wait() -> None:
     """Until the device has done what it was told."""
-    import torch
-
     if torch.cuda.is_available():
         torch.cuda.synchronize()
 
 
 def forget_peak() -> None:
     """Count the device's memory from here."""
-    import torch
-
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
@@ -168,8 +160,6 @@ def forget_peak() -> None:
 
 def peak_mib() -> float | None:
     """Most memory that torch held on the device since `forget_peak`; None without a device."""
-    import torch
-
     return torch.cuda.max_memory_allocated() / 2**20 if torch.cuda.is_available() else None
 
 
@@ -195,8 +185,6 @@ def measure_environment(plan: Plan) -> Iterator[str]:
 
 def machine() -> dict[str, object]:
     """Said at the top of every report."""
-    import torch
-
     query = "--query-gpu=name,driver_version,memory.total,power.limit"
     found = describe_machine()
     found.pop("libraries")
@@ -215,8 +203,6 @@ def machine() -> dict[str, object]:
 
 def renderer() -> str:
     """Of the driver that EGL finds."""
-    from langsplat_core.raster.opengl.scene_textures import create_egl_context
-
     try:
         context = create_egl_context()
     except BackendError as error:
@@ -320,11 +306,9 @@ def measure_gradients(plan: Plan) -> Iterator[str]:
     settings = gsplat.drawn_settings(INRIA)
     band = ReferenceRasterizer().view(case.gaussians, case.camera, settings).cut_off_band(BAND)
     image[band] = 0
-    exact = vars(
-        TorchRasterizer(torch.float64).view(case.gaussians, case.camera, settings).backward(values, image)
-    )
+    exact = exact_gradients(case, values, image, settings)
     on_cpu = load_lifting_rasterizer("cpu").view(case.gaussians, case.camera, settings)
-    cpu = vars(on_cpu.backward(values, image))  # type: ignore[attr-defined]
+    cpu = on_cpu.backward(values, image)._asdict()  # type: ignore[attr-defined]
     cuda = gradients(case, values, image)
     rows = [(name, _error(cpu[name], exact[name]), _error(cuda[name], exact[name])) for name in NAMES]
     yield f"# Gradients: {count} Gaussians at {size[0]}x{size[1]}\n"
@@ -343,6 +327,16 @@ def gradients(case: Case, values: Array, image: Array) -> dict[str, Array]:
     (drawn.image * gsplat.to_device(image)).sum().backward()
     leaves = {**vars(kept), "values": x, "means_px": drawn.means_px}
     return {name: leaf.grad.reshape(len(values), -1).cpu().numpy() for name, leaf in leaves.items()}
+
+
+def exact_gradients(case: Case, values: Array, image: Array, settings: RasterSettings) -> dict[str, Array]:
+    """Gradients of <picture, image> as `gradients` returns them, by float64 autograd."""
+    leaves = torch_reference.parameters(case.gaussians)
+    x = torch.tensor(values, dtype=torch.float64, requires_grad=True)
+    drawn, _, means_px = torch_reference.render(leaves, x, case.camera, settings)
+    (drawn * torch.tensor(image, dtype=torch.float64)).sum().backward()
+    leaves |= {"values": x, "means_px": means_px}
+    return {name: leaf.grad.numpy() for name, leaf in leaves.items() if leaf.grad is not None}
 
 
 def _error(got: Array, want: Array) -> float:
@@ -645,7 +639,7 @@ def _largest_difference(one: Array, two: Array) -> float:
 
 # The project's own tests of the rasterizers, on the device.
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def measure_tests(plan: Plan) -> Iterator[str]:

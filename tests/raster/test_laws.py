@@ -150,7 +150,7 @@ def test_gradients_are_finite(slow: bool) -> None:
         by_image = rng.normal(size=(camera.height, camera.width, 2))
         gradients = view.backward(random_values(len(gaussians), 2), by_image, by_image[..., 0])
         undrawn = view.radii == 0
-        for name, gradient in vars(gradients).items():
+        for name, gradient in gradients._asdict().items():
             assert np.isfinite(gradient).all(), name
             assert not gradient[undrawn].any(), name
 
@@ -280,7 +280,7 @@ def check_gradients(seen: Seen) -> None:
     gradients = seen.view.backward(seen.drawing.features(), by_image, by_alpha)
     dropped = ~seen.drawing.gaussians.valid()
     assert gradients.values.shape == seen.drawing.features().shape
-    for name, gradient in vars(gradients).items():
+    for name, gradient in gradients._asdict().items():
         assert len(gradient) == len(dropped)
         assert np.isfinite(gradient).all(), name
         assert not gradient[dropped].any(), name
@@ -355,7 +355,7 @@ def test_results_do_not_depend_on_the_number_of_threads(case: Case) -> None:
         view = load_rasterizer("cpu", threads=threads).view(
             drawing.gaussians, drawing.camera, drawing.settings
         )
-        gradients = vars(view.backward(x, target, target[..., 0])).values()
+        gradients = view.backward(x, target, target[..., 0])
         results.append([*view.splat(x), view.gather(target), view.median_depth(), *gradients])
     for other in results[1:]:
         assert all(np.array_equal(one, two) for one, two in zip(results[0], other, strict=True))

@@ -52,7 +52,7 @@ def test_the_scenes_antialiasing_and_the_profile_apply():
 
 
 def test_what_cannot_draw_is_said():
-    with pytest.raises(InputError, match="choose one of"):
+    with pytest.raises(InputError, match="choose one of reference, cpu, opengl, cuda"):
         render(Scene(G), CAMERA, backend="vulkan")
     with pytest.raises(BackendError, match="--backend cpu"):
         render(Scene(G), CAMERA, backend="cuda")
@@ -86,10 +86,7 @@ def test_a_camera_file_of_65536_x_65536(tmp_path: Path, monkeypatch: pytest.Monk
         render(Scene(G), camera)
     assert tracemalloc.get_traced_memory()[1] < 1e9  # modules that are imported meanwhile, no pictures
     tracemalloc.stop()
-
-
-def test_what_memory_holds_is_drawn() -> None:
-    assert render(Scene(G), random_camera(2)).alpha.max() > 0
+    monkeypatch.undo()
     assert 1e8 < protocol.memory_bytes() < 1e15
 
 

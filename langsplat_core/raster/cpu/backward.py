@@ -175,19 +175,19 @@ def backward(
 # Gradients of the CPU backend, second half: from a footprint back to the Gaussian's parameters.
 
 
-class ParameterGradients(NamedTuple):
-    """Result of `to_parameters`, float32; rows that are not drawn are left alone."""
+class GaussianGradients(NamedTuple):
+    """Gradient of a scalar by every parameter of N Gaussians, float32; 0 for those that are not drawn."""
 
-    means: Array  # (N, 3)
+    means: Array  # (N, 3) per world unit
     log_scales: Array  # (N, 3)
-    quats_wxyz: Array  # (N, 4)
+    quats_wxyz: Array  # (N, 4) by the unnormalised quaternion
     opacity_logits: Array  # (N,)
     values: Array  # (N, C)
-    means_px: Array  # (N, 2)
+    means_px: Array  # (N, 2) per pixel, by the 2D mean alone (densification watches its length)
 
 
 @helper
-def _fetch(i: int, rows: cp.Rows, out: ParameterGradients) -> None:
+def _fetch(i: int, rows: cp.Rows, out: GaussianGradients) -> None:
     """Ask for the rows of Gaussian `i`: depth order is a random order in memory."""
     row = np.int64(i)
     prefetch(rows.means, 3 * row)
@@ -324,7 +324,7 @@ def to_parameters(
     partial: Array,
     rows: cp.Rows,
     camera: cp.KernelCamera,
-    out: ParameterGradients,
+    out: GaussianGradients,
 ) -> None:
     """For drawn Gaussians [first, last) in depth order: sum what `backward` left, in the order of the tiles,
     and pull the moments back through the projection."""

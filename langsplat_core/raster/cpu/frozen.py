@@ -70,17 +70,7 @@ def find_spans(
         tile = spread(i, count)
         transmittance = start_tile(tile, tiles, width, height)
         work = (spans, seen)
-        walk(
-            tile,
-            tiles,
-            geometry,
-            cutoffs,
-            transmittance,
-            work,
-            _forget_rows,
-            _look_at_row,
-            _keep_span,
-        )
+        walk(tile, tiles, geometry, cutoffs, transmittance, work, _forget_rows, _look_at_row, _keep_span)
         write_alpha(transmittance, alpha, tile, tiles)
 
 
@@ -160,11 +150,8 @@ def gather(
             correlate(planes, lines, buffer, low, high, partial, s, 0)
 
 
-# A view of the CPU rasterizer that keeps W itself (see `frozen_kernels`).
-
-
 class FrozenView(TileOperator):
-    """A view whose blending weights are kept, each to 1 / 131070 (see `frozen_kernels`)."""
+    """A view whose blending weights are kept, each to 1 / 131070."""
 
     def __init__(self, view: TileOperator, run: Callable[..., None]) -> None:
         """`run(kernel, *arguments)` runs a kernel over the view's tiles."""

@@ -5,7 +5,6 @@ per Gaussian in a fixed order.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,23 +15,12 @@ from langsplat_core.compiled import Workers, plain, shared_workers
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.progress import lap
 from langsplat_core.raster.cpu import backward, blend, projection
+from langsplat_core.raster.cpu.backward import GaussianGradients
 from langsplat_core.raster.cpu.blend import TileOperator, gather_labels, in_fours
 from langsplat_core.raster.cpu.frozen import FrozenView
 from langsplat_core.raster.cpu.tiles import bin_tiles, depth_order, make_cutoffs
-from langsplat_core.raster.protocol import check_picture
+from langsplat_core.raster.protocol import check_picture, mean_depth
 from langsplat_core.scene import Camera, Gaussians
-
-
-@dataclass(frozen=True, eq=False)
-class GaussianGradients:
-    """Gradient of a scalar by every parameter of N Gaussians, float32; 0 for those that are not drawn."""
-
-    means: Array  # (N, 3) per world unit
-    log_scales: Array  # (N, 3)
-    quats_wxyz: Array  # (N, 4) by the unnormalised quaternion
-    opacity_logits: Array  # (N,)
-    values: Array  # (N, C)
-    means_px: Array  # (N, 2) per pixel, by the 2D mean alone (densification watches its length)
 
 
 class CpuView(TileOperator):
@@ -88,9 +76,8 @@ class CpuView(TileOperator):
             run, self.tiles, self.workers, np.require(maps, np.int32, ["C", "W"]), count, least
         )
         drawn = len(self.order)
-        place = np.full(
-            self.count, drawn
-        )  # Gaussians that are not drawn share an empty row behind the others
+        # Gaussians that are not drawn share an empty row behind the others.
+        place = np.full(self.count, drawn)
         place[self.order] = np.arange(drawn)
         indptr = np.append(found.indptr, found.indptr[-1])
         return sparse.csr_matrix((found.data, found.indices, indptr), shape=(drawn + 1, count))[place]
@@ -114,10 +101,10 @@ class CpuView(TileOperator):
         check_array("alpha_grad", alpha_grad, (height, width))
         ordered = in_fours(values[self.order])
         grads = (plain(image_grad), plain(alpha_grad)[..., None])
-        moments = backward.MOMENTS
-        partial = np.empty((len(self.tiles.ranks), moments + ordered.shape[1]), np.float32)
+        columns = backward.MOMENTS + ordered.shape[1]
+        partial = np.empty((len(self.tiles.ranks), columns), np.float32)
         self._over_tiles(backward.backward, ordered, grads, self._cutoffs, partial)
-        out = backward.ParameterGradients(
+        out = GaussianGradients(
             *(np.zeros((n, *shape), np.float32) for shape in ((3,), (3,), (4,), (), (channels,), (2,)))
         )
         self.workers.run(
@@ -131,7 +118,7 @@ class CpuView(TileOperator):
             self._kernel_camera,
             out,
         )
-        return GaussianGradients(*out)
+        return out
 
     def _over_tiles(self, kernel: Callable[..., None], *arguments: Any) -> None:
         self.workers.run(kernel, len(self.tiles.starts) - 1, self.tiles, self._geometry, *arguments)
@@ -146,7 +133,7 @@ class CpuView(TileOperator):
         both = np.zeros((self.count, 2), np.float32)
         both[self.order] = np.stack([self._depths, np.ones_like(self._depths)], -1)
         sums, weights = np.moveaxis(self.splat(both)[0], -1, 0)
-        return np.where(weights > 0, sums / np.where(weights > 0, weights, 1), 0)
+        return mean_depth(sums, weights)
 
 
 def _aligned(shape: tuple[int, int]) -> Array:

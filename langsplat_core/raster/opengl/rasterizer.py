@@ -28,7 +28,7 @@ from langsplat_core.raster.opengl.scene_textures import (
     set_uniforms,
     shader,
 )
-from langsplat_core.raster.protocol import View, farthest, tangent_limits
+from langsplat_core.raster.protocol import View, farthest, mean_depth, tangent_limits
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 
 MAX_TARGETS = 4  # colour attachments of one pass, three values each
@@ -274,7 +274,7 @@ class GlView(View):
 
     def depth(self) -> Array:
         total, alpha = np.moveaxis(self._read(self.rasterizer.draw(self, [], with_depth=True)[0]), -1, 0)
-        return np.where(alpha > 0, total / np.where(alpha > 0, alpha, 1), 0)
+        return mean_depth(total, alpha)
 
     def depth_at(self, column: int, row: int) -> tuple[float, float]:
         """Surface depth and alpha of one pixel, from the projection read back.
