@@ -31,6 +31,8 @@ _ONCE_S = 2.0  # a call that takes longer is its own measurement
 _WINDOW = 64  # pixels a side
 _PLACES = ((0.5, 0.5), (0.3, 0.42), (0.64, 0.7))  # centres of the windows, as fractions of the image
 _BAND = 1e-3  # relative distance to a cut-off; float32 footprints of a GPU are within about 3e-4 of it
+_DIFFERENTIATED = ("means", "log_scales", "quats_wxyz", "opacity_logits")
+_DIRECTIONS, _STEP = 2, 3e-6  # along which derivatives are compared, and how far each way
 _FLIP = 2e-5  # an error in the band is a flip if larger than this and than twice all others
 
 
@@ -85,7 +87,8 @@ class Measurement:
     fastest: float | None = None  # milliseconds
     calls: int = 0
     peak_mib: float | None = None  # rise of the resident set; None: unknown
-    largest_error: float | None = None  # None: not compared
+    # None: not compared. Of "backward": of a derivative along random directions, relative to its terms' norm.
+    largest_error: float | None = None
     error_off_cuts: float | None = None  # away from cut-offs
     flips: int | None = None  # pixels near a cut-off that came out on its other side
     note: str = ""
@@ -183,7 +186,8 @@ def operations(
     view: Any = backend.view(case.gaussians, case.camera)
     yield from _linear(view, values, image, exact, "")
     if hasattr(view, "backward"):
-        yield Operation("backward", lambda: view.backward(values, image))
+        wrong = None if exact is None else lambda: _gradient_error(view, case, values, image, exact)
+        yield Operation("backward", lambda: view.backward(values, image), wrong)
     if isinstance(view, LiftingView):
         yield _labels(view, case.camera, exact)
     if isinstance(view, LiftingView) and view.frozen() is not view:
@@ -247,6 +251,39 @@ def _two_cameras(camera: Camera) -> tuple[Camera, Camera]:
     moved = camera.world_to_camera.copy()
     moved[2, 3] -= 1e-3
     return camera, replace(camera, world_to_camera=moved)
+
+
+def _gradient_error(view: Any, case: Case, values: Array, image: Array, exact: "ReferenceWindows") -> Error:
+    """Error of `backward`: its derivatives along random directions of all parameters at once, against central
+    differences of the float64 reference."""
+    masked, scene = exact.masked(image), case.gaussians.take(exact.rows)
+    got = view.backward(values, masked)
+    features, generator, worst = values[exact.rows], np.random.default_rng(2), 0.0
+    for _ in range(_DIRECTIONS):
+        steps = {name: generator.normal(size=getattr(scene, name).shape) for name in _DIFFERENTIATED}
+        steps["means"] *= np.exp(scene.log_scales).min(1, keepdims=True)
+        there, back = (
+            replace(
+                scene, **{name: getattr(scene, name) + sign * _STEP * step for name, step in steps.items()}
+            )
+            for sign in (1, -1)
+        )
+        moved = generator.normal(size=features.shape)
+        change = _pulled(there, features + _STEP * moved, case.camera, masked)
+        change -= _pulled(back, features - _STEP * moved, case.camera, masked)
+        terms = [2 * _STEP * moved * got.values[exact.rows]]
+        for name in _DIFFERENTIATED:  # as far as they went in float32
+            went = getattr(there, name).astype(np.float64) - getattr(back, name)
+            terms.append(went * getattr(got, name)[exact.rows])
+        joined = np.concatenate([term.ravel() for term in terms])
+        worst = max(worst, abs(float(joined.sum()) - change) / max(float(np.linalg.norm(joined)), 1e-30))
+    return Error(worst, worst, 0)
+
+
+def _pulled(scene: Gaussians, features: Array, camera: Camera, masked: Array) -> float:
+    """The product of `masked` (H, W, C) and the reference's image of (K, C) features, float64."""
+    drawn = reference_windows(scene, camera)
+    return float((drawn.gather(masked) * features[drawn.rows]).sum())
 
 
 def _timed(call: Callable[[], Any]) -> tuple[list[float], float | None]:
