@@ -34,9 +34,9 @@ from langsplat_core.query.grammar import (
     unparse,
 )
 from langsplat_core.query.instances import axis_aligned_box
-from langsplat_core.query.surface import Surface
 from langsplat_core.scene import LEVELS, NO_THING, Camera
 from langsplat_core.scene.language import phrase_key, tidy
+from langsplat_core.scene.surface import Surface
 from langsplat_core.semantics.relevancy import FLOOR
 
 FEWEST = 8  # Gaussians; what has fewer is a speck

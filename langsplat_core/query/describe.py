@@ -27,11 +27,11 @@ from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.instances import axis_aligned_box
-from langsplat_core.query.surface import surface_areas
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import pixel_weights
 from langsplat_core.scene import LEVELS, Camera, Codec, LanguageField
 from langsplat_core.scene.language import phrase_key
+from langsplat_core.scene.surface import surface_areas
 from langsplat_core.semantics.relevancy import FLOOR
 from langsplat_core.semantics.vocabulary import Bundled, bundled_vocabulary
 

@@ -26,9 +26,10 @@ from langsplat_core.query.answers import (
 from langsplat_core.query.grammar import STOP_WORDS, check_names, only
 from langsplat_core.query.instances import Instance, find_instances
 from langsplat_core.query.lookup import Lookup, build_lookup
-from langsplat_core.query.surface import Regions, Surface, build_regions, build_surface
+from langsplat_core.query.regions import Regions, build_regions
 from langsplat_core.scene import CANONICAL_PHRASES, Calibration, LanguageField, Scene
 from langsplat_core.scene.language import phrase_key, tidy
+from langsplat_core.scene.surface import Surface, build_surface
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE
 from langsplat_core.semantics.relevancy import Scale
 from langsplat_core.semantics.vocabulary import FEWEST, everyday_vectors

@@ -9,8 +9,8 @@ from scipy.spatial import ConvexHull, QhullError
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.compiled import plain
 from langsplat_core.errors import InputError
-from langsplat_core.query.surface import Surface
 from langsplat_core.scene import Gaussians
+from langsplat_core.scene.surface import Surface
 
 INNER = (0.02, 0.98)  # a box holds the points between these quantiles of each coordinate: strays do not count
 TURNED = 256  # points, at most, that the box is turned by

@@ -24,15 +24,9 @@ from langsplat_core.query.answers import (
 )
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Named
-from langsplat_core.query.surface import (
-    SMALLEST,
-    Regions,
-    Surface,
-    build_regions,
-    build_surface,
-    regions_from,
-)
+from langsplat_core.query.regions import SMALLEST, Regions, build_regions, regions_from
 from langsplat_core.scene import LEVELS, Calibration, LanguageField, Odds, Reading, Scene
+from langsplat_core.scene.surface import Surface, build_surface
 from langsplat_core.semantics.relevancy import FLOOR, Scale
 from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, blob_scene, blobs, language
 from tests.support.file_samples import random_field

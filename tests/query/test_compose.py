@@ -33,9 +33,9 @@ from langsplat_core.query.grammar import (
     parse,
     unparse,
 )
-from langsplat_core.query.surface import build_surface
 from langsplat_core.scene import NO_THING, look_at
 from langsplat_core.scene.language import split_phrases
+from langsplat_core.scene.surface import build_surface
 from tests.support.query_scenes import UP, PlainEncoder, front_camera, laid_table, meaning
 
 MUG, BOOK, DESK = Atom("mug"), Atom("book"), Atom("table")

@@ -22,10 +22,10 @@ from langsplat_core.query.describe import (
     suggest,
 )
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.surface import surface_areas
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Gaussians, LanguageField, LinearCodec, Scene
 from langsplat_core.scene.codec import CodebookCodec
+from langsplat_core.scene.surface import surface_areas
 from tests.support.fakes import (
     CENTRES,
     NAMES,

@@ -21,8 +21,8 @@ from langsplat_core.query.instances import (
     hull,
     oriented_box,
 )
-from langsplat_core.query.surface import Surface, build_surface
 from langsplat_core.scene import Gaussians
+from langsplat_core.scene.surface import Surface, build_surface
 from tests.support.scenes import random_gaussians
 
 

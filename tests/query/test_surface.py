@@ -11,20 +11,10 @@ from scipy.sparse.csgraph import connected_components
 from langsplat_core.arrays import sigmoid, unit
 from langsplat_core.errors import InputError
 from langsplat_core.query import selection
+from langsplat_core.query.regions import BORDER, SCALE, SMALLEST, STEPS, UNKNOWN, Regions, build_regions
 from langsplat_core.query.selection import Projected, in_polygon, in_rectangle, in_stroke, on_surface, project
-from langsplat_core.query.surface import (
-    BORDER,
-    NEIGHBOURS,
-    SCALE,
-    SMALLEST,
-    STEPS,
-    UNKNOWN,
-    Regions,
-    Surface,
-    build_regions,
-    build_surface,
-)
 from langsplat_core.scene import NO_THING, Gaussians, LanguageField, look_at
+from langsplat_core.scene.surface import NEIGHBOURS, Surface, build_surface
 from tests.support.fakes import CENTRES, PER_BLOB, blob_scene
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_gaussians

@@ -16,9 +16,8 @@ from langsplat_core.io.scenes import format_of, scene_files
 from langsplat_core.pipeline.forecast import count_photographs
 from langsplat_core.pipeline.report import stated_warnings
 from langsplat_core.progress import Progress
-from langsplat_core.query import surface
 from langsplat_core.query.engine import no_field
-from langsplat_core.scene import Camera, Scene
+from langsplat_core.scene import Camera, Scene, surface
 from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions.filming import load_path
 from langsplat_viewer.actions.history import forget, remember

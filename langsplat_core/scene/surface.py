@@ -1,7 +1,8 @@
 """The surface that Gaussians lie on, as the nearest neighbours of each: to smooth over it, to walk along it,
-and to divide it into regions that mean the same."""
+and to divide it into patches."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -9,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.compiled import kernel, plain, shared_workers
-from langsplat_core.scene import LEVELS, NO_THING, Codec, Gaussians, LanguageField
+from langsplat_core.scene.gaussians import Gaussians
 
 NEIGHBOURS = 16
 FAINTEST = 1e-3  # weight of a Gaussian whose opacity is less, so that no mean divides by nothing
@@ -41,6 +42,13 @@ class Surface:
     weights: Array  # (M,) float32 opacity
     links: csr_matrix  # (M, M) who is next to whom on one surface; symmetric
     anchors: Array  # (N,) int32 number of every Gaussian, if it is too faint of the nearest; -1: none is near
+
+    @cached_property
+    def ends(self) -> tuple[Array, Array]:
+        """(E,) int32 numbers at either end of the links, each link once."""
+        links = self.links.tocoo()
+        once = links.row < links.col
+        return links.row[once].astype(np.int32), links.col[once].astype(np.int32)
 
     def smooth(self, values: Array, numbers: Array | None = None) -> Array:
         """(N,) float32 values of all Gaussians -> (K,) float32 opacity-weighted means over the neighbourhoods
@@ -165,113 +173,25 @@ def _label(
     return parts, found
 
 
-# Regions: patches of the surface that mean the same, at each level.
-#
-# Gaussians vary, things do not: an answer made of whole regions has the borders of the things and no
-# speckles, and its peak is a mean over a patch instead of one lucky Gaussian. Regions are found once for a
-# scene, on the graph of neighbours along its surface, by the criterion of Felzenszwalb and Huttenlocher
-# (2004): two patches merge where the step between their meanings is no larger than the steps within either.
-# Where a scene knows which thing a Gaussian belongs to (`LanguageField.things`), these are the borders of
-# the coarsest level: the encoder may see the front and the back of a thing differently, and it stays one.
+def divide(surface: Surface, steps: Array, order: Array, scale: float, smallest: int) -> Array:
+    """Return the (M,) int32 number, from 0, of the patch of each Gaussian of a surface.
 
-SCALE = 6.8  # of the criterion, in typical steps times Gaussians: larger prefers larger regions
-SMALLEST = 10  # Gaussians; smaller patches join the neighbour that means the most similar
-BORDER = 0.6  # added to the step between two things, in typical steps
-UNKNOWN = 2.0  # step between a Gaussian with a meaning and one without: as much as between opposites
-PIECES = 4  # that a level is summed in, so that more than three cores have work
-STEPS = 65_535 / (UNKNOWN + 2 * BORDER)  # of 1 - cosine that are told apart: 16 bits sort in linear time
-
-
-@dataclass(frozen=True, eq=False)
-class Regions:
-    """Regions of the M Gaussians of a surface, and of the N of its scene."""
-
-    of: Array  # (3, M) int32 number of the region at each level, from 0
-    sizes: tuple[Array, ...]  # (R,) Gaussians in each region of a level
-    everywhere: Array  # (3, N) int32 the same of all Gaussians, faint ones with the nearest; -1: none is near
-    weights: Array  # (N,) float32 opacity of the surface's Gaussians, 0 for all others
-    totals: tuple[Array, ...]  # (R,) float64 sums of these weights
-
-    def means(self, values: Array) -> tuple[Array, ...]:
-        """(3, N) values of all Gaussians -> of every level the (R,) float64 opacity-weighted means.
-
-        In the order of the Gaussians and not of the surface: memory is read from front to back.
-        """
-        longest = max(len(total) for total in self.totals)
-        sums = np.zeros((len(LEVELS) * PIECES, longest))
-        workers = shared_workers()
-        workers.run(_sum_pieces, len(sums), plain(values), self.everywhere, self.weights, sums)
-        levels = sums.reshape(len(LEVELS), PIECES, longest).sum(1)
-        return tuple(row[: len(total)] / total for row, total in zip(levels, self.totals, strict=True))
-
-    def spread(self, level: int, values: Array, others: Array) -> Array:
-        """(R,) values of a level's regions -> (N,) of all Gaussians: of a faint one what is next to it, and
-        where nothing is, its own of `others` (N,) of the same type."""
-        spread = np.empty_like(others)
-        shared_workers().run(_spread, len(others), self.everywhere[level], values, others, spread)
-        return spread
-
-    def even(self, values: Array) -> Array:
-        """(3, N) float32 values -> the same, of every region its mean; of what is off the surface its own."""
-        own = plain(values)
-        means = [row.astype(np.float32) for row in self.means(own)]
-        return np.stack([self.spread(level, row, own[level]) for level, row in enumerate(means)])
-
-
-def build_regions(surface: Surface, field: LanguageField) -> Regions:
-    """Regions of a scene's surface, by what its field means there; once for a scene."""
-    links = surface.links.tocoo()
-    once = links.row < links.col
-    ends = links.row[once].astype(np.int32), links.col[once].astype(np.int32)
-    of = []
-    for level, known in enumerate(field.known[:, surface.rows]):
-        latents = field.latents[level, surface.rows]
-        steps = _steps(field.codec, latents, known, ends)
-        # Between two Gaussians drawn by chance, on average: what is far in this encoder's space.
-        typical = field.codec.spread(latents[known]) if known.any() else 1.0
-        if level == len(LEVELS) - 1 and field.things is not None:
-            steps = _along_things(steps, field.things[surface.rows], ends, BORDER * typical)
-        ranks = np.round(steps * STEPS).astype(np.uint16)
-        order = np.argsort(ranks, kind="stable").astype(np.int32)
-        roots = _merge(len(surface.rows), *ends, steps.astype(np.float32), order, SCALE * typical, SMALLEST)
-        of.append(np.unique(roots, return_inverse=True)[1].astype(np.int32).reshape(-1))
-    return regions_from(surface, np.stack(of))
-
-
-def regions_from(surface: Surface, of: Array) -> Regions:
-    """Regions by the (3, M) int32 number of each Gaussian's region at each level, counted from 0."""
-    everywhere = np.full((len(LEVELS), len(surface.anchors)), -1, np.int32)
-    near = surface.anchors >= 0
-    everywhere[:, near] = of[:, surface.anchors[near]]
-    weights = np.zeros(len(surface.anchors), np.float32)
-    weights[surface.rows] = surface.weights
-    totals = tuple(np.bincount(row, surface.weights) for row in of)
-    return Regions(of, tuple(map(np.bincount, of)), everywhere, weights, totals)
-
-
-def _steps(codec: Codec, latents: Array, known: Array, ends: tuple[Array, Array]) -> Array:
-    """(E,) 1 - cosine between what the two ends of each link mean, in [0, 2]."""
-    a, b = ends
-    steps = codec.distances(latents, a, b)
-    both, neither = known[a] & known[b], ~known[a] & ~known[b]
-    return np.asarray(np.where(both, steps, np.where(neither, 0.0, UNKNOWN)).clip(0, UNKNOWN))
-
-
-def _along_things(steps: Array, things: Array, ends: tuple[Array, Array], border: float) -> Array:
-    """No step within a thing, a larger one between two."""
-    a, b = things[ends[0]], things[ends[1]]
-    told = (a != NO_THING) & (b != NO_THING)
-    return np.where(told, np.where(a == b, 0, steps + border), steps)
+    Two patches become one where the step between them is no larger than the steps within either (Felzenszwalb
+    and Huttenlocher 2004); then those of fewer than `smallest` Gaussians join the neighbour at the least
+    step. steps: (E,) of the links `Surface.ends`, >= 0; order: (E,) int32 of the links, by rising step;
+    scale: of the criterion, in steps times Gaussians, larger for larger patches.
+    """
+    roots = _merge(len(surface.rows), *surface.ends, steps.astype(np.float32), order, scale, smallest)
+    return np.unique(roots, return_inverse=True)[1].astype(np.int32).reshape(-1)
 
 
 @kernel
 def _merge(
     count: int, first: Array, second: Array, steps: Array, order: Array, scale: float, smallest: int
 ) -> Array:
-    """(M,) a member of each Gaussian's region, the same for all of a region. order: of the links, by rising
-    step."""
+    """(M,) a member of each Gaussian's patch, the same for all of a patch."""
     parent, size = np.arange(count, dtype=np.int32), np.ones(count, np.int32)
-    largest = np.zeros(count, np.float32)  # step within each region
+    largest = np.zeros(count, np.float32)  # step within each patch
     for gathering in range(2):  # the criterion, then the small ones
         for link in order:
             a, b = first[link], second[link]
@@ -297,22 +217,3 @@ def _merge(
             root = parent[root]
         parent[item] = root
     return parent
-
-
-@kernel
-def _sum_pieces(first: int, last: int, values: Array, everywhere: Array, weights: Array, sums: Array) -> None:
-    """Rows [first, last) of `sums` (3 P, R): of a level's P pieces the weighted sums over its regions."""
-    count, pieces = len(weights), len(sums) // len(values)
-    for row in range(first, last):
-        level, piece = row // pieces, row % pieces
-        for i in range(count * piece // pieces, count * (piece + 1) // pieces):
-            if weights[i] > 0:
-                sums[row, everywhere[level, i]] += np.float64(weights[i]) * values[level, i]
-
-
-@kernel
-def _spread(first: int, last: int, of: Array, values: Array, others: Array, spread: Array) -> None:
-    """Rows [first, last) of `spread` (N,)."""
-    for i in range(first, last):
-        region = of[i]
-        spread[i] = values[region] if region >= 0 else others[i]
