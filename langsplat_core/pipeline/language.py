@@ -231,23 +231,14 @@ class _Stages:
         """Pairs of every view, in files that are read where they are needed, and the groups of the masks."""
         if self._made is None:
             folder = self._work / stage_key("memberships", 2, *self._inputs)
-            files = [folder / f"{index:05d}.npy" for index in range(len(self._views))]
-            rasterizer = self._rasterizer()
-            for index in self._processes.share(range(len(self._views))):
-                kept_array(files[index], partial(self._pairs, rasterizer, index))
-                self._progress("lifting masks onto the Gaussians", (index + 1) / len(self._views))
-            self._processes.barrier()
-            pairs = [open_array(path) for path in files]
+            shared = self._rasterizer(), self._processes, self._progress
+            mask_weights = kept_mask_weights(self._gaussians, self._views, folder, *shared)
             path = folder / "groups.npz"
             groups = self._processes.once(
                 lambda: kept(path, lambda: group_masks(self._vectors), _pack_groups, self._unpack_groups)
             )
-            self._made = MaskWeights(pairs, len(self._gaussians)), groups
+            self._made = mask_weights, groups
         return self._made
-
-    def _pairs(self, rasterizer: LiftingRasterizer, index: int) -> Array:
-        camera, features = self._views[index]
-        return view_pairs(rasterizer, self._gaussians, camera, features)
 
     def _rasterizer(self) -> LiftingRasterizer:
         return load_lifting_rasterizer(self._config.lift.backend)
@@ -255,6 +246,28 @@ class _Stages:
     def _unpack_groups(self, arrays: Arrays) -> MaskGroups:
         edges = np.cumsum([len(view) for view in self._vectors])[:-1]
         return MaskGroups(tuple(np.split(arrays["of_mask"], edges)), arrays["vectors"])
+
+
+def kept_mask_weights(
+    gaussians: Gaussians,
+    views: Views,
+    folder: Path,
+    rasterizer: LiftingRasterizer,
+    processes: ProcessGroup,
+    progress: Progress,
+) -> MaskWeights:
+    """Mask weights of all views, a file in `folder` each, which is read where it is looked at."""
+
+    def pairs(index: int) -> Array:
+        camera, features = views[index]
+        return view_pairs(rasterizer, gaussians, camera, features)
+
+    files = [folder / f"{index:05d}.npy" for index in range(len(views))]
+    for index in processes.share(range(len(views))):
+        kept_array(files[index], partial(pairs, index))
+        progress("lifting masks onto the Gaussians", (index + 1) / len(views))
+    processes.barrier()
+    return MaskWeights([open_array(path) for path in files], len(gaussians))
 
 
 def _what_matters(config: LiftConfig) -> LiftConfig:

@@ -21,6 +21,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.io.files import check_output_folder, shown
 from langsplat_core.io.ply import read_ply, write_ply
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
+from langsplat_core.pipeline.agreement import agreed_features
 from langsplat_core.pipeline.language import check_lift, check_masks, language_field
 from langsplat_core.pipeline.report import (
     TrainReport,
@@ -31,6 +32,7 @@ from langsplat_core.pipeline.report import (
 )
 from langsplat_core.pipeline.stages import ProcessGroup, sole_use, stage_key
 from langsplat_core.progress import Progress, silent
+from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import Camera, Gaussians, Scene
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE, load_encoder
 from langsplat_core.semantics.masks import MaskSource
@@ -106,7 +108,8 @@ def _train(
     store = FeatureStore(work / "features")  # keyed by mask settings, encoder and image
     mine = processes.share(train)
     names = [capture.cameras[i].name for i in mine]
-    describe_capture([capture.images[i] for i in mine], names, mask_source, encoder, store, progress)
+    seen_by = encoder if mask_source.agrees else None  # others are described once they agree
+    describe_capture([capture.images[i] for i in mine], names, mask_source, seen_by, store, progress)
     processes.barrier()
     cameras = tuple(capture.cameras[i] for i in train)
     features = StoredFeatures(store, [camera.name for camera in cameras])
@@ -122,6 +125,12 @@ def _train(
     clock.lap("radiance")
 
     views = StoredViews(cameras, features)
+    if not mask_source.agrees:
+        shared = load_lifting_rasterizer(config.lift.backend), work, progress, processes
+        photographs = [capture.images[i] for i in train]
+        features = agreed_features(gaussians, views, photographs, encoder, *shared)
+        views = StoredViews(cameras, features)
+        clock.lap("masks that agree")
     language, loss = language_field(gaussians, views, encoder, config, work, progress, processes)
     if not capture.drawn:
         language = replace(language, reading=language.reading.elsewhere)

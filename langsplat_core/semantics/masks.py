@@ -32,6 +32,10 @@ class LevelMasks:
 class MaskSource(Protocol):
     """Finds the masks of a photograph."""
 
+    agrees: bool = True
+    """False where masks of different photographs differ so much that what all of them agree on takes their
+    place (`pipeline.agreement`) before CLIP sees it."""
+
     @property
     def name(self) -> str:
         """Name for messages, such as "graph (no weights)"."""
@@ -205,6 +209,7 @@ class GraphMasks(MaskSource):
     """Masks without weights: regions of like colour."""
 
     name = "graph (no weights)"
+    agrees = False
 
     @property
     def key(self) -> str:

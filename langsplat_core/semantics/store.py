@@ -225,21 +225,26 @@ def describe_capture(
     images: Sequence[Array],
     names: Sequence[str],
     mask_source: MaskSource,
-    encoder: ImageEncoder,
+    encoder: ImageEncoder | None,
     store: FeatureStore,
     progress: Progress = silent,
 ) -> StoredFeatures:
     """Masks and CLIP vectors of every photograph, in order; those that `store` has already are not redone.
+    Without an encoder the vectors have no numbers.
 
     images: (H, W, 3) uint8 each; names: unique, one per image. What is finished is in the store even when
     `progress` interrupts the work. Each photograph's regions are encoded by themselves: its file does not
     depend on which others were made beside it.
     """
-    made_by = fingerprint(encoder)
+    made_by = "none" if encoder is None else fingerprint(encoder)
 
     def keep(finish: Callable[[], LevelMasks], image: Array, name: str, key: str) -> None:
         labels = label_maps(finish())
-        store.save(name, ImageFeatures(labels, embed_regions(image, labels, encoder)), key)
+        if encoder is None:
+            vectors = np.zeros((int(labels.max()) + 1, 0), np.float32)
+        else:
+            vectors = embed_regions(image, labels, encoder)
+        store.save(name, ImageFeatures(labels, vectors), key)
 
     with ThreadPoolExecutor(1) as worker:  # filters, crops and files of one while masks of the next are found
         before: Future[None] | None = None

@@ -47,6 +47,7 @@ from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import InputError
 from langsplat_core.io.hostile import write_npy
 from langsplat_core.io.language import means_checksum
+from langsplat_core.pipeline.agreement import agreed_features
 from langsplat_core.pipeline.language import Views, language_field
 from langsplat_core.pipeline.stages import stage_key
 from langsplat_core.pipeline.train import trained_gaussians
@@ -253,14 +254,19 @@ class Room:
         train, _ = self.capture.split(HOLD_OUT)
         cameras = [self.capture.cameras[i] for i in train]
         start = time.perf_counter()
+        photographs, encoder = [self.capture.images[i] for i in train], cast(Encoder, self.encoder)
         features: Sequence[ImageFeatures] = describe_capture(
-            [self.capture.images[i] for i in train],
+            photographs,
             [camera.name for camera in cameras],
             source,
-            self.encoder,
-            FeatureStore(self.folder / f"features-{outlines}-{self.weights}"),
+            encoder if source.agrees else None,
+            FeatureStore(self.folder / f"features-{outlines}-{self.weights if source.agrees else 'none'}"),
             self.progress,
         )
+        if not source.agrees:
+            rough, work = list(zip(cameras, features, strict=True)), self.folder / f"agreed-{self.weights}"
+            shared = CpuRasterizer(), work, self.progress
+            features = agreed_features(self.gaussians, rough, photographs, encoder, *shared)
         self._lap(f"masks ({variant.masks}) and vectors", start)
         if isinstance(self.encoder, ClipGeometry):
             features = [

@@ -1,0 +1,87 @@
+"""Masks that all photographs agree on, in place of those that each photograph was given.
+
+A segmenter without weights divides every photograph by itself, each one differently. Their consensus is a
+tree of things on the Gaussians (`training.language.tree`); three cuts of it, drawn into each photograph, are
+masks that fit from all sides, and these are shown to the encoder.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.pipeline.language import Views, kept_mask_weights
+from langsplat_core.pipeline.stages import (
+    Arrays,
+    ProcessGroup,
+    features_digest,
+    gaussians_digest,
+    kept,
+    stage_key,
+)
+from langsplat_core.progress import Progress
+from langsplat_core.raster.protocol import LiftingRasterizer
+from langsplat_core.scene import Gaussians
+from langsplat_core.scene.surface import build_surface
+from langsplat_core.semantics.store import (
+    MASKS_STAGE,
+    FeatureStore,
+    ImageEncoder,
+    ImageFeatures,
+    StoredFeatures,
+    embed_regions,
+    fingerprint,
+)
+from langsplat_core.training.language.tree import Tree, draw_patches, find_tree, nested_maps
+
+CUTS = (0.15, 0.4, 0.8)  # costs up to which subparts, parts and wholes grow; chosen in rooms 201 and 203
+LEAST = 2.5e-4  # of the image: smaller regions show the encoder nothing
+VERSION = 1
+
+
+def agreed_features(
+    gaussians: Gaussians,
+    views: Views,
+    photographs: Sequence[Array],
+    encoder: ImageEncoder,
+    rasterizer: LiftingRasterizer,
+    work: Path,
+    progress: Progress,
+    processes: ProcessGroup | None = None,
+) -> StoredFeatures:
+    """Masks and CLIP vectors of every view by the consensus of all views' masks, whose vectors are not read.
+
+    photographs: (H, W, 3) uint8 of each view. What is finished is kept in `work`.
+    """
+    processes = processes or ProcessGroup()
+    inputs = gaussians_digest(gaussians), [features_digest(features) for _, features in views]
+    folder = work / stage_key("rough-memberships", VERSION, *inputs)
+    mask_weights = kept_mask_weights(gaussians, views, folder, rasterizer, processes, progress)
+    counts = [len(features.vectors) for _, features in views]
+    eyes = np.stack([camera.position for camera, _ in views])
+
+    def make() -> Tree:
+        return find_tree(gaussians, build_surface(gaussians), mask_weights, counts, eyes, progress)
+
+    key = stage_key("tree", VERSION, *inputs)
+    tree = processes.once(lambda: kept(work / f"{key}.npz", make, _pack, _unpack))
+    cuts = [tree.cut(cost) for cost in CUTS]
+    store, made_by = FeatureStore(work / "agreed"), stage_key(key, VERSION, CUTS, LEAST, fingerprint(encoder))
+    for index in processes.share(range(len(views))):
+        camera, _ = views[index]
+        if not store.has(camera.name, made_by):
+            maps = nested_maps(draw_patches(rasterizer.view(gaussians, camera), tree.patches), cuts, LEAST)
+            vectors = embed_regions(photographs[index], maps, encoder)
+            store.save(camera.name, ImageFeatures(maps, vectors), made_by)
+        progress(MASKS_STAGE, (index + 1) / len(views))
+    processes.barrier()
+    return StoredFeatures(store, [camera.name for camera, _ in views])
+
+
+def _pack(tree: Tree) -> Arrays:
+    return {"patches": tree.patches, "children": tree.children, "costs": tree.costs}
+
+
+def _unpack(arrays: Arrays) -> Tree:
+    return Tree(arrays["patches"], arrays["children"], arrays["costs"])

@@ -1,0 +1,225 @@
+"""The tree of things against plain loops in float64, and on scenes whose things are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
+from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.scene.surface import build_surface
+from langsplat_core.semantics.store import ImageFeatures
+from langsplat_core.training.language import tree as module
+from langsplat_core.training.language.mask_weights import MaskWeights, find_mask_weights
+from langsplat_core.training.language.tree import (
+    BENT,
+    COLOUR,
+    ENOUGH,
+    PLAIN,
+    SEEN,
+    SMALL,
+    UNSEEN,
+    Patches,
+    Tree,
+    draw_patches,
+    find_borders,
+    find_tree,
+    link_concavity,
+    link_disagreement,
+    merge,
+    nested_maps,
+)
+from tests.support.fakes import PER_BLOB, blob_scene, cameras
+from tests.support.scenes import make_views, random_camera, random_gaussians
+
+
+def random_patches(seed: int, count: int = 24, views: int = 4) -> Patches:
+    """Patches along a ring with chords, random masses in random masks; some are seen nowhere."""
+    rng = np.random.default_rng(seed)
+    masks = 5 * 3 * views
+    masses = rng.uniform(0, 20, (count, masks)) * (rng.uniform(size=(count, masks)) < 0.3)
+    masses[rng.integers(0, count, 2)] = 0
+    first = np.concatenate([np.arange(count), rng.integers(0, count, count)])
+    second = np.concatenate([np.roll(np.arange(count), 1), rng.integers(0, count, count)])
+    borders = find_borders(
+        np.arange(count), (first, second), rng.uniform(size=2 * count), rng.uniform(size=2 * count)
+    )
+    labelling = np.arange(masks, dtype=np.int32) // 5
+    colours, areas = rng.dirichlet(np.ones(3), count), rng.uniform(0.1, 3, count)
+    return Patches(sparse.csr_matrix(masses.astype(np.float32)), labelling, colours, areas, borders)
+
+
+def merged_plainly(patches: Patches) -> tuple[list[tuple[int, int]], list[float]]:
+    """Every cost anew at every step, from the patches themselves."""
+    masses, borders = patches.masses.toarray().astype(np.float64), patches.borders
+    nodes = {number: [number] for number in range(len(patches.areas))}
+    children, costs = [], []
+
+    def cost(a: list[int], b: list[int]) -> float | None:
+        across = [
+            row
+            for row, ends in enumerate(zip(borders.first, borders.second, strict=True))
+            if (ends[0] in a and ends[1] in b) or (ends[0] in b and ends[1] in a)
+        ]
+        if not across:
+            return None
+        agreed = seen = 0.0
+        for k in range(patches.labelling.max() + 1):
+            mine, theirs = (masses[nodes][:, patches.labelling == k].sum(0) for nodes in (a, b))
+            least = min(mine.sum(), theirs.sum())
+            seen += least
+            if least > 0:
+                agreed += least * (mine / mine.sum()) @ (theirs / theirs.sum())
+        agreement = agreed / seen if seen > 0 else 1 - UNSEEN
+        links = borders.links[across].sum()
+        means = [np.average(patches.colours[nodes], axis=0, weights=patches.areas[nodes]) for nodes in (a, b)]
+        between = SEEN * (1 - agreement) + SEEN * borders.disagreement[across].sum() / links
+        between += BENT * borders.concavity[across].sum() / links
+        between += COLOUR * np.linalg.norm(means[0] - means[1])
+        smaller = min(patches.areas[a].sum(), patches.areas[b].sum()) / patches.areas.sum()
+        return between * (smaller / PLAIN) ** SMALL
+
+    while True:
+        pairs = [(cost(nodes[a], nodes[b]), a, b) for a in nodes for b in nodes if a < b]
+        pairs = [pair for pair in pairs if pair[0] is not None]
+        if not pairs:
+            return children, costs
+        least, a, b = min(pairs)
+        nodes[len(patches.areas) + len(children)] = nodes.pop(a) + nodes.pop(b)
+        children.append((a, b))
+        costs.append(least)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_merging_is_average_linkage(seed):
+    patches = random_patches(seed)
+    children, costs = merge(patches)
+    want, want_costs = merged_plainly(patches)
+    assert children.tolist() == [list(pair) for pair in want]
+    np.testing.assert_allclose(costs, want_costs, rtol=1e-5)  # masses are summed in float32
+
+
+def test_disagreement_of_links():
+    gaussians = random_gaussians(120, seed=3, scale_range=(0.1, 0.3))
+    mask_weights = find_mask_weights(CpuRasterizer(), gaussians, make_views(4))
+    surface = build_surface(gaussians)
+    found = link_disagreement(surface, mask_weights)
+    assert 0 < found.mean() < 1
+    for link in range(0, len(found), 7):
+        ends = [surface.rows[numbers[link]] for numbers in surface.ends]
+        apart = seen = 0.0
+        for pairs in mask_weights.pairs:
+            for level in range(3):
+                own = [pairs[(pairs["row"] == row) & (pairs["level"] == level)] for row in ends]
+                if all(map(len, own)):
+                    best = [one[one["weight"].argmax()] for one in own]
+                    weight = min(*(one["weight"] for one in best), ENOUGH)
+                    seen += weight
+                    apart += weight * (best[0]["mask"] != best[1]["mask"])
+        assert found[link] == pytest.approx(apart / seen if seen else UNSEEN, abs=1e-5)
+
+
+def test_a_surface_bends_towards_itself_in_a_corner_and_away_on_a_ridge():
+    """Two planes that meet in a right angle, seen from the open side and from behind."""
+    rng = np.random.default_rng(0)
+    flat = np.concatenate([rng.uniform(0, 1, (800, 2)), np.zeros((800, 1))], 1)
+    means = np.concatenate([flat, flat[:, [2, 1, 0]]])
+    base = random_gaussians(len(means), scale_range=(0.02, 0.03))
+    gaussians = replace(base, means=means.astype(np.float32), opacity_logits=base.opacity_logits * 0 + 4)
+    surface = build_surface(gaussians)
+    middles = surface.positions[surface.ends[0]]
+    crease = (middles[:, 0] < 0.05) & (middles[:, 2] < 0.05)
+    inside = link_concavity(surface, np.array([[2.0, 0.5, 2.0]]))
+    outside = link_concavity(surface, np.array([[-2.0, 0.5, -2.0]]))
+    assert inside[crease].mean() > 5 * inside[~crease].mean()
+    assert inside[crease].mean() > 5 * outside[crease].mean()
+    assert ((inside >= 0) & (inside <= 1)).all()
+
+
+def blob_views(wrong: float) -> tuple:
+    """A scene of blobs, the blob of each Gaussian, and views with a mask a blob; a share of all pixels has a
+    random mask."""
+    scene, rng = blob_scene(), np.random.default_rng(0)
+    blob = np.arange(len(scene.gaussians)) // PER_BLOB
+    views = []
+    for camera in cameras():
+        view = CpuRasterizer().view(scene.gaussians, camera)
+        labels = draw_patches(view, blob.astype(np.int32))
+        noise = rng.integers(0, blob.max() + 1, labels.shape)
+        labels = np.where((rng.uniform(size=labels.shape) < wrong) & (labels >= 0), noise, labels)
+        maps = np.stack([np.full_like(labels, -1), np.full_like(labels, -1), labels]).astype(np.int32)
+        views.append((camera, ImageFeatures(maps, np.zeros((int(blob.max()) + 1, 0), np.float32))))
+    return scene, blob, views
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.15])
+def test_things_come_out_though_some_masks_are_wrong(wrong):
+    scene, blob, views = blob_views(wrong)
+    mask_weights = find_mask_weights(CpuRasterizer(), scene.gaussians, views)
+    surface = build_surface(scene.gaussians)
+    eyes = np.stack([camera.position for camera, _ in views])
+    counts = [len(features.vectors) for _, features in views]
+    tree = find_tree(scene.gaussians, surface, mask_weights, counts, eyes)
+    nodes = tree.cut(0.5)[tree.patches[surface.rows]]
+    for one in np.unique(blob):
+        own = blob[surface.rows] == one
+        node = np.bincount(nodes[own]).argmax()
+        assert (own & (nodes == node)).sum() / (own | (nodes == node)).sum() > 0.9
+
+
+def test_cuts_are_nested_and_end_at_their_cost():
+    patches = random_patches(1)
+    children, costs = merge(patches)
+    tree = Tree(np.arange(24, dtype=np.int32), children, costs)
+    assert tree.cut(-1.0).tolist() == list(range(24))
+    coarser = tree.cut(np.inf)
+    assert coarser.max() + 1 == 24 - len(children)
+    for low, high in zip(
+        np.quantile(costs, [0.1, 0.4, 0.7]), np.quantile(costs, [0.4, 0.7, 0.9]), strict=True
+    ):
+        fine, coarse = tree.cut(low), tree.cut(high)
+        for node in np.unique(fine):
+            assert len(np.unique(coarse[fine == node])) == 1
+
+
+def test_a_pixel_has_the_patch_it_shows_most_of():
+    gaussians, camera = random_gaussians(60, scale_range=(0.1, 0.4)), random_camera(1, 24, 18)
+    patches = np.random.default_rng(0).integers(-1, 5, 60).astype(np.int32)
+    drawn = draw_patches(CpuRasterizer().view(gaussians, camera), patches)
+    image, alpha = (
+        ReferenceRasterizer()
+        .view(gaussians, camera)
+        .splat((patches[:, None] == np.arange(5)).astype(np.float64))
+    )
+    two = np.sort(image, axis=-1)[..., -2:]
+    clear = (two[..., 1] - two[..., 0] > 1e-3) & (np.abs(alpha - module.SOLID) > 1e-3)
+    want = np.where((alpha > module.SOLID) & (image.max(-1) > 0), image.argmax(-1), -1)
+    assert clear.mean() > 0.8
+    np.testing.assert_array_equal(drawn[clear], want[clear])
+
+
+def test_maps_number_what_is_seen_of_three_cuts():
+    drawn = np.array([[0, 0, 1, 1], [2, 2, 3, -1]])
+    maps = nested_maps(drawn, [np.arange(4), np.array([0, 0, 1, 1]), np.zeros(4, np.int64)], 2 / drawn.size)
+    assert maps.tolist() == [
+        [[0, 0, 1, 1], [2, 2, -1, -1]],
+        [[3, 3, 3, 3], [4, 4, 4, -1]],
+        [[5, 5, 5, 5], [5, 5, 5, -1]],
+    ]
+
+
+def test_almost_nothing():
+    """No Gaussian, one, and masks that no Gaussian paints."""
+    eyes = np.zeros((1, 3))
+    for count in (0, 1, 3):
+        gaussians = random_gaussians(count)
+        mask_weights = MaskWeights(
+            [find_mask_weights(CpuRasterizer(), random_gaussians(0), make_views(1)).pairs[0][:0]], count
+        )
+        tree = find_tree(gaussians, build_surface(gaussians), mask_weights, [7], eyes)
+        assert tree.patches.shape == (count,)
+        assert (tree.cut(0.5) >= 0).all()
+    view = CpuRasterizer().view(random_gaussians(3), random_camera(0, 8, 6))
+    assert (draw_patches(view, np.full(3, -1, np.int32)) == -1).all()
+    assert (nested_maps(np.full((6, 8), -1, np.int32), [np.zeros(0, np.int32)] * 3, 0.1) == -1).all()
