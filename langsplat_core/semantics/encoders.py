@@ -90,7 +90,7 @@ def clip_text(weights: Weights) -> TextTower:
     return plain_text_tower(weights) or ClipText(weights)
 
 
-CLIP = Family("CLIP", clip_text, ClipImages)
+CLIP = Family(clip_text, ClipImages)
 
 
 def _load(kind: Any, tower: str, weights: Weights) -> Any:
@@ -189,7 +189,7 @@ def _siglip_config(weights: Weights) -> Any:
     return load_config(SiglipConfig, weights, "SigLIP")
 
 
-SIGLIP = Family("SigLIP", SiglipText, SiglipImages)
+SIGLIP = Family(SiglipText, SiglipImages)
 
 
 # Image-text encoders by hub id, folder or file: a new family is two towers above and one row here.
