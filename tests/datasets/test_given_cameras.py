@@ -1,4 +1,4 @@
-"""Datasets that bring cameras, COLMAP's and nerfstudio's: read as they are meant, odd and hostile ones too."""
+"""Datasets that bring cameras, COLMAP's and nerfstudio's: read as they are meant, also hostile ones."""
 
 import json
 import logging

@@ -486,20 +486,6 @@ def refusal(load: Callable[[str], object], path: Path) -> str:
     return said
 
 
-@pytest.mark.parametrize("case", HOSTILE_CLIP)
-def test_tensors_that_are_no_clip_are_one_line(case: str, tmp_path: Path) -> None:
-    letter_tokenizer(tmp_path)
-    torch.save(HOSTILE_CLIP[case](open_clip_tensors()), tmp_path / "model.pt")
-    refusal(load_encoder, tmp_path / "model.pt")
-
-
-@pytest.mark.parametrize("case", HOSTILE_SAM)
-def test_tensors_that_are_no_sam_are_one_line(case: str, tmp_path: Path) -> None:
-    tensors = segment_anything_tensors(tiny_sam(tmp_path, decoder_heads=8))
-    torch.save(HOSTILE_SAM[case](tensors), tmp_path / "sam.pth")
-    refusal(load_segmenter, tmp_path / "sam.pth")
-
-
 HOSTILE_SAM2 = {
     "three points": without("sam_prompt_encoder.point_embeddings.2.weight"),
     "a flat point": replaced("sam_prompt_encoder.point_embeddings.2.weight", torch.zeros(16)),
@@ -519,20 +505,37 @@ def sam2_size(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(layouts, "SAM2_SIZES", {(8, 5): layouts.Hiera(1, (8, 4, 4, 2), (3,))})
 
 
-@pytest.mark.usefixtures("sam2_size")
-@pytest.mark.parametrize("case", HOSTILE_SAM2)
-def test_tensors_that_are_no_sam2_are_one_line(case: str, tmp_path: Path) -> None:
-    model = tiny_sam2(tmp_path / "folder", decoder_heads=8)
+def sam2_checkpoint(folder: Path) -> Tensors:
+    model = tiny_sam2(folder / "folder", decoder_heads=8)
     model.shared_image_embedding = model.prompt_encoder.shared_embedding
-    tensors = sam2_tensors(model)
-    torch.save({"model": HOSTILE_SAM2[case](tensors)}, tmp_path / "sam2.1_hiera_tiny.pt")
-    refusal(load_segmenter, tmp_path / "sam2.1_hiera_tiny.pt")
+    return sam2_tensors(model)
+
+
+def sam_checkpoint(folder: Path) -> Tensors:
+    return segment_anything_tensors(tiny_sam(folder, decoder_heads=8))
+
+
+@pytest.mark.usefixtures("sam2_size")
+@pytest.mark.parametrize(
+    ("make", "change", "load"),
+    [
+        *((lambda folder: open_clip_tensors(), change, load_encoder) for change in HOSTILE_CLIP.values()),
+        *((sam_checkpoint, change, load_segmenter) for change in HOSTILE_SAM.values()),
+        *((sam2_checkpoint, change, load_segmenter) for change in HOSTILE_SAM2.values()),
+    ],
+    ids=[*HOSTILE_CLIP, *(f"SAM: {case}" for case in HOSTILE_SAM), *(f"SAM 2: {c}" for c in HOSTILE_SAM2)],
+)
+def test_tensors_of_no_model_known_are_one_line(make, change, load, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    letter_tokenizer(tmp_path)
+    changed = change(make(tmp_path))
+    torch.save({"model": changed} if make is sam2_checkpoint else changed, tmp_path / "model.pt")
+    refusal(load, tmp_path / "model.pt")
 
 
 def test_a_mobile_sam_is_told_what_to_take_in_its_place(tmp_path: Path) -> None:
-    tensors = segment_anything_tensors(tiny_sam(tmp_path, decoder_heads=8))
     encoder = {"image_encoder.patch_embed.seq.0.c.weight": torch.zeros(32, 3, 3, 3)}
-    decoder = {name: tensor for name, tensor in tensors.items() if not name.startswith("image_encoder")}
+    tensors = sam_checkpoint(tmp_path).items()
+    decoder = {name: tensor for name, tensor in tensors if not name.startswith("image_encoder")}
     torch.save(encoder | decoder, tmp_path / "mobile_sam.pt")
     assert "sam_vit_b_01ec64.pth" in refusal(load_segmenter, tmp_path / "mobile_sam.pt")
 
