@@ -1,9 +1,9 @@
-"""pycolmap, imported so that it leaves signals alone and its libraries keep to one thread.
+"""Lenses of photographs: their formulas, their inverses, and resampling to a pinhole; and pycolmap.
 
-Its logging library installs a handler of its own for SIGTERM, which prints a stack trace and kills the
-process. Whatever was there before is put back. Its wheel brings OpenMP (and a package of other make may bring
-OpenBLAS) of its own, which ask the environment how many threads to use when they are loaded, and never again.
-COLMAP's own threads are another matter. Import `pycolmap` from here.
+Import `pycolmap` from here, where it leaves signals alone and its libraries keep to one thread. Its logging
+library installs a handler of its own for SIGTERM, which prints a stack trace and kills the process: what was
+there before is put back. Its wheel brings OpenMP (and a package of other make may bring OpenBLAS) of its own,
+which ask the environment how many threads to use when they are loaded, and never again.
 """
 
 import ctypes
@@ -141,7 +141,6 @@ class ColmapDistortion:
     cy: float
 
     def __call__(self, xy: Array) -> Array:
-
         # The size plays no part in these models, but pycolmap asks for one.
         camera = pycolmap.Camera(model=self.model, width=1, height=1, params=np.array(self.params))
         rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
@@ -250,18 +249,9 @@ def pinhole_for(intrinsics: PhotoIntrinsics, max_side: int) -> Camera:
     """
     if intrinsics.distortion is None:
         scale = min(1.0, max_side / max(intrinsics.width, intrinsics.height))
-        whole = Camera(
-            intrinsics.width,
-            intrinsics.height,
-            intrinsics.fx,
-            intrinsics.fy,
-            intrinsics.cx,
-            intrinsics.cy,
-            np.eye(4),
-        )
-        return whole.resized(
-            max(1, round(intrinsics.width * scale)), max(1, round(intrinsics.height * scale))
-        )
+        size = max(1, round(intrinsics.width * scale)), max(1, round(intrinsics.height * scale))
+        lens = intrinsics.resized(*size)
+        return Camera(*size, lens.fx, lens.fy, lens.cx, lens.cy, np.eye(4))
     left, top, right, bottom = _inner_rectangle(intrinsics)
     wide, high = intrinsics.fx * (right - left), intrinsics.fy * (bottom - top)
     if not (wide >= 1 and high >= 1):

@@ -33,7 +33,9 @@ Json = dict[str, Any]
 
 def load_nerfstudio(file: Path, max_side: int, progress: Progress) -> Capture:
     """The photographs and cameras that `file` lists; points only if it names a PLY."""
-    top = _read_json(file)
+    top = read_json_file(file, JSON_LIMIT)
+    if not isinstance(top, dict):
+        raise FormatError(f"{file} is not a nerfstudio dataset: expected an object at the top")
     frames = top.get("frames")
     if not isinstance(frames, list) or not frames:
         raise FormatError(f'{file} has no list of "frames"; it is not a nerfstudio dataset')
@@ -88,13 +90,6 @@ def _report_missing(file: Path, missing: list[str], total: int) -> None:
             file.name,
             shortened(missing),
         )
-
-
-def _read_json(file: Path) -> Json:
-    top = read_json_file(file, JSON_LIMIT)
-    if not isinstance(top, dict):
-        raise FormatError(f"{file} is not a nerfstudio dataset: expected an object at the top")
-    return top
 
 
 def _photo_file(folder: Path, label: str) -> Path | None:

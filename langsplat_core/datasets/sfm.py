@@ -1,4 +1,4 @@
-"""Cameras of plain photographs by structure from motion (pycolmap)."""
+"""Structure from motion (pycolmap): focal lengths from EXIF data, features and matches, cameras, points."""
 
 import errno
 import hashlib
@@ -69,13 +69,7 @@ def _on_film(inner: dict[int, Any], size: tuple[int, int]) -> dict[int, int]:
     return {_FOCAL_ON_FILM: round(length)} if known else {}
 
 
-def tags(exif: Image.Exif) -> dict[int, object]:
-    """Return all tags, the inner ones too."""
-    return dict(exif) | dict(exif.get_ifd(_EXIF_IFD))
-
-
-# pycolmap, wrapped: features, matches and triangulation, in steps that report and resume; mapping is in
-# `mapping.py`.
+# Features, matches and triangulation by pycolmap, in steps that report and resume.
 #
 # A *workspace* is a folder with small copies of the photographs (``images``), COLMAP's ``database.db`` and,
 # in the end, the model (``sparse``). It is named by a digest of all that it is made from; the database
@@ -569,7 +563,9 @@ def _small_copies(folder: Path, numbered: dict[str, Path], progress: Progress) -
             if not (folder / name).is_file():
                 _write_copy(path, folder / name)
             with opened(folder / name) as copy:
-                copies.append(_Copy(name, copy.size, str(tags(copy.getexif()))))
+                exif = copy.getexif()
+                lens = str(dict(exif) | dict(exif.get_ifd(_EXIF_IFD)))
+                copies.append(_Copy(name, copy.size, lens))
         except PictureError as error:
             broken.append(f"{path.name} ({error.reason})")
     progress("preparing photographs", 1.0)

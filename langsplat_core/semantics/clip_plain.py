@@ -106,12 +106,9 @@ class PlainClipText:
         return text_vectors(self._tensors, self._config, ids, np.array([len(row) - 1 for row in rows]))
 
 
-def plain_text_tower(weights: Weights, most: int = MOST_WEIGHTS) -> PlainClipText | None:
+def plain_text_tower(weights: Weights) -> PlainClipText | None:
     """The text half in `weights`, if it is small, whole and of a kind that is computed here; else None, and
-    torch reads the folder, or says what is wrong with it.
-
-    most: how many weights the half may have.
-    """
+    torch reads the folder, or says what is wrong with it."""
     if weights.device != "cpu" or weights.converted:
         return None
     config = _text_config(weights)
@@ -122,7 +119,7 @@ def plain_text_tower(weights: Weights, most: int = MOST_WEIGHTS) -> PlainClipTex
     ):
         return None
     shapes = config.shapes()
-    if sum(int(np.prod(shape)) for shape in shapes.values()) > most:
+    if sum(int(np.prod(shape)) for shape in shapes.values()) > MOST_WEIGHTS:
         return None
     tokenizer = read_pair_tokenizer(weights.folder / FILE)
     tensors = _tensors(weights.folder, shapes) if tokenizer else None

@@ -180,7 +180,6 @@ class ImageTower(Protocol):
 class Family:
     """An architecture: how its two halves are loaded."""
 
-    name: str  # in messages
     text: Callable[[Weights], TextTower]
     images: Callable[[Weights], ImageTower]
 

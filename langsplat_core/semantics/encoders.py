@@ -32,7 +32,7 @@ from langsplat_core.semantics.weights import (
     load_model,
     loading_errors,
     model_type,
-    read_scalars,
+    read_scalar,
     torch_device,
     weights_path,
 )
@@ -90,7 +90,7 @@ def clip_text(weights: Weights) -> TextTower:
     return plain_text_tower(weights) or ClipText(weights)
 
 
-CLIP = Family("CLIP", clip_text, ClipImages)
+CLIP = Family(clip_text, ClipImages)
 
 
 def _load(kind: Any, tower: str, weights: Weights) -> Any:
@@ -145,7 +145,7 @@ class SiglipText:
         self._model: Any = load_model(SiglipTextModel, weights, config)
         self._clean = text_cleaner()
         self._tokens = load_tokens(weights, int(config.max_position_embeddings))
-        scale = read_scalars(weights, ("logit_scale",)).get("logit_scale", math.nan)
+        scale = read_scalar(weights, "logit_scale")
         if not math.isfinite(scale):
             raise EncoderError(f"{weights.id}: not SigLIP weights: logit_scale is not in them")
         self.temperature = SHARE_OF_SCALE * math.exp(scale)
@@ -189,7 +189,7 @@ def _siglip_config(weights: Weights) -> Any:
     return load_config(SiglipConfig, weights, "SigLIP")
 
 
-SIGLIP = Family("SigLIP", SiglipText, SiglipImages)
+SIGLIP = Family(SiglipText, SiglipImages)
 
 
 # Image-text encoders by hub id, folder or file: a new family is two towers above and one row here.

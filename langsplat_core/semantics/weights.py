@@ -1,10 +1,11 @@
 """Finding and reading the weights of a model: a folder, a file, or a model of the Hugging Face hub."""
 
 import json
+import math
 import pickle
 import warnings
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
@@ -162,32 +163,32 @@ def load_model(kind: Any, weights: Weights, config: Any) -> Any:
     return model.eval().to(weights.device)
 
 
-def read_scalars(weights: Weights, names: Iterable[str]) -> dict[str, float]:
-    """Read those of the named numbers that are among the weights, without loading the rest of them.
+def read_scalar(weights: Weights, name: str) -> float:
+    """Read a number that is among the weights, without loading the rest of them; NaN where it is not there.
 
     Half a model (a text tower) has no place for what belongs to the pair, such as a logit scale.
     """
     with loading_errors(weights.id, "readable"):
-        for patterns, read in ((SAFE, _safe_scalars), (PICKLED, _pickled_scalars)):
+        for patterns, read in ((SAFE, _safe_tensor), (PICKLED, _pickled_tensor)):
             paths = sorted(path for pattern in patterns for path in weights.folder.glob(pattern))
             if paths:  # transformers, too, prefers the first kind where both are there
-                return {name: value for path in paths for name, value in read(path, tuple(names)).items()}
-    return {}
+                found = [tensor for path in paths if (tensor := read(path, name)) is not None]
+                return float(found[-1]) if found else math.nan
+    return math.nan
 
 
-def _safe_scalars(path: Path, names: tuple[str, ...]) -> dict[str, float]:
+def _safe_tensor(path: Path, name: str) -> Any:
     from safetensors import safe_open
 
     with safe_open(path, framework="pt") as file:
-        return {name: float(file.get_tensor(name)) for name in names if name in file.keys()}  # noqa: SIM118
+        return file.get_tensor(name) if name in file.keys() else None  # noqa: SIM118
 
 
-def _pickled_scalars(path: Path, names: tuple[str, ...]) -> dict[str, float]:
+def _pickled_tensor(path: Path, name: str) -> Any:
     import torch
 
     mapped = zipfile.is_zipfile(path)  # files of PyTorch before 1.6 are none, and are read whole
-    tensors = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
-    return {name: float(tensors[name]) for name in names if name in tensors}
+    return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped).get(name)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Digests of captures, by which the stages of a training are named."""
+"""Captures: digests, memory, photographs of every kind, the length of a unit, random points."""
 
 import errno
 import math
@@ -259,20 +259,17 @@ def test_the_place_of_a_photograph(photo: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("latitude", "signs"),
+    ("latitude", "north"),
     [
-        ((91.0, 0.0, 0.0), ("N", "E")),
-        ((IFDRational(1, 0), 0.0, 0.0), ("N", "E")),
-        ((47.0, 22.0), ("N", "E")),
-        ((47.0, 22.0, 1.0), ("X", "E")),
+        ((91.0, 0.0, 0.0), "N"),
+        ((IFDRational(1, 0), 0.0, 0.0), "N"),
+        ((47.0, 22.0), "N"),
+        ((47.0, 22.0, 1.0), "X"),
     ],
 )
-def test_what_is_no_place(photo: Path, latitude: object, signs: tuple[str, str]) -> None:
-    assert all(map(math.isnan, place(tagged(photo, latitude, parts(8.0), signs))))
-
-
-def test_a_photograph_without_a_place_or_that_cannot_be_read(photo: Path) -> None:
+def test_what_is_no_place(photo: Path, latitude: object, north: str) -> None:
     assert all(map(math.isnan, place(photo)))
+    assert all(map(math.isnan, place(tagged(photo, latitude, parts(8.0), (north, "E")))))
     photo.write_bytes(b"no photograph")
     assert all(map(math.isnan, place(photo)))
 

@@ -1,5 +1,7 @@
 """Lenses, their inverses, and the pictures made from them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
@@ -42,6 +44,8 @@ PHONE = PhotoIntrinsics(640, 480, 600.0, 604.0, 326.0, 236.0, BrownDistortion(0.
 BARREL = PhotoIntrinsics(640, 480, 420.0, 420.0, 310.0, 246.0, BrownDistortion(-0.25, 0.06))
 FISHEYE = PhotoIntrinsics(640, 480, 400.0, 397.0, 322.0, 239.0, FisheyeDistortion(0.02, -0.01, 0.003, -0.001))
 
+LENSES = [*map(intrinsics_of, map(camera_of, DISTORTED)), PHONE, BARREL, FISHEYE]
+
 
 def test_the_table_of_models_is_colmaps() -> None:
     theirs = {}
@@ -62,9 +66,7 @@ def test_pixels_agree_with_colmap(model: str) -> None:
     np.testing.assert_allclose(intrinsics_of(camera).pixels(xy), want, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "intrinsics", [*map(intrinsics_of, map(camera_of, DISTORTED)), PHONE, BARREL, FISHEYE]
-)
+@pytest.mark.parametrize("intrinsics", LENSES)
 def test_undistort_then_distort_comes_back(intrinsics: PhotoIntrinsics) -> None:
     assert intrinsics.distortion is not None
     grid = np.stack(
@@ -76,9 +78,7 @@ def test_undistort_then_distort_comes_back(intrinsics: PhotoIntrinsics) -> None:
     assert np.abs(back - pixels).max() < 1e-6  # px
 
 
-@pytest.mark.parametrize(
-    "intrinsics", [*map(intrinsics_of, map(camera_of, DISTORTED)), PHONE, BARREL, FISHEYE]
-)
+@pytest.mark.parametrize("intrinsics", LENSES)
 def test_the_pinhole_shows_no_outside_and_wastes_little(intrinsics: PhotoIntrinsics) -> None:
     camera = pinhole_for(intrinsics, 10_000)
     outline = source_positions(intrinsics, camera)
@@ -110,24 +110,18 @@ def test_a_pinhole_keeps_the_whole_photograph() -> None:
 @pytest.mark.parametrize("max_side", [10_000, 213])
 def test_the_picture_is_what_the_pinhole_sees(intrinsics: PhotoIntrinsics, max_side: int) -> None:
     pose = poses(3)[1]
-    camera = pinhole_for(intrinsics, max_side)
-    assert max(camera.width, camera.height) <= max_side
-    posed = type(camera)(*_intrinsics(camera), pose)
-    positions = None if intrinsics.distortion is None else source_positions(intrinsics, camera)
-    got = resample(Image.fromarray(photograph(intrinsics, pose)), intrinsics, camera, positions)
+    posed = replace(pinhole_for(intrinsics, max_side), world_to_camera=pose)
+    assert max(posed.width, posed.height) <= max_side
+    positions = None if intrinsics.distortion is None else source_positions(intrinsics, posed)
+    got = resample(Image.fromarray(photograph(intrinsics, pose)), intrinsics, posed, positions)
     # A shrunk picture averages over the area of its pixels; so must the truth.
     samples = 1 if max_side > 1000 else 4
     match = psnr(got, pinhole_picture(posed, samples))
     # The shrunk photograph has the right magnification at its centre; towards the edges of a barrel or
     # fisheye lens, which squeezes them, some detail is lost with the shrinking: 38.4 dB at worst.
     assert match > (40 if max_side > 1000 else 37)
-    w, h, fx, fy, cx, cy = _intrinsics(camera)
-    half_a_pixel_off = type(camera)(w, h, fx, fy, cx + 0.5, cy, pose)
+    half_a_pixel_off = replace(posed, cx=posed.cx + 0.5)
     assert psnr(got, pinhole_picture(half_a_pixel_off, samples)) < match - 5
-
-
-def _intrinsics(camera) -> tuple[int, int, float, float, float, float]:  # type: ignore[no-untyped-def]
-    return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
 
 
 def test_shrinking_averages_in_the_distorted_path_too() -> None:

@@ -1,4 +1,4 @@
-"""A walk straight ahead between two walls: what structure from motion finds hardest to begin with."""
+"""Structure from motion and triangulation, in a textured room and in a street, and EXIF focal lengths."""
 
 import json
 import logging
@@ -35,6 +35,8 @@ from tests.support.photographs import (
     write_photos,
 )
 from tests.support.processes import files_of_at_most, stop_at
+
+# A walk straight ahead between two walls: what structure from motion finds hardest to begin with.
 
 LENGTH, HALF_WIDTH, HEIGHT = 40.0, 3.0, 4.0  # world units; one walks along y at x = 0 and looks along it
 TEXELS = 24  # per unit

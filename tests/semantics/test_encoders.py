@@ -26,6 +26,7 @@ from transformers import (
 
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.scene import Calibration, Odds, Reading
+from langsplat_core.semantics import clip_plain
 from langsplat_core.semantics.clip_plain import (
     BYTES,
     PlainClipText,
@@ -208,19 +209,6 @@ def test_a_broken_reading_is_one_line(tmp_path, broken):
 
 # SigLIP and SigLIP 2 through the real loading path, with tiny models made here.
 
-Maker = Callable[[Path], Any]
-MAKERS: dict[str, Maker] = {
-    "siglip": tiny_siglip,
-    "siglip2": lambda folder: tiny_siglip(folder, second=True),
-}
-
-
-@pytest.fixture(scope="module", params=sorted(MAKERS))
-def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
-    folder = tmp_path_factory.mktemp("made") / request.param
-    folder.mkdir()
-    return folder, MAKERS[request.param](folder)
-
 
 def unit_tensor(tensor: torch.Tensor) -> np.ndarray:
     rows = tensor.detach().numpy()
@@ -251,7 +239,7 @@ def test_texts_agree_with_the_whole_model(tmp_path: Path) -> None:
 
 
 def test_texts_of_the_second_generation_agree_with_transformers(tmp_path: Path) -> None:
-    model = MAKERS["siglip2"](tmp_path)
+    model = tiny_siglip(tmp_path, second=True)
     phrases = ["Red mug", "red", "a red mug, with a very long handle"]
     ids = padded_ids(Siglip2Tokenizer.from_pretrained(tmp_path), phrases)
     assert ids[1].tolist()[1:] == [1] + [0] * (LENGTH - 2)  # an end, then padding to the right
@@ -260,11 +248,15 @@ def test_texts_of_the_second_generation_agree_with_transformers(tmp_path: Path) 
     np.testing.assert_allclose(got, want, atol=2e-6)
 
 
-def test_case_does_not_matter_and_punctuation_only_to_the_second(made: tuple[Path, Any]) -> None:
-    encoder = load_text_encoder(str(made[0]))
+@pytest.mark.parametrize("second", [False, True])
+def test_case_does_not_matter_and_punctuation_only_to_the_second(second: bool, tmp_path: Path) -> None:
+    tiny_siglip(tmp_path, second=second)
+    encoder = load_text_encoder(str(tmp_path))
     small, large, dotted = encoder.encode_texts(["red mug", "RED Mug", "red mug!"])
     np.testing.assert_allclose(small, large, atol=1e-6)
-    assert np.allclose(small, dotted, atol=1e-6) == (made[0].name == "siglip")
+    assert np.allclose(small, dotted, atol=1e-6) != second
+    for read in (encoder, load_encoder(str(tmp_path), "cpu")):
+        assert read.temperature == pytest.approx(SCALE / 10)  # a tenth of the learned scale
 
 
 def test_images_agree_with_the_whole_siglip(tmp_path: Path) -> None:
@@ -274,19 +266,6 @@ def test_images_agree_with_the_whole_siglip(tmp_path: Path) -> None:
     pixels = torch.from_numpy((pictures / 127.5 - 1).transpose(0, 3, 1, 2).astype(np.float32))
     want = unit_tensor(model.get_image_features(pixel_values=pixels).pooler_output)
     np.testing.assert_allclose(encoder.encode_images(pictures), want, atol=2e-6)
-
-
-def test_the_temperature_is_a_tenth_of_the_learned_scale(made: tuple[Path, Any]) -> None:
-    for load in (load_encoder, load_text_encoder):
-        assert load(str(made[0]), "cpu").temperature == pytest.approx(SCALE / 10)
-
-
-def remove_tokenizer(folder: Path) -> None:
-    (folder / "tokenizer.json").unlink()
-
-
-def damage_tokenizer(folder: Path) -> None:
-    (folder / "tokenizer.json").write_text('{"version": "1.0"}', encoding="utf-8")
 
 
 def remove_special_tokens(folder: Path) -> None:
@@ -301,12 +280,8 @@ def remove_logit_scale(folder: Path) -> None:
     torch.save(state, folder / "pytorch_model.bin")
 
 
-def another_model(folder: Path) -> None:
-    change_config(folder, lambda config: config.update(model_type="bert"))
-
-
-def no_json(folder: Path) -> None:
-    (folder / "config.json").write_text("{", encoding="utf-8")
+def holding(name: str, text: str) -> Callable[[Path], object]:
+    return lambda folder: (folder / name).write_text(text, encoding="utf-8")
 
 
 def change_config(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
@@ -319,15 +294,18 @@ def change_config(folder: Path, change: Callable[[dict[str, Any]], None]) -> Non
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (remove_tokenizer, r"no tokenizer\.json in this folder"),
-        (damage_tokenizer, r"tokenizer\.json is no tokenizer"),
+        (lambda folder: (folder / "tokenizer.json").unlink(), r"no tokenizer\.json in this folder"),
+        (holding("tokenizer.json", '{"version": "1.0"}'), r"tokenizer\.json is no tokenizer"),
         (remove_special_tokens, "no eos_token"),
         (remove_logit_scale, "logit_scale is not in them"),
-        (another_model, "'bert' model is no image-text encoder known here; known are clip, siglip"),
-        (no_json, r"config\.json cannot be read"),
+        (
+            holding("config.json", '{"model_type": "bert"}'),
+            "'bert' model is no image-text encoder known here; known are clip, siglip",
+        ),
+        (holding("config.json", "{"), r"config\.json cannot be read"),
     ],
 )
-def test_a_broken_folder_is_one_line(tmp_path: Path, damage: Callable[[Path], None], message: str) -> None:
+def test_a_broken_folder_is_one_line(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:
     tiny_siglip(tmp_path)
     damage(tmp_path)
     with pytest.raises(EncoderError, match=message) as error:
@@ -391,8 +369,6 @@ def test_a_random_one_agrees_with_float64(tmp_path: Path, activation: str, half:
 def test_an_end_token_numbered_as_of_old(tmp_path: Path) -> None:
     """OpenAI's and OpenCLIP's configurations say 2, and mean the token with the highest number."""
     tiny_clip(tmp_path)
-    path = tmp_path / "tokenizer.json"
-    path.write_text(path.read_text(encoding="utf-8"), encoding="utf-8")
     change_config(tmp_path, lambda config: config["text_config"].update(eos_token_id=2))
     assert plain_text_tower(Weights("tiny", tmp_path, "cpu")) is None  # whose end token is the second
 
@@ -421,12 +397,15 @@ def test_what_is_not_computed_here_is_left_to_torch(tmp_path: Path, case: str) -
     assert plain_text_tower(weights) is None
 
 
-def test_large_models_and_other_devices_are_left_to_torch(tmp_path: Path) -> None:
+def test_large_models_and_other_devices_are_left_to_torch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     tiny_clip(tmp_path)
     count = sum(int(np.prod(shape)) for shape in TextConfig().shapes().values())
     assert count == 63_428_096  # the text half of ViT-B/16
-    assert plain_text_tower(Weights("tiny", tmp_path, "cpu"), most=1_000) is None
     assert plain_text_tower(Weights("tiny", tmp_path, "cuda")) is None
+    monkeypatch.setattr(clip_plain, "MOST_WEIGHTS", 1_000)
+    assert plain_text_tower(Weights("tiny", tmp_path, "cpu")) is None
 
 
 @pytest.mark.parametrize("plain", [True, False])

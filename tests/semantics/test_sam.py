@@ -1,4 +1,4 @@
-"""The suppression of masks in plain loops, one pair at a time."""
+"""Masks of the SAM family against plain loops: suppression, crops, and the whole source point by point."""
 
 import json
 from collections.abc import Callable

@@ -21,7 +21,7 @@ from langsplat_core.config import (
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import CANONICAL_PHRASES, AutoencoderCodec, CodebookCodec, Codec, LinearCodec
 from langsplat_core.scene.codec import KINDS, principal_colours, stretched
-from langsplat_core.semantics.encoder import Encoder, PhraseEncoder
+from langsplat_core.semantics.encoder import PhraseEncoder
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
 from langsplat_core.semantics.vocabulary import everyday_phrases, everyday_vectors
 from langsplat_core.training.language.mask_weights import nearest_centres, spherical_kmeans
@@ -42,7 +42,7 @@ class Vocabulary:
         return relevancy_of(vectors @ self.phrases.T, zero[:, None], rate[:, None])
 
 
-def everyday_vocabulary(encoder: Encoder | PhraseEncoder, phrases: tuple[str, ...] = ()) -> Vocabulary:
+def everyday_vocabulary(encoder: PhraseEncoder, phrases: tuple[str, ...] = ()) -> Vocabulary:
     """`phrases` and everyday ones, as `encoder` writes them."""
     texts = list(dict.fromkeys([*phrases, *everyday_phrases(encoder.unknown_words)]))
     canonical = encoder.encode_texts(list(CANONICAL_PHRASES))

@@ -1,7 +1,7 @@
 """Rendering with gradients by every parameter of the Gaussians, one small interface, two backends.
 
 * CPU: the project's own kernels behind a `torch.autograd.Function`; arrays are shared, not copied.
-* CUDA: gsplat (`differentiable_cuda`), imported only when asked for or found.
+* CUDA: gsplat and its gradients.
 """
 
 from collections.abc import Callable
@@ -122,11 +122,8 @@ class CpuRenderer:
         return Rendered(image, alpha, visible[0], probe)
 
 
-# The `DifferentiableRenderer` on CUDA: gsplat's rasterizer and its gradients.
-
-
 class CudaRenderer:
-    """Draws with gsplat; how it differs from the CPU kernels says `raster.gsplat`."""
+    """`DifferentiableRenderer` on gsplat; `raster.gsplat` says how it differs from the CPU kernels."""
 
     def __init__(self, settings: RasterSettings = INRIA) -> None:
         self.device = torch.device(gsplat.DEVICE)
@@ -144,8 +141,6 @@ class CudaRenderer:
         return Rendered(drawn.image, drawn.alpha, drawn.visible, drawn.means_px)
 
 
-# Which renderer a training draws with.
-
 Backend = Literal["auto", "cpu", "cuda"]
 
 
@@ -156,7 +151,6 @@ def renderer_for(backend: Backend) -> DifferentiableRenderer:
     """
     if backend == "cpu" or (backend == "auto" and not torch.cuda.is_available()):
         return CpuRenderer()
-
     try:
         return CudaRenderer()
     except BackendError:

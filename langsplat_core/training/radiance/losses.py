@@ -1,9 +1,7 @@
-"""`losses.radiance_loss` and its gradient for the CPU, fused in three passes over the picture's rows.
+"""Image losses: L1 and structural similarity (Wang et al. 2004), in torch and as compiled CPU kernels.
 
-The same formulas as in `losses` (whose torch version is the reference it is tested against). The windows
-are separable, so: pass 1 blurs the raw moments along rows; pass 2 blurs them across rows, forms SSIM and
-its derivatives by the moments, and blurs those along rows; pass 3 blurs the derivatives across rows and
-adds everything up. Rows are independent within a pass, so results do not depend on the number of threads.
+Images are (H, W, C) float32 with values about [0, 1]. The SSIM window is the usual Gaussian of 11x11 pixels
+with sigma 1.5; outside the image it sees zeros, as in the INRIA code.
 """
 
 import math
@@ -16,9 +14,22 @@ from torch import Tensor
 from langsplat_core.arrays import Array
 from langsplat_core.compiled import helper, kernel, shared_workers
 
-RADIUS = 5  # of the window, pixels
+RADIUS, SIGMA = 5, 1.5  # of the window, pixels
+C1, C2 = 0.01**2, 0.03**2  # of SSIM, for a data range of 1
 _TWO = np.float32(2)  # a plain 2 would turn every product into float64 and halve the speed
 _ONE = np.float32(1)
+
+
+def _window() -> list[float]:
+    """The 11 normalised taps of the one-dimensional window."""
+    taps = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(-RADIUS, RADIUS + 1)]
+    return [tap / sum(taps) for tap in taps]
+
+
+# The loss and its gradient in three passes over the rows: pass 1 blurs the raw moments along rows; pass 2
+# blurs them across rows, forms SSIM and its derivatives by the moments, and blurs those along rows; pass 3
+# blurs the derivatives across rows and adds everything up. Rows are independent within a pass, so results do
+# not depend on the number of threads.
 
 
 @helper
@@ -129,44 +140,25 @@ def _gather_gradient(
         row_l1[row] = difference.sum()
 
 
-def loss_and_gradient(
-    picture: Array, target: Array, lambda_dssim: float, taps: Array, constants: tuple[float, float]
-) -> tuple[float, Array]:
-    """(H, W, C) contiguous float32 pictures -> the loss and its (H, W, C) gradient by `picture`.
-
-    `taps` are the window's 11 taps, `constants` SSIM's C1 and C2.
-    """
+def loss_and_gradient(picture: Array, target: Array, lambda_dssim: float) -> tuple[float, Array]:
+    """(H, W, C) contiguous float32 pictures -> the loss and its (H, W, C) gradient by `picture`."""
     height, width, channels = picture.shape
     n = width * channels
     x, y = picture.reshape(height, n), target.reshape(height, n)
-    taps = np.ascontiguousarray(taps, np.float32)
+    taps, constants = np.array(_window(), np.float32), np.array((C1, C2), np.float32)
     moments, derivatives = np.empty((4, height, n), np.float32), np.empty((3, height, n), np.float32)
     row_ssim, row_l1 = np.empty(height), np.empty(height)
     gradient = np.empty((height, n), np.float32)
     weights = np.array([1 - lambda_dssim, lambda_dssim], np.float32) / np.float32(x.size)
     run = shared_workers().run
     run(_blur_moments, height, x, y, channels, taps, moments)
-    run(_compare, height, moments, np.array(constants, np.float32), channels, taps, derivatives, row_ssim)
+    run(_compare, height, moments, constants, channels, taps, derivatives, row_ssim)
     run(_gather_gradient, height, x, y, derivatives, weights, taps, gradient, row_l1)
     loss = (1 - lambda_dssim) * row_l1.sum() / x.size + lambda_dssim * (1 - row_ssim.sum() / x.size)
     return float(loss), gradient.reshape(picture.shape)
 
 
-# Picture losses and scores: L1, structural similarity (Wang et al. 2004), PSNR. Torch, any device.
-#
-# Pictures are (H, W, C) float32 with values about [0, 1]. The SSIM window is the usual Gaussian of 11x11
-# pixels with sigma 1.5; outside the picture it sees zeros, as in the INRIA code.
-
-WINDOW_RADIUS = 5  # pixels
-WINDOW_SIGMA = 1.5  # pixels
-C1 = 0.01**2  # for a data range of 1
-C2 = 0.03**2
-
-
-def _window() -> list[float]:
-    """The 11 normalised taps of the one-dimensional window."""
-    taps = [math.exp(-0.5 * (k / WINDOW_SIGMA) ** 2) for k in range(-WINDOW_RADIUS, WINDOW_RADIUS + 1)]
-    return [tap / sum(taps) for tap in taps]
+# The same by torch, on any device, and the loss of training.
 
 
 def blur(pictures: Tensor) -> Tensor:
@@ -178,7 +170,7 @@ def blur(pictures: Tensor) -> Tensor:
     taps = _window()
     height, width = pictures.shape[-3], pictures.shape[-2]
     for axis, size in ((-2, width), (-3, height)):
-        padding = [0, 0] * (-axis - 1) + [WINDOW_RADIUS, WINDOW_RADIUS]
+        padding = [0, 0] * (-axis - 1) + [RADIUS, RADIUS]
         padded = torch.nn.functional.pad(pictures, padding)
         pictures = padded.narrow(axis, 0, size) * taps[0]
         for offset, tap in enumerate(taps[1:], start=1):
@@ -228,7 +220,7 @@ class _MeanSsim(torch.autograd.Function):
 
 
 class _CpuLoss(torch.autograd.Function):
-    """`radiance_loss` by `cpu_loss`, which finds value and gradient together."""
+    """`radiance_loss` by the compiled kernels, which find value and gradient together."""
 
     @staticmethod
     def forward(ctx: Any, picture: Tensor, target: Tensor, lambda_dssim: float) -> Tensor:
@@ -236,8 +228,6 @@ class _CpuLoss(torch.autograd.Function):
             picture.detach().contiguous().numpy(),
             target.contiguous().numpy(),
             lambda_dssim,
-            np.array(_window()),
-            (C1, C2),
         )
         ctx.save_for_backward(torch.from_numpy(gradient))
         return torch.tensor(value)

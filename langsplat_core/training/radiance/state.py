@@ -95,10 +95,8 @@ def _neighbour_distance(points: Array) -> Array:
     return np.maximum(np.sqrt((distances[:, 1:] ** 2).mean(1)), SMALLEST_DISTANCE)
 
 
-# What radiance training changes from step to step: parameters, Adam's moments, statistics.
-#
-# All of it has one row per Gaussian, so that adding and removing Gaussians is one operation (`rearrange`)
-# that cannot leave the optimiser behind the parameters.
+# Parameters, Adam's moments and statistics. All of it has one row per Gaussian, so that adding and removing
+# Gaussians is one operation (`rearrange`) that cannot leave the optimiser behind the parameters.
 
 PARAMETERS = ("means", "log_scales", "quats_wxyz", "opacity_logits", "sh_dc", "sh_rest")
 ADAM_BETAS = (0.9, 0.999)

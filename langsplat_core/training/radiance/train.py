@@ -150,7 +150,7 @@ class ViewScore:
 
 class _Pictures:
     """Photographs and cameras of the training views, whole and at half size. On a GPU they are copied to it;
-    else they stay as they are, which for many is in files (`datasets.album`)."""
+    else they stay as they are, which for many is in files (`capture.Album`)."""
 
     def __init__(self, capture: Capture, indices: Sequence[int], device: torch.device) -> None:
         def kept(image: Array) -> Array | Tensor:

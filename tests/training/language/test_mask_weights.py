@@ -10,7 +10,6 @@ from langsplat_core.raster import load_lifting_rasterizer, protocol
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import LEVELS, NO_THING
 from langsplat_core.semantics.store import ImageFeatures
-from langsplat_core.training.language import mask_weights as blocks
 from langsplat_core.training.language import mask_weights as module
 from langsplat_core.training.language.mask_weights import (
     PAIR,
@@ -299,5 +298,5 @@ def test_a_mask_that_the_sample_misses_shows_no_thing(monkeypatch):
 def test_blocks_change_nothing(monkeypatch):
     views = random_views(5)
     whole = found(views, 240)
-    monkeypatch.setattr(blocks, "BLOCK", 37)
+    monkeypatch.setattr(module, "BLOCK", 37)
     np.testing.assert_array_equal(found(views, 240), whole)

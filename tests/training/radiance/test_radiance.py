@@ -1,4 +1,4 @@
-"""Losses against scikit-image, automatic differentiation and hand-made cases."""
+"""Radiance training: losses, density control, schedule, checkpoints, and whole runs on a tiny scene."""
 
 import math
 import os
