@@ -25,7 +25,6 @@ from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.scene import Gaussians
 from langsplat_core.scene.surface import build_surface
 from langsplat_core.semantics.store import (
-    MASKS_STAGE,
     FeatureStore,
     ImageEncoder,
     ImageFeatures,
@@ -37,6 +36,7 @@ from langsplat_core.training.language.tree import Tree, draw_patches, find_tree,
 
 CUTS = (0.15, 0.4, 0.8)  # costs up to which subparts, parts and wholes grow; chosen in rooms 201 and 203
 LEAST = 2.5e-4  # of the image: smaller regions show the encoder nothing
+STAGE = "describing what masks agree on"
 VERSION = 1
 
 
@@ -74,7 +74,7 @@ def agreed_features(
             maps = nested_maps(draw_patches(rasterizer.view(gaussians, camera), tree.patches), cuts, LEAST)
             vectors = embed_regions(photographs[index], maps, encoder)
             store.save(camera.name, ImageFeatures(maps, vectors), made_by)
-        progress(MASKS_STAGE, (index + 1) / len(views))
+        progress(STAGE, (index + 1) / len(views))
     processes.barrier()
     return StoredFeatures(store, [camera.name for camera, _ in views])
 

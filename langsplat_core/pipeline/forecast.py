@@ -21,6 +21,7 @@ SURE = 0.05  # share of a stage from which its own speed is trusted
 GPU = 1 / 30  # of the seconds of two CPU cores; not measured
 POINT = 0.17  # seconds of a point that a segmenter is asked at
 REGIONS = 300  # of an ordinary photograph
+AGREEING = 3.0  # seconds of a megapixel that masks are drawn into, once they agree
 # Millions of weights by what a hub id contains, the first that fits.
 MILLIONS = {
     "vit-huge": 641,
@@ -54,8 +55,9 @@ def plan(
     """The stages of a training from so many photographs, in their order; on_gpu: whether models run there."""
     megapixels = ASPECT * config.dataset.max_side**2 / 1e6
     speed = GPU if on_gpu else 1.0
-    per_photograph = _mask_seconds(config.masks, megapixels, speed)
-    per_photograph += _encoder_seconds(config.clip.model, config.masks) * speed
+    masks = _mask_seconds(config.masks, megapixels, speed)
+    vectors = _encoder_seconds(config.clip.model, config.masks) * speed
+    agreeing = 0.0 if _has_segmenter(config.masks) else AGREEING * megapixels  # and then the vectors
     gaussians = config.radiance.max_gaussians
     # A step costs what it draws, and what it keeps: 0.02 s at 0.1 megapixels, 0.1 s at 100 000 Gaussians.
     step = 0.2 * megapixels + 1e-6 * min(gaussians, 300_000)
@@ -72,14 +74,26 @@ def plan(
             ),
             photographs * {"nothing": 5.0, "cameras": 2.5, "points": 0.05}[given],
         ),
-        Stage("masks and vectors", ("masks and vectors",), photographs * per_photograph),
+        Stage(
+            "masks and vectors",
+            ("masks and vectors",),
+            photographs * (masks if agreeing else masks + vectors),
+        ),
         Stage("Gaussians", ("training Gaussians",), 0.0 if has_gaussians else config.radiance.steps * step),
-        Stage("language field", (), lifting + codec),
+        Stage(
+            "language field",
+            (),
+            lifting + codec + photographs * (agreeing + vectors if agreeing else 0.0),
+        ),
     )
 
 
+def _has_segmenter(masks: MaskConfig) -> bool:
+    return bool(masks.sam) and masks.source != "graph"
+
+
 def _mask_seconds(masks: MaskConfig, megapixels: float, speed: float) -> float:
-    if not masks.sam or masks.source == "graph":
+    if not _has_segmenter(masks):
         return 0.4 + megapixels
     of_million = 0.14 if "sam2" in masks.sam.lower() else 0.24  # seconds of seeing an image
     crops = sum(4**layer for layer in range(masks.crop_layers + 1))
