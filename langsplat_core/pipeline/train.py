@@ -105,10 +105,11 @@ def _train(
     train, held_out = capture.split(config.dataset.test_every)
     clock.lap("photographs")
 
-    store = FeatureStore(work / "features")  # keyed by mask settings, encoder and image
+    # Keyed by mask settings, encoder and image. Masks that do not agree yet are described when they do.
+    store = FeatureStore(work / ("features" if mask_source.agrees else "masks"))
     mine = processes.share(train)
     names = [capture.cameras[i].name for i in mine]
-    seen_by = encoder if mask_source.agrees else None  # others are described once they agree
+    seen_by = encoder if mask_source.agrees else None
     describe_capture([capture.images[i] for i in mine], names, mask_source, seen_by, store, progress)
     processes.barrier()
     cameras = tuple(capture.cameras[i] for i in train)
