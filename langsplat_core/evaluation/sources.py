@@ -1,4 +1,4 @@
-"""What is scored: a scene of ours, or relevancy maps and masks that another system rendered, as files.
+"""Subjects of an evaluation: a scene of ours, or relevancy maps and masks that another system rendered.
 
     <view>/<phrase>.npy                  float (L, H, W) or (H, W) relevancy; L levels, at most three
     <view>/<phrase>.<level>.npy|.png     or one file per level: subpart, part, whole; any of them

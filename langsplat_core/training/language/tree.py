@@ -150,7 +150,7 @@ def link_disagreement(surface: Surface, mask_weights: MaskWeights, progress: Pro
 def _heaviest(
     numbers: Array, pair_masks: Array, levels: Array, pair_weights: Array, masks: Array, weights: Array
 ) -> None:
-    """Of each Gaussian at each level the mask it paints most of, the first of equal ones."""
+    """Find the mask that each Gaussian paints most of at each level, the first of equal ones."""
     for pair in range(len(numbers)):
         number, level = numbers[pair], levels[pair]
         if number >= 0 and pair_weights[pair] > weights[level, number]:
