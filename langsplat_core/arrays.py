@@ -61,7 +61,7 @@ def mean_squared_error(a: Array, b: Array) -> float:
 
 
 def psnr(a: Array, b: Array) -> float:
-    """Peak signal-to-noise ratio of two pictures with values in [0, 1], dB; at most 100, for equal ones."""
+    """Peak signal-to-noise ratio of two images with values in [0, 1], dB; at most 100, for equal ones."""
     return float(-10 * np.log10(max(mean_squared_error(a, b), 1e-10)))
 
 

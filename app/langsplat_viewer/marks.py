@@ -21,14 +21,14 @@ from langsplat_core.query.selection import (
 )
 from langsplat_core.scene import Camera
 
-# The scene itself is never changed: deleting marks, and what is marked is left out of pictures and of what is
+# The scene itself is never changed: deleting marks, and what is marked is left out of images and of what is
 # saved. So everything can be undone, and an answer's numbers per Gaussian keep their places.
 
 Tool = Literal["thing", "rectangle", "lasso", "brush", "sphere", "box"]
 Mode = Literal["replace", "add", "remove", "intersect"]
 TOOLS: tuple[Tool, ...] = get_args(Tool)
 MODES: tuple[Mode, ...] = get_args(Mode)
-BRUSHES = (0.005, 0.25)  # least and largest radius of the brush, of the picture's height
+BRUSHES = (0.005, 0.25)  # least and largest radius of the brush, of the image's height
 REACHES = (0.001, 1.0)  # least and largest reach, scene radii
 
 
@@ -37,8 +37,8 @@ class Marks:
     """Masks over a scene's N Gaussians. Nothing that is hidden or deleted is selected."""
 
     selected: Array  # (N,) bool
-    hidden: Array  # (N,) bool: in no picture until it is shown again
-    deleted: Array  # (N,) bool: in no picture, and in nothing that is saved
+    hidden: Array  # (N,) bool: in no image until it is shown again
+    deleted: Array  # (N,) bool: in no image, and in nothing that is saved
 
     @property
     def shown(self) -> Array:
@@ -104,7 +104,7 @@ def deleting(marks: Marks) -> Marks:
 
 @dataclass(frozen=True)
 class Stroke:
-    """A stroke of the mouse. Places are fractions of the picture, (0, 0) its top left corner."""
+    """A stroke of the mouse. Places are fractions of the image, (0, 0) its top left corner."""
 
     path: tuple[tuple[float, float], ...]  # where the mouse was, one place or more
     centre: tuple[float, float, float] | None = None  # of a sphere or box: on the surface, world units
@@ -126,7 +126,7 @@ class Selection:
     saved: Array | None = None  # (N,) what was deleted when the scene was last saved; None: not yet
     tool: Tool | None = None  # what a drag in the scene does; None: it turns the camera
     mode: Mode = "replace"
-    brush: float = 0.03  # radius, of the picture's height, within BRUSHES
+    brush: float = 0.03  # radius, of the image's height, within BRUSHES
     reach: float = 0.05  # how far growing goes, and how large a sphere of one click is; of the scene's radius
     only_visible: bool = True  # rectangle, lasso and brush leave out what lies behind something
     stroke: Stroke | None = None
@@ -201,21 +201,21 @@ def _unpacked(packed: PackedMarks, place: int, now: Pair) -> Array:
 
 # What a drag with a tool encloses: the Gaussians in it, and its outline. Plain maths, no window.
 #
-# Places are fractions of the picture, (0, 0) its top left corner.
+# Places are fractions of the image, (0, 0) its top left corner.
 
-CLICK = 0.006  # of the picture's height: a shorter drag is a click
+CLICK = 0.006  # of the image's height: a shorter drag is a click
 ROUND = 48  # corners of a circle
 ON_SCREEN: tuple[Tool, ...] = ("rectangle", "lasso", "brush")  # the others are bodies in the scene
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A stroke in the picture that it is drawn in."""
+    """A stroke in the image that it is drawn in."""
 
     tool: Tool
     stroke: Stroke
     camera: Camera
-    brush: float  # radius, of the picture's height
+    brush: float  # radius, of the image's height
     reach: float  # world units: radius of a sphere and half the side of a box that were only clicked
 
     @property
@@ -296,7 +296,7 @@ def _of_box(drawn: Drawn) -> list[Array]:
 
 
 def _projected(drawn: Drawn, lines: list[Array]) -> list[Array]:
-    """Lines of world points in the picture; none that reaches behind the camera."""
+    """Lines of world points in the image; none that reaches behind the camera."""
     camera, found = drawn.camera, []
     for line in lines:
         pixels, depths = camera.project(line)

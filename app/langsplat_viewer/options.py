@@ -69,11 +69,11 @@ class ViewerOptions:
     dim: Share = PictureConfig.dim
     """Brightness of what a query does not find."""
     size: Annotated[str, tyro.conf.arg(metavar="WxH")] = ""
-    """Size of the window or picture in pixels."""
+    """Size of the window or image in pixels."""
     camera: Annotated[str, tyro.conf.arg(metavar="FILE|INDEX")] = ""
     """First view: a camera file (JSON, as "Save view" writes it), or a training camera by number from 0."""
     orthographic: Span | None = None
-    """Look without perspective: so many world units across the picture's shorter side."""
+    """Look without perspective: so many world units across the image's shorter side."""
     backend: Backend = "auto"
     """What draws."""
     encoder: Annotated[str, tyro.conf.arg(metavar="ID|FOLDER")] = ""
@@ -81,9 +81,9 @@ class ViewerOptions:
     fresh: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Neither use nor change the remembered layout, settings and recent files."""
     headless: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Draw a picture or a film without a window and print the answers."""
+    """Draw an image or a film without a window and print the answers."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE.png")] = None
-    """Where --headless writes: a picture (.png); a film (.mp4, .webp, .gif) or a folder of its pictures."""
+    """Where --headless writes: an image (.png); a film (.mp4, .webp, .gif) or a folder of its images."""
     path: Annotated[Path | None, tyro.conf.arg(metavar="PATH.json")] = None
     """A camera path: with --headless the film along it, else it is opened in the panel "Record"."""
     turntable: Seconds | None = None
@@ -91,11 +91,11 @@ class ViewerOptions:
     around: Literal["view", "answer"] = "view"
     """What --turntable goes around; answer: the last query found, from near."""
     fps: PicturesPerSecond = 30.0
-    """Pictures per second of a film."""
+    """Images per second of a film."""
     colour_map: ColourMap | None = None
-    """Colours of relevancy and depth in a picture of --headless (default: turbo)."""
+    """Colours of relevancy and depth in an image of --headless (default: turbo)."""
     transparent: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Draw the picture of --headless without a background, transparent where the scene is not."""
+    """Draw the image of --headless without a background, transparent where the scene is not."""
 
     @property
     def wanted_size(self) -> tuple[int, int] | None:

@@ -159,7 +159,7 @@ class Recording:
     turns: bool = False  # once around in place of the keyframes
     turn_seconds: float = TURN_SECONDS
     turn_from: OrbitCamera | None = None  # where the turn that is played began
-    size: tuple[int, int] = (1280, 720)  # of films, and of pictures that are no screenshots, pixels
+    size: tuple[int, int] = (1280, 720)  # of films, and of images that are no screenshots, pixels
     fps: float = 30.0
     film_typed: str = ""  # where the film goes; empty: a new name
     path_typed: str = ""  # a file with a path

@@ -184,14 +184,14 @@ T = TypeVar("T")
 
 
 class Surface(Protocol):
-    """The picture on screen, as far as actions need it."""
+    """The image on screen, as far as actions need it."""
 
     def point_at(self, u: float, v: float) -> Array | None:
-        """(3,) world point of the surface at a place in the picture, fractions from the top left corner."""
+        """(3,) world point of the surface at a place in the image, fractions from the top left corner."""
 
     def depths(self) -> Array | None:
-        """(H, W) camera z of the surface all over the picture, world units, 0 where nothing is drawn; its
-        size may be another than the window's. None while there is no picture."""
+        """(H, W) camera z of the surface all over the image, world units, 0 where nothing is drawn; its
+        size may be another than the window's. None while there is no image."""
 
     def capture(self, request: RenderRequest) -> Array:
         """(H, W, 3) uint8, or (H, W, 4) of a transparent image: the request at full resolution."""

@@ -36,7 +36,7 @@ from langsplat_viewer.panels.style import scene_area
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.viewer import Services, Viewer
 
-# 4.3 sorts splats, 4.1 draws them on every system; 3.3 still shows the CPU's pictures.
+# 4.3 sorts splats, 4.1 draws them on every system; 3.3 still shows the CPU's images.
 GL_VERSIONS = ((4, 3), (4, 1), (3, 3))
 
 
@@ -129,7 +129,7 @@ IDLE_FPS = 0.01  # frames per second while nothing happens: an event, or the wor
 AWAKE_SECONDS = 0.4  # after an event: tooltips come, and widgets take their places in a few frames
 AWAKE_FRAMES = 4  # after news from the worker, for the same reason
 
-# What may go wrong while a picture is drawn, from drivers to arrays that do not fit. It is shown as a line in
+# What may go wrong while an image is drawn, from drivers to arrays that do not fit. It is shown as a line in
 # the window: an exception that left a frame half way would take the whole window down.
 DRAW_ERRORS = (
     LangSplatError,
@@ -158,7 +158,7 @@ class WindowRequest:
     display: Display = "rgb"
     size: tuple[int, int] | None = None  # of the window, pixels
     camera: str = ""
-    orthographic: float | None = None  # world units across the picture's shorter side; None: in perspective
+    orthographic: float | None = None  # world units across the image's shorter side; None: in perspective
     backend: Backend = "auto"
     path_file: Path | None = None  # a camera path
     heat_opacity: float = PictureConfig.heat_opacity
@@ -192,7 +192,7 @@ class Window:
         self._canvas: Canvas | None = None
         self._photograph: overlays.PhotographOverlay | None = None
         self._screen: moderngl.Framebuffer | None = None
-        self.unfinished = False  # a finer picture is due
+        self.unfinished = False  # a finer image is due
         self.idles = True  # False for scripts that drive the window and count on its next frame
         self._began = 0.0  # this frame, seconds
         self._frames = AWAKE_FRAMES  # to be drawn whatever happens
@@ -347,7 +347,7 @@ class Window:
             self._titled = path
 
     def _picture(self) -> None:
-        """After the panels: take what they left of mouse and keys, bring the picture up to date and put it
+        """After the panels: take what they left of mouse and keys, bring the image up to date and put it
         behind them."""
         if self.failure is not None:
             return

@@ -1,4 +1,4 @@
-"""`langsplat demo`: pictures of the bundled scene, and answers about it, without a window."""
+"""`langsplat demo`: images of the bundled scene, and answers about it, without a window."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ from types import MappingProxyType
 from langsplat_core.cli.run import OutFolder
 from langsplat_core.errors import LangSplatError
 
-# Name of a picture -> options of the viewer.
+# Name of an image -> options of the viewer.
 PICTURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "colours.png": (),
@@ -28,7 +28,7 @@ PICTURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Demo:
-    """Render pictures of the bundled scene and answer phrases about it."""
+    """Render images of the bundled scene and answer phrases about it."""
 
     out: OutFolder = Path("demo_out")
     """Folder to write."""

@@ -27,14 +27,14 @@ IN_MEMORY = 512_000_000  # bytes of photographs
 
 
 class Album:
-    """Pictures in bounded memory: beyond a limit they lie in files without a name in the temporary folder
+    """Images in bounded memory: beyond a limit they lie in files without a name in the temporary folder
     (`TMPDIR`), which the system reads in where they are looked at and which end with the process."""
 
     def __init__(self, in_memory: int = IN_MEMORY) -> None:
         self._left = in_memory
 
     def keep(self, picture: Array) -> Array:
-        """The same (H, W, 3) uint8 picture, in memory as long as there is room, else in a file."""
+        """The same (H, W, 3) uint8 image, in memory as long as there is room, else in a file."""
         self._left -= picture.nbytes
         if self._left >= 0:
             return picture
@@ -48,7 +48,7 @@ class Album:
             raise OSError(error.errno, error.strerror, tempfile.gettempdir()) from error
 
 
-# Photographs: finding them, reading them whatever their kind, and making pinhole pictures of them.
+# Photographs: finding them, reading them whatever their kind, and making pinhole images of them.
 
 log = logging.getLogger("langsplat")
 
@@ -95,7 +95,7 @@ def unique_names(labels: Sequence[str]) -> list[str]:
 
 
 def read_photo(path: Path, upright: bool) -> Image.Image:
-    """An RGB picture; transparent pixels are laid over black, 16 bits become 8.
+    """An RGB image; transparent pixels are laid over black, 16 bits become 8.
 
     With `upright` it is turned as its EXIF data ask. Raises PictureError.
     """
@@ -123,7 +123,7 @@ def upright_copy(picture: Image.Image) -> Image.Image:
 
 
 def _read_for(photo: Photo) -> tuple[Image.Image, PhotoIntrinsics]:
-    """The picture, and the photo's lens on its pixel grid.
+    """The image, and the photo's lens on its pixel grid.
 
     COLMAP reads pixels as stored, other tools turn them first; when the stored shape does not fit the
     lens but the turned one does, the latter is meant.
@@ -152,7 +152,7 @@ def _fits(size: tuple[int, int], intrinsics: PhotoIntrinsics) -> bool:
 
 
 def developer(max_side: int) -> Callable[[Photo], tuple[Camera, Array]]:
-    """Return the function that makes a pinhole camera, yet without a name, and a (H, W, 3) uint8 picture of
+    """Return the function that makes a pinhole camera, yet without a name, and a (H, W, 3) uint8 image of
     at most `max_side` pixels of a photograph. It raises PictureError for a file that cannot be read."""
 
     # Photographs of one lens share its pinhole and its map; a few maps are kept, not one per photograph.
@@ -173,7 +173,7 @@ def developer(max_side: int) -> Callable[[Photo], tuple[Camera, Array]]:
 def develop(
     photos: Sequence[Photo], max_side: int, progress: Progress
 ) -> tuple[tuple[Camera, ...], tuple[Array, ...], tuple[Photo, ...]]:
-    """Pinhole cameras and (H, W, 3) uint8 pictures of `photos`, sorted by name, and what each is made from.
+    """Pinhole cameras and (H, W, 3) uint8 images of `photos`, sorted by name, and what each is made from.
 
     Files that cannot be read are reported once and left out; InputError when none is left.
     """
@@ -236,7 +236,7 @@ class Capture:
     points: Array  # (M, 3) float64 structure-from-motion points; M may be 0
     colours: Array  # (M, 3) uint8
     metres_per_unit: float | None = None  # > 0, how long a unit of its world is; None: unknown
-    photos: tuple[Photo, ...] = ()  # the files, in the same order; none for pictures made otherwise
+    photos: tuple[Photo, ...] = ()  # the files, in the same order; none for images made otherwise
     drawn: bool = False  # by `assets.making`, where encoders are calibrated, see `scene.Reading.elsewhere`
 
     def __post_init__(self) -> None:

@@ -173,7 +173,7 @@ class PhotoIntrinsics(Intrinsics):
             object.__setattr__(self, "distortion", None)
 
     def regridded(self, width: int, height: int) -> "PhotoIntrinsics":
-        """The same lens on another pixel grid over the same picture."""
+        """The same lens on another pixel grid over the same image."""
         inner = self.resized(width, height)
         return PhotoIntrinsics(width, height, inner.fx, inner.fy, inner.cx, inner.cy, self.distortion)
 
@@ -185,7 +185,7 @@ class PhotoIntrinsics(Intrinsics):
 
 # From a lens to a pinhole: the inverse of a distortion, the choice of pinhole, and the resampling.
 
-MAX_HALF_ANGLE = np.radians(65)  # from the axis; a pinhole picture stretches without bound towards 90
+MAX_HALF_ANGLE = np.radians(65)  # from the axis; a pinhole image stretches without bound towards 90
 BORDER_SAMPLES = 64  # per side of the photograph
 NEWTON_STEPS = 30
 
@@ -297,7 +297,7 @@ def source_positions(intrinsics: PhotoIntrinsics, camera: Camera) -> Array:
 def resample(
     photo: Image.Image, intrinsics: PhotoIntrinsics, camera: Camera, positions: Array | None
 ) -> Array:
-    """(H, W, 3) uint8 picture of `camera` from an RGB photograph of `lens`, which has the same size.
+    """(H, W, 3) uint8 image of `camera` from an RGB photograph of `lens`, which has the same size.
 
     `positions` is `source_positions(lens, camera)`, or None for a lens without distortion. The
     photograph is first shrunk to the camera's magnification by an area-weighted filter, so that the

@@ -21,7 +21,7 @@ TELLING_POINTS = 50  # from this many known points on, depths follow theirs
 
 
 def inside(camera: Camera, points: Array) -> Array:
-    """(N,) True where a point lies in front of the camera and inside its picture."""
+    """(N,) True where a point lies in front of the camera and inside its image."""
     pixels, depths = camera.project(points)
     return (depths > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
 
@@ -52,7 +52,7 @@ def random_points(
     that they fall on.
 
     images: (H, W, 3) uint8, one per camera; known: (M, 3) points whose depths tell where the scene is, M may
-    be 0. Depths are uniform in 1/z, so that near and far are equally dense in the pictures. Twice as many
+    be 0. Depths are uniform in 1/z, so that near and far are equally dense in the images. Twice as many
     are drawn and those in sight of at least half the cameras preferred: one view alone teaches no depth.
     """
     distance = look_distance(cameras)
@@ -80,7 +80,7 @@ def random_points(
 
 log = logging.getLogger("langsplat")
 
-POINTS_SIDE = 1600  # px, longer side of the pictures that features are sought in
+POINTS_SIDE = 1600  # px, longer side of the images that features are sought in
 MIN_POINTS = 100
 RANDOM_POINTS = 20_000
 NEIGHBOURS = 12  # views that each view is matched with
@@ -124,8 +124,8 @@ def _triangulated(
 def _write_pictures(
     folder: Path, names: Sequence[str], capture: Capture, views: Sequence[int], progress: Progress
 ) -> tuple[Camera, ...]:
-    """Pictures to seek features in, one after the other; returns their cameras. They are made from the files
-    again, larger than what is trained on: small pictures lack the details that features are found at."""
+    """Images to seek features in, one after the other; returns their cameras. They are made from the files
+    again, larger than what is trained on: small images lack the details that features are found at."""
     enlarge = developer(POINTS_SIDE)
     cameras = []
     for count, (name, index) in enumerate(zip(names, views, strict=True)):

@@ -108,7 +108,7 @@ def _number(values: Json, key: str, default: float | None = None) -> float:
 
 
 def _stored_size(path: Path) -> tuple[int, int] | None:
-    """Width and height in the file's header; None if it is no picture."""
+    """Width and height in the file's header; None if it is no image."""
     try:
         return picture_size(path)
     except PictureError:

@@ -38,7 +38,7 @@ def optics(path: Path) -> Image.Exif:
     copy.
 
     Where a camera gives pixels per inch of its sensor instead of the length on film, that is worked out:
-    COLMAP compares those with the size of the picture, which is another for a copy.
+    COLMAP compares those with the size of the image, which is another for a copy.
     """
     kept = Image.Exif()
     try:
@@ -58,7 +58,7 @@ def optics(path: Path) -> Image.Exif:
 
 def _on_film(inner: dict[int, Any], size: tuple[int, int]) -> dict[int, int]:
     """The focal length on film from the one on a sensor whose pixels are counted by the inch; `size`: of the
-    picture, pixels."""
+    image, pixels."""
     try:
         width = inner.get(_WIDTH, size[0]) * _MILLIMETRES[inner.get(_PLANE_UNIT, 2)] / inner[_PLANE_X]
         diagonal = width * math.hypot(*size) / size[0]

@@ -38,7 +38,7 @@ def _turbo() -> Array:
 
 def _published() -> dict[ColourMap, Array]:
     """Viridis and magma by N. Smith and S. van der Walt (2015) and cividis by J. Nunez, C. Anderton and
-    R. Renslow (2018), as matplotlib has them: the rows of a small picture beside this file."""
+    R. Renslow (2018), as matplotlib has them: the rows of a small image beside this file."""
     table = files(__package__).joinpath("colour_maps.png").read_bytes()
     with opened(table, "colour_maps.png") as picture:
         rows = np.asarray(picture.convert("RGB"))

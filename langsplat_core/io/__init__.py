@@ -1,1 +1,1 @@
-"""Files: scenes in every supported format, their companions, tables, pictures; whole or damaged."""
+"""Files: scenes in every supported format, their companions, tables, images; whole or damaged."""

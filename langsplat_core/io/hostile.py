@@ -203,26 +203,26 @@ def opened_archive(path: Path, kind: str) -> Iterator[Archive]:
             raise FormatError(f"{path}: not a readable {kind} ({what})") from None
 
 
-# ---- pictures: the one place of the project that hands a file to Pillow ----
+# ---- images: the one place of the project that hands a file to Pillow ----
 #
 # The kind is told by the content, and only the kinds below are tried: others (EPS, WMF, FITS ...) make
 # Pillow start other programs or allocate what a header of a few bytes asks for. The size that the header
 # declares is judged before a pixel is decoded. Pillow lets through whatever its decoders meet in damaged
 # data (IndexError, AssertionError, TypeError, NotImplementedError ...), so here every exception means an
-# unreadable picture, and its warnings about damaged metadata are silenced: a picture is either read or
+# unreadable image, and its warnings about damaged metadata are silenced: an image is either read or
 # refused.
 
 KINDS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # always; AVIF and HEIF where Pillow has a codec
 # HEIF is named where it cannot be read, too: the message then says why such photographs are left out
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif", ".heic", ".heif")
-MOST_PIXELS = 178_000_000  # of any picture: 0.7 GB once decoded. The largest cameras make 151 million
+MOST_PIXELS = 178_000_000  # of any image: 0.7 GB once decoded. The largest cameras make 151 million
 # Declared pixels beyond these need a file of a fitting size: photographs keep 2 to 100 pixels a byte, what is
-# made to exhaust memory a million. The decoders of WebP and AVIF hold two more copies of the picture.
+# made to exhaust memory a million. The decoders of WebP and AVIF hold two more copies of the image.
 FREE_PIXELS, FREE_PIXELS_COPIED, PIXELS_PER_BYTE = 16_000_000, 8_000_000, 128
 
 
 class PictureError(FormatError):
-    """A picture that cannot be read; `reason` is the message without the file's name."""
+    """An image that cannot be read; `reason` is the message without the file's name."""
 
     def __init__(self, name: object, reason: str) -> None:
         self.reason = reason
@@ -233,7 +233,7 @@ class PictureError(FormatError):
 def opened(
     source: Path | bytes, name: str | None = None, kinds: tuple[str, ...] | None = None
 ) -> Iterator[Image.Image]:
-    """The picture in a file or in bytes, not decoded yet; inside the block it may be.
+    """The image in a file or in bytes, not decoded yet; inside the block it may be.
 
     `name` is for messages, by default the path. Raises PictureError for what cannot be opened, is of none of
     the `kinds` (default: all that are read) or declares too many pixels, and for whatever Pillow raises

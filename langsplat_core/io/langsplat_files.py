@@ -232,7 +232,7 @@ def write_checkpoint(path: Path, gaussians: Gaussians, features: Array) -> None:
         _tensor(gaussians.quats_wxyz),
         _tensor(gaussians.opacity_logits[:, None]),
         _tensor(features),
-        torch.zeros(count),  # largest radii in pictures
+        torch.zeros(count),  # largest radii in images
         nothing,  # sums of gradients
         nothing.clone(),  # and how many
         {"state": {}, "param_groups": []},

@@ -37,7 +37,7 @@ class DeviceGaussians:
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """One picture, differentiable by everything that it was made of."""
+    """One image, differentiable by everything that it was made of."""
 
     image: Tensor  # (H, W, C)
     alpha: Tensor  # (H, W)

@@ -46,7 +46,7 @@ def basis(directions: Array, count: int) -> Array:
 def colours(sh: Array, means: Array, camera_position: Array) -> Array:
     """(N, K, 3) coefficients seen from `camera_position` -> (N, 3) float64 display colours >= 0.
 
-    Not clamped above: values over 1 are legal until the picture is quantised. Invalid rows give 0.
+    Not clamped above: values over 1 are legal until the image is quantised. Invalid rows give 0.
     """
     if sh.shape[1] == 1:
         directions = np.broadcast_to(np.array([0.0, 0.0, 1.0]), means.shape)
@@ -136,10 +136,10 @@ def project(gaussians: Gaussians, camera: Camera, settings: RasterSettings = INR
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One Gaussian's part in a picture."""
+    """One Gaussian's part in an image."""
 
     index: int
-    window: tuple[slice, slice]  # rows and columns of the picture that it may touch
+    window: tuple[slice, slice]  # rows and columns of the image that it may touch
     weights: Array  # alpha T in the window, 0 where it is not added
     after: Array  # transmittance behind it
 

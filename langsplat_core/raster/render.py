@@ -1,4 +1,4 @@
-"""The front door of the rasterizers: a scene and a camera in, a picture out.
+"""The front door of the rasterizers: a scene and a camera in, an image out.
 
 >>> import numpy as np
 >>> from langsplat_core import Gaussians, Scene, look_at, render
@@ -7,8 +7,8 @@
 ...     opacity_logits=np.array([9.0]), sh=np.full((1, 1, 3), 1.0),
 ... )
 >>> camera = look_at(np.array([0, 0, -4.0]), np.zeros(3), np.array([0, -1.0, 0]), (64, 48))
->>> picture = render(Scene(one), camera, backend="reference")
->>> picture.colours.shape, picture.alpha.shape, round(float(picture.alpha[24, 32]), 2)
+>>> image = render(Scene(one), camera, backend="reference")
+>>> image.colours.shape, image.alpha.shape, round(float(image.alpha[24, 32]), 2)
 ((48, 64, 3), (48, 64), 0.99)
 """
 
@@ -34,7 +34,7 @@ def pixel_weights(
     alpha_i T_i > 0, which add up to the pixel's alpha.
 
     Only those that could reach the pixel are projected; they keep their order, so the weights are those
-    of the whole view. The pixel must lie in the picture.
+    of the whole view. The pixel must lie in the image.
     """
     column, row = pixel
     near = np.flatnonzero(_may_reach(gaussians, camera, pixel, settings))
@@ -112,7 +112,7 @@ def render(
 
 
 def splat_colours(view: View, gaussians: Gaussians, camera: Camera, values: Array | None = None) -> Rendering:
-    """The picture of a view that is projected already, in one pass; values as in `render`."""
+    """The image of a view that is projected already, in one pass; values as in `render`."""
     columns = [colours_seen(gaussians, camera)]
     if values is not None:
         columns.append(np.asarray(values, np.float32))

@@ -10,7 +10,7 @@ from langsplat_core.arrays import Array, check_array
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Focal lengths and principal point. Sizes may be fractions where no picture is meant."""
+    """Focal lengths and principal point. Sizes may be fractions where no image is meant."""
 
     width: float  # pixels, > 0
     height: float
@@ -26,12 +26,12 @@ class Intrinsics:
             raise ValueError("focal lengths must be positive and the principal point finite")
 
     def resized(self, width: float, height: float) -> "Intrinsics":
-        """The same camera on another pixel grid over the same picture."""
+        """The same camera on another pixel grid over the same image."""
         sx, sy = width / self.width, height / self.height
         return Intrinsics(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
     def fitted(self, width: float, height: float) -> "Intrinsics":
-        """The same camera in a window that holds its whole picture, centred, as large as it goes, with
+        """The same camera in a window that holds its whole image, centred, as large as it goes, with
         square pixels kept square."""
         scale = min(width / self.width, height / self.height)
         cx = (self.cx - self.width / 2) * scale + width / 2

@@ -89,7 +89,7 @@ class Gaussians:
         )
 
 
-# A scene with fewer and larger Gaussians that looks much the same: for pictures that have to be fast.
+# A scene with fewer and larger Gaussians that looks much the same: for images that have to be fast.
 #
 # Neighbours are merged four at a time where together they are about one blob: mean and covariance become
 # those of the mixture, weighted by opacity times area, and the optical depth is kept. The rest stays as it

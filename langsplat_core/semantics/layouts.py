@@ -1,7 +1,7 @@
 """Weights in the layouts of open_clip, OpenAI, segment_anything and sam2, renamed to those of transformers.
 
 What a model is made of follows from the shapes of its tensors; an open_clip_config.json beside them says
-what shapes do not: the heads, and which GELU. Without one, CLIP's heads are 64 wide, those for pictures at
+what shapes do not: the heads, and which GELU. Without one, CLIP's heads are 64 wide, those for images at
 most 16, as in the models that OpenAI and open_clip published; and the GELU is OpenAI's quick one where the
 file holds OpenAI's `input_resolution` too or has "quickgelu" or "openai" in its name, else the exact one.
 Of SAM 2, whose windows and heads no shape tells, the published sizes are known.
@@ -124,7 +124,7 @@ class Hiera:
 
     heads: int  # of the first stage; they double with the width
     windows: tuple[int, int, int, int]  # side by stage, in positions of its grid
-    everywhere: tuple[int, ...]  # blocks that attend to the whole picture
+    everywhere: tuple[int, ...]  # blocks that attend to the whole image
 
 
 SAM2_SIZES: Mapping[tuple[int, int], Hiera] = MappingProxyType(  # by width of the first stage and blocks
@@ -413,7 +413,7 @@ def _decoder_config(tensors: Tensors, first: str) -> Settings:
 
 
 def _sam2(tensors: dict[str, Any]) -> Converted:
-    """The half of a SAM 2 or 2.1 that sees single pictures; its memory of films is left out.
+    """The half of a SAM 2 or 2.1 that sees single images; its memory of films is left out.
 
     tensors: without "sam_" before the names of prompt encoder and mask decoder.
     """

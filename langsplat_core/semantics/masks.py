@@ -81,12 +81,12 @@ MEAN_LIGHTNESS = 0.25  # weight of lightness where mean colours are compared: sh
 EDGE_LIGHTNESS = 0.4  # and where a boundary's contrast is measured
 CONTRAST_REACH = 2  # px on either side of a boundary, because blurred edges are wider than one step
 SIZE_POWER = 0.25  # how much cheaper small regions merge than large ones
-SIZE_UNIT = 1 / 200  # of the picture: a region of this size merges at its plain cost
+SIZE_UNIT = 1 / 200  # of the image: a region of this size merges at its plain cost
 ENCLOSED = 0.5  # a region wholly inside another merges with it at this much less
 
 
 class RegionGraph:
-    """Regions of a picture with their neighbours; the cheapest pair merges first, so that every later
+    """Regions of an image with their neighbours; the cheapest pair merges first, so that every later
     partition is made of unions of every earlier one.
 
     The cost of a pair is the distance of its mean colours plus the mean contrast along the common
@@ -113,7 +113,7 @@ class RegionGraph:
                     self._push(i, j)
 
     def merge_until(self, cost: float, min_fraction: float) -> None:
-        """Merge every pair cheaper than `cost`, then every region below `min_fraction` of the picture with
+        """Merge every pair cheaper than `cost`, then every region below `min_fraction` of the image with
         its cheapest neighbour."""
         while self._heap and self._heap[0][0] <= cost:
             _, i, j, version_i, version_j = heapq.heappop(self._heap)
@@ -202,7 +202,7 @@ SMOOTHING = 0.12  # total variation weight on L/100: removes carpet, keeps edges
 TYPICAL = 66.0  # L + 16 at L = 50, so that chromaticities below are of the size of a and b
 CHROMA_FALL = 0.045
 MERGE_COSTS = (6.0, 11.0, 19.0)  # colour difference plus contrast; chosen on photographs and renderings
-MIN_FRACTIONS = (0.0008, 0.002, 0.004)  # of the picture's area
+MIN_FRACTIONS = (0.0008, 0.002, 0.004)  # of the image's area
 
 
 class GraphMasks(MaskSource):

@@ -1,4 +1,4 @@
-"""Masks by models of the SAM family: a picture is seen once, asked about a grid of points, and filtered."""
+"""Masks by models of the SAM family: an image is seen once, asked about a grid of points, and filtered."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -34,17 +34,17 @@ LEVELS = 3  # masks per point
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """A picture as a model has seen it."""
+    """An image as a model has seen it."""
 
     model: Any  # a transformers model
-    seen: Mapping[str, Any]  # arguments of the model that stand for the picture
+    seen: Mapping[str, Any]  # arguments of the model that stand for the image
     side: int  # of the square that the model sees, px
-    size: tuple[int, int] | None  # (height, width) of the picture in it; None where it fills the square
-    shape: tuple[int, int]  # (height, width) of the picture itself, px
+    size: tuple[int, int] | None  # (height, width) of the image in it; None where it fills the square
+    shape: tuple[int, int]  # (height, width) of the image itself, px
     ordered: bool  # whether the three answers to a point are subpart, part, whole, in this order
 
     def ask(self, points: Array) -> tuple[Any, Any]:
-        """(P, 2) float32 points x, y, px of the picture -> (P, 3) predicted IoU and (P, 3, h, w) logits, low
+        """(P, 2) float32 points x, y, px of the image -> (P, 3) predicted IoU and (P, 3, h, w) logits, low
         resolution, of the masks subpart, part, whole at each point."""
         import torch
 
@@ -56,7 +56,7 @@ class Look:
         return (ious, logits) if self.ordered else by_area(ious, logits)
 
     def enlarge(self, logits: Any) -> Any:
-        """(B, h, w) low-resolution logits -> (B, H, W) of the picture."""
+        """(B, h, w) low-resolution logits -> (B, H, W) of the image."""
         return upscale(logits, self.side, self.size, self.shape)
 
 
@@ -68,7 +68,7 @@ class Segmenter(Protocol):
         """Name for messages, such as "SAM 2"."""
 
     def look(self, image: Array) -> Look:
-        """Show the model a picture (H, W, 3) uint8 once."""
+        """Show the model an image (H, W, 3) uint8 once."""
 
 
 def by_area(ious: Any, logits: Any) -> tuple[Any, Any]:
@@ -83,7 +83,7 @@ def by_area(ious: Any, logits: Any) -> tuple[Any, Any]:
 def padded(image: Array, side: int) -> tuple[Array, tuple[int, int]]:
     """Scale the longer side of (H, W, 3) uint8 to `side`, normalise, pad with zeros to the right and below.
 
-    Returns (1, 3, side, side) float32 and the (height, width) of the picture in it, px.
+    Returns (1, 3, side, side) float32 and the (height, width) of the image in it, px.
     """
     height, width = image.shape[:2]
     scale = side / max(height, width)
@@ -94,7 +94,7 @@ def padded(image: Array, side: int) -> tuple[Array, tuple[int, int]]:
 
 
 def squashed(image: Array, side: int) -> Array:
-    """(H, W, 3) uint8 -> (1, 3, side, side) float32, normalised; a picture's proportions are lost."""
+    """(H, W, 3) uint8 -> (1, 3, side, side) float32, normalised; an image's proportions are lost."""
     return np.ascontiguousarray(_normalised(image, (side, side)).transpose(2, 0, 1)[None])
 
 
@@ -142,7 +142,7 @@ class Sam:
         return Look(self._model, seen, side, size, image.shape[:2], ordered=True)
 
 
-# SAM 2 and 2.1 (Ravi et al. 2024) on single pictures, by the image half of their video model.
+# SAM 2 and 2.1 (Ravi et al. 2024) on single images, by the image half of their video model.
 
 
 class Sam2:
@@ -189,14 +189,14 @@ def load_segmenter(model: str, device: str = "auto") -> Segmenter:
 #
 # Source: the mask generator of segment-anything, with the settings of LangSplat's public code.
 
-OVERLAP = 512 / 1500  # of neighbouring crops, as a share of the picture's shorter side, in the first layer
+OVERLAP = 512 / 1500  # of neighbouring crops, as a share of the image's shorter side, in the first layer
 EDGE = 20.0  # px: a box that ends this near to an edge touches it
 
 
 def crop_boxes(shape: tuple[int, int], layers: int) -> Array:
-    """(C, 4) int64 left, top, right, bottom, px, of the whole picture and its crops; the last two exclusive.
+    """(C, 4) int64 left, top, right, bottom, px, of the whole image and its crops; the last two exclusive.
 
-    shape: (height, width); layer k cuts 2^k x 2^k crops that overlap. The whole picture comes first.
+    shape: (height, width); layer k cuts 2^k x 2^k crops that overlap. The whole image comes first.
     """
     height, width = shape
     boxes = [(0, 0, width, height)]
@@ -216,10 +216,10 @@ def _spans(length: int, count: int, overlap: int) -> list[tuple[int, int]]:
 
 
 def cut_by_crop(boxes: Array, crop: Array, shape: tuple[int, int]) -> Array:
-    """(...,) bool: whether a mask's box ends at an edge of the crop that is no edge of the picture: what it
-    shows goes on outside, and the next crop or the whole picture shows it better.
+    """(...,) bool: whether a mask's box ends at an edge of the crop that is no edge of the image: what it
+    shows goes on outside, and the next crop or the whole image shows it better.
 
-    boxes: (..., 4); crop: (4,) left, top, right, bottom, px of the picture; shape: its (height, width).
+    boxes: (..., 4); crop: (4,) left, top, right, bottom, px of the image; shape: its (height, width).
     """
     picture = np.array([0, 0, shape[1], shape[0]])
     at_crop, at_picture = np.abs(boxes - crop) <= EDGE, np.abs(boxes - picture) <= EDGE
@@ -336,7 +336,7 @@ def mask_nms(masks: Array, scores: Array, config: MaskConfig) -> Array:
 # Masks by a model of the SAM family: a grid of points, three masks a point, filtered.
 #
 # The three answers to one point are taken as the levels subpart, part and whole (LangSplat section 3.1). The
-# picture is seen once, as a whole; the method's public code, not its paper, sees 2 x 2 crops of it too.
+# image is seen once, as a whole; the method's public code, not its paper, sees 2 x 2 crops of it too.
 
 VERSION = 2
 # Full-size masks of float logits held at one time: on a CPU 16 take twice as long as four times 4, since the
@@ -372,13 +372,13 @@ class Proposal:
     """A mask that is the best of those like it in its crop."""
 
     bits: Array  # (ceil(h w / 8),) uint8, packed, of its box: thousands of masks are held at once
-    box: Array  # (4,) left, top, right, bottom, px of the picture; right and bottom exclusive
+    box: Array  # (4,) left, top, right, bottom, px of the image; right and bottom exclusive
     predicted_iou: float
     stability: float
     crop_area: int  # px, of the crop that it was found in
 
     def mask(self, shape: tuple[int, int]) -> Array:
-        """(H, W) bool: the mask in a picture of `shape`."""
+        """(H, W) bool: the mask in an image of `shape`."""
         left, top, right, bottom = self.box
         size = bottom - top, right - left
         mask = np.zeros(shape, bool)
@@ -429,7 +429,7 @@ class SamMasks(MaskSource):
         return LevelMasks((kept[0][0], kept[1][0], kept[2][0]), (kept[0][1], kept[1][1], kept[2][1]))
 
     def _in_crop(self, image: Array, crop: Array, progress: Progress, half: bool) -> list[list[Proposal]]:
-        """The proposals that one crop (4,) of the picture gives at each level, in pixels of the picture.
+        """The proposals that one crop (4,) of the image gives at each level, in pixels of the image.
 
         Raises OverflowError for `half` where numbers are larger than float16 holds.
         """
@@ -460,7 +460,7 @@ class SamMasks(MaskSource):
         self, look: Look, answer: tuple[Any, Any], crop: Array, shape: tuple[int, int]
     ) -> tuple[Array, Any]:
         """Masks that pass the tests for themselves: (M, 7) level, predicted IoU, stability and box in
-        the picture, and (M, h, w) logits, low resolution, still on the device."""
+        the image, and (M, h, w) logits, low resolution, still on the device."""
         import torch
 
         ious, logits = (found.flatten(0, 1).float() for found in answer)
@@ -535,7 +535,7 @@ def filter_level(
 
 
 def grid_points(per_side: int, size: tuple[int, int]) -> Array:
-    """(per_side^2, 2) float32 points x, y in a picture of `size` (height, width): centres of equal cells,
+    """(per_side^2, 2) float32 points x, y in an image of `size` (height, width): centres of equal cells,
     row by row."""
     centres = (np.arange(per_side) + 0.5) / per_side
     x, y = np.meshgrid(centres * size[1], centres * size[0])

@@ -58,7 +58,7 @@ class ImageEncoder(Protocol):
 
     @property
     def image_size(self) -> int:
-        """Side of the pictures it takes, px."""
+        """Side of the images it takes, px."""
 
     def encode_images(self, crops: Array) -> Array:
         """(M, S, S, 3) uint8 -> (M, D) float32 unit vectors."""

@@ -174,7 +174,7 @@ def load_typed_path(viewer: Viewer, folder: Path) -> None:
         viewer.state.say("type the name of a file with a path first", is_error=True)
 
 
-# Films and pictures of any size, drawn by the CPU on a thread of their own; pictures as commands.
+# Films and images of any size, drawn by the CPU on a thread of their own; images as commands.
 
 
 def set_film_size(viewer: Viewer, width: int, height: int) -> None:
@@ -184,7 +184,7 @@ def set_film_size(viewer: Viewer, width: int, height: int) -> None:
 
 
 def set_film_fps(viewer: Viewer, fps: float) -> None:
-    """Pictures per second of a film."""
+    """Images per second of a film."""
     viewer.state.record.fps = fps
 
 
@@ -254,7 +254,7 @@ def save_sized_picture(viewer: Viewer, folder: Path) -> None:
 
 
 def cancel_film(viewer: Viewer) -> None:
-    """Stop what is being drawn; a folder of pictures is continued by the same film."""
+    """Stop what is being drawn; a folder of images is continued by the same film."""
     viewer.recorder.cancel()
     viewer.state.say("film stopped")
 
@@ -265,7 +265,7 @@ def _submit(viewer: Viewer, label: str, work: Callable[[Progress], str]) -> None
 
 
 def copy_command(viewer: Viewer, folder: Path) -> str:
-    """Put the command that draws this picture without a window on the clipboard, and return it; "" where that
+    """Put the command that draws this image without a window on the clipboard, and return it; "" where that
     failed. A view that is no training camera's is saved to a file in `folder` first."""
     state = viewer.state
     if state.view is None or state.path is None:

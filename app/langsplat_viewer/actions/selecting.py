@@ -322,7 +322,7 @@ def stay(viewer: Viewer) -> None:
 
 # Selecting with the mouse: a stroke begins, goes on and ends; (u, v) are fractions of the scene's area.
 
-STEP = 0.002  # of the picture: places nearer to each other are one
+STEP = 0.002  # of the image: places nearer to each other are one
 LONGEST = 4000  # places of a stroke that are kept
 
 
@@ -373,7 +373,7 @@ def end_stroke(viewer: Viewer, mode: Mode | None = None) -> None:
 
 
 def drawn_stroke(viewer: Viewer) -> Drawn | None:
-    """The stroke under way, in the picture as it is; None without one."""
+    """The stroke under way, in the image as it is; None without one."""
     state = viewer.state
     tool, stroke = state.selection.tool, state.selection.stroke
     if tool is None or stroke is None or state.view is None:

@@ -1,4 +1,4 @@
-"""Several pictures side by side, and what lies over them."""
+"""Several images side by side, and what lies over them."""
 
 from dataclasses import fields, replace
 
@@ -25,7 +25,7 @@ def compare_with(viewer: Viewer, display: Display, latent_level: int | None = No
 
 
 def toggle_wipe(viewer: Viewer) -> None:
-    """Show the second display that was chosen last, or one picture again."""
+    """Show the second display that was chosen last, or one image again."""
     split = viewer.state.settings.split
     if split.mode == "wipe":
         show_one(viewer)
@@ -34,7 +34,7 @@ def toggle_wipe(viewer: Viewer) -> None:
 
 
 def toggle_levels(viewer: Viewer) -> None:
-    """Show the three semantic levels side by side, or one picture again."""
+    """Show the three semantic levels side by side, or one image again."""
     split = viewer.state.settings.split
     if split.mode == "levels":
         show_one(viewer)
@@ -48,7 +48,7 @@ def show_one(viewer: Viewer) -> None:
 
 
 def move_line(viewer: Viewer, at: float) -> None:
-    """Move the line that divides the two pictures, as a fraction of the area's width."""
+    """Move the line that divides the two images, as a fraction of the area's width."""
     low, high = AT_RANGE
     _set_split(viewer, replace(viewer.state.settings.split, at=min(max(at, low), high)), "line")
 
@@ -161,7 +161,7 @@ def set_display(viewer: Viewer, display: Display, latent_level: int | None = Non
 
 
 def set_picture(viewer: Viewer, picture: PictureConfig) -> None:
-    """Take other settings of the picture, as its sliders give them."""
+    """Take other settings of the image, as its sliders give them."""
     before = viewer.state.picture
     if picture != before:
         names = (field.name for field in fields(picture))

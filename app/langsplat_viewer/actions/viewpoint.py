@@ -229,7 +229,7 @@ def toggle_orthographic(viewer: Viewer) -> None:
 
 
 def open_orthographic(viewer: Viewer, span: float) -> None:
-    """Look without perspective, `span` world units across the shorter side of the uncropped picture."""
+    """Look without perspective, `span` world units across the shorter side of the uncropped image."""
     extent = viewer.state.extent
     if extent is not None:
         move(viewer, lambda view: spanning(view, span))

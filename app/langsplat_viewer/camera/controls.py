@@ -12,7 +12,7 @@ from langsplat_core.scene import Camera, Gaussians, Intrinsics, Scene, look_at
 
 
 def narrowed(inner: Intrinsics, factor: float) -> Intrinsics:
-    """The same picture by a lens that is longer by `factor`."""
+    """The same image by a lens that is longer by `factor`."""
     return replace(inner, fx=inner.fx * factor, fy=inner.fy * factor)
 
 
@@ -20,7 +20,7 @@ def narrowed(inner: Intrinsics, factor: float) -> Intrinsics:
 
 SAMPLE = 50_000  # Gaussians looked at; quantiles need no more
 SHARE = 0.99  # of the weight that a framing view holds: what is left out are floaters
-MARGIN = 0.9  # of the picture's width and height that is filled
+MARGIN = 0.9  # of the image's width and height that is filled
 _BISECTIONS = 12
 
 
@@ -50,7 +50,7 @@ def reach(sample: Sample, centre: Array) -> float:
 
 def framing_eye(sample: Sample, rotation: Array, inner: Intrinsics, share: float = SHARE) -> Array | None:
     """(3,) where a camera of that `rotation` (world to camera) and `inner` geometry stands nearest while
-    `share` of the weight lies in its picture, filled to `MARGIN`; None without points.
+    `share` of the weight lies in its image, filled to `MARGIN`; None without points.
 
     A point is inside the right border where x - t z <= ex - t ez, with t the tangent of the angle to that
     border and e the eye: so a border is one number, the quantile of x - t z, and both eye and distance follow
@@ -117,8 +117,8 @@ def _quantile(values: Array, weights: Array, share: float) -> float:
 # An `OrbitCamera` turns around a target point. Every control is a function from one camera to the next,
 # so that a test can do and undo it.
 
-MAX_ELEVATION = math.radians(88)  # nearer to the pole a small drag would spin the picture
-DEFAULT_FOV = 50.0  # degrees, of the picture's shorter side
+MAX_ELEVATION = math.radians(88)  # nearer to the pole a small drag would spin the image
+DEFAULT_FOV = 50.0  # degrees, of the image's shorter side
 FOV_RANGE = (10.0, 120.0)  # degrees
 FARTHEST = 12.0  # of the distance from the middle that holds the scene: it is still a spot that can be seen
 NARROW = 1e4  # how much longer the lens is by which a scene is framed without perspective
@@ -143,7 +143,7 @@ class OrbitCamera:
     target: Array  # (3,) world units, on the optical axis
     distance: float  # world units from the eye to the target, > 0
     up: Array  # (3,) unit, the world's up: the axis that a sideways drag turns about
-    intrinsics: Intrinsics  # of a picture that any window shows whole, uncropped
+    intrinsics: Intrinsics  # of an image that any window shows whole, uncropped
     orthographic: bool = False  # without perspective: everything has the size that it has at the target
 
     @property
@@ -152,7 +152,7 @@ class OrbitCamera:
         return self.target - self.distance * self.rotation[2]
 
     def camera(self, width: int, height: int) -> Camera:
-        """The camera for a picture of `width` x `height` pixels."""
+        """The camera for an image of `width` x `height` pixels."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.rotation
         matrix[:3, 3] = -self.rotation @ self.eye
@@ -164,11 +164,11 @@ class OrbitCamera:
 
     @property
     def span(self) -> float:
-        """World units across the shorter side of the uncropped picture, as far away as the target."""
+        """World units across the shorter side of the uncropped image, as far away as the target."""
         return self.span_in(self.intrinsics.width, self.intrinsics.height)
 
     def span_in(self, width: float, height: float) -> float:
-        """The same of a picture of `width` x `height` pixels."""
+        """The same of an image of `width` x `height` pixels."""
         inner = self.intrinsics.fitted(width, height)
         return self.distance * min(width, height) / min(inner.fx, inner.fy)
 
@@ -208,7 +208,7 @@ def look(view: OrbitCamera, yaw: float, pitch: float) -> OrbitCamera:
 
 
 def roll(view: OrbitCamera, angle: float) -> OrbitCamera:
-    """Turn the picture clockwise by `angle` radians about the line of sight."""
+    """Turn the image clockwise by `angle` radians about the line of sight."""
     return replace(view, rotation=_about(np.array([0, 0, 1.0]), angle) @ view.rotation)
 
 
@@ -238,7 +238,7 @@ def fly(view: OrbitCamera, right: float, up: float, forward: float) -> OrbitCame
 
 
 def walk(view: OrbitCamera, right: float, up: float, forward: float) -> OrbitCamera:
-    """As `fly`, but ahead is level; one who looks straight up or down goes where the picture's top or foot
+    """As `fly`, but ahead is level; one who looks straight up or down goes where the image's top or foot
     points."""
     ahead = view.rotation[2] - (view.rotation[2] @ view.up) * view.up
     if np.linalg.norm(ahead) < 1e-3:
@@ -260,7 +260,7 @@ def frame_of(up: Array) -> Array:
 
 def from_side(view: OrbitCamera, side: Side) -> OrbitCamera:
     """The same target from the same distance, along an axis of `frame_of`; from the top and from below the
-    picture's foot is the front."""
+    image's foot is the front."""
     right, up, front = frame_of(view.up)
     forward, down = {
         "front": (-front, -up),
@@ -289,7 +289,7 @@ def level(view: OrbitCamera) -> OrbitCamera:
 
 
 def adopt_up(view: OrbitCamera) -> OrbitCamera:
-    """Take the picture's up as the world's up, for scenes whose file says nothing about it."""
+    """Take the image's up as the world's up, for scenes whose file says nothing about it."""
     return replace(view, up=-view.rotation[1])
 
 
@@ -353,7 +353,7 @@ def with_projection(view: OrbitCamera, orthographic: bool) -> OrbitCamera:
 
 def spanning(view: OrbitCamera, span: float) -> OrbitCamera:
     """The orthographic view from the same eye, `span` world units across the shorter side of the uncropped
-    picture."""
+    image."""
     distance = view.distance * span / view.span
     return with_projection(focus(view, view.eye + distance * view.rotation[2], distance), orthographic=True)
 
@@ -373,7 +373,7 @@ def frame_all(view: OrbitCamera, extent: Extent, size: tuple[int, int]) -> Orbit
 
 
 def holding_distance(view: OrbitCamera, box: Array) -> float:
-    """Distance from which a thing in `box` (2, 3) fills about half of the picture, world units."""
+    """Distance from which a thing in `box` (2, 3) fills about half of the image, world units."""
     radius = 0.5 * float(np.linalg.norm(box[1] - box[0]))
     return SURROUNDINGS * radius / math.sin(math.radians(min(view.intrinsics.fov_degrees, 170.0)) / 2)
 

@@ -33,11 +33,11 @@ class Pose:
 
     position: Array  # (3,) world units
     rotation: Array  # (3, 3) world to camera, rows are right, down and forward
-    fov_degrees: float  # across the picture's shorter side, within `FOV_LIMITS`
+    fov_degrees: float  # across the image's shorter side, within `FOV_LIMITS`
     span: float | None = None  # world units across that side without perspective, > 0; None: in perspective
 
     def camera(self, width: int, height: int) -> Camera:
-        """The pinhole camera of a picture of `width` x `height` pixels, its principal point in the centre;
+        """The pinhole camera of an image of `width` x `height` pixels, its principal point in the centre;
         `camera_of` minds `span`."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.rotation
@@ -137,7 +137,7 @@ def view_of(pose: Pose, extent: Extent) -> OrbitCamera:
 
 
 def camera_of(pose: Pose, extent: Extent, size: tuple[int, int]) -> Camera:
-    """The camera of a picture of `size` (width, height) pixels from `pose`."""
+    """The camera of an image of `size` (width, height) pixels from `pose`."""
     return pose.camera(*size) if pose.span is None else view_of(pose, extent).camera(*size)
 
 
@@ -147,8 +147,8 @@ def pose_at(motion: Motion, seconds: float) -> Pose:
 
 
 def frame_times(motion: Motion, fps: float) -> Array:
-    """(T,) when a film of `fps` pictures a second is taken, T >= 1. A motion that ends where it began leaves
-    its last picture out: it would be there twice when the film is repeated."""
+    """(T,) when a film of `fps` images a second is taken, T >= 1. A motion that ends where it began leaves
+    its last image out: it would be there twice when the film is repeated."""
     if motion.closed:
         count = max(round(motion.seconds * fps), 1)
     else:

@@ -13,7 +13,7 @@ from langsplat_viewer.camera.controls import Extent, OrbitCamera, Sample, frame_
 
 @dataclass(frozen=True)
 class Label:
-    """The room that words take, in units of the picture, y down."""
+    """The room that words take, in units of the image, y down."""
 
     x: float  # left edge, where they are wanted
     y: float  # upper edge
@@ -27,8 +27,8 @@ class Label:
 
 
 def placed(labels: Sequence[Label], size: tuple[float, float]) -> list[Label]:
-    """The labels, none over another, in a picture of `size` (width, height). Each one goes straight up until
-    it is free of those before it, where the picture ends straight down; where there is no room it stays.
+    """The labels, none over another, in an image of `size` (width, height). Each one goes straight up until
+    it is free of those before it, where the image ends straight down; where there is no room it stays.
 
     A label depends on those before it alone and in always the same way: it moves with its thing, and jumps
     only where it meets another or parts from it.
@@ -44,7 +44,7 @@ def placed(labels: Sequence[Label], size: tuple[float, float]) -> list[Label]:
 
 
 def _moved(label: Label, others: Sequence[Label], *, up: bool) -> Label | None:
-    """Move a label up or down as far as it must; None beyond the upper edge of the picture."""
+    """Move a label up or down as far as it must; None beyond the upper edge of the image."""
     while label.y >= 0:
         met = next((other for other in others if label.covers(other)), None)
         if met is None:
@@ -69,8 +69,8 @@ def clip_segments(camera: Camera, segments: Array, least_depth: float) -> tuple[
     (K,) rows they come from, in rising order.
 
     A segment is cut where its camera z is `least_depth` (world units, > 0) and at the four planes of the
-    picture's borders. All are linear in camera space, so that nothing is divided before the cut and no
-    coordinate on screen is beyond the picture.
+    image's borders. All are linear in camera space, so that nothing is divided before the cut and no
+    coordinate on screen is beyond the image.
     """
     points = segments.astype(np.float64) @ camera.rotation.T + camera.world_to_camera[:3, 3]
     start, step = points[:, 0], points[:, 1] - points[:, 0]
@@ -100,7 +100,7 @@ def clip_segments(camera: Camera, segments: Array, least_depth: float) -> tuple[
 
 
 def frusta(cameras: Sequence[Camera], depth: float) -> Array:
-    """(C, 8, 2, 3) edges of the pyramids from each camera's eye to its picture at `depth` world units, the
+    """(C, 8, 2, 3) edges of the pyramids from each camera's eye to its image at `depth` world units, the
     four from the eye first."""
     made = np.zeros((len(cameras), 5, 3))
     for row, camera in zip(made, cameras, strict=True):
@@ -237,7 +237,7 @@ def face_at(faces: Sequence[Face], point: tuple[float, float]) -> str:
 def facing(view: OrbitCamera, name: str) -> OrbitCamera:
     """The view that sees the face `name` from straight ahead, around the same target at the same distance.
 
-    The world's up is up; from above and below the axis that is nearest to the picture's up now.
+    The world's up is up; from above and below the axis that is nearest to the image's up now.
     """
     frame = frame_of(view.up)
     normal = np.array(FACES[name], float) @ frame

@@ -4,7 +4,7 @@
  "keyframes": [{"seconds": 0.0,             rising, 0 to 36000
                 "position": [x, y, z],      world units
                 "rotation": [[...], ...],   camera to world, three rows; OpenCV axes, as in cameras.json
-                "fov_degrees": 50.0,        across the picture's shorter side
+                "fov_degrees": 50.0,        across the image's shorter side
                 "span": 4.0}]}              world units across it; where it is, there is no perspective
 """
 

@@ -86,7 +86,7 @@ def _fits(size: tuple[int, int], camera: Camera) -> bool:
 
 
 def corners(camera: Camera, shown: Camera) -> tuple[float, float, float, float]:
-    """Left, top, right and bottom of a camera's photograph in the picture of another with the same pose, in
+    """Left, top, right and bottom of a camera's photograph in the image of another with the same pose, in
     pixels of the latter."""
     x, y = shown.fx / camera.fx, shown.fy / camera.fy
     left, top = shown.cx - camera.cx * x, shown.cy - camera.cy * y

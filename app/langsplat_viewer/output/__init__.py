@@ -1,1 +1,1 @@
-"""Pictures and films as files, with a window or without."""
+"""Images and films as files, with a window or without."""

@@ -1,7 +1,7 @@
-"""Films as files: MP4 by the system's ffmpeg, animated WebP and GIF, or a folder of pictures.
+"""Films as files: MP4 by the system's ffmpeg, animated WebP and GIF, or a folder of images.
 
-A file is written whole or not at all. A folder is filled picture by picture; where the same film was begun in
-it before, the pictures that are there are kept.
+A file is written whole or not at all. A folder is filled image by image; where the same film was begun in
+it before, the images that are there are kept.
 """
 
 import hashlib
@@ -32,12 +32,12 @@ from langsplat_viewer.rendering.renderer import ArrayRenderer, Backend, GlRender
 from langsplat_viewer.rendering.request import Inputs, RenderRequest
 
 VIDEO, ANIMATIONS = ".mp4", (".webp", ".gif")
-SETTINGS = "film.json"  # in a folder of pictures: what they are pictures of
+SETTINGS = "film.json"  # in a folder of images: what they are images of
 FRAME = re.compile(r"frame-\d{5,}\.png")
 MOST_FRAMES = 100_000
 END_SECONDS = 60.0  # that ffmpeg has to finish a file
 
-Draw = Callable[[int], Array]  # (H, W, 3) uint8 picture by its number from 0
+Draw = Callable[[int], Array]  # (H, W, 3) uint8 image by its number from 0
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,10 @@ class Film:
     """A film to be written."""
 
     out: Path  # .mp4, .webp or .gif; else a folder
-    count: int  # pictures
+    count: int  # images
     size: tuple[int, int]  # width and height, pixels
     fps: float
-    settings: str  # the same for films of the same pictures
+    settings: str  # the same for films of the same images
 
 
 def check_film(out: Path | None, size: tuple[int, int] | None) -> Path:
@@ -72,7 +72,7 @@ def check_film(out: Path | None, size: tuple[int, int] | None) -> Path:
 
 
 def is_folder(out: Path) -> bool:
-    """True where a film to `out` is a folder of pictures."""
+    """True where a film to `out` is a folder of images."""
     return out.is_dir() or not out.suffix
 
 
@@ -82,8 +82,8 @@ def find_ffmpeg() -> str | None:
 
 
 def write_film(film: Film, draw: Draw) -> int:
-    """Draw and write all pictures; returns how many were drawn, for others were there already. Raises
-    InputError where ffmpeg or the picture library fail, OSError where nothing can be written, and what
+    """Draw and write all images; returns how many were drawn, for others were there already. Raises
+    InputError where ffmpeg or the image library fail, OSError where nothing can be written, and what
     `draw` does; a file is then as it was before."""
     if is_folder(film.out):
         return _write_pictures(film, draw)
@@ -100,7 +100,7 @@ def frame_name(number: int) -> str:
 
 
 def _check_own(folder: Path) -> None:
-    """InputError where pictures in `folder` were not written by us: they would be overwritten."""
+    """InputError where images in `folder` were not written by us: they would be overwritten."""
     if folder.is_dir() and not (folder / SETTINGS).exists():
         stranger = next((path.name for path in folder.iterdir() if FRAME.fullmatch(path.name)), None)
         if stranger is not None:
@@ -150,7 +150,7 @@ def _write_animation(film: Film, draw: Draw) -> None:
 
 
 def _write_video(film: Film, draw: Draw) -> None:
-    """Raw pictures through a pipe. ffmpeg runs in a session of its own, so that Ctrl-C is ours to handle."""
+    """Raw images through a pipe. ffmpeg runs in a session of its own, so that Ctrl-C is ours to handle."""
     with atomic_path(film.out) as temporary, tempfile.TemporaryFile() as complaints:
         command = _ffmpeg(film, temporary)
         process = subprocess.Popen(
@@ -222,7 +222,7 @@ def cameras_of(motion: Motion, extent: Extent, fps: float, size: tuple[int, int]
 
 
 def make_film(shot: Shot, out: Path, progress: Progress = silent) -> list[str]:
-    """Draw and write a film; returns the lines to print. Raises InputError, among others where no picture
+    """Draw and write a film; returns the lines to print. Raises InputError, among others where no image
     shows anything of the scene, and BackendError; `progress` may raise to stop it."""
     width, height = shot.request.size
     film = Film(out, len(shot.cameras), (width, height), shot.fps, fingerprint(shot))

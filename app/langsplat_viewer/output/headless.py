@@ -129,7 +129,7 @@ def even(camera: Camera) -> Camera:
 
 def turn(prepared: Prepared, options: ViewerOptions) -> Motion:
     """Once around what the camera sees in its middle, or around the place of the last answer, from as far
-    as it fills half of the picture. InputError where nothing was found."""
+    as it fills half of the image. InputError where nothing was found."""
     extent = extent_of(prepared.request.scene.source)
     view = from_camera(prepared.request.camera, extent)
     if options.around == "answer":

@@ -1,4 +1,4 @@
-"""Pictures and cameras to files, whole or not at all."""
+"""Images and cameras to files, whole or not at all."""
 
 from itertools import count
 from pathlib import Path
@@ -25,7 +25,7 @@ def free_name(folder: Path, stem: str, suffix: str, companions: tuple[str, ...] 
 
 
 def save_png(path: Path, image: Array) -> None:
-    """Write an (H, W, 3) or (H, W, 4) uint8 picture, whole or not at all."""
+    """Write an (H, W, 3) or (H, W, 4) uint8 image, whole or not at all."""
     with atomic_path(path) as temporary:
         Image.fromarray(image).save(temporary, format="PNG")
 

@@ -191,7 +191,7 @@ def draw_messages(viewer: Viewer) -> None:
 
 def figures(viewer: Viewer, frames_per_second: float | None) -> str:
     """One line: frames per second (None: the window sleeps until something happens), backend, time and
-    size of the last picture."""
+    size of the last image."""
     stats = viewer.state.stats
     speed = "idle" if frames_per_second is None else f"{frames_per_second:.0f} fps"
     parts = [speed, viewer.state.backend]
@@ -204,7 +204,7 @@ def figures(viewer: Viewer, frames_per_second: float | None) -> str:
 
 
 def draw_timing(viewer: Viewer) -> None:
-    """Medians of the last pictures, memory, and a comparison."""
+    """Medians of the last images, memory, and a comparison."""
     viewpoint.measure_frame(viewer)
     rows = [(title, f"{milliseconds:.1f} ms") for title, milliseconds in viewer.state.timing.medians()]
     memory = memory_bytes()

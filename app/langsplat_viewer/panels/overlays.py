@@ -146,7 +146,7 @@ class PhotographOverlay:
         self._texture: moderngl.Texture | None = None
 
     def draw(self, viewer: Viewer, area: Area) -> None:
-        """Over every picture in the area, where one stands at its camera."""
+        """Over every image in the area, where one stands at its camera."""
         state = viewer.state
         photograph = opening.photograph_here(state)
         if state.settings.fade == 0 or photograph is None or photograph.image is None or state.view is None:
@@ -189,15 +189,15 @@ GRID, RULER = (0.85, 0.85, 0.85, 0.4), (1.0, 0.9, 0.2, 1.0)
 
 @dataclass(frozen=True)
 class Named:
-    """A thing that has a name in the picture."""
+    """A thing that has a name in the image."""
 
     text: str
-    corner: tuple[float, float]  # the highest one of its box, in units of the picture
+    corner: tuple[float, float]  # the highest one of its box, in units of the image
     colour: tuple[float, float, float, float]
 
 
 def draw_lines(viewer: Viewer, area: Area) -> None:
-    """Over every picture in the area, after they are drawn."""
+    """Over every image in the area, after they are drawn."""
     state = viewer.state
     if state.scene is None or state.view is None or state.extent is None:
         return
@@ -254,7 +254,7 @@ def _least_depth(viewer: Viewer) -> float:
 
 
 def _lines(area: Area, segments: Array, colour: tuple[float, float, float, float], thick: float) -> None:
-    """(K, 2, 2) segments in units of the picture in `area`."""
+    """(K, 2, 2) segments in units of the image in `area`."""
     paint, packed = imgui.get_background_draw_list(), imgui.get_color_u32(colour)
     for (x0, y0), (x1, y1) in (segments + (area.left, area.top)).tolist():
         paint.add_line(ImVec2(x0, y0), ImVec2(x1, y1), packed, thick)
@@ -425,7 +425,7 @@ def say(text: str, area: Area) -> None:
 
 
 def bar_colours(slot: int, strength: float, alone: bool, colour_map: ColourMap = "turbo") -> Array:
-    """(STEPS, 3) colours of a bar from its coldest to its hottest end, as the picture has them: the colour
+    """(STEPS, 3) colours of a bar from its coldest to its hottest end, as the image has them: the colour
     map for a query that is painted alone, else black to its own colour; what is half as strong ends there."""
     heat = np.linspace(0, strength, STEPS)
     if alone:
@@ -507,7 +507,7 @@ INK = (0.08, 0.08, 0.10)
 
 
 def draw_cube(viewer: Viewer, area: Area) -> None:
-    """Over everything in the picture."""
+    """Over everything in the image."""
     view = viewer.state.view
     if view is None or "cube" not in viewer.state.preferences.overlays:
         return

@@ -153,7 +153,7 @@ HINTS: dict[Tool, str] = {
     "box": "drag from the middle outwards, or click",
 }
 TOOL_KEYS = "Shift adds, Ctrl removes, both intersect; Esc leaves"
-LIGHT, DARK = (1.0, 1.0, 1.0, 0.95), (0.0, 0.0, 0.0, 0.6)  # a line in two colours is seen on every picture
+LIGHT, DARK = (1.0, 1.0, 1.0, 0.95), (0.0, 0.0, 0.0, 0.6)  # a line in two colours is seen on every image
 PAINT = (float(TINT[0]), float(TINT[1]), float(TINT[2]), 0.35)
 
 

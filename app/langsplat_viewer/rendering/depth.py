@@ -27,10 +27,10 @@ class Clip:
 UNCLIPPED = Clip()
 
 
-# Image formation for looking round: what training would clip is shown, a picture of nothing explained.
+# Image formation for looking round: what training would clip is shown, an image of nothing explained.
 
-NEAR_SHARE = 0.25  # of the depth of what is nearest in the picture
-NEAREST_SHARE = 0.01  # of the Gaussians in the picture that count as the nearest
+NEAR_SHARE = 0.25  # of the depth of what is nearest in the image
+NEAREST_SHARE = 0.01  # of the Gaussians in the image that count as the nearest
 LEAST_NEAR = 1e-3  # of the depth of the middle one: nearer, a Gaussian would be a fog over everything
 VISIBLE_ALPHA = 1 / 255
 _SAMPLE = 20_000  # Gaussians looked at; quantiles need no more
@@ -38,7 +38,7 @@ _SAMPLE = 20_000  # Gaussians looked at; quantiles need no more
 
 def near_plane(gaussians: Gaussians, camera: Camera, most: float = INRIA.near) -> float:
     """World units from the camera to the near plane: a share of the depth of what is nearest in the
-    picture, so that one can go as near to a thing as it is small; at most `most`, the constant of training,
+    image, so that one can go as near to a thing as it is small; at most `most`, the constant of training,
     so that the view of a photograph is the one that was trained. Without perspective, that of the eye."""
     if camera.orthographic:
         return 0.0

@@ -174,7 +174,7 @@ def median_depth(
 # ``W^T onehot(labels)`` in one walk: how much of every Gaussian lies in every region of label maps.
 #
 # A tile of 256 pixels meets few regions. It gets one plane of ones and zeros for each that it meets, whatever
-# their number in the whole picture; the weights of an intersection are correlated with those planes, and a
+# their number in the whole image; the weights of an intersection are correlated with those planes, and a
 # Gaussian's partial sums are added up over its tiles.
 
 

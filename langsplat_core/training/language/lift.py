@@ -260,7 +260,7 @@ def _compare(
     signs: Array,
     losses: Array,
 ) -> None:
-    """Rows [first, last) of a picture: `share` with the sign of (image - latents of the labels), zero where
+    """Rows [first, last) of an image: `share` with the sign of (image - latents of the labels), zero where
     there is no label, and the sum of the absolute differences of each row."""
     levels, d = labels.shape[0], latents.shape[1]
     for row in range(first, last):

@@ -22,11 +22,11 @@ from langsplat_core.scene import Camera, Gaussians
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """One picture, still attached to the parameters it came from."""
+    """One image, still attached to the parameters it came from."""
 
     image: Tensor  # (H, W, 3) blended colours on black, >= 0, not clamped above
     alpha: Tensor  # (H, W) in [0, 1]
-    visible: Tensor  # (N,) bool: the Gaussian's extent meets the picture
+    visible: Tensor  # (N,) bool: the Gaussian's extent meets the image
     means_px: Tensor  # its `grad`, after `backward`, is the loss gradient by the projected means, 1/px
 
     def means_px_grad(self) -> Tensor:
@@ -39,7 +39,7 @@ class Rendered:
 class DifferentiableRenderer(Protocol):
     """A backend of radiance training."""
 
-    device: torch.device  # where parameters and pictures live
+    device: torch.device  # where parameters and images live
 
     def render(self, parameters: dict[str, Tensor], camera: Camera, sh_degree: int) -> Rendered:
         """Draw the raw `parameters` (see `state`) with harmonics up to `sh_degree`."""
@@ -86,7 +86,7 @@ class _CpuPicture(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         gaussians, camera, view, values = ctx.kept
         image_grad, alpha_grad = grads
-        assert image_grad is not None  # the picture always enters the loss
+        assert image_grad is not None  # the image always enters the loss
         by = view.backward(
             values,
             np.ascontiguousarray(image_grad.numpy()),

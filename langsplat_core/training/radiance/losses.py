@@ -49,7 +49,7 @@ def _along(padded: Array, out: Array, taps: Array, channels: int) -> None:
 
 @helper
 def _across(rows: Array, y: int, out: Array, taps: Array) -> None:
-    """Blur `rows` (H, n) at row y over the rows around it; zeros beyond the picture."""
+    """Blur `rows` (H, n) at row y over the rows around it; zeros beyond the image."""
     out[:] = 0
     for k in range(max(RADIUS - y, 0), min(taps.shape[0], rows.shape[0] + RADIUS - y)):
         _add_scaled(out, taps[k], rows[y + k - RADIUS])
@@ -59,7 +59,7 @@ def _across(rows: Array, y: int, out: Array, taps: Array) -> None:
 def _blur_moments(
     first: int, last: int, picture: Array, target: Array, channels: int, taps: Array, moments: Array
 ) -> None:
-    """Pass 1: (H, n) pictures -> `moments` (4, H, n), x, y, x^2 + y^2, x y blurred along rows."""
+    """Pass 1: (H, n) images -> `moments` (4, H, n), x, y, x^2 + y^2, x y blurred along rows."""
     n, edge = picture.shape[1], RADIUS * channels
     padded = np.zeros((4, n + 2 * edge), np.float32)
     squares, products = padded[2, edge : edge + n], padded[3, edge : edge + n]
@@ -124,7 +124,7 @@ def _gather_gradient(
     gradient: Array,
     row_l1: Array,
 ) -> None:
-    """Pass 3: the gradient by the picture, weights[0] sign(x - y) - weights[1] dSSIM/dx; L1 sums per row."""
+    """Pass 3: the gradient by the image, weights[0] sign(x - y) - weights[1] dSSIM/dx; L1 sums per row."""
     n = picture.shape[1]
     d = np.empty((3, n), np.float32)
     difference = np.empty(n, np.float32)
@@ -141,7 +141,7 @@ def _gather_gradient(
 
 
 def loss_and_gradient(picture: Array, target: Array, lambda_dssim: float) -> tuple[float, Array]:
-    """(H, W, C) contiguous float32 pictures -> the loss and its (H, W, C) gradient by `picture`."""
+    """(H, W, C) contiguous float32 images -> the loss and its (H, W, C) gradient by `picture`."""
     height, width, channels = picture.shape
     n = width * channels
     x, y = picture.reshape(height, n), target.reshape(height, n)
@@ -192,9 +192,9 @@ def ssim_terms(moments: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 class _MeanSsim(torch.autograd.Function):
-    """Mean SSIM with its gradient by the first picture written out.
+    """Mean SSIM with its gradient by the first image written out.
 
-    Automatic differentiation of the same formula keeps some twenty picture-sized temporaries; by hand it
+    Automatic differentiation of the same formula keeps some twenty image-sized temporaries; by hand it
     is three more blurs. With S = a1 a2 / (b1 b2) and mx, xx, xy the blurred x, x^2, x y:
     dS/dmx = 2 my (a2 - a1) / (b1 b2) - 2 mx S (1/b1 - 1/b2), dS/dxx = -S / b2, dS/dxy = 2 a1 / (b1 b2),
     and dS/dx = blur(dS/dmx) + 2 x blur(dS/dxx) + y blur(dS/dxy), because the blur is symmetric.
@@ -239,7 +239,7 @@ class _CpuLoss(torch.autograd.Function):
 
 
 def ssim(picture: Tensor, target: Tensor) -> Tensor:
-    """Mean structural similarity of two (H, W, C) pictures, a scalar in [-1, 1].
+    """Mean structural similarity of two (H, W, C) images, a scalar in [-1, 1].
 
     Differentiable by `picture` only.
     """

@@ -305,7 +305,7 @@ def _rebuild(tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> Traini
 # Adaptive density control: where Gaussians are added and removed (Kerbl et al. 2023, section 5.2).
 #
 # The statistic is INRIA's: the norm of the loss gradient by the projected mean, in normalised device
-# coordinates (the gradient per pixel times half the picture's width and height), averaged over the steps
+# coordinates (the gradient per pixel times half the image's width and height), averaged over the steps
 # in which the Gaussian was visible.
 
 SPLIT_SHRINK = 1.6  # children of a split are smaller by this factor

@@ -67,7 +67,7 @@ class Schedule:
     reset_every: int  # opacity resets, before `densify_until` only
     sh_degree: int
     sh_degree_every: int
-    coarse_until: int  # up to this step pictures have half their size
+    coarse_until: int  # up to this step images have half their size
     position_lr: tuple[float, float]  # first and last, world units per step
     rates: dict[str, float]  # of all other parameters, by their names in `state`
 
@@ -134,7 +134,7 @@ def schedule_for(config: RadianceConfig, extent: float) -> Schedule:
 # resumes from a checkpoint exactly where it stopped.
 
 LOSSES_SAID = 200  # mean losses reported in a run
-COARSE_MIN_SIDE = 64  # px: smaller pictures are never halved
+COARSE_MIN_SIDE = 64  # px: smaller images are never halved
 SMALLEST_EXTENT = 0.05  # of the distance to the scene: one camera, or cameras in one place, have no extent
 
 
@@ -164,7 +164,7 @@ class _Pictures:
         return len(self._fine)
 
     def at(self, index: int, coarse: bool) -> tuple[Camera, Tensor]:
-        """The camera and its (H, W, 3) float picture in [0, 1]."""
+        """The camera and its (H, W, 3) float image in [0, 1]."""
         camera, picture = (self._coarse if coarse else self._fine)[index]
         copy = picture if isinstance(picture, Tensor) else torch.tensor(picture)
         return camera, copy.float().div_(255)
@@ -305,7 +305,7 @@ def _step(run: _Run, state: TrainingState) -> float:
 
 
 def _visible(gaussians: Gaussians) -> Gaussians:
-    """Without the rows that no picture can show: invalid ones and those that never reach alpha 1/255."""
+    """Without the rows that no image can show: invalid ones and those that never reach alpha 1/255."""
     return gaussians.take(gaussians.valid() & (sigmoid(gaussians.opacity_logits) >= INRIA.alpha_min))
 
 
