@@ -74,7 +74,8 @@ def agreed_features(
     for index in processes.share(range(len(views))):
         camera, _ = views[index]
         if not store.has(camera.name, made_by):
-            maps = nested_maps(draw_patches(rasterizer.view(gaussians, camera), tree.patches), cuts, LEAST)
+            drawn = draw_patches(rasterizer.view(gaussians, camera), gaussians, tree.patches)
+            maps = nested_maps(drawn, cuts, LEAST)
             vectors = embed_regions(photographs[index], maps, encoder)
             store.save(camera.name, ImageFeatures(maps, vectors), made_by)
         progress(STAGE, (index + 1) / len(views))

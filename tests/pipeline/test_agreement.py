@@ -30,7 +30,7 @@ def room():
     blob = (np.arange(len(scene.gaussians)) // PER_BLOB).astype(np.int32)
     views, photographs = [], []
     for camera in cameras():
-        labels = draw_patches(CpuRasterizer().view(scene.gaussians, camera), blob)
+        labels = draw_patches(CpuRasterizer().view(scene.gaussians, camera), scene.gaussians, blob)
         count, maps = int(blob.max()) + 1, []
         for level in range(3):
             halves = (np.arange(labels.shape[1]) > rng.integers(0, labels.shape[1])).astype(np.int32)
@@ -49,7 +49,7 @@ def test_every_photograph_shows_the_things_of_the_scene(room, tmp_path):
     )
     for (camera, _), seen in zip(views, features, strict=True):
         whole = seen.labels[2]
-        true = draw_patches(CpuRasterizer().view(gaussians, camera), blob)
+        true = draw_patches(CpuRasterizer().view(gaussians, camera), gaussians, blob)
         for one in np.unique(true[true >= 0]):
             own = true == one
             if own.sum() < 20:

@@ -30,7 +30,8 @@ from langsplat_core.compiled import kernel, shared_workers
 from langsplat_core.io.shapes import base_colours
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.protocol import LiftingView
-from langsplat_core.scene import LEVELS, Gaussians
+from langsplat_core.raster.reference import project
+from langsplat_core.scene import LEVELS, Camera, Gaussians
 from langsplat_core.scene.surface import Surface, divide, surface_areas
 from langsplat_core.training.language.mask_weights import MaskWeights
 
@@ -356,25 +357,64 @@ def _agreement(
 # The nodes as one sees them in a photograph.
 
 SOLID = 0.5  # of a pixel: where the Gaussians cover less, there is nothing
-CHANNELS = 32  # patches that are drawn at a time
+CHANNELS = 32  # that are drawn at a time
 FAINTEST = 1.0  # pixels: what a view shows less of is not drawn
+CELL = 8  # pixels a side, in which patches of one channel keep apart
 
 
-def draw_patches(view: LiftingView, patches: Array) -> Array:
-    """(N,) int32 patches of the Gaussians, -1 for none -> (H, W) int32 the one that most of a pixel is."""
-    view, inside = view.frozen(), patches >= 0
-    seen = np.bincount(patches[inside], view.contributions()[inside])
-    shown = np.flatnonzero(seen >= FAINTEST)
+def draw_patches(view: LiftingView, gaussians: Gaussians, patches: Array) -> Array:
+    """(N,) int32 patches of the Gaussians, -1 for none -> (H, W) int32 the one that most of a pixel is.
+
+    Patches whose boxes in the image do not meet share a channel, so that thousands take some dozen.
+    """
+    inside = patches >= 0
+    seen = np.bincount(patches[inside], view.contributions()[inside]) if inside.any() else np.zeros(0)
+    channel_of, owners = _share_channels(_boxes(view.camera, gaussians, patches, len(seen)), seen >= FAINTEST)
+    channels, view = np.where(inside, channel_of[patches] if len(seen) else -1, -1), view.frozen()
     most = np.zeros((view.camera.height, view.camera.width), np.float32)
     drawn = np.full(most.shape, -1, np.int32)
-    for start in range(0, len(shown), CHANNELS):
-        some = shown[start : start + CHANNELS]
-        image, alpha = view.splat((patches[:, None] == some).astype(np.float32))
+    rows, columns = np.indices(most.shape) // CELL
+    for start in range(0, len(owners), CHANNELS):
+        some = np.arange(start, min(start + CHANNELS, len(owners)))
+        image, alpha = view.splat((channels[:, None] == some).astype(np.float32))
         best = image.max(-1)
         more = (best > most) & (alpha > SOLID)
-        drawn[more] = some[image.argmax(-1)[more]]
+        drawn[more] = owners[some[image.argmax(-1)[more]], rows[more], columns[more]]
         most = np.where(more, best, most)
     return drawn
+
+
+def _boxes(camera: Camera, gaussians: Gaussians, patches: Array, count: int) -> Array:
+    """(P, 4) left, top, right, bottom cell of everything that a patch may paint, the last two exclusive."""
+    footprints = project(gaussians, camera)
+    drawn = np.flatnonzero((patches >= 0) & (footprints.opacities > 0))
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    np.minimum.at(low, patches[drawn], footprints.means_px[drawn] - footprints.extents_px[drawn] - 1)
+    np.maximum.at(high, patches[drawn], footprints.means_px[drawn] + footprints.extents_px[drawn] + 1)
+    size = camera.width, camera.height
+    boxes = np.concatenate([np.clip(low, 0, size) // CELL, -(-np.clip(high, 0, size) // CELL)], 1)
+    return np.asarray(boxes.astype(np.int64))
+
+
+def _share_channels(boxes: Array, shown: Array) -> tuple[Array, Array]:
+    """(P,) channel of each patch, -1 for those not shown, and (C, rows, columns) int32 the patch that each
+    cell of a channel belongs to. The largest boxes choose first."""
+    channel_of = np.full(len(boxes), -1)
+    owners: list[Array] = []
+    rows, columns = (int(boxes[:, side].max(initial=0)) for side in (3, 2))
+    areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+    for patch in np.argsort(-areas, kind="stable"):
+        left, top, right, bottom = boxes[patch]
+        if not shown[patch] or right <= left or bottom <= top:
+            continue
+        place = np.s_[top:bottom, left:right]
+        free = (number for number, owner in enumerate(owners) if owner[place].max() < 0)
+        channel = next(free, len(owners))
+        if channel == len(owners):
+            owners.append(np.full((rows, columns), -1, np.int32))
+        owners[channel][place] = patch
+        channel_of[patch] = channel
+    return channel_of, np.stack(owners) if owners else np.zeros((0, rows, columns), np.int32)
 
 
 def nested_maps(drawn: Array, cuts: Sequence[Array], least: float) -> Array:

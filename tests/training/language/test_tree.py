@@ -145,7 +145,7 @@ def blob_views(wrong: float) -> tuple:
     views = []
     for camera in cameras():
         view = CpuRasterizer().view(scene.gaussians, camera)
-        labels = draw_patches(view, blob.astype(np.int32))
+        labels = draw_patches(view, scene.gaussians, blob.astype(np.int32))
         noise = rng.integers(0, blob.max() + 1, labels.shape)
         labels = np.where((rng.uniform(size=labels.shape) < wrong) & (labels >= 0), noise, labels)
         maps = np.stack([np.full_like(labels, -1), np.full_like(labels, -1), labels]).astype(np.int32)
@@ -186,7 +186,7 @@ def test_cuts_are_nested_and_end_at_their_cost():
 def test_a_pixel_has_the_patch_it_shows_most_of():
     gaussians, camera = random_gaussians(60, scale_range=(0.1, 0.4)), random_camera(1, 24, 18)
     patches = np.random.default_rng(0).integers(-1, 5, 60).astype(np.int32)
-    drawn = draw_patches(CpuRasterizer().view(gaussians, camera), patches)
+    drawn = draw_patches(CpuRasterizer().view(gaussians, camera), gaussians, patches)
     image, alpha = (
         ReferenceRasterizer()
         .view(gaussians, camera)
@@ -220,6 +220,7 @@ def test_almost_nothing():
         tree = find_tree(gaussians, build_surface(gaussians), mask_weights, [7], eyes)
         assert tree.patches.shape == (count,)
         assert (tree.cut(0.5) >= 0).all()
-    view = CpuRasterizer().view(random_gaussians(3), random_camera(0, 8, 6))
-    assert (draw_patches(view, np.full(3, -1, np.int32)) == -1).all()
+    gaussians = random_gaussians(3)
+    view = CpuRasterizer().view(gaussians, random_camera(0, 8, 6))
+    assert (draw_patches(view, gaussians, np.full(3, -1, np.int32)) == -1).all()
     assert (nested_maps(np.full((6, 8), -1, np.int32), [np.zeros(0, np.int32)] * 3, 0.1) == -1).all()
