@@ -67,10 +67,8 @@ def agreed_features(
     key = stage_key("tree", VERSION, *inputs)
     tree = processes.once(lambda: kept(work / f"{key}.npz", make, _pack, _unpack))
     cuts = [tree.cut(cost) for cost in CUTS]
-    store, made_by = (
-        FeatureStore(work / "features"),
-        stage_key(key, VERSION, CUTS, LEAST, fingerprint(encoder)),
-    )
+    store = FeatureStore(work / "features")
+    made_by = stage_key(key, VERSION, CUTS, LEAST, fingerprint(encoder))
     for index in processes.share(range(len(views))):
         camera, _ = views[index]
         if not store.has(camera.name, made_by):

@@ -47,6 +47,7 @@ def test_every_photograph_shows_the_things_of_the_scene(room, tmp_path):
     features = agreed_features(
         *(gaussians, views, photographs, MeanColour(), CpuRasterizer()), tmp_path, silent
     )
+    judged = 0
     for (camera, _), seen in zip(views, features, strict=True):
         whole = seen.labels[2]
         true = draw_patches(CpuRasterizer().view(gaussians, camera), gaussians, blob)
@@ -54,9 +55,11 @@ def test_every_photograph_shows_the_things_of_the_scene(room, tmp_path):
             own = true == one
             if own.sum() < 20:
                 continue
+            judged += 1
             row = np.bincount(whole[own & (whole >= 0)]).argmax()
             assert (own & (whole == row)).sum() / (own | (whole == row)).sum() > 0.8
         assert sorted(np.unique(seen.labels[seen.labels >= 0])) == list(range(len(seen.vectors)))
+    assert judged >= len(views)
 
 
 def test_an_interrupted_run_goes_on_where_it_stopped(room, tmp_path):

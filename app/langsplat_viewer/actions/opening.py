@@ -309,7 +309,7 @@ def fade_photograph(viewer: Viewer, fade: float) -> None:
 
 
 def fetch_photograph(viewer: Viewer) -> None:
-    """Once per frame: have the worker look for the photograph that is wanted now and was not looked for."""
+    """Have the worker look for the photograph that is wanted; called once per frame now and was not looked for."""
     state = viewer.state
     camera = standing_at(state) if state.settings.fade > 0 else None
     if camera is None or state.path is None:
@@ -348,7 +348,7 @@ def ask_for_photographs(viewer: Viewer) -> None:
 
 
 def choose_photograph_folder(viewer: Viewer, folder: Path) -> None:
-    """Look for the photographs of this scene there from now on; remembered."""
+    """Set the folder of this scene's photographs, and remember it."""
     state = viewer.state
     state.browser = None
     if state.path is not None:

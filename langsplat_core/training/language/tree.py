@@ -1,7 +1,7 @@
 """A tree of things from masks that disagree: parts in things in groups, by the consensus of all views.
 
-The surface of a scene is divided into small patches, and then the two neighbours merge whose common border is
-least, until one is left (average linkage). What stands between two neighbours x and y is
+The surface of a scene is divided into small patches, and then the two neighbours merge between which least
+stands, until no two are neighbours (average linkage). What stands between two neighbours x and y is
 
     cost(x, y) = [ SEEN (1 - agreement) + SEEN border + BENT concavity + |difference of chromaticity| ] s
 
