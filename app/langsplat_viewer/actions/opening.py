@@ -309,7 +309,7 @@ def fade_photograph(viewer: Viewer, fade: float) -> None:
 
 
 def fetch_photograph(viewer: Viewer) -> None:
-    """Have the worker look for the photograph that is wanted; called once per frame now and was not looked for."""
+    """Have the worker look for a photograph that is wanted and was not looked for; called once per frame."""
     state = viewer.state
     camera = standing_at(state) if state.settings.fade > 0 else None
     if camera is None or state.path is None:
