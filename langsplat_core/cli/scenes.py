@@ -98,7 +98,10 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
         ("text encoder", f"{field.encoder}, {field.vector_dim} numbers"),
         ("phrasebook", f"{field.phrases} phrases"),
         ("observed", observed),
-        ("things", "none" if field.things is None else f"{field.things}"),
+        (
+            "tree",
+            "none" if field.nodes is None else f"{', '.join(map(str, field.nodes))} nodes at the levels",
+        ),
     ]
 
 

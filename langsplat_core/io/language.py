@@ -1,14 +1,18 @@
 """The language field of a scene: `scene.langsplat.safetensors` beside `scene.ply`.
 
 A safetensors file (an 8-byte length, a JSON header, raw little-endian tensors: nothing in it is ever
-executed). Version 2, for N Gaussians, CLIP vectors of D numbers and P phrases:
+executed). Version 3, for N Gaussians, CLIP vectors of D numbers, P phrases and K nodes:
 
     tensor           type     shape      meaning
     codes            uint16   (3, N)     number of the codeword at subpart, part, whole: of a codebook
     latents          float    (3, N, d)  instead, of another codec; zero where never observed
     confidence       float    (3, N)     total blending weight of the observations, >= 0; 0 for no meaning
-    things           uint16   (N,)       number of the thing a Gaussian belongs to, 65535 for none; absent
-                                         where it is not known
+    tree.leaves      uint16   (N,)       smallest node that a Gaussian is in, 65535 for none; uint32 and
+                                         4294967295 where there are more nodes. No tensor of a tree where
+                                         the scene has none
+    tree.parents     uint32   (K,)       node that each is part of, a later one; 4294967295 for none
+    tree.levels      uint8    (K,)       0, 1, 2: subpart, part, whole
+    tree.votes       uint16   (K, 2)     photographs with a mask of just this node; those without one
     positions        uint64   (N,)       of the Gaussians that the field belongs to, see `pack_positions`
     corners          float32  (2, 3)     of the box of these positions
     canonical        float    (4, D)     unit text vectors of "object", "things", "stuff", "texture"
@@ -21,7 +25,7 @@ executed). Version 2, for N Gaussians, CLIP vectors of D numbers and P phrases:
 
     metadata         value
     format           "langsplat"
-    version          "2"
+    version          "3"
     encoder          hub id or folder of the text encoder
     levels           "subpart,part,whole"
     codec            "codebook", "autoencoder" or "linear"
@@ -36,11 +40,12 @@ executed). Version 2, for N Gaussians, CLIP vectors of D numbers and P phrases:
 
 "float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
 like the one in memory. With a codebook as `langsplat train` makes it that is 22 bytes per Gaussian, 6 of
-them codes.
+them codes and 2 the tree.
 
 The PLY stays a plain file that other programs edit; the checksum notices it, and the positions let
-`rematch_language` carry the field over to an edited PLY. Version 1 is read too: everything float32, `means`
-(N, 3) in place of positions and corners, no temperature and no found.
+`rematch_language` carry the field over to an edited PLY. Older versions are read too: version 2 has no tree
+but `things`, uint16 (N,) number of the thing of each Gaussian, 65535 for none; in version 1 everything is
+float32, with `means` (N, 3) in place of positions and corners, no temperature and no found.
 """
 
 import hashlib
@@ -51,6 +56,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
@@ -61,15 +67,17 @@ from langsplat_core.io.hostile import open_for_reading, parse_json
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     LEVELS,
-    NO_THING,
+    NO_NODE,
     Calibration,
     LanguageField,
     Odds,
     Reading,
+    Tree,
     codec_from_tensors,
 )
+from langsplat_core.scene.tree import tree_of_wholes
 
-FORMAT, VERSION = "langsplat", "2"
+FORMAT, VERSION = "langsplat", "3"
 CODEC = "codec."
 WAYS = len(fields(Calibration))  # to look for something, each with odds of its own
 _KEYS = {
@@ -79,8 +87,17 @@ _KEYS = {
         *("temperature", "found"),
     ),
 }
-_FLOATS = {"1": ("F32",), "2": ("F32", "F16")}
-_WHOLE = {"codes": "U16", "things": "U16", "positions": "U64"}  # tensors that hold no floating-point numbers
+_KEYS["3"] = _KEYS["2"]
+_FLOATS = {"1": ("F32",), "2": ("F32", "F16"), "3": ("F32", "F16")}
+_WHOLE = {  # types of tensors that hold no floating-point numbers
+    "codes": ("U16",),
+    "things": ("U16",),
+    "positions": ("U64",),
+    "tree.leaves": ("U16", "U32"),
+    "tree.parents": ("U32",),
+    "tree.levels": ("U8",),
+    "tree.votes": ("U16",),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +121,7 @@ def read_stored(path: Path) -> Stored:
             tensors = {}
             for name in file.keys():  # noqa: SIM118 (not a dictionary)
                 kind = file.get_slice(name).get_dtype()
-                wanted = (_WHOLE[name],) if name in _WHOLE else _FLOATS[metadata["version"]]
+                wanted = _WHOLE.get(name, _FLOATS[metadata["version"]])
                 if kind not in wanted:
                     raise FormatError(
                         f"{path}: tensor {quoted(name)} is {kind}; expected {' or '.join(wanted)}"
@@ -173,9 +190,28 @@ def _field(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> L
         metadata["encoder"],
         dict(zip(phrases, vectors, strict=True)),
         reading,
-        tensors.get("things"),
+        _tree(tensors),
         tensors.get("everyday"),
     )
+
+
+def _tree(tensors: dict[str, Array]) -> Tree | None:
+    if "things" in tensors:
+        return tree_of_wholes(_signed(tensors["things"]))
+    if "tree.leaves" not in tensors:
+        return None
+    leaves, parents = _signed(tensors["tree.leaves"]), _signed(tensors["tree.parents"])
+    return Tree(leaves, parents, tensors["tree.levels"], tensors["tree.votes"])
+
+
+def _signed(numbers: Array) -> Array:
+    """Numbers as int32, the largest of their type as NO_NODE."""
+    none = np.iinfo(numbers.dtype).max
+    return np.where(numbers == none, NO_NODE, numbers.astype(np.int64)).astype(np.int32)
+
+
+def _unsigned(numbers: Array, kind: DTypeLike) -> Array:
+    return np.where(numbers == NO_NODE, np.iinfo(kind).max, numbers).astype(kind)
 
 
 def _calibration(metadata: dict[str, str], path: Path) -> Calibration | None:
@@ -251,8 +287,11 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
     }
     tensors = {name: _narrow(tensor) for name, tensor in floats.items()}
     tensors |= {"positions": positions, "corners": corners}
-    if field.things is not None:
-        tensors["things"] = field.things
+    if field.tree is not None:
+        few = field.tree.count < np.iinfo(np.uint16).max
+        tensors["tree.leaves"] = _unsigned(field.tree.leaves, np.uint16 if few else np.uint32)
+        tensors["tree.parents"] = _unsigned(field.tree.parents, np.uint32)
+        tensors |= {"tree.levels": field.tree.levels, "tree.votes": field.tree.votes}
     metadata = {
         "format": FORMAT,
         "version": VERSION,
@@ -315,7 +354,7 @@ def rematch_language(
     new_rows = np.flatnonzero(np.isfinite(new_means).all(1))
     latents = np.zeros((len(LEVELS), len(new_means), field.latents.shape[2]), field.latents.dtype)
     confidence = np.zeros((len(LEVELS), len(new_means)), np.float32)
-    things = np.full(len(new_means), NO_THING, np.uint16)
+    leaves = np.full(len(new_means), NO_NODE, np.int32)
     if len(old_rows) and len(new_rows):
         tree = cKDTree(old_means[old_rows])
         if max_distance is None:
@@ -324,11 +363,10 @@ def rematch_language(
         found = distance <= max_distance + stored.precision
         to, source = new_rows[found], old_rows[partner[found]]
         latents[:, to], confidence[:, to] = field.latents[:, source], field.confidence[:, source]
-        if field.things is not None:
-            things[to] = field.things[source]
-    return replace(
-        field, latents=latents, confidence=confidence, things=None if field.things is None else things
-    )
+        if field.tree is not None:
+            leaves[to] = field.tree.leaves[source]
+    tree = None if field.tree is None else replace(field.tree, leaves=leaves)
+    return replace(field, latents=latents, confidence=confidence, tree=tree)
 
 
 def _median_spacing(tree: Any) -> float:

@@ -12,7 +12,7 @@ from langsplat_core.config import INRIA
 from langsplat_core.io import cameras, language
 from langsplat_core.io.scenes import companion_path
 from langsplat_core.io.sog import META_NAME
-from langsplat_core.scene import LEVELS, NO_THING, SH_COUNTS, Gaussians, LanguageField, Scene
+from langsplat_core.scene import LEVELS, SH_COUNTS, Gaussians, LanguageField, Scene
 
 NEEDLE = 1e3  # longest over shortest axis from which a Gaussian counts as extremely stretched
 OPACITY_EDGES = (0.0, INRIA.alpha_min, 0.1, 0.5, 0.9, 1.0)
@@ -28,9 +28,9 @@ class LanguageSummary:
     vector_dim: int
     phrases: int
     observed: Mapping[str, float]  # level -> share of the Gaussians with a meaning
-    things: int | None  # that the Gaussians are told to belong to; None: no such numbers
+    nodes: tuple[int, ...] | None  # of the tree, at each level; None: the scene keeps no tree
     calibrated: bool  # whether answers come with a probability
-    bytes: int  # latents, confidences and things
+    bytes: int  # latents, confidences and leaves of the tree
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,8 @@ def _sh_energy(gaussians: Gaussians) -> tuple[float, ...]:
 
 def _arrays(field: LanguageField) -> list[Array]:
     """Arrays with a row for each Gaussian."""
-    return [array for array in (field.latents, field.confidence, field.things) if array is not None]
+    leaves = () if field.tree is None else (field.tree.leaves,)
+    return [field.latents, field.confidence, *leaves]
 
 
 def _language(field: LanguageField) -> LanguageSummary:
@@ -155,7 +156,9 @@ def _language(field: LanguageField) -> LanguageSummary:
         vector_dim=field.codec.vector_dim,
         phrases=len(field.phrasebook),
         observed=observed,
-        things=None if field.things is None else len(np.setdiff1d(field.things, [NO_THING])),
+        nodes=None
+        if field.tree is None
+        else tuple(int((field.tree.levels == level).sum()) for level in range(3)),
         calibrated=field.reading.calibration is not None,
         bytes=sum(array.nbytes for array in _arrays(field)),
     )

@@ -32,7 +32,7 @@ from langsplat_core.semantics.store import (
     embed_regions,
     fingerprint,
 )
-from langsplat_core.training.language.tree import Tree, draw_patches, find_tree, nested_maps
+from langsplat_core.training.language.tree import MergeTree, draw_patches, find_tree, nested_maps
 
 CUTS = (0.15, 0.4, 0.8)  # costs up to which subparts, parts and wholes grow; chosen in rooms 201 and 203
 LEAST = 2.5e-4  # of the image: smaller regions show the encoder nothing
@@ -61,7 +61,7 @@ def agreed_features(
     counts = [len(features.vectors) for _, features in views]
     eyes = np.stack([camera.position for camera, _ in views])
 
-    def make() -> Tree:
+    def make() -> MergeTree:
         return find_tree(gaussians, build_surface(gaussians), mask_weights, counts, eyes, progress)
 
     key = stage_key("tree", VERSION, *inputs)
@@ -81,9 +81,9 @@ def agreed_features(
     return StoredFeatures(store, [camera.name for camera, _ in views])
 
 
-def _pack(tree: Tree) -> Arrays:
+def _pack(tree: MergeTree) -> Arrays:
     return {"patches": tree.patches, "children": tree.children, "costs": tree.costs}
 
 
-def _unpack(arrays: Arrays) -> Tree:
-    return Tree(arrays["patches"], arrays["children"], arrays["costs"])
+def _unpack(arrays: Arrays) -> MergeTree:
+    return MergeTree(arrays["patches"], arrays["children"], arrays["costs"])

@@ -36,10 +36,13 @@ from langsplat_core.scene import (
     Codec,
     Gaussians,
     LanguageField,
+    Tree,
     codec_from_tensors,
 )
 from langsplat_core.scene.codec import KINDS
 from langsplat_core.scene.language import phrase_key
+from langsplat_core.scene.surface import build_surface
+from langsplat_core.scene.tree import build_tree, tree_of_wholes
 from langsplat_core.semantics.encoder import Encoder, PhraseEncoder
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.semantics.vocabulary import everyday_vectors
@@ -63,6 +66,7 @@ from langsplat_core.training.language.mask_weights import (
     group_masks,
     view_pairs,
 )
+from langsplat_core.training.language.tree import count_votes
 
 Views = Sequence[tuple[Camera, ImageFeatures]]  # read when needed: they may be more than memory holds
 Latents = tuple[Array, Array]  # (3, N, d) of the codec's type, (3, N) float32
@@ -89,18 +93,18 @@ def language_field(
     stages = _Stages(gaussians, views, encoder, config, work, processes or ProcessGroup(), progress)
     codec, report = stages.codec()
     latents, confidence = stages.latents(codec)
+    confidence = confidence.clip(max=MOST_CONFIDENCE).astype(np.float16).astype(np.float32)
     field = LanguageField(
         latents=latents,
-        confidence=confidence.clip(max=MOST_CONFIDENCE).astype(np.float16).astype(np.float32),
+        confidence=confidence,
         codec=codec,
         canonical=encoder.encode_texts(list(CANONICAL_PHRASES)),
         encoder_id=encoder.id,
         phrasebook=encoded_phrases(encoder, config.phrases),
         reading=encoder.reading,
-        things=stages.things(),
         everyday=everyday_vectors(encoder),
     )
-    return field, report
+    return replace(field, tree=stages.tree(field)), report
 
 
 def check_lift(config: TrainConfig) -> None:
@@ -167,20 +171,26 @@ class _Stages:
             shutil.rmtree(blocks, ignore_errors=True)
         return made
 
-    def things(self) -> Array | None:
-        """Return the instance of each Gaussian; None where latents are averaged themselves, which needs no
+    def tree(self, field: LanguageField) -> Tree:
+        """Return the tree of the scene; without votes where latents are averaged themselves, which needs no
         mask weights."""
+        surface = partial(build_surface, self._gaussians)
         if self._lift.mode in LATENT_LIFTS:
-            return None
-        path = self._work / f"{stage_key('things', 1, *self._inputs)}.npy"
+            return self._processes.once(
+                lambda: build_tree(surface(), field.codec, field.latents, field.known)
+            )
+        path = self._work / f"{stage_key('nodes', 1, *self._inputs, self._lift, self._config.codec)}.npz"
         if not path.exists():
             self._mask_weights()  # everyone's work
-        self._processes.once(lambda: kept_array(path, self._find_things))
-        return np.array(open_array(path))
 
-    def _find_things(self) -> Array:
-        self._progress("finding things", 0.5)
-        return find_things(self._mask_weights()[0], [len(vectors) for vectors in self._vectors])
+        def make() -> Tree:
+            self._progress("building the tree", 0.5)
+            counts, mask_weights = [len(vectors) for vectors in self._vectors], self._mask_weights()[0]
+            wholes = tree_of_wholes(find_things(mask_weights, counts))
+            tree = build_tree(surface(), field.codec, field.latents, field.known, wholes)
+            return replace(tree, votes=count_votes(tree, mask_weights, counts))
+
+        return self._processes.once(lambda: kept(path, make, _pack_tree, _unpack_tree))
 
     def _fit(self) -> tuple[Codec, CodecReport]:
         config, vocabulary = self._config.codec, everyday_vocabulary(self._encoder, self._config.phrases)
@@ -290,6 +300,14 @@ def _pack(latents: Latents) -> Arrays:
 
 def _unpack(arrays: Arrays) -> Latents:
     return arrays["latents"], arrays["confidence"]
+
+
+def _pack_tree(tree: Tree) -> Arrays:
+    return {"leaves": tree.leaves, "parents": tree.parents, "levels": tree.levels, "votes": tree.votes}
+
+
+def _unpack_tree(arrays: Arrays) -> Tree:
+    return Tree(arrays["leaves"], arrays["parents"], arrays["levels"], arrays["votes"])
 
 
 def _pack_groups(groups: MaskGroups) -> Arrays:

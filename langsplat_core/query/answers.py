@@ -17,9 +17,10 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.grammar import Named, named
 from langsplat_core.query.instances import axis_aligned_box
-from langsplat_core.query.regions import SMALLEST, Regions
+from langsplat_core.query.regions import Regions
 from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField
 from langsplat_core.scene.surface import Surface
+from langsplat_core.scene.tree import SMALLEST
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, Scale, relevancy_of
 
 Triple = tuple[float, float, float]  # one number a level
@@ -146,15 +147,17 @@ def excess(fits: Fits, bars: Bars, named: Named | Literal["inside"], level: Leve
     return max(bars[2].excess(fits[2], whole), bars[3].excess(max(fits[:2]), finer))
 
 
-def chance_in(field: LanguageField, surface: Surface, regions: Regions, scale: Scale) -> Chance:
+def chance_in(field: LanguageField, regions: Regions, scale: Scale) -> Chance:
     """The fits of everyday phrases in a scene."""
     assert scale.everyday is not None
     fits = []
     for level, known in enumerate(field.known):
-        has = known[surface.rows]
-        latents, of = field.codec.unique(field.latents[level, surface.rows[has]])
+        rows = np.flatnonzero(known & (regions.weights > 0))
+        latents, of = field.codec.unique(field.latents[level, rows])
         shape = (len(regions.totals[level]), len(latents))
-        shares = csr_matrix((surface.weights[has], (regions.of[level][has], of)), shape=shape).tocsc()
+        shares = csr_matrix(
+            (regions.weights[rows], (regions.everywhere[level, rows], of)), shape=shape
+        ).tocsc()
         means = np.zeros((shape[0], len(scale.everyday)))
         for start in range(0, len(latents), CHUNK):
             part = slice(start, start + CHUNK)
@@ -206,20 +209,20 @@ def _level(best: Array, named: Named) -> int:
 def by_regions(
     phrase: str,
     relevancy: Array,
-    surface: Surface,
+    means: Array,
     regions: Regions,
     scale: Scale,
     bars: Bars,
     calibration: Calibration | None,
     level: LevelChoice,
 ) -> QueryResult:
-    """The answer of whole regions that fit nearly as well as the best one."""
-    kind, means = named(phrase), regions.means(relevancy)
-    peaks = triple(_best(values, sizes) for values, sizes in zip(means, regions.sizes, strict=True))
+    """The answer of whole regions that fit nearly as well as the best one. means: (N, 3) of the Gaussians."""
+    kind, every = named(phrase), regions.means(relevancy)
+    peaks = triple(_best(values, sizes) for values, sizes in zip(every, regions.sizes, strict=True))
     best = scale.fit(np.array(peaks))
     chosen = _level(best, kind) if level == "auto" else LEVELS.index(level)
-    inside = scale.fit(means[chosen]) >= lowest(float(best[chosen]))  # (R,) bool
-    values, peak, fits = means[chosen].astype(np.float32), peaks[chosen], triple(best)
+    inside = scale.fit(every[chosen]) >= lowest(float(best[chosen]))  # (R,) bool
+    values, peak, fits = every[chosen].astype(np.float32), peaks[chosen], triple(best)
     probability = above = None
     if calibration is None:
         above = excess(fits, bars, kind, level)
@@ -230,8 +233,9 @@ def by_regions(
         # It may be there, but what the wanted level shows is nearer to other phrases.
         found = (level == "auto" or fits[chosen] >= 0) and probability >= odds.found
     solid = np.where(values > np.float32(peak), 0, values)  # what is above the best is a crumb
-    reached = np.nextafter(values[inside].min(initial=np.float32(1)), np.float32(0))
-    place, box = locate(surface, solid[regions.of[chosen]], reached)
+    place = box = None
+    if solid.max(initial=0) > 0:
+        place, box = _place_of(means[regions.counted(chosen, int(solid.argmax()))])
     return QueryResult(
         phrase=phrase,
         level=chosen,
@@ -281,6 +285,17 @@ def by_peak(
 
 
 # Places: the strongest among the Gaussians, and the pixel of the peak in a view.
+
+MIDDLE = 16  # Gaussians around the middle of a region
+
+
+def _place_of(points: Array) -> tuple[Array, Array]:
+    """Place (3,), at what is nearest to the middle, and box (2, 3) of a region's (K, 3) points, K >= 1."""
+    points = points.astype(np.float64)
+    far = ((points - points.mean(0)) ** 2).sum(1)
+    near = np.argpartition(far, min(MIDDLE, len(far)) - 1)[:MIDDLE]
+    return points[near].mean(0), axis_aligned_box(points)
+
 
 PLATEAU = 1e-3  # of relevancy: what is this close to the peak is as high
 

@@ -21,10 +21,10 @@ from langsplat_core.query.grammar import (
     Both,
     Extreme,
     Inside,
+    Phrase,
     Relation,
     Side,
     Superlative,
-    Tree,
     Union,
     Without,
     atoms,
@@ -34,9 +34,10 @@ from langsplat_core.query.grammar import (
     unparse,
 )
 from langsplat_core.query.instances import axis_aligned_box
-from langsplat_core.scene import LEVELS, NO_THING, Camera
+from langsplat_core.scene import LEVELS, NO_NODE, Camera
 from langsplat_core.scene.language import phrase_key, tidy
 from langsplat_core.scene.surface import Surface
+from langsplat_core.scene.tree import Tree
 from langsplat_core.semantics.relevancy import FLOOR
 
 FEWEST = 8  # Gaussians; what has fewer is a speck
@@ -118,17 +119,16 @@ def body(positions: Array, frame: Array) -> Body:
     return Body(points, low, high)
 
 
-def separate(surface: Surface, inside: Array, things: Array | None = None) -> list[Array]:
+def separate(surface: Surface, inside: Array, tree: Tree | None = None) -> list[Array]:
     """(M,) bool -> surface numbers of each single thing in it, the largest first, without specks.
 
-    things: (N,) uint16, see `LanguageField.things`: what tells apart things that touch, and keeps together
-    one that is half hidden. Gaussians that are of none, or all of them where nothing is known of things, are
-    taken apart where the surface is.
+    tree: what tells apart things that touch, and keeps together one that is half hidden, by its wholes that
+    masks voted for. All other Gaussians are taken apart where the surface is.
     """
     numbers = np.flatnonzero(inside)
-    owner = np.full(len(numbers), NO_THING) if things is None else things[surface.rows[numbers]]
-    parts = surface.parts(numbers[owner == NO_THING]).each()
-    parts += [numbers[owner == one] for one in np.unique(owner[owner != NO_THING])]
+    owner = np.full(len(numbers), NO_NODE) if tree is None else tree.voted(WHOLE)[surface.rows[numbers]]
+    parts = surface.parts(numbers[owner == NO_NODE]).each()
+    parts += [numbers[owner == one] for one in np.unique(owner[owner != NO_NODE])]
     parts.sort(key=len, reverse=True)
     return [part for part in parts if len(part) >= max(FEWEST, SPECK * len(parts[0]))]
 
@@ -356,7 +356,7 @@ class ComposedResult:
     """The answer to a phrase, and the tree as which it was read."""
 
     answer: QueryResult  # in the form of a simple one
-    tree: Tree
+    tree: Phrase
 
     @property
     def reading(self) -> str:
@@ -412,7 +412,7 @@ def check_phrase(
             raise
 
 
-def _check_viewpoint(tree: Tree, viewpoint: Camera | None) -> None:
+def _check_viewpoint(tree: Phrase, viewpoint: Camera | None) -> None:
     """InputError for the first word in the tree that only a viewer can say, if there is none."""
     match tree:
         case Relation(kind) | Superlative(kind):
@@ -435,7 +435,7 @@ class _Asking:
         self._frame = upright(engine.scene.up())
         self._viewpoint = None if camera is None else viewpoint(camera, self._frame)
 
-    def answer(self, tree: Tree, level: LevelChoice = "auto") -> QueryResult:
+    def answer(self, tree: Phrase, level: LevelChoice = "auto") -> QueryResult:
         """The answer to a tree; without a place, which only the last answer needs."""
         match tree:
             case Atom(text):
@@ -467,7 +467,7 @@ class _Asking:
         whole = self._ask(text, "whole")
         return whole if whole.peak >= FLOOR else self._ask(text, "auto")
 
-    def _inside(self, part: Tree, whole: Tree, level: LevelChoice) -> QueryResult:
+    def _inside(self, part: Phrase, whole: Phrase, level: LevelChoice) -> QueryResult:
         thing = self.answer(whole)
         there = grown(self.surface, thing.members)
         if not isinstance(part, Atom):
@@ -510,5 +510,5 @@ class _Asking:
     def _bodies(self, answer: QueryResult) -> list[tuple[Array, Body]]:
         """Every single thing of an answer, as surface numbers and as the place it takes."""
         inside = answer.members[self.surface.rows]
-        parts = separate(self.surface, inside, self.engine.field.things)
+        parts = separate(self.surface, inside, self.engine.tree)
         return [(numbers, body(self.surface.positions[numbers], self._frame)) for numbers in parts]

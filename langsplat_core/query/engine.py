@@ -29,7 +29,8 @@ from langsplat_core.query.lookup import Lookup, build_lookup
 from langsplat_core.query.regions import Regions, build_regions
 from langsplat_core.scene import CANONICAL_PHRASES, Calibration, LanguageField, Scene
 from langsplat_core.scene.language import phrase_key, tidy
-from langsplat_core.scene.surface import Surface, build_surface
+from langsplat_core.scene.surface import Surface, build_surface, surface_weights
+from langsplat_core.scene.tree import Tree, build_tree
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE
 from langsplat_core.semantics.relevancy import Scale
 from langsplat_core.semantics.vocabulary import FEWEST, everyday_vectors
@@ -202,9 +203,17 @@ class QueryEngine:
         return build_surface(self.scene.gaussians)
 
     @cached_property
+    def tree(self) -> Tree:
+        """The scene's own tree; where it has none, or wholes alone, one that is built when first needed."""
+        field = self.field
+        if field.tree is not None and field.tree.complete:
+            return field.tree
+        return build_tree(self.surface, field.codec, field.latents, field.known, field.tree)
+
+    @cached_property
     def regions(self) -> Regions:
-        """Patches of the surface that mean the same; found when first needed."""
-        return build_regions(self.surface, self.field)
+        """The tree's nodes at each level."""
+        return build_regions(self.tree, surface_weights(self.scene.gaussians))
 
     @cached_property
     def _lookup(self) -> Lookup:
@@ -215,7 +224,7 @@ class QueryEngine:
         """The fits of everyday phrases in the scene; None where there are none."""
         if self.scale.everyday is None:
             return None
-        return chance_in(self.field, self.surface, self.regions, self.scale)
+        return chance_in(self.field, self.regions, self.scale)
 
     @cached_property
     def _bars(self) -> Bars | None:
@@ -359,7 +368,14 @@ class QueryEngine:
             found = self.field.reading.found
             return by_peak(phrase, relevancy, self.surface, self.scale, found, level)
         return by_regions(
-            phrase, relevancy, self.surface, self.regions, self.scale, self._bars, self.calibration, level
+            phrase,
+            relevancy,
+            self.scene.gaussians.means,
+            self.regions,
+            self.scale,
+            self._bars,
+            self.calibration,
+            level,
         )
 
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:

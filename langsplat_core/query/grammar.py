@@ -25,8 +25,8 @@ class Atom:
 class Inside:
     """A part, looked for on the whole alone."""
 
-    part: "Tree"
-    whole: "Tree"
+    part: "Phrase"
+    whole: "Phrase"
 
 
 @dataclass(frozen=True)
@@ -34,30 +34,30 @@ class Relation:
     """The ones of `what` that stand so to one of `anchor`."""
 
     kind: Side
-    what: "Tree"
-    anchor: "Tree"
+    what: "Phrase"
+    anchor: "Phrase"
 
 
 @dataclass(frozen=True)
 class Both:
     """All of them, each to be there."""
 
-    items: tuple["Tree", ...]
+    items: tuple["Phrase", ...]
 
 
 @dataclass(frozen=True)
 class Union:
     """Whichever of them is there."""
 
-    items: tuple["Tree", ...]
+    items: tuple["Phrase", ...]
 
 
 @dataclass(frozen=True)
 class Without:
     """Everything that is `what` and not `unwanted`."""
 
-    what: "Tree"
-    unwanted: "Tree"
+    what: "Phrase"
+    unwanted: "Phrase"
 
 
 @dataclass(frozen=True)
@@ -65,21 +65,21 @@ class Superlative:
     """The one of `what` that is most so; "nearest" and "farthest" are seen from `anchor`, else the viewer."""
 
     kind: Extreme
-    what: "Tree"
-    anchor: "Tree | None" = None
+    what: "Phrase"
+    anchor: "Phrase | None" = None
 
 
-Tree = Atom | Inside | Relation | Both | Union | Without | Superlative
+Phrase = Atom | Inside | Relation | Both | Union | Without | Superlative
 
 
-def atoms(tree: Tree) -> tuple[Atom, ...]:
+def atoms(tree: Phrase) -> tuple[Atom, ...]:
     """The phrases of a tree, in the order in which they are written."""
     if isinstance(tree, Atom):
         return (tree,)
     return tuple(atom for child in children(tree) for atom in atoms(child))
 
 
-def unparse(tree: Tree) -> str:  # noqa: PLR0911  one row of a table each
+def unparse(tree: Phrase) -> str:  # noqa: PLR0911  one row of a table each
     """A tree as text, such as "handle  inside  red mug"; groups in a group stand in brackets."""
     match tree:
         case Atom(text):
@@ -99,11 +99,11 @@ def unparse(tree: Tree) -> str:  # noqa: PLR0911  one row of a table each
             return f"{kind}  {_nested(what)}{seen_from}"
 
 
-def _nested(tree: Tree) -> str:
+def _nested(tree: Phrase) -> str:
     return tree.text if isinstance(tree, Atom) else f"({unparse(tree)})"
 
 
-def children(tree: Tree) -> tuple[Tree, ...]:
+def children(tree: Phrase) -> tuple[Phrase, ...]:
     """The trees that a tree is made of."""
     match tree:
         case Both(items) | Union(items):
@@ -270,7 +270,7 @@ _EXCLUSIONS = tuple(
 )
 
 
-def parse(text: str) -> Tree:
+def parse(text: str) -> Phrase:
     """The tree of one query.
 
     Raises InputError where nothing is named, where something is only excluded ("not the cup"), and for a text
@@ -293,7 +293,7 @@ def parse(text: str) -> Tree:
     return tree
 
 
-def _query(tokens: list[str]) -> Tree:
+def _query(tokens: list[str]) -> Phrase:
     sides: list[list[str]] = [[]]
     at = 0
     while at < len(tokens):
@@ -311,7 +311,7 @@ def _query(tokens: list[str]) -> Tree:
     return Without(wanted, unwanted[0] if len(unwanted) == 1 else Union(tuple(unwanted)))
 
 
-def _of_it(unwanted: Tree, wanted: Tree) -> Tree:
+def _of_it(unwanted: Phrase, wanted: Phrase) -> Phrase:
     """ "mug without handle": the mug's own handle is meant."""
     part, whole = (atoms(tree)[0].text.split()[-1] for tree in (unwanted, wanted))
     own = isinstance(unwanted, Atom) and is_part(part) and isinstance(wanted, Atom) and not is_part(whole)
@@ -326,7 +326,7 @@ def _exclusion_at(tokens: list[str], at: int) -> int:
     return 0
 
 
-def _alternatives(tokens: list[str]) -> Tree:
+def _alternatives(tokens: list[str]) -> Phrase:
     ahead = [*(token.lower() for token in tokens[1:]), ""]
     tokens = [token for token, then in zip(tokens, ahead, strict=True) if (token, then) != (",", "or")]
     sides = _split(tokens, ("or", ","))
@@ -334,7 +334,7 @@ def _alternatives(tokens: list[str]) -> Tree:
     return items[0] if len(items) == 1 else Union(tuple(items))
 
 
-def _all(tokens: list[str]) -> Tree:
+def _all(tokens: list[str]) -> Phrase:
     as_one = " ".join(tokens)
     tokens = re.sub(r"\bas well as\b", "&", as_one, flags=re.IGNORECASE).split(" ")
     items = [_clause(part) for part in _split(tokens, ("and", "&"))]
@@ -358,7 +358,7 @@ def _names(tokens: list[str]) -> bool:
     return not only(_EMPTY, words) or (bool(words) and words[-1].lower() in ALSO_NOUNS)
 
 
-def _clause(tokens: list[str]) -> Tree:
+def _clause(tokens: list[str]) -> Phrase:
     tokens = _without_articles(tokens)
     low = [token.lower() for token in tokens]
     kind = _SUPERLATIVES.get(low[0])
@@ -376,7 +376,7 @@ def _clause(tokens: list[str]) -> Tree:
     return _related(tokens)
 
 
-def _related(tokens: list[str]) -> Tree:
+def _related(tokens: list[str]) -> Phrase:
     for at in range(1, len(tokens)):
         for length in range(min(_LONGEST, len(tokens) - at - 1), 0, -1):
             kind = _PREPOSITIONS.get(tuple(token.lower() for token in tokens[at : at + length]))
@@ -396,7 +396,7 @@ def _holds(tokens: list[str]) -> bool:
     return is_measure(tokens[-1]) and only(_EMPTY, tokens[:-1])
 
 
-def _thing(tokens: list[str]) -> Tree:
+def _thing(tokens: list[str]) -> Phrase:
     for at, token in enumerate(tokens[:-1]):
         owner, rest = [*tokens[:at], re.sub(r"'s?$", "", token)], tokens[at + 1 :]
         owned = re.search(r"(?:\w's|s')$", token) and owner[-1].lower() not in OWNERS

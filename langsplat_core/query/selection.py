@@ -46,7 +46,7 @@ def at_point(surface: Surface, regions: Regions, level: int, point: Array) -> Ar
     if len(surface.rows) == 0:
         return np.zeros(len(surface.anchors), bool)
     nearest = int(((surface.positions - point) ** 2).sum(1).argmin())
-    same: Array = regions.everywhere[level] == regions.of[level][nearest]
+    same: Array = regions.everywhere[level] == regions.everywhere[level, surface.rows[nearest]]
     return same
 
 

@@ -12,7 +12,6 @@ from langsplat_core.scene.gaussians import SH_COUNTS, Gaussians
 from langsplat_core.scene.language import (
     CANONICAL_PHRASES,
     LEVELS,
-    NO_THING,
     Calibration,
     Fits,
     LanguageField,
@@ -20,12 +19,13 @@ from langsplat_core.scene.language import (
     Reading,
 )
 from langsplat_core.scene.scene import Scene
+from langsplat_core.scene.tree import NO_NODE, Tree
 
 __all__ = [
     "CANONICAL_PHRASES",
     "FARTHEST",
     "LEVELS",
-    "NO_THING",
+    "NO_NODE",
     "SH_COUNTS",
     "AutoencoderCodec",
     "Calibration",
@@ -40,6 +40,7 @@ __all__ = [
     "Odds",
     "Reading",
     "Scene",
+    "Tree",
     "codec_from_tensors",
     "look_at",
 ]

@@ -13,6 +13,7 @@ import numpy as np
 
 from langsplat_core.arrays import Array, check_array, sigmoid
 from langsplat_core.scene.codec import Codec
+from langsplat_core.scene.tree import Tree
 
 _SEPARATE = re.compile(r"[;\n]|,(?!\s*(?:(?:but|and)\s+)?(?:not|without|except)\b)", re.IGNORECASE)
 _APOSTROPHES = str.maketrans(dict.fromkeys("’‘ʼ′＇´`", "'"))
@@ -128,7 +129,6 @@ class Reading:
 
 LEVELS = ("subpart", "part", "whole")  # index 0, 1, 2 wherever a level axis appears
 CANONICAL_PHRASES = ("object", "things", "stuff", "texture")  # LERF's negatives, used by LangSplat
-NO_THING = 65_535  # in `LanguageField.things`: of no thing in particular
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +142,7 @@ class LanguageField:
     encoder_id: str  # hub id or folder of the text encoder, e.g. "demo"
     phrasebook: Mapping[str, Array] = field(default_factory=dict)  # `phrase_key` -> (D,) unit vector
     reading: Reading = field(default_factory=Reading)
-    things: Array | None = None  # (N,) uint16 number of the thing that each belongs to, or NO_THING
+    tree: Tree | None = None  # of N Gaussians; of wholes alone where nothing but these was kept
     everyday: Array | None = None  # (V, D) float32 unit vectors of phrases most of which name nothing here
 
     def __post_init__(self) -> None:
@@ -153,8 +153,8 @@ class LanguageField:
         check_array("canonical", self.canonical, ("C", big), dtype=np.float32)
         if len(self.canonical) == 0:
             raise ValueError("canonical: a phrase is compared with one other at least")
-        if self.things is not None:
-            check_array("things", self.things, ("N",), dims, dtype=np.uint16)
+        if self.tree is not None:
+            check_array("leaves", self.tree.leaves, ("N",), dims)
         if self.everyday is not None:
             check_array("everyday", self.everyday, ("V", big), dtype=np.float32)
         known = {phrase_key(phrase): vector for phrase, vector in self.phrasebook.items()}
@@ -178,5 +178,5 @@ class LanguageField:
             self,
             latents=self.latents[:, rows],
             confidence=self.confidence[:, rows],
-            things=None if self.things is None else self.things[rows],
+            tree=None if self.tree is None else self.tree.take(rows),
         )

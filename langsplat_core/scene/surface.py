@@ -79,13 +79,20 @@ class Surface:
         return order[:count]
 
 
-def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
-    """Surface of all valid Gaussians with at least `min_opacity` (of all valid ones if none has)."""
+def surface_weights(gaussians: Gaussians, min_opacity: float = 0.1) -> Array:
+    """(N,) float32 opacity of what the surface consists of, 0 for all others: valid Gaussians with at least
+    `min_opacity`, or all valid ones if none has."""
     valid = gaussians.valid()
     opacity = np.where(valid, sigmoid(gaussians.opacity_logits.astype(np.float64)), 0)
-    rows = np.flatnonzero(opacity >= min_opacity)
-    if len(rows) == 0:
-        rows = np.flatnonzero(valid)
+    counts = opacity >= min_opacity
+    counts = counts if counts.any() else valid
+    return np.where(counts, np.maximum(opacity, FAINTEST), 0).astype(np.float32)
+
+
+def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
+    """Surface of all valid Gaussians with at least `min_opacity` (of all valid ones if none has)."""
+    valid, every = gaussians.valid(), surface_weights(gaussians, min_opacity)
+    rows = np.flatnonzero(every)
     k = min(NEIGHBOURS, len(rows))
     if k == 0:
         nothing = np.zeros((0, 1), np.int32), np.zeros(0, np.float32), csr_matrix((0, 0), dtype=bool)
@@ -96,7 +103,7 @@ def build_surface(gaussians: Gaussians, min_opacity: float = 0.1) -> Surface:
     distances, neighbours = tree.query(positions, k=k, workers=-1)
     shape = (len(rows), k)
     distances, neighbours = distances.reshape(shape), neighbours.reshape(shape).astype(np.int32)
-    weights = np.maximum(opacity[rows], FAINTEST).astype(np.float32)
+    weights = every[rows]
     reach = REACH * np.median(distances, axis=1) + 1e-12
     anchors = np.full(len(gaussians), -1, np.int32)
     anchors[rows] = np.arange(len(rows))

@@ -1,12 +1,28 @@
-"""The tree of a scene: nested sets of Gaussians, wholes with their parts and these with their subparts."""
+"""The tree of a scene: nested sets of Gaussians, wholes with their parts and these with their subparts.
+
+Gaussians vary, things do not: an answer made of whole nodes has the borders of the things and no speckles,
+and its peak is a mean over a patch instead of one lucky Gaussian. Nodes are patches of the surface that mean
+the same at a level, by the criterion of Felzenszwalb and Huttenlocher (2004): two patches merge where the
+step between their meanings is no larger than the steps within either. Wholes are found first, then parts
+within each, then subparts within these. What masks of many photographs say is one thing stays one whole: the
+encoder may see its front and its back differently.
+"""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from langsplat_core.arrays import Array, check_array
+from langsplat_core.scene.codec import Codec
+from langsplat_core.scene.surface import Surface, divide
 
 NO_NODE = -1
+LEVEL_COUNT = 3
+SCALE = 6.8  # of the criterion, in typical steps times Gaussians: larger prefers larger patches
+SMALLEST = 10  # Gaussians; smaller patches join the neighbour that means the most similar
+BORDER = 0.6  # added to the step between two things, in typical steps
+UNKNOWN = 2.0  # step between a Gaussian with a meaning and one without: as much as between opposites
+STEPS = 65_535 / (UNKNOWN + 2 * BORDER)  # of 1 - cosine that are told apart: 16 bits sort in linear time
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,7 +32,9 @@ class Tree:
     leaves: Array  # (N,) int32 smallest node that each Gaussian is in; NO_NODE for those in none
     parents: Array  # (K,) int32 node that each is part of, a later one; NO_NODE for what is part of none
     levels: Array  # (K,) uint8 index into LEVELS of what a node means; never above its parent's
-    votes: Array  # (K, 2) uint16 photographs with a mask of just this node, and those that show it without one
+    votes: (
+        Array  # (K, 2) uint16 photographs with a mask of just this node, and those that show it without one
+    )
 
     def __post_init__(self) -> None:
         check_array("leaves", self.leaves, ("N",), dtype=np.int32)
@@ -29,8 +47,13 @@ class Tree:
         parents, child = self.parents, self.parents != NO_NODE
         if (parents[child] <= numbers[child]).any() or (parents >= count).any() or (parents < NO_NODE).any():
             raise ValueError("tree: every parent must be a later node")
-        if (self.levels > 2).any() or (self.levels[child] > self.levels[parents[child]]).any():
+        if (self.levels >= LEVEL_COUNT).any() or (self.levels[child] > self.levels[parents[child]]).any():
             raise ValueError("tree: levels must be 0, 1 or 2 and not above the parent's")
+
+    @property
+    def complete(self) -> bool:
+        """False where there are wholes alone."""
+        return bool((self.levels < LEVEL_COUNT - 1).any()) or self.count == 0
 
     @property
     def count(self) -> int:
@@ -38,7 +61,7 @@ class Tree:
         return len(self.parents)
 
     def around(self, level: int) -> Array:
-        """(K,) int32 the largest node of at most `level` around each node; itself where it is of a higher one."""
+        """(K,) int32 the largest node of at most `level` around each node; itself where it is above."""
         owners = np.arange(self.count, dtype=np.int32)
         for node in range(self.count - 1, -1, -1):
             parent = self.parents[node]
@@ -49,6 +72,12 @@ class Tree:
     def at(self, level: int) -> Array:
         """(N,) int32 node of each Gaussian at a level (index into LEVELS); NO_NODE for those in none."""
         return np.append(self.around(level), np.int32(NO_NODE))[self.leaves]
+
+    def voted(self, level: int) -> Array:
+        """`at` a level, NO_NODE where no mask voted for that node."""
+        at = self.at(level)
+        votes = np.append(self.votes[:, 0] > 0, False)
+        return np.where(votes[at], at, np.int32(NO_NODE))
 
     def path(self, node: int) -> tuple[int, ...]:
         """The node, its parent, that one's parent, ... up to a root."""
@@ -72,3 +101,84 @@ class Tree:
     def take(self, rows: Array) -> "Tree":
         """The tree of the Gaussians at `rows` (indices or a boolean mask); its nodes keep their numbers."""
         return replace(self, leaves=self.leaves[rows])
+
+
+def tree_of_wholes(things: Array) -> Tree:
+    """The tree of things alone: (N,) number of the thing of each Gaussian, from 0; NO_NODE for none."""
+    count = int(things.max(initial=NO_NODE)) + 1
+    votes = np.tile(np.array([1, 0], np.uint16), (count, 1))
+    return Tree(
+        things.astype(np.int32), np.full(count, NO_NODE, np.int32), np.full(count, 2, np.uint8), votes
+    )
+
+
+def build_tree(
+    surface: Surface, codec: Codec, latents: Array, known: Array, wholes: Tree | None = None
+) -> Tree:
+    """The tree of a scene. latents: (3, N, d); known: (3, N) bool; wholes: what masks say of whole things,
+    whose votes are kept."""
+    things = None if wholes is None else wholes.at(LEVEL_COUNT - 1)[surface.rows]
+    above: Array | None = None  # (M,) node of the level above
+    of: list[Array] = []
+    for level in range(LEVEL_COUNT - 1, -1, -1):
+        above = _divided(
+            surface, codec, latents[level, surface.rows], known[level, surface.rows], above, things
+        )
+        of.insert(0, above)
+        things = None
+    counts = [int(row.max(initial=-1)) + 1 for row in of]
+    firsts = np.cumsum([0, *counts])
+    parents = np.full(firsts[-1], NO_NODE, np.int32)
+    for level in range(LEVEL_COUNT - 1):
+        parents[firsts[level] + of[level]] = firsts[level + 1] + of[level + 1]
+    votes = np.zeros((firsts[-1], 2), np.uint16)
+    if wholes is not None:
+        told = wholes.at(LEVEL_COUNT - 1)[surface.rows]
+        inside = told != NO_NODE
+        owner = np.full(counts[-1], NO_NODE)
+        owner[of[-1][inside]] = told[inside]
+        votes[firsts[-2] :][owner != NO_NODE] = wholes.votes[owner[owner != NO_NODE]]
+    leaves = np.full(len(surface.anchors), NO_NODE, np.int32)
+    near = surface.anchors >= 0
+    leaves[near] = of[0][surface.anchors[near]]
+    return Tree(leaves, parents, np.repeat(np.arange(LEVEL_COUNT, dtype=np.uint8), counts), votes)
+
+
+def _divided(
+    surface: Surface, codec: Codec, latents: Array, known: Array, above: Array | None, things: Array | None
+) -> Array:
+    """(M,) int32 number, from 0, of the patch of each Gaussian at one level, within those of the level
+    `above`; or, at the coarsest, along the borders of `things` (M,)."""
+    a, b = surface.ends
+    steps = _steps(codec, latents, known, a, b)
+    # Between two Gaussians drawn by chance, on average: what is far in this encoder's space.
+    typical = codec.spread(latents[known]) if known.any() else 1.0
+    if things is not None:
+        told = (things[a] != NO_NODE) & (things[b] != NO_NODE)
+        steps = np.where(told, np.where(things[a] == things[b], 0, steps + BORDER * typical), steps)
+    ranks = np.round(steps * STEPS).astype(np.uint16)
+    order = np.argsort(ranks, kind="stable").astype(np.int32)
+    if above is not None:
+        order = order[above[a[order]] == above[b[order]]]
+    of = divide(surface, steps, order, SCALE * typical, SMALLEST)
+    return of if things is None else _united(of, things, surface.weights)
+
+
+def _steps(codec: Codec, latents: Array, known: Array, a: Array, b: Array) -> Array:
+    """(E,) 1 - cosine between what the two ends of each link mean, in [0, 2]."""
+    steps = codec.distances(latents, a, b)
+    both, neither = known[a] & known[b], ~known[a] & ~known[b]
+    return np.asarray(np.where(both, steps, np.where(neither, 0.0, UNKNOWN)).clip(0, UNKNOWN))
+
+
+def _united(of: Array, things: Array, weights: Array) -> Array:
+    """(M,) patches, those of one thing joined, wherever they are: half hidden, it is still one. A patch is of
+    the thing that most of it is."""
+    count, size = int(of.max(initial=-1)) + 1, int(things.max(initial=NO_NODE)) + 2
+    place, row = np.unique(of.astype(np.int64) * size + things + 1, return_inverse=True)
+    shares = np.bincount(row, weights, len(place))
+    order = np.lexsort((shares, place // size))  # of each patch the largest share last
+    thing = np.full(count, NO_NODE)
+    thing[place[order] // size] = place[order] % size - 1
+    joined = np.where(thing == NO_NODE, size + np.arange(count), thing)
+    return np.unique(joined[of], return_inverse=True)[1].astype(np.int32).reshape(-1)

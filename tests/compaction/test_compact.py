@@ -32,6 +32,7 @@ from langsplat_core.progress import Progress, Report, silent
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import Camera, Scene, look_at
+from langsplat_core.scene.tree import tree_of_wholes
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_gaussians
 
@@ -54,8 +55,8 @@ def scene() -> Scene:
     gaussians.opacity_logits[::2] = -5.0
     gaussians.sh[:, 1:] *= 0.05
     extras = {"age": np.arange(N, dtype=np.float32)}
-    things = np.arange(N, dtype=np.uint16) // 9
-    field = replace(random_field(N, phrases=("red mug", "door")), things=things)
+    tree = tree_of_wholes(np.arange(N) // 9)
+    field = replace(random_field(N, phrases=("red mug", "door")), tree=tree)
     return Scene(gaussians, field, cameras(), extras=extras)
 
 
@@ -130,7 +131,7 @@ def test_budget_companions_and_order_survive_the_file(scene, source, tmp_path):
     count = small.gaussians.sh.shape[1]
     np.testing.assert_array_equal(small.gaussians.sh, scene.gaussians.sh[rows, :count])
     np.testing.assert_array_equal(small.language.latents, scene.language.latents[:, rows])
-    np.testing.assert_array_equal(small.language.things, scene.language.things[rows])
+    np.testing.assert_array_equal(small.language.tree.leaves, scene.language.tree.leaves[rows])
     assert len(small.cameras) == len(scene.cameras)
     held = choose_views(scene, None, CONFIG, silent).measuring
     losses = psnr_losses(
@@ -146,7 +147,7 @@ def test_budget_companions_and_order_survive_the_file(scene, source, tmp_path):
         old, new = (engine.run(answer.phrase) for engine in engines)
         assert answer.same == ((old.found, old.level) == (new.found, new.level))
         assert answer.moved == pytest.approx(np.linalg.norm(old.place - new.place), abs=1e-6)
-    assert report.before.memory_bytes == 4 * N * (3 + 3 + 4 + 1 + 12 + 1 + 3 * 4) + 2 * N  # things
+    assert report.before.memory_bytes == 4 * N * (3 + 3 + 4 + 1 + 12 + 1 + 3 * 4) + 4 * N  # leaves
     sizes = [file.stat().st_size for file in tmp_path.iterdir() if file.name.startswith("out.")]
     assert len(sizes) == 3
     assert report.after.disk_bytes == sum(sizes)

@@ -22,7 +22,7 @@ from langsplat_core.io.language import (
     unpack_positions,
     write_language,
 )
-from langsplat_core.scene import NO_THING, Calibration, CodebookCodec, LanguageField, Odds, Reading
+from langsplat_core.scene import NO_NODE, Calibration, CodebookCodec, LanguageField, Odds, Reading, Tree
 from tests.support.comparing import assert_same_field
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_gaussians
@@ -32,9 +32,12 @@ CALIBRATION = Calibration(Odds(-0.25, 18.548, 2.7, 0.62), Odds(0.5, 2.25, 15.5),
 
 
 def full_field(kind: str = "autoencoder", calibration: Calibration | None = CALIBRATION) -> LanguageField:
-    things = (np.arange(N) // 7).astype(np.uint16)
-    things[::5] = NO_THING
-    return replace(random_field(N, kind), things=things, reading=Reading(11.7, 0.73, calibration))
+    leaves = (np.arange(N) // 7).astype(np.int32)
+    leaves[::5] = NO_NODE
+    parents = np.array([9, 9, 9, 10, 10, 10, 10, 10, 10, NO_NODE, NO_NODE], np.int32)
+    levels = np.array([0] * 9 + [1, 2], np.uint8)
+    tree = Tree(leaves, parents, levels, np.arange(22, dtype=np.uint16).reshape(11, 2))
+    return replace(random_field(N, kind), tree=tree, reading=Reading(11.7, 0.73, calibration))
 
 
 @pytest.fixture
@@ -126,7 +129,10 @@ def test_the_layout_is_the_documented_one(sidecar, means):
     for name, kind, shape in (
         ("latents", "F32", [3, N, 3]),
         ("confidence", "F32", [3, N]),
-        ("things", "U16", [N]),
+        ("tree.leaves", "U16", [N]),
+        ("tree.parents", "U32", [11]),
+        ("tree.levels", "U8", [11]),
+        ("tree.votes", "U16", [11, 2]),
         ("positions", "U64", [N]),
         ("corners", "F32", [2, 3]),
         ("canonical", "F32", [4, 16]),
@@ -139,7 +145,7 @@ def test_the_layout_is_the_documented_one(sidecar, means):
     assert json.loads(metadata.pop("odds")) == numbers
     assert metadata == {
         "format": "langsplat",
-        "version": "2",
+        "version": "3",
         "encoder": "demo",
         "levels": "subpart,part,whole",
         "codec": "autoencoder",
@@ -157,7 +163,7 @@ MALFORMED: dict[str, tuple[Spoil, str]] = {
     "another program's": (says(format="gguf"), "not a language field"),
     "no format": (says(format=None), "not a language field"),
     "no metadata": (lambda p: change_header(p, lambda h: h.pop("__metadata__")), "not a language field"),
-    "a newer version": (says(version="3"), "version '3'; this program reads 1 and 2, update"),
+    "a newer version": (says(version="4"), "version '4'; this program reads 1 and 2 and 3, update"),
     "no checksum": (says(means_blake2b=None), "the header has no 'means_blake2b'"),
     "levels in another order": (says(levels="whole,part,subpart"), "levels 'whole,part"),
     "an unknown codec": (says(codec="vq"), "unknown codec kind 'vq'"),
@@ -196,10 +202,14 @@ MALFORMED: dict[str, tuple[Spoil, str]] = {
     "negative confidence": (spoilt("confidence", -1), "tensor 'confidence' holds"),
     "everyday phrases of integers": (holds(everyday=np.zeros((60, 16), np.int32)), "'everyday' is I32"),
     "short everyday phrases": (holds(everyday=np.zeros((60, 3), np.float32)), "everyday: expected shape"),
-    "things of floats": (holds(things=np.zeros(N, np.float32)), "'things' is F32; expected U16"),
-    "things of bytes": (holds(things=np.zeros(N, np.uint8)), "'things' is U8; expected U16"),
-    **{f"things of {shape}": (holds(things=np.zeros(shape, np.uint16)), "things: expected shape") for shape in
-       ((N - 1,), (N + 1,), (3, N), ())},
+    "leaves of floats": (holds(**{"tree.leaves": np.zeros(N, np.float32)}), "leaves' is F32; expected U16"),
+    "votes of bytes": (holds(**{"tree.votes": np.zeros((11, 2), np.uint8)}), "votes' is U8; expected U16"),
+    **{f"leaves of {shape}": (holds(**{"tree.leaves": np.zeros(shape, np.uint16)}), "leaves: expected shape")
+       for shape in ((N - 1,), (N + 1,), (3, N), ())},
+    "leaves in no node": (holds(**{"tree.leaves": np.full(N, 11, np.uint16)}), "outside the 11 nodes"),
+    "parents in a circle": (holds(**{"tree.parents": np.zeros(11, np.uint32)}), "a later node"),
+    "levels of nothing": (holds(**{"tree.levels": np.full(11, 3, np.uint8)}), "levels must be"),
+    "no parents": (holds(**{"tree.parents": None}), "tensor 'tree.parents' is missing"),
     "not safetensors": (lambda p: p.write_bytes(b"\x80\x04pickle"), "not a whole safetensors file"),
     "empty": (lambda p: p.write_bytes(b""), "not a whole safetensors file"),
     "truncated": (lambda p: p.write_bytes(p.read_bytes()[:-1]), "not a whole safetensors file"),
@@ -217,12 +227,27 @@ def test_every_broken_rule_has_its_message(sidecar, means, case):
         assert "\n" not in str(caught.value)
 
 
+NO_TREE = {f"tree.{name}": None for name in ("leaves", "parents", "levels", "votes")}
+
+
+def test_the_things_of_version_2_are_wholes(sidecar, means):
+    things = (np.arange(N) // 7).astype(np.uint16)
+    things[::5] = 65_535
+    change(sidecar, things=things, **NO_TREE)
+    says(version="2")(sidecar)
+    tree = read_language(sidecar, means).tree
+    assert tree is not None
+    assert not tree.complete
+    assert tree.at(2).tolist() == [NO_NODE if row % 5 == 0 else row // 7 for row in range(N)]
+    assert (tree.voted(2) == tree.at(2)).all()
+
+
 def test_a_field_without_things_and_odds_is_what_files_held_before(sidecar, means):
-    change(sidecar, things=None, everyday=None)
+    change(sidecar, **NO_TREE, everyday=None)
     says(odds=None, calibration="[-0.25, 18.5, 2.75, 0.625]")(sidecar)  # of another scale: not read
     field = read_language(sidecar, means)
-    assert (field.things, field.everyday, field.reading) == (None, None, Reading(11.7, 0.73))
-    assert rematch_language(sidecar, means[:9]).things is None
+    assert (field.tree, field.everyday, field.reading) == (None, None, Reading(11.7, 0.73))
+    assert rematch_language(sidecar, means[:9]).tree is None
 
 
 def test_rematch_after_removing_reordering_and_adding(sidecar, means):
@@ -235,9 +260,9 @@ def test_rematch_after_removing_reordering_and_adding(sidecar, means):
     assert_same_field(got.take(np.arange(N)), field)
     assert not got.latents[:, N:].any()
     assert not got.confidence[:, N:].any()
-    assert got.things.tolist()[N:] == [NO_THING] * 2
+    assert got.tree.leaves.tolist()[N:] == [NO_NODE] * 2
     nobody = rematch_language(sidecar, np.zeros((0, 3), np.float32))
-    assert (nobody.things.shape, nobody.things.dtype) == ((0,), np.uint16)
+    assert nobody.tree.leaves.shape == (0,)
 
 
 def test_a_field_of_other_gaussians_is_refused_with_the_way_to_mend_it(sidecar, means):

@@ -29,7 +29,8 @@ from langsplat_core.io.scenes import (
 from langsplat_core.io.shapes import base_colours, write_meshes, write_points
 from langsplat_core.io.summary import disk_bytes, duplicates, summarise
 from langsplat_core.query.engine import NO_FIELD, QueryEngine
-from langsplat_core.scene import NO_THING, Calibration, Gaussians, Odds, Reading, Scene
+from langsplat_core.scene import NO_NODE, Calibration, Gaussians, Odds, Reading, Scene
+from langsplat_core.scene.tree import tree_of_wholes
 from tests.support.comparing import assert_same_extras, assert_same_field
 from tests.support.fakes import blob_scene
 from tests.support.file_samples import compressed_ply, random_field, sog_files, write_folder
@@ -372,15 +373,15 @@ def test_size_of_a_folder_counts_its_files(real_data):
     assert disk_bytes(folder) == disk_bytes(folder / "meta.json") == expected
 
 
-def test_things_are_counted():
+def test_nodes_are_counted():
     field = random_field(40)
-    things = np.array([3, 3, 9, NO_THING] * 10, np.uint16)
+    tree = tree_of_wholes(np.array([1, 1, 0, NO_NODE] * 10))
     plain, named = (
-        summarise(Scene(random_gaussians(40), made)) for made in (field, replace(field, things=things))
+        summarise(Scene(random_gaussians(40), made)) for made in (field, replace(field, tree=tree))
     )
-    assert (plain.language.things, named.language.things) == (None, 2)
-    assert named.language.bytes - plain.language.bytes == things.nbytes
-    assert named.memory_bytes - plain.memory_bytes == things.nbytes
+    assert (plain.language.nodes, named.language.nodes) == (None, (0, 0, 2))
+    assert named.language.bytes - plain.language.bytes == tree.leaves.nbytes
+    assert named.memory_bytes - plain.memory_bytes == tree.leaves.nbytes
     odds = Odds(0, 1, 0)
     sure = replace(field, reading=Reading(calibration=Calibration(odds, odds, odds)))
     assert not plain.language.calibrated

@@ -35,6 +35,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.semantics import store
 from langsplat_core.semantics.masks import LevelMasks, MaskSource
 from langsplat_core.training.language.mask_weights import find_things
+from tests.support.comparing import assert_same_tree
 from tests.support.fakes import blob_scene
 from tests.support.processes import bound_by_permissions, stop_at
 from tests.support.tiny_room import tiny_room, tiny_settings
@@ -96,7 +97,7 @@ STAGES = (
     "memberships-*/groups.npz",
     "codec-*.npz",
     "latents-*.npz",
-    "things-*.npy",
+    "nodes-*.npz",
 )
 
 
@@ -134,16 +135,16 @@ def test_the_same_command_again_changes_nothing_and_repeats_no_stage(room, tmp_p
         np.testing.assert_array_equal(tensor, tensors.pop(name))
     assert not tensors
     assert replace(again, seconds={}) == replace(first, seconds={})
-    (path,) = (tmp_path / "scene.work").glob("things-*.npy")
-    things = load_scene(out).language.things
-    np.testing.assert_array_equal(things, np.load(path))
-    assert 0 in things  # numbered from the largest
+    (path,) = (tmp_path / "scene.work").glob("nodes-*.npz")
+    tree = load_scene(out).language.tree
+    np.testing.assert_array_equal(tree.leaves, np.load(path)["leaves"])
+    assert (tree.votes[tree.levels == 2] > 0).any()
     path.unlink()  # as in a work folder of before there were any: they alone are found again
     monkeypatch.setattr(language, "find_things", find_things)
     train_scene(room, out, tiny_settings(room))
     now = kept_results(tmp_path / "scene.work")
     assert {name for name in now if now[name] != kept.get(name)} == {str(path)}
-    np.testing.assert_array_equal(load_scene(out).language.things, things)
+    assert_same_tree(load_scene(out).language.tree, tree)
 
 
 def test_a_setting_repeats_only_what_depends_on_it(room, tmp_path):
@@ -152,10 +153,10 @@ def test_a_setting_repeats_only_what_depends_on_it(room, tmp_path):
     before = kept_results(work)
     train_scene(room, out, replace(tiny_settings(room), codec=CodebookConfig(size=9)))
     added = {Path(name).name.partition("-")[0] for name in set(kept_results(work)) - set(before)}
-    assert added == {"codec", "latents"}
+    assert added == {"codec", "latents", "nodes"}
     other_machine = replace(tiny_settings(room), lift=LiftConfig(backend="cpu"))
     train_scene(room, out, other_machine)
-    assert len(kept_results(work)) == len(before) + 2  # who computes, and in which batches, changes nothing
+    assert len(kept_results(work)) == len(before) + 3  # who computes, and in which batches, changes nothing
 
 
 def test_more_steps_of_lifting_do_not_fit_the_codec_again(room, tmp_path):
@@ -167,7 +168,7 @@ def test_more_steps_of_lifting_do_not_fit_the_codec_again(room, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["memberships-*/*.npy", "memberships-*/*.npz", "codec-*", "latents-*", "things-*"]
+    "name", ["memberships-*/*.npy", "memberships-*/*.npz", "codec-*", "latents-*", "nodes-*"]
 )
 def test_a_damaged_result_is_one_line(room, tmp_path, name):
     out, work = tmp_path / "scene.ply", tmp_path / "scene.work"
@@ -193,11 +194,12 @@ def test_other_liftings(room, tmp_path, mode):
     assert field is not None
     assert field.codec.kind == "linear"
     assert np.isfinite(field.latents).all()
-    assert (field.things is None) == (mode != "mean")  # averaging latents needs no memberships
+    assert field.tree.complete
+    assert field.tree.votes.any() == (mode == "mean")  # averaging latents needs no mask weights
 
 
 @pytest.mark.parametrize(
-    "stage", ["reading", "training", "masks", "lifting", "codebook", "averaging", "finding"]
+    "stage", ["reading", "training", "masks", "lifting", "codebook", "averaging", "building"]
 )
 def test_an_interrupted_run_leaves_no_scene_and_resumes(room, tmp_path, stage):
     out = tmp_path / "scene.ply"

@@ -24,13 +24,14 @@ from langsplat_core.query.answers import (
 )
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Named
-from langsplat_core.query.regions import SMALLEST, Regions, build_regions, regions_from
-from langsplat_core.scene import LEVELS, Calibration, LanguageField, Odds, Reading, Scene
+from langsplat_core.query.regions import Regions, build_regions
+from langsplat_core.scene import LEVELS, NO_NODE, Calibration, Gaussians, LanguageField, Odds, Reading, Scene
 from langsplat_core.scene.surface import Surface, build_surface
+from langsplat_core.scene.tree import SMALLEST
 from langsplat_core.semantics.relevancy import FLOOR, Scale
 from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, blob_scene, blobs, language
 from tests.support.file_samples import random_field
-from tests.support.scenes import random_gaussians
+from tests.support.scenes import chain_of_levels, random_gaussians, regions_of
 
 RULES = ("regions", "peak")
 SURE = Calibration(*[Odds(constant=0.0, whole=20.0, finer=2.0, found=0.8)] * 3)
@@ -43,14 +44,15 @@ def calibrated(calibration: Calibration | None) -> QueryEngine:
 
 
 def asked(
-    relevancy, surface: Surface, field: LanguageField, rule: str, level="auto", phrase="x"
+    relevancy, gaussians: Gaussians, field: LanguageField, rule: str, level="auto", phrase="x"
 ) -> QueryResult:
+    surface = build_surface(gaussians)
     scale = Scale(field.canonical, field.everyday, field.reading.temperature)
     if rule == "peak":
         return by_peak(phrase, relevancy, surface, scale, field.reading.found, level)
-    regions, calibration = build_regions(surface, field), field.reading.calibration
-    by_chance = bars(chance_in(field, surface, regions, replace(scale, everyday=field.everyday[:9])))
-    return by_regions(phrase, relevancy, surface, regions, scale, by_chance, calibration, level)
+    regions, calibration = regions_of(Scene(gaussians, field), surface), field.reading.calibration
+    by_chance = bars(chance_in(field, regions, replace(scale, everyday=field.everyday[:9])))
+    return by_regions(phrase, relevancy, gaussians.means, regions, scale, by_chance, calibration, level)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -78,7 +80,8 @@ def test_whatever_is_asked_the_answer_is_sound(kind, rule, level):
 def test_an_answer_by_regions_has_their_borders():
     engine = QueryEngine(Scene(random_gaussians(400), random_field(400, "linear")))
     result = engine.run("red mug")
-    of, rows = engine.regions.of[result.level], engine.surface.rows
+    rows = engine.surface.rows
+    of = engine.regions.everywhere[result.level, rows]
     members, even = result.members[rows], result.even[rows]
     for number in range(of.max() + 1):
         assert len(set(zip(members[of == number], even[of == number], strict=True))) == 1
@@ -110,7 +113,7 @@ def test_a_crumb_is_no_place():
     relevancy = np.full((3, len(gaussians)), 0.3, np.float32)
     relevancy[2, PER_BLOB : 2 * PER_BLOB] = 0.8
     relevancy[2, far] = 0.95
-    result = asked(relevancy, build_surface(gaussians), language(), "regions")
+    result = asked(relevancy, gaussians, language(), "regions")
     assert result.peak == pytest.approx(0.8, abs=1e-6)
     np.testing.assert_allclose(result.place, CENTRES[1], atol=0.3)
     assert result.box[1][0] < 30
@@ -135,8 +138,7 @@ def test_a_part_that_is_asked_for_alone_has_odds_of_its_own():
     relevancy[1, :100] = 0.7  # among the parts it is there, among wholes it is not
     calibration = Calibration(Odds(0, 20, 0), Odds(0, 0, 20), Odds(-99, 1, 1))
     field = replace(field, reading=Reading(calibration=calibration))
-    surface = build_surface(gaussians)
-    part, thing = (asked(relevancy, surface, field, "regions", phrase=text) for text in ("handle", "mug"))
+    part, thing = (asked(relevancy, gaussians, field, "regions", phrase=text) for text in ("handle", "mug"))
     assert part.fits == thing.fits
     assert part.probability == pytest.approx(sigmoid(np.array(20 * max(part.fits[:2]))))
     assert part.probability > 0.5 > thing.probability
@@ -169,7 +171,7 @@ def test_negative_fits_everywhere(rule):
     gaussians, field = random_gaussians(200), random_field(200, "codebook")
     relevancy = np.random.default_rng(0).uniform(0.05, 0.2, (3, 200)).astype(np.float32)
     for level in ("auto", *LEVELS):
-        result = asked(relevancy, build_surface(gaussians), field, rule, level)
+        result = asked(relevancy, gaussians, field, rule, level)
         assert (result.found, result.verdict) == (False, "not here")
         assert max(result.fits) < 0
         assert result.heat_range == (FLOOR, pytest.approx(FLOOR + 0.1))
@@ -264,17 +266,19 @@ def surface() -> Surface:
     return build_surface(random_gaussians(N), min_opacity=0.0)
 
 
-def regions_of(surface: Surface, sizes: tuple[int, ...]) -> Regions:
+def regions_by(surface: Surface, sizes: tuple[int, ...]) -> Regions:
     """Of one partition at all levels; `sizes` add up to the Gaussians of the surface."""
-    of = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
-    return regions_from(surface, np.stack([of] * 3))
+    leaves = np.full(len(surface.anchors), NO_NODE, np.int32)
+    leaves[surface.rows] = np.repeat(np.arange(len(sizes)), sizes)
+    return build_regions(chain_of_levels(leaves), (leaves != NO_NODE).astype(np.float32))
 
 
 def spread_out(surface: Surface, regions: Regions, fits) -> Array:
     """(3, N) relevancy that has the given fits, of each level and region."""
     relevancy = np.zeros((3, len(surface.anchors)), np.float32)
     for level, row in enumerate(fits):
-        relevancy[level, surface.rows] = sigmoid(np.asarray(row, np.float64))[regions.of[level]]
+        of = regions.everywhere[level, surface.rows]
+        relevancy[level, surface.rows] = sigmoid(np.asarray(row, np.float64))[of]
     return relevancy
 
 
@@ -284,7 +288,8 @@ PHRASES = {"thing": "mug", "part": "handle", "part of a thing": "mug handle"}
 def answer_of(
     surface: Surface, relevancy, regions: Regions, level="auto", named: Named = "thing"
 ) -> QueryResult:
-    return by_regions(PHRASES[named], relevancy, surface, regions, SCALE, BARS, None, level)
+    means = np.random.default_rng(1).normal(size=(len(surface.anchors), 3))
+    return by_regions(PHRASES[named], relevancy, means, regions, SCALE, BARS, None, level)
 
 
 def plain_extent(fits, sizes, level: str, named: Named) -> tuple[int, list[bool]]:
@@ -306,10 +311,10 @@ def test_the_extent_is_that_of_the_plain_rule(surface, level, named, middle):
         sizes = (*rng.integers(3, 30, 9).tolist(),)
         sizes = (*sizes, count - sum(sizes))
         fits = middle + rng.normal(size=(3, len(sizes)))
-        regions = regions_of(surface, sizes)
+        regions = regions_by(surface, sizes)
         got = answer_of(surface, spread_out(surface, regions, fits), regions, level, named)
         chosen, answering = plain_extent(fits, sizes, level, named)
-        of, solid = regions.of[chosen], np.array(sizes) >= SMALLEST
+        of, solid = regions.everywhere[chosen, surface.rows], np.array(sizes) >= SMALLEST
         assert got.level == chosen
         np.testing.assert_array_equal(got.members[surface.rows], np.array(answering)[of])
         np.testing.assert_allclose(got.fits, fits[:, solid].max(1), atol=1e-5)
@@ -320,10 +325,10 @@ def test_the_extent_is_that_of_the_plain_rule(surface, level, named, middle):
 
 def test_where_all_are_crumbs_or_as_bad_all_of_it_answers(surface):
     small = build_surface(random_gaussians(4), min_opacity=0.0)
-    crumbs = regions_of(small, (1, len(small.rows) - 1))
+    crumbs = regions_by(small, (1, len(small.rows) - 1))
     got = answer_of(small, spread_out(small, crumbs, [(0.9, 0.2)] * 3), crumbs)
     assert got.fits == pytest.approx((0.9,) * 3, abs=1e-4)
-    regions = regions_of(surface, (100, len(surface.rows) - 100))
+    regions = regions_by(surface, (100, len(surface.rows) - 100))
     for value in (0.0, 0.5, 1.0):
         got = answer_of(surface, np.full((3, N), value, np.float32), regions)
         assert (got.level, got.members.all()) == (2, True)  # of equal ones the coarsest

@@ -33,9 +33,10 @@ from langsplat_core.query.grammar import (
     parse,
     unparse,
 )
-from langsplat_core.scene import NO_THING, look_at
+from langsplat_core.scene import NO_NODE, look_at
 from langsplat_core.scene.language import split_phrases
 from langsplat_core.scene.surface import build_surface
+from langsplat_core.scene.tree import tree_of_wholes
 from tests.support.query_scenes import UP, PlainEncoder, front_camera, laid_table, meaning
 
 MUG, BOOK, DESK = Atom("mug"), Atom("book"), Atom("table")
@@ -340,10 +341,10 @@ def test_what_is_known_of_things_tells_apart_what_touches_and_keeps_together_wha
     surface = build_surface(scene.gaussians)
     mugs = blocks["far mug"] | blocks["red mug"]
     inside: Array = (mugs | blocks["table"])[surface.rows]
-    things = np.full(len(scene.gaussians), NO_THING, np.uint16)
+    things = np.full(len(scene.gaussians), NO_NODE)
     things[mugs] = 3  # as if one thing, half hidden by what stands before it
-    counts = sorted(len(part) for part in separate(surface, inside, things))
+    counts = sorted(len(part) for part in separate(surface, inside, tree_of_wholes(things)))
     assert counts == sorted([int(mugs.sum()), int(blocks["table"].sum())])
-    apart = separate(surface, mugs[surface.rows], np.full(len(things), NO_THING, np.uint16))
+    apart = separate(surface, mugs[surface.rows], tree_of_wholes(np.full(len(things), NO_NODE)))
     assert [list(part) for part in apart] == [list(part) for part in separate(surface, mugs[surface.rows])]
     assert len(apart) == 2

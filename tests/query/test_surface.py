@@ -11,13 +11,14 @@ from scipy.sparse.csgraph import connected_components
 from langsplat_core.arrays import sigmoid, unit
 from langsplat_core.errors import InputError
 from langsplat_core.query import selection
-from langsplat_core.query.regions import BORDER, SCALE, SMALLEST, STEPS, UNKNOWN, Regions, build_regions
+from langsplat_core.query.regions import Regions
 from langsplat_core.query.selection import Projected, in_polygon, in_rectangle, in_stroke, on_surface, project
-from langsplat_core.scene import NO_THING, Gaussians, LanguageField, look_at
+from langsplat_core.scene import NO_NODE, Gaussians, LanguageField, Scene, look_at
 from langsplat_core.scene.surface import NEIGHBOURS, Surface, build_surface
+from langsplat_core.scene.tree import BORDER, SCALE, SMALLEST, STEPS, UNKNOWN, tree_of_wholes
 from tests.support.fakes import CENTRES, PER_BLOB, blob_scene
 from tests.support.file_samples import random_field
-from tests.support.scenes import random_gaussians
+from tests.support.scenes import random_gaussians, regions_of
 
 
 def test_smoothing_is_the_weighted_mean_of_the_nearest():
@@ -83,12 +84,12 @@ def patched(kind: str, seed: int = 0, things: bool = False) -> tuple[Gaussians, 
         latents = unit(unit(rng.normal(size=(8, d)))[said] + 0.2 * rng.normal(size=(3, N, d)))
     confidence = field.confidence * (rng.uniform(size=(3, N)) < 0.9)
     # The first thing was never outlined, nor what has no meaning as a whole.
-    numbers = np.where((octant < 2) | (confidence[2] == 0), NO_THING, octant // 2).astype(np.uint16)
+    numbers = np.where((octant < 2) | (confidence[2] == 0), NO_NODE, octant // 2)
     return gaussians, replace(
         field,
         latents=latents.astype(field.latents.dtype),
         confidence=confidence.astype(np.float32),
-        things=numbers if things else None,
+        tree=tree_of_wholes(numbers) if things else None,
     )
 
 
@@ -127,14 +128,33 @@ def plain_typical_step(surface: Surface, field: LanguageField, level: int) -> fl
     return float(np.mean(1 - vectors @ vectors.T))
 
 
+def plain_things(surface: Surface, patches: set[frozenset[int]], things: np.ndarray) -> dict[int, int]:
+    """A negative number for each Gaussian in a patch that a thing has most of."""
+    firsts: dict[int, int] = {}
+    for members in patches:
+        shares: dict[int, float] = {}
+        for number in members:
+            thing = int(things[surface.rows[number]])
+            shares[thing] = shares.get(thing, 0.0) + float(surface.weights[number])
+        thing = max(shares, key=lambda one: shares[one])
+        if thing != NO_NODE:
+            firsts |= dict.fromkeys(members, -1 - thing)
+    return firsts
+
+
 def plain_regions(surface: Surface, field: LanguageField, level: int) -> list[int]:
-    """Felzenszwalb and Huttenlocher, with sets: the first member of each Gaussian's region."""
+    """Felzenszwalb and Huttenlocher, with sets: the first member of each Gaussian's region, within those of
+    the level above; wholes of one thing are joined."""
     steps, typical = [], plain_typical_step(surface, field, level)
+    above = None if level == 2 else plain_regions(surface, field, level + 1)
+    things = None if level < 2 or field.tree is None else field.tree.leaves
     for a, b in links_of(surface):
+        if above is not None and above[a] != above[b]:
+            continue
         one, other = surface.rows[a], surface.rows[b]
         step = min(max(plain_step(field, level, one, other), 0.0), UNKNOWN)
-        if level == 2 and field.things is not None and NO_THING not in field.things[[one, other]]:
-            step = 0.0 if field.things[one] == field.things[other] else step + BORDER * typical
+        if things is not None and NO_NODE not in things[[one, other]]:
+            step = 0.0 if things[one] == things[other] else step + BORDER * typical
         steps.append((round(step * STEPS), step, a, b))
     steps.sort(key=lambda link: link[0])
     region = {number: frozenset([number]) for number in range(len(surface.rows))}
@@ -154,7 +174,10 @@ def plain_regions(surface: Surface, field: LanguageField, level: int) -> list[in
                 both = mine | other
                 within[both] = max(step, within[mine], within[other])
                 region.update(dict.fromkeys(both, both))
-    return [min(region[number]) for number in range(len(surface.rows))]
+    firsts = {number: min(members) for number, members in region.items()}
+    if things is not None:
+        firsts |= plain_things(surface, set(region.values()), things)
+    return [firsts[number] for number in range(len(surface.rows))]
 
 
 def assert_same_partition(got, want) -> None:
@@ -163,16 +186,27 @@ def assert_same_partition(got, want) -> None:
     assert pairs == len(np.unique(got)) == len(np.unique(want))
 
 
-def assert_sound(regions: Regions, surface: Surface) -> None:
-    """Numbered from 0 without a gap, sizes as counted, none over a gap of the surface, none too small."""
+def on_surface_of(regions: Regions, surface: Surface) -> np.ndarray:
+    """(3, M) region of every Gaussian of the surface."""
+    return regions.everywhere[:, surface.rows]
+
+
+def assert_sound(regions: Regions, surface: Surface, united: bool = False) -> None:
+    """Numbered from 0 without a gap, sizes as counted, each within one above, none over a gap of the surface
+    and none too small, but for things that are `united`."""
     _, parts = connected_components(surface.links, directed=False)
-    assert (regions.of.shape, regions.of.dtype) == ((3, len(surface.rows)), np.int32)
-    for of, sizes in zip(regions.of, regions.sizes, strict=True):
+    every = on_surface_of(regions, surface)
+    for level, (of, sizes) in enumerate(zip(every, regions.sizes, strict=True)):
         np.testing.assert_array_equal(np.bincount(of, minlength=len(sizes)), sizes)
         assert (sizes > 0).all()
+        if level < 2:
+            assert len(np.unique(every[level : level + 2], axis=1).T) == len(sizes)
+        if united and level == 2:
+            continue
         assert len(np.unique(np.stack([of, parts]), axis=1).T) == len(sizes)
+        around = parts if level == 2 else parts * len(of) + every[level + 1]
         for number in np.flatnonzero(sizes < SMALLEST):
-            assert (parts == parts[of.tolist().index(number)]).sum() == sizes[number]  # nobody to join
+            assert (around == around[of.tolist().index(number)]).sum() == sizes[number]  # nobody to join
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -180,10 +214,10 @@ def assert_sound(regions: Regions, surface: Surface) -> None:
 def test_regions_are_those_of_the_plain_criterion(kind, things):
     gaussians, field = patched(kind, seed=KINDS.index(kind), things=things)
     surface = build_surface(gaussians)
-    regions = build_regions(surface, field)
-    assert_sound(regions, surface)
-    for level in range(3):
-        assert_same_partition(regions.of[level], plain_regions(surface, field, level))
+    regions = regions_of(Scene(gaussians, field), surface)
+    assert_sound(regions, surface, united=things)
+    for level, of in enumerate(on_surface_of(regions, surface)):
+        assert_same_partition(of, plain_regions(surface, field, level))
         assert 1 < len(regions.sizes[level]) < 30  # neither one lump nor crumbs
 
 
@@ -200,7 +234,8 @@ def test_the_order_of_the_gaussians_moves_no_border(kind):
     ):
         surface = build_surface(scene)
         numbers = np.full((3, N), -1)
-        numbers[:, rows[surface.rows]] = build_regions(surface, meaning).of
+        regions = regions_of(Scene(scene, meaning), surface)
+        numbers[:, rows[surface.rows]] = on_surface_of(regions, surface)
         found.append(numbers)
     for got, want in zip(*found, strict=True):
         assert_same_partition(got, want)
@@ -212,8 +247,9 @@ def test_one_meaning_or_none_is_a_region_for_every_part_of_the_surface(kind, kno
     field = random_field(70, kind)
     latents = np.broadcast_to(field.latents[:1, :1], field.latents.shape).copy()
     field = replace(field, latents=latents, confidence=np.full_like(field.confidence, known))
-    surface = build_surface(line(70, gaps=(20, 61)))
-    regions = build_regions(surface, field)
+    gaussians = line(70, gaps=(20, 61))
+    surface = build_surface(gaussians)
+    regions = regions_of(Scene(gaussians, field), surface)
     assert_sound(regions, surface)
     assert [sorted(sizes) for sizes in regions.sizes] == [[9, 20, 41]] * 3
 
@@ -224,15 +260,16 @@ HALVES, SIDES = np.repeat([0, 1], 40), np.repeat([5, 3, 6], [20, 40, 20])
 @pytest.mark.parametrize(
     ("meaning", "known", "things", "finer", "whole"),
     [
-        (3, 1, HALVES, 0, HALVES),  # two things that touch stay apart, as wholes alone
-        (SIDES, 1, HALVES, SIDES, HALVES),  # a thing is one region, whatever its sides mean
-        (3, 1, np.where(HALVES, NO_THING, 4), 0, 0),  # what is of no thing goes by its meaning
-        (SIDES, 1, NO_THING, SIDES, SIDES),
+        (3, 1, HALVES, HALVES, HALVES),  # two things that touch stay apart
+        (SIDES, 1, HALVES, SIDES + 9 * HALVES, HALVES),  # a thing is one whole, whatever its sides mean
+        (3, 1, np.where(HALVES, NO_NODE, 4), 0, 0),  # what is of no thing goes by its meaning
+        (SIDES, 1, NO_NODE, SIDES, SIDES),
         (3, HALVES, None, HALVES, HALVES),  # what means something is apart from what means nothing
     ],
 )
 def test_borders_of_regions_on_a_line(meaning, known, things, finer, whole):
-    field, surface = random_field(80, "codebook"), build_surface(line(80))
+    field, gaussians = random_field(80, "codebook"), line(80)
+    surface = build_surface(gaussians)
     latents, confidence, things = (
         None if row is None else np.broadcast_to(row, 80) for row in (meaning, known, things)
     )
@@ -240,9 +277,10 @@ def test_borders_of_regions_on_a_line(meaning, known, things, finer, whole):
         field,
         latents=np.tile(latents.astype(np.uint16)[:, None], (3, 1, 1)),
         confidence=np.tile(confidence.astype(np.float32), (3, 1)),
-        things=None if things is None else things.astype(np.uint16),
+        tree=None if things is None else tree_of_wholes(things),
     )
-    for of, want in zip(build_regions(surface, field).of, (finer, finer, whole), strict=True):
+    regions = on_surface_of(regions_of(Scene(gaussians, field), surface), surface)
+    for of, want in zip(regions, (finer, finer, whole), strict=True):
         assert_same_partition(of, np.broadcast_to(want, 80)[surface.rows])
 
 
@@ -250,10 +288,9 @@ def test_values_without_meaning_elsewhere_harm_no_mean():
     """Faint Gaussians are off the surface: what they hold is not looked at."""
     gaussians, field = patched("codebook")
     gaussians.opacity_logits[::3] = -9
-    surface = build_surface(gaussians)
     values = np.full((3, N), 0.5, np.float32)
     values[:, ::3] = np.nan
-    for means in build_regions(surface, field).means(values):
+    for means in regions_of(Scene(gaussians, field)).means(values):
         assert means == pytest.approx(0.5)
 
 
@@ -263,7 +300,7 @@ def plain_means(surface: Surface, regions: Regions, values: np.ndarray) -> list[
     of_surface = values.astype(np.float64)[:, surface.rows]
     return [
         np.array([np.average(row[of == r], weights=weights[of == r]) for r in range(of.max(initial=-1) + 1)])
-        for of, row in zip(regions.of, of_surface, strict=True)
+        for of, row in zip(on_surface_of(regions, surface), of_surface, strict=True)
     ]
 
 
@@ -277,7 +314,7 @@ def scattered() -> tuple[Surface, Regions]:
     gaussians.opacity_logits[:] = rng.choice([-4.0, 1.0], 3000, p=[1 / 3, 2 / 3])
     field = random_field(3000, "codebook")
     surface = build_surface(gaussians)
-    return surface, build_regions(surface, field)
+    return surface, regions_of(Scene(gaussians, field), surface)
 
 
 def test_means_of_regions_and_what_is_spread_from_them(scattered):
@@ -289,7 +326,7 @@ def test_means_of_regions_and_what_is_spread_from_them(scattered):
     for level, (got, want) in enumerate(zip(regions.means(values), wanted, strict=True)):
         assert len(want) > 1
         np.testing.assert_allclose(got, want, rtol=1e-12)
-        of = regions.of[level][surface.anchors[near]]
+        of = on_surface_of(regions, surface)[level][surface.anchors[near]]
         np.testing.assert_allclose(even[level, near], want[of], rtol=1e-6)
     np.testing.assert_array_equal(even[:, ~near], values[:, ~near])
     assert 0 < (~near).sum() < 3000 / 3 < (regions.weights == 0).sum()
@@ -300,14 +337,14 @@ def test_means_of_regions_and_what_is_spread_from_them(scattered):
 def test_almost_no_gaussians(kind, count):
     surface = build_surface(random_gaussians(count), min_opacity=0.0)
     assert surface.smooth(np.full(count, 0.25, np.float32)).tolist() == [0.25] * len(surface.rows)
-    field = replace(random_field(count, kind), things=np.zeros(count, np.uint16))
-    regions = build_regions(build_surface(line(count)), field)
-    assert regions.of.tolist() == [[0] * count] * 3
+    field = replace(random_field(count, kind), tree=tree_of_wholes(np.zeros(count, np.int32)))
+    regions = regions_of(Scene(line(count), field))
+    assert regions.everywhere.tolist() == [[0] * count] * 3
     means = regions.means(np.full((3, count), 0.25, np.float32))
     assert [mean.tolist() for mean in means] == [[0.25] * min(count, 1)] * 3
     lost = line(count)
     lost.means[:] = np.nan
-    regions = build_regions(build_surface(lost), field)
+    regions = regions_of(Scene(lost, field))
     assert [len(row) for row in regions.means(np.ones((3, count)))] == [0, 0, 0]
     spread = regions.spread(0, np.zeros(0, np.float32), np.ones(count, np.float32))
     np.testing.assert_array_equal(spread, 1)
@@ -387,7 +424,7 @@ def test_shrinking_undoes_growing_on_a_sheet_and_faint_ones_follow():
 def test_what_lies_nearest_to_a_point_is_selected_as_a_region():
     scene = blob_scene()
     surface, blob = build_surface(scene.gaussians), np.repeat(np.arange(3), PER_BLOB)
-    regions = build_regions(surface, scene.language)
+    regions = regions_of(scene, surface)
     for number, point in ((0, CENTRES[0]), (2, CENTRES[2] + [9.0, 0, 0])):
         assert selection.at_point(surface, regions, 2, point).tolist() == (blob == number).tolist()
     nothing = scene.take(np.zeros(len(scene.gaussians), bool))

@@ -11,7 +11,7 @@ from langsplat_core.arrays import logit, psnr, sigmoid
 from langsplat_core.bench.query import repeated
 from langsplat_core.progress import Cancelled
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.scene import NO_THING, Gaussians, Odds, Scene
+from langsplat_core.scene import NO_NODE, Gaussians, Odds, Scene, Tree
 from langsplat_core.scene.gaussians import GROUP, merged
 from langsplat_core.scene.language import phrase_key, split_phrases, tidy, tokens
 from tests.support.file_samples import random_field
@@ -216,21 +216,53 @@ def test_odds_rise_with_fits(numbers):
         Odds(*numbers)
 
 
-@pytest.mark.parametrize(
-    "things",
-    [np.zeros(N - 1, np.uint16), np.zeros((N, 1), np.uint16), np.zeros(N, np.int32), np.zeros(N), [0] * N],
+LEAVES = np.array([0, 0, 1, 2, 2, NO_NODE, 3], np.int32)  # two subparts of a part of a whole; another whole
+TREE = Tree(
+    LEAVES,
+    np.array([4, 4, 5, 5, 6, NO_NODE, NO_NODE], np.int32),
+    np.array([0, 0, 2, 0, 1, 2, 2], np.uint8),
+    np.zeros((7, 2), np.uint16),
 )
-def test_things_are_a_number_of_16_bits_each(things):
-    with pytest.raises((ValueError, TypeError), match="things"):
-        replace(random_field(N), things=things)
 
 
-def test_taking_rows_takes_their_things():
-    field = replace(random_field(N), things=np.arange(N, dtype=np.uint16))
-    field.things[3] = NO_THING
-    mask = np.arange(N) % 2 == 1
+def test_nodes_are_nested_sets():
+    assert TREE.at(0).tolist() == [0, 0, 1, 2, 2, NO_NODE, 3]
+    assert TREE.at(1).tolist() == [4, 4, 4, 2, 2, NO_NODE, 3]
+    assert TREE.at(2).tolist() == [6, 6, 6, 5, 5, NO_NODE, 5]
+    assert (TREE.path(1), TREE.children(5).tolist()) == ((1, 4, 6), [2, 3])
+    for node in range(TREE.count):
+        within = [leaf != NO_NODE and node in TREE.path(leaf) for leaf in LEAVES]
+        assert TREE.members(node).tolist() == within
+    voted = replace(TREE, votes=np.array([[0, 5]] * 5 + [[1, 2], [0, 1]], np.uint16))
+    assert voted.voted(2).tolist() == [NO_NODE] * 3 + [5, 5, NO_NODE, 5]
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"leaves": LEAVES + 4},
+        {"leaves": LEAVES - 1},
+        {"leaves": LEAVES.astype(np.uint16)},
+        {"parents": np.zeros(7, np.int32)},  # a parent of its own, or an earlier node
+        {"parents": np.full(7, 7, np.int32)},
+        {"levels": np.arange(7, dtype=np.uint8)},
+        {"levels": np.array([1, 0, 2, 0, 0, 2, 2], np.uint8)},  # a part within a subpart
+        {"votes": np.zeros((7, 3), np.uint16)},
+    ],
+)
+def test_what_is_no_tree_is_refused(changed):
+    with pytest.raises((ValueError, TypeError)):
+        replace(TREE, **changed)
+
+
+def test_a_field_has_a_leaf_for_every_gaussian_and_taking_rows_takes_them():
+    with pytest.raises(ValueError, match="leaves"):
+        replace(random_field(N), tree=TREE)
+    field = replace(random_field(len(LEAVES)), tree=TREE)
+    mask = np.arange(len(LEAVES)) % 2 == 1
     for rows in (np.array([5, 3, 3, 0]), mask, np.zeros(0, int)):
         taken = field.take(rows)
-        np.testing.assert_array_equal(taken.things, field.things[rows])
-        assert (len(taken), taken.things.dtype) == (len(field.things[rows]), np.uint16)
-    assert random_field(N).take(mask).things is None
+        assert taken.tree is not None
+        np.testing.assert_array_equal(taken.tree.at(1), TREE.at(1)[rows])
+        assert len(taken) == len(LEAVES[rows])
+    assert random_field(N).take(np.arange(3)).tree is None

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from langsplat_core.arrays import Array
-from langsplat_core.scene import Gaussians, LanguageField
+from langsplat_core.scene import Gaussians, LanguageField, Tree
 
 BAND = 1e-4  # relative distance to a cut-off; float32 kernels are within about 1e-6 of it
 
@@ -64,14 +64,20 @@ def assert_same_extras(got, want) -> None:
         np.testing.assert_array_equal(got[name], values, name)
 
 
+def assert_same_tree(got: Tree, want: Tree) -> None:
+    """Node by node."""
+    for name in ("leaves", "parents", "levels", "votes"):
+        assert getattr(got, name).dtype == getattr(want, name).dtype
+        np.testing.assert_array_equal(getattr(got, name), getattr(want, name), name)
+
+
 def assert_same_field(got: LanguageField, want: LanguageField) -> None:
     """Bit for bit: a saved scene must answer exactly like the one in memory."""
     for name in ("latents", "confidence", "canonical"):
         np.testing.assert_array_equal(getattr(got, name), getattr(want, name), name)
-    assert (got.things is None) == (want.things is None)
-    if want.things is not None:
-        np.testing.assert_array_equal(got.things, want.things)
-        assert got.things.dtype == np.uint16
+    assert (got.tree is None) == (want.tree is None)
+    if want.tree is not None and got.tree is not None:
+        assert_same_tree(got.tree, want.tree)
     assert (got.everyday is None) == (want.everyday is None)
     if want.everyday is not None:
         np.testing.assert_array_equal(got.everyday, want.everyday)

@@ -6,8 +6,11 @@ from typing import Any, Literal
 import numpy as np
 
 from langsplat_core.arrays import Array, logit, rotation_matrices, unit
+from langsplat_core.query.regions import Regions, build_regions
 from langsplat_core.raster.reference import ReferenceRasterizer
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians, LanguageField, LinearCodec, Scene, look_at
+from langsplat_core.scene.surface import Surface, build_surface, surface_weights
+from langsplat_core.scene.tree import Tree, build_tree
 from langsplat_core.semantics.store import ImageFeatures
 
 
@@ -126,6 +129,27 @@ class Answer:
     level: int = 2
     verdict: Literal["found", "weak match", "not here"] = "found"
     heat_range: tuple[float, float] = (0.5, 0.9)
+
+
+def tree_of(scene: Scene, surface: Surface | None = None) -> Tree:
+    """The tree that is built of a scene with a field."""
+    field = scene.language
+    assert field is not None
+    surface = surface or build_surface(scene.gaussians)
+    return build_tree(surface, field.codec, field.latents, field.known, field.tree)
+
+
+def regions_of(scene: Scene, surface: Surface | None = None) -> Regions:
+    """The regions of the tree that is built of a scene."""
+    return build_regions(tree_of(scene, surface), surface_weights(scene.gaussians))
+
+
+def chain_of_levels(leaves: Array) -> Tree:
+    """(N,) int32 numbers from 0, NO_NODE for none -> a tree of these sets, the same at all levels."""
+    count = int(leaves.max(initial=-1)) + 1
+    parents = np.concatenate([np.arange(count, 3 * count), np.full(count, -1)]).astype(np.int32)
+    levels = np.repeat(np.arange(3, dtype=np.uint8), count)
+    return Tree(leaves, parents, levels, np.zeros((3 * count, 2), np.uint16))
 
 
 def random_answer(count: int, seed: int, **changed: Any) -> Answer:

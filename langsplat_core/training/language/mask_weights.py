@@ -12,7 +12,7 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.config import INRIA, RasterSettings
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.protocol import LiftingRasterizer
-from langsplat_core.scene import LEVELS, NO_THING, Camera, Gaussians
+from langsplat_core.scene import LEVELS, NO_NODE, Camera, Gaussians
 from langsplat_core.semantics.store import ImageFeatures
 
 # Spherical k-means: few unit vectors that many lie close to (Dhillon and Modha 2001).
@@ -261,9 +261,8 @@ THING_SAMPLE = (
 
 
 def find_things(mask_weights: MaskWeights, counts: Sequence[int]) -> Array:
-    """(N,) uint16 number of the thing that each Gaussian belongs to, at the coarsest level.
-
-    NO_THING where no mask of that level shows it, or where a scene has more things than can be numbered.
+    """(N,) int32 number of the thing that each Gaussian belongs to, at the coarsest level; NO_NODE where no
+    mask of that level shows it.
 
     counts: number of masks of each view. Things are numbered from the largest, by number of Gaussians.
     """
@@ -279,9 +278,9 @@ def find_things(mask_weights: MaskWeights, counts: Sequence[int]) -> Array:
             known = np.diff(weights.indptr) > 0
             things[first:last] = np.where(known, np.asarray(weights.argmax(axis=1)).ravel(), size)
     order = np.argsort(-np.bincount(things, minlength=size + 1)[:size], kind="stable")
-    rank = np.full(size + 1, NO_THING)
-    rank[order] = np.minimum(np.arange(size), NO_THING)
-    return np.asarray(rank[things].astype(np.uint16))
+    rank = np.full(size + 1, NO_NODE, np.int32)
+    rank[order] = np.arange(size)
+    return np.asarray(rank[things])
 
 
 def masks_of_things(mask_weights: MaskWeights, counts: Sequence[int], level: int) -> Array:

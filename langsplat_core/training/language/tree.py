@@ -31,7 +31,7 @@ from langsplat_core.io.shapes import base_colours
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.protocol import LiftingView
 from langsplat_core.raster.reference import project
-from langsplat_core.scene import LEVELS, Camera, Gaussians
+from langsplat_core.scene import LEVELS, NO_NODE, Camera, Gaussians, Tree
 from langsplat_core.scene.surface import Surface, divide, surface_areas
 from langsplat_core.training.language.mask_weights import MaskWeights
 
@@ -46,7 +46,7 @@ STAGE = "merging what masks agree on"
 
 
 @dataclass(frozen=True, eq=False)
-class Tree:
+class MergeTree:
     """A binary tree over P patches of a surface: nodes 0 to P - 1 are the patches, later ones merge two."""
 
     patches: Array  # (N,) int32 patch of every Gaussian; -1 for those on no surface
@@ -100,11 +100,11 @@ def find_tree(
     counts: Sequence[int],
     eyes: Array,
     progress: Progress = silent,
-) -> Tree:
+) -> MergeTree:
     """The tree of a scene. counts: number of masks of each view; eyes: (V, 3) positions of the cameras."""
     everywhere = np.full(len(gaussians), -1, np.int32)
     if len(surface.rows) == 0:
-        return Tree(everywhere, np.zeros((0, 2), np.int32), np.zeros(0))
+        return MergeTree(everywhere, np.zeros((0, 2), np.int32), np.zeros(0))
     disagreement = link_disagreement(surface, mask_weights, progress)
     concavity = link_concavity(surface, eyes)
     colours = _chromaticities(gaussians, surface)
@@ -124,7 +124,7 @@ def find_tree(
     children, costs = merge(patches, progress)
     near = surface.anchors >= 0
     everywhere[near] = of[surface.anchors[near]]
-    return Tree(everywhere, children, costs)
+    return MergeTree(everywhere, children, costs)
 
 
 # What stands between two linked Gaussians.
@@ -249,6 +249,41 @@ def find_borders(of: Array, ends: tuple[Array, Array], disagreement: Array, conc
     return Borders(first, second, np.bincount(row, minlength=len(found)).astype(np.float64), *sums)
 
 
+VOTE = 0.5  # overlap over union of a node and a mask from which the mask is of just that node
+SHOWN = 25.0  # pixels of a node from which a photograph shows it
+
+
+def count_votes(tree: Tree, mask_weights: MaskWeights, counts: Sequence[int]) -> Array:
+    """(K, 2) uint16 photographs with a mask of just each node, and those that show the node without one.
+
+    counts: number of masks of each view. Compared is what the view shows of the node.
+    """
+    masses, labelling = _masses(mask_weights, counts, tree.leaves, tree.count)
+    masses, inside = masses.tocsc(), _descendants(tree)
+    votes = np.zeros((tree.count, 2), np.uint16)
+    for pairs, first, count in zip(mask_weights.pairs, np.cumsum([0, *counts]), counts, strict=False):
+        shared = (inside @ masses[:, first : first + count]).toarray()  # (K, M) pixels
+        level_of = labelling[first : first + count] % len(LEVELS)
+        visible = np.stack([shared[:, level_of == level].sum(1) for level in range(len(LEVELS))], 1)
+        every = np.bincount(pairs["mask"], pairs["weight"], count)
+        union = visible[:, level_of] + every - shared
+        agree = (shared > VOTE * union).any(1)
+        shown = visible.max(1) >= SHOWN
+        votes += np.stack([shown & agree, shown & ~agree], 1).astype(np.uint16)
+    return votes
+
+
+def _descendants(tree: Tree) -> sparse.csr_matrix:
+    """(K, K) float32 ones where the column's node is the row's or within it."""
+    rows, columns = [np.arange(tree.count)], [np.arange(tree.count)]
+    while len(rows[-1]):
+        above = tree.parents[rows[-1]]
+        rows.append(above[above != NO_NODE])
+        columns.append(columns[-1][above != NO_NODE])
+    places = np.concatenate(rows), np.concatenate(columns)
+    return sparse.csr_matrix((np.ones(len(places[0]), np.float32), places), (tree.count, tree.count))
+
+
 class _Merger:
     """Nodes that are alive, with their sums and neighbours."""
 
@@ -303,8 +338,8 @@ class _Merger:
 
 
 def merge(patches: Patches, progress: Progress = silent) -> tuple[Array, Array]:
-    """(K, 2) int32 nodes that are merged and (K,) float64 costs, in their order; see `Tree`. Of equal costs
-    the older nodes merge first."""
+    """(K, 2) int32 nodes that are merged and (K,) float64 costs, in their order; see `MergeTree`. Of equal
+    costs the older nodes merge first."""
     nodes, count = _Merger(patches), len(patches.areas)
     waiting = [(nodes.cost(a, b), a, b) for a in range(count) for b in nodes.neighbours[a] if a < b]
     heapq.heapify(waiting)

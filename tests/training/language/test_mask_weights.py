@@ -8,7 +8,7 @@ import pytest
 from langsplat_core.arrays import Array, unit
 from langsplat_core.raster import load_lifting_rasterizer, protocol
 from langsplat_core.raster.reference import ReferenceRasterizer
-from langsplat_core.scene import LEVELS, NO_THING
+from langsplat_core.scene import LEVELS, NO_NODE
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language import mask_weights as module
 from langsplat_core.training.language.mask_weights import (
@@ -207,9 +207,9 @@ def test_a_gaussian_belongs_to_the_thing_that_it_paints_most(seed):
             if level == WHOLE and numbers[first + mask] >= 0:
                 weights[row, numbers[first + mask]] += weight
     want = np.where(weights.any(1), weights.argmax(1), -1)
-    assert ((things == NO_THING) == (want == -1)).all()
+    assert ((things == NO_NODE) == (want == -1)).all()
     assert len({*zip(things.tolist(), want.tolist(), strict=True)}) == len({*want.tolist()})
-    sizes = np.bincount(things[things != NO_THING])
+    sizes = np.bincount(things[things != NO_NODE])
     assert (np.diff(sizes) <= 0).all()  # from the largest
     assert sizes.min() > 0
     np.testing.assert_array_equal(found(views, 240), things)
@@ -240,7 +240,7 @@ CASES = {
     "a mask over two things merges neither": (
         [view(HALVES), view(1 - HALVES), view(np.zeros(40, int))], HALVES
     ),
-    "no masks": ([np.zeros(0, PAIR)] * 2, np.full(5, NO_THING)),
+    "no masks": ([np.zeros(0, PAIR)] * 2, np.full(5, NO_NODE)),
     "views without masks": (
         [np.zeros(0, PAIR), view(np.zeros(12, int)), np.zeros(0, PAIR), view(np.zeros(12, int))], np.zeros(12)
     ),
@@ -253,7 +253,7 @@ def test_things_of_a_case(name):
     """Things of one size may be numbered either way."""
     views, want = CASES[name]
     things = found(views, len(want))
-    assert things.dtype == np.uint16
+    assert things.dtype == np.int32
     if "two things" in name or "touching" in name or "never meet" in name:
         things = (things != things[:1]).astype(int)
     np.testing.assert_array_equal(things, want)
@@ -264,9 +264,9 @@ def test_masks_of_other_levels_show_no_thing():
     views = [joined(view(np.where(rows < 10, 0, UNSEEN)), view(np.full(20, 1), level=1))] * 2
     for level, want in ((WHOLE, [0, -1, 0, -1]), (1, [-1, 0, -1, 0]), (0, [-1] * 4)):
         assert masks_of_things(MaskWeights(views, 20), [2, 2], level).tolist() == want
-    assert found(views, 20).tolist() == [0] * 10 + [NO_THING] * 10
+    assert found(views, 20).tolist() == [0] * 10 + [NO_NODE] * 10
     hidden = find_things(MaskWeights([np.zeros(0, PAIR)], 5), [3])  # masks behind everything
-    assert hidden.tolist() == [NO_THING] * 5
+    assert hidden.tolist() == [NO_NODE] * 5
 
 
 def test_a_gaussian_that_two_masks_share_evenly_is_claimed_by_neither():
@@ -292,7 +292,7 @@ def test_a_mask_that_the_sample_misses_shows_no_thing(monkeypatch):
     assert found([view(of_row)], 200)[7] == 1
     missed = [s for s in range(1, 200) if 7 not in np.random.default_rng(0).permutation(200)[:s]]
     monkeypatch.setattr(module, "THING_SAMPLE", missed[-1])
-    assert found([view(of_row)], 200)[7] == NO_THING
+    assert found([view(of_row)], 200)[7] == NO_NODE
 
 
 def test_blocks_change_nothing(monkeypatch):

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from scipy import sparse
 
+from langsplat_core.arrays import Array
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.raster.reference import ReferenceRasterizer
+from langsplat_core.scene import Tree
 from langsplat_core.scene.surface import build_surface
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.training.language import tree as module
-from langsplat_core.training.language.mask_weights import MaskWeights, find_mask_weights
+from langsplat_core.training.language.mask_weights import PAIR, MaskWeights, find_mask_weights
 from langsplat_core.training.language.tree import (
     BENT,
     COLOUR,
@@ -20,8 +22,9 @@ from langsplat_core.training.language.tree import (
     SEEN,
     SMALL,
     UNSEEN,
+    MergeTree,
     Patches,
-    Tree,
+    count_votes,
     draw_patches,
     find_borders,
     find_tree,
@@ -171,7 +174,7 @@ def test_things_come_out_though_some_masks_are_wrong(wrong):
 def test_cuts_are_nested_and_end_at_their_cost():
     patches = random_patches(1)
     children, costs = merge(patches)
-    tree = Tree(np.arange(24, dtype=np.int32), children, costs)
+    tree = MergeTree(np.arange(24, dtype=np.int32), children, costs)
     assert tree.cut(-1.0).tolist() == list(range(24))
     coarser = tree.cut(np.inf)
     assert coarser.max() + 1 == 24 - len(children)
@@ -224,3 +227,35 @@ def test_almost_nothing():
     view = CpuRasterizer().view(gaussians, random_camera(0, 8, 6))
     assert (draw_patches(view, gaussians, np.full(3, -1, np.int32)) == -1).all()
     assert (nested_maps(np.full((6, 8), -1, np.int32), [np.zeros(0, np.int32)] * 3, 0.1) == -1).all()
+
+
+# Votes: masks of just one node, in photograph after photograph.
+
+
+def test_votes_are_masks_of_just_that_node():
+    """Two subparts in a whole. One photograph outlines the whole, one both subparts, one something else."""
+    rows = np.arange(40)
+    tree = Tree(
+        (rows // 20).astype(np.int32),
+        np.array([2, 2, -1], np.int32),
+        np.array([0, 0, 2], np.uint8),
+        np.zeros((3, 2), np.uint16),
+    )
+
+    def photograph(mask: Array, level: int, seen: Array) -> Array:
+        pairs = np.zeros(int(seen.sum()), PAIR)
+        pairs["row"], pairs["mask"], pairs["level"] = rows[seen], mask[seen], level
+        pairs["weight"] = 3.0
+        return pairs
+
+    everything = rows >= 0
+    views = [
+        photograph(np.zeros(40, int), 2, everything),
+        photograph(rows // 20, 0, everything),
+        photograph((rows >= 13).astype(int), 1, everything),  # 13 and 27: overlaps of 0.65, 0.74 and 0.675
+        photograph(np.zeros(40, int), 2, rows < 8),  # 24 pixels show nothing
+        photograph(np.zeros(40, int), 2, rows < 9),  # the part that is seen is all that counts
+        np.zeros(0, PAIR),
+    ]
+    votes = count_votes(tree, MaskWeights(views, 40), [1, 2, 2, 1, 1, 0])
+    assert votes.tolist() == [[3, 1], [2, 1], [3, 1]]
