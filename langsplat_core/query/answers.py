@@ -188,9 +188,7 @@ ADVANTAGE: Mapping[Named, tuple[float, float, float]] = {
     "part of a thing": (0.0, 0.1, 0.0),
 }
 PARTS = 0.25  # weight of its best part in the fit of a region: of a thing, something in it is sure
-REACH = (
-    0.45  # of the best fit: what fits less by no more than this, and by `NEAREST` to `FARTHEST`, is it too
-)
+REACH = 0.45  # of the best fit: what fits less by this or less, within `NEAREST` and `FARTHEST`, is it too
 NEAREST, FARTHEST = 0.15, 1.0  # spreads
 NOTHING = float(logit(np.array(2 * NARROWEST)))  # fit: of less there is no meaning
 
