@@ -14,6 +14,7 @@ from scipy.ndimage import uniform_filter
 from scipy.sparse import csr_matrix
 
 from langsplat_core.arrays import Array, logit, sigmoid
+from langsplat_core.compiled import plain
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.grammar import Named, named
 from langsplat_core.query.instances import axis_aligned_box
@@ -217,6 +218,14 @@ def with_parts(regions: Regions, own: tuple[Array, ...]) -> tuple[Array, ...]:
 def _relevancy(fits: Array) -> Array:
     """Relevancy that fits stand for, 0 of what means nothing."""
     return np.where(fits > NOTHING, sigmoid(fits), 0)
+
+
+def even_relevancy(regions: Regions, scale: Scale, relevancy: Array) -> Array:
+    """(3, N) relevancy -> the same, of every region what its fit stands for; of what is in none its own."""
+    own = plain(relevancy)
+    fits = with_parts(regions, tuple(map(scale.fit, regions.means(own))))
+    values = [_relevancy(row).astype(np.float32) for row in fits]
+    return np.stack([regions.spread(level, row, own[level]) for level, row in enumerate(values)])
 
 
 def _best(values: Array, sizes: Array) -> float:

@@ -27,7 +27,7 @@ from langsplat_core.query.grammar import STOP_WORDS, check_names, only
 from langsplat_core.query.instances import Instance, find_instances
 from langsplat_core.query.lookup import Lookup, build_lookup
 from langsplat_core.query.regions import Regions, build_regions
-from langsplat_core.scene import CANONICAL_PHRASES, Calibration, LanguageField, Scene
+from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Calibration, LanguageField, Scene
 from langsplat_core.scene.language import phrase_key, tidy
 from langsplat_core.scene.surface import Surface, build_surface, surface_weights
 from langsplat_core.scene.tree import Tree, build_tree
@@ -381,7 +381,9 @@ class QueryEngine:
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
         """The things among the members of an answer, best first, or only so many of them."""
         relevancy = result.relevancy[result.level]
-        return find_instances(self.surface, self.scene.gaussians, result.members, relevancy, at_most)
+        whole = len(LEVELS) - 1
+        told = self.tree.voted(whole), result.level == whole
+        return find_instances(self.surface, self.scene.gaussians, result.members, relevancy, at_most, *told)
 
 
 def _enough(everyday: Array | None) -> Array | None:

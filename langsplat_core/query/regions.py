@@ -42,12 +42,6 @@ class Regions:
         shared_workers().run(_spread, len(others), self.everywhere[level], values, others, spread)
         return spread
 
-    def even(self, values: Array) -> Array:
-        """(3, N) float32 values -> the same, of every region its mean; of what is off the surface its own."""
-        own = plain(values)
-        means = [row.astype(np.float32) for row in self.means(own)]
-        return np.stack([self.spread(level, row, own[level]) for level, row in enumerate(means)])
-
     def best_parts(self, level: int, values: tuple[Array, ...]) -> Array:
         """(R, ...) the largest value among each region's parts at the level below; its own where it has none.
 
