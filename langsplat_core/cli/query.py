@@ -91,15 +91,15 @@ class QueryScene:
             return
         for answer, lines in zip(answers, tables, strict=True):
             verdict, reading = answer["verdict"], answer["reading"]
-            count = answer["count"]
             if answer["probability"] is not None:
                 verdict += f" ({100 * answer['probability']:.0f} %)"
+            if answer["count"]["most"] > 1:
+                verdict += f", {_counted(**answer['count'])}"
             place = "-" if answer["place"] is None else f"{unit.format(answer['place'])} {unit.name}"
             print(
                 f"{answer['phrase']}: {verdict}, score {answer['score']:.3f} at level {answer['level']}, "
                 f"place {place}, pixel {answer['pixel']}",
                 *([] if reading is None else [f"  read as: {reading}"]),
-                *([f"  {_counted(**count)}"] if count["best"] else []),
                 *lines,
                 sep="\n",
             )
