@@ -29,7 +29,7 @@ from langsplat_core.query.lookup import Lookup, build_lookup
 from langsplat_core.query.regions import Regions, build_regions
 from langsplat_core.query.taught import WordSpace, build_word_space, by_showing, shown
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Calibration, LanguageField, Scene, TaughtWord
-from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, phrase_key, tidy
+from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, phrase_key, split_phrases, tidy
 from langsplat_core.scene.surface import Surface, build_surface, surface_weights
 from langsplat_core.scene.tree import Tree, build_tree
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE
@@ -350,9 +350,9 @@ class QueryEngine:
         progress: Progress = silent,
         vector: Array | None = None,
     ) -> QueryResult:
-        """Answer `phrase`, by what was shown if it is a taught word. The level is chosen once for the scene, on raw relevancy, so that the image
-        does not flicker between levels as the camera moves. vector: (D,) unit, the phrase's own, where it is
-        at hand. Raises as `text_vector` does."""
+        """Answer `phrase`; a taught word by what was shown. The level is chosen once for the scene, on raw
+        relevancy, so that the image does not flicker between levels as the camera moves. vector: (D,) unit,
+        the phrase's own, where it is at hand. Raises as `text_vector` does."""
         if vector is None and phrase_key(phrase) in self.taught:
             return self._by_showing(self.taught[phrase_key(phrase)], level)
         if vector is None:
@@ -398,13 +398,16 @@ class QueryEngine:
         return build_word_space(self.field, self.regions)
 
     def teach(self, name: str, members: Array, level: LevelChoice = "auto") -> TaughtWord:
-        """Learn `name` for what `members` (N,) bool mean at a level, by default the one that has a region most
+        """Learn `name` for what `members` (N,) bool mean at a level, by default the one with a region most
         like them. It answers from now on, in place of any text; a word that is taught again has one example
-        more. Nothing is written. Raises InputError for what is no name, and for members without a meaning."""
+        more. Nothing is written. Raises InputError for what is no name, and for members without meaning."""
         tidied = tidy(name)
-        check_names(phrase_key(name).split())
-        if len(tidied) > LONGEST_NAME or "," in tidied or ";" in name:
-            raise InputError(f"a name has at most {LONGEST_NAME} characters and neither ',' nor ';'")
+        unsayable = only(STOP_WORDS, phrase_key(name).split()) or split_phrases(name) != [tidied]
+        if unsayable or len(tidied) > LONGEST_NAME or "," in tidied:
+            raise InputError(
+                f"'{tidied[:LONGEST_NAME]}' cannot be a name; give one of at most {LONGEST_NAME} characters, "
+                "without commas and semicolons, such as 'grandma's vase'"
+            )
         known = self.taught.get(phrase_key(name))
         if known is not None and len(known.vectors) >= MOST_SHOWN:
             raise InputError(f"'{tidied}' was shown {MOST_SHOWN} times, which is the most; remove it first")
@@ -417,7 +420,7 @@ class QueryEngine:
         return word
 
     def like(self, members: Array, level: LevelChoice = "auto") -> QueryResult:
-        """Everything that is like `members` (N,) bool, they too: as `teach` and `run`, but nothing is kept."""
+        """Everything that is like `members` (N,) bool, they too: `teach` and `run`, but nothing is kept."""
         at = self.regions.level_of(members) if level == "auto" else LEVELS.index(level)
         word = shown(self.word_space, self.field, self.regions, "more like this", members, at)
         return self._by_showing(word, "auto")

@@ -65,8 +65,8 @@ def build_word_space(field: LanguageField, regions: Regions) -> WordSpace:
 def _means(
     field: LanguageField, basis: Array, level: int, of: Array, weights: Array, count: int
 ) -> tuple[Array, Array]:
-    """(count, W) means in a space of what sets of Gaussians mean, and (count,) bool, False for a set without a
-    meaning. of: (N,) number of each Gaussian's set, -1 for none; weights: (N,)."""
+    """(count, W) means in a space of what sets of Gaussians mean, and (count,) bool, False for a set without
+    a meaning. of: (N,) number of each Gaussian's set, -1 for none; weights: (N,)."""
     rows = np.flatnonzero(field.known[level] & (of >= 0) & (weights > 0))
     latents, kinds = field.codec.unique(field.latents[level, rows])
     shares = csr_matrix((weights[rows], (of[rows], kinds)), shape=(count, len(latents))).tocsc()

@@ -5,7 +5,7 @@ every other room: where a thing of its kind is, and where none is. Colours and s
 rooms, so that things of the same colour are also counted alone.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -65,8 +65,8 @@ class Shown:
     def there(self, text: str) -> Array:
         """(N,) bool: what a phrase is true for; too few Gaussians are nothing."""
         ids = [n for n, region in self.truth.regions.items() if text in region.words]
-        right = np.isin(self.room.labels, ids).any(0)
-        return right if right.sum() >= MIN_GAUSSIANS else np.zeros_like(right)
+        right = np.asarray(np.isin(self.room.labels, ids).any(0))
+        return np.asarray(right & (right.sum() >= MIN_GAUSSIANS))
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,9 @@ def measure_taught(rooms: Sequence[Shown], examples: int) -> Iterator[TaughtRow]
 
 def joined(words: Sequence[TaughtWord]) -> TaughtWord:
     """One word with the examples of all."""
-    vectors, rivals = (np.concatenate([getattr(word, part) for word in words]) for part in ("vectors", "rivals"))
+    vectors, rivals = (
+        np.concatenate([getattr(word, part) for word in words]) for part in ("vectors", "rivals")
+    )
     return replace(words[0], vectors=vectors, rivals=rivals)
 
 
@@ -139,32 +141,33 @@ def scored(
 
 def taught_table(rows: Sequence[TaughtRow]) -> str:
     """Markdown: means over rooms with their standard deviation."""
-    head = ("tier", "shown in", "asked for", "words", "accepted %", "right of these %", "best region right %")
+    head = (
+        *("tier", "shown in", "asked for", "words", "accepted %", "right of these %"),
+        *("best region right %", "3D IoU %", "absent rejected %"),
+    )
     lines = []
     for tier, examples in dict.fromkeys((row.tier, row.examples) for row in rows):
         group = [row for row in rows if (row.tier, row.examples) == (tier, examples)]
-        absent = _by_room([row for row in group if not row.there])
-        rejected = _cell([1 - np.mean([row.found for row in room]) for room in absent])
+        rejected = _cell(group, lambda row: np.nan if row.there else not row.found)
         for name, chosen in (
             ("same kind", [row for row in group if row.there]),
             ("same kind and colour", [row for row in group if row.alike]),
         ):
-            rooms = _by_room(chosen)
             cells = (
-                [np.mean([row.found for row in room]) for room in rooms],
-                [np.mean([row.right for row in room if row.found] or [np.nan]) for room in rooms],
-                [np.mean([row.right for row in room]) for room in rooms],
-                [np.mean([row.iou for row in room]) for room in rooms],
+                _cell(chosen, lambda row: row.found),
+                _cell(chosen, lambda row: row.right if row.found else np.nan),
+                _cell(chosen, lambda row: row.right),
+                _cell(chosen, lambda row: row.iou),
             )
             where = f"{examples} room{'s' if examples > 1 else ''}"
-            lines.append((tier, where, name, len(chosen), *map(_cell, cells), rejected))
-    return markdown((*head, "3D IoU %", "absent rejected %"), lines)
+            lines.append((tier, where, name, len(chosen), *cells, rejected))
+    return markdown(head, lines)
 
 
-def _cell(shares: Sequence[float]) -> str:
-    values = 100 * np.array(shares)
-    return spread(values[np.isfinite(values)])
-
-
-def _by_room(rows: Sequence[TaughtRow]) -> list[list[TaughtRow]]:
-    return [[row for row in rows if row.seed == seed] for seed in dict.fromkeys(row.seed for row in rows)]
+def _cell(rows: Sequence[TaughtRow], share: Callable[[TaughtRow], float]) -> str:
+    """Of the means over the words of each room; NaN does not count."""
+    shares = []
+    for seed in dict.fromkeys(row.seed for row in rows):
+        values = np.array([share(row) for row in rows if row.seed == seed], float)
+        shares.append(100 * values[np.isfinite(values)].mean() if np.isfinite(values).any() else np.nan)
+    return spread(np.array(shares)[np.isfinite(shares)])
