@@ -3,10 +3,9 @@
 Cosines between images are no cosines between an image and a text: those of any two images of CLIP are 0.65,
 and what tells things apart is lost in what is no matter of words, such as light and background. So regions
 are compared in the *word space*: along the directions in which everyday phrases differ, and less the mean of
-the scene's regions. How alike two different things are there depends on encoder and scene; it is measured as
-the scene's *rival*, the similarity of a whole with the nearest other one, at the quantile `LOW`: things that
-are there several times lie above it. A region is what was shown if it is more like it than `FOUND` times the
-mean rival of both scenes.
+the scene's regions. How alike different things are there depends on encoder and scene; it is measured as the
+scene's *rival*, the similarity that most pairs of its wholes stay below: the rest may show one thing twice. A
+region is what was shown if it is more like it than `FOUND` times the mean rival of both scenes.
 """
 
 from dataclasses import dataclass
@@ -17,18 +16,19 @@ from scipy.sparse import csr_matrix
 from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import InputError
-from langsplat_core.query.answers import LOW, QueryResult, place_of, triple
+from langsplat_core.query.answers import QueryResult, place_of, triple
 from langsplat_core.query.regions import Regions
 from langsplat_core.scene import LEVELS, LanguageField, TaughtWord
 from langsplat_core.scene.tree import SMALLEST
 
 VARIANCE = 0.95  # share of the everyday phrases' variance that the word space holds
+OTHERS = 0.84  # share of pairs of wholes
 # Times the rival from which a region of each level is what was shown. Of what was shown in one of rooms 201
 # to 203 and is absent in another, 95 % stays below, with the bundled encoder and CLIP's geometry together.
-FOUND = (1.75, 1.75, 1.38)
-LEAST = 0.2  # rival: a few regions say little about it
+FOUND = (3.2, 3.2, 2.6)
+LEAST = 0.08  # rival: a few regions say little about it
 HIGHEST = 0.95  # similarity from which anything is what was shown
-UNIT = 0.23  # of the similarity from which it is found: half of it below, 80 % of what is absent is less
+UNIT = 0.3  # of the similarity from which it is found: half of it below, 80 % of what is absent is less
 HEAT = 4.0  # fit of what is exactly as shown: a relevancy of 0.98
 CHUNK = 16_384  # latents compared with the word space at a time
 
@@ -57,8 +57,8 @@ def build_word_space(field: LanguageField, regions: Regions) -> WordSpace:
         centres.append(means[solid].mean(0) if solid.any() else np.zeros(len(basis)))
         every.append(np.where(known[:, None], unit(means - centres[-1]), 0))
     alike = every[-1][solid] @ every[-1][solid].T
-    np.fill_diagonal(alike, 0)
-    rival = float(np.quantile(alike.max(1).clip(0, 1), LOW)) if len(alike) else 0.0
+    pairs = alike[np.triu_indices(len(alike), 1)].clip(0, 1)
+    rival = float(np.quantile(pairs, OTHERS)) if len(pairs) else 0.0
     return WordSpace(basis, np.stack(centres), tuple(every), rival)
 
 
