@@ -46,7 +46,7 @@ class WordSpace:
 def build_word_space(field: LanguageField, regions: Regions) -> WordSpace:
     """The word space of a scene; that of all images where the scene keeps no everyday phrases."""
     basis = np.eye(field.codec.vector_dim, dtype=np.float32)
-    if field.everyday is not None:
+    if field.everyday is not None and len(field.everyday) > 1:
         _, spreads, axes = np.linalg.svd(field.everyday - field.everyday.mean(0), full_matrices=False)
         shares = np.cumsum(spreads.astype(np.float64) ** 2)
         basis = axes[: int(np.searchsorted(shares, VARIANCE * shares[-1])) + 1]
