@@ -29,7 +29,7 @@ from langsplat_core.io.shapes import (
 )
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.answers import QueryResult, peak_pixel
-from langsplat_core.query.compose import check_phrase, joined, run_phrase
+from langsplat_core.query.compose import Number, check_phrase, count_things, joined, run_phrase
 from langsplat_core.query.describe import Describer, Entry, Words, look_at_pixel
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder
 from langsplat_core.query.grammar import Atom
@@ -95,6 +95,8 @@ class QueryScene:
         for result, understood in found:
             answer = _answer(result, scene, engine, camera, self.mode) | {"reading": understood}
             things = engine.instances(result, self.instances) if result.found else ()
+            number = count_things(engine, result) if result.found else Number(0, 0, 0)
+            answer |= {"count": {"best": number.best, "least": number.least, "most": number.most}}
             answers.append(answer | _basis(engine) | {"metres_per_unit": unit.metres, **_listed(things)})
             tables.append(_table(things, unit))
         if self.json:
@@ -104,6 +106,8 @@ class QueryScene:
             verdict, reading = answer["verdict"], answer["reading"]
             if answer["probability"] is not None:
                 verdict += f" ({100 * answer['probability']:.0f} %)"
+            if answer["count"]["most"] > 1:
+                verdict += f", {_counted(**answer['count'])}"
             place = "-" if answer["place"] is None else f"{unit.format(answer['place'])} {unit.name}"
             print(
                 f"{answer['phrase']}: {verdict}, score {answer['score']:.3f} at level {answer['level']}, "
@@ -201,6 +205,10 @@ def _answer(
         column, row, score = peak_pixel(np.asarray(relevancy[..., 0]), PAPER_FILTER)
         answer |= {"pixel": [column, row], "pixel_score": score}
     return answer
+
+
+def _counted(best: int, least: int, most: int) -> str:
+    return f"{best} of them" if least == most else f"{best} of them ({least} to {most})"
 
 
 # `langsplat select`.
@@ -344,6 +352,8 @@ class Describe:
     """Which of the things that --phrase finds, as `langsplat query` lists them; the best is 1."""
     level: Level | None = None
     """This semantic level alone."""
+    outline: bool = False
+    """The scene as a tree: wholes, with their parts under them."""
     top: Count = 5
     """Words per level."""
     vocabulary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -364,7 +374,12 @@ class Describe:
         if self.json:
             _print_json(answer | _basis(engine))
             return
-        if self._everything:
+        if self.outline:
+            named = [one for one in answer["outline"] if one["word"] is not None or one["parts"]]
+            _print_outline(named, _unit(scene, None))
+            if len(named) < len(answer["outline"]):
+                print(f"and {len(answer['outline']) - len(named)} without a name, which --json lists")
+        elif self._everything:
             _print_inventory(answer["inventory"])
         else:
             _print_words(answer["levels"])
@@ -388,6 +403,10 @@ class Describe:
 
     def _check(self, scene: Scene) -> None:
         """InputError for arguments that do not go with the scene or each other, before anything is loaded."""
+        if self.outline and (self._asked_of or self.level is not None):
+            raise InputError(
+                "--outline is of the whole scene, at all levels; leave out what else is asked for"
+            )
         if len(self._asked_of) > 1:
             raise InputError(f"{' and '.join(self._asked_of)} are several questions; ask one of them")
         if self.phrase is None and self.instance != 1:
@@ -406,6 +425,10 @@ class Describe:
     def _described(self, describer: Describer, progress: Progress) -> dict[str, Any]:
         """The inventory, or the words of the place that is asked for, ready for JSON."""
         engine = describer.engine
+        sure = engine.basis.calibration is not None
+        asked = {"asked": len(describer.words[0].phrases), "left_out": len(describer.left_out)}
+        if self.outline:
+            return asked | {"outline": [_plain(one, sure) for one in describer.outline()]}
         found: Sequence[Words | Entry]
         place: dict[str, Any] = {}
         if self.pixel is not None:
@@ -423,9 +446,7 @@ class Describe:
             place = {"gaussian": self.gaussian}
         else:
             found = describer.inventory(progress)
-        sure = engine.basis.calibration is not None
         wanted = [_plain(one, sure) for one in found if self.level in (None, LEVELS[one.level])]
-        asked = {"asked": len(describer.words[0].phrases), "left_out": len(describer.left_out)}
         return place | asked | {"inventory" if self._everything else "levels": wanted}
 
 
@@ -477,6 +498,27 @@ def _print_inventory(entries: list[dict[str, Any]]) -> None:
     OutputConsole(width=max(WIDTH, console.width)).print(table)
     if not entries:
         print("nothing of the vocabulary was found in the scene")
+
+
+def _print_outline(nodes: list[dict[str, Any]], unit: "Unit", depth: int = 0) -> None:
+    """Nodes with their parts indented under them; a line for those of one name that have none, too."""
+    groups: dict[Any, list[dict[str, Any]]] = {}
+    for node in nodes:
+        name = None if node["word"] is None else node["word"]["phrase"]
+        groups.setdefault(node["node"] if node["parts"] or name is None else name, []).append(node)
+    for group in groups.values():
+        node = group[0]
+        word = "?" if node["word"] is None else f"{node['word']['phrase']}{_percent(node['word'])}"
+        what = [
+            node["level"],
+            f"{unit.format(np.array(node['size']), ' x ')} {unit.name}",
+            f"{node['count']} Gaussians",
+        ]
+        if any(node["votes"]):
+            what.append(f"outlined in {node['votes'][0]} of {sum(node['votes'])} photographs")
+        times = f"{len(group)} x " if len(group) > 1 else ""
+        print(f"{'  ' * depth}{times}{word}: {'the largest ' if times else ''}{', '.join(what)}")
+        _print_outline(node["parts"], unit, depth + 1)
 
 
 def _print_words(levels: list[dict[str, Any]]) -> None:

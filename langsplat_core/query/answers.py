@@ -13,7 +13,8 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 from scipy.sparse import csr_matrix
 
-from langsplat_core.arrays import Array
+from langsplat_core.arrays import Array, logit, sigmoid
+from langsplat_core.compiled import plain
 from langsplat_core.config import LevelChoice
 from langsplat_core.query.grammar import Named, named
 from langsplat_core.query.instances import axis_aligned_box
@@ -150,7 +151,7 @@ def excess(fits: Fits, bars: Bars, named: Named | Literal["inside"], level: Leve
 def chance_in(field: LanguageField, regions: Regions, scale: Scale) -> Chance:
     """The fits of everyday phrases in a scene."""
     assert scale.everyday is not None
-    fits = []
+    fits: list[Array] = []
     for level, known in enumerate(field.known):
         rows = np.flatnonzero(known & (regions.weights > 0))
         latents, of = field.codec.unique(field.latents[level, rows])
@@ -166,9 +167,12 @@ def chance_in(field: LanguageField, regions: Regions, scale: Scale) -> Chance:
             everyday = cosines[:, len(scale.canonical) :]
             means += shares[:, part] @ relevancy_of(everyday, zero[:, None], rate[:, None])
         means /= regions.totals[level][:, None]
-        own, solid = scale.fit(means).astype(np.float32), regions.sizes[level] >= SMALLEST
-        fits.append(np.where(solid[:, None], own, -np.inf) if solid.any() else own)  # as in `_best`
-    return tuple(fits)
+        fits.append(scale.fit(means).astype(np.float32))
+    solid = [sizes >= SMALLEST for sizes in regions.sizes]
+    return tuple(
+        np.where(rows[:, None], own, -np.inf) if rows.any() else own  # as in `_best`
+        for own, rows in zip(with_parts(regions, tuple(fits)), solid, strict=True)
+    )
 
 
 # The answer by regions: its level, the regions that are it, and how good the best one is.
@@ -178,14 +182,16 @@ def chance_in(field: LanguageField, regions: Regions, scale: Scale) -> Chance:
 # geometry of CLIP, never on rooms that measure.
 
 # Spreads that each level is given before the best is chosen, by what a phrase names. A thing is one whole,
-# whatever some part of it looks like; a part is rather too fine than too coarse.
+# whatever some part of it looks like.
 ADVANTAGE: Mapping[Named, tuple[float, float, float]] = {
-    "thing": (0.0, 0.0, 0.5),
-    "part": (0.0, 0.0, 0.25),
-    "part of a thing": (0.0, 0.0, -0.25),
+    "thing": (0.0, 0.25, 0.75),
+    "part": (0.0, 0.0, 0.5),
+    "part of a thing": (0.0, 0.1, 0.0),
 }
-REACH = 0.4  # of the best fit: what fits less by no more than this, and by `NEAREST` to `FARTHEST`, is it too
+PARTS = 0.25  # weight of its best part in the fit of a region: of a thing, something in it is sure
+REACH = 0.45  # of the best fit: what fits less by this or less, within `NEAREST` and `FARTHEST`, is it too
 NEAREST, FARTHEST = 0.15, 1.0  # spreads
+NOTHING = float(logit(np.array(2 * NARROWEST)))  # fit: of less there is no meaning
 
 
 def lowest(best: float, share: float = 1.0) -> float:
@@ -194,10 +200,38 @@ def lowest(best: float, share: float = 1.0) -> float:
     return best - share * float(np.clip(REACH * best, NEAREST, FARTHEST))
 
 
-def _best(means: Array, sizes: Array) -> float:
+def with_parts(regions: Regions, own: tuple[Array, ...]) -> tuple[Array, ...]:
+    """The fits of regions, of each level (R, ...), from those of their own Gaussians' mean relevancy. Parts
+    that mean nothing, and crumbs, say nothing."""
+    telling = [sizes >= SMALLEST for sizes in regions.sizes]
+    parts = tuple(
+        np.where((fits.T > NOTHING) & rows, fits.T, -np.inf).T
+        for fits, rows in zip(own, telling, strict=True)
+    )
+    best = (regions.best_parts(level, parts) for level in range(len(own)))
+    return tuple(
+        np.where(np.isfinite(part), (1 - PARTS) * fits + PARTS * part, fits)
+        for fits, part in zip(own, best, strict=True)
+    )
+
+
+def _relevancy(fits: Array) -> Array:
+    """Relevancy that fits stand for, 0 of what means nothing."""
+    return np.where(fits > NOTHING, sigmoid(fits), 0)
+
+
+def even_relevancy(regions: Regions, scale: Scale, relevancy: Array) -> Array:
+    """(3, N) relevancy -> the same, of every region what its fit stands for; of what is in none its own."""
+    own = plain(relevancy)
+    fits = with_parts(regions, tuple(map(scale.fit, regions.means(own))))
+    values = [_relevancy(row).astype(np.float32) for row in fits]
+    return np.stack([regions.spread(level, row, own[level]) for level, row in enumerate(values)])
+
+
+def _best(values: Array, sizes: Array) -> float:
     """The best region's relevancy; crumbs that no neighbour took do not count where there are others."""
-    solid = means[sizes >= SMALLEST]
-    return float((solid if len(solid) else means).max(initial=0))
+    solid = values[sizes >= SMALLEST]
+    return float((solid if len(solid) else values).max(initial=0))
 
 
 def _level(best: Array, named: Named) -> int:
@@ -217,12 +251,12 @@ def by_regions(
     level: LevelChoice,
 ) -> QueryResult:
     """The answer of whole regions that fit nearly as well as the best one. means: (N, 3) of the Gaussians."""
-    kind, every = named(phrase), regions.means(relevancy)
-    peaks = triple(_best(values, sizes) for values, sizes in zip(every, regions.sizes, strict=True))
+    kind, every = named(phrase), with_parts(regions, tuple(map(scale.fit, regions.means(relevancy))))
+    peaks = triple(_best(_relevancy(each), sizes) for each, sizes in zip(every, regions.sizes, strict=True))
     best = scale.fit(np.array(peaks))
     chosen = _level(best, kind) if level == "auto" else LEVELS.index(level)
-    inside = scale.fit(every[chosen]) >= lowest(float(best[chosen]))  # (R,) bool
-    values, peak, fits = every[chosen].astype(np.float32), peaks[chosen], triple(best)
+    inside = every[chosen] >= lowest(float(best[chosen]))  # (R,) bool
+    values, peak, fits = _relevancy(every[chosen]).astype(np.float32), peaks[chosen], triple(best)
     probability = above = None
     if calibration is None:
         above = excess(fits, bars, kind, level)

@@ -14,7 +14,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.answers import QueryResult, excess, locate, lowest, triple
+from langsplat_core.query.answers import QueryResult, even_relevancy, excess, locate, lowest, triple
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import (
     Atom,
@@ -33,8 +33,8 @@ from langsplat_core.query.grammar import (
     parse,
     unparse,
 )
-from langsplat_core.query.instances import axis_aligned_box
-from langsplat_core.scene import LEVELS, NO_NODE, Camera
+from langsplat_core.query.instances import axis_aligned_box, told_apart
+from langsplat_core.scene import LEVELS, Camera
 from langsplat_core.scene.language import phrase_key, tidy
 from langsplat_core.scene.surface import Surface
 from langsplat_core.scene.tree import Tree
@@ -125,12 +125,35 @@ def separate(surface: Surface, inside: Array, tree: Tree | None = None) -> list[
     tree: what tells apart things that touch, and keeps together one that is half hidden, by its wholes that
     masks voted for. All other Gaussians are taken apart where the surface is.
     """
-    numbers = np.flatnonzero(inside)
-    owner = np.full(len(numbers), NO_NODE) if tree is None else tree.voted(WHOLE)[surface.rows[numbers]]
-    parts = surface.parts(numbers[owner == NO_NODE]).each()
-    parts += [numbers[owner == one] for one in np.unique(owner[owner != NO_NODE])]
+    wholes = None if tree is None else tree.voted(WHOLE)
+    parts = told_apart(surface, np.flatnonzero(inside), wholes, join=True)
     parts.sort(key=len, reverse=True)
     return [part for part in parts if len(part) >= max(FEWEST, SPECK * len(parts[0]))]
+
+
+@dataclass(frozen=True)
+class Number:
+    """How many single things an answer has, and how many it may have."""
+
+    best: int
+    least: int  # with a stricter cut
+    most: int  # with a wider one
+
+
+STRICT, WIDE = 0.25, 2.0  # of the way that an answer reaches
+
+
+def count_things(engine: QueryEngine, answer: QueryResult) -> Number:
+    """The number of single things in an answer, as `separate` tells them apart, and in what it would be if it
+    reached less far or farther below its best region."""
+    fits = engine.scale.fit(answer.even)
+    best = float(fits[answer.members].max(initial=-np.inf))
+    least, most = (fits >= lowest(best, share) for share in (STRICT, WIDE))
+    low, own, high = (
+        len(separate(engine.surface, inside[engine.surface.rows], engine.tree))
+        for inside in (least & answer.members, answer.members, most | answer.members)
+    )
+    return Number(own, min(low, own), max(high, own))
 
 
 def gap(one: Body, other: Body) -> float:
@@ -245,7 +268,7 @@ def cut_inside(
     """The answers of a part in one, cut anew among the Gaussians of its thing. there: (N,) bool."""
     surface, known = engine.surface, engine.field.known
     relevancy = np.asarray(np.mean([result.relevancy for result in asked], axis=0, dtype=np.float32))
-    even = np.where(there, engine.regions.even(relevancy), 0)
+    even = np.where(there, even_relevancy(engine.regions, engine.scale, relevancy), 0)
     relevancy = np.where(there, relevancy, 0)
     peaks = triple(even[:, surface.rows[there[surface.rows]]].max(1, initial=0))
     own = int(np.argmax(peaks[:WHOLE])) if max(peaks[:WHOLE]) > 0 else WHOLE

@@ -26,10 +26,10 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.instances import axis_aligned_box
+from langsplat_core.query.instances import axis_aligned_box, oriented_box
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import pixel_weights
-from langsplat_core.scene import LEVELS, Camera, Codec, LanguageField
+from langsplat_core.scene import LEVELS, NO_NODE, Camera, Codec, LanguageField
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.scene.surface import surface_areas
 from langsplat_core.semantics.relevancy import FLOOR
@@ -163,6 +163,8 @@ LEAST_SPOT = 0.15  # of its largest spot's surface: a smaller one is a splinter 
 LEAST_COUNT = 12  # Gaussians of a spot
 SAME = 0.5  # overlap of claims from which two words name the same thing
 LIKELY = 0.5  # probability from which a word is listed
+OR = " or "
+NAMES = 3  # words, at most, that a node of the tree is called by
 RUNNERS_UP = 5  # words per meaning that may be names for it
 MOST = 200  # candidates per level, the largest first
 ATTRIBUTES: tuple[Bundled, ...] = ("colours", "materials")
@@ -191,6 +193,21 @@ class Entry:
     score: float  # peak relevancy of the phrase, as a query gives it
     share: float  # of the scene's surface, in [0, 1]
     spots: tuple[Spot, ...]  # the largest first
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """A node of the scene's tree in words, with its parts."""
+
+    node: int  # number in the tree
+    level: int  # index into LEVELS
+    word: Word | None  # the best name; None where nothing of the vocabulary is likely
+    count: int  # Gaussians
+    share: float  # of the scene's surface, in [0, 1]
+    centre: Array  # (3,) world units
+    size: Array  # (3,) sides of the oriented box, longest first, world units
+    votes: tuple[int, int]  # photographs with a mask of just this, and those that show it without one
+    parts: tuple["Outline", ...]  # the largest first
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,6 +359,62 @@ class Describer:
                         named.update(claim.phrases)
             progress("checking words", 1.0, LEVELS[level])
         return entries
+
+    def outline(self, least: float = LEAST_SHARE) -> tuple[Outline, ...]:
+        """The scene's tree, wholes with the largest surface first. Left out are nodes of less than `least` of
+        the scene's surface, and parts that say nothing new: without a word, or with that of what they are in;
+        their own parts take their place."""
+        tree, members = self.engine.tree, self.engine.tree.gaussians()
+        every = max(float(self.areas.sum()), 1e-300)
+        totals = np.array([self.areas[rows].sum() for rows in members]) / every
+        large = [
+            node for node, rows in enumerate(members) if totals[node] >= least and len(rows) >= LEAST_COUNT
+        ]
+        large.sort(key=lambda node: -totals[node])
+        parts: dict[int, list[int]] = {}
+        for node in large:
+            parts.setdefault(int(tree.parents[node]), []).append(node)
+
+        def below(node: int, word: Word | None) -> Iterator[Outline]:
+            for part in parts.get(node, []):
+                own = self._name(part, members[part])
+                if own is None or (word is not None and own.phrase.split(OR)[0] in word.phrase.split(OR)):
+                    yield from below(part, word)
+                else:
+                    yield shown(part, own)
+
+        def shown(node: int, word: Word | None) -> Outline:
+            within = sorted(below(node, word), key=lambda part: -part.share)
+            return self._outlined(node, word, members[node], float(totals[node]), tuple(within))
+
+        return tuple(shown(node, self._name(node, members[node])) for node in parts.get(NO_NODE, []))
+
+    def _name(self, node: int, rows: Array) -> Word | None:
+        """The best word for a node, or as many as are likely together: "mug or cup"; None where none are."""
+        level, weights = int(self.engine.tree.levels[node]), np.maximum(self.areas[rows], 1e-300)
+        words = self._at_level(level, rows, weights, NAMES).words
+        for count in range(1, len(words) + 1):
+            probability = sum(word.probability for word in words[:count])
+            if probability >= LIKELY:
+                return Word(OR.join(word.phrase for word in words[:count]), probability)
+        return None
+
+    def _outlined(
+        self, node: int, word: Word | None, rows: Array, share: float, parts: tuple[Outline, ...]
+    ) -> Outline:
+        tree, weights = self.engine.tree, np.maximum(self.areas[rows], 1e-300)
+        positions = self.engine.scene.gaussians.means[rows].astype(np.float64)
+        return Outline(
+            node=node,
+            level=int(tree.levels[node]),
+            word=word,
+            count=len(rows),
+            share=share,
+            centre=weights @ positions / weights.sum(),
+            size=2 * oriented_box(positions).half_extents,
+            votes=(int(tree.votes[node, 0]), int(tree.votes[node, 1])),
+            parts=parts,
+        )
 
     def _verified(self, claim: _Claim) -> Entry | None:
         """The claim as an entry under the first of its words that a query finds there, if any."""

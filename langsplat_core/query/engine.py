@@ -431,7 +431,9 @@ class QueryEngine:
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
         """The things among the members of an answer, best first, or only so many of them."""
         relevancy = result.relevancy[result.level]
-        return find_instances(self.surface, self.scene.gaussians, result.members, relevancy, at_most)
+        whole = len(LEVELS) - 1
+        told = self.tree.voted(whole), result.level == whole
+        return find_instances(self.surface, self.scene.gaussians, result.members, relevancy, at_most, *told)
 
 
 def check_words(field: LanguageField, words: Words) -> None:

@@ -11,6 +11,7 @@ from langsplat_core.compiled import plain
 from langsplat_core.errors import InputError
 from langsplat_core.scene import Gaussians
 from langsplat_core.scene.surface import Surface
+from langsplat_core.scene.tree import NO_NODE
 
 INNER = (0.02, 0.98)  # a box holds the points between these quantiles of each coordinate: strays do not count
 TURNED = 256  # points, at most, that the box is turned by
@@ -105,7 +106,8 @@ def _right_handed(axes: Array) -> Array:
     return axes * signs
 
 
-# Two members belong to one instance when a walk over linked members of the surface leads from one to the
+# Two members belong to one instance when they are of one whole that masks voted for, in an answer of wholes,
+# or when a walk over linked members of the surface, of the same such whole or of none, leads from one to the
 # other. What is too faint to be on the surface belongs where the surface Gaussian nearest to it belongs.
 
 CRUMB_COUNT = 8  # half of the neighbourhood that relevancy is smoothed over
@@ -148,14 +150,36 @@ class Instance:
         return size
 
 
+def told_apart(surface: Surface, numbers: Array, wholes: Array | None, join: bool) -> list[Array]:
+    """Of the Gaussians `numbers` (K,) of a surface those of each single thing.
+
+    wholes: (N,) voted wholes, see `Tree.voted`, which tell apart things that touch; join: what is of one
+    whole is one, half hidden or not.
+    """
+    if wholes is None:
+        return surface.parts(numbers).each()
+    owner = wholes[surface.rows[numbers]]
+    found: list[Array] = []
+    for whole in np.unique(owner):
+        own = numbers[owner == whole]
+        found += [own] if join and whole != NO_NODE else surface.parts(own).each()
+    return found
+
+
 def find_instances(
-    surface: Surface, gaussians: Gaussians, members: Array, relevancy: Array, at_most: int | None = None
+    surface: Surface,
+    gaussians: Gaussians,
+    members: Array,
+    relevancy: Array,
+    at_most: int | None = None,
+    wholes: Array | None = None,
+    join: bool = False,
 ) -> tuple[Instance, ...]:
     """The instances among `members` (N,) bool, best first by score, of equal ones the larger first.
 
-    relevancy: (N,) in [0, 1], at the level of the answer. at_most: only so many of the best. Crumbs are left
-    out: parts of fewer than `CRUMB_COUNT` Gaussians on the surface, or of less than `CRUMB_SHARE` of the
-    largest part's extent. Where all are crumbs, the largest alone is kept.
+    relevancy: (N,) in [0, 1], at the level of the answer. wholes, join: see `told_apart`. at_most: only so
+    many of the best. Crumbs are left out: parts of fewer than `CRUMB_COUNT` Gaussians on the surface, or of
+    less than `CRUMB_SHARE` of the largest part's extent. Where all are crumbs, the largest alone is kept.
     """
     every = np.flatnonzero(members)
     numbers = surface.anchors[every]
@@ -164,18 +188,20 @@ def find_instances(
     visible = surface.rows[numbers] == rows
     if not visible.any():
         return ()
-    parts = surface.parts(numbers[visible])
-    values = plain(relevancy)
-    scores = np.maximum.reduceat(surface.smooth(values, parts.order), parts.starts)
-    labels = parts.labels[numbers]  # -1: faint ones beside something else
+    parts = told_apart(surface, numbers[visible], wholes, join)
+    counts, values = np.array(list(map(len, parts))), plain(relevancy)
+    starts = np.cumsum(counts) - counts
+    scores = np.maximum.reduceat(surface.smooth(values, np.concatenate(parts)), starts)
+    label_of = np.full(len(surface.rows), -1)
+    label_of[np.concatenate(parts)] = np.repeat(np.arange(len(parts)), counts)
+    labels = label_of[numbers]  # -1: faint ones beside something else
     sizes = _extent(gaussians, every)
-    extents = np.bincount(labels + 1, sizes[near], len(parts.starts) + 1)[1:]
-    counts = np.diff(parts.starts, append=len(parts.order))
+    extents = np.bincount(labels + 1, sizes[near], len(parts) + 1)[1:]
     found = []
     for part in _ranked(scores, extents, counts)[:at_most]:
-        own = parts.order[parts.starts[part] :][: counts[part]]
         share = extents[part] / max(sizes.sum(), 1e-300)
-        found.append(_instance(surface, own, rows[labels == part], values, float(scores[part]), share))
+        own = rows[labels == part]
+        found.append(_instance(surface, parts[part], own, values, float(scores[part]), share))
     return tuple(found)
 
 

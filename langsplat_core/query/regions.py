@@ -19,6 +19,7 @@ class Regions:
     nodes: tuple[Array, ...]  # (R,) number in the tree of each region of a level, rising
     everywhere: Array  # (3, N) int32 number of the region at each level, from 0; -1: in none
     weights: Array  # (N,) float32 opacity of what counts, 0 for all others, see `surface_weights`
+    parents: tuple[Array, Array]  # (R,) region of the level above that each is part of: of two levels
     sizes: tuple[Array, ...]  # (R,) Gaussians that count
     totals: tuple[Array, ...]  # (R,) float64 sums of their weights
 
@@ -41,11 +42,17 @@ class Regions:
         shared_workers().run(_spread, len(others), self.everywhere[level], values, others, spread)
         return spread
 
-    def even(self, values: Array) -> Array:
-        """(3, N) float32 values -> the same, of every region its mean; of what is off the surface its own."""
-        own = plain(values)
-        means = [row.astype(np.float32) for row in self.means(own)]
-        return np.stack([self.spread(level, row, own[level]) for level, row in enumerate(means)])
+    def best_parts(self, level: int, values: tuple[Array, ...]) -> Array:
+        """(R, ...) the largest value among each region's parts at the level below; its own where it has none.
+
+        values: of each level, the (R, ...) values of its regions.
+        """
+        own = values[level]
+        if level == 0:
+            return own
+        best = np.full_like(own, -np.inf)
+        np.maximum.at(best, self.parents[level - 1], values[level - 1])
+        return np.where(np.isfinite(best), best, own)
 
     def level_of(self, members: Array) -> int:
         """The level with the region that overlaps most with `members` (N,) bool; of equal ones the
@@ -63,18 +70,21 @@ class Regions:
 
 def build_regions(tree: Tree, weights: Array) -> Regions:
     """The regions of a scene. weights: (N,) float32, see `surface_weights`."""
-    nodes, everywhere, sizes, totals = [], [], [], []
     weights = np.where(tree.leaves >= 0, weights, np.float32(0))
+    counts = np.flatnonzero(weights > 0)
+    nodes, everywhere, parents, sizes, totals = [], [], [], [], []
     for level in range(len(LEVELS)):
         at = tree.at(level)
-        there, row = np.unique(at[weights > 0], return_inverse=True)
+        there, first, row = np.unique(at[counts], return_index=True, return_inverse=True)
         number = np.full(tree.count + 1, -1, np.int32)
         number[there] = np.arange(len(there))
         nodes.append(there)
         everywhere.append(number[at])
         sizes.append(np.bincount(row, minlength=len(there)))
-        totals.append(np.bincount(row, weights[weights > 0], minlength=len(there)))
-    return Regions(tuple(nodes), np.stack(everywhere), weights, tuple(sizes), tuple(totals))
+        totals.append(np.bincount(row, weights[counts], minlength=len(there)))
+        parents.append(counts[first])  # a Gaussian of each region
+    above = everywhere[1][parents[0]], everywhere[2][parents[1]]
+    return Regions(tuple(nodes), np.stack(everywhere), weights, above, tuple(sizes), tuple(totals))
 
 
 @kernel

@@ -9,6 +9,7 @@ encoder may see its front and its back differently.
 """
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -97,6 +98,16 @@ class Tree:
         for other in range(node - 1, -1, -1):
             inside[other] = self.parents[other] != NO_NODE and inside[self.parents[other]]
         return np.asarray(inside[self.leaves])
+
+    def gaussians(self) -> list[Array]:
+        """Of every node its Gaussians, rising."""
+        order = np.argsort(self.leaves, kind="stable")
+        firsts = np.searchsorted(self.leaves[order], np.arange(self.count + 1))
+        found = [order[a:b] for a, b in pairwise(firsts)]
+        for node, parent in enumerate(self.parents):
+            if parent != NO_NODE:
+                found[parent] = np.union1d(found[parent], found[node])
+        return found
 
     def take(self, rows: Array) -> "Tree":
         """The tree of the Gaussians at `rows` (indices or a boolean mask); its nodes keep their numbers."""

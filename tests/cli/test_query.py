@@ -171,6 +171,7 @@ def test_the_things_of_an_answer_are_listed(folder, capsys):
     found, absent = answers(capsys, "query", "a.ply", "pair", "void")
     assert absent["instances"] == []
     assert found["metres_per_unit"] == 0.5
+    assert (found["count"], absent["count"]["most"]) == ({"best": 2, "least": 1, "most": 2}, 0)
     assert [thing["number"] for thing in found["instances"]] == [1, 2]
     centres = sorted(thing["centre"][0] for thing in found["instances"])
     np.testing.assert_allclose(centres, [-1.2, 1.2], atol=0.1)
@@ -345,6 +346,19 @@ def described(folder: Path) -> Path:
     return folder
 
 
+def test_the_outline_lists_wholes_with_what_is_new_in_them(described, capsys):
+    words = ("describe", "named.ply", "--vocabulary", "list.txt", "--outline")
+    said = lines(capsys, *words)
+    assert [line.split(":")[0] for line in said[:3]] == ["mug", "book", "plant"]
+    found = answers(capsys, *words)["outline"]
+    assert [node["word"]["phrase"] for node in found] == ["mug", "book", "plant"]
+    for node in found:
+        assert (node["level"], node["parts"]) == ("whole", [])  # their parts mean the same, or nothing
+        assert sum(node["votes"]) == 0
+        assert node["share"] == pytest.approx(1 / 3, abs=0.05)
+        assert (np.diff(node["size"]) <= 0).all()
+
+
 def test_the_inventory_as_a_table_and_as_json(described, capsys):
     words = ("describe", "named.ply", "--vocabulary", "list.txt")
     said = "\n".join(lines(capsys, *words))
@@ -407,6 +421,7 @@ def test_words_for_a_gaussian_a_thing_and_a_pixel(described, capsys):
         ("describe named.ply --phrase mug --instance 9", "--instance 9: there are 1"),
         ("describe named.ply --phrase wall", "'wall' was not found"),
         ("describe named.ply --camera 1", "needs a --pixel X Y"),
+        ("describe named.ply --outline --gaussian 3", "--outline is of the whole scene"),
         ("describe named.ply --vocabulary empty.txt", "empty.txt: the vocabulary is empty"),
         ("describe named.ply --vocabulary bad.txt", "bad.txt, line 2"),
         ("describe named.ply --vocabulary sofas.txt", "knows none of the vocabulary's 1 phrases"),

@@ -13,6 +13,7 @@ from langsplat_core.query.answers import (
     FARTHEST,
     FOUND,
     NEAREST,
+    PARTS,
     REACH,
     Bar,
     QueryResult,
@@ -21,6 +22,7 @@ from langsplat_core.query.answers import (
     by_regions,
     chance_in,
     excess,
+    with_parts,
 )
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Named
@@ -111,7 +113,7 @@ def test_a_crumb_is_no_place():
     far, gaussians = np.arange(SMALLEST - 1), blobs()
     gaussians.means[far] += np.array([60, 0, 0], np.float32)
     relevancy = np.full((3, len(gaussians)), 0.3, np.float32)
-    relevancy[2, PER_BLOB : 2 * PER_BLOB] = 0.8
+    relevancy[:, PER_BLOB : 2 * PER_BLOB] = 0.8
     relevancy[2, far] = 0.95
     result = asked(relevancy, gaussians, language(), "regions")
     assert result.peak == pytest.approx(0.8, abs=1e-6)
@@ -135,7 +137,7 @@ def test_a_calibrated_verdict(below, verdict):
 def test_a_part_that_is_asked_for_alone_has_odds_of_its_own():
     gaussians, field = random_gaussians(300), random_field(300, "codebook")
     relevancy = np.full((3, 300), 0.4, np.float32)
-    relevancy[1, :100] = 0.7  # among the parts it is there, among wholes it is not
+    relevancy[1, :100] = 0.8  # among the parts it is there, among wholes it is not
     calibration = Calibration(Odds(0, 20, 0), Odds(0, 0, 20), Odds(-99, 1, 1))
     field = replace(field, reading=Reading(calibration=calibration))
     part, thing = (asked(relevancy, gaussians, field, "regions", phrase=text) for text in ("handle", "mug"))
@@ -207,9 +209,9 @@ def test_fits_by_chance_are_those_of_looking_everyday_phrases_up(kind, monkeypat
     fits = engine.chance
     for number, vector in enumerate(engine.field.everyday):
         means = engine.regions.means(engine.relevancy(vector))
-        for level in range(len(LEVELS)):
+        every = with_parts(engine.regions, tuple(map(engine.scale.fit, means)))
+        for level, want in enumerate(every):
             solid = engine.regions.sizes[level] >= SMALLEST
-            want = engine.scale.fit(means[level])
             np.testing.assert_allclose(fits[level][solid, number], want[solid], atol=TOLERANCE[kind])
             assert np.isneginf(fits[level][~solid, number]).all() or not solid.any()
 
@@ -313,6 +315,8 @@ def test_the_extent_is_that_of_the_plain_rule(surface, level, named, middle):
         fits = middle + rng.normal(size=(3, len(sizes)))
         regions = regions_by(surface, sizes)
         got = answer_of(surface, spread_out(surface, regions, fits), regions, level, named)
+        solid = np.array(sizes) >= SMALLEST  # every region has one part, all of it; of crumbs it says nothing
+        fits[1:, solid] = (1 - PARTS) * fits[1:, solid] + PARTS * fits[:-1, solid]
         chosen, answering = plain_extent(fits, sizes, level, named)
         of, solid = regions.everywhere[chosen, surface.rows], np.array(sizes) >= SMALLEST
         assert got.level == chosen

@@ -78,6 +78,24 @@ def test_every_ball_is_an_instance_with_the_figures_of_a_plain_account():
     assert [i.count for i in find_instances(surface, gaussians, members, relevancy, at_most=2)] == [200, 90]
 
 
+def test_wholes_that_masks_voted_for_tell_apart_what_touches():
+    """A row of 80 that touch: two wholes, then ten of none. An answer of wholes joins what is of one of them,
+    a finer one takes apart what lies apart."""
+    gaussians = balls([80])[0]
+    gaussians.means[:] = np.stack([np.arange(80), np.zeros(80), np.zeros(80)], 1)
+    surface, wholes = build_surface(gaussians), np.repeat([7, 3, -1], [40, 30, 10])
+    members, relevancy = np.ones(80, bool), np.full(80, 0.8)
+
+    def counts(inside: np.ndarray, *told: object) -> list[int]:
+        return sorted(i.count for i in find_instances(surface, gaussians, inside, relevancy, None, *told))
+
+    assert counts(members) == [80]
+    assert counts(members, wholes, True) == counts(members, wholes, False) == [10, 30, 40]
+    members[15:26] = False
+    assert counts(members, wholes, True) == [10, 29, 30]
+    assert counts(members, wholes, False) == [10, 14, 15, 30]
+
+
 def test_of_equal_scores_the_larger_comes_first():
     gaussians, number = balls([50, 150, 80])
     relevancy = 0.8 + np.array([0.4, 0.0, 0.2])[number] * EQUAL_SCORES

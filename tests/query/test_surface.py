@@ -321,14 +321,15 @@ def test_means_of_regions_and_what_is_spread_from_them(scattered):
     """Faint Gaussians beside a region take its value; those near nothing keep their own."""
     surface, regions = scattered
     values = np.random.default_rng(5).uniform(size=(3, 3000)).astype(np.float32)
-    even, near = regions.even(values), surface.anchors >= 0
+    near = surface.anchors >= 0
     wanted = plain_means(surface, regions, values)
     for level, (got, want) in enumerate(zip(regions.means(values), wanted, strict=True)):
         assert len(want) > 1
         np.testing.assert_allclose(got, want, rtol=1e-12)
         of = on_surface_of(regions, surface)[level][surface.anchors[near]]
-        np.testing.assert_allclose(even[level, near], want[of], rtol=1e-6)
-    np.testing.assert_array_equal(even[:, ~near], values[:, ~near])
+        spread = regions.spread(level, got.astype(np.float32), values[level])
+        np.testing.assert_allclose(spread[near], want[of], rtol=1e-6)
+        np.testing.assert_array_equal(spread[~near], values[level, ~near])
     assert 0 < (~near).sum() < 3000 / 3 < (regions.weights == 0).sum()
 
 

@@ -144,6 +144,12 @@ def regions_of(scene: Scene, surface: Surface | None = None) -> Regions:
     return build_regions(tree_of(scene, surface), surface_weights(scene.gaussians))
 
 
+def with_tree(scene: Scene) -> Scene:
+    """`scene` with its tree in its field."""
+    assert scene.language is not None
+    return replace(scene, language=replace(scene.language, tree=tree_of(scene)))
+
+
 def chain_of_levels(leaves: Array) -> Tree:
     """(N,) int32 numbers from 0, NO_NODE for none -> a tree of these sets, the same at all levels."""
     count = int(leaves.max(initial=-1)) + 1
