@@ -34,11 +34,12 @@ class Taught(InRooms):
     masks: MaskOrigin = "truth"  # where outlines come from
     codec: CodecConfig = field(default_factory=CodebookConfig)
     examples: tuple[Count, ...] = (1, 3)  # rooms in which each thing is shown
+    whole_vectors: bool = False  # compared, and not what of them is a matter of words
 
     def run(self) -> None:
         with TerminalProgress() as progress:
             variant = Variant("the method", self.masks, codec=self.codec)
-            rooms = [Shown(room, variant) for room in self.rooms(progress)]
+            rooms = [Shown(room, variant, self.whole_vectors) for room in self.rooms(progress)]
         rows = [row for count in self.examples for row in measure_taught(rooms, count)]
         publish(self, "taught", "Taught by showing in one room, asked in others", taught_table(rows), rows)
 
@@ -46,9 +47,10 @@ class Taught(InRooms):
 class Shown:
     """A room, and a word for one thing of each kind in it."""
 
-    def __init__(self, room: Room, variant: Variant) -> None:
+    def __init__(self, room: Room, variant: Variant, whole_vectors: bool = False) -> None:
         self.room, self.truth = room, room.truth
-        self.scene = Scene(room.gaussians, room.field(variant)[0])
+        field = room.field(variant)[0]
+        self.scene = Scene(room.gaussians, replace(field, everyday=None) if whole_vectors else field)
         self.seen = np.asarray((room.labels >= 0).any(0))
         engine, whole = QueryEngine(self.scene), room.labels[WHOLE]
         self.words: dict[str, tuple[TaughtWord, str]] = {}  # by kind, with the colour of what was shown

@@ -130,10 +130,10 @@ def _found(viewer: Viewer) -> None:
 
 def _name(viewer: Viewer) -> None:
     """Draw the box for a name by which what is selected is found from now on."""
-    leave_room("Name it", 12)
-    flags = imgui.InputTextFlags_.enter_returns_true
-    hint, typed = "a name for it", viewer.state.selection.name
-    entered, typed = imgui.input_text_with_hint("##name", hint, typed, flags)
+    button = imgui.calc_text_size("Name it").x + 2 * imgui.get_style().frame_padding.x
+    imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
+    flags, hint = imgui.InputTextFlags_.enter_returns_true, "a name for what is selected"
+    entered, typed = imgui.input_text_with_hint("##name", hint, viewer.state.selection.name, flags)
     queries.type_name(viewer, typed)
     imgui.same_line()
     if imgui.button("Name it") or entered:
