@@ -136,7 +136,8 @@ def tree_of(scene: Scene, surface: Surface | None = None) -> Tree:
     field = scene.language
     assert field is not None
     surface = surface or build_surface(scene.gaussians)
-    return build_tree(surface, field.codec, field.latents, field.known, field.tree)
+    things = None if field.tree is None else field.tree.things()
+    return build_tree(surface, field.codec, field.latents, field.known, things)
 
 
 def regions_of(scene: Scene, surface: Surface | None = None) -> Regions:
