@@ -38,7 +38,7 @@ from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.selection import grow, of_rows, shrink
 from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
 from langsplat_core.scene import LEVELS, Camera, Scene
-from langsplat_core.scene.language import phrase_key, split_phrases
+from langsplat_core.scene.language import split_phrases
 from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.vocabulary import read_vocabulary
 
@@ -125,9 +125,9 @@ class QueryScene:
         reasons: dict[str, list[str]] = {}  # why not -> these phrases
         for phrase in dict.fromkeys(phrases):
             try:
-                if self.mode == "paper" and phrase_key(phrase) in engine.taught:
+                if self.mode == "paper" and engine.is_taught(phrase):
                     raise InputError(NOT_DECODED)
-                if self._plainly and phrase_key(phrase) not in engine.taught:
+                if self._plainly and not engine.is_taught(phrase):
                     engine.text_vector(phrase)
                 else:
                     check_phrase(engine, phrase, camera)

@@ -249,7 +249,7 @@ class QueryEngine:
     def unknown_words(self, phrase: str) -> tuple[str, ...]:
         """Words for which `phrase` cannot be asked; none where it was taught or the phrasebook has it.
         EncoderError as `load_encoder` raises it."""
-        if phrase_key(phrase) in self.taught or phrase_key(phrase) in self.field.phrasebook:
+        if self.is_taught(phrase) or phrase_key(phrase) in self.field.phrasebook:
             return ()
         return self.load_encoder().unknown_words(phrase_key(phrase))
 
@@ -355,7 +355,7 @@ class QueryEngine:
         """Answer `phrase`; a taught word by what was shown. The level is chosen once for the scene, on raw
         relevancy, so that the image does not flicker between levels as the camera moves. vector: (D,) unit,
         the phrase's own, where it is at hand. Raises as `text_vector` does."""
-        if vector is None and phrase_key(phrase) in self.taught:
+        if vector is None and self.is_taught(phrase):
             return self._by_showing(self.taught[phrase_key(phrase)], level)
         if vector is None:
             vector = self.text_vector(phrase, progress)
@@ -368,13 +368,12 @@ class QueryEngine:
         """The answers of `run` to each of `phrases`, which are encoded and compared with the scene's meanings
         together. An answer keeps 17 bytes per Gaussian. Raises as `text_vector` does, before any is asked."""
         results: list[QueryResult] = []
-        plain = [phrase for phrase in phrases if phrase_key(phrase) not in self.taught]
+        plain = [phrase for phrase in phrases if not self.is_taught(phrase)]
         relevancies = self._relevancies(self.text_vectors(plain, progress))
         for phrase in phrases:
             progress(f"searching '{tidy(phrase)}'", len(results) / len(phrases))
-            word = self.taught.get(phrase_key(phrase))
-            if word is not None:
-                results.append(self._by_showing(word, level))
+            if self.is_taught(phrase):
+                results.append(self._by_showing(self.taught[phrase_key(phrase)], level))
             else:
                 results.append(self._answer(tidy(phrase), next(relevancies), level))
         return results
@@ -399,10 +398,15 @@ class QueryEngine:
         """The scene's regions as taught words see them."""
         return build_word_space(self.field, self.regions)
 
+    def is_taught(self, phrase: str) -> bool:
+        """Whether a phrase is a taught word, and is answered by what was shown."""
+        return phrase_key(phrase) in self.taught
+
     def teach(self, name: str, members: Array, level: LevelChoice = "auto") -> TaughtWord:
         """Learn `name` for what `members` (N,) bool mean at a level, by default the one with a region most
-        like them. It answers from now on, in place of any text; a word that is taught again has one example
-        more. Nothing is written. Raises InputError for what is no name, and for members without meaning."""
+        like them. It answers from now on, in place of any text; a word that is taught again, at its own
+        level, has one example more. Nothing is written. Raises InputError for what is no name, members
+        without a meaning, and a word that is known at another level or by enough examples."""
         tidied = tidy(name)
         unsayable = only(STOP_WORDS, phrase_key(name).split()) or split_phrases(name) != [tidied]
         if unsayable or len(tidied) > LONGEST_NAME or "," in tidied:
@@ -413,7 +417,9 @@ class QueryEngine:
         known = self.taught.get(phrase_key(name))
         if known is not None and len(known.vectors) >= MOST_SHOWN:
             raise InputError(f"'{tidied}' was shown {MOST_SHOWN} times, which is the most; remove it first")
-        at = self.regions.level_of(members) if level == "auto" else LEVELS.index(level)
+        if known is not None and level not in ("auto", LEVELS[known.level]):
+            raise InputError(f"'{tidied}' was taught at level {LEVELS[known.level]}; teach it there again")
+        at = self._level(members, level) if known is None else known.level
         word = shown(self.word_space, self.field, self.regions, tidied, members, at)
         if known is not None:
             vectors = np.concatenate([known.vectors, word.vectors])
@@ -423,9 +429,12 @@ class QueryEngine:
 
     def like(self, members: Array, level: LevelChoice = "auto") -> QueryResult:
         """Everything that is like `members` (N,) bool, they too: `teach` and `run`, but nothing is kept."""
-        at = self.regions.level_of(members) if level == "auto" else LEVELS.index(level)
+        at = self._level(members, level)
         word = shown(self.word_space, self.field, self.regions, "more like this", members, at)
         return self._by_showing(word, "auto")
+
+    def _level(self, members: Array, level: LevelChoice) -> int:
+        return self.regions.level_of(members) if level == "auto" else LEVELS.index(level)
 
     def _by_showing(self, word: TaughtWord, level: LevelChoice) -> QueryResult:
         return by_showing(word, self.word_space, self.regions, self.scene.gaussians.means, level)

@@ -111,6 +111,8 @@ def test_an_example_more_is_found_too():
     word = engine.teach("Both!", members(9, 24))
     assert len(word.vectors) == len(word.rivals) == 2
     assert set(np.flatnonzero(engine.run("both").members) // EACH) == {3, 9}
+    with pytest.raises(InputError, match="taught at level whole"):
+        engine.teach("both", members(3, 24), "part")
     for _ in range(MOST_SHOWN - 2):
         engine.teach("both", members(3, 24))
     with pytest.raises(InputError, match="remove it first"):
