@@ -38,7 +38,7 @@ from langsplat_core.query.answers import QueryResult, peak_pixel
 from langsplat_core.query.compose import Number, check_phrase, count_things, joined, run_phrase
 from langsplat_core.query.describe import Describer, Entry, Words, look_at_pixel
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, no_field
-from langsplat_core.query.grammar import Atom, atoms
+from langsplat_core.query.grammar import Atom, heads
 from langsplat_core.query.instances import Instance, hull
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.selection import grow, of_rows, shrink
@@ -151,13 +151,13 @@ class QueryScene:
 
     def _ask(
         self, engine: QueryEngine, text: str, camera: Camera | None
-    ) -> tuple[QueryResult, str | None, str]:
+    ) -> tuple[QueryResult, str | None, tuple[str, ...]]:
         """The answer, how the phrase was read where it has structure, and the words of what is asked for."""
         if self._plainly:
-            return engine.run(text, self.level), None, text
+            return engine.run(text, self.level), None, (text,)
         composed = run_phrase(engine, text, self.level, camera)
         simple = isinstance(composed.tree, Atom)
-        return composed.answer, None if simple else composed.reading, atoms(composed.tree)[0].text
+        return composed.answer, None if simple else composed.reading, heads(composed.tree)
 
 
 class _Explainer:
@@ -174,10 +174,12 @@ class _Explainer:
             self._photographs = kept_photographs(*place, progress)
         self._rasterizer, self._sheets = load_rasterizer("cpu"), list[Array]()
 
-    def __call__(self, engine: QueryEngine, answer: QueryResult, phrase: str) -> dict[str, Any] | None:
+    def __call__(
+        self, engine: QueryEngine, answer: QueryResult, phrases: tuple[str, ...]
+    ) -> dict[str, Any] | None:
         """The evidence of an answer, ready for JSON; it is drawn too."""
         with TerminalProgress() as progress:
-            found = find_evidence(engine, answer, phrase, self._features, self._rasterizer, progress)
+            found = find_evidence(engine, answer, phrases, self._features, self._rasterizer, progress)
         if found is None:
             return None
         low, high = found.interval
@@ -186,6 +188,7 @@ class _Explainer:
             "node": found.node,
             "for": len(found.votes),
             "against": len(found.others),
+            "fitting": found.fitting,
             "share": found.share,
             "interval": [low, high],
             "rows": [asdict(vote) | {"agrees": vote.agrees} for vote in (*found.votes, *found.others)],
@@ -206,9 +209,8 @@ class _Explainer:
 def _tally(evidence: dict[str, Any]) -> str:
     low, high = (100 * edge for edge in evidence["interval"])
     seen = evidence["for"] + evidence["against"]
-    return (
-        f"outlined in {evidence['for']} of {seen} photographs that show it (90 %: {low:.0f} to {high:.0f} %)"
-    )
+    share = f"outlined in {evidence['for']} of {seen} photographs that show it"
+    return f"{share} (90 %: {low:.0f} to {high:.0f} %), {evidence['fitting']} of these fit the phrase"
 
 
 def _reasons(evidence: dict[str, Any] | None = None) -> list[str]:

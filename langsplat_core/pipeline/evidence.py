@@ -68,6 +68,11 @@ class Evidence:
         return (1 + len(self.votes)) / (2 + len(self.votes) + len(self.others))
 
     @property
+    def fitting(self) -> int:
+        """Count of the votes for the answer whose mask fits the phrase better than by chance."""
+        return sum(vote.fit is not None and vote.fit > 0 for vote in self.votes)
+
+    @property
     def interval(self) -> tuple[float, float]:
         """The 5 % and 95 % quantiles of the same distribution."""
         low, high = betaincinv(1 + len(self.votes), 1 + len(self.others), TAILS)
@@ -77,18 +82,21 @@ class Evidence:
 def find_evidence(
     engine: QueryEngine,
     answer: QueryResult,
-    phrase: str,
+    phrases: Sequence[str],
     features: Sequence[ImageFeatures],
     rasterizer: Rasterizer,
     progress: Progress = silent,
 ) -> Evidence | None:
     """Evidence of the best region of `answer`; None where no region answers.
 
-    features: of the scene's cameras. Raises FormatError for features of another scene.
+    phrases: masks are compared with the one that fits the region best; features: of the scene's cameras.
+    Raises FormatError for features of another scene.
     """
     scene, found = engine.scene, _best_region(engine, answer)
     if found is None:
         return None
+    place = answer.level, found[1]
+    phrase = max(phrases, key=lambda one: float(engine.relevancy(engine.text_vector(one))[place].mean()))
     text, votes = engine.text_vector(phrase), []
     for view, camera in enumerate(scene.cameras):
         progress(STAGE, view / len(scene.cameras))
@@ -102,6 +110,7 @@ def find_evidence(
         shown = _shown(scene, view, found[1], rasterizer)
         if shown.sum() >= SHOWN:
             votes.append(_vote(engine, text, view, seen, shown))
+    progress(STAGE, 1.0)
     agreeing = sorted((vote for vote in votes if vote.agrees), key=lambda vote: -(vote.fit or 0.0))
     others = sorted((vote for vote in votes if not vote.agrees), key=lambda vote: -vote.pixels)
     return Evidence(phrase, *found, tuple(agreeing), tuple(others))
@@ -208,6 +217,7 @@ SIDE, GAP, LINE = 200, 10, 16  # px: of a thumbnail, between them, from line to 
 AROUND = 0.3  # of what is outlined, shown around it
 LEAST = 48  # px of the photograph that a thumbnail shows at least
 PAPER, INK, MASK, ANSWER = (255, 255, 255), (30, 30, 30), (255, 210, 0), (0, 200, 255)
+LEGEND = "yellow: the mask that overlaps most; blue: the answer as rendered"
 
 
 def draw_evidence(
@@ -228,6 +238,7 @@ def draw_evidence(
     sheet = Image.new("RGB", (GAP + FEW * (SIDE + GAP), 3 * LINE + len(kept) * step), PAPER)
     brush, font = ImageDraw.Draw(sheet), ImageFont.load_default(13)
     brush.text((GAP, GAP), heading, INK, ImageFont.load_default(16))
+    brush.text((sheet.width - GAP, 2 * LINE), LEGEND, INK, font, anchor="ra")
     for row, (title, votes) in enumerate(kept.items()):
         top = 3 * LINE + row * step
         brush.text((GAP, top), title, INK, font)
@@ -247,11 +258,20 @@ def _thumbnail(photograph: Array, mask: Array, shown: Array) -> Image.Image:
     """The square of a photograph around mask and answer, with both outlined."""
     rows, columns = np.nonzero(mask | shown)
     low, high = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1
-    side = max(int((1 + 2 * AROUND) * (high - low).max()), LEAST)
-    left, top = ((low + high - side) // 2).tolist()
-    box = left, top, left + side, top + side  # what is outside of the photograph is black
-    image = np.array(Image.fromarray(photograph).crop(box).resize((SIDE, SIDE), Image.Resampling.BICUBIC))
+    size = np.array([photograph.shape[1], photograph.shape[0]])
+    side = min(max(int((1 + 2 * AROUND) * (high - low).max()), LEAST), int(size.max()))
+    corner = (low + high - side) // 2
+    # Within the photograph, or, of a side that is longer than it, with as much beyond it at both ends.
+    corner = np.where(side > size, (size - side) // 2, corner.clip(0, (size - side).clip(0)))
+    left, top = corner.tolist()
+    box = left, top, left + side, top + side
+    image = np.array(_cut(photograph, box, Image.Resampling.BICUBIC))
+    image[~np.asarray(_cut(np.ones(mask.shape, bool), box, Image.Resampling.NEAREST))] = PAPER
     for region, colour in ((shown, ANSWER), (mask, MASK)):
-        inside = np.asarray(Image.fromarray(region).crop(box).resize((SIDE, SIDE), Image.Resampling.NEAREST))
+        inside = np.asarray(_cut(region, box, Image.Resampling.NEAREST))
         image[inside & ~ndimage.binary_erosion(inside, iterations=2, border_value=1)] = colour
     return Image.fromarray(image)
+
+
+def _cut(image: Array, box: tuple[int, int, int, int], how: Image.Resampling) -> Image.Image:
+    return Image.fromarray(image).crop(box).resize((SIDE, SIDE), how)
