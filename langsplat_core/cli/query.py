@@ -182,21 +182,19 @@ class _Explainer:
             found = find_evidence(engine, answer, phrases, self._features, self._rasterizer, progress)
         if found is None:
             return None
-        low, high = found.interval
-        plain = {
+        source = engine.scene, self._features, self._photographs, self._rasterizer
+        self._sheets.append(draw_evidence(found, answer, *source))
+        return {
+            "summary": str(found),
             "phrase": found.phrase,
             "node": found.node,
             "for": len(found.votes),
             "against": len(found.others),
             "fitting": found.fitting,
             "share": found.share,
-            "interval": [low, high],
+            "interval": list(found.interval),
             "rows": [asdict(vote) | {"agrees": vote.agrees} for vote in (*found.votes, *found.others)],
         }
-        heading = f"{answer.phrase}: {answer.verdict}, {LEVELS[answer.level]}; {_tally(plain)}"
-        source = engine.scene, self._features, self._photographs, self._rasterizer
-        self._sheets.append(draw_evidence(found, heading, *source))
-        return plain
 
     def write(self) -> None:
         """Write the sheets one below the other."""
@@ -206,20 +204,13 @@ class _Explainer:
             Image.fromarray(np.concatenate(self._sheets)).save(temporary, "PNG")
 
 
-def _tally(evidence: dict[str, Any]) -> str:
-    low, high = (100 * edge for edge in evidence["interval"])
-    seen = evidence["for"] + evidence["against"]
-    share = f"outlined in {evidence['for']} of {seen} photographs that show it"
-    return f"{share} (90 %: {low:.0f} to {high:.0f} %), {evidence['fitting']} of these fit the phrase"
-
-
 def _reasons(evidence: dict[str, Any] | None = None) -> list[str]:
     if evidence is None:
         return []
     votes = [row for row in evidence["rows"] if row["agrees"]]
     ends = [] if not votes else [("best", votes[0]), ("worst", votes[-1])]
     said = [f"{name} {row['photograph']}, fit {row['fit']:+.2f}" for name, row in ends]
-    return [f"  why: {'; '.join([_tally(evidence), *said])}"]
+    return [f"  why: {'; '.join([evidence['summary'], *said])}"]
 
 
 def _once(load: LoadEncoder) -> LoadEncoder:

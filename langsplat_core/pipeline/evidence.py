@@ -24,7 +24,7 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.protocol import Rasterizer
-from langsplat_core.scene import NO_NODE, Scene
+from langsplat_core.scene import LEVELS, NO_NODE, Scene
 from langsplat_core.scene.tree import SMALLEST
 from langsplat_core.semantics.relevancy import relevancy_of
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures
@@ -77,6 +77,12 @@ class Evidence:
         """The 5 % and 95 % quantiles of the same distribution."""
         low, high = betaincinv(1 + len(self.votes), 1 + len(self.others), TAILS)
         return float(low), float(high)
+
+    def __str__(self) -> str:
+        low, high = (100 * edge for edge in self.interval)
+        seen = len(self.votes) + len(self.others)
+        share = f"outlined in {len(self.votes)} of {seen} photographs that show it"
+        return f"{share} (90 %: {low:.0f} to {high:.0f} %), {self.fitting} of these fit the phrase"
 
 
 def find_evidence(
@@ -222,7 +228,7 @@ LEGEND = "yellow: the mask that overlaps most; blue: the answer as rendered"
 
 def draw_evidence(
     evidence: Evidence,
-    heading: str,
+    answer: QueryResult,
     scene: Scene,
     features: Sequence[ImageFeatures],
     photographs: Mapping[str, Array],
@@ -237,6 +243,7 @@ def draw_evidence(
     step = SIDE + 5 * LINE
     sheet = Image.new("RGB", (GAP + FEW * (SIDE + GAP), 3 * LINE + len(kept) * step), PAPER)
     brush, font = ImageDraw.Draw(sheet), ImageFont.load_default(13)
+    heading = f"{answer.phrase}: {answer.verdict}, {LEVELS[answer.level]}; {evidence}"
     brush.text((GAP, GAP), heading, INK, ImageFont.load_default(16))
     brush.text((sheet.width - GAP, 2 * LINE), LEGEND, INK, font, anchor="ra")
     for row, (title, votes) in enumerate(kept.items()):

@@ -12,7 +12,6 @@ from langsplat_core.cli import query
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.errors import FormatError, InputError
-from langsplat_core.io.scenes import save_scene
 from langsplat_core.pipeline.evidence import (
     Evidence,
     draw_evidence,
@@ -20,14 +19,13 @@ from langsplat_core.pipeline.evidence import (
     kept_features,
     kept_photographs,
 )
-from langsplat_core.pipeline.report import work_folder
 from langsplat_core.pipeline.train import train_scene
 from langsplat_core.query.compose import run_phrase
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Scene
-from langsplat_core.semantics.store import FeatureStore, ImageFeatures
-from tests.support.fakes import DIM, PER_BLOB, FakeEncoder, axis, blob_scene, cameras
+from langsplat_core.semantics.store import ImageFeatures
+from tests.support.fakes import DIM, PER_BLOB, FakeEncoder, as_trained, axis, blob_scene, cameras
 from tests.support.tiny_room import tiny_room, tiny_settings
 
 VIEWS = 8
@@ -155,13 +153,14 @@ def test_features_of_another_scene_are_refused(engine, features, wrong):
         find_evidence(engine, engine.run("mug"), ["mug"], [other] * VIEWS, load_rasterizer("cpu"))
 
 
-def test_the_sheet_outlines_masks_in_their_photographs(evidence, scene, features):
+def test_the_sheet_outlines_masks_in_their_photographs(evidence, engine, scene, features):
+    answer = engine.run("mug")
     grey = {camera.name: np.full((120, 160, 3), 128, np.uint8) for camera in scene.cameras}
-    sheet = draw_evidence(evidence, "mug", scene, features, grey, load_rasterizer("cpu"))
+    sheet = draw_evidence(evidence, answer, scene, features, grey, load_rasterizer("cpu"))
     yellow, blue = ((sheet == colour).all(-1) for colour in ((255, 210, 0), (0, 200, 255)))
     assert yellow.sum() > 1000
     assert blue.sum() > 200  # of the merged one and the blank one, whose masks lie elsewhere
-    few = draw_evidence(replace(evidence, others=()), "mug", scene, features, grey, load_rasterizer("cpu"))
+    few = draw_evidence(replace(evidence, others=()), answer, scene, features, grey, load_rasterizer("cpu"))
     assert few.shape[0] < sheet.shape[0]
 
 
@@ -177,19 +176,7 @@ def trained(tmp_path, monkeypatch, scene, features):
     """The blobs as if they had been trained, "a.ply", with photographs in "photographs"."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(query, "load_text_encoder", lambda name: FakeEncoder())
-    save_scene(tmp_path / "a.ply", scene)
-    work = work_folder(tmp_path / "a.ply")
-    store, frames = FeatureStore(work / "features"), []
-    (tmp_path / "photographs").mkdir()
-    for camera, seen in zip(scene.cameras, features, strict=True):
-        store.save(camera.name, seen)
-        Image.new("RGB", (160, 120), (90, 90, 90)).save(tmp_path / "photographs" / f"{camera.name}.png")
-        pose = np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1, -1, 1])
-        frames.append({"file_path": f"{camera.name}.png", "transform_matrix": pose.tolist()})
-    one = scene.cameras[0]
-    lens = {"fl_x": one.fx, "fl_y": one.fy, "cx": one.cx, "cy": one.cy, "w": one.width, "h": one.height}
-    (tmp_path / "photographs" / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
-    (work / "report.json").write_text(json.dumps({"dataset": str(tmp_path / "photographs")}))
+    as_trained(tmp_path / "a.ply", scene, features)
     return tmp_path
 
 
