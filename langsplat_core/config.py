@@ -378,7 +378,7 @@ class CompactConfig:
     phrases: tuple[str, ...] = ()  # asked before and after, beside those in the scene's phrasebook
 
 
-Display = Literal["rgb", "latent", "relevancy", "segmentation", "depth", "alpha"]
+Display = Literal["rgb", "latent", "tree", "relevancy", "segmentation", "depth", "alpha"]
 ColourMap = Literal["turbo", "viridis", "cividis", "magma", "grey"]
 LevelChoice = Literal["auto", "subpart", "part", "whole"]
 

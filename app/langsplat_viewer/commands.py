@@ -158,7 +158,10 @@ COMMANDS: tuple[Command, ...] = (
     _export("save the selection as points", "selection", as_points=True),
     _export("save the rest", "rest"),
     _export("save the scene without what was deleted", "edited"),
-    *(Command(_name(button), _show(button), (str(key),), "View") for key, button in enumerate(BUTTONS, 1)),
+    *(
+        Command(_name(button), _show(button), (str(key),) if key < 10 else (), "View")
+        for key, button in enumerate(BUTTONS, 1)
+    ),
     Command("say what is under the cursor", viewpoint.toggle_pointing, ("I",), "View"),
     Command("compare two displays", settings.toggle_wipe, ("V",), "View"),
     Command("three levels side by side", settings.toggle_levels, menu="View"),

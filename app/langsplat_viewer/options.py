@@ -182,7 +182,7 @@ def check_display(scene: Scene, display: Display, queries: tuple[str, ...]) -> N
 
 
 def latent_level(level: LevelChoice) -> int:
-    """Index into `scene.LEVELS` of the latents that the display "latent" shows; auto is the whole."""
+    """Index into `scene.LEVELS` of what the displays "latent" and "tree" show; auto is the whole."""
     return LEVELS.index("whole" if level == "auto" else level)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import ColourMap, Display, PictureConfig
 from langsplat_core.io.hostile import opened
-from langsplat_core.scene import LanguageField
+from langsplat_core.scene import NO_NODE, LanguageField
 
 # Turbo colour map: polynomial fit published by A. Mikhailov, Google (2019), coefficients by channel.
 _TURBO_COEFFICIENTS = np.array(
@@ -178,6 +178,23 @@ def latent_colours(field: LanguageField) -> Array:
     colours = field.codec.colours(flat, seen.reshape(-1).astype(np.float64)).reshape(*seen.shape, 3)
     _LATENT[field] = np.where(seen[..., None], colours, np.float32(0.5)).astype(np.float32)
     return _LATENT[field]
+
+
+GOLDEN = 0.6180339887  # steps of so much around the circle of hues keep neighbours in number apart
+UNLIKE = 0.35, 0.6, 0.85  # brightnesses that nodes of one hue are told apart by
+
+
+def nodes(subject: Subject) -> Array | None:
+    """(N, 3) colours of the tree's nodes at a level, each its own; grey where there is none. None for a scene
+    that keeps no tree."""
+    if subject.language is None or subject.language.tree is None or subject.level is None:
+        return None
+    found, of = np.unique(subject.language.tree.at(subject.level), return_inverse=True)
+    hue = (np.arange(len(found)) * GOLDEN)[:, None] + np.array([0, 1 / 3, 2 / 3])
+    tint = np.clip(np.abs(6 * (hue % 1) - 3) - 1, 0, 1)  # saturated red, green and blue of a hue
+    light = np.array(UNLIKE)[np.arange(len(found)) // 3 % 3, None]
+    colours = np.where(found[:, None] == NO_NODE, 0.5, light * (0.25 + 0.75 * tint) / 0.85)
+    return np.asarray(colours.astype(np.float32)[of.reshape(-1)])
 
 
 # From channels to an image.
@@ -359,6 +376,16 @@ _ROWS = (
         _latent,
         "vec4(sums.rgb / share + uncovered, c.a)",
         latents,
+        is_colour=True,
+        by_level=True,
+        needs_field=True,
+    ),
+    DisplayRow(
+        "tree",
+        "Tree",
+        _latent,
+        "vec4(sums.rgb / share + uncovered, c.a)",
+        nodes,
         is_colour=True,
         by_level=True,
         needs_field=True,

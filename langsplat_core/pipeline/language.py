@@ -42,7 +42,7 @@ from langsplat_core.scene import (
 from langsplat_core.scene.codec import KINDS
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.scene.surface import build_surface
-from langsplat_core.scene.tree import build_tree, tree_of_wholes
+from langsplat_core.scene.tree import build_tree
 from langsplat_core.semantics.encoder import Encoder, PhraseEncoder
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.semantics.vocabulary import everyday_vectors
@@ -179,15 +179,15 @@ class _Stages:
             return self._processes.once(
                 lambda: build_tree(surface(), field.codec, field.latents, field.known)
             )
-        path = self._work / f"{stage_key('nodes', 1, *self._inputs, self._lift, self._config.codec)}.npz"
+        path = self._work / f"{stage_key('nodes', 2, *self._inputs, self._lift, self._config.codec)}.npz"
         if not path.exists():
             self._mask_weights()  # everyone's work
 
         def make() -> Tree:
             self._progress("building the tree", 0.5)
             counts, mask_weights = [len(vectors) for vectors in self._vectors], self._mask_weights()[0]
-            wholes = tree_of_wholes(find_things(mask_weights, counts))
-            tree = build_tree(surface(), field.codec, field.latents, field.known, wholes)
+            things = np.stack([find_things(mask_weights, counts, level) for level in range(len(LEVELS))])
+            tree = build_tree(surface(), field.codec, field.latents, field.known, things)
             return replace(tree, votes=count_votes(tree, mask_weights, counts))
 
         return self._processes.once(lambda: kept(path, make, _pack_tree, _unpack_tree))

@@ -208,7 +208,9 @@ class QueryEngine:
         field = self.field
         if field.tree is not None and field.tree.complete:
             return field.tree
-        return build_tree(self.surface, field.codec, field.latents, field.known, field.tree)
+        things = None if field.tree is None else field.tree.things()
+        tree = build_tree(self.surface, field.codec, field.latents, field.known, things)
+        return tree if things is None else tree.voted_by(things)
 
     @cached_property
     def regions(self) -> Regions:

@@ -3,8 +3,8 @@
 Gaussians vary, things do not: an answer made of whole nodes has the borders of the things and no speckles,
 and its peak is a mean over a patch instead of one lucky Gaussian. Nodes are patches of the surface that mean
 the same at a level, by the criterion of Felzenszwalb and Huttenlocher (2004): two patches merge where the
-step between their meanings is no larger than the steps within either. Wholes are found first, then parts
-within each, then subparts within these. What masks of many photographs say is one thing stays one whole: the
+step between their meanings is no larger than the steps within either. Wholes are found first, parts within
+each, then subparts within these. What masks of many photographs say is one stays one, at each level: the
 encoder may see its front and its back differently.
 """
 
@@ -109,6 +109,23 @@ class Tree:
                 found[parent] = np.union1d(found[parent], found[node])
         return found
 
+    def things(self) -> Array:
+        """(3, N) int32 nodes of each level that masks voted for, see `build_tree`."""
+        levels = np.append(self.levels, LEVEL_COUNT)
+        voted = [self.voted(level) for level in range(LEVEL_COUNT)]
+        return np.stack([np.where(levels[row] == level, row, NO_NODE) for level, row in enumerate(voted)])
+
+    def voted_by(self, things: Array) -> "Tree":
+        """The tree with a vote for each node that is mostly of `things`, see `build_tree`: of scenes that do
+        not know how many photographs said so."""
+        votes = np.zeros((self.count, 2), np.uint16)
+        for level, row in enumerate(things):
+            at = self.at(level)
+            inside = at != NO_NODE
+            shares = np.bincount(at[inside], row[inside] != NO_NODE, self.count)
+            votes[2 * shares > np.bincount(at[inside], minlength=self.count), 0] = 1
+        return replace(self, votes=votes)
+
     def take(self, rows: Array) -> "Tree":
         """The tree of the Gaussians at `rows` (indices or a boolean mask); its nodes keep their numbers."""
         return replace(self, leaves=self.leaves[rows])
@@ -124,55 +141,48 @@ def tree_of_wholes(things: Array) -> Tree:
 
 
 def build_tree(
-    surface: Surface, codec: Codec, latents: Array, known: Array, wholes: Tree | None = None
+    surface: Surface, codec: Codec, latents: Array, known: Array, things: Array | None = None
 ) -> Tree:
-    """The tree of a scene. latents: (3, N, d); known: (3, N) bool; wholes: what masks say of whole things,
-    whose votes are kept."""
-    things = None if wholes is None else wholes.at(LEVEL_COUNT - 1)[surface.rows]
-    above: Array | None = None  # (M,) node of the level above
+    """The tree of a scene, without votes.
+
+    latents: (3, N, d); known: (3, N) bool; things: (3, N) int32 number, from 0, of what masks of many
+    photographs say is one, at each level, NO_NODE for none.
+    """
+    above = np.zeros(len(surface.rows), np.int32)  # node of the level above
     of: list[Array] = []
     for level in range(LEVEL_COUNT - 1, -1, -1):
-        above = _divided(
-            surface, codec, latents[level, surface.rows], known[level, surface.rows], above, things
-        )
+        own = latents[level, surface.rows], known[level, surface.rows]
+        told = np.full(len(surface.rows), NO_NODE) if things is None else things[level, surface.rows]
+        above = _divided(surface, codec, *own, above, told)
         of.insert(0, above)
-        things = None
     counts = [int(row.max(initial=-1)) + 1 for row in of]
     firsts = np.cumsum([0, *counts])
     parents = np.full(firsts[-1], NO_NODE, np.int32)
     for level in range(LEVEL_COUNT - 1):
         parents[firsts[level] + of[level]] = firsts[level + 1] + of[level + 1]
-    votes = np.zeros((firsts[-1], 2), np.uint16)
-    if wholes is not None:
-        told = wholes.at(LEVEL_COUNT - 1)[surface.rows]
-        inside = told != NO_NODE
-        owner = np.full(counts[-1], NO_NODE)
-        owner[of[-1][inside]] = told[inside]
-        votes[firsts[-2] :][owner != NO_NODE] = wholes.votes[owner[owner != NO_NODE]]
     leaves = np.full(len(surface.anchors), NO_NODE, np.int32)
     near = surface.anchors >= 0
     leaves[near] = of[0][surface.anchors[near]]
-    return Tree(leaves, parents, np.repeat(np.arange(LEVEL_COUNT, dtype=np.uint8), counts), votes)
+    levels = np.repeat(np.arange(LEVEL_COUNT, dtype=np.uint8), counts)
+    return Tree(leaves, parents, levels, np.zeros((len(levels), 2), np.uint16))
 
 
 def _divided(
-    surface: Surface, codec: Codec, latents: Array, known: Array, above: Array | None, things: Array | None
+    surface: Surface, codec: Codec, latents: Array, known: Array, above: Array, things: Array
 ) -> Array:
     """(M,) int32 number, from 0, of the patch of each Gaussian at one level, within those of the level
-    `above`; or, at the coarsest, along the borders of `things` (M,)."""
+    `above` (M,) and along the borders of `things` (M,)."""
     a, b = surface.ends
     steps = _steps(codec, latents, known, a, b)
     # Between two Gaussians drawn by chance, on average: what is far in this encoder's space.
     typical = codec.spread(latents[known]) if known.any() else 1.0
-    if things is not None:
-        told = (things[a] != NO_NODE) & (things[b] != NO_NODE)
-        steps = np.where(told, np.where(things[a] == things[b], 0, steps + BORDER * typical), steps)
+    told = (things[a] != NO_NODE) & (things[b] != NO_NODE)
+    steps = np.where(told, np.where(things[a] == things[b], 0, steps + BORDER * typical), steps)
     ranks = np.round(steps * STEPS).astype(np.uint16)
     order = np.argsort(ranks, kind="stable").astype(np.int32)
-    if above is not None:
-        order = order[above[a[order]] == above[b[order]]]
+    order = order[above[a[order]] == above[b[order]]]
     of = divide(surface, steps, order, SCALE * typical, SMALLEST)
-    return of if things is None else _united(of, things, surface.weights)
+    return _united(of, things, above, surface.weights)
 
 
 def _steps(codec: Codec, latents: Array, known: Array, a: Array, b: Array) -> Array:
@@ -182,14 +192,15 @@ def _steps(codec: Codec, latents: Array, known: Array, a: Array, b: Array) -> Ar
     return np.asarray(np.where(both, steps, np.where(neither, 0.0, UNKNOWN)).clip(0, UNKNOWN))
 
 
-def _united(of: Array, things: Array, weights: Array) -> Array:
-    """(M,) patches, those of one thing joined, wherever they are: half hidden, it is still one. A patch is of
-    the thing that most of it is."""
+def _united(of: Array, things: Array, above: Array, weights: Array) -> Array:
+    """(M,) patches, those of one thing and one node `above` joined, wherever they are: half hidden, it is
+    still one. A patch is of the thing that most of it is."""
     count, size = int(of.max(initial=-1)) + 1, int(things.max(initial=NO_NODE)) + 2
     place, row = np.unique(of.astype(np.int64) * size + things + 1, return_inverse=True)
     shares = np.bincount(row, weights, len(place))
     order = np.lexsort((shares, place // size))  # of each patch the largest share last
-    thing = np.full(count, NO_NODE)
+    thing, within = np.full(count, NO_NODE), np.zeros(count, np.int64)
     thing[place[order] // size] = place[order] % size - 1
-    joined = np.where(thing == NO_NODE, size + np.arange(count), thing)
+    within[of] = above
+    joined = np.where(thing == NO_NODE, -1 - np.arange(count), within * size + thing)
     return np.unique(joined[of], return_inverse=True)[1].astype(np.int32).reshape(-1)

@@ -24,11 +24,13 @@ from langsplat_core.display.displays import (
     mapped,
     member_ranges,
     members,
+    nodes,
     painted,
     relevancies,
 )
 from langsplat_core.scene import LanguageField, LinearCodec
-from tests.support.scenes import random_answer
+from tests.support.file_samples import random_field
+from tests.support.scenes import chain_of_levels, random_answer
 
 PICTURE = PictureConfig()
 HEAT = PictureConfig(display="relevancy", heat_opacity=1.0)
@@ -39,7 +41,7 @@ WEAK, ABSENT = replace(FOUND, verdict="weak match"), replace(FOUND, verdict="not
 
 def channels(display: Display = "rgb", value: float = 0.9, alpha: float = 1.0) -> Channels:
     """A grey image; `value` is that of the further channel."""
-    count = 3 if display == "latent" else 1
+    count = 3 if display in ("latent", "tree") else 1
     extra = None if DISPLAYS[display].channel is None else np.full((4, 5, count), value * alpha)
     return Channels(np.full((4, 5, 3), 0.5 * alpha), np.full((4, 5), alpha), extra)
 
@@ -163,7 +165,7 @@ def test_a_transparent_picture_over_its_background_is_the_opaque_one(display):
         assert clear.shape == (4, 5, 4)
         share = clear[..., 3:]
         over = clear[..., :3] * share + (1 - share) * picture.background
-        if display in ("rgb", "latent", "depth", "alpha") or alpha == 1:
+        if display in ("rgb", "latent", "tree", "depth", "alpha") or alpha == 1:
             np.testing.assert_allclose(over, compose(shown, picture, RANGES) / 255, atol=0.01)
         if display not in ("alpha", "depth"):
             np.testing.assert_allclose(share, alpha, atol=0.003)
@@ -188,3 +190,15 @@ def test_latent_colours_for_any_dimension(d):
     assert colours.max() <= 1
     assert (colours[:, 10] == 0.5).all()
     assert np.ptp(colours[:, :10]) > 0.5
+
+
+def test_nodes_have_colours_of_their_own_and_what_is_in_none_is_grey():
+    field = random_field(6)
+    assert nodes(Subject(6, field, level=0)) is None  # keeps no tree
+    tree = chain_of_levels(np.array([0, 1, 1, -1, 2, 0], np.int32))
+    colours = nodes(Subject(6, replace(field, tree=tree), level=1))
+    assert (colours.shape, colours.dtype) == ((6, 3), np.float32)
+    assert colours[3].tolist() == [0.5] * 3
+    assert ((colours >= 0) & (colours <= 1)).all()
+    same = (colours[:, None] == colours[None]).all(-1)
+    assert (same == (tree.leaves[:, None] == tree.leaves[None])).all()

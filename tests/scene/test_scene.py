@@ -266,3 +266,14 @@ def test_a_field_has_a_leaf_for_every_gaussian_and_taking_rows_takes_them():
         np.testing.assert_array_equal(taken.tree.at(1), TREE.at(1)[rows])
         assert len(taken) == len(LEAVES[rows])
     assert random_field(N).take(np.arange(3)).tree is None
+
+
+def test_things_are_nodes_of_their_level_that_masks_voted_for():
+    voted = replace(TREE, votes=np.array([[1, 0], [0, 3], [2, 0], [0, 0], [4, 1], [0, 0], [1, 1]], np.uint16))
+    assert voted.things().tolist() == [
+        [0, 0, NO_NODE, NO_NODE, NO_NODE, NO_NODE, NO_NODE],
+        [4, 4, 4, NO_NODE, NO_NODE, NO_NODE, NO_NODE],
+        [6, 6, 6, NO_NODE, NO_NODE, NO_NODE, NO_NODE],
+    ]
+    again = replace(TREE, votes=np.zeros((7, 2), np.uint16)).voted_by(voted.things())
+    assert again.votes[:, 0].tolist() == [1, 0, 0, 0, 1, 0, 1]

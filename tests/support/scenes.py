@@ -136,12 +136,19 @@ def tree_of(scene: Scene, surface: Surface | None = None) -> Tree:
     field = scene.language
     assert field is not None
     surface = surface or build_surface(scene.gaussians)
-    return build_tree(surface, field.codec, field.latents, field.known, field.tree)
+    things = None if field.tree is None else field.tree.things()
+    return build_tree(surface, field.codec, field.latents, field.known, things)
 
 
 def regions_of(scene: Scene, surface: Surface | None = None) -> Regions:
     """The regions of the tree that is built of a scene."""
     return build_regions(tree_of(scene, surface), surface_weights(scene.gaussians))
+
+
+def with_tree(scene: Scene) -> Scene:
+    """`scene` with its tree in its field."""
+    assert scene.language is not None
+    return replace(scene, language=replace(scene.language, tree=tree_of(scene)))
 
 
 def chain_of_levels(leaves: Array) -> Tree:

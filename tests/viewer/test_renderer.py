@@ -31,10 +31,10 @@ from langsplat_viewer.rendering.renderer import (
 from langsplat_viewer.rendering.request import RenderKey, RenderRequest, Split, plain_request
 from tests.support.fakes import blob_scene
 from tests.support.fixtures import gl_state
-from tests.support.scenes import random_answer, random_camera, random_gaussians, random_scene
+from tests.support.scenes import random_answer, random_camera, random_gaussians, random_scene, with_tree
 
 COUNT = 150
-SCENE = random_scene(COUNT)
+SCENE = with_tree(random_scene(COUNT))
 CAMERA = random_camera(1, distance=2.0)
 ANSWERS = (random_answer(COUNT, 2), random_answer(COUNT, 7, heat_range=(0.5, 0.6)), random_answer(COUNT, 11))
 PICTURE = PictureConfig(background=(0.2, 0.5, 0.9))
@@ -63,7 +63,7 @@ def random_channels(seed: int, display: str, queries: int) -> Channels:
     """Alpha from 0 to 1 with many pixels about the gate, colours beyond 1, depths beyond the range."""
     rng = np.random.default_rng(seed)
     alpha = np.clip(rng.normal(0.4, 0.35, size=(40, 50)), 0, 1).astype(np.float32)
-    count = {"latent": 3, "relevancy": queries, "segmentation": queries}.get(display, 1)
+    count = {"latent": 3, "tree": 3, "relevancy": queries, "segmentation": queries}.get(display, 1)
     rgb = rng.uniform(size=(40, 50, 3)).astype(np.float32) * alpha[..., None] * 1.3
     if DISPLAYS[display].channel is None:
         return Channels(rgb, alpha)

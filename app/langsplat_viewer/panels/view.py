@@ -24,7 +24,7 @@ BACKDROPS = {"Black": 0.0, "Grey": 0.5, "White": 1.0}
 
 def draw_display(viewer: Viewer) -> None:
     """Draw the panel "Display"."""
-    for _, group in groupby(DISPLAYS.values(), lambda row: (row.needs_field, row.needs_query)):
+    for _, group in groupby(DISPLAYS.values(), lambda row: row.name if row.by_level else row.needs_query):
         _display_line(viewer, tuple(group))
     _compared(viewer)
     picture = viewer.state.picture

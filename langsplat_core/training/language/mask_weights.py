@@ -260,13 +260,12 @@ THING_SAMPLE = (
 )
 
 
-def find_things(mask_weights: MaskWeights, counts: Sequence[int]) -> Array:
-    """(N,) int32 number of the thing that each Gaussian belongs to, at the coarsest level; NO_NODE where no
-    mask of that level shows it.
+def find_things(mask_weights: MaskWeights, counts: Sequence[int], level: int = len(LEVELS) - 1) -> Array:
+    """(N,) int32 number of the thing that each Gaussian belongs to, at a level, by default the coarsest;
+    NO_NODE where no mask of that level shows it.
 
     counts: number of masks of each view. Things are numbered from the largest, by number of Gaussians.
     """
-    level = len(LEVELS) - 1
     numbers = masks_of_things(mask_weights, counts, level)
     size = int(numbers.max(initial=-1)) + 1
     of_mask = np.split(np.where(numbers >= 0, numbers, size).astype(np.int32), np.cumsum(counts)[:-1])
