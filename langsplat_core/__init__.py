@@ -10,6 +10,7 @@ from langsplat_core.errors import optional_imports
 
 if TYPE_CHECKING:
     from langsplat_core.config import TrainConfig
+    from langsplat_core.io.language import Words, read_words, write_words
     from langsplat_core.io.scenes import load_scene, save_scene
     from langsplat_core.pipeline.train import train_scene
     from langsplat_core.query.answers import QueryResult
@@ -24,6 +25,9 @@ __version__ = "0.1.0"
 _HOMES = {
     "load_scene": "langsplat_core.io.scenes",
     "save_scene": "langsplat_core.io.scenes",
+    "Words": "langsplat_core.io.language",
+    "read_words": "langsplat_core.io.language",
+    "write_words": "langsplat_core.io.language",
     "render": "langsplat_core.raster.render",
     "Rendering": "langsplat_core.raster.render",
     "load_rasterizer": "langsplat_core.raster",
@@ -51,14 +55,17 @@ __all__ = [
     "Rendering",
     "Scene",
     "TrainConfig",
+    "Words",
     "load_lifting_rasterizer",
     "load_rasterizer",
     "load_scene",
     "load_text_encoder",
     "look_at",
+    "read_words",
     "render",
     "save_scene",
     "train_scene",
+    "write_words",
 ]
 
 

@@ -85,6 +85,11 @@ def _three_levels(ctx: Any, window: Window) -> None:
     settings.toggle_levels(window.viewer)
 
 
+def _tree(ctx: Any, window: Window) -> None:
+    settings.set_display(window.viewer, "tree")
+    settings.toggle_levels(window.viewer)
+
+
 def _overlays(ctx: Any, window: Window) -> None:
     viewer = window.viewer
     settings.open_panel(viewer, "Overlays")
@@ -135,8 +140,8 @@ def _timed(ctx: Any, window: Window) -> None:
 def _trained(ctx: Any, window: Window) -> None:
     """A room of a dozen photographs, in the midst of its training."""
     viewer, folder = window.viewer, Path(tempfile.mkdtemp())
-    room = ["demo", "dataset", "--seed", "3", "--views", "12", "--out", str(folder / "room")]
-    subprocess.run([sys.executable, "-m", "langsplat_core", *room], check=True)
+    room = ["dataset", "--seed", "3", "--views", "12", "--out", str(folder / "room")]
+    subprocess.run([sys.executable, "-m", "assets.making", *room], check=True)
     settings.open_panel(viewer, "Train")
     training.fill_in(viewer, TrainingForm(str(folder / "room"), str(folder / "room.ply"), "quick"))
     training.start_training(viewer)
@@ -162,6 +167,7 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
     "palette.jpg": (QUERIES, _palette),
     "structure.jpg": (("toy, not teddy bear", "keyboard of the laptop"), _with_structure),
     "three_levels.jpg": (("teddy bear",), _three_levels),
+    "tree.jpg": (("teddy bear",), _tree),
     "light.jpg": (("teddy bear",), _light),
     "overlays.jpg": (("teddy bear",), _overlays),
     "orthographic.jpg": (("teddy bear",), _orthographic),

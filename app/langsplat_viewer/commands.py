@@ -147,6 +147,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("select nothing", selecting.select_none, ("Ctrl+D", "Ctrl+Shift+A"), "Select", is_edit=True),
     Command("invert the selection", selecting.invert_selection, ("Ctrl+I",), "Select", is_edit=True),
     Command("select what the search found", selecting.select_query, menu="Select"),
+    Command("select everything like the selection", selecting.select_alike, menu="Select"),
     Command("grow the selection", selecting.grow_selection, menu="Select"),
     Command("shrink the selection", selecting.shrink_selection, menu="Select"),
     *(_tool(tool) for tool in TOOLS),

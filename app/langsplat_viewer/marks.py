@@ -129,6 +129,7 @@ class Selection:
     brush: float = 0.03  # radius, of the image's height, within BRUSHES
     reach: float = 0.05  # how far growing goes, and how large a sphere of one click is; of the scene's radius
     only_visible: bool = True  # rectangle, lasso and brush leave out what lies behind something
+    name: str = ""  # that is being typed for what is selected
     stroke: Stroke | None = None
     leaving: Leaving | None = None
     writing: Future[Any] | None = None  # what was last written, or is being written

@@ -22,6 +22,7 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
         "query": "query.QueryScene",
         "describe": "query.Describe",
         "select": "query.Select",
+        "teach": "teach.Teach",
         "scale": "scenes.Scale",
         "convert": "scenes.Convert",
         "compact": "scenes.Compact",

@@ -15,10 +15,12 @@ from rich.table import Table
 
 from langsplat_core.arrays import Array
 from langsplat_core.cli.run import OutFile, OutputConsole
+from langsplat_core.cli.teach import Level, camera_of, pixel_in, pointed, searchable
 from langsplat_core.config import Count, CountOrZero, LevelChoice, NotNegative, PictureConfig, Positive
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.scenes import check_writable, load_scene, save_scene
+from langsplat_core.io.language import read_words
+from langsplat_core.io.scenes import check_writable, save_scene
 from langsplat_core.io.shapes import (
     MESH_SUFFIXES,
     POINT_SUFFIXES,
@@ -37,7 +39,7 @@ from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.answers import QueryResult, peak_pixel
 from langsplat_core.query.compose import Number, check_phrase, count_things, joined, run_phrase
 from langsplat_core.query.describe import Describer, Entry, Words, look_at_pixel
-from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder, no_field
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder
 from langsplat_core.query.grammar import Atom, heads
 from langsplat_core.query.instances import Instance, hull
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
@@ -49,6 +51,7 @@ from langsplat_core.semantics.encoders import load_text_encoder
 from langsplat_core.semantics.vocabulary import read_vocabulary
 
 PAPER_FILTER = 20  # px, mean filter before the peak is taken (paper, implementation details)
+NOT_DECODED = "--mode paper decodes pixels, and what was shown is compared with regions; leave it out"
 WIDTH = 118  # characters of a table that is not written to a terminal
 
 
@@ -58,9 +61,13 @@ class QueryScene:
 
     scene: tyro.conf.Positional[Path]
     """A trained scene, *.ply with its language field beside it."""
-    texts: tyro.conf.Positional[tuple[str, ...]]
+    texts: tyro.conf.Positional[tuple[str, ...]] = ()
     """Phrases, each in quotes if it has several words; "," and ";" separate them too. What cannot be asked
     is named on stderr, and the rest is answered; with nothing left the exit code is 2."""
+    like: Annotated[str, tyro.conf.arg(metavar="X,Y")] = ""
+    """Find more like what is in this pixel of the --camera, at --level; auto: like the whole thing."""
+    taught: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Your own words, as `langsplat teach --into FILE` writes them, beside those of the scene."""
     level: LevelChoice = "auto"
     """Semantic level; auto takes the one that answers best, for a thing rather the whole."""
     whole: bool = False
@@ -86,16 +93,19 @@ class QueryScene:
     """Print JSON, lengths in world units."""
 
     def run(self) -> None:
-        scene = _searchable(self.scene)
-        if not self.texts:
-            raise InputError("no phrase given; for example: langsplat query scene.ply 'red cup'")
+        scene = searchable(self.scene)
+        self._check()
         explain = _Explainer(self, scene) if self.why is not None else None
-        camera = _camera(scene, self.camera) if scene.cameras else None
-        engine = QueryEngine(scene, _once(load_text_encoder), encoder_id=self.encoder)
+        camera = camera_of(scene, self.camera) if scene.cameras else None
+        engine = _engine(scene, _once(load_text_encoder), self.encoder, self.taught)
         unit = _unit(scene, self.scale)
+        found = [self._ask(engine, text, camera) for text in self._askable(engine, camera)]
+        if self.like:
+            level = "whole" if self.level == "auto" else self.level
+            alike = engine.like(pointed(engine, self.camera, self.like, "--like", level), level)
+            found.append((replace(alike, phrase=f"like {self.like}"), None, ()))
         answers, tables = [], []
-        for text in self._askable(engine, camera):
-            result, understood, of = self._ask(engine, text, camera)
+        for result, understood, of in found:
             answer = _answer(result, scene, engine, camera, self.mode) | {"reading": understood}
             things = engine.instances(result, self.instances) if result.found else ()
             number = count_things(engine, result) if result.found else Number(0, 0, 0)
@@ -125,6 +135,14 @@ class QueryScene:
             )
         print(f"answers: {engine.basis.long}")
 
+    def _check(self) -> None:
+        if not self.texts and not self.like:
+            raise InputError("no phrase given; for example: langsplat query scene.ply 'red cup'")
+        if self.like and self.mode == "paper":
+            raise InputError(NOT_DECODED)
+        if self.like and self.why is not None:
+            raise InputError("--why is of phrases; give what --like finds a name with `langsplat teach`")
+
     def _askable(self, engine: QueryEngine, camera: Camera | None) -> list[str]:
         """The phrases that can be asked; the others are named on stderr with the reason, before anything is
         searched. Raises that reason where none is left."""
@@ -132,14 +150,16 @@ class QueryScene:
         reasons: dict[str, list[str]] = {}  # why not -> these phrases
         for phrase in dict.fromkeys(phrases):
             try:
-                if self._plainly:
+                if self.mode == "paper" and engine.is_taught(phrase):
+                    raise InputError(NOT_DECODED)
+                if self._plainly and not engine.is_taught(phrase):
                     engine.text_vector(phrase)
                 else:
                     check_phrase(engine, phrase, camera)
             except LangSplatError as error:
                 reasons.setdefault(str(error), []).append(phrase)
         unasked = {phrase for same in reasons.values() for phrase in same}
-        if unasked.issuperset(phrases):
+        if phrases and unasked.issuperset(phrases):
             raise InputError("; ".join(reasons))
         for reason, same in reasons.items():
             print(f"langsplat: not asked: {', '.join(map(repr, same))}: {reason}", file=sys.stderr)
@@ -229,10 +249,12 @@ def _once(load: LoadEncoder) -> LoadEncoder:
     return load_once
 
 
-def _camera(scene: Scene, index: int) -> Camera:
-    if not 0 <= index < len(scene.cameras):
-        raise InputError(f"--camera {index}: the scene has cameras 0 to {len(scene.cameras) - 1}")
-    return scene.cameras[index]
+def _engine(scene: Scene, load: LoadEncoder, encoder: str, taught: Path | None) -> QueryEngine:
+    words = None if taught is None else read_words(taught)
+    try:
+        return QueryEngine(scene, load, encoder_id=encoder, words=words)
+    except EncoderError as error:
+        raise EncoderError(f"{taught}: {error}") from None
 
 
 def _answer(
@@ -302,14 +324,16 @@ class Select:
     """Metres per world unit, in place of what the scene says."""
     encoder: str = ""
     """Text encoder folder or hub id, in place of the one the scene names."""
+    taught: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Your own words, as `langsplat teach --into FILE` writes them, beside those of the scene."""
     json: bool = False
     """Print JSON, lengths in world units."""
 
     def run(self) -> None:
         self._check()
-        scene = _searchable(self.scene)
+        scene = searchable(self.scene)
         unit = _unit(scene, self.scale)
-        engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
+        engine = _engine(scene, load_text_encoder, self.encoder, self.taught)
         answers = [_found(engine, text, self.level) for text in self.texts]
         answer = answers[0] if len(answers) == 1 else joined(answers, all_needed=True)
         found = engine.instances(answer)
@@ -389,8 +413,6 @@ class Select:
 
 # `langsplat describe`.
 
-Level = Literal["subpart", "part", "whole"]
-
 
 @dataclass(frozen=True)
 class Describe:
@@ -424,7 +446,7 @@ class Describe:
 
     def run(self) -> None:
         phrases = None if self.vocabulary is None else read_vocabulary(self.vocabulary)
-        scene = _searchable(self.scene)
+        scene = searchable(self.scene)
         self._check(scene)
         with TerminalProgress() as progress:
             engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
@@ -479,12 +501,7 @@ class Describe:
             return
         if not scene.cameras:
             raise InputError(f"{self.scene}: has no cameras, so --pixel means nothing; ask by --gaussian")
-        camera, (column, row) = _camera(scene, self.camera), self.pixel
-        if not (0 <= column < camera.width and 0 <= row < camera.height):
-            raise InputError(
-                f"--pixel {column} {row}: camera {self.camera} has columns 0 to {camera.width - 1} and rows "
-                f"0 to {camera.height - 1}"
-            )
+        pixel_in(scene, self.camera, self.pixel, "--pixel {} {}".format(*self.pixel))
 
     def _described(self, describer: Describer, progress: Progress) -> dict[str, Any]:
         """The inventory, or the words of the place that is asked for, ready for JSON."""
@@ -686,14 +703,6 @@ def _chosen(found: Sequence[Instance], numbers: Sequence[int]) -> Sequence[Insta
         if not 1 <= number <= len(found):
             raise InputError(f"--instance {number}: there are {len(found)}, numbered from 1")
     return [found[number - 1] for number in numbers] or found
-
-
-def _searchable(path: Path) -> Scene:
-    """The scene of a file; InputError where it has no language field."""
-    scene = load_scene(path)
-    if scene.language is None:
-        raise InputError(f"{path}: {no_field(scene)}")
-    return scene
 
 
 def _basis(engine: QueryEngine) -> dict[str, Any]:

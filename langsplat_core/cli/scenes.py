@@ -97,6 +97,7 @@ def _lines(a: SceneSummary) -> list[tuple[str, str]]:
         ("language field", f"codec {field.codec} of {field.size}; {field.bytes / 1e6:.2f} MB in memory"),
         ("text encoder", f"{field.encoder}, {field.vector_dim} numbers"),
         ("phrasebook", f"{field.phrases} phrases"),
+        ("taught words", ", ".join(field.taught) or "none"),
         ("observed", observed),
         (
             "tree",

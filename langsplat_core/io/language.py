@@ -19,6 +19,9 @@ executed). Version 3, for N Gaussians, CLIP vectors of D numbers, P phrases and 
     everyday         float    (V, D)     unit text vectors of phrases most of which name nothing in the scene;
                                          absent where the encoder knows too few
     phrasebook       float    (P, D)     unit text vectors of `phrases`; absent when P = 0
+    taught           float    (T, D)     examples of the taught words, one word after the other: unit vectors,
+                                         see `scene.TaughtWord`; absent where none was taught
+    taught.rivals    float    (T,)       of each example, in [0, 1]
     codec.*          float               of a codebook vectors (K, D) and colours (K, 3); basis (d, D) of a
                                          linear codec; of an autoencoder
                                          {encoder,decoder}.{layer}.{weight,bias}
@@ -37,6 +40,11 @@ executed). Version 3, for N Gaussians, CLIP vectors of D numbers, P phrases and 
     found            relevancy from which a phrase counts as present, decimal
     odds             JSON: a list of numbers for each of the three `Odds` of `scene.Calibration`; absent where
                      the encoder has none ("calibration" of older files is of another scale, and is not read)
+    taught           JSON: of each taught word a list of its name, its level (0, 1, 2) and the number of its
+                     examples; absent where there are none
+
+A user's own words are a file of this kind too: `taught`, `taught.rivals` and `canonical`, with the metadata
+format "langsplat words", version "1", encoder and taught.
 
 "float" is float16 where every number of the tensor is one, else float32: a saved scene answers exactly
 like the one in memory. With a codebook as `langsplat train` makes it that is 22 bytes per Gaussian, 6 of
@@ -51,6 +59,7 @@ float32, with `means` (N, 3) in place of positions and corners, no temperature a
 import hashlib
 import json
 import struct
+from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -72,12 +81,15 @@ from langsplat_core.scene import (
     LanguageField,
     Odds,
     Reading,
+    TaughtWord,
     Tree,
     codec_from_tensors,
 )
+from langsplat_core.scene.language import MOST_SHOWN
 from langsplat_core.scene.tree import tree_of_wholes
 
 FORMAT, VERSION = "langsplat", "3"
+WORDS_FORMAT, WORDS_VERSION = "langsplat words", "1"
 CODEC = "codec."
 WAYS = len(fields(Calibration))  # to look for something, each with odds of its own
 _KEYS = {
@@ -88,7 +100,6 @@ _KEYS = {
     ),
 }
 _KEYS["3"] = _KEYS["2"]
-_FLOATS = {"1": ("F32",), "2": ("F32", "F16"), "3": ("F32", "F16")}
 _WHOLE = {  # types of tensors that hold no floating-point numbers
     "codes": ("U16",),
     "things": ("U16",),
@@ -113,15 +124,23 @@ class Stored:
 def read_stored(path: Path) -> Stored:
     """Everything in the sidecar `path`. Raises InputError when it cannot be opened and FormatError when it
     breaks a rule of the layout."""
+    tensors, metadata = _read_tensors(path, _check_metadata)
+    return _assemble(tensors, metadata, path)
+
+
+def _read_tensors(
+    path: Path, check: Callable[[dict[str, str], Path], None]
+) -> tuple[dict[str, Array], dict[str, str]]:
+    """Tensors, floats as float32, and metadata, which `check` raises FormatError for."""
     open_for_reading(path)[0].close()  # the same messages for a missing file as everywhere
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
-            _check_metadata(metadata, path)
+            check(metadata, path)
             tensors = {}
             for name in file.keys():  # noqa: SIM118 (not a dictionary)
                 kind = file.get_slice(name).get_dtype()
-                wanted = _WHOLE.get(name, _FLOATS[metadata["version"]])
+                wanted = _WHOLE.get(name, ("F32", "F16"))
                 if kind not in wanted:
                     raise FormatError(
                         f"{path}: tensor {quoted(name)} is {kind}; expected {' or '.join(wanted)}"
@@ -130,7 +149,10 @@ def read_stored(path: Path) -> Stored:
                 tensors[name] = tensor if name in _WHOLE else tensor.astype(np.float32)
     except SafetensorError as error:
         raise FormatError(f"{path}: not a whole safetensors file ({printable_line(error, 80)})") from None
-    return _assemble(tensors, metadata, path)
+    for name, tensor in tensors.items():
+        if name != "means" and not np.isfinite(tensor).all():
+            raise FormatError(f"{path}: tensor {quoted(name)} holds numbers that are not finite")
+    return tensors, metadata
 
 
 def _check_metadata(metadata: dict[str, str], path: Path) -> None:
@@ -154,9 +176,6 @@ def _assemble(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -
     for name in ("confidence", "canonical", *places):
         if name not in tensors:
             raise FormatError(f"{path}: tensor {name!r} is missing")
-    for name, tensor in tensors.items():
-        if name != "means" and not np.isfinite(tensor).all():
-            raise FormatError(f"{path}: tensor {quoted(name)} holds numbers that are not finite")
     try:
         field = _field(tensors, metadata, path)
         means, precision = _means(tensors, len(field))
@@ -192,6 +211,7 @@ def _field(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> L
         reading,
         _tree(tensors),
         tensors.get("everyday"),
+        _taught(tensors, metadata, path),
     )
 
 
@@ -202,6 +222,35 @@ def _tree(tensors: dict[str, Array]) -> Tree | None:
         return None
     leaves, parents = _signed(tensors["tree.leaves"]), _signed(tensors["tree.parents"])
     return Tree(leaves, parents, tensors["tree.levels"], tensors["tree.votes"])
+
+
+def _taught(tensors: dict[str, Array], metadata: dict[str, str], path: Path) -> tuple[TaughtWord, ...]:
+    if "taught" not in metadata:
+        return ()
+    stated = parse_json(metadata["taught"].encode(), path)
+    if not isinstance(stated, list) or not all(map(_stated, stated)):
+        raise FormatError(f"{path}: the header's 'taught' is not a list of names, levels and counts")
+    vectors, rivals = tensors["taught"], tensors["taught.rivals"]
+    check_array("taught", vectors, (sum(count for *_, count in stated), "D"))
+    check_array("taught.rivals", rivals, (len(vectors),))
+    ends = np.cumsum([count for *_, count in stated])[:-1]
+    every = zip(stated, np.split(vectors, ends), np.split(rivals, ends), strict=True)
+    return tuple(TaughtWord(name, level, *examples) for (name, level, _), *examples in every)
+
+
+def _stated(word: object) -> bool:
+    kinds = list(map(type, word)) if isinstance(word, list) else []
+    return kinds == [str, int, int] and 0 < word[2] <= MOST_SHOWN  # type: ignore[index]
+
+
+def _taught_parts(words: Sequence[TaughtWord]) -> tuple[dict[str, Array], dict[str, str]]:
+    """Tensors and metadata of taught words; nothing for none."""
+    if not words:
+        return {}, {}
+    stated = [[word.name, word.level, len(word.vectors)] for word in words]
+    vectors, rivals = np.concatenate([w.vectors for w in words]), np.concatenate([w.rivals for w in words])
+    texts = {"taught": json.dumps(stated, ensure_ascii=False)}
+    return {"taught": _narrow(vectors), "taught.rivals": _narrow(rivals)}, texts
 
 
 def _signed(numbers: Array) -> Array:
@@ -285,7 +334,8 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
         **({"phrasebook": np.stack(list(field.phrasebook.values()))} if field.phrasebook else {}),
         **{CODEC + name: tensor for name, tensor in field.codec.tensors().items()},
     }
-    tensors = {name: _narrow(tensor) for name, tensor in floats.items()}
+    taught, stated = _taught_parts(field.taught)
+    tensors = {name: _narrow(tensor) for name, tensor in floats.items()} | taught
     tensors |= {"positions": positions, "corners": corners}
     if field.tree is not None:
         few = field.tree.count < np.iinfo(np.uint16).max
@@ -304,12 +354,58 @@ def write_language(path: Path | str, field: LanguageField, means: Array) -> None
         "phrases": json.dumps(list(field.phrasebook), ensure_ascii=False),
         "temperature": repr(field.reading.temperature),
         "found": repr(field.reading.found),
+        **stated,
     }
     if field.reading.calibration is not None:
         odds = astuple(field.reading.calibration)
         metadata["odds"] = json.dumps([[float(n) for n in numbers] for numbers in odds])
     with atomic_path(path) as temporary:
         save_tensors(temporary, tensors, metadata)
+
+
+@dataclass(frozen=True, eq=False)
+class Words:
+    """Taught words of one encoder."""
+
+    encoder_id: str
+    canonical: Array  # (4, D) float32 unit text vectors of its canonical phrases, by which it is recognised
+    words: tuple[TaughtWord, ...]
+
+
+def write_words(path: Path | str, words: Words) -> None:
+    """Write taught words as a file of a user's own, atomically."""
+    taught, stated = _taught_parts(words.words)
+    metadata = {"format": WORDS_FORMAT, "version": WORDS_VERSION, "encoder": words.encoder_id, **stated}
+    with atomic_path(path) as temporary:
+        save_tensors(temporary, {"canonical": words.canonical, **taught}, metadata)
+
+
+def read_words(path: Path | str) -> Words:
+    """The taught words in a file of `write_words`. Raises as `read_stored` does."""
+    path = Path(path)
+    tensors, metadata = _read_tensors(path, _check_words)
+    try:
+        canonical, words = tensors["canonical"], _taught(tensors, metadata, path)
+        dims = check_array("canonical", canonical, (len(CANONICAL_PHRASES), "D"))
+        for word in words:
+            check_array("taught", word.vectors, ("T", "D"), {"D": dims["D"]})
+    except KeyError as missing:
+        raise FormatError(f"{path}: tensor {missing} is missing") from None
+    except (ValueError, TypeError) as error:
+        raise FormatError(f"{path}: {error}") from None
+    if len({word.key for word in words}) != len(words):
+        raise FormatError(f"{path}: two taught words have one name")
+    return Words(metadata["encoder"], canonical, words)
+
+
+def _check_words(metadata: dict[str, str], path: Path) -> None:
+    if metadata.get("format") != WORDS_FORMAT or "encoder" not in metadata:
+        raise FormatError(f"{path}: a safetensors file, but not of taught words; `langsplat teach` makes one")
+    if metadata.get("version") != WORDS_VERSION:
+        raise FormatError(
+            f"{path}: version {quoted(metadata.get('version'))} of taught words; this program reads "
+            f"{WORDS_VERSION}, update it"
+        )
 
 
 def _narrow(tensor: Array) -> Array:

@@ -27,6 +27,7 @@ class LanguageSummary:
     encoder: str
     vector_dim: int
     phrases: int
+    taught: tuple[str, ...]  # names of taught words
     observed: Mapping[str, float]  # level -> share of the Gaussians with a meaning
     nodes: tuple[int, ...] | None  # of the tree, at each level; None: the scene keeps no tree
     calibrated: bool  # whether answers come with a probability
@@ -155,6 +156,7 @@ def _language(field: LanguageField) -> LanguageSummary:
         encoder=field.encoder_id,
         vector_dim=field.codec.vector_dim,
         phrases=len(field.phrasebook),
+        taught=tuple(word.name for word in field.taught),
         observed=observed,
         nodes=None
         if field.tree is None

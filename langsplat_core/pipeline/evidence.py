@@ -26,7 +26,6 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.protocol import Rasterizer
 from langsplat_core.scene import LEVELS, NO_NODE, Scene
 from langsplat_core.scene.tree import SMALLEST
-from langsplat_core.semantics.relevancy import relevancy_of
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures
 from langsplat_core.training.language.tree import SHOWN, SOLID, VOTE
 
@@ -44,7 +43,7 @@ class Vote:
     mask: int  # row of the photograph's features; -1 where no mask touches the answer
     overlap: float  # intersection over union of the mask and the answer as rendered, in [0, 1]
     cosine: float | None  # of the mask's vector with the phrase; None without a mask
-    fit: float | None  # the same in spreads above chance, see `semantics.relevancy.Scale`
+    fit: float | None  # the same in spreads above chance, see `QueryEngine.compare`
 
     @property
     def agrees(self) -> bool:
@@ -101,21 +100,27 @@ def find_evidence(
     scene, found = engine.scene, _best_region(engine, answer)
     if found is None:
         return None
-    place = answer.level, found[1]
-    phrase = max(phrases, key=lambda one: float(engine.relevancy(engine.text_vector(one))[place].mean()))
-    text, votes = engine.text_vector(phrase), []
+    size, votes = engine.field.codec.vector_dim, []
+    phrase, place = phrases[0], (answer.level, found[1])
+    if len(phrases) > 1:
+        phrase = max(phrases, key=lambda one: float(engine.run(one).relevancy[place].mean()))
     for view, camera in enumerate(scene.cameras):
         progress(STAGE, view / len(scene.cameras))
         seen = features[view]
-        if seen.labels.shape[1:] != (camera.height, camera.width) or seen.vectors.shape[1:] != text.shape:
+        if seen.labels.shape[1:] != (camera.height, camera.width) or seen.vectors.shape[1] != size:
             raise FormatError(
                 f"the masks of {camera.name!r} are of another scene: {seen.labels.shape[2]}x"
                 f"{seen.labels.shape[1]} pixels and {seen.vectors.shape[1]} numbers, not {camera.width}x"
-                f"{camera.height} and {len(text)}; name this scene's own folder with --work"
+                f"{camera.height} and {size}; name this scene's own folder with --work"
             )
         shown = _shown(scene, view, found[1], rasterizer)
         if shown.sum() >= SHOWN:
-            votes.append(_vote(engine, text, view, seen, shown))
+            mask, overlap = _nearest(seen, shown)
+            cosine = fit = None
+            if mask >= 0:
+                cosines, fits = engine.compare(phrase, seen.vectors[[mask]], answer.level)
+                cosine, fit = float(cosines[0]), float(fits[0])
+            votes.append(Vote(view, camera.name, int(shown.sum()), mask, overlap, cosine, fit))
     progress(STAGE, 1.0)
     agreeing = sorted((vote for vote in votes if vote.agrees), key=lambda vote: -(vote.fit or 0.0))
     others = sorted((vote for vote in votes if not vote.agrees), key=lambda vote: -vote.pixels)
@@ -140,23 +145,17 @@ def _shown(scene: Scene, view: int, members: Array, rasterizer: Rasterizer) -> A
     return np.asarray(drawn.splat(members[:, None].astype(np.float32))[0][..., 0] > SOLID)
 
 
-def _vote(engine: QueryEngine, text: Array, view: int, seen: ImageFeatures, shown: Array) -> Vote:
+def _nearest(seen: ImageFeatures, shown: Array) -> tuple[int, float]:
+    """The mask, of any level, that overlaps most with `shown` (H, W), or -1, and its overlap."""
     count = len(seen.vectors)
     overlaps = np.zeros(count)
     for labels in seen.labels:
         shared = np.bincount(labels[shown & (labels >= 0)], minlength=count)
         areas = np.bincount(labels[labels >= 0], minlength=count)
         overlaps = np.maximum(overlaps, shared / (areas + shown.sum() - shared))
-    mask = int(overlaps.argmax()) if overlaps.any() else -1
-    cosine = fit = None
-    if mask >= 0:
-        vector = seen.vectors[mask]
-        cosine = float(vector @ text)
-        zero, rate = engine.scale.of(vector[None] @ engine.scale.texts.T)
-        fit = float(engine.scale.fit(relevancy_of(np.array([cosine]), zero, rate))[0])
-    overlap = float(overlaps[mask]) if mask >= 0 else 0.0
-    name = engine.scene.cameras[view].name
-    return Vote(view, name, int(shown.sum()), mask, overlap, cosine, fit)
+    if not overlaps.any():
+        return -1, 0.0
+    return int(overlaps.argmax()), float(overlaps.max())
 
 
 # What training kept beside a scene.

@@ -269,7 +269,7 @@ def by_regions(
     solid = np.where(values > np.float32(peak), 0, values)  # what is above the best is a crumb
     place = box = None
     if solid.max(initial=0) > 0:
-        place, box = _place_of(means[regions.counted(chosen, int(solid.argmax()))])
+        place, box = place_of(means[regions.counted(chosen, int(solid.argmax()))])
     return QueryResult(
         phrase=phrase,
         level=chosen,
@@ -323,7 +323,7 @@ def by_peak(
 MIDDLE = 16  # Gaussians around the middle of a region
 
 
-def _place_of(points: Array) -> tuple[Array, Array]:
+def place_of(points: Array) -> tuple[Array, Array]:
     """Place (3,), at what is nearest to the middle, and box (2, 3) of a region's (K, 3) points, K >= 1."""
     points = points.astype(np.float64)
     far = ((points - points.mean(0)) ** 2).sum(1)

@@ -404,7 +404,7 @@ def run_phrase(
     Raises InputError as `grammar.parse` does and where a viewpoint is needed, EncoderError as
     `QueryEngine.run`.
     """
-    tree = parse(text)
+    tree = parse(text, engine.taught)
     if not isinstance(tree, Atom):
         _check_viewpoint(tree, viewpoint)
         asking = _Asking(engine, viewpoint, progress)
@@ -425,11 +425,12 @@ def check_phrase(
 ) -> None:
     """Raise what `run_phrase` would, without searching: for a phrase that names nothing, unknown words, an
     encoder that cannot be loaded, a viewpoint that is needed. What was encoded for it is kept."""
-    tree = parse(text)
+    tree = parse(text, engine.taught)
     if not isinstance(tree, Atom):
         _check_viewpoint(tree, viewpoint)
     try:
-        engine.text_vectors([atom.text for atom in atoms(tree)], progress)
+        texts = [atom.text for atom in atoms(tree) if not engine.is_taught(atom.text)]
+        engine.text_vectors(texts, progress)
     except EncoderError:
         if phrase_key(text) not in engine.field.phrasebook:
             raise
@@ -485,7 +486,7 @@ class _Asking:
 
     def _thing(self, text: str, level: LevelChoice) -> QueryResult:
         """The answer to a phrase; a thing is looked for among wholes, unless it is a part, or fits none."""
-        if level != "auto" or named(text) != "thing":
+        if level != "auto" or named(text) != "thing" or self.engine.is_taught(text):
             return self._ask(text, level)
         whole = self._ask(text, "whole")
         return whole if whole.peak >= FLOOR else self._ask(text, "auto")
@@ -493,11 +494,11 @@ class _Asking:
     def _inside(self, part: Phrase, whole: Phrase, level: LevelChoice) -> QueryResult:
         thing = self.answer(whole)
         there = grown(self.surface, thing.members)
-        if not isinstance(part, Atom):
+        if not isinstance(part, Atom) or self.engine.is_taught(part.text):
             found = self.answer(part, level)
             return restricted(found, found.members & there, thing)
         asked = [self._ask(part.text, level)]
-        if isinstance(whole, Atom):
+        if isinstance(whole, Atom) and not self.engine.is_taught(whole.text):
             asked += self._if_known(f"{whole.text} {part.text}", level)
         return cut_inside(self.engine, asked, thing, there, level)
 

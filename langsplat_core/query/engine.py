@@ -11,7 +11,7 @@ import numpy as np
 from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.errors import EncoderError, InputError, UnknownWordError
-from langsplat_core.io.language import SUFFIX
+from langsplat_core.io.language import SUFFIX, Words
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.answers import (
     AnswerRule,
@@ -27,12 +27,13 @@ from langsplat_core.query.grammar import STOP_WORDS, check_names, only
 from langsplat_core.query.instances import Instance, find_instances
 from langsplat_core.query.lookup import Lookup, build_lookup
 from langsplat_core.query.regions import Regions, build_regions
-from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Calibration, LanguageField, Scene
-from langsplat_core.scene.language import phrase_key, tidy
+from langsplat_core.query.taught import WordSpace, build_word_space, by_showing, compared, shown
+from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Calibration, LanguageField, Scene, TaughtWord
+from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, phrase_key, split_phrases, tidy
 from langsplat_core.scene.surface import Surface, build_surface, surface_weights
 from langsplat_core.scene.tree import Tree, build_tree
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE
-from langsplat_core.semantics.relevancy import Scale
+from langsplat_core.semantics.relevancy import Scale, relevancy_of
 from langsplat_core.semantics.vocabulary import FEWEST, everyday_vectors
 
 BATCH = 256  # phrases that are encoded, and compared with codewords, at a time
@@ -86,11 +87,13 @@ class QueryEngine:
         encoder_id: str = "",
         exact: bool = False,
         rule: AnswerRule = "regions",
+        words: Words | None = None,
     ) -> None:
         """load_encoder: usually `semantics.encoders.load_text_encoder`; without one only the scene's own
         phrasebook can be asked. encoder_id: in place of the encoder that the scene names. exact: compare
         every latent instead of looking it up in a table, to measure the table by. rule: see `answers`;
-        "regions" becomes "peak" where neither scene nor encoder has everyday phrases to compare with."""
+        "regions" becomes "peak" where neither scene nor encoder has everyday phrases to compare with. words:
+        taught ones of the user, before those of the scene; EncoderError where they are of another encoder."""
         self.scene = scene
         self.exact = exact
         self._rule: AnswerRule = rule
@@ -102,6 +105,11 @@ class QueryEngine:
         self._encoder_checked = False
         self._canonical: Array | None = None  # (C, D) in place of the scene's own
         self.canonical_phrases: tuple[str, ...] = CANONICAL_PHRASES
+        taught = () if scene.language is None else scene.language.taught
+        if words is not None:
+            check_words(self.field, words)
+            taught += words.words
+        self.taught: dict[str, TaughtWord] = {word.key: word for word in taught}
 
     @property
     def field(self) -> LanguageField:
@@ -239,9 +247,9 @@ class QueryEngine:
         return bars(self.chance, [np.unique(row[row >= 0]) for row in everywhere])
 
     def unknown_words(self, phrase: str) -> tuple[str, ...]:
-        """Words for which `phrase` cannot be asked; none where the phrasebook has it. EncoderError as
-        `load_encoder` raises it."""
-        if phrase_key(phrase) in self.field.phrasebook:
+        """Words for which `phrase` cannot be asked; none where it was taught or the phrasebook has it.
+        EncoderError as `load_encoder` raises it."""
+        if self.is_taught(phrase) or phrase_key(phrase) in self.field.phrasebook:
             return ()
         return self.load_encoder().unknown_words(phrase_key(phrase))
 
@@ -321,7 +329,7 @@ class QueryEngine:
         canonical = np.asarray(encoder.encode_texts(list(CANONICAL_PHRASES)), np.float64)
         assert self.scene.language is not None
         own = self.scene.language.canonical
-        if canonical.shape != own.shape or ((canonical * own).sum(1) < SAME_ENCODER).any():
+        if not _same(canonical, own):
             raise EncoderError(
                 f"the scene was made with other weights of {self.field.encoder_id}; give those with "
                 "--encoder, or make the scene again"
@@ -333,8 +341,9 @@ class QueryEngine:
         return next(self._relevancies(vector[None]))
 
     def _relevancies(self, vectors: Array) -> Iterator[Array]:
-        for values in self._lookup.relevancies(vectors):
-            yield values.reshape(self.field.confidence.shape)
+        for start in range(0, len(vectors), BATCH):
+            for values in self._lookup.relevancies(vectors[start : start + BATCH]):
+                yield values.reshape(self.field.confidence.shape)
 
     def run(
         self,
@@ -343,9 +352,11 @@ class QueryEngine:
         progress: Progress = silent,
         vector: Array | None = None,
     ) -> QueryResult:
-        """Answer `phrase`. The level is chosen once for the scene, on raw relevancy, so that the image
-        does not flicker between levels as the camera moves. vector: (D,) unit, the phrase's own, where it is
-        at hand. Raises as `text_vector` does."""
+        """Answer `phrase`; a taught word by what was shown. The level is chosen once for the scene, on raw
+        relevancy, so that the image does not flicker between levels as the camera moves. vector: (D,) unit,
+        the phrase's own, where it is at hand. Raises as `text_vector` does."""
+        if vector is None and self.is_taught(phrase):
+            return self._by_showing(self.taught[phrase_key(phrase)], level)
         if vector is None:
             vector = self.text_vector(phrase, progress)
         progress(f"searching '{tidy(phrase)}'", 0.5)
@@ -357,12 +368,14 @@ class QueryEngine:
         """The answers of `run` to each of `phrases`, which are encoded and compared with the scene's meanings
         together. An answer keeps 17 bytes per Gaussian. Raises as `text_vector` does, before any is asked."""
         results: list[QueryResult] = []
-        vectors = self.text_vectors(phrases, progress)
-        for start in range(0, len(phrases), BATCH):
-            part = slice(start, start + BATCH)
-            for phrase, relevancy in zip(phrases[part], self._relevancies(vectors[part]), strict=True):
-                progress(f"searching '{tidy(phrase)}'", len(results) / len(phrases))
-                results.append(self._answer(tidy(phrase), relevancy, level))
+        plain = [phrase for phrase in phrases if not self.is_taught(phrase)]
+        relevancies = self._relevancies(self.text_vectors(plain, progress))
+        for phrase in phrases:
+            progress(f"searching '{tidy(phrase)}'", len(results) / len(phrases))
+            if self.is_taught(phrase):
+                results.append(self._by_showing(self.taught[phrase_key(phrase)], level))
+            else:
+                results.append(self._answer(tidy(phrase), next(relevancies), level))
         return results
 
     def _answer(self, phrase: str, relevancy: Array, level: LevelChoice) -> QueryResult:
@@ -380,12 +393,83 @@ class QueryEngine:
             level,
         )
 
+    @cached_property
+    def word_space(self) -> WordSpace:
+        """The scene's regions as taught words see them."""
+        return build_word_space(self.field, self.regions)
+
+    def is_taught(self, phrase: str) -> bool:
+        """Whether a phrase is a taught word, and is answered by what was shown."""
+        return phrase_key(phrase) in self.taught
+
+    def teach(self, name: str, members: Array, level: LevelChoice = "auto") -> TaughtWord:
+        """Learn `name` for what `members` (N,) bool mean at a level, by default the one with a region most
+        like them. It answers from now on, in place of any text; a word that is taught again, at its own
+        level, has one example more. Nothing is written. Raises InputError for what is no name, members
+        without a meaning, and a word that is known at another level or by enough examples."""
+        tidied = tidy(name)
+        unsayable = only(STOP_WORDS, phrase_key(name).split()) or split_phrases(name) != [tidied]
+        if unsayable or len(tidied) > LONGEST_NAME or "," in tidied:
+            raise InputError(
+                f"'{tidied[:LONGEST_NAME]}' cannot be a name; give one of at most {LONGEST_NAME} characters, "
+                "without commas and semicolons, such as 'grandma's vase'"
+            )
+        known = self.taught.get(phrase_key(name))
+        if known is not None and len(known.vectors) >= MOST_SHOWN:
+            raise InputError(f"'{tidied}' was shown {MOST_SHOWN} times, which is the most; remove it first")
+        if known is not None and level not in ("auto", LEVELS[known.level]):
+            raise InputError(f"'{tidied}' was taught at level {LEVELS[known.level]}; teach it there again")
+        at = self._level(members, level) if known is None else known.level
+        word = shown(self.word_space, self.field, self.regions, tidied, members, at)
+        if known is not None:
+            vectors = np.concatenate([known.vectors, word.vectors])
+            word = replace(known, vectors=vectors, rivals=np.append(known.rivals, word.rivals))
+        self.taught[word.key] = word
+        return word
+
+    def like(self, members: Array, level: LevelChoice = "auto") -> QueryResult:
+        """Everything that is like `members` (N,) bool, they too: `teach` and `run`, but nothing is kept."""
+        at = self._level(members, level)
+        word = shown(self.word_space, self.field, self.regions, "more like this", members, at)
+        return self._by_showing(word, "auto")
+
+    def _level(self, members: Array, level: LevelChoice) -> int:
+        return self.regions.level_of(members) if level == "auto" else LEVELS.index(level)
+
+    def _by_showing(self, word: TaughtWord, level: LevelChoice) -> QueryResult:
+        return by_showing(word, self.word_space, self.regions, self.scene.gaussians.means, level)
+
+    def compare(self, phrase: str, vectors: Array, level: int) -> tuple[Array, Array]:
+        """Cosines (M,) of a phrase with (M, D) unit vectors of images, and their fits, in spreads; of a
+        taught word at a level (index into LEVELS), see `taught.compared`. Raises as `text_vector` does."""
+        if self.is_taught(phrase):
+            return compared(self.taught[phrase_key(phrase)], self.word_space, vectors, level)
+        cosines = vectors @ self.text_vector(phrase)
+        zero, rate = self.scale.of(vectors @ self.scale.texts.T)
+        return cosines, self.scale.fit(relevancy_of(cosines, zero, rate))
+
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
         """The things among the members of an answer, best first, or only so many of them."""
         relevancy = result.relevancy[result.level]
         whole = len(LEVELS) - 1
         told = self.tree.voted(whole), result.level == whole
         return find_instances(self.surface, self.scene.gaussians, result.members, relevancy, at_most, *told)
+
+
+def check_words(field: LanguageField, words: Words) -> None:
+    """EncoderError unless taught words are of the encoder of a field, whatever its folder is called."""
+    if not _same(words.canonical, field.canonical):
+        raise EncoderError(
+            f"these words were taught with {words.encoder_id}, the scene was made with {field.encoder_id}; "
+            "teach them in a scene of that encoder"
+        )
+
+
+def _same(canonical: Array, own: Array) -> bool:
+    """Whether canonical vectors are of one encoder."""
+    return canonical.shape == own.shape and bool(
+        ((canonical.astype(np.float64) * own).sum(1) >= SAME_ENCODER).all()
+    )
 
 
 def _enough(everyday: Array | None) -> Array | None:

@@ -1,7 +1,7 @@
 """Phrases with structure, read as a tree of the phrases in them."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -279,15 +279,15 @@ _EXCLUSIONS = tuple(
 )
 
 
-def parse(text: str) -> Phrase:
-    """The tree of one query.
+def parse(text: str, names: Collection[str] = ()) -> Phrase:
+    """The tree of one query. names: keys of phrases that are one name, whatever words they have.
 
     Raises InputError where nothing is named, where something is only excluded ("not the cup"), and for a text
     beyond `MAX_CHARACTERS` or `MAX_ATOMS`.
     """
     if len(text) > MAX_CHARACTERS:
         raise InputError(f"a query of {len(text)} characters; use at most {MAX_CHARACTERS}")
-    tokens = tokens_of(text)
+    tokens = _with_names(tokens_of(text), names)
     words = [token for token in tokens if token != ","]
     if words and _exclusion_at(tokens, 0):
         raise InputError(
@@ -300,6 +300,19 @@ def parse(text: str) -> Phrase:
     if count > MAX_ATOMS:
         raise InputError(f"a query of {count} phrases; ask at most {MAX_ATOMS} at a time")
     return tree
+
+
+def _with_names(tokens: list[str], names: Collection[str]) -> list[str]:
+    """The tokens, those of a name as one with no-break spaces, the longest name first."""
+    at = 0
+    longest = max((len(name.split()) for name in names), default=0)
+    while at < len(tokens):
+        for count in range(longest, 1, -1):
+            if " ".join(tokens[at : at + count]).lower() in names:
+                tokens = [*tokens[:at], "\xa0".join(tokens[at : at + count]), *tokens[at + count :]]
+                break
+        at += 1
+    return tokens
 
 
 def _query(tokens: list[str]) -> Phrase:

@@ -54,6 +54,15 @@ class Regions:
         np.maximum.at(best, self.parents[level - 1], values[level - 1])
         return np.where(np.isfinite(best), best, own)
 
+    def level_of(self, members: Array) -> int:
+        """The level with the region that overlaps most with `members` (N,) bool; of equal ones the
+        coarsest."""
+        best = []
+        for of, sizes in zip(self.everywhere, self.sizes, strict=True):
+            hits = np.bincount(of[members & (of >= 0) & (self.weights > 0)], minlength=len(sizes))
+            best.append((hits / np.maximum(sizes + hits.sum() - hits, 1)).max(initial=0))
+        return int(np.flatnonzero(np.array(best) == max(best))[-1])
+
     def counted(self, level: int, region: int) -> Array:
         """(K,) the Gaussians of one region that count."""
         return np.flatnonzero((self.everywhere[level] == region) & (self.weights > 0))

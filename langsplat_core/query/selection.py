@@ -50,6 +50,14 @@ def at_point(surface: Surface, regions: Regions, level: int, point: Array) -> Ar
     return same
 
 
+def in_pixel(regions: Regions, level: int, rows: Array, weights: Array) -> Array:
+    """(N,) bool: the whole region, at a level, that paints most of a pixel, by the `rows` (M,) of Gaussians
+    in it and their blending weights. Nothing where no region does."""
+    of = regions.everywhere[level]
+    shares = np.bincount(of[rows] + 1, weights, 1)[1:]
+    return np.asarray(of == shares.argmax()) if shares.any() else np.zeros(len(of), bool)
+
+
 def grow(surface: Surface, selected: Array, distance: float) -> Array:
     """`selected` and all that lies within `distance` of it along the surface, world units."""
     if not 0 <= distance < float("inf"):

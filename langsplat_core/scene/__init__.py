@@ -17,6 +17,7 @@ from langsplat_core.scene.language import (
     LanguageField,
     Odds,
     Reading,
+    TaughtWord,
 )
 from langsplat_core.scene.scene import Scene
 from langsplat_core.scene.tree import NO_NODE, Tree
@@ -40,6 +41,7 @@ __all__ = [
     "Odds",
     "Reading",
     "Scene",
+    "TaughtWord",
     "Tree",
     "codec_from_tensors",
     "look_at",

@@ -129,6 +129,36 @@ class Reading:
 
 LEVELS = ("subpart", "part", "whole")  # index 0, 1, 2 wherever a level axis appears
 CANONICAL_PHRASES = ("object", "things", "stuff", "texture")  # LERF's negatives, used by LangSplat
+MOST_SHOWN = 8  # examples of a taught word; the more there are, the more is like one of them by chance
+LONGEST_NAME = 80  # characters
+
+
+@dataclass(frozen=True, eq=False)
+class TaughtWord:
+    """A word that was taught by showing examples of what it names, see `query.taught`."""
+
+    name: str  # as it is shown, see `tidy`
+    level: int  # index into LEVELS of what was shown
+    vectors: Array  # (T, D) float32 unit: the mean meaning of each example, less that of its scene
+    rivals: Array  # (T,) float32 in [0, 1]: cosine of different things in the scene of each example
+
+    def __post_init__(self) -> None:
+        dims = check_array("vectors", self.vectors, ("T", "D"), dtype=np.float32)
+        check_array("rivals", self.rivals, ("T",), dims, dtype=np.float32)
+        named = 0 < len(self.name) <= LONGEST_NAME and self.name == tidy(self.name) and "," not in self.name
+        if not (named and self.level in range(len(LEVELS)) and 0 < len(self.vectors) <= MOST_SHOWN):
+            raise ValueError(
+                f"taught word {self.name[:40]!r}: expected a name of 1 to {LONGEST_NAME} characters without "
+                f"quotes and commas, a level and 1 to {MOST_SHOWN} examples"
+            )
+        near_unit = abs(np.linalg.norm(self.vectors, axis=1) - 1) <= 1e-3
+        if not (near_unit.all() and ((self.rivals >= 0) & (self.rivals <= 1)).all()):
+            raise ValueError(f"taught word {self.name[:40]!r}: expected unit vectors and rivals in [0, 1]")
+
+    @property
+    def key(self) -> str:
+        """Key by which it is looked up."""
+        return phrase_key(self.name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +174,7 @@ class LanguageField:
     reading: Reading = field(default_factory=Reading)
     tree: Tree | None = None  # of N Gaussians; of wholes alone where nothing but these was kept
     everyday: Array | None = None  # (V, D) float32 unit vectors of phrases most of which name nothing here
+    taught: tuple[TaughtWord, ...] = ()  # no two of one key
 
     def __post_init__(self) -> None:
         d, big = self.codec.latent_dim, self.codec.vector_dim
@@ -157,6 +188,10 @@ class LanguageField:
             check_array("leaves", self.tree.leaves, ("N",), dims)
         if self.everyday is not None:
             check_array("everyday", self.everyday, ("V", big), dtype=np.float32)
+        for word in self.taught:
+            check_array(f"taught[{word.name!r}]", word.vectors, ("T", big))
+        if len({word.key for word in self.taught}) != len(self.taught):
+            raise ValueError("taught: two words have one name")
         known = {phrase_key(phrase): vector for phrase, vector in self.phrasebook.items()}
         object.__setattr__(self, "phrasebook", known)
         for phrase, vector in known.items():

@@ -1,4 +1,4 @@
-"""`python -m tests.benchmarks rooms|verdicts|phrases|votes|lifting|scale`: one report each."""
+"""`python -m tests.benchmarks rooms|verdicts|taught|phrases|votes|lifting|scale`: one report each."""
 
 import sys
 from typing import Union
@@ -8,6 +8,7 @@ from tests.benchmarks.lifting import Lifting
 from tests.benchmarks.phrases import Phrases
 from tests.benchmarks.rooms import Rooms
 from tests.benchmarks.scale import Scale
+from tests.benchmarks.taught import Taught
 from tests.benchmarks.verdicts import Verdicts
 from tests.benchmarks.votes import Votes
 
@@ -17,7 +18,7 @@ PROGRAM = "python -m tests.benchmarks"
 def parse(args: list[str]) -> Command:
     """The report that the words of a command line name; SystemExit as tyro raises it."""
     about = "Measure this project where the truth is known, and at large sizes."
-    known = (Rooms, Verdicts, Phrases, Votes, Lifting, Scale)
+    known = (Rooms, Verdicts, Taught, Phrases, Votes, Lifting, Scale)
     reports = tuple(with_codec(report, args) for report in known)
     command: Command = parsed(PROGRAM, Union[(*reports,)], args, about)
     return command

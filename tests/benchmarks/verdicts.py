@@ -228,10 +228,11 @@ def _score(row: Verdict) -> float:
 
 
 def _spreads(rooms: Sequence[tuple[float, ...]]) -> list[str]:
-    return [_spread(column[np.isfinite(column)]) for column in 100 * np.array(rooms).T]
+    return [spread(column[np.isfinite(column)]) for column in 100 * np.array(rooms).T]
 
 
-def _spread(values: Array) -> str:
+def spread(values: Array) -> str:
+    """Mean and standard deviation of percentages, as cells of tables have them."""
     if len(values) == 0:
         return "-"
     return f"{values.mean():.1f} +/- {values.std(ddof=1) if len(values) > 1 else 0:.1f}"

@@ -14,21 +14,39 @@ from safetensors.numpy import load_file, save_file
 from langsplat_core.arrays import Array
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.language import (
+    Words,
     means_checksum,
     pack_positions,
     position_step,
     read_language,
+    read_words,
     rematch_language,
     unpack_positions,
     write_language,
+    write_words,
 )
-from langsplat_core.scene import NO_NODE, Calibration, CodebookCodec, LanguageField, Odds, Reading, Tree
+from langsplat_core.scene import (
+    NO_NODE,
+    Calibration,
+    CodebookCodec,
+    LanguageField,
+    Odds,
+    Reading,
+    TaughtWord,
+    Tree,
+)
 from tests.support.comparing import assert_same_field
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_gaussians
 
 N = 60
 CALIBRATION = Calibration(Odds(-0.25, 18.548, 2.7, 0.62), Odds(0.5, 2.25, 15.5), Odds(0.75, -0.5, 9.25, 0.5))
+
+AXES = np.eye(3, 16, dtype=np.float32)
+TAUGHT = (
+    TaughtWord("Grandma's vase", 2, AXES[:2], np.array([0.25, 0.5], np.float32)),
+    TaughtWord("tür", 0, AXES[2:], np.ones(1, np.float32)),
+)
 
 
 def full_field(kind: str = "autoencoder", calibration: Calibration | None = CALIBRATION) -> LanguageField:
@@ -37,7 +55,8 @@ def full_field(kind: str = "autoencoder", calibration: Calibration | None = CALI
     parents = np.array([9, 9, 9, 10, 10, 10, 10, 10, 10, NO_NODE, NO_NODE], np.int32)
     levels = np.array([0] * 9 + [1, 2], np.uint8)
     tree = Tree(leaves, parents, levels, np.arange(22, dtype=np.uint16).reshape(11, 2))
-    return replace(random_field(N, kind), tree=tree, reading=Reading(11.7, 0.73, calibration))
+    made = replace(random_field(N, kind), tree=tree, reading=Reading(11.7, 0.73, calibration))
+    return replace(made, taught=TAUGHT)
 
 
 @pytest.fixture
@@ -138,6 +157,8 @@ def test_the_layout_is_the_documented_one(sidecar, means):
         ("canonical", "F32", [4, 16]),
         ("everyday", "F16", [60, 16]),
         ("phrasebook", "F32", [2, 16]),
+        ("taught", "F16", [3, 16]),
+        ("taught.rivals", "F16", [3]),
         ("codec.encoder.0.weight", "F32", [8, 16]),
     ):
         assert layout[name] == (kind, shape)
@@ -155,10 +176,46 @@ def test_the_layout_is_the_documented_one(sidecar, means):
         "phrases": '["red mug", "tür"]',
         "temperature": "11.7",
         "found": "0.73",
+        "taught": '[["Grandma\'s vase", 2, 2], ["tür", 0, 1]]',
     }
 
 
 LISTS = "not 3 lists of four numbers"
+EXAMPLES = "not a list of names, levels and counts"
+# Of taught words, in a scene and in a file of their own.
+MISTAUGHT: dict[str, tuple[Spoil, str]] = {
+    "taught words that are no JSON": (says(taught="[["), "not readable as JSON"),
+    **{
+        f"taught words {text}": (says(taught=text), EXAMPLES)
+        for text in (
+            '{"a": 1}',
+            "3",
+            '["a"]',
+            '[["a", 2]]',
+            '[["a", 2, 3.0]]',
+            '[["a", true, 3]]',
+            '[["a", 2, 0]]',
+            '[["a", 2, 9]]',
+            '[["a", 2, -1], ["b", 2, 4]]',
+            '[[["a"], 2, 3]]',
+        )
+    },
+    "too few examples": (says(taught='[["a", 2, 4]]'), r"taught: expected shape \(4, D\)"),
+    "too many examples": (says(taught='[["a", 2, 2]]'), r"taught: expected shape \(2, D\)"),
+    "no examples": (holds(taught=None), "tensor 'taught' is missing"),
+    "no rivals": (holds(**{"taught.rivals": None}), "tensor 'taught.rivals' is missing"),
+    "rivals of another shape": (declares("taught.rivals", shape=[1, 3]), "taught.rivals: expected shape"),
+    "a word at no level": (says(taught='[["a", 3, 3]]'), "expected a name"),
+    "a word without a name": (says(taught='[["", 2, 3]]'), "expected a name"),
+    "a name of blanks and breaks": (says(taught='[["a \\n b", 2, 3]]'), "expected a name"),
+    "a name without end": (says(taught=f'[["{"a" * 100_000}", 2, 3]]'), "expected a name"),
+    "one name twice": (says(taught='[["vase", 2, 2], ["Vase", 2, 1]]'), "words have one name"),
+    "examples that are no unit vectors": (spoilt("taught", 3.0), "expected unit vectors"),
+    "examples that are NaN": (spoilt("taught", np.nan), "tensor 'taught' holds numbers"),
+    "a rival of more than one": (holds(**{"taught.rivals": np.full(3, 2, np.float16)}), "rivals in"),
+    "examples of integers": (declares("taught", dtype="I16"), "'taught' is I16"),
+    "examples of another length": (holds(taught=np.eye(3, 15, dtype=np.float16)), "taught"),
+}
 MALFORMED: dict[str, tuple[Spoil, str]] = {
     "another program's": (says(format="gguf"), "not a language field"),
     "no format": (says(format=None), "not a language field"),
@@ -183,6 +240,7 @@ MALFORMED: dict[str, tuple[Spoil, str]] = {
     **{f"odds {text[:40]}": (says(odds=text), LISTS) for text in
        ('{"constant": 1.0}', "1.0", "null", '["0.0", "1.0", "2.0", "0.7"]', "[true, true, true, true]",
         "[[0.0, 1.0, 2.0, 0.7], [0.0, 1.0, 2.0, 0.7]]", "[1" + "0" * 500 + ", 1.0, 2.0, 0.7]")},
+    **MISTAUGHT,
     "odds that are NaN": (odds("NaN, 1.0, 2.0, 0.7"), "expected finite numbers"),
     "infinite odds": (odds("0.0, Infinity, 2.0, 0.7"), "expected finite numbers"),
     "falling odds": (odds("0.0, -3.0, 2.0, 0.7"), "rising with fits"),
@@ -228,6 +286,44 @@ def test_every_broken_rule_has_its_message(sidecar, means, case):
 
 
 NO_TREE = {f"tree.{name}": None for name in ("leaves", "parents", "levels", "votes")}
+
+
+@pytest.fixture
+def own_words(tmp_path: Path) -> Path:
+    """A file of a user's words."""
+    path = tmp_path / "words.safetensors"
+    write_words(path, Words("demo", random_field(N, "linear").canonical, TAUGHT))
+    return path
+
+
+def test_words_of_a_user_are_read_back(own_words):
+    got, want = read_words(own_words), replace(random_field(N, "linear"), taught=TAUGHT)
+    assert_same_field(replace(want, taught=got.words), want)
+    assert got.encoder_id == "demo"
+    np.testing.assert_array_equal(got.canonical, want.canonical)
+    write_words(own_words, replace(got, words=()))
+    assert read_words(own_words).words == ()
+
+
+MISTOLD = MISTAUGHT | {
+    "a scene's": (says(format="langsplat"), "not of taught words"),
+    "no format": (says(format=None), "not of taught words"),
+    "no encoder": (says(encoder=None), "not of taught words"),
+    "a newer version": (says(version="2"), "version '2' of taught words; this program reads 1, update"),
+    "no canonical vectors": (holds(canonical=None), "tensor 'canonical' is missing"),
+    "too few canonical vectors": (holds(canonical=np.eye(3, 16, dtype=np.float32)), "canonical: expected"),
+    "half of it": (lambda p: p.write_bytes(p.read_bytes()[:-9]), "not a whole safetensors file"),
+}
+
+
+@pytest.mark.parametrize("case", MISTOLD)
+def test_every_broken_rule_of_a_users_words_has_its_message(own_words, case):
+    spoil, message = MISTOLD[case]
+    spoil(own_words)
+    with pytest.raises(FormatError, match=message) as error:
+        read_words(own_words)
+    assert str(error.value).startswith(f"{own_words}: ")
+    assert len(str(error.value)) < 400
 
 
 def test_the_things_of_version_2_are_wholes(sidecar, means):

@@ -12,6 +12,7 @@ from langsplat_core.cli import query
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.errors import FormatError, InputError
+from langsplat_core.io.scenes import load_scene
 from langsplat_core.pipeline.evidence import (
     Evidence,
     draw_evidence,
@@ -231,7 +232,7 @@ def test_a_training_keeps_all_that_is_needed(tmp_path):
     """Also for masks of no segmenter, which agree later."""
     room = tiny_room(tmp_path / "room")
     train_scene(room, tmp_path / "a.ply", tiny_settings(room))
-    scene = query.load_scene(tmp_path / "a.ply")
+    scene = load_scene(tmp_path / "a.ply")
     engine, seen = QueryEngine(scene), kept_features(tmp_path / "a.ply", scene)
     photographs = kept_photographs(tmp_path / "a.ply", scene)
     assert [image.shape[:2] for image in photographs.values()] == [(48, 64)] * len(scene.cameras)
@@ -240,3 +241,14 @@ def test_a_training_keeps_all_that_is_needed(tmp_path):
     assert found.votes or found.others
     with pytest.raises(InputError, match="--work"):
         kept_features(tmp_path / "b.ply", scene)
+
+
+def test_a_taught_word_is_compared_with_what_was_shown(engine, features):
+    """No text says what it is; the mask of another region is told from those of what was shown."""
+    engine.teach("gizmo", MUG, "whole")
+    found = find_evidence(engine, engine.run("gizmo"), ["gizmo"], features, load_rasterizer("cpu"))
+    np.testing.assert_array_equal(found.members, MUG)
+    *right, wrong = found.votes
+    assert wrong.view == WRONG
+    assert wrong.fit < 0 < min(vote.fit for vote in right)
+    del engine.taught["gizmo"]

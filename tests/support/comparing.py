@@ -87,6 +87,10 @@ def assert_same_field(got: LanguageField, want: LanguageField) -> None:
     assert got.codec.tensors().keys() == want.codec.tensors().keys()
     for name, tensor in want.codec.tensors().items():
         np.testing.assert_array_equal(got.codec.tensors()[name], tensor, name)
+    assert [(w.name, w.level) for w in got.taught] == [(w.name, w.level) for w in want.taught]
+    for one, other in zip(got.taught, want.taught, strict=True):
+        np.testing.assert_array_equal(one.vectors, other.vectors)
+        np.testing.assert_array_equal(one.rivals, other.rivals)
     assert list(got.phrasebook) == list(want.phrasebook)
     for phrase, vector in want.phrasebook.items():
         np.testing.assert_array_equal(got.phrasebook[phrase], vector)

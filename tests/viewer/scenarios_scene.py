@@ -467,8 +467,29 @@ def ask_before_leaving(s: Any) -> None:
     assert len(load_scene(s.folder / "blobs.ply").gaussians) == 360  # as it was
 
 
+def name_what_is_clicked(s: Any) -> None:
+    """A thing is clicked, named in the panel, and found by its name; what is like it is selected."""
+    s.menu("Window", "Select")
+    s.settle()
+    press(s, "//**/Thing##tool")
+    s.ctx.mouse_teleport_to_pos(on_screen(s, PLANT))
+    s.ctx.mouse_click(0)
+    s.settle()
+    assert marked(s.window.viewer)[0] == "plant"
+    s.ctx.item_click("//Select/##name")
+    s.ctx.key_chars_append_enter("grandma's mug")
+    s.settle()
+    query = s.state.queries[-1]
+    assert (query.phrase, query.result.found) == ("grandma's mug", True)
+    np.testing.assert_array_equal(query.result.members, s.state.selection.marks.selected)
+    s.shot("named")
+    press(s, "//**/More like it##verb")
+    assert marked(s.window.viewer)[0] == "plant"
+
+
 SELECTING: dict[str, tuple[Any, str, dict[str, Any]]] = {
     "select_with_the_mouse": (select_with_the_mouse, "blobs.ply", {}),
     "outline_and_rest": (outline_and_rest, "blobs.ply", {}),
+    "name_what_is_clicked": (name_what_is_clicked, "blobs.ply", {}),
     "ask_before_leaving": (ask_before_leaving, "blobs.ply", {}),
 }

@@ -497,3 +497,37 @@ def test_what_is_being_written_is_waited_for(opened, tmp_path):
     selecting.export(opened, tmp_path, "selection")
     selecting.finish_writing(opened)
     assert "blobs-selection-001.ply" in names_in(tmp_path)
+
+
+def test_what_is_named_is_found_by_its_name_and_kept_where_it_is_saved(opened, tmp_path):
+    take(opened, blob("plant"))
+    queries.type_name(opened, "grandma's mug")
+    queries.name_selection(opened)
+    settle(opened)
+    query = opened.state.queries[-1]
+    assert query.phrase == "grandma's mug"
+    np.testing.assert_array_equal(query.result.members, blob("plant"))
+    assert opened.state.selection.name == ""
+    selecting.export(opened, tmp_path, "edited")
+    settle(opened)
+    (saved,) = tmp_path.glob("*.ply")
+    assert [word.name for word in load_scene(saved).language.taught] == ["grandma's mug"]
+    assert errors(opened) == []
+
+
+def test_what_cannot_be_a_name_is_said(opened):
+    queries.name_selection(opened)
+    assert "nothing is selected" in opened.state.messages[-1].text
+    take(opened, blob("plant"))
+    queries.type_name(opened, "the")
+    queries.name_selection(opened)
+    settle(opened)
+    assert "'the' cannot be a name" in errors(opened)[-1]
+    assert (opened.state.queries, opened.state.selection.name) == ([], "the")
+
+
+def test_everything_like_the_selection(opened):
+    take(opened, blob("mug"))
+    selecting.select_alike(opened)
+    settle(opened)
+    assert marked(opened)[0] == "mug"

@@ -46,6 +46,7 @@ def folder(tmp_path: Path) -> Path:
         "many_queries",
         "select_with_the_mouse",
         "outline_and_rest",
+        "name_what_is_clicked",
         "ask_before_leaving",
         "type_while_opening",
         "look_at_nothing",

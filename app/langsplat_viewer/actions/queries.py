@@ -17,9 +17,11 @@ from langsplat_core.query.engine import QueryEngine, no_field
 from langsplat_core.query.grammar import Atom, heads
 from langsplat_core.query.instances import Instance
 from langsplat_core.raster import load_rasterizer
+from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
 from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions.history import let_go, remember
+from langsplat_viewer.actions.selecting import has_selection
 from langsplat_viewer.actions.settings import mute_letters, open_panel
 from langsplat_viewer.files.browsing import SUFFIX, QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.jobs import one_line
@@ -84,6 +86,29 @@ def ask_typed(viewer: Viewer) -> None:
         return
     ask(viewer, viewer.state.typed)
     viewer.state.typed = ""
+
+
+def type_name(viewer: Viewer, name: str) -> None:
+    """Take the text of the box for a name of what is selected."""
+    viewer.state.selection = replace(viewer.state.selection, name=name)
+
+
+def name_selection(viewer: Viewer) -> None:
+    """Teach the typed name by what is selected, and search for it. What is saved from now on keeps it."""
+    engine, scene, selection = viewer.engine, viewer.state.scene, viewer.state.selection
+    if not has_selection(viewer) or engine is None:
+        return
+
+    def work(progress: Progress) -> TaughtWord:
+        return engine.teach(selection.name, selection.marks.selected)
+
+    def done(word: TaughtWord) -> None:
+        if viewer.state.scene is scene:
+            type_name(viewer, "")
+            viewer.state.say(f"taught '{word.name}'; to keep it, save the scene")
+            ask_one(viewer, word.name)
+
+    viewer.run("naming the selection", work, done)
 
 
 def focus_search(viewer: Viewer) -> None:

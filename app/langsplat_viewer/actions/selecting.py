@@ -125,6 +125,13 @@ def shrink_selection(viewer: Viewer) -> None:
         find(viewer, "shrinking", lambda engine: shrink(engine.surface, selected, distance), "intersect")
 
 
+def select_alike(viewer: Viewer) -> None:
+    """Select everything that is like what is selected, wherever it is; see `QueryEngine.like`."""
+    if has_selection(viewer):
+        selected = viewer.state.selection.marks.selected
+        find(viewer, "looking for more like", lambda engine: engine.like(selected).members, "replace")
+
+
 def find(viewer: Viewer, label: str, work: Callable[[QueryEngine], Array], mode: Mode | None) -> None:
     """Have the worker find (N,) bool with the scene's engine, and take it."""
     engine, scene = viewer.engine, viewer.state.scene
@@ -226,9 +233,12 @@ def export(
     cameras, or a point cloud. `then` runs once it is written; if that fails the reason is said."""
     if not (has_scene(viewer) if part == "edited" else has_selection(viewer)):
         return
-    state = viewer.state
+    state, engine = viewer.state, viewer.engine
     scene, marks = state.scene, state.selection.marks
     assert scene is not None
+    field = scene.language
+    if field is not None and engine is not None:
+        field = replace(field, taught=tuple(engine.taught.values()))
     rows = np.flatnonzero(rows_of(marks, part))
     if len(rows) == 0:
         state.say(f"the {part} holds no Gaussians: nothing to write", is_error=True)
@@ -236,7 +246,7 @@ def export(
     stem = f"{state.path.stem if state.path else 'scene'}-{part}{'-points' if as_points else ''}"
 
     def work(progress: Progress) -> Written:
-        return _write(scene, rows, folder, stem, as_points)
+        return _write(replace(scene, language=field), rows, folder, stem, as_points)
 
     def done(written: Written) -> None:
         kind = "points" if as_points else "Gaussians"

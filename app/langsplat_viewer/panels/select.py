@@ -8,7 +8,7 @@ from imgui_bundle import ImVec2, hello_imgui, imgui
 
 from langsplat_core.arrays import Array
 from langsplat_viewer import marks
-from langsplat_viewer.actions import selecting
+from langsplat_viewer.actions import queries, selecting
 from langsplat_viewer.commands import with_key
 from langsplat_viewer.marks import BRUSHES, MODES, REACHES, TOOLS, Marks, Mode, Tool
 from langsplat_viewer.panels.overlays import QUIET
@@ -33,6 +33,7 @@ CHANGES: tuple[Verb, ...] = (
     ("Invert", selecting.invert_selection, "What was not selected"),
     ("Grow", selecting.grow_selection, "And what is within reach along the surface"),
     ("Shrink", selecting.shrink_selection, "Without what is within reach of the rest"),
+    ("More like it", selecting.select_alike, "Everything that is like what is selected, and that too"),
 )
 FATES: tuple[Verb, ...] = (
     ("Hide", selecting.hide_selected, "Out of the picture"),
@@ -69,6 +70,7 @@ def draw(viewer: Viewer) -> None:
     imgui.separator()
     _buttons(viewer, CHANGES)
     selecting.set_reach(viewer, _slider("Reach", viewer.state.selection.reach, REACHES, "%.3f of the scene"))
+    _name(viewer)
     imgui.separator()
     _buttons(viewer, FATES)
     imgui.separator()
@@ -124,6 +126,19 @@ def _found(viewer: Viewer) -> None:
         if imgui.button(f"{number}##thing"):
             selecting.select_thing(viewer, thing)
         tip(f"{thing.count:,} Gaussians, {100 * thing.share:.0f} % of the answer, score {thing.score:.2f}")
+
+
+def _name(viewer: Viewer) -> None:
+    """Draw the box for a name by which what is selected is found from now on."""
+    button = imgui.calc_text_size("Name it").x + 2 * imgui.get_style().frame_padding.x
+    imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
+    flags, hint = imgui.InputTextFlags_.enter_returns_true, "a name for what is selected"
+    entered, typed = imgui.input_text_with_hint("##name", hint, viewer.state.selection.name, flags)
+    queries.type_name(viewer, typed)
+    imgui.same_line()
+    if imgui.button("Name it") or entered:
+        queries.name_selection(viewer)
+    tip("Searching for the name finds this, and what is like it")
 
 
 def _buttons(viewer: Viewer, verbs: Sequence[Verb]) -> None:

@@ -261,7 +261,8 @@ def panes(picture: PictureConfig, level: int, answers: Answers, split: Split) ->
         return pane(display, level if DISPLAYS[display].by_level else None)
 
     if split.mode == "levels":
-        shown: Display = "relevancy" if DISPLAYS[picture.display].needs_query else "latent"
+        row = DISPLAYS[picture.display]
+        shown: Display = "relevancy" if row.needs_query else picture.display if row.by_level else "latent"
         return tuple(pane(shown, place) for place in range(len(LEVELS)))
     first = whole(picture.display, level)
     return (first, whole(split.second, split.second_level)) if split.mode == "wipe" else (first,)
