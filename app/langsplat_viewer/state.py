@@ -191,9 +191,18 @@ class Query:
     things: tuple[Instance, ...] = ()  # what it found, one by one, where it ends by itself
     cut: float | None = None  # relevancy at which it ends instead
     reading: str = ""  # how the phrase was understood, where it has structure
+    asked_for: tuple[str, ...] = ()  # its words without what that is related to, see `grammar.heads`
     problem: str = ""  # why it has no result, one line
     meant: str = ""  # the phrase with its unknown words replaced by known ones, where there are such
     pending: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class EvidenceSheet:
+    """The photographs and masks that an answer stands on."""
+
+    phrase: str
+    image: Array  # (H, W, 3) uint8, row 0 on top
 
 
 @dataclass(frozen=True)
@@ -270,6 +279,7 @@ class SceneState:
 
     queries: list[Query] = field(default_factory=list)
     selected: Query | None = None  # whose details are shown
+    evidence: EvidenceSheet | None = None  # in a window of its own, while that is open
     canonical: tuple[str, ...] = ()  # phrases that everything is compared with; none: the scene's own
     canonical_typed: str = ""
     suggestions: Suggestions = field(default_factory=Suggestions)

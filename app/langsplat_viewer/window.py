@@ -191,6 +191,7 @@ class Window:
         self._remembered = Remembered(request.settings, self.viewer.state)
         self._canvas: Canvas | None = None
         self._photograph: overlays.PhotographOverlay | None = None
+        self._evidence: overlays.EvidenceWindow | None = None
         self._screen: moderngl.Framebuffer | None = None
         self.unfinished = False  # a finer image is due
         self.idles = True  # False for scripts that drive the window and count on its next frame
@@ -242,6 +243,7 @@ class Window:
             quick = self._make_renderer(ctx) if renderer.backend == "cpu" else None
             self._canvas = Canvas(ctx, renderer, quick=quick)
             self._photograph = overlays.PhotographOverlay(ctx)
+            self._evidence = overlays.EvidenceWindow(ctx)
             self.viewer.state.backend = renderer.backend
         except DRAW_ERRORS as error:
             self.failure = BackendError(one_line(error))
@@ -353,6 +355,8 @@ class Window:
             return
         viewer, area = self.viewer, scene_area()
         layout.draw_over(viewer)
+        if self._evidence is not None:
+            self._evidence.draw(viewer)
         navigation.handle(viewer, area)
         scale = imgui.get_io().display_framebuffer_scale
         settings.resize(viewer, round(area.width * scale.x), round(area.height * scale.y))

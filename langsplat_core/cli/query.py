@@ -4,12 +4,13 @@ own, and words for what is there."""
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
+from PIL import Image
 from rich.table import Table
 
 from langsplat_core.arrays import Array
@@ -17,6 +18,7 @@ from langsplat_core.cli.run import OutFile, OutputConsole
 from langsplat_core.cli.teach import Level, camera_of, pixel_in, pointed, searchable
 from langsplat_core.config import Count, CountOrZero, LevelChoice, NotNegative, PictureConfig, Positive
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
+from langsplat_core.io.files import atomic_path
 from langsplat_core.io.language import read_words
 from langsplat_core.io.scenes import check_writable, save_scene
 from langsplat_core.io.shapes import (
@@ -27,12 +29,18 @@ from langsplat_core.io.shapes import (
     write_meshes,
     write_points,
 )
+from langsplat_core.pipeline.evidence import (
+    draw_evidence,
+    find_evidence,
+    kept_features,
+    kept_photographs,
+)
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.answers import QueryResult, peak_pixel
 from langsplat_core.query.compose import Number, check_phrase, count_things, joined, run_phrase
 from langsplat_core.query.describe import Describer, Entry, Words, look_at_pixel
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder
-from langsplat_core.query.grammar import Atom
+from langsplat_core.query.grammar import Atom, heads
 from langsplat_core.query.instances import Instance, hull
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.selection import grow, of_rows, shrink
@@ -74,15 +82,20 @@ class QueryScene:
     """How many of a phrase's things are listed, the best first."""
     scale: Positive | None = None
     """Metres per world unit, in place of what the scene says."""
+    why: OutFile | None = None
+    """Draw the evidence here, *.png: the photographs and masks that the best region of each answer stands on,
+    best and worst. --json then has it, too."""
+    work: Path | None = None
+    """Folder of the training, with its masks, for --why (default: <scene>.work)."""
+    photographs: Path | None = None
+    """The dataset of the training, for --why, if it is elsewhere now."""
     json: bool = False
     """Print JSON, lengths in world units."""
 
     def run(self) -> None:
         scene = searchable(self.scene)
-        if not self.texts and not self.like:
-            raise InputError("no phrase given; for example: langsplat query scene.ply 'red cup'")
-        if self.like and self.mode == "paper":
-            raise InputError(NOT_DECODED)
+        self._check()
+        explain = _Explainer(self, scene) if self.why is not None else None
         camera = camera_of(scene, self.camera) if scene.cameras else None
         engine = _engine(scene, _once(load_text_encoder), self.encoder, self.taught)
         unit = _unit(scene, self.scale)
@@ -90,15 +103,19 @@ class QueryScene:
         if self.like:
             level = "whole" if self.level == "auto" else self.level
             alike = engine.like(pointed(engine, self.camera, self.like, "--like", level), level)
-            found.append((replace(alike, phrase=f"like {self.like}"), None))
+            found.append((replace(alike, phrase=f"like {self.like}"), None, ()))
         answers, tables = [], []
-        for result, understood in found:
+        for result, understood, of in found:
             answer = _answer(result, scene, engine, camera, self.mode) | {"reading": understood}
             things = engine.instances(result, self.instances) if result.found else ()
             number = count_things(engine, result) if result.found else Number(0, 0, 0)
             answer |= {"count": {"best": number.best, "least": number.least, "most": number.most}}
-            answers.append(answer | _basis(engine) | {"metres_per_unit": unit.metres, **_listed(things)})
-            tables.append(_table(things, unit))
+            because = {} if explain is None else {"evidence": explain(engine, result, of)}
+            answer |= _basis(engine) | {"metres_per_unit": unit.metres, **_listed(things)}
+            answers.append(answer | because)
+            tables.append(_table(things, unit) + _reasons(**because))
+        if explain is not None:
+            explain.write()
         if self.json:
             _print_json(answers)
             return
@@ -117,6 +134,14 @@ class QueryScene:
                 sep="\n",
             )
         print(f"answers: {engine.basis.long}")
+
+    def _check(self) -> None:
+        if not self.texts and not self.like:
+            raise InputError("no phrase given; for example: langsplat query scene.ply 'red cup'")
+        if self.like and self.mode == "paper":
+            raise InputError(NOT_DECODED)
+        if self.like and self.why is not None:
+            raise InputError("--why is of phrases; give what --like finds a name with `langsplat teach`")
 
     def _askable(self, engine: QueryEngine, camera: Camera | None) -> list[str]:
         """The phrases that can be asked; the others are named on stderr with the reason, before anything is
@@ -144,12 +169,68 @@ class QueryScene:
     def _plainly(self) -> bool:
         return self.whole or self.mode == "paper"
 
-    def _ask(self, engine: QueryEngine, text: str, camera: Camera | None) -> tuple[QueryResult, str | None]:
-        """The answer, and how the phrase was read where it has structure."""
+    def _ask(
+        self, engine: QueryEngine, text: str, camera: Camera | None
+    ) -> tuple[QueryResult, str | None, tuple[str, ...]]:
+        """The answer, how the phrase was read where it has structure, and the words of what is asked for."""
         if self._plainly:
-            return engine.run(text, self.level), None
+            return engine.run(text, self.level), None, (text,)
         composed = run_phrase(engine, text, self.level, camera)
-        return composed.answer, None if isinstance(composed.tree, Atom) else composed.reading
+        simple = isinstance(composed.tree, Atom)
+        return composed.answer, None if simple else composed.reading, heads(composed.tree)
+
+
+class _Explainer:
+    """Evidence of answers, and the contact sheets of all of them in one image."""
+
+    def __init__(self, asked: QueryScene, scene: Scene) -> None:
+        """Raises InputError where masks or photographs are missing, before anything is asked."""
+        assert asked.why is not None
+        if asked.why.suffix.lower() != ".png":
+            raise InputError(f"--why {asked.why}: evidence is drawn as an image; name a .png file")
+        self._out, self._features = asked.why, kept_features(asked.scene, scene, asked.work)
+        with TerminalProgress() as progress:
+            place = asked.scene, scene, asked.work, asked.photographs
+            self._photographs = kept_photographs(*place, progress)
+        self._rasterizer, self._sheets = load_rasterizer("cpu"), list[Array]()
+
+    def __call__(
+        self, engine: QueryEngine, answer: QueryResult, phrases: tuple[str, ...]
+    ) -> dict[str, Any] | None:
+        """The evidence of an answer, ready for JSON; it is drawn too."""
+        with TerminalProgress() as progress:
+            found = find_evidence(engine, answer, phrases, self._features, self._rasterizer, progress)
+        if found is None:
+            return None
+        source = engine.scene, self._features, self._photographs, self._rasterizer
+        self._sheets.append(draw_evidence(found, answer, *source))
+        return {
+            "summary": str(found),
+            "phrase": found.phrase,
+            "node": found.node,
+            "for": len(found.votes),
+            "against": len(found.others),
+            "fitting": found.fitting,
+            "share": found.share,
+            "interval": list(found.interval),
+            "rows": [asdict(vote) | {"agrees": vote.agrees} for vote in (*found.votes, *found.others)],
+        }
+
+    def write(self) -> None:
+        """Write the sheets one below the other."""
+        if not self._sheets:
+            raise InputError(f"{self._out}: not written, because nothing in the scene answers")
+        with atomic_path(self._out) as temporary:
+            Image.fromarray(np.concatenate(self._sheets)).save(temporary, "PNG")
+
+
+def _reasons(evidence: dict[str, Any] | None = None) -> list[str]:
+    if evidence is None:
+        return []
+    votes = [row for row in evidence["rows"] if row["agrees"]]
+    ends = [] if not votes else [("best", votes[0]), ("worst", votes[-1])]
+    said = [f"{name} {row['photograph']}, fit {row['fit']:+.2f}" for name, row in ends]
+    return [f"  why: {'; '.join([evidence['summary'], *said])}"]
 
 
 def _once(load: LoadEncoder) -> LoadEncoder:

@@ -12,7 +12,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.io.files import shown
 from langsplat_core.progress import Progress, silent
 
-__all__ = ["Capture", "load_capture"]
+__all__ = ["Capture", "load_capture", "load_photographs"]
 
 ACCEPTED = (
     "a folder with transforms.json (nerfstudio) or that file, a folder with sparse/0 and images (COLMAP), "
@@ -30,14 +30,7 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
     said by `config`, the dataset, or the places (GPS) of the photographs. What had to be left out
     is reported once, by a warning of the logger "langsplat". Raises InputError where nothing usable remains.
     """
-    path = Path(path)
-    check_settings(config, "--dataset.")
-    if not os.path.exists(path):  # unlike Path.exists, also no for names that no file system could hold
-        raise InputError(f"{shown(path)} does not exist; expected {ACCEPTED}")
-    try:
-        capture = _load(path, config, work, progress)
-    except PermissionError as error:
-        raise InputError(f"{error.filename}: may not be read ({error.strerror}); see to its rights") from None
+    capture = load_photographs(path, config, work, progress)
     metres = config.metres_per_unit or capture.metres_per_unit or metres_of(capture)
     capture = replace(capture, metres_per_unit=metres)
     if len(capture.points):
@@ -46,6 +39,18 @@ def load_capture(path: Path, config: DatasetConfig, work: Path, progress: Progre
     from langsplat_core.datasets.known_poses import add_points
 
     return add_points(capture, capture.split(config.test_every)[0], work, progress)
+
+
+def load_photographs(path: Path, config: DatasetConfig, work: Path, progress: Progress = silent) -> Capture:
+    """`load_capture` with the points and the scale that the dataset states, or none."""
+    path = Path(path)
+    check_settings(config, "--dataset.")
+    if not os.path.exists(path):  # unlike Path.exists, also no for names that no file system could hold
+        raise InputError(f"{shown(path)} does not exist; expected {ACCEPTED}")
+    try:
+        return _load(path, config, work, progress)
+    except PermissionError as error:
+        raise InputError(f"{error.filename}: may not be read ({error.strerror}); see to its rights") from None
 
 
 def _load(path: Path, config: DatasetConfig, work: Path, progress: Progress) -> Capture:

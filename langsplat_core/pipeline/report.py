@@ -44,6 +44,7 @@ class TrainReport:
     observed: float  # fraction of Gaussians with a meaning at the whole level
     warnings: tuple[str, ...]  # what speaks against the scene, with the remedy
     seconds: dict[str, float]  # per stage, of this run: a stage that was already done takes almost none
+    dataset: str = ""  # absolute path of the photographs; "" in reports of earlier versions
 
 
 def work_folder(out: Path) -> Path:

@@ -157,6 +157,7 @@ def _train(
             observed=float((language.confidence[2] > 0).mean()) if len(gaussians) else 0.0,
             warnings=quality_warnings(scores, cameras),
             seconds=clock.laps,
+            dataset=str(dataset.resolve()),
         )
         write_report(work, report)
     processes.barrier()

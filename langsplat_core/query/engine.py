@@ -27,13 +27,13 @@ from langsplat_core.query.grammar import STOP_WORDS, check_names, only
 from langsplat_core.query.instances import Instance, find_instances
 from langsplat_core.query.lookup import Lookup, build_lookup
 from langsplat_core.query.regions import Regions, build_regions
-from langsplat_core.query.taught import WordSpace, build_word_space, by_showing, shown
+from langsplat_core.query.taught import WordSpace, build_word_space, by_showing, compared, shown
 from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Calibration, LanguageField, Scene, TaughtWord
 from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN, phrase_key, split_phrases, tidy
 from langsplat_core.scene.surface import Surface, build_surface, surface_weights
 from langsplat_core.scene.tree import Tree, build_tree
 from langsplat_core.semantics.encoders import DEMO, DEMO_ELSEWHERE
-from langsplat_core.semantics.relevancy import Scale
+from langsplat_core.semantics.relevancy import Scale, relevancy_of
 from langsplat_core.semantics.vocabulary import FEWEST, everyday_vectors
 
 BATCH = 256  # phrases that are encoded, and compared with codewords, at a time
@@ -438,6 +438,15 @@ class QueryEngine:
 
     def _by_showing(self, word: TaughtWord, level: LevelChoice) -> QueryResult:
         return by_showing(word, self.word_space, self.regions, self.scene.gaussians.means, level)
+
+    def compare(self, phrase: str, vectors: Array, level: int) -> tuple[Array, Array]:
+        """Cosines (M,) of a phrase with (M, D) unit vectors of images, and their fits, in spreads; of a
+        taught word at a level (index into LEVELS), see `taught.compared`. Raises as `text_vector` does."""
+        if self.is_taught(phrase):
+            return compared(self.taught[phrase_key(phrase)], self.word_space, vectors, level)
+        cosines = vectors @ self.text_vector(phrase)
+        zero, rate = self.scale.of(vectors @ self.scale.texts.T)
+        return cosines, self.scale.fit(relevancy_of(cosines, zero, rate))
 
     def instances(self, result: QueryResult, at_most: int | None = None) -> tuple[Instance, ...]:
         """The things among the members of an answer, best first, or only so many of them."""

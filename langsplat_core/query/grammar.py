@@ -79,6 +79,15 @@ def atoms(tree: Phrase) -> tuple[Atom, ...]:
     return tuple(atom for child in children(tree) for atom in atoms(child))
 
 
+def heads(tree: Phrase) -> tuple[str, ...]:
+    """The words of what is asked for, without what that is related to: "mug" and "handle" of "mug or handle
+    of the cup"."""
+    if isinstance(tree, Atom):
+        return (tree.text,)
+    asked = children(tree) if isinstance(tree, Both | Union) else children(tree)[:1]
+    return tuple(text for child in asked for text in heads(child))
+
+
 def unparse(tree: Phrase) -> str:  # noqa: PLR0911  one row of a table each
     """A tree as text, such as "handle  inside  red mug"; groups in a group stand in brackets."""
     match tree:

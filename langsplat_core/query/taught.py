@@ -93,19 +93,35 @@ def shown(
     return TaughtWord(name, level, vector[None], np.array([space.rival], np.float16).astype(np.float32))
 
 
+def compared(word: TaughtWord, space: WordSpace, vectors: Array, level: int) -> tuple[Array, Array]:
+    """(M, D) unit vectors of images -> (M,) the largest cosine with an example at a level (index into
+    LEVELS), both in the word space, and (M,) the fits."""
+    examples, bars = _examples(word, space)
+    alike = unit(vectors @ space.basis.T - space.centres[level]) @ examples.T
+    return alike.max(1), _fits(alike, bars[level])
+
+
+def _examples(word: TaughtWord, space: WordSpace) -> tuple[Array, Array]:
+    """(T, W) unit examples, and (3, T) similarity from which something is as each of them, at each level."""
+    rivals = np.maximum((word.rivals + space.rival) / 2, LEAST)
+    return unit(word.vectors @ space.basis.T), np.minimum(np.outer(FOUND, rivals), HIGHEST)
+
+
+def _fits(alike: Array, bar: Array) -> Array:
+    return np.asarray((HEAT * (alike - bar) / (1 - bar)).max(1, initial=-HEAT))
+
+
 def by_showing(
     word: TaughtWord, space: WordSpace, regions: Regions, means: Array, level: LevelChoice
 ) -> QueryResult:
     """The answer to a taught word: the whole regions that are like one of its examples. At the level that was
     shown unless another `level` is asked for. means: (N, 3) of the Gaussians."""
     chosen = word.level if level == "auto" else LEVELS.index(level)
-    examples = unit(word.vectors @ space.basis.T)
-    rivals = np.maximum((word.rivals + space.rival) / 2, LEAST)
-    bars = np.minimum(np.outer(FOUND, rivals), HIGHEST)  # (3, T)
+    examples, bars = _examples(word, space)
     fits, above = [], []
     for row, bar in zip(space.regions, bars, strict=True):
         alike = row @ examples.T  # (R, T)
-        fits.append((HEAT * (alike - bar) / (1 - bar)).max(1, initial=-HEAT))
+        fits.append(_fits(alike, bar))
         above.append(((alike / bar - 1) / UNIT).max(1, initial=-1 / UNIT))
     every = [sigmoid(row) for row in fits]
     solid = [sizes >= min(SMALLEST, sizes.max(initial=0)) for sizes in regions.sizes]

@@ -1,4 +1,4 @@
-"""`python -m tests.benchmarks rooms|verdicts|taught|phrases|lifting|scale`: one report each."""
+"""`python -m tests.benchmarks rooms|verdicts|taught|phrases|votes|lifting|scale`: one report each."""
 
 import sys
 from typing import Union
@@ -10,6 +10,7 @@ from tests.benchmarks.rooms import Rooms
 from tests.benchmarks.scale import Scale
 from tests.benchmarks.taught import Taught
 from tests.benchmarks.verdicts import Verdicts
+from tests.benchmarks.votes import Votes
 
 PROGRAM = "python -m tests.benchmarks"
 
@@ -17,7 +18,8 @@ PROGRAM = "python -m tests.benchmarks"
 def parse(args: list[str]) -> Command:
     """The report that the words of a command line name; SystemExit as tyro raises it."""
     about = "Measure this project where the truth is known, and at large sizes."
-    reports = tuple(with_codec(report, args) for report in (Rooms, Verdicts, Taught, Phrases, Lifting, Scale))
+    known = (Rooms, Verdicts, Taught, Phrases, Votes, Lifting, Scale)
+    reports = tuple(with_codec(report, args) for report in known)
     command: Command = parsed(PROGRAM, Union[(*reports,)], args, about)
     return command
 

@@ -29,6 +29,7 @@ from langsplat_core.query.grammar import (
     Union,
     Without,
     atoms,
+    heads,
     named,
     parse,
     unparse,
@@ -142,6 +143,12 @@ def test_every_text_is_read_or_refused(text):
         except InputError:
             continue
         assert all(atom.text.strip() and atom.text in unparse(tree) for atom in atoms(tree))
+
+
+def test_what_is_asked_for_is_told_from_what_it_is_related_to():
+    assert heads(parse("biggest red mug on the table")) == ("red mug",)
+    assert heads(parse("mug, not red mug")) == ("mug",)
+    assert heads(parse("mug or handle of the cup")) == ("mug", "handle")
 
 
 NAMED = {

@@ -1,12 +1,17 @@
 """A scene of three blobs with known meanings, a text encoder that knows their names, and phrases for it."""
 
+import json
+from collections.abc import Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from langsplat_core.arrays import Array, logit, unit
+from langsplat_core.io.scenes import save_scene
+from langsplat_core.pipeline.report import REPORT, work_folder
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
@@ -20,6 +25,7 @@ from langsplat_core.scene import (
     look_at,
 )
 from langsplat_core.scene.codec import CodebookCodec
+from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 
 COUNT = 64
 
@@ -128,3 +134,21 @@ def named_field(codebook: bool = True) -> LanguageField:
 
 def named_scene(codebook: bool = True, path: Path | None = None) -> Scene:
     return Scene(blobs(), named_field(codebook), cameras(), path)
+
+
+def as_trained(path: Path, scene: Scene, features: Sequence[ImageFeatures]) -> None:
+    """Save a scene with the masks and the report that its training would have left beside it, and grey
+    photographs in the folder "photographs"."""
+    save_scene(path, scene)
+    work, photographs = work_folder(path), path.parent / "photographs"
+    photographs.mkdir()
+    frames = []
+    for camera, seen in zip(scene.cameras, features, strict=True):
+        FeatureStore(work / "features").save(camera.name, seen)
+        Image.new("RGB", (camera.width, camera.height), (90, 90, 90)).save(photographs / f"{camera.name}.png")
+        pose = np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": f"{camera.name}.png", "transform_matrix": pose.tolist()})
+    one = scene.cameras[0]
+    lens = {"fl_x": one.fx, "fl_y": one.fy, "cx": one.cx, "cy": one.cy, "w": one.width, "h": one.height}
+    (photographs / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    (work / REPORT).write_text(json.dumps({"dataset": str(photographs)}))

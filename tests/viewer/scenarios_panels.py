@@ -12,12 +12,13 @@ from PIL import Image
 from imgui_bundle import imgui  # isort: skip
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.pipeline.report import REPORT
+from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer import viewer as training
 from langsplat_viewer.actions import filming, opening, settings, viewpoint
 from langsplat_viewer.files.flights import read_flight
 from langsplat_viewer.panels.layout import PANELS
 from langsplat_viewer.panels.style import scene_area
-from tests.support.fakes import CENTRES, blob_scene
+from tests.support.fakes import CENTRES, as_trained, blob_scene
 
 
 def reload_what_changed(s: Any) -> None:
@@ -81,6 +82,23 @@ def fade_in_a_photograph(s: Any) -> None:
     s.drag((600, 300), (656, 279))
     s.settle()
     assert opening.photograph_here(s.state) is None
+
+
+def see_the_evidence(s: Any) -> None:
+    """The sheet lies in a window over the scene, until that is closed."""
+    scene = blob_scene()
+    seen = ImageFeatures(np.zeros((3, 120, 160), np.int32), np.eye(1, 8, dtype=np.float32))
+    as_trained(s.state.path, scene, [seen] * len(scene.cameras))
+    s.search("mug")
+    plain, area = s.shot("plain"), scene_area()
+    s.ctx.item_click("//Search/Why?")
+    s.wait(lambda: s.state.evidence is not None)
+    s.ctx.yield_(3)
+    inside = np.s_[int(area.top) + 60 : int(area.top) + 200, int(area.left) + 40 : int(area.left) + 400]
+    assert (s.shot("evidence")[inside] == 255).all(-1).mean() > 0.2 > (plain[inside] == 255).all(-1).mean()
+    s.ctx.window_close("//###evidence")
+    s.ctx.yield_(2)
+    assert s.state.evidence is None
 
 
 def switch_between_scenes(s: Any) -> None:
@@ -191,6 +209,7 @@ Scenario = tuple[Callable[[Any], None], str, dict[str, Any]]
 FILES: dict[str, Scenario] = {
     "reload_what_changed": (reload_what_changed, "blobs.ply", {}),
     "fade_in_a_photograph": (fade_in_a_photograph, "blobs.ply", {}),
+    "see_the_evidence": (see_the_evidence, "blobs.ply", {}),
     "switch_between_scenes": (switch_between_scenes, "blobs.ply", {}),
     "watch_a_training": (watch_a_training, "blobs.ply", {}),
     "read_what_speaks_against": (read_what_speaks_against, "blobs.ply", {}),

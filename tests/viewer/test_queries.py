@@ -11,12 +11,13 @@ from numpy.testing import assert_allclose
 from langsplat_core.display.displays import NO_HEAT, Subject, relevancies
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.scene import CANONICAL_PHRASES, Reading
+from langsplat_core.semantics.store import ImageFeatures
 from langsplat_viewer.actions import opening, queries, settings, undoing
 from langsplat_viewer.files.browsing import QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.output.headless import describe
 from langsplat_viewer.panels.search import BINS, hint, histogram
 from langsplat_viewer.viewer import Services
-from tests.support.fakes import CENTRES, FakeEncoder, blob_scene, calibrated_for, language
+from tests.support.fakes import CENTRES, FakeEncoder, as_trained, axis, blob_scene, calibrated_for, language
 from tests.support.windowless import SCENES, errors, load, settle
 
 
@@ -193,6 +194,28 @@ def test_what_was_found_is_told_apart(opened):
     one, both = opened.state.queries
     assert (len(one.things), len(both.things)) == (1, 2)
     assert np.linalg.norm(one.things[0].centre - CENTRES[0]) < 0.3
+
+
+# Evidence.
+
+
+def test_an_answer_is_explained_by_what_training_kept(opened, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    queries.ask(opened, "book")
+    settle(opened)
+    (query,) = opened.state.queries
+    queries.explain(opened, query)
+    settle(opened)
+    assert "--work" in errors(opened)[-1]
+    scene = opened.state.scene
+    seen = ImageFeatures(np.zeros((3, 120, 160), np.int32), axis(1)[None])
+    as_trained(tmp_path / "blobs.ply", scene, [seen] * len(scene.cameras))
+    queries.explain(opened, query)
+    settle(opened)
+    assert opened.state.evidence.phrase == "book"
+    assert opened.state.evidence.image.ndim == 3
+    queries.close_evidence(opened)
+    assert opened.state.evidence is None
 
 
 # Own cuts, canonical phrases and sets of queries, without a window.

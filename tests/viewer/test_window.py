@@ -65,6 +65,7 @@ def folder(tmp_path: Path) -> Path:
         "switch_between_scenes",
         "time_and_compare",
         "fade_in_a_photograph",
+        "see_the_evidence",
         "large_letters",
     ],
 )

@@ -4,16 +4,19 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
+from langsplat_core.arrays import Array
 from langsplat_core.config import LevelChoice
 from langsplat_core.display.displays import DISPLAYS
 from langsplat_core.errors import InputError, UnknownWordError
+from langsplat_core.pipeline.evidence import draw_evidence, find_evidence, kept_features, kept_photographs
 from langsplat_core.progress import Progress
 from langsplat_core.query.answers import QueryResult, recut
 from langsplat_core.query.compose import ComposedResult, run_phrase
 from langsplat_core.query.describe import Suggestions, completions, corrected, suggest
 from langsplat_core.query.engine import QueryEngine, no_field
-from langsplat_core.query.grammar import Atom
+from langsplat_core.query.grammar import Atom, heads
 from langsplat_core.query.instances import Instance
+from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import TaughtWord
 from langsplat_core.scene.language import phrase_key, split_phrases
 from langsplat_core.semantics.encoders import DEMO
@@ -23,7 +26,7 @@ from langsplat_viewer.actions.settings import mute_letters, open_panel
 from langsplat_viewer.files.browsing import SUFFIX, QuerySet, SavedQuery, read_queries, write_queries
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.output.saving import free_name
-from langsplat_viewer.state import SLOTS, Query
+from langsplat_viewer.state import SLOTS, EvidenceSheet, Query
 from langsplat_viewer.viewer import Viewer
 
 MOST_THINGS = 20  # of one answer that are told apart
@@ -172,6 +175,7 @@ def _take(query: Query, composed: ComposedResult, things: tuple[Instance, ...]) 
     query.automatic, query.things = composed.answer, things
     query.problem, query.meant, query.pending = "", "", False
     query.result = composed.answer if query.cut is None else recut(composed.answer, query.cut)
+    query.asked_for = heads(composed.tree)
     query.reading = "" if isinstance(composed.tree, Atom) else composed.reading
 
 
@@ -229,6 +233,37 @@ def set_level(viewer: Viewer, level: LevelChoice) -> None:
     remember(viewer)
     viewer.state.level = level
     ask_again(viewer)
+
+
+# What an answer stands on.
+
+
+def explain(viewer: Viewer, query: Query) -> None:
+    """Have the worker draw the evidence of an answer, and show it."""
+    engine, state, result = viewer.engine, viewer.state, query.result
+    if engine is None or result is None or state.path is None:
+        return
+    path, scene = state.path, engine.scene
+
+    def work(progress: Progress) -> Array:
+        features = kept_features(path, scene)
+        photographs = kept_photographs(path, scene, progress=progress)
+        rasterizer = load_rasterizer("cpu")
+        found = find_evidence(engine, result, query.asked_for, features, rasterizer, progress)
+        if found is None:
+            raise InputError(f"'{query.phrase}': nothing in the scene answers")
+        return draw_evidence(found, result, scene, features, photographs, rasterizer)
+
+    def done(image: Array) -> None:
+        if query in state.queries:
+            state.evidence = EvidenceSheet(query.phrase, image)
+
+    viewer.run(f"looking for the evidence of '{query.phrase}'", work, done)
+
+
+def close_evidence(viewer: Viewer) -> None:
+    """Close the window with the evidence."""
+    viewer.state.evidence = None
 
 
 # How queries are asked and where they end: own cuts, canonical phrases, whole sets of queries.

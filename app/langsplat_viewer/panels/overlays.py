@@ -13,12 +13,12 @@ from langsplat_core.display.displays import QUERY_COLOURS, STRENGTH, mapped, pai
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.describe import Words
 from langsplat_core.scene import LEVELS, Camera
-from langsplat_viewer.actions import opening, settings, viewpoint
+from langsplat_viewer.actions import opening, queries, settings, viewpoint
 from langsplat_viewer.camera import overlays
 from langsplat_viewer.camera.controls import OrbitCamera
 from langsplat_viewer.camera.overlays import Face, Label, face_at, placed, visible_faces, world_axes
 from langsplat_viewer.files.photographs import corners
-from langsplat_viewer.panels.style import Area, elided, muted, width_of
+from langsplat_viewer.panels.style import Area, elided, muted, scene_area, width_of
 from langsplat_viewer.state import Hover
 from langsplat_viewer.viewer import Viewer
 
@@ -137,13 +137,53 @@ def _foreground() -> Any:
 # The photograph of a training camera.
 
 
-class PhotographOverlay:
-    """Holds the photograph as a texture."""
+class _Uploaded:
+    """Holds an image as a texture."""
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self._ctx = ctx
         self._image: Array | None = None  # what the texture has
         self._texture: moderngl.Texture | None = None
+
+    def _upload(self, image: Array) -> moderngl.Texture:
+        if self._texture is None or self._image is not image:
+            if self._texture is not None:
+                self._texture.release()
+            height, width = image.shape[:2]
+            texture = self._ctx.texture((width, height), 3, image.tobytes(), alignment=1)
+            texture.build_mipmaps()
+            texture.filter = moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR
+            texture.repeat_x = texture.repeat_y = False
+            self._texture, self._image = texture, image
+        return self._texture
+
+
+EVIDENCE_EM = 50.0, 34.0  # size of the window at first
+
+
+class EvidenceWindow(_Uploaded):
+    """The evidence of an answer, in a window that can be closed."""
+
+    def draw(self, viewer: Viewer) -> None:
+        sheet = viewer.state.evidence
+        if sheet is None:
+            return
+        texture = self._upload(sheet.image)
+        area = scene_area()
+        imgui.set_next_window_pos(ImVec2(area.left, area.top), imgui.Cond_.appearing)
+        imgui.set_next_window_size(hello_imgui.em_to_vec2(*EVIDENCE_EM), imgui.Cond_.appearing)
+        imgui.set_next_window_bg_alpha(1.0)
+        _, still_open = imgui.begin(f"Evidence: {sheet.phrase}###evidence", True)
+        width = imgui.get_content_region_avail().x
+        size = ImVec2(width, width * texture.height / texture.width)
+        imgui.image(imgui.ImTextureRef(texture.glo), size)
+        imgui.end()
+        if not still_open:
+            queries.close_evidence(viewer)
+
+
+class PhotographOverlay(_Uploaded):
+    """The photograph of the camera at which one stands, over the image."""
 
     def draw(self, viewer: Viewer, area: Area) -> None:
         """Over every image in the area, where one stands at its camera."""
@@ -165,18 +205,6 @@ class PhotographOverlay:
             reference = imgui.ImTextureRef(texture.glo)
             paint.add_image(reference, low, high, ImVec2(0, 0), ImVec2(1, 1), tint)
             paint.pop_clip_rect()
-
-    def _upload(self, image: Array) -> moderngl.Texture:
-        if self._texture is None or self._image is not image:
-            if self._texture is not None:
-                self._texture.release()
-            height, width = image.shape[:2]
-            texture = self._ctx.texture((width, height), 3, image.tobytes(), alignment=1)
-            texture.build_mipmaps()
-            texture.filter = moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR
-            texture.repeat_x = texture.repeat_y = False
-            self._texture, self._image = texture, image
-        return self._texture
 
 
 # Lines: training cameras, boxes of instances, ground grid, ruler; and the clicks on them.

@@ -199,14 +199,24 @@ def _verdict(query: Query) -> None:
             imgui.set_tooltip(f"{100 * probability:.0f} % likely to be there")
 
 
+def _enabled(label: str, is_enabled: bool) -> bool:
+    """Draw a button; True where it is clicked."""
+    imgui.begin_disabled(not is_enabled)
+    clicked = imgui.button(label)
+    imgui.end_disabled()
+    return clicked
+
+
 def _details(viewer: Viewer, query: Query) -> None:
     """Place and a button to go there, scores per level, how it was read or why it was not answered."""
     result = query.result
     place = None if result is None or result.verdict == "not here" else result.place
-    imgui.begin_disabled(place is None)
-    if imgui.button("Focus"):
+    if _enabled("Focus", place is not None):
         viewpoint.focus_result(viewer, query)
-    imgui.end_disabled()
+    imgui.same_line()
+    if _enabled("Why?", result is not None):
+        queries.explain(viewer, query)
+    tip("The photographs and masks that the answer stands on, the best and the worst")
     if place is not None:
         imgui.same_line()
         imgui.align_text_to_frame_padding()

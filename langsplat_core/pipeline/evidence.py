@@ -1,0 +1,283 @@
+"""Evidence of an answer: the photographs with a mask of just what answers, those that show it without one,
+and the fit of the phrase to each mask, so that one sees a wrong vote.
+
+What a region means is a mean over masks, in which a wrong one hides, and which looks as sure for three
+photographs as for thirty. So every photograph counts as one vote, for the region or against it, and the share
+of votes for it has a beta distribution.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from scipy import ndimage
+from scipy.special import betaincinv
+
+from langsplat_core.arrays import Array
+from langsplat_core.config import DatasetConfig
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.io.hostile import exists, read_json_file
+from langsplat_core.pipeline.report import LIMIT, REPORT, work_folder
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.answers import QueryResult
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster.protocol import Rasterizer
+from langsplat_core.scene import LEVELS, NO_NODE, Scene
+from langsplat_core.scene.tree import SMALLEST
+from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures
+from langsplat_core.training.language.tree import SHOWN, SOLID, VOTE
+
+TAILS = (0.05, 0.95)  # quantiles of the share of votes between which it is given
+STAGE = "comparing photographs"
+
+
+@dataclass(frozen=True)
+class Vote:
+    """A photograph that shows an answer, and its mask that overlaps most with it."""
+
+    view: int  # index into the scene's cameras
+    photograph: str  # name of that camera
+    pixels: int  # of the photograph, that show the answer
+    mask: int  # row of the photograph's features; -1 where no mask touches the answer
+    overlap: float  # intersection over union of the mask and the answer as rendered, in [0, 1]
+    cosine: float | None  # of the mask's vector with the phrase; None without a mask
+    fit: float | None  # the same in spreads above chance, see `QueryEngine.compare`
+
+    @property
+    def agrees(self) -> bool:
+        """True for a vote for the answer: its mask is of just that."""
+        return self.overlap >= VOTE
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The photographs that show the best region of an answer."""
+
+    phrase: str  # that masks are compared with: of "handle of the mug", "handle"
+    node: int  # of the scene's tree
+    members: Array  # (N,) bool Gaussians of the answer in that node
+    votes: tuple[Vote, ...]  # for the answer, the best fit first
+    others: tuple[Vote, ...]  # against it, those that show most of it first
+
+    @property
+    def share(self) -> float:
+        """Mean of the distribution Beta(1 + votes for, 1 + votes against), in (0, 1)."""
+        return (1 + len(self.votes)) / (2 + len(self.votes) + len(self.others))
+
+    @property
+    def fitting(self) -> int:
+        """Count of the votes for the answer whose mask fits the phrase better than by chance."""
+        return sum(vote.fit is not None and vote.fit > 0 for vote in self.votes)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The 5 % and 95 % quantiles of the same distribution."""
+        low, high = betaincinv(1 + len(self.votes), 1 + len(self.others), TAILS)
+        return float(low), float(high)
+
+    def __str__(self) -> str:
+        low, high = (100 * edge for edge in self.interval)
+        seen = len(self.votes) + len(self.others)
+        share = f"outlined in {len(self.votes)} of {seen} photographs that show it"
+        return f"{share} (90 %: {low:.0f} to {high:.0f} %), {self.fitting} of these fit the phrase"
+
+
+def find_evidence(
+    engine: QueryEngine,
+    answer: QueryResult,
+    phrases: Sequence[str],
+    features: Sequence[ImageFeatures],
+    rasterizer: Rasterizer,
+    progress: Progress = silent,
+) -> Evidence | None:
+    """Evidence of the best region of `answer`; None where no region answers.
+
+    phrases: masks are compared with the one that fits the region best; features: of the scene's cameras.
+    Raises FormatError for features of another scene.
+    """
+    scene, found = engine.scene, _best_region(engine, answer)
+    if found is None:
+        return None
+    size, votes = engine.field.codec.vector_dim, []
+    phrase, place = phrases[0], (answer.level, found[1])
+    if len(phrases) > 1:
+        phrase = max(phrases, key=lambda one: float(engine.run(one).relevancy[place].mean()))
+    for view, camera in enumerate(scene.cameras):
+        progress(STAGE, view / len(scene.cameras))
+        seen = features[view]
+        if seen.labels.shape[1:] != (camera.height, camera.width) or seen.vectors.shape[1] != size:
+            raise FormatError(
+                f"the masks of {camera.name!r} are of another scene: {seen.labels.shape[2]}x"
+                f"{seen.labels.shape[1]} pixels and {seen.vectors.shape[1]} numbers, not {camera.width}x"
+                f"{camera.height} and {size}; name this scene's own folder with --work"
+            )
+        shown = _shown(scene, view, found[1], rasterizer)
+        if shown.sum() >= SHOWN:
+            mask, overlap = _nearest(seen, shown)
+            cosine = fit = None
+            if mask >= 0:
+                cosines, fits = engine.compare(phrase, seen.vectors[[mask]], answer.level)
+                cosine, fit = float(cosines[0]), float(fits[0])
+            votes.append(Vote(view, camera.name, int(shown.sum()), mask, overlap, cosine, fit))
+    progress(STAGE, 1.0)
+    agreeing = sorted((vote for vote in votes if vote.agrees), key=lambda vote: -(vote.fit or 0.0))
+    others = sorted((vote for vote in votes if not vote.agrees), key=lambda vote: -vote.pixels)
+    return Evidence(phrase, *found, tuple(agreeing), tuple(others))
+
+
+def _best_region(engine: QueryEngine, answer: QueryResult) -> tuple[int, Array] | None:
+    """The node of the best region of an answer, and what of the answer is in it."""
+    at = engine.tree.at(answer.level)
+    inside = answer.members & (at != NO_NODE)
+    if not inside.any():
+        return None
+    nodes, row, counts = np.unique(at[inside], return_inverse=True, return_counts=True)
+    relevancies = np.bincount(row, answer.even[inside]) / counts
+    best = int(nodes[np.lexsort((relevancies, counts >= SMALLEST))[-1]])
+    return best, inside & (at == best)
+
+
+def _shown(scene: Scene, view: int, members: Array, rasterizer: Rasterizer) -> Array:
+    """(H, W) bool pixels of a view that these Gaussians paint more than half of."""
+    drawn = rasterizer.view(scene.gaussians, scene.cameras[view], scene.raster_settings())
+    return np.asarray(drawn.splat(members[:, None].astype(np.float32))[0][..., 0] > SOLID)
+
+
+def _nearest(seen: ImageFeatures, shown: Array) -> tuple[int, float]:
+    """The mask, of any level, that overlaps most with `shown` (H, W), or -1, and its overlap."""
+    count = len(seen.vectors)
+    overlaps = np.zeros(count)
+    for labels in seen.labels:
+        shared = np.bincount(labels[shown & (labels >= 0)], minlength=count)
+        areas = np.bincount(labels[labels >= 0], minlength=count)
+        overlaps = np.maximum(overlaps, shared / (areas + shown.sum() - shared))
+    if not overlaps.any():
+        return -1, 0.0
+    return int(overlaps.argmax()), float(overlaps.max())
+
+
+# What training kept beside a scene.
+
+
+def kept_features(path: Path, scene: Scene, work: Path | None = None) -> StoredFeatures:
+    """Masks and vectors of the photographs of the scene in `path`, from `work` or the folder beside it.
+    Raises InputError where there are none."""
+    store = FeatureStore((work or work_folder(path)) / "features")
+    missing = [camera.name for camera in scene.cameras if not exists(store.path(camera.name))]
+    if missing or not scene.cameras:
+        what = f"no masks of {missing[0]!r}" if scene.cameras and exists(store.folder) else "no such folder"
+        raise InputError(
+            f"{store.folder}: {what}; evidence needs the masks that `langsplat train` keeps beside a scene, "
+            "which bundled and imported ones come without: train it, or name its folder with --work"
+        )
+    return StoredFeatures(store, [camera.name for camera in scene.cameras])
+
+
+def kept_photographs(
+    path: Path,
+    scene: Scene,
+    work: Path | None = None,
+    dataset: Path | None = None,
+    progress: Progress = silent,
+) -> dict[str, Array]:
+    """Photographs by the name of their camera, (H, W, 3) uint8 as training saw them, from `dataset` or from
+    where the report of the training says. Raises InputError where some are missing."""
+    from langsplat_core.datasets import load_photographs  # pycolmap: half a second
+
+    work = work or work_folder(path)
+    dataset = dataset or _stated_dataset(path, work / REPORT)
+    most = max(max(camera.width, camera.height) for camera in scene.cameras)
+    capture = load_photographs(dataset, DatasetConfig(max_side=most, allow_few_cameras=True), work, progress)
+    found = {camera.name: image for camera, image in zip(capture.cameras, capture.images, strict=True)}
+    photographs = {}
+    for camera in scene.cameras:
+        if camera.name not in found:
+            raise InputError(f"{dataset}: has no photograph {camera.name!r}; name another with --photographs")
+        image = found[camera.name]
+        if image.shape[:2] != (camera.height, camera.width):  # rounded otherwise
+            image = np.asarray(Image.fromarray(image).resize((camera.width, camera.height)))
+        photographs[camera.name] = image
+    return photographs
+
+
+def _stated_dataset(path: Path, report: Path) -> Path:
+    """The dataset that a report names, if it is still there."""
+    try:
+        stated = read_json_file(report, LIMIT)
+    except InputError:
+        stated = None
+    place = stated.get("dataset") if isinstance(stated, dict) else None
+    if isinstance(place, str) and place and exists(Path(place)):
+        return Path(place)
+    where = f"not in {place}" if isinstance(place, str) and place else f"not named in {report}"
+    raise InputError(f"{path}: its photographs are {where}; name their folder with --photographs")
+
+
+# A contact sheet.
+
+FEW = 5  # photographs in a row
+SIDE, GAP, LINE = 200, 10, 16  # px: of a thumbnail, between them, from line to line
+AROUND = 0.3  # of what is outlined, shown around it
+LEAST = 48  # px of the photograph that a thumbnail shows at least
+PAPER, INK, MASK, ANSWER = (255, 255, 255), (30, 30, 30), (255, 210, 0), (0, 200, 255)
+LEGEND = "yellow: the mask that overlaps most; blue: the answer as rendered"
+
+
+def draw_evidence(
+    evidence: Evidence,
+    answer: QueryResult,
+    scene: Scene,
+    features: Sequence[ImageFeatures],
+    photographs: Mapping[str, Array],
+    rasterizer: Rasterizer,
+) -> Array:
+    """(H, W, 3) uint8 contact sheet: the best votes, the worst ones, and photographs that show the answer
+    without a mask of just that. Yellow outlines the mask, blue the answer as rendered."""
+    rows = {"best votes": evidence.votes[:FEW]}
+    rows["worst votes"] = evidence.votes[FEW:][-FEW:]
+    rows["shown without a mask of just that"] = evidence.others[:FEW]
+    kept = {title: votes for title, votes in rows.items() if votes}
+    step = SIDE + 5 * LINE
+    sheet = Image.new("RGB", (GAP + FEW * (SIDE + GAP), 3 * LINE + len(kept) * step), PAPER)
+    brush, font = ImageDraw.Draw(sheet), ImageFont.load_default(13)
+    heading = f"{answer.phrase}: {answer.verdict}, {LEVELS[answer.level]}; {evidence}"
+    brush.text((GAP, GAP), heading, INK, ImageFont.load_default(16))
+    brush.text((sheet.width - GAP, 2 * LINE), LEGEND, INK, font, anchor="ra")
+    for row, (title, votes) in enumerate(kept.items()):
+        top = 3 * LINE + row * step
+        brush.text((GAP, top), title, INK, font)
+        for column, vote in enumerate(votes):
+            shown = _shown(scene, vote.view, evidence.members, rasterizer)
+            mask = (features[vote.view].labels == vote.mask).any(0) & (vote.mask >= 0)
+            left = GAP + column * (SIDE + GAP)
+            thumbnail = _thumbnail(photographs[vote.photograph], mask, shown)
+            sheet.paste(thumbnail, (left, top + LINE + 2))
+            says = "no mask" if vote.cosine is None else f"cosine {vote.cosine:.3f}, fit {vote.fit:+.2f}"
+            caption = f"{vote.photograph[:24]}\n{says}\noverlap {vote.overlap:.2f}"
+            brush.text((left, top + LINE + SIDE + 4), caption, INK, font, spacing=2)
+    return np.asarray(sheet)
+
+
+def _thumbnail(photograph: Array, mask: Array, shown: Array) -> Image.Image:
+    """The square of a photograph around mask and answer, with both outlined."""
+    rows, columns = np.nonzero(mask | shown)
+    low, high = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1
+    size = np.array([photograph.shape[1], photograph.shape[0]])
+    side = min(max(int((1 + 2 * AROUND) * (high - low).max()), LEAST), int(size.max()))
+    corner = (low + high - side) // 2
+    # Within the photograph, or, of a side that is longer than it, with as much beyond it at both ends.
+    corner = np.where(side > size, (size - side) // 2, corner.clip(0, (size - side).clip(0)))
+    left, top = corner.tolist()
+    box = left, top, left + side, top + side
+    image = np.array(_cut(photograph, box, Image.Resampling.BICUBIC))
+    image[~np.asarray(_cut(np.ones(mask.shape, bool), box, Image.Resampling.NEAREST))] = PAPER
+    for region, colour in ((shown, ANSWER), (mask, MASK)):
+        inside = np.asarray(_cut(region, box, Image.Resampling.NEAREST))
+        image[inside & ~ndimage.binary_erosion(inside, iterations=2, border_value=1)] = colour
+    return Image.fromarray(image)
+
+
+def _cut(image: Array, box: tuple[int, int, int, int], how: Image.Resampling) -> Image.Image:
+    return Image.fromarray(image).crop(box).resize((SIDE, SIDE), how)

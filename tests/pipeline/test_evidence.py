@@ -1,0 +1,254 @@
+"""Evidence: which photographs vote for an answer, and what the phrase says of their masks."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from langsplat_core.arrays import unit
+from langsplat_core.cli import query
+from langsplat_core.cli.app import parse
+from langsplat_core.cli.run import main
+from langsplat_core.errors import FormatError, InputError
+from langsplat_core.io.scenes import load_scene
+from langsplat_core.pipeline.evidence import (
+    Evidence,
+    draw_evidence,
+    find_evidence,
+    kept_features,
+    kept_photographs,
+)
+from langsplat_core.pipeline.train import train_scene
+from langsplat_core.query.compose import run_phrase
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster import load_rasterizer
+from langsplat_core.scene import Scene
+from langsplat_core.semantics.store import ImageFeatures
+from tests.support.fakes import DIM, PER_BLOB, FakeEncoder, as_trained, axis, blob_scene, cameras
+from tests.support.tiny_room import tiny_room, tiny_settings
+
+VIEWS = 8
+WRONG, MERGED, BLANK, AWAY = 2, 4, 5, 6  # photographs that are not as the others
+MUG = np.arange(3 * PER_BLOB) < PER_BLOB
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """Blobs that are seen from `VIEWS` sides; camera `AWAY` looks past them."""
+    views = list(cameras(VIEWS))
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ views[AWAY].world_to_camera
+    views[AWAY] = replace(views[AWAY], world_to_camera=turned)
+    return replace(blob_scene(), cameras=tuple(views))
+
+
+@pytest.fixture(scope="module")
+def shown(scene):
+    """(VIEWS, H, W) bool pixels of the mug, and of everything, by the reference in double precision."""
+    values, found = np.stack([MUG, ~MUG], 1).astype(np.float64), []
+    for camera in scene.cameras:
+        image, _ = load_rasterizer("reference").view(scene.gaussians, camera).splat(values)
+        found.append((image[..., 0] > 0.5, image.sum(-1) > 0.5))
+    return found
+
+
+@pytest.fixture(scope="module")
+def features(shown) -> list[ImageFeatures]:
+    """A mask of the mug in every photograph at level whole, less and less like it from one to the next, and a
+    larger one at level part. One mask means a book, one photograph has all in one mask, one has no mask."""
+    made = []
+    for view, (mug, everything) in enumerate(shown):
+        labels = np.full((3, *mug.shape), -1, np.int32)
+        labels[1][everything] = 1
+        labels[2][everything if view == MERGED else mug] = 0
+        if view == BLANK:
+            labels[:] = -1
+        means = axis(1) if view == WRONG else unit(axis(0) + 0.1 * view * axis(4)).astype(np.float32)
+        made.append(ImageFeatures(labels, np.stack([means, axis(2)])))
+    return made
+
+
+@pytest.fixture(scope="module")
+def engine(scene) -> QueryEngine:
+    return QueryEngine(scene, lambda _: FakeEncoder())
+
+
+@pytest.fixture(scope="module")
+def evidence(engine, features) -> Evidence:
+    found = find_evidence(engine, engine.run("mug"), ["mug"], features, load_rasterizer("cpu"))
+    assert found is not None
+    return found
+
+
+def test_masks_of_just_the_answer_vote_for_it(evidence, shown):
+    np.testing.assert_array_equal(evidence.members, MUG)
+    assert [vote.view for vote in evidence.votes] == [0, 1, 3, 7, WRONG]
+    assert {vote.view for vote in evidence.others} == {MERGED, BLANK}  # and nobody counts who does not see it
+    for vote in (*evidence.votes, *evidence.others):
+        mug, everything = shown[vote.view]
+        assert vote.photograph == f"photo_{vote.view}"
+        assert vote.pixels == pytest.approx(mug.sum(), abs=3)
+        inside = 0 if vote.view == BLANK else mug.sum() / (everything if vote.view == MERGED else mug).sum()
+        assert vote.overlap == pytest.approx(inside, abs=0.02)
+        assert vote.agrees == (inside >= 0.5)
+
+
+def test_a_wrong_mask_is_the_worst_vote(evidence):
+    *right, wrong = evidence.votes
+    assert wrong.view == WRONG
+    assert evidence.fitting == len(right)
+    assert wrong.cosine == pytest.approx(0, abs=1e-6)
+    assert wrong.fit < 0 < min(vote.fit for vote in right)
+
+
+def test_cosines_and_fits_are_those_of_the_masks_own_vectors(evidence, scene):
+    everyday, canonical = (
+        getattr(scene.language, name).astype(np.float64) for name in ("everyday", "canonical")
+    )
+    for vote in evidence.votes:
+        vector = (
+            np.eye(DIM)[1] if vote.view == WRONG else unit(np.eye(DIM)[0] + 0.1 * vote.view * np.eye(DIM)[4])
+        )
+        by_chance = np.sort(everyday @ vector)
+        top = by_chance[-round(0.07 * len(by_chance)) :].mean()
+        zero = 0.25 * (canonical @ vector).max() + 0.75 * top
+        assert vote.cosine == pytest.approx(vector[0], abs=1e-5)
+        assert vote.fit == pytest.approx((vector[0] - zero) / by_chance.std(), rel=1e-4)
+    blank = next(vote for vote in evidence.others if vote.view == BLANK)
+    assert (blank.mask, blank.cosine, blank.fit, blank.overlap) == (-1, None, None, 0.0)
+
+
+@pytest.mark.parametrize(("votes", "others"), [(0, 0), (0, 3), (5, 2), (30, 0)])
+def test_the_share_is_that_of_a_beta_distribution(evidence, votes, others):
+    some = replace(evidence, votes=evidence.votes[:1] * votes, others=evidence.others[:1] * others)
+    shares = np.linspace(0, 1, 400_001)
+    density = shares**votes * (1 - shares) ** others
+    below = np.cumsum(density) / density.sum()
+    low, high = np.interp([0.05, 0.95], below, shares)
+    assert some.share == pytest.approx((shares * density).sum() / density.sum(), abs=1e-4)
+    assert some.interval == pytest.approx((low, high), abs=1e-4)
+
+
+def test_nothing_answers_without_members(engine, features):
+    nothing = replace(engine.run("mug"), members=np.zeros(len(MUG), bool))
+    assert find_evidence(engine, nothing, ["mug"], features, load_rasterizer("cpu")) is None
+
+
+def test_evidence_of_several_is_of_the_best_region(engine, features):
+    both = run_phrase(engine, "mug or plant").answer
+    uneven = replace(both, even=np.where(MUG, both.even, 0.5 * both.even))
+    found = find_evidence(engine, uneven, ["plant", "mug"], features, load_rasterizer("cpu"))
+    assert both.members.sum() > MUG.sum()
+    np.testing.assert_array_equal(found.members, MUG)
+    assert found.phrase == "mug"
+
+
+@pytest.mark.parametrize("wrong", ["size", "numbers"])
+def test_features_of_another_scene_are_refused(engine, features, wrong):
+    labels, vectors = features[0].labels, features[0].vectors
+    other = ImageFeatures(
+        labels[..., :-1] if wrong == "size" else labels, vectors[:, : DIM - (wrong != "size")]
+    )
+    with pytest.raises(FormatError, match="another scene"):
+        find_evidence(engine, engine.run("mug"), ["mug"], [other] * VIEWS, load_rasterizer("cpu"))
+
+
+def test_the_sheet_outlines_masks_in_their_photographs(evidence, engine, scene, features):
+    answer = engine.run("mug")
+    grey = {camera.name: np.full((120, 160, 3), 128, np.uint8) for camera in scene.cameras}
+    sheet = draw_evidence(evidence, answer, scene, features, grey, load_rasterizer("cpu"))
+    yellow, blue = ((sheet == colour).all(-1) for colour in ((255, 210, 0), (0, 200, 255)))
+    assert yellow.sum() > 1000
+    assert blue.sum() > 200  # of the merged one and the blank one, whose masks lie elsewhere
+    few = draw_evidence(replace(evidence, others=()), answer, scene, features, grey, load_rasterizer("cpu"))
+    assert few.shape[0] < sheet.shape[0]
+
+
+# On the command line, with what a training keeps.
+
+
+def run(*words: str) -> int:
+    return main("langsplat", lambda: parse(list(words)))
+
+
+@pytest.fixture
+def trained(tmp_path, monkeypatch, scene, features):
+    """The blobs as if they had been trained, "a.ply", with photographs in "photographs"."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(query, "load_text_encoder", lambda name: FakeEncoder())
+    as_trained(tmp_path / "a.ply", scene, features)
+    return tmp_path
+
+
+def test_the_command_draws_and_says_why(trained, capsys):
+    assert run("query", "a.ply", "mug", "book", "--why", "out.png", "--json") == 0
+    mug, book = (answer["evidence"] for answer in json.loads(capsys.readouterr().out))
+    assert (mug["for"], mug["against"], mug["phrase"]) == (5, 2, "mug")
+    assert mug["interval"][0] < mug["share"] < mug["interval"][1]
+    assert mug["rows"][4]["photograph"] == f"photo_{WRONG}"
+    assert book["for"] == 0
+    with Image.open("out.png") as sheet:
+        assert sheet.height > 800  # of both
+    assert run("query", "a.ply", "mug", "--why", "out.png") == 0
+    said = capsys.readouterr().out
+    assert "5 of 7 photographs" in said
+    assert f"worst photo_{WRONG}" in said
+
+
+@pytest.mark.parametrize(
+    "spoil", ["work", "mask", "truncated", "report", "list", "photographs", "photograph", "jpg"]
+)
+def test_what_is_missing_is_said_in_one_line(trained, capsys, spoil):
+    work, out = trained / "a.work", "out.png"
+    mask = work / "features" / "photo_3.features.npz"
+    told = {
+        "work": ("--work", lambda: work.rename(trained / "elsewhere")),
+        "mask": ("photo_3", mask.unlink),
+        "truncated": ("photo_3", lambda: mask.write_bytes(mask.read_bytes()[:200])),
+        "report": ("--photographs", (work / "report.json").unlink),
+        "list": ("--photographs", lambda: (work / "report.json").write_text('["dataset"]')),
+        "photographs": ("--photographs", lambda: (trained / "photographs").rename(trained / "p")),
+        "photograph": ("photo_7", (trained / "photographs" / "photo_7.png").unlink),
+        "jpg": (".png", lambda: None),
+    }  # fmt: skip
+    names, break_it = told[spoil]
+    break_it()
+    assert run("query", "a.ply", "mug", "--why", "out.jpg" if spoil == "jpg" else out) == 2
+    said = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning")]
+    assert names in said[-1]
+    assert not (trained / out).exists()
+
+
+def test_both_may_lie_elsewhere(trained, capsys):
+    (trained / "a.work").rename(trained / "w")
+    (trained / "photographs").rename(trained / "p")
+    assert run("query", "a.ply", "mug", "--why", "out.png", "--work", "w", "--photographs", "p") == 0
+    assert (trained / "out.png").exists()
+
+
+@pytest.mark.long
+def test_a_training_keeps_all_that_is_needed(tmp_path):
+    """Also for masks of no segmenter, which agree later."""
+    room = tiny_room(tmp_path / "room")
+    train_scene(room, tmp_path / "a.ply", tiny_settings(room))
+    scene = load_scene(tmp_path / "a.ply")
+    engine, seen = QueryEngine(scene), kept_features(tmp_path / "a.ply", scene)
+    photographs = kept_photographs(tmp_path / "a.ply", scene)
+    assert [image.shape[:2] for image in photographs.values()] == [(48, 64)] * len(scene.cameras)
+    found = find_evidence(engine, engine.run("red mug"), ["red mug"], seen, load_rasterizer("cpu"))
+    assert found is not None
+    assert found.votes or found.others
+    with pytest.raises(InputError, match="--work"):
+        kept_features(tmp_path / "b.ply", scene)
+
+
+def test_a_taught_word_is_compared_with_what_was_shown(engine, features):
+    """No text says what it is; the mask of another region is told from those of what was shown."""
+    engine.teach("gizmo", MUG, "whole")
+    found = find_evidence(engine, engine.run("gizmo"), ["gizmo"], features, load_rasterizer("cpu"))
+    np.testing.assert_array_equal(found.members, MUG)
+    *right, wrong = found.votes
+    assert wrong.view == WRONG
+    assert wrong.fit < 0 < min(vote.fit for vote in right)
+    del engine.taught["gizmo"]
