@@ -1,5 +1,6 @@
 """Searching: the box, the list of queries, their colours and their level."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -130,7 +131,7 @@ def take_search_focus(viewer: Viewer) -> bool:
     return wanted
 
 
-Answered = tuple[ComposedResult, tuple[Instance, ...]] | UnknownWordError
+Answered = ComposedResult | UnknownWordError
 
 
 def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
@@ -149,7 +150,7 @@ def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
         except UnknownWordError as error:
             return error
         took.append(1e3 * (perf_counter() - began))
-        return composed, engine.instances(composed.answer, MOST_THINGS) if composed.answer.found else ()
+        return composed
 
     def done(answered: Answered) -> None:
         if query not in viewer.state.queries:  # it was taken off meanwhile
@@ -159,9 +160,11 @@ def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
             failed(str(answered))
             return
         viewer.state.timing.add("search", took[0])
-        _take(query, *answered)
+        _take(query, answered)
         if then_show:
-            _show_answer(viewer, query, answered[0].answer)
+            _show_answer(viewer, query, answered.answer)
+        if answered.answer.found:
+            _tell_apart(viewer, query, answered.answer)
 
     def failed(reason: str) -> None:
         query.problem, query.pending = reason, False
@@ -171,8 +174,22 @@ def _answer(viewer: Viewer, query: Query, then_show: bool = False) -> None:
     viewer.run(f"searching '{query.phrase}'", work, done, failed)
 
 
-def _take(query: Query, composed: ComposedResult, things: tuple[Instance, ...]) -> None:
-    query.automatic, query.things = composed.answer, things
+def _tell_apart(viewer: Viewer, query: Query, answer: QueryResult) -> None:
+    """Have the worker find the instances of an answer that is shown by then: the surface that they are told
+    apart on takes seconds where there are a million Gaussians."""
+    engine = viewer.engine
+    if engine is None:
+        return
+
+    def done(things: tuple[Instance, ...]) -> None:
+        if query.automatic is answer:
+            query.things = things
+
+    viewer.run("telling things apart", lambda progress: engine.instances(answer, MOST_THINGS), done)
+
+
+def _take(query: Query, composed: ComposedResult) -> None:
+    query.automatic, query.things = composed.answer, ()
     query.problem, query.meant, query.pending = "", "", False
     query.result = composed.answer if query.cut is None else recut(composed.answer, query.cut)
     query.asked_for = heads(composed.tree)
