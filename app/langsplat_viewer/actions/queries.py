@@ -1,6 +1,5 @@
 """Searching: the box, the list of queries, their colours and their level."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
