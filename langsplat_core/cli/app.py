@@ -20,7 +20,7 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
     {
         "train": "train.Train",
         "query": "query.QueryScene",
-        "describe": "query.Describe",
+        "describe": "describe.Describe",
         "select": "query.Select",
         "teach": "teach.Teach",
         "scale": "scenes.Scale",

@@ -1,21 +1,19 @@
-"""`langsplat query`, `select` and `describe`: where in a scene a phrase is true, that alone as a scene of its
-own, and words for what is there."""
+"""`langsplat query` and `select`: where in a scene a phrase is true, and that alone as a scene of its own."""
 
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
 from PIL import Image
-from rich.table import Table
 
 from langsplat_core.arrays import Array
-from langsplat_core.cli.run import OutFile, OutputConsole
-from langsplat_core.cli.teach import Level, camera_of, pixel_in, pointed, searchable
+from langsplat_core.cli.run import OutFile
+from langsplat_core.cli.teach import camera_of, pointed, searchable
 from langsplat_core.config import Count, CountOrZero, LevelChoice, NotNegative, PictureConfig, Positive
 from langsplat_core.errors import EncoderError, InputError, LangSplatError
 from langsplat_core.io.files import atomic_path
@@ -35,20 +33,18 @@ from langsplat_core.pipeline.evidence import (
     kept_features,
     kept_photographs,
 )
-from langsplat_core.progress import Progress, TerminalProgress
+from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.answers import QueryResult, peak_pixel
 from langsplat_core.query.compose import Number, check_phrase, count_things, joined, run_phrase
-from langsplat_core.query.describe import Describer, Entry, Words, look_at_pixel
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder
 from langsplat_core.query.grammar import Atom, heads
 from langsplat_core.query.instances import Instance, hull
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.selection import grow, of_rows, shrink
-from langsplat_core.raster import load_lifting_rasterizer, load_rasterizer
+from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import LEVELS, Camera, Scene
 from langsplat_core.scene.language import split_phrases
 from langsplat_core.semantics.encoders import load_text_encoder
-from langsplat_core.semantics.vocabulary import read_vocabulary
 
 PAPER_FILTER = 20  # px, mean filter before the peak is taken (paper, implementation details)
 NOT_DECODED = "--mode paper decodes pixels, and what was shown is compared with regions; leave it out"
@@ -98,7 +94,7 @@ class QueryScene:
         explain = _Explainer(self, scene) if self.why is not None else None
         camera = camera_of(scene, self.camera) if scene.cameras else None
         engine = _engine(scene, _once(load_text_encoder), self.encoder, self.taught)
-        unit = _unit(scene, self.scale)
+        unit = unit_of(scene, self.scale)
         found = [self._ask(engine, text, camera) for text in self._askable(engine, camera)]
         if self.like:
             level = "whole" if self.level == "auto" else self.level
@@ -111,13 +107,13 @@ class QueryScene:
             number = count_things(engine, result) if result.found else Number(0, 0, 0)
             answer |= {"count": {"best": number.best, "least": number.least, "most": number.most}}
             because = {} if explain is None else {"evidence": explain(engine, result, of)}
-            answer |= _basis(engine) | {"metres_per_unit": unit.metres, **_listed(things)}
+            answer |= basis_fields(engine) | {"metres_per_unit": unit.metres, **_listed(things)}
             answers.append(answer | because)
             tables.append(_table(things, unit) + _reasons(**because))
         if explain is not None:
             explain.write()
         if self.json:
-            _print_json(answers)
+            print_json(answers)
             return
         for answer, lines in zip(answers, tables, strict=True):
             verdict, reading = answer["verdict"], answer["reading"]
@@ -332,12 +328,12 @@ class Select:
     def run(self) -> None:
         self._check()
         scene = searchable(self.scene)
-        unit = _unit(scene, self.scale)
+        unit = unit_of(scene, self.scale)
         engine = _engine(scene, load_text_encoder, self.encoder, self.taught)
-        answers = [_found(engine, text, self.level) for text in self.texts]
+        answers = [found_answer(engine, text, self.level) for text in self.texts]
         answer = answers[0] if len(answers) == 1 else joined(answers, all_needed=True)
         found = engine.instances(answer)
-        rows = np.concatenate([instance.members for instance in _chosen(found, self.instance)])
+        rows = np.concatenate([instance.members for instance in chosen_instances(found, self.instance)])
         selected = self._reshaped(engine, of_rows(rows, len(answer.members)), unit)
         written = self._write(engine, replace(answer, members=selected))
         self._print(found, unit, int(selected.sum()), written)
@@ -403,213 +399,12 @@ class Select:
                 "written": written,
                 "out": str(self.out),
             }
-            _print_json(content)
+            print_json(content)
             return
         print("\n".join(_table(found, unit)))
         what = {"scene": "Gaussians", "points": "points", "hull": "closed hulls"}[self.shape]
         of = f"all but the {selected} selected" if self.remove else f"of {selected} selected Gaussians"
         print(f"{self.out}: {written} {what}, {of}")
-
-
-# `langsplat describe`.
-
-
-@dataclass(frozen=True)
-class Describe:
-    """Name what is here: the best words of a vocabulary for a pixel, a Gaussian or an instance of a phrase,
-    or the scene's inventory."""
-
-    scene: tyro.conf.Positional[Path]
-    """A trained scene, *.ply with its language field beside it."""
-    camera: Annotated[CountOrZero, tyro.conf.arg(metavar="INDEX")] = 0
-    """Training view in which --pixel is meant."""
-    pixel: Annotated[tuple[CountOrZero, CountOrZero] | None, tyro.conf.arg(metavar="X Y")] = None
-    """Column and row, counted from the top left pixel, 0 0."""
-    gaussian: Annotated[CountOrZero | None, tyro.conf.arg(metavar="NUMBER")] = None
-    """One Gaussian, by its row in the file, from 0."""
-    phrase: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
-    """A thing that this phrase finds."""
-    instance: Annotated[Count, tyro.conf.arg(metavar="NUMBER")] = 1
-    """Which of the things that --phrase finds, as `langsplat query` lists them; the best is 1."""
-    level: Level | None = None
-    """This semantic level alone."""
-    outline: bool = False
-    """The scene as a tree: wholes, with their parts under them."""
-    top: Count = 5
-    """Words per level."""
-    vocabulary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Your own list, one phrase per line, in place of the bundled everyday things and parts."""
-    encoder: str = ""
-    """Text encoder folder or hub id, in place of the one the scene names."""
-    json: bool = False
-    """Print JSON."""
-
-    def run(self) -> None:
-        phrases = None if self.vocabulary is None else read_vocabulary(self.vocabulary)
-        scene = searchable(self.scene)
-        self._check(scene)
-        with TerminalProgress() as progress:
-            engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
-            describer = Describer(engine, phrases, progress)
-            answer = self._described(describer, progress)
-        if self.json:
-            _print_json(answer | _basis(engine))
-            return
-        if self.outline:
-            named = [one for one in answer["outline"] if one["word"] is not None or one["parts"]]
-            _print_outline(named, _unit(scene, None))
-            if len(named) < len(answer["outline"]):
-                print(f"and {len(answer['outline']) - len(named)} without a name, which --json lists")
-        elif self._everything:
-            _print_inventory(answer["inventory"])
-        else:
-            _print_words(answer["levels"])
-        print(f"answers: {engine.basis.long}")
-        if describer.left_out:
-            names = ", ".join(describer.left_out[:3]) + (" ..." if len(describer.left_out) > 3 else "")
-            print(
-                f"{answer['asked']} phrases were compared; {len(describer.left_out)} were left out, because "
-                f"the encoder was never taught their words ({names})"
-            )
-
-    @property
-    def _everything(self) -> bool:
-        return self._asked_of == []
-
-    @property
-    def _asked_of(self) -> list[str]:
-        """The options that name a place."""
-        given = {"--pixel": self.pixel, "--gaussian": self.gaussian, "--phrase": self.phrase}
-        return [option for option, value in given.items() if value is not None]
-
-    def _check(self, scene: Scene) -> None:
-        """InputError for arguments that do not go with the scene or each other, before anything is loaded."""
-        if self.outline and (self._asked_of or self.level is not None):
-            raise InputError(
-                "--outline is of the whole scene, at all levels; leave out what else is asked for"
-            )
-        if len(self._asked_of) > 1:
-            raise InputError(f"{' and '.join(self._asked_of)} are several questions; ask one of them")
-        if self.phrase is None and self.instance != 1:
-            raise InputError(f"--instance {self.instance} needs a --phrase that finds it")
-        count = len(scene.gaussians)
-        if self.gaussian is not None and not 0 <= self.gaussian < count:
-            raise InputError(f"--gaussian {self.gaussian}: the scene has Gaussians 0 to {count - 1}")
-        if self.pixel is None:
-            if self.camera != 0:
-                raise InputError(f"--camera {self.camera} needs a --pixel X Y in it")
-            return
-        if not scene.cameras:
-            raise InputError(f"{self.scene}: has no cameras, so --pixel means nothing; ask by --gaussian")
-        pixel_in(scene, self.camera, self.pixel, "--pixel {} {}".format(*self.pixel))
-
-    def _described(self, describer: Describer, progress: Progress) -> dict[str, Any]:
-        """The inventory, or the words of the place that is asked for, ready for JSON."""
-        engine = describer.engine
-        sure = engine.basis.calibration is not None
-        asked = {"asked": len(describer.words[0].phrases), "left_out": len(describer.left_out)}
-        if self.outline:
-            return asked | {"outline": [_plain(one, sure) for one in describer.outline()]}
-        found: Sequence[Words | Entry]
-        place: dict[str, Any] = {}
-        if self.pixel is not None:
-            camera = engine.scene.cameras[self.camera]
-            at = look_at_pixel(load_lifting_rasterizer("cpu"), describer, camera, self.pixel, top=self.top)
-            found = describer.at_gaussians(np.zeros(0, np.int64)) if at is None else at.words
-            place = {"camera": self.camera, "view": camera.name, "pixel": list(self.pixel)}
-        elif self.phrase is not None:
-            instances = engine.instances(_found(engine, self.phrase, "auto"))
-            thing = _chosen(instances, [self.instance])[0]
-            found = describer.at_gaussians(thing.members, top=self.top)
-            place = {"phrase": self.phrase, "thing": _instance(thing, self.instance)}
-        elif self.gaussian is not None:
-            found = describer.at_gaussians(np.array([self.gaussian]), np.ones(1), self.top)
-            place = {"gaussian": self.gaussian}
-        else:
-            found = describer.inventory(progress)
-        wanted = [_plain(one, sure) for one in found if self.level in (None, LEVELS[one.level])]
-        return place | asked | {"inventory" if self._everything else "levels": wanted}
-
-
-def _plain(value: Any, sure: bool) -> Any:
-    """Words, spots and entries, ready for JSON. A share of the softmax over a vocabulary is a probability too
-    where that is `sure`."""
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, tuple):
-        return [_plain(item, sure) for item in value]
-    if not is_dataclass(value):
-        return value
-    made: dict[str, Any] = {}
-    for name in (field.name for field in fields(value)):
-        held = getattr(value, name)
-        if name == "level":
-            made[name] = LEVELS[held]
-        elif name == "rows":
-            made["gaussians"] = len(held)
-        elif name == "probability":
-            made |= {"softmax": held, "probability": held if sure else None}
-        else:
-            made[name] = _plain(held, sure)
-    return made
-
-
-def _looks(described: dict[str, Any]) -> str:
-    return " ".join(described[key]["phrase"] for key in ("colour", "material") if described[key] is not None)
-
-
-def _percent(described: dict[str, Any]) -> str:
-    return "" if described["probability"] is None else f" {100 * described['probability']:.0f} %"
-
-
-def _print_inventory(entries: list[dict[str, Any]]) -> None:
-    table = Table("what", "also", "level", "p %", "surface %", "looks", "centre", box=None)
-    for entry in entries:
-        names = (
-            entry["phrase"],
-            ", ".join(entry["also"]),
-            entry["level"],
-            _percent(entry).strip(" %") or "-",
-        )
-        for number, spot in enumerate(entry["spots"]):
-            centre = " ".join(f"{value:.2f}" for value in spot["centre"])
-            start = names if number == 0 else ("", "", "", "")
-            table.add_row(*start, f"{100 * spot['share']:.2f}", _looks(spot), centre)
-    console = OutputConsole()
-    OutputConsole(width=max(WIDTH, console.width)).print(table)
-    if not entries:
-        print("nothing of the vocabulary was found in the scene")
-
-
-def _print_outline(nodes: list[dict[str, Any]], unit: "Unit", depth: int = 0) -> None:
-    """Nodes with their parts indented under them; a line for those of one name that have none, too."""
-    groups: dict[Any, list[dict[str, Any]]] = {}
-    for node in nodes:
-        name = None if node["word"] is None else node["word"]["phrase"]
-        groups.setdefault(node["node"] if node["parts"] or name is None else name, []).append(node)
-    for group in groups.values():
-        node = group[0]
-        word = "?" if node["word"] is None else f"{node['word']['phrase']}{_percent(node['word'])}"
-        what = [
-            node["level"],
-            f"{unit.format(np.array(node['size']), ' x ')} {unit.name}",
-            f"{node['count']} Gaussians",
-        ]
-        if any(node["votes"]):
-            what.append(f"outlined in {node['votes'][0]} of {sum(node['votes'])} photographs")
-        times = f"{len(group)} x " if len(group) > 1 else ""
-        print(f"{'  ' * depth}{times}{word}: {'the largest ' if times else ''}{', '.join(what)}")
-        _print_outline(node["parts"], unit, depth + 1)
-
-
-def _print_words(levels: list[dict[str, Any]]) -> None:
-    for level in reversed(levels):
-        if not level["words"]:
-            print(f"{level['level']:<8} nothing is known here")
-            continue
-        said = ", ".join(word["phrase"] + _percent(word) for word in level["words"])
-        looks = _looks(level)
-        print(f"{level['level']:<8} {said}" + (f"; looks {looks}" if looks else ""))
 
 
 # Scenes, instances and JSON, as all three print them.
@@ -632,7 +427,7 @@ class Unit:
         return between.join(f"{self.length * value:.3f}" for value in values)
 
 
-def _unit(scene: Scene, metres_per_unit: float | None = None) -> Unit:
+def unit_of(scene: Scene, metres_per_unit: float | None = None) -> Unit:
     """Metres by `metres_per_unit`, else by the scene's own, else world units."""
     metres = metres_per_unit or scene.metres_per_unit
     return Unit("units", 1.0) if metres is None else Unit("m", metres)
@@ -661,10 +456,10 @@ def _table(instances: Sequence[Instance], unit: Unit) -> list[str]:
 
 
 def _listed(instances: Sequence[Instance]) -> dict[str, Any]:
-    return {"instances": [_instance(instance, number) for number, instance in enumerate(instances, 1)]}
+    return {"instances": [instance_fields(instance, number) for number, instance in enumerate(instances, 1)]}
 
 
-def _instance(instance: Instance, number: int) -> dict[str, Any]:
+def instance_fields(instance: Instance, number: int) -> dict[str, Any]:
     """An instance, ready for JSON, lengths in world units."""
     box = instance.oriented
     return {
@@ -684,7 +479,7 @@ def _instance(instance: Instance, number: int) -> dict[str, Any]:
     }
 
 
-def _found(engine: QueryEngine, text: str, level: LevelChoice) -> QueryResult:
+def found_answer(engine: QueryEngine, text: str, level: LevelChoice) -> QueryResult:
     """The answer to a phrase; InputError where it was not found."""
     answer = run_phrase(engine, text, level).answer
     if not answer.found or not answer.members.any():
@@ -695,7 +490,7 @@ def _found(engine: QueryEngine, text: str, level: LevelChoice) -> QueryResult:
     return answer
 
 
-def _chosen(found: Sequence[Instance], numbers: Sequence[int]) -> Sequence[Instance]:
+def chosen_instances(found: Sequence[Instance], numbers: Sequence[int]) -> Sequence[Instance]:
     """The instances of these numbers, the best is 1; all without numbers. Raises InputError for another."""
     if not found:
         raise InputError("what was found lies nowhere on a surface: nothing to select")
@@ -705,10 +500,10 @@ def _chosen(found: Sequence[Instance], numbers: Sequence[int]) -> Sequence[Insta
     return [found[number - 1] for number in numbers] or found
 
 
-def _basis(engine: QueryEngine) -> dict[str, Any]:
+def basis_fields(engine: QueryEngine) -> dict[str, Any]:
     return {"encoder": engine.basis.encoder, "calibration": engine.basis.calibration}
 
 
-def _print_json(content: Any) -> None:
+def print_json(content: Any) -> None:
     json.dump(content, sys.stdout, indent=1)
     print()

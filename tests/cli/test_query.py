@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from langsplat_core.cli import query
+from langsplat_core.cli import describe, query
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.run import main
 from langsplat_core.cli.scenes import Scale
@@ -48,7 +48,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     field = replace(scene.language, phrasebook=known)
     save_scene(tmp_path / "a.ply", replace(scene, language=field, extras=extras, metres_per_unit=0.5))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(query, "load_text_encoder", lambda name: FakeEncoder())
+    for module in (query, describe):
+        monkeypatch.setattr(module, "load_text_encoder", lambda name: FakeEncoder())
     return tmp_path
 
 
