@@ -177,6 +177,11 @@ def check_display(scene: Scene, display: Display, queries: tuple[str, ...]) -> N
     """InputError for a display or query that this scene cannot answer."""
     if scene.language is None and (queries or DISPLAYS[display].needs_field):
         raise InputError(f"{scene.path}: {no_field(scene)}")
+    if display == "tree" and scene.language is not None and scene.language.tree is None:
+        raise InputError(
+            f"{scene.path}: keeps no tree, like all imported scenes and those of earlier versions; "
+            "`langsplat train --gaussians` makes the field again"
+        )
     if DISPLAYS[display].needs_query and not queries:
         raise InputError(f"--display {display} shows a search; add --query TEXT")
 

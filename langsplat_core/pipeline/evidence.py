@@ -25,7 +25,7 @@ from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.protocol import Rasterizer
 from langsplat_core.scene import LEVELS, NO_NODE, Scene
-from langsplat_core.scene.tree import SMALLEST
+from langsplat_core.scene.surface import SMALLEST
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures, StoredFeatures
 from langsplat_core.training.language.tree import SHOWN, SOLID, VOTE
 

@@ -41,8 +41,7 @@ from langsplat_core.scene import (
 )
 from langsplat_core.scene.codec import KINDS
 from langsplat_core.scene.language import phrase_key
-from langsplat_core.scene.surface import build_surface
-from langsplat_core.scene.tree import build_tree
+from langsplat_core.scene.surface import build_surface, build_tree
 from langsplat_core.semantics.encoder import Encoder, PhraseEncoder
 from langsplat_core.semantics.store import ImageFeatures
 from langsplat_core.semantics.vocabulary import everyday_vectors
@@ -179,7 +178,7 @@ class _Stages:
             return self._processes.once(
                 lambda: build_tree(surface(), field.codec, field.latents, field.known)
             )
-        path = self._work / f"{stage_key('nodes', 2, *self._inputs, self._lift, self._config.codec)}.npz"
+        path = self._work / f"{stage_key('nodes', 3, *self._inputs, self._lift, self._config.codec)}.npz"
         if not path.exists():
             self._mask_weights()  # everyone's work
 

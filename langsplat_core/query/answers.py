@@ -20,8 +20,7 @@ from langsplat_core.query.grammar import Named, named
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.query.regions import Regions
 from langsplat_core.scene import LEVELS, Calibration, Fits, LanguageField
-from langsplat_core.scene.surface import Surface
-from langsplat_core.scene.tree import SMALLEST
+from langsplat_core.scene.surface import SMALLEST, Surface
 from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST, Scale, relevancy_of
 
 Triple = tuple[float, float, float]  # one number a level

@@ -19,7 +19,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.query.answers import QueryResult, place_of, triple
 from langsplat_core.query.regions import Regions
 from langsplat_core.scene import LEVELS, LanguageField, TaughtWord
-from langsplat_core.scene.tree import SMALLEST
+from langsplat_core.scene.surface import SMALLEST
 
 VARIANCE = 0.95  # share of the everyday phrases' variance that the word space holds
 OTHERS = 0.84  # share of pairs of wholes

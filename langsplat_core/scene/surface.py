@@ -1,5 +1,5 @@
 """The surface that Gaussians lie on, as the nearest neighbours of each: to smooth over it, to walk along it,
-and to divide it into patches."""
+to divide it into patches, and these into the nodes of the scene's tree."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,7 +10,9 @@ from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import Array, sigmoid
 from langsplat_core.compiled import kernel, plain, shared_workers
+from langsplat_core.scene.codec import Codec
 from langsplat_core.scene.gaussians import Gaussians
+from langsplat_core.scene.tree import LEVEL_COUNT, NO_NODE, Tree
 
 NEIGHBOURS = 16
 FAINTEST = 1e-3  # weight of a Gaussian whose opacity is less, so that no mean divides by nothing
@@ -224,3 +226,81 @@ def _merge(
             root = parent[root]
         parent[item] = root
     return parent
+
+
+# The tree of a scene: patches that mean the same at a level, by the criterion of `divide`. Wholes are found
+# first, parts within each, then subparts within these. What masks of many photographs say is one thing stays
+# one whole, since the encoder may see its front and its back differently; their borders count at all levels.
+
+SCALE = 6.8  # of the criterion, in typical steps times Gaussians: larger prefers larger patches
+SMALLEST = 10  # Gaussians; smaller patches join the neighbour that means the most similar
+BORDER = 0.6  # added to the step between two things, in typical steps
+UNKNOWN = 2.0  # step between a Gaussian with a meaning and one without: as much as between opposites
+STEPS = 65_535 / (UNKNOWN + 2 * BORDER)  # of 1 - cosine that are told apart: 16 bits sort in linear time
+
+
+def build_tree(
+    surface: Surface, codec: Codec, latents: Array, known: Array, things: Array | None = None
+) -> Tree:
+    """The tree of a scene, without votes.
+
+    latents: (3, N, d); known: (3, N) bool; things: (3, N) int32 number, from 0, of what masks of many
+    photographs say is one, at each level, NO_NODE for none.
+    """
+    above: Array | None = None  # (M,) node of the level above
+    of: list[Array] = []
+    for level in range(LEVEL_COUNT - 1, -1, -1):
+        own = latents[level, surface.rows], known[level, surface.rows]
+        told = np.full(len(surface.rows), NO_NODE) if things is None else things[level, surface.rows]
+        above = _divided(surface, codec, *own, above, told)
+        of.insert(0, above)
+    counts = [int(row.max(initial=-1)) + 1 for row in of]
+    firsts = np.cumsum([0, *counts])
+    parents = np.full(firsts[-1], NO_NODE, np.int32)
+    for level in range(LEVEL_COUNT - 1):
+        parents[firsts[level] + of[level]] = firsts[level + 1] + of[level + 1]
+    leaves = np.full(len(surface.anchors), NO_NODE, np.int32)
+    near = surface.anchors >= 0
+    leaves[near] = of[0][surface.anchors[near]]
+    levels = np.repeat(np.arange(LEVEL_COUNT, dtype=np.uint8), counts)
+    return Tree(leaves, parents, levels, np.zeros((len(levels), 2), np.uint16))
+
+
+def _divided(
+    surface: Surface, codec: Codec, latents: Array, known: Array, above: Array | None, things: Array
+) -> Array:
+    """(M,) int32 number, from 0, of the patch of each Gaussian at one level, with borders between `things`
+    (M,). Without a level `above` (M,) what is of one thing is one, else patches are within those above."""
+    a, b = surface.ends
+    steps = _steps(codec, latents, known, a, b)
+    # Between two Gaussians drawn by chance, on average: what is far in this encoder's space.
+    typical = codec.spread(latents[known]) if known.any() else 1.0
+    told = (things[a] != NO_NODE) & (things[b] != NO_NODE)
+    within = 0 if above is None else steps
+    steps = np.where(told, np.where(things[a] == things[b], within, steps + BORDER * typical), steps)
+    ranks = np.round(steps * STEPS).astype(np.uint16)
+    order = np.argsort(ranks, kind="stable").astype(np.int32)
+    if above is not None:
+        order = order[above[a[order]] == above[b[order]]]
+    of = divide(surface, steps, order, SCALE * typical, SMALLEST)
+    return of if above is not None else _united(of, things, surface.weights)
+
+
+def _steps(codec: Codec, latents: Array, known: Array, a: Array, b: Array) -> Array:
+    """(E,) 1 - cosine between what the two ends of each link mean, in [0, 2]."""
+    steps = codec.distances(latents, a, b)
+    both, neither = known[a] & known[b], ~known[a] & ~known[b]
+    return np.asarray(np.where(both, steps, np.where(neither, 0.0, UNKNOWN)).clip(0, UNKNOWN))
+
+
+def _united(of: Array, things: Array, weights: Array) -> Array:
+    """(M,) patches, those of one thing joined, wherever they are: half hidden, it is still one. A patch is of
+    the thing that most of it is."""
+    count, size = int(of.max(initial=-1)) + 1, int(things.max(initial=NO_NODE)) + 2
+    place, row = np.unique(of.astype(np.int64) * size + things + 1, return_inverse=True)
+    shares = np.bincount(row, weights, len(place))
+    order = np.lexsort((shares, place // size))  # of each patch the largest share last
+    thing = np.full(count, NO_NODE)
+    thing[place[order] // size] = place[order] % size - 1
+    joined = np.where(thing == NO_NODE, size + np.arange(count), thing)
+    return np.unique(joined[of], return_inverse=True)[1].astype(np.int32).reshape(-1)

@@ -28,8 +28,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import Named
 from langsplat_core.query.regions import Regions, build_regions
 from langsplat_core.scene import LEVELS, NO_NODE, Calibration, Gaussians, LanguageField, Odds, Reading, Scene
-from langsplat_core.scene.surface import Surface, build_surface
-from langsplat_core.scene.tree import SMALLEST
+from langsplat_core.scene.surface import SMALLEST, Surface, build_surface
 from langsplat_core.semantics.relevancy import FLOOR, Scale
 from tests.support.fakes import CENTRES, PER_BLOB, FakeEncoder, blob_scene, blobs, language
 from tests.support.file_samples import random_field

@@ -14,8 +14,17 @@ from langsplat_core.query import selection
 from langsplat_core.query.regions import Regions
 from langsplat_core.query.selection import Projected, in_polygon, in_rectangle, in_stroke, on_surface, project
 from langsplat_core.scene import NO_NODE, Gaussians, LanguageField, Scene, look_at
-from langsplat_core.scene.surface import NEIGHBOURS, Surface, build_surface
-from langsplat_core.scene.tree import BORDER, SCALE, SMALLEST, STEPS, UNKNOWN, tree_of_wholes
+from langsplat_core.scene.surface import (
+    BORDER,
+    NEIGHBOURS,
+    SCALE,
+    SMALLEST,
+    STEPS,
+    UNKNOWN,
+    Surface,
+    build_surface,
+)
+from langsplat_core.scene.tree import tree_of_wholes
 from tests.support.fakes import CENTRES, PER_BLOB, blob_scene
 from tests.support.file_samples import random_field
 from tests.support.scenes import random_gaussians, regions_of

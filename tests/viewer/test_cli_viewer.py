@@ -19,6 +19,7 @@ from langsplat_core.scene import Camera, Scene
 from langsplat_viewer import __main__ as program
 from langsplat_viewer.options import DisplayChoice, latent_level, parse_size
 from tests.support.fakes import CENTRES, blob_scene
+from tests.support.scenes import with_tree
 
 MUG, BOOK, PLANT = CENTRES
 
@@ -26,7 +27,8 @@ MUG, BOOK, PLANT = CENTRES
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working folder, with scenes in it."""
-    save_scene(tmp_path / "blobs.ply", blob_scene(phrasebook=True))
+    save_scene(tmp_path / "blobs.ply", with_tree(blob_scene(phrasebook=True)))
+    save_scene(tmp_path / "old.ply", blob_scene())
     save_scene(tmp_path / "plain.ply", blob_scene(field=False, with_cameras=False))
     whole = (tmp_path / "plain.ply").read_bytes()
     (tmp_path / "truncated.ply").write_bytes(whole[: len(whole) // 2])
@@ -164,7 +166,7 @@ def test_without_perspective_the_picture_has_the_scale_that_was_asked_for(run_vi
 
 def test_a_cut_of_zero_is_the_answers_own(run_viewer, folder):
     asked = ("blobs.ply", "--headless", "--display", "segmentation", "--query", "mug", "--query", "plant")
-    for out, cuts in (("a.png", ()), ("b.png", ("0", "0")), ("c.png", ("0", "0.2"))):
+    for out, cuts in (("a.png", ()), ("b.png", ("0", "0")), ("c.png", ("0", "0.01"))):
         words = [word for cut in cuts for word in ("--cut", cut)]
         assert run_viewer(*asked, "--out", out, *words)[0] == 0
     own, zero, cut = (picture(folder / name) for name in ("a.png", "b.png", "c.png"))
@@ -212,6 +214,7 @@ def test_a_scene_without_cameras_is_framed(run_viewer, folder):
         (["plain.ply", "--camera", "0"], "no training cameras"),
         (["plain.ply", "--query", "mug"], "langsplat train"),
         (["plain.ply", "--display", "latent"], "langsplat train"),
+        (["old.ply", "--display", "tree"], "keeps no tree"),
         (["plain.ply", "--display", "relevancy"], "langsplat train"),
         (["blobs.ply", "--display", "segmentation"], "add --query"),
         (["blobs.ply", "--display", "pretty"], "pretty"),
