@@ -178,7 +178,7 @@ class _Stages:
             return self._processes.once(
                 lambda: build_tree(surface(), field.codec, field.latents, field.known)
             )
-        path = self._work / f"{stage_key('nodes', 3, *self._inputs, self._lift, self._config.codec)}.npz"
+        path = self._work / f"{stage_key('nodes', 4, *self._inputs, self._lift, self._config.codec)}.npz"
         if not path.exists():
             self._mask_weights()  # everyone's work
 

@@ -282,8 +282,7 @@ def _divided(
     order = np.argsort(ranks, kind="stable").astype(np.int32)
     if above is not None:
         order = order[above[a[order]] == above[b[order]]]
-    of = divide(surface, steps, order, SCALE * typical, SMALLEST)
-    return of if above is not None else _united(of, things, surface.weights)
+    return divide(surface, steps, order, SCALE * typical, SMALLEST)
 
 
 def _steps(codec: Codec, latents: Array, known: Array, a: Array, b: Array) -> Array:
@@ -291,16 +290,3 @@ def _steps(codec: Codec, latents: Array, known: Array, a: Array, b: Array) -> Ar
     steps = codec.distances(latents, a, b)
     both, neither = known[a] & known[b], ~known[a] & ~known[b]
     return np.asarray(np.where(both, steps, np.where(neither, 0.0, UNKNOWN)).clip(0, UNKNOWN))
-
-
-def _united(of: Array, things: Array, weights: Array) -> Array:
-    """(M,) patches, those of one thing joined, wherever they are: half hidden, it is still one. A patch is of
-    the thing that most of it is."""
-    count, size = int(of.max(initial=-1)) + 1, int(things.max(initial=NO_NODE)) + 2
-    place, row = np.unique(of.astype(np.int64) * size + things + 1, return_inverse=True)
-    shares = np.bincount(row, weights, len(place))
-    order = np.lexsort((shares, place // size))  # of each patch the largest share last
-    thing = np.full(count, NO_NODE)
-    thing[place[order] // size] = place[order] % size - 1
-    joined = np.where(thing == NO_NODE, size + np.arange(count), thing)
-    return np.unique(joined[of], return_inverse=True)[1].astype(np.int32).reshape(-1)

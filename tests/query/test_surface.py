@@ -137,23 +137,9 @@ def plain_typical_step(surface: Surface, field: LanguageField, level: int) -> fl
     return float(np.mean(1 - vectors @ vectors.T))
 
 
-def plain_things(surface: Surface, patches: set[frozenset[int]], things: np.ndarray) -> dict[int, int]:
-    """A negative number for each Gaussian in a patch that a thing has most of."""
-    firsts: dict[int, int] = {}
-    for members in patches:
-        shares: dict[int, float] = {}
-        for number in members:
-            thing = int(things[surface.rows[number]])
-            shares[thing] = shares.get(thing, 0.0) + float(surface.weights[number])
-        thing = max(shares, key=lambda one: shares[one])
-        if thing != NO_NODE:
-            firsts |= dict.fromkeys(members, -1 - thing)
-    return firsts
-
-
 def plain_regions(surface: Surface, field: LanguageField, level: int) -> list[int]:
     """Felzenszwalb and Huttenlocher, with sets: the first member of each Gaussian's region, within those of
-    the level above; wholes of one thing are joined."""
+    the level above."""
     steps, typical = [], plain_typical_step(surface, field, level)
     above = None if level == 2 else plain_regions(surface, field, level + 1)
     things = None if level < 2 or field.tree is None else field.tree.leaves
@@ -183,10 +169,7 @@ def plain_regions(surface: Surface, field: LanguageField, level: int) -> list[in
                 both = mine | other
                 within[both] = max(step, within[mine], within[other])
                 region.update(dict.fromkeys(both, both))
-    firsts = {number: min(members) for number, members in region.items()}
-    if things is not None:
-        firsts |= plain_things(surface, set(region.values()), things)
-    return [firsts[number] for number in range(len(surface.rows))]
+    return [min(region[number]) for number in range(len(surface.rows))]
 
 
 def assert_same_partition(got, want) -> None:
@@ -200,9 +183,9 @@ def on_surface_of(regions: Regions, surface: Surface) -> np.ndarray:
     return regions.everywhere[:, surface.rows]
 
 
-def assert_sound(regions: Regions, surface: Surface, united: bool = False) -> None:
+def assert_sound(regions: Regions, surface: Surface) -> None:
     """Numbered from 0 without a gap, sizes as counted, each within one above, none over a gap of the surface
-    and none too small, but for things that are `united`."""
+    and none too small."""
     _, parts = connected_components(surface.links, directed=False)
     every = on_surface_of(regions, surface)
     for level, (of, sizes) in enumerate(zip(every, regions.sizes, strict=True)):
@@ -210,8 +193,6 @@ def assert_sound(regions: Regions, surface: Surface, united: bool = False) -> No
         assert (sizes > 0).all()
         if level < 2:
             assert len(np.unique(every[level : level + 2], axis=1).T) == len(sizes)
-        if united and level == 2:
-            continue
         assert len(np.unique(np.stack([of, parts]), axis=1).T) == len(sizes)
         around = parts if level == 2 else parts * len(of) + every[level + 1]
         for number in np.flatnonzero(sizes < SMALLEST):
@@ -224,7 +205,7 @@ def test_regions_are_those_of_the_plain_criterion(kind, things):
     gaussians, field = patched(kind, seed=KINDS.index(kind), things=things)
     surface = build_surface(gaussians)
     regions = regions_of(Scene(gaussians, field), surface)
-    assert_sound(regions, surface, united=things)
+    assert_sound(regions, surface)
     for level, of in enumerate(on_surface_of(regions, surface)):
         assert_same_partition(of, plain_regions(surface, field, level))
         assert 1 < len(regions.sizes[level]) < 30  # neither one lump nor crumbs

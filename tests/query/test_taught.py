@@ -11,10 +11,9 @@ from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.language import Words, read_language, read_words, write_language, write_words
 from langsplat_core.query.compose import check_phrase, run_phrase
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.scene import LanguageField, Scene, TaughtWord
+from langsplat_core.scene import NO_NODE, LanguageField, Scene, TaughtWord, Tree
 from langsplat_core.scene.codec import CodebookCodec
 from langsplat_core.scene.language import LONGEST_NAME, MOST_SHOWN
-from langsplat_core.scene.tree import tree_of_wholes
 from tests.support.scenes import random_gaussians
 
 DIM, KINDS, SPAN = 96, 40, 32  # vectors; things there are; directions in which words differ
@@ -210,8 +209,12 @@ def test_scenes_of_almost_nothing_answer():
 
 def test_the_level_is_the_one_that_has_what_was_marked():
     scene = scene_of([*range(8)], seed=7)
-    pairs = tree_of_wholes(np.arange(len(scene.gaussians)) // (2 * EACH))  # one mask had two things each
-    engine = QueryEngine(Scene(scene.gaussians, replace(scene.language, tree=pairs)))
+    leaves = (np.arange(len(scene.gaussians)) // EACH).astype(np.int32)
+    count, pairs = int(leaves.max()) + 1, int(leaves.max()) // 2 + 1  # wholes of two things each
+    parents = np.concatenate([count + np.arange(count) // 2, np.full(pairs, NO_NODE)]).astype(np.int32)
+    levels = np.repeat(np.array([1, 2], np.uint8), [count, pairs])
+    tree = Tree(leaves, parents, levels, np.zeros((count + pairs, 2), np.uint16))
+    engine = QueryEngine(Scene(scene.gaussians, replace(scene.language, tree=tree)))
     assert engine.teach("one", members(3, 8)).level == 1
     assert engine.teach("two", members(2, 8) | members(3, 8)).level == 2
 
