@@ -24,6 +24,7 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
         "select": "query.Select",
         "teach": "teach.Teach",
         "scale": "scenes.Scale",
+        "export": "export.Export",
         "convert": "scenes.Convert",
         "compact": "scenes.Compact",
         "inspect": "scenes.Inspect",
