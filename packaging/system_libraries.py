@@ -20,6 +20,8 @@ NEEDED = {
 # Mesa's software driver has no library that find_library sees: look for the driver folder's file.
 DRI_PACKAGE = "libgl1-mesa-dri"
 XVFB_PACKAGE = "xvfb"
+# Exported pages are tested in a browser, by any of these names.
+BROWSERS, BROWSER_PACKAGE = ("chromium", "chromium-browser", "google-chrome"), "chromium"
 
 
 def missing_packages() -> list[str]:
@@ -34,11 +36,14 @@ def missing_packages() -> list[str]:
         missing.append(DRI_PACKAGE)
     if shutil.which("Xvfb") is None and not os.environ.get("DISPLAY"):
         missing.append(XVFB_PACKAGE)  # window tests; the headless path does not need it
+    if "--tests" in sys.argv[1:] and not any(map(shutil.which, BROWSERS)):
+        missing.append(BROWSER_PACKAGE)
     return missing
 
 
 def main() -> int:
-    """Install what is missing, or print the line that does; 0 unless an install failed."""
+    """Install what is missing (with --tests also what only tests need), or print the line that does; 0
+    unless an install failed."""
     if not sys.platform.startswith("linux"):
         return 0
     missing = missing_packages()

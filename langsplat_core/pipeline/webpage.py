@@ -1,9 +1,10 @@
 """A scene as one HTML file that a browser draws and searches without a network: `write_page`.
 
-The file holds a compressed safetensors file (Gaussians of 8 and 16 bits, codes, codebook, words, regions) and
-the modules of `langsplat_core/web`. A phrase is answered there by the rule of `query.answers.by_regions`: what
-does not depend on the phrase is computed here, so that little more than a product with the codebook is left.
-Gaussians that can never be drawn are left out; the others lie along a curve, so that neighbours compress well.
+The file holds a compressed safetensors file (Gaussians of 8 and 16 bits, codes, codebook, words, regions)
+and the modules of `langsplat_core/web`. A phrase is answered there by the rule of `query.answers.by_regions`:
+what does not depend on the phrase is computed here, so that little more than a product with the codebook is
+left. Gaussians that can never be drawn are left out; the others lie along a curve, so that neighbours
+compress well.
 """
 
 import base64
@@ -42,12 +43,13 @@ from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST
 from langsplat_core.semantics.vocabulary import BUNDLED, bundled_vocabulary
 
 MODULES = ("data", "language", "camera", "draw", "page")  # in the order in which they import each other
+WIDE = 10  # columns of 16 bits: means, scales, quaternions
 CHUNK = 256  # Gaussians that share the range of a quantised column
 FLATTEST, OPAQUE = -46.0, 20.0  # bounds of the logarithm of a scale, whatever a file holds; of a logit
 MOST_VIEWS = 200  # bookmarks; of more cameras every so-manyth
 IMPORT = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL)
 EXPORT = re.compile(r"^export (?=async |class|const|function|let)", re.MULTILINE)
-NO_TABLES = "the page answers by regions, for which the scene's encoder or its everyday phrases have to be there"
+NO_TABLES = "a page answers by everyday phrases, and neither the scene nor an encoder here has them"
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,8 @@ class PageReport:
 def write_page(
     path: Path, scene: Scene, engine: QueryEngine | None, title: str, progress: Progress = silent
 ) -> PageReport:
-    """Write `scene` as an HTML file. engine: of the same scene, None to be looked at alone. title: plain text.
+    """Write `scene` as an HTML file. engine: of the same scene, None where it is only to be
+    looked at. title: plain text.
 
     Raises InputError for a scene of which nothing can be drawn.
     """
@@ -124,7 +127,7 @@ def drawable(gaussians: Gaussians) -> Array:
 
 
 def pack_gaussians(gaussians: Gaussians, centre: Array) -> dict[str, Array]:
-    """`low` and `high` (C, M) uint8 bytes of the columns, the high ones of the first 12 alone, and `ranges`
+    """`low` and `high` (C, M) uint8 bytes of the columns, high ones of the first `WIDE` alone, and `ranges`
     (C, M / CHUNK, 2) float32; columns as listed here, means relative to `centre`."""
     count = len(gaussians)
     columns = np.concatenate(
@@ -138,7 +141,9 @@ def pack_gaussians(gaussians: Gaussians, centre: Array) -> dict[str, Array]:
         axis=1,
     ).T
     chunks = -(-count // CHUNK)
-    edge = np.pad(columns, ((0, 0), (0, chunks * CHUNK - count)), mode="edge").reshape(len(columns), -1, CHUNK)
+    edge = np.pad(columns, ((0, 0), (0, chunks * CHUNK - count)), mode="edge").reshape(
+        len(columns), -1, CHUNK
+    )
     ranges = np.stack([edge.min(2), edge.max(2)], -1).astype(np.float32)
     steps = np.where(np.arange(len(columns)) < WIDE, 65_535, 255)[:, None, None]
     low = ranges[..., :1].astype(np.float64)
@@ -152,11 +157,8 @@ def pack_gaussians(gaussians: Gaussians, centre: Array) -> dict[str, Array]:
     }
 
 
-WIDE = 10  # columns of 16 bits: means, scales, quaternions
-
-
 def views(scene: Scene) -> list[dict[str, Any]]:
-    """The scene's cameras as bookmarks, relative to the page's origin; one that frames it where it has none."""
+    """The scene's cameras as bookmarks, relative to the page's origin; one that frames it without any."""
     centre, _ = scene.bounds()
     cameras: Sequence[Camera] = scene.cameras or (scene.framing_camera((1280, 800)),)
     step = -(-len(cameras) // MOST_VIEWS)
@@ -284,7 +286,7 @@ def _region_tables(engine: QueryEngine) -> dict[str, Array]:
 
 
 def _words(engine: QueryEngine, suggested: Sequence[str]) -> tuple[dict[str, Any], dict[str, Array]]:
-    """The phrases whose vectors are in the page, and, where it is small and its words are few, the encoder."""
+    """The phrases whose vectors are in the page; the encoder too where it is small and its words are few."""
     book = tuple(engine.field.phrasebook)
     try:
         encoder: TextEncoder | None = engine.load_encoder()

@@ -1,6 +1,6 @@
 // Cameras in OpenCV's frame (x right, y down, z forward) and their control by mouse, touch and keys.
-// A camera is { width, height, fx, fy, cx, cy, rotation, position }: rotation is 3 x 3 world to camera, by rows;
-// positions are relative to the page's origin.
+// A camera is { width, height, fx, fy, cx, cy, rotation, position }: rotation is 3 x 3 world to camera, by
+// rows; positions are relative to the page's origin.
 
 const add = (a, b, t = 1) => a.map((v, i) => v + t * b[i]);
 const inner = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -24,28 +24,37 @@ const STEP = 24; // pixels of a drag that a press of an arrow key is worth
 const FLIGHT = 700; // ms
 
 export class Controls {
-  // changed(): called when the camera has another pose. size(): [width, height] of the view, pixels of CSS.
-  constructor(element, { radius, up }, size, changed) {
-    Object.assign(this, { element, radius, up, size, changed, moving: 0, pointers: new Map() });
+  // changed(): called when the camera has another pose. free(): left, top, width and height of what no panel
+  // covers, pixels of CSS.
+  constructor(element, { radius, up }, free, changed) {
+    Object.assign(this, { element, radius, up, free, changed, moving: 0, pointers: new Map() });
     this.calm = matchMedia("(prefers-reduced-motion: reduce)");
     element.addEventListener("pointerdown", (event) => this.down(event));
     element.addEventListener("pointermove", (event) => this.move(event));
-    for (const name of ["pointerup", "pointercancel"]) element.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
-    element.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      this.zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)));
-    }, { passive: false });
+    for (const name of ["pointerup", "pointercancel"])
+      element.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
+    element.addEventListener(
+      "wheel",
+      (event) => {
+        event.preventDefault();
+        this.zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)));
+      },
+      { passive: false },
+    );
     element.addEventListener("contextmenu", (event) => event.preventDefault());
     element.addEventListener("keydown", (event) => this.key(event));
   }
 
-  // The camera as it is drawn in a view of so many pixels: the bookmark's whole image, centred.
-  camera(width, height) {
-    const { view } = this, scale = Math.min(width / view.width, height / view.height);
+  // The camera that fills the window, at so many pixels for one of CSS: the bookmark's whole image lies in
+  // the middle of what is free.
+  camera(dots) {
+    const { view } = this, [left, top, across, along] = this.free().map((length) => length * dots);
+    const scale = Math.min(across / view.width, along / view.height);
     return {
-      width, height, fx: view.fx * scale, fy: view.fy * scale,
-      cx: (view.cx - view.width / 2) * scale + width / 2, cy: (view.cy - view.height / 2) * scale + height / 2,
-      rotation: view.rotation, position: view.position,
+      width: Math.max(Math.round(innerWidth * dots), 1), height: Math.max(Math.round(innerHeight * dots), 1),
+      fx: view.fx * scale, fy: view.fy * scale, cx: (view.cx - view.width / 2) * scale + left + across / 2,
+      cy: (view.cy - view.height / 2) * scale + top + along / 2, rotation: view.rotation,
+      position: view.position,
     };
   }
 
@@ -64,7 +73,10 @@ export class Controls {
     this.pointers.set(event.pointerId, here);
     if (other) {
       this.pan(dx / 2, dy / 2);
-      this.zoom(Math.hypot(here[0] - other[0], here[1] - other[1]) / Math.max(Math.hypot(last[0] - other[0], last[1] - other[1]), 1));
+      this.zoom(
+        Math.hypot(here[0] - other[0], here[1] - other[1]) /
+          Math.max(Math.hypot(last[0] - other[0], last[1] - other[1]), 1),
+      );
     } else if (event.shiftKey || event.buttons & 6) this.pan(dx, dy);
     else this.orbit(dx, dy);
   }
@@ -87,17 +99,24 @@ export class Controls {
   // Turn around the pivot, `distance` ahead, by a drag in pixels; never over the pole.
   orbit(dx, dy) {
     this.moving++;
-    const { up, view } = this, pivot = this.pivot(), angle = Math.PI / Math.max(...this.size());
+    const { up, view } = this, pivot = this.pivot(), angle = Math.PI / Math.max(innerWidth, innerHeight);
     let rows = axes(view).map((axis) => turned(axis, up, -dx * angle)), right = rows[0];
     const lifted = rows.map((axis) => turned(axis, right, -dy * angle));
-    if (Math.abs(inner(lifted[2], up)) < 0.995 || Math.abs(inner(lifted[2], up)) < Math.abs(inner(rows[2], up))) rows = lifted;
+    if (
+      Math.abs(inner(lifted[2], up)) < 0.995 ||
+      Math.abs(inner(lifted[2], up)) < Math.abs(inner(rows[2], up))
+    )
+      rows = lifted;
     this.pose(rows.flat(), add(pivot, rows[2], -this.distance));
   }
 
   pan(dx, dy) {
     this.moving++;
-    const [right, down] = axes(this.view), { fx } = this.camera(...this.size());
-    this.pose(this.view.rotation, add(add(this.view.position, right, (-dx * this.distance) / fx), down, (-dy * this.distance) / fx));
+    const [right, down] = axes(this.view), { fx } = this.camera(1);
+    this.pose(
+      this.view.rotation,
+      add(add(this.view.position, right, (-dx * this.distance) / fx), down, (-dy * this.distance) / fx),
+    );
   }
 
   // Come closer to the pivot by a factor; close to it, move it on ahead.
@@ -107,7 +126,9 @@ export class Controls {
     const distance = Math.min(this.distance / factor, 50 * this.radius);
     const step = distance < least ? (this.distance * (factor - 1)) / factor : 0;
     this.distance = Math.max(distance, least);
-    this.pose(this.view.rotation, step ? add(this.view.position, ahead, step) : add(pivot, ahead, -this.distance));
+    this.pose(
+      this.view.rotation, step ? add(this.view.position, ahead, step) : add(pivot, ahead, -this.distance),
+    );
   }
 
   pivot() {
@@ -125,7 +146,7 @@ export class Controls {
     const points = Array.from({ length: 8 }, (_, k) => Array.from(corners.slice(3 * k, 3 * k + 3)));
     const middle = points.reduce((sum, point) => add(sum, point, 1 / 8), [0, 0, 0]);
     const reach = Math.max(...points.map((point) => Math.hypot(...add(point, middle, -1))));
-    const [width, height] = this.size(), { fx } = this.camera(width, height);
+    const [, , width, height] = this.free(), { fx } = this.camera(1);
     const distance = Math.max((4 * reach * fx) / Math.min(width, height), 0.1 * this.radius);
     const [, , ahead] = axes(this.view);
     this.fly({ ...this.view, position: add(middle, ahead, -distance) }, distance);
@@ -144,7 +165,10 @@ export class Controls {
       const mixed = from.rotation.map((v, i) => v + s * (view.rotation[i] - v));
       const ahead = unit(mixed.slice(6, 9)), right = unit(cross(mixed.slice(3, 6), ahead));
       const rotation = [...right, ...cross(ahead, right), ...ahead];
-      this.view = t === 1 ? view : { ...view, rotation, position: add(from.position, add(view.position, from.position, -1), s) };
+      this.view =
+        t === 1
+          ? view
+          : { ...view, rotation, position: add(from.position, add(view.position, from.position, -1), s) };
       this.changed();
       if (t < 1) requestAnimationFrame(step);
     };

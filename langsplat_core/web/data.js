@@ -5,7 +5,9 @@ const HALVES = new Float32Array(65536).map((_, bits) => {
   if (exponent === 0) return sign * fraction * 2 ** -24;
   return exponent === 31 ? NaN : sign * (1 + fraction / 1024) * 2 ** (exponent - 15);
 });
-const KINDS = { U8: Uint8Array, U16: Uint16Array, I32: Int32Array, U32: Uint32Array, F32: Float32Array, F64: Float64Array };
+const KINDS = {
+  U8: Uint8Array, U16: Uint16Array, I32: Int32Array, U32: Uint32Array, F32: Float32Array, F64: Float64Array,
+};
 
 // Tensors by name as { values, shape }, half floats as single ones, and the JSON that lies beside them.
 export async function readPage(text) {
@@ -18,16 +20,23 @@ export async function readPage(text) {
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 8, size)));
   const tensors = {};
   const { __metadata__: metadata, ...listed } = header;
-  for (const [name, { dtype, shape, data_offsets: [from, to] }] of Object.entries(listed)) {
+  for (const [
+    name,
+    { dtype, shape, data_offsets: [from, to] },
+  ] of Object.entries(listed)) {
     const bytes = buffer.slice(8 + size + from, 8 + size + to);
-    const values = dtype === "F16" ? Float32Array.from(new Uint16Array(bytes), (bits) => HALVES[bits]) : new KINDS[dtype](bytes);
+    const values =
+      dtype === "F16"
+        ? Float32Array.from(new Uint16Array(bytes), (bits) => HALVES[bits])
+        : new KINDS[dtype](bytes);
     tensors[name] = { values, shape };
   }
   return { tensors, meta: JSON.parse(metadata.page) };
 }
 
 const CHUNK = 256;
-const MEAN = 0, SCALE = 3, QUATERNION = 6, OPACITY = 10, SH = 11; // first column of each
+const MEAN = 0, SCALE = 3, QUATERNION = 6, OPACITY = 10,
+  SH = 11; // first column of each
 
 // The Gaussians as textures take them: `means` (M, 3), relative to the page's origin; `geometry`, three layers
 // of RGBA floats (mean and opacity, scales, unit quaternion) and `sh`, the coefficients four to a texel.
@@ -40,7 +49,8 @@ export function unpackGaussians({ low, high, ranges }, texels) {
     return ranges.values[range] + part * (ranges.values[range + 1] - ranges.values[range]);
   };
   const layers = Math.ceil((columns - SH) / 4);
-  const means = new Float32Array(3 * count), geometry = new Float32Array(12 * texels), sh = new Float32Array(4 * layers * texels);
+  const means = new Float32Array(3 * count),
+    geometry = new Float32Array(12 * texels), sh = new Float32Array(4 * layers * texels);
   const quaternion = [0, 0, 0, 0];
   for (let i = 0; i < count; ++i) {
     for (let axis = 0; axis < 3; ++axis) {
@@ -51,7 +61,7 @@ export function unpackGaussians({ low, high, ranges }, texels) {
     for (let k = 0; k < 4; ++k) quaternion[k] = value(QUATERNION + k, i);
     const length = Math.hypot(...quaternion) || 1;
     for (let k = 0; k < 4; ++k) geometry[4 * (2 * texels + i) + k] = quaternion[k] / length;
-    for (let c = SH; c < columns; ++c) sh[4 * ((c - SH >> 2) * texels + i) + (c - SH & 3)] = value(c, i);
+    for (let c = SH; c < columns; ++c) sh[4 * (((c - SH) >> 2) * texels + i) + ((c - SH) & 3)] = value(c, i);
   }
   return { count, means, geometry, sh, layers };
 }

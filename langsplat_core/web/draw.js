@@ -40,14 +40,20 @@ function sortWorker() {
 export class Painter {
   // Throws an Error with a sentence for people where this browser cannot draw the scene.
   constructor(canvas, meta, tensors) {
-    const gl = (this.gl = canvas.getContext("webgl2", { antialias: false, alpha: false, powerPreference: "high-performance" }));
+    const gl = (this.gl = canvas.getContext("webgl2", {
+      antialias: false, alpha: false, powerPreference: "high-performance",
+    }));
     if (!gl) throw new Error("This browser offers no WebGL 2, which the scene is drawn with.");
-    if (!gl.getExtension("EXT_color_buffer_float")) throw new Error("This browser's graphics cannot draw into float textures.");
+    if (!gl.getExtension("EXT_color_buffer_float"))
+      throw new Error("This browser's graphics cannot draw into float textures.");
     Object.assign(this, { canvas, meta });
     const count = tensors.low.shape[1], most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.columns = Math.min(4096, most, count);
     this.rows = Math.ceil(count / this.columns);
-    if (this.rows > most) throw new Error(`This browser's graphics hold ${most * most} Gaussians at most; the scene has ${count}.`);
+    if (this.rows > most)
+      throw new Error(
+        `This browser's graphics hold ${most * most} Gaussians at most; the scene has ${count}.`,
+      );
     const texels = this.columns * this.rows, scene = unpackGaussians(tensors, texels);
     this.count = count;
     this.places = scene.geometry.slice(0, 4 * count); // mean and opacity of each Gaussian
@@ -57,9 +63,12 @@ export class Painter {
     this.extra = this.texture(gl.RGBA32F, this.columns, this.rows);
     this.values = new Float32Array(4 * texels);
     this.colourMap = this.texture(gl.RGBA8, 256, 1);
-    const map = tensors.colour_map.values, rgba = Uint8Array.from({ length: 1024 }, (_, i) => (i % 4 === 3 ? 255 : map[3 * (i >> 2) + (i % 4)]));
+    const map = tensors.colour_map.values,
+      rgba = Uint8Array.from({ length: 1024 }, (_, i) => (i % 4 === 3 ? 255 : map[3 * (i >> 2) + (i % 4)]));
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 256, 1, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
-    this.programs = Object.fromEntries(Object.entries(meta.shaders).map(([name, pair]) => [name, this.program(...pair)]));
+    this.programs = Object.fromEntries(
+      Object.entries(meta.shaders).map(([name, pair]) => [name, this.program(...pair)]),
+    );
     this.quads = gl.createVertexArray();
     this.order = gl.createBuffer();
     gl.bindVertexArray(this.quads);
@@ -102,7 +111,8 @@ export class Painter {
     const { gl } = this, { program, uniforms } = this.programs[name];
     gl.useProgram(program);
     const set = {
-      [gl.FLOAT]: "uniform1fv", [gl.FLOAT_VEC2]: "uniform2fv", [gl.FLOAT_VEC3]: "uniform3fv", [gl.FLOAT_VEC4]: "uniform4fv",
+      [gl.FLOAT]: "uniform1fv", [gl.FLOAT_VEC2]: "uniform2fv", [gl.FLOAT_VEC3]: "uniform3fv",
+      [gl.FLOAT_VEC4]: "uniform4fv",
     };
     for (const [key, value] of Object.entries(values)) {
       if (!uniforms[key]) continue;
@@ -124,8 +134,10 @@ export class Painter {
     const { gl } = this, texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, texture);
     gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
-    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, key, gl.NEAREST);
-    for (const key of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, key, gl.CLAMP_TO_EDGE);
+    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
+      gl.texParameteri(gl.TEXTURE_2D, key, gl.NEAREST);
+    for (const key of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T])
+      gl.texParameteri(gl.TEXTURE_2D, key, gl.CLAMP_TO_EDGE);
     return texture;
   }
 
@@ -133,8 +145,11 @@ export class Painter {
     const { gl } = this, texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
     gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, format, this.columns, this.rows, count);
-    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D_ARRAY, key, gl.NEAREST);
-    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, 0, this.columns, this.rows, count, gl.RGBA, gl.FLOAT, values);
+    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
+      gl.texParameteri(gl.TEXTURE_2D_ARRAY, key, gl.NEAREST);
+    gl.texSubImage3D(
+      gl.TEXTURE_2D_ARRAY, 0, 0, 0, 0, this.columns, this.rows, count, gl.RGBA, gl.FLOAT, values,
+    );
     return texture;
   }
 
@@ -147,7 +162,8 @@ export class Painter {
       return texture;
     });
     gl.drawBuffers(formats.map((_, i) => gl.COLOR_ATTACHMENT0 + i));
-    if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE) throw new Error("This browser's graphics refuse the images that the scene is drawn into.");
+    if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE)
+      throw new Error("This browser's graphics refuse the images that the scene is drawn into.");
     return { framebuffer, textures, width, height };
   }
 
@@ -155,7 +171,8 @@ export class Painter {
   show(values, components) {
     const { gl } = this;
     this.values.fill(0);
-    for (let i = 0; i < this.count; ++i) for (let c = 0; c < components; ++c) this.values[4 * i + c] = values[components * i + c];
+    for (let i = 0; i < this.count; ++i)
+      for (let c = 0; c < components; ++c) this.values[4 * i + c] = values[components * i + c];
     gl.bindTexture(gl.TEXTURE_2D, this.extra);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, this.columns, this.rows, gl.RGBA, gl.FLOAT, this.values);
   }
@@ -192,7 +209,8 @@ export class Painter {
   // Draw into the canvas, which gets the camera's size. look: { display, ranges, dim } by names of displays.
   paint(camera, look) {
     const { gl, meta } = this, { width, height } = camera, { raster, picture } = meta;
-    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
+    if (this.canvas.width !== width || this.canvas.height !== height)
+      Object.assign(this.canvas, { width, height });
     if (this.image?.width !== width || this.image?.height !== height) {
       if (this.image) {
         this.image.textures.forEach((texture) => gl.deleteTexture(texture));
@@ -201,13 +219,18 @@ export class Painter {
       this.image = this.target(width, height, Array(2).fill(gl.RGBA16F));
     }
     const r = camera.rotation, high = camera.position.map(Math.fround);
-    const mx = (0.5 * (raster.fov_clamp - 1) * width) / camera.fx, my = (0.5 * (raster.fov_clamp - 1) * height) / camera.fy;
+    const mx = (0.5 * (raster.fov_clamp - 1) * width) / camera.fx,
+      my = (0.5 * (raster.fov_clamp - 1) * height) / camera.fy;
     this.use("project", {
-      gaussians: 0, sh: 1, orthographic: 0, sh_count: meta.sh_count, antialiased: +raster.antialiased, dilation: raster.dilation,
-      alpha_min: raster.alpha_min, colour_max: 65504, focal: [camera.fx, camera.fy], principal: [camera.cx, camera.cy],
-      world_to_camera: [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]],
-      camera_high: high, camera_low: camera.position.map((v, i) => v - high[i]),
-      tangents: [camera.cx / camera.fx + mx, camera.cy / camera.fy + my, (width - camera.cx) / camera.fx + mx, (height - camera.cy) / camera.fy + my],
+      gaussians: 0, sh: 1, orthographic: 0, sh_count: meta.sh_count, antialiased: +raster.antialiased,
+      dilation: raster.dilation, alpha_min: raster.alpha_min, colour_max: 65504,
+      focal: [camera.fx, camera.fy], principal: [camera.cx, camera.cy],
+      world_to_camera: [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]], camera_high: high,
+      camera_low: camera.position.map((v, i) => v - high[i]),
+      tangents: [
+        camera.cx / camera.fx + mx, camera.cy / camera.fy + my, (width - camera.cx) / camera.fx + mx,
+        (height - camera.cy) / camera.fy + my,
+      ],
     });
     this.bound([gl.TEXTURE_2D_ARRAY, this.geometry], [gl.TEXTURE_2D_ARRAY, this.sh]);
     this.pass(this.projected, null);
@@ -220,8 +243,9 @@ export class Painter {
     this.pass(this.image, this.quads);
     this.use("compose", {
       colours: 0, extra: 1, colour_maps: 2, colour_map: 0, query_colours: meta.query_colours.flat(),
-      display: picture.displays[look.display], ranges: look.ranges.flat(), own_colours: 0, heat_opacity: picture.heat_opacity,
-      dim: look.dim ?? picture.dim, threshold: picture.threshold, alpha_gate: picture.alpha_gate, background: picture.background, transparent: 0,
+      display: picture.displays[look.display], ranges: look.ranges.flat(), own_colours: 0,
+      heat_opacity: picture.heat_opacity, dim: look.dim ?? picture.dim, threshold: picture.threshold,
+      alpha_gate: picture.alpha_gate, background: picture.background, transparent: 0,
     });
     this.bound(...[...this.image.textures, this.colourMap].map((texture) => [gl.TEXTURE_2D, texture]));
     this.pass({ framebuffer: null, width, height }, null);
@@ -247,7 +271,8 @@ export class Painter {
     const { gl } = this, { width, height } = this.canvas, bytes = new Uint8Array(4 * width * height);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
     const rows = new Uint8Array(bytes.length), row = 4 * width;
-    for (let y = 0; y < height; ++y) rows.set(bytes.subarray(row * (height - 1 - y), row * (height - y)), row * y);
+    for (let y = 0; y < height; ++y)
+      rows.set(bytes.subarray(row * (height - 1 - y), row * (height - y)), row * y);
     return rows;
   }
 }

@@ -6,16 +6,19 @@ import { Controls, project } from "./camera.js";
 import { Painter } from "./draw.js";
 
 const at = (id) => document.getElementById(id);
-const made = (tag, text, properties = {}) => Object.assign(document.createElement(tag), { textContent: text }, properties);
+const made = (tag, text, properties = {}) =>
+  Object.assign(document.createElement(tag), { textContent: text }, properties);
 const DISPLAYS = { rgb: "Colours", relevancy: "Relevancy", segmentation: "Found", latent: "Latent" };
 const KEYS = { c: "rgb", r: "relevancy", s: "segmentation", l: "latent" };
-const SLOW = 60; // ms between two frames of a moving camera, above which fewer pixels are drawn until it rests
+const SLOW = 60; // ms between frames of a moving camera, above which fewer pixels are drawn until it rests
 const COARSEST = 0.3;
 const REST = 180; // ms
 const MOST_BOXES = 24;
 const FAINT = 0.1; // opacity, as of scene/surface.py
 const INNER = [0.02, 0.98]; // quantiles that a box holds, as of query/instances.py
-const EDGES = [[0, 1], [0, 2], [0, 4], [1, 3], [1, 5], [2, 3], [2, 6], [3, 7], [4, 5], [4, 6], [5, 7], [6, 7]];
+const EDGES = [
+  [0, 1], [0, 2], [0, 4], [1, 3], [1, 5], [2, 3], [2, 6], [3, 7], [4, 5], [4, 6], [5, 7], [6, 7],
+];
 
 class Page {
   constructor(meta, tensors) {
@@ -23,8 +26,7 @@ class Page {
     this.painter = new Painter(at("scene"), meta, tensors);
     this.painter.onorder = () => this.redraw();
     this.language = meta.language && new Language(meta.language, tensors);
-    const size = () => [innerWidth, innerHeight];
-    this.controls = new Controls(at("scene"), meta, size, () => this.moved());
+    this.controls = new Controls(at("scene"), meta, () => this.free(), () => this.moved());
     this.fill();
     this.listen();
     this.update();
@@ -32,30 +34,46 @@ class Page {
   }
 
   fill() {
-    const radios = (id, entries, chosen) => at(id).append(...entries.map(([value, text]) => {
-      const input = Object.assign(document.createElement("input"), { type: "radio", name: id, value, checked: value === chosen });
-      input.addEventListener("change", () => this.choose(id, value));
-      const label = made("label", text);
-      label.prepend(input);
-      return label;
-    }));
-    radios("levels", [["auto", "Auto"], ["subpart", "Subpart"], ["part", "Part"], ["whole", "Whole"]], "auto");
+    const radios = (id, entries, chosen) =>
+      at(id).append(
+        ...entries.map(([value, text]) => {
+          const input = Object.assign(document.createElement("input"), {
+            type: "radio", name: id, value, checked: value === chosen,
+          });
+          input.addEventListener("change", () => this.choose(id, value));
+          const label = made("label", text);
+          label.prepend(input);
+          return label;
+        }),
+      );
+    radios(
+      "levels",
+      [["auto", "Auto"], ["subpart", "Subpart"], ["part", "Part"], ["whole", "Whole"]],
+      "auto",
+    );
     radios("displays", Object.entries(DISPLAYS), "rgb");
     at("views").append(...this.meta.views.map(({ name }, value) => made("option", name, { value })));
-    const map = at("legend").querySelector("canvas").getContext("2d"), row = map.createImageData(256, 1), colours = this.meta.map;
-    for (let i = 0; i < 256; ++i) row.data.set([colours[3 * i], colours[3 * i + 1], colours[3 * i + 2], 255], 4 * i);
+    const map = at("legend").querySelector("canvas").getContext("2d"),
+      row = map.createImageData(256, 1), colours = this.meta.map;
+    for (let i = 0; i < 256; ++i)
+      row.data.set([colours[3 * i], colours[3 * i + 1], colours[3 * i + 2], 255], 4 * i);
     map.putImageData(row, 0, 0);
     const gaussians = `${this.painter.count.toLocaleString("en")} Gaussians`, { language } = this.meta;
-    at("about").textContent = language
-      ? `${gaussians}. ${language.encoder ? "The text encoder is in this page: any of its words, in any combination." : `${this.language.keys.size.toLocaleString("en")} phrases can be asked.`} Answers: ${language.basis}. Made with the LangSplat viewer.`
-      : `${gaussians}. Nothing can be searched: ${this.meta.why_not}.`;
+    let about = `Nothing can be searched: ${this.meta.why_not}.`;
+    if (language?.encoder) about = "The text encoder is in this page: ask any of its words, in any combination.";
+    else if (language) about = `${this.language.keys.size.toLocaleString("en")} phrases can be asked.`;
+    if (language) about += ` A phrase is asked whole. Answers: ${language.basis}.`;
+    at("about").textContent = `${gaussians}. ${about} Made with the LangSplat viewer.`;
     for (const id of ["search", "examples", "levels", "displays", "verdict"]) at(id).hidden = !language;
     document.querySelector(".check").hidden = !language;
-    if (language) at("examples").append(...language.examples.map((phrase) => {
-      const button = made("button", phrase, { type: "button" });
-      button.addEventListener("click", () => this.search(phrase));
-      return button;
-    }));
+    if (language)
+      at("examples").append(
+        ...language.examples.map((phrase) => {
+          const button = made("button", phrase, { type: "button" });
+          button.addEventListener("click", () => this.search(phrase));
+          return button;
+        }),
+      );
   }
 
   listen() {
@@ -94,12 +112,14 @@ class Page {
     at("show").addEventListener("click", () => this.panel(true));
     addEventListener("resize", () => this.redraw());
     addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey || ["INPUT", "SELECT"].includes(event.target.tagName) && event.target.type !== "radio" && event.target.type !== "checkbox") return;
+      const typing = event.target.matches("select, input[type=text]");
+      if (event.ctrlKey || event.metaKey || event.altKey || typing) return;
       if (event.key === "[" || event.key === "]") this.view(this.current + (event.key === "]" ? 1 : -1));
       else if (event.key === "h") this.panel(at("panel").hidden);
       else if (!this.language) return;
-      else if (event.key === "/") this.panel(true), at("phrase").focus(), at("phrase").select();
-      else if ("0123".includes(event.key)) this.choose("levels", ["auto", ...this.meta.language.levels][event.key]);
+      else if (event.key === "/") (this.panel(true), at("phrase").focus(), at("phrase").select());
+      else if ("0123".includes(event.key))
+        this.choose("levels", ["auto", ...this.meta.language.levels][event.key]);
       else if (KEYS[event.key]) this.choose("displays", KEYS[event.key]);
       else if (event.key === "b") at("boxes").click();
       else return;
@@ -107,23 +127,36 @@ class Page {
     });
   }
 
+  // Left, top, width and height of what the panel does not cover: it lies at the left, on phones below.
+  free() {
+    const { right, top, width } = at("panel").getBoundingClientRect();
+    if (!width) return [0, 0, innerWidth, innerHeight];
+    return right < 0.6 * innerWidth ? [right, 0, innerWidth - right, innerHeight] : [0, 0, innerWidth, top];
+  }
+
   panel(shown) {
     at("panel").hidden = !shown;
     at("show").hidden = shown;
     (shown ? at("phrase") : at("show")).focus();
+    this.redraw();
   }
 
   // Options under the search box; the arrow keys mark one, which enter then asks.
   offer(phrases) {
     const list = at("list"), input = at("phrase");
-    list.replaceChildren(...phrases.map((phrase, i) => made("li", phrase, { role: "option", id: `option${i}`, ariaSelected: "false" })));
+    list.replaceChildren(
+      ...phrases.map((phrase, i) =>
+        made("li", phrase, { role: "option", id: `option${i}`, ariaSelected: "false" }),
+      ),
+    );
     list.hidden = phrases.length === 0;
     input.setAttribute("aria-expanded", String(!list.hidden));
     input.removeAttribute("aria-activedescendant");
   }
 
   mark(step) {
-    const options = [...at("list").children], now = options.findIndex((option) => option.ariaSelected === "true");
+    const options = [...at("list").children],
+      now = options.findIndex((option) => option.ariaSelected === "true");
     const next = options[(now + step + options.length + (now < 0 && step < 0 ? 1 : 0)) % options.length];
     for (const option of options) option.ariaSelected = String(option === next);
     at("phrase").setAttribute("aria-activedescendant", next.id);
@@ -175,7 +208,8 @@ class Page {
         input.checked = input.value === value;
         input.disabled = id === "displays" && ["relevancy", "segmentation"].includes(input.value) && !answer;
       }
-    for (const button of at("examples").children) button.ariaPressed = String(Boolean(answer) && button.textContent === this.phrase);
+    for (const button of at("examples").children)
+      button.ariaPressed = String(Boolean(answer) && button.textContent === this.phrase);
     said.replaceChildren();
     said.className = "";
     at("answer").hidden = !answer || answer.top < 0;
@@ -184,63 +218,84 @@ class Page {
       const { found, verdict } = answer, count = this.shown.length;
       said.className = { found: "found", "weak match": "weak", "not here": "none" }[verdict];
       const word = { found: "Found", "weak match": "Weak match", "not here": "Not here" }[verdict];
-      const unit = this.meta.metres_per_unit === 1 ? " m" : "", place = answer.place?.map((v) => v.toFixed(2)).join(" ");
-      const where = verdict === "not here" ? answer.phrase : `${count} ${count > 1 ? "places" : "place"}, level ${levels[answer.level]}; at ${place}${unit}`;
+      const unit = this.meta.metres_per_unit === 1 ? " m" : "",
+        place = answer.place?.map((v) => v.toFixed(2)).join(" ");
+      const where =
+        verdict === "not here"
+          ? answer.phrase
+          : `${count} ${count > 1 ? "places" : "place"}, level ${levels[answer.level]}; at ${place}${unit}`;
       said.append(made("b", word + sure), made("small", where));
       const [low, high] = this.look().ranges[0], spans = at("legend").querySelectorAll("span");
       spans[0].textContent = low.toFixed(2);
       spans[1].textContent = high.toFixed(2);
       at("face").hidden = verdict === "not here";
     } else if (this.problem) said.append(this.problem);
-    if (this.display === "latent") this.painter.show(this.language.latents(this.level === "auto" ? 2 : levels.indexOf(this.level)), 3);
+    if (this.display === "latent")
+      this.painter.show(this.language.latents(this.level === "auto" ? 2 : levels.indexOf(this.level)), 3);
     else if (answer && this.display !== "rgb") {
       const { values, members } = this.language.spread(answer, answer.level);
-      this.painter.show(this.look().strength === 0 ? values.fill(0) : this.display === "segmentation" ? members : values, 1);
+      this.painter.show(
+        this.look().strength === 0 ? values.fill(0) : this.display === "segmentation" ? members : values, 1,
+      );
     }
     this.redraw();
   }
 
   // What the composing shader is told, as display/displays.py has it: a weak match is half as hot.
   look() {
-    const nothing = [0.5, 1], { answer, display } = this, { picture } = this.meta, whole = display === "segmentation";
+    const nothing = [0.5, 1],
+      { answer, display } = this, { picture } = this.meta, whole = display === "segmentation";
     const strength = answer ? picture.strength[answer.verdict] : 0;
     const [low, high] = !strength ? nothing : whole ? [0, 1] : answer.heat;
     const shown = answer || !["relevancy", "segmentation"].includes(display) ? display : "rgb";
-    return { display: shown, strength, ranges: [[low, low + (high - low) / (strength || 1)], nothing, nothing] };
+    return {
+      display: shown, strength, ranges: [[low, low + (high - low) / (strength || 1)], nothing, nothing],
+    };
   }
 
   corners(region) {
-    return this.language.t.corners.subarray(24 * region, 24 * region + 24).map((v, i) => v - this.meta.origin[i % 3]);
+    return this.language.t.corners
+      .subarray(24 * region, 24 * region + 24)
+      .map((v, i) => v - this.meta.origin[i % 3]);
   }
 
-  // Corners of the boxes of an answer, the best first: one for each whole thing that answers or has parts that do.
+  // Corners of the boxes of an answer, the best first: one for each whole that answers or has parts that do.
   boxes(answer) {
     if (!answer || answer.verdict === "not here") return [];
     const { language } = this, { sizes, parents } = language.t, things = new Map();
     const solid = answer.inside.filter((r) => sizes[r] >= this.meta.language.rules.smallest);
-    for (const r of (solid.length ? solid : answer.inside).toSorted((a, b) => answer.values[b] - answer.values[a])) {
+    for (const r of (solid.length ? solid : answer.inside).toSorted(
+      (a, b) => answer.values[b] - answer.values[a],
+    )) {
       let whole = r;
       while (whole < language.firsts[2]) whole = parents[whole];
       things.set(whole, [...(things.get(whole) ?? []), r]);
     }
-    return [...things.values()].slice(0, MOST_BOXES).map((own) => (own.length > 1 ? this.around(own, answer.level) : this.corners(own[0])));
+    return [...things.values()]
+      .slice(0, MOST_BOXES)
+      .map((own) => (own.length > 1 ? this.around(own, answer.level) : this.corners(own[0])));
   }
 
   // Corners of the box around several regions of a level, along the sides of the largest one's.
   around(regions, level) {
-    const { language, painter } = this, { sizes, regions: of } = language.t, wanted = new Set(regions), { count, places } = painter;
+    const { language, painter } = this,
+      { sizes, regions: of } = language.t, wanted = new Set(regions), { count, places } = painter;
     const largest = this.corners(regions.reduce((a, b) => (sizes[b] > sizes[a] ? b : a)));
     const edges = [4, 2, 1].map((k) => [0, 1, 2].map((axis) => largest[3 * k + axis] - largest[axis]));
     const sides = edges.map((edge) => edge.map((v) => v / (Math.hypot(...edge) || 1))), along = [[], [], []];
     for (let i = 0; i < count; ++i) {
       if (places[4 * i + 3] < FAINT || !wanted.has(language.firsts[level] + of[level * count + i])) continue;
-      sides.forEach((side, k) => along[k].push(side[0] * places[4 * i] + side[1] * places[4 * i + 1] + side[2] * places[4 * i + 2]));
+      sides.forEach((side, k) =>
+        along[k].push(side[0] * places[4 * i] + side[1] * places[4 * i + 1] + side[2] * places[4 * i + 2]),
+      );
     }
     const ends = along.map((values) => {
       const sorted = Float64Array.from(values).sort();
       return INNER.map((share) => sorted[Math.round(share * (sorted.length - 1))]);
     });
-    return Float32Array.from({ length: 24 }, (_, i) => [0, 1, 2].reduce((sum, k) => sum + sides[k][i % 3] * ends[k][(Math.floor(i / 3) >> (2 - k)) & 1], 0));
+    return Float32Array.from({ length: 24 }, (_, i) =>
+      [0, 1, 2].reduce((sum, k) => sum + sides[k][i % 3] * ends[k][(Math.floor(i / 3) >> (2 - k)) & 1], 0),
+    );
   }
 
   view(number) {
@@ -252,7 +307,8 @@ class Page {
 
   moved() {
     const now = performance.now();
-    if (now - this.last < 2 * REST && now - this.last > SLOW) this.share = Math.max(this.share * 0.8, COARSEST);
+    if (now - this.last < 2 * REST && now - this.last > SLOW)
+      this.share = Math.max(this.share * 0.8, COARSEST);
     this.last = now;
     clearTimeout(this.rest);
     this.rest = setTimeout(() => {
@@ -266,8 +322,7 @@ class Page {
     if (this.asked || !this.controls.view) return;
     this.asked = requestAnimationFrame(() => {
       this.asked = 0;
-      const dots = devicePixelRatio * this.share;
-      const camera = this.controls.camera(Math.max(Math.round(innerWidth * dots), 1), Math.max(Math.round(innerHeight * dots), 1));
+      const camera = this.controls.camera(devicePixelRatio * this.share);
       this.painter.sort(camera);
       this.painter.paint(camera, this.look());
       this.draw();
@@ -276,16 +331,20 @@ class Page {
 
   // Boxes over the image, in pixels of the screen.
   draw() {
-    const canvas = at("marks"), dots = devicePixelRatio, size = [Math.round(innerWidth * dots), Math.round(innerHeight * dots)];
-    if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
-    const context = canvas.getContext("2d"), camera = this.controls.camera(...size);
-    context.clearRect(0, 0, ...size);
+    const canvas = at("marks"),
+      dots = devicePixelRatio, camera = this.controls.camera(dots), { width, height } = camera;
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    const context = canvas.getContext("2d");
+    context.clearRect(0, 0, width, height);
     if (!at("boxes").checked) return;
     for (const [rank, corners] of this.shown.entries()) {
-      const seen = Array.from({ length: 8 }, (_, k) => project(camera, Array.from(corners.slice(3 * k, 3 * k + 3))));
+      const seen = Array.from({ length: 8 }, (_, k) =>
+        project(camera, Array.from(corners.slice(3 * k, 3 * k + 3))),
+      );
       if (seen.some(([, , z]) => z < this.meta.raster.near)) continue;
       context.beginPath();
-      for (const [a, b] of EDGES) context.moveTo(seen[a][0], seen[a][1]), context.lineTo(seen[b][0], seen[b][1]);
+      for (const [a, b] of EDGES)
+        (context.moveTo(seen[a][0], seen[a][1]), context.lineTo(seen[b][0], seen[b][1]));
       for (const [width, colour] of [[3.5, "#0009"], [1.5, rank ? "#ffffffb3" : "#ffffff"]]) {
         Object.assign(context, { lineWidth: width * dots, strokeStyle: colour });
         context.stroke();
@@ -297,7 +356,8 @@ class Page {
   tag(context, text, seen, dots) {
     const [x, y] = seen.reduce((top, point) => (point[1] < top[1] ? point : top));
     context.font = `600 ${13 * dots}px system-ui, "DejaVu Sans", sans-serif`;
-    const shown = text.length > 40 ? `${text.slice(0, 39)}…` : text, width = context.measureText(shown).width, pad = 7 * dots;
+    const shown = text.length > 40 ? `${text.slice(0, 39)}…` : text,
+      width = context.measureText(shown).width, pad = 7 * dots;
     context.fillStyle = "#10141ce6";
     context.beginPath();
     context.roundRect(x - width / 2 - pad, y - 30 * dots, width + 2 * pad, 22 * dots, 6 * dots);
@@ -313,9 +373,9 @@ globalThis.langsplat = (async () => {
   const { tensors, meta } = await readPage(at("data").textContent);
   at("data").remove();
   meta.map = tensors.colour_map.values;
+  at("panel").hidden = false;
   const page = new Page(meta, tensors);
   at("loading").remove();
-  at("panel").hidden = false;
   const image = async (camera, display = "rgb", phrase = "") => {
     Object.assign(page, { display, phrase, level: "auto", answer: null });
     if (page.language) page.ask();

@@ -160,7 +160,9 @@ class DepthSorter:
     def __init__(self, ctx: moderngl.Context) -> None:
         self._ctx = ctx
         self._programs: Mapping[str, moderngl.ComputeShader] = {
-            name: ctx.compute_shader(shader("depth_sort.comp", "430 core", STEP=number, GROUP=GROUP, ROUNDS=ROUNDS))
+            name: ctx.compute_shader(
+                shader("depth_sort.comp", "430 core", STEP=number, GROUP=GROUP, ROUNDS=ROUNDS)
+            )
             for number, name in enumerate(STEPS)
         }
 

@@ -1,4 +1,4 @@
-"""Sources of the shaders: one text for OpenGL 4.1 and for WebGL 2 (GLSL ES 3.00), which exported pages draw with."""
+"""Sources of the shaders: one text for OpenGL 4.1 and for WebGL 2 (GLSL ES 3.00), by which pages draw."""
 
 from importlib.resources import files
 
@@ -11,7 +11,9 @@ _WEB_HEAD = (
 )
 
 
-def shader(name: str, version: str = "410 core", package: str = __name__, **defines: int | float | str) -> str:
+def shader(
+    name: str, version: str = "410 core", package: str = __name__, **defines: int | float | str
+) -> str:
     """Source of `name`.glsl in `package` with its GLSL version and `defines` in front."""
     head = [f"#version {version}", *(_WEB_HEAD if version == WEB else ())]
     head += [f"#define {key} {value}" for key, value in defines.items()]
@@ -20,6 +22,9 @@ def shader(name: str, version: str = "410 core", package: str = __name__, **defi
 
 def splat_shaders(values: int, depth: bool, version: str = "410 core") -> tuple[str, str]:
     """Vertex and fragment shader that splat so many images, and depth."""
-    defines: dict[str, int | str] = {"VALUES": values, "DEPTH": int(depth)}
-    defines["EACH_VALUE(DO)"] = " ".join(f"DO({number})" for number in range(values))
-    return shader("splat.vert", version, **defines), shader("splat.frag", version, **defines)
+    each = {"EACH_VALUE(DO)": " ".join(f"DO({number})" for number in range(values))}
+    vertex, fragment = (
+        shader(name, version, VALUES=values, DEPTH=int(depth), **each)
+        for name in ("splat.vert", "splat.frag")
+    )
+    return vertex, fragment
