@@ -95,7 +95,7 @@ gpu:  ## on a machine with CUDA: run what never ran without, write docs/benchmar
 	  --requirement packaging/gpu/$(if $(SITE),beside_torch,requirements).txt
 	MAX_JOBS=$${MAX_JOBS:-$$(nproc)} $(GPU)/bin/python packaging/gpu/run.py $(if $(ONLY),--only $(ONLY))
 
-pictures: system  ## make the README's pictures again (on a display, or on Xvfb)
+pictures: browser  ## make the README's pictures again (on a display, or on Xvfb)
 	if [ -n "$$DISPLAY" ]; then $(BIN)/python packaging/pictures.py; \
 	else xvfb-run -a -s "-screen 0 1280x800x24" $(BIN)/python packaging/pictures.py; fi
 

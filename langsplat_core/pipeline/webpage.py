@@ -213,6 +213,7 @@ def language_tables(
         "levels": LEVELS,
         "counts": [len(nodes) for nodes in regions.nodes],
         "basis": engine.basis.long,
+        "guess": engine.basis.short if engine.basis.guesses else "",
         "bars": bars,
         "calibration": None if engine.calibration is None else asdict(engine.calibration),
         "rules": _rules(),

@@ -53,6 +53,7 @@ class Page {
     );
     radios("displays", Object.entries(DISPLAYS), "rgb");
     at("views").append(...this.meta.views.map(({ name }, value) => made("option", name, { value })));
+    for (const id of ["before", "after", "views"]) at(id).hidden = this.meta.views.length < 2;
     const map = at("legend").querySelector("canvas").getContext("2d"),
       row = map.createImageData(256, 1), colours = this.meta.map;
     for (let i = 0; i < 256; ++i)
@@ -224,7 +225,7 @@ class Page {
         verdict === "not here"
           ? answer.phrase
           : `${count} ${count > 1 ? "places" : "place"}, level ${levels[answer.level]}; at ${place}${unit}`;
-      said.append(made("b", word + sure), made("small", where));
+      said.append(made("b", word + sure), made("small", where), made("small", this.meta.language.guess));
       const [low, high] = this.look().ranges[0], spans = at("legend").querySelectorAll("span");
       spans[0].textContent = low.toFixed(2);
       spans[1].textContent = high.toFixed(2);

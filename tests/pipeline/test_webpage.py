@@ -12,7 +12,7 @@ import moderngl
 import numpy as np
 import pytest
 
-from langsplat_core.arrays import Array, psnr
+from langsplat_core.arrays import Array, psnr, unit
 from langsplat_core.cli.app import parse
 from langsplat_core.cli.export import Export
 from langsplat_core.config import PictureConfig
@@ -23,7 +23,7 @@ from langsplat_core.pipeline.webpage import write_page
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.raster.opengl.rasterizer import GlRasterizer
 from langsplat_core.raster.render import splat_colours
-from langsplat_core.scene import LEVELS, Camera, Gaussians, Scene
+from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Camera, Gaussians, Scene
 from langsplat_core.semantics.encoders import load_text_encoder
 from tests.support.browser import Tab, open_browser, open_tab
 from tests.support.file_samples import random_field
@@ -257,6 +257,42 @@ def test_without_an_encoder_the_phrasebook_and_taught_words_answer(
         tab.page.press("#phrase", "Enter")
         assert "zebra" in tab.page.inner_text("#verdict")
         assert tab.page.locator("#answer").is_hidden()
+
+
+class Fluent:
+    """Knows every word, each by numbers of its own; the canonical phrases as the bundled scene has them."""
+
+    def __init__(self, canonical: Array) -> None:
+        self.known = dict(zip(CANONICAL_PHRASES, canonical, strict=True))
+
+    def encode_texts(self, texts: list[str]) -> Array:
+        seeds = [list(text.encode()) for text in texts]
+        drawn = [np.random.default_rng(seed).normal(size=512) for seed in seeds]
+        return np.float32([self.known.get(text, unit(own)) for text, own in zip(texts, drawn, strict=True)])
+
+    def unknown_words(self, text: str) -> tuple[str, ...]:
+        return ()
+
+    near_words = unknown_words
+
+
+def test_with_an_encoder_that_stays_here_the_page_knows_thousands_of_phrases(
+    browser: Any, demo: Scene, tmp_path: Path
+) -> None:
+    scene = demo.take(np.arange(0, len(demo.gaussians), 8))
+    assert scene.language is not None
+    encoder = Fluent(scene.language.canonical)
+    engine = QueryEngine(scene, lambda name: encoder)
+    report = write_page(tmp_path / "a.html", scene, engine, "A")
+    assert (report.free_text, report.why_not) == (False, "")
+    assert report.phrases > 2000
+    visible = scene.gaussians.opacity_logits >= -np.log(254)
+    with open_tab(browser, tmp_path / "a.html") as tab:
+        phrases = tab.run("async () => [...(await langsplat).page.language.keys.keys()]")
+        assert len(phrases) == report.phrases
+        for phrase in phrases[:: len(phrases) // 20]:
+            expected = engine.run(phrase)
+            same(tab.ask(phrase), expected, int(expected.members[visible].sum()))
 
 
 def test_names_with_markup_are_text_and_nothing_else(
