@@ -123,8 +123,8 @@ def body(positions: Array, frame: Array) -> Body:
 def separate(surface: Surface, inside: Array, tree: Tree | None = None) -> list[Array]:
     """(M,) bool -> surface numbers of each single thing in it, the largest first, without specks.
 
-    tree: what tells apart things that touch, and keeps together one that is half hidden, by its wholes that
-    masks voted for. All other Gaussians are taken apart where the surface is.
+    tree: what tells apart things that touch, by its wholes that masks voted for. All other Gaussians are
+    taken apart where the surface is.
     """
     wholes = None if tree is None else tree.voted(WHOLE)
     parts = told_apart(surface, np.flatnonzero(inside), wholes, join=True)
