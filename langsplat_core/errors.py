@@ -80,6 +80,7 @@ EXTRAS: Mapping[str, str] = MappingProxyType(  # name as imported -> extra, as i
         "ftfy": "encoders",
         "matplotlib": "plots",
         "gsplat": "cuda",
+        "mcp": "agents",
     }
 )
 

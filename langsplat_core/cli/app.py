@@ -23,6 +23,7 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
         "describe": "describe.Describe",
         "select": "query.Select",
         "teach": "teach.Teach",
+        "serve": "serve.Serve",
         "scale": "scenes.Scale",
         "export": "export.Export",
         "convert": "scenes.Convert",

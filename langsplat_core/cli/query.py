@@ -37,7 +37,7 @@ from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.answers import QueryResult, peak_pixel
 from langsplat_core.query.compose import Number, check_phrase, count_things, joined, run_phrase
 from langsplat_core.query.engine import LoadEncoder, QueryEngine, TextEncoder
-from langsplat_core.query.grammar import Atom, heads
+from langsplat_core.query.grammar import Atom, Counted, Phrase, heads, unparse
 from langsplat_core.query.instances import Instance, hull
 from langsplat_core.query.lookup import decoded_relevancy, splatted_relevancy
 from langsplat_core.query.selection import grow, of_rows, shrink
@@ -101,10 +101,12 @@ class QueryScene:
             alike = engine.like(pointed(engine, self.camera, self.like, "--like", level), level)
             found.append((replace(alike, phrase=f"like {self.like}"), None, ()))
         answers, tables = [], []
-        for result, understood, of in found:
+        for result, tree, of in found:
+            understood = None if tree is None else unparse(tree)
             answer = _answer(result, scene, engine, camera, self.mode) | {"reading": understood}
             things = engine.instances(result, self.instances) if result.found else ()
-            number = count_things(engine, result) if result.found else Number(0, 0, 0)
+            counts = result.found or (isinstance(tree, Counted) and result.verdict == "weak match")
+            number = count_things(engine, result) if counts else Number(0, 0, 0)
             answer |= {"count": {"best": number.best, "least": number.least, "most": number.most}}
             because = {} if explain is None else {"evidence": explain(engine, result, of)}
             answer |= basis_fields(engine) | {"metres_per_unit": unit.metres, **_listed(things)}
@@ -119,7 +121,7 @@ class QueryScene:
             verdict, reading = answer["verdict"], answer["reading"]
             if answer["probability"] is not None:
                 verdict += f" ({100 * answer['probability']:.0f} %)"
-            if answer["count"]["most"] > 1:
+            if answer["count"]["most"] > 1 or (not answer["found"] and answer["count"]["most"]):
                 verdict += f", {_counted(**answer['count'])}"
             place = "-" if answer["place"] is None else f"{unit.format(answer['place'])} {unit.name}"
             print(
@@ -167,13 +169,13 @@ class QueryScene:
 
     def _ask(
         self, engine: QueryEngine, text: str, camera: Camera | None
-    ) -> tuple[QueryResult, str | None, tuple[str, ...]]:
+    ) -> tuple[QueryResult, Phrase | None, tuple[str, ...]]:
         """The answer, how the phrase was read where it has structure, and the words of what is asked for."""
         if self._plainly:
             return engine.run(text, self.level), None, (text,)
         composed = run_phrase(engine, text, self.level, camera)
         simple = isinstance(composed.tree, Atom)
-        return composed.answer, None if simple else composed.reading, heads(composed.tree)
+        return composed.answer, None if simple else composed.tree, heads(composed.tree)
 
 
 class _Explainer:

@@ -19,6 +19,7 @@ from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.grammar import (
     Atom,
     Both,
+    Counted,
     Extreme,
     Inside,
     Phrase,
@@ -122,8 +123,8 @@ def body(positions: Array, frame: Array) -> Body:
 def separate(surface: Surface, inside: Array, tree: Tree | None = None) -> list[Array]:
     """(M,) bool -> surface numbers of each single thing in it, the largest first, without specks.
 
-    tree: what tells apart things that touch, and keeps together one that is half hidden, by its wholes that
-    masks voted for. All other Gaussians are taken apart where the surface is.
+    tree: what tells apart things that touch, by its wholes that masks voted for. All other Gaussians are
+    taken apart where the surface is.
     """
     wholes = None if tree is None else tree.voted(WHOLE)
     parts = told_apart(surface, np.flatnonzero(inside), wholes, join=True)
@@ -464,10 +465,9 @@ class _Asking:
         match tree:
             case Atom(text):
                 return self._thing(text, level)
-            case Both(items):
-                return joined([self.answer(item, level) for item in items], all_needed=True)
-            case Union(items):
-                return joined([self.answer(item, level) for item in items], all_needed=False)
+            case Both(items) | Union(items):
+                answers = [self.answer(item, level) for item in items]
+                return joined(answers, all_needed=isinstance(tree, Both))
             case Without(what, unwanted):
                 excluded = self.answer(unwanted)
                 if isinstance(unwanted, Atom):
@@ -475,6 +475,10 @@ class _Asking:
                 return without(self.answer(what, level), excluded)
             case Inside(part, whole):
                 return self._inside(part, whole, level)
+            case Counted(count, what):
+                every = self.answer(what, level)
+                enough = every.found and count_things(self.engine, every).most >= count
+                return replace(every, found=enough)
             case Relation() | Superlative():
                 return self._chosen(tree, level)
 

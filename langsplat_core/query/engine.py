@@ -396,7 +396,7 @@ class QueryEngine:
     @cached_property
     def word_space(self) -> WordSpace:
         """The scene's regions as taught words see them."""
-        return build_word_space(self.field, self.regions)
+        return build_word_space(self.field, self.regions, self.tree.votes[:, 0])
 
     def is_taught(self, phrase: str) -> bool:
         """Whether a phrase is a taught word, and is answered by what was shown."""

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from langsplat_core.errors import InputError
@@ -69,7 +69,15 @@ class Superlative:
     anchor: "Phrase | None" = None
 
 
-Phrase = Atom | Inside | Relation | Both | Union | Without | Superlative
+@dataclass(frozen=True)
+class Counted:
+    """All of `what`, of which there are to be so many or more."""
+
+    count: int
+    what: "Phrase"
+
+
+Phrase = Atom | Inside | Relation | Both | Union | Without | Superlative | Counted
 
 
 def atoms(tree: Phrase) -> tuple[Atom, ...]:
@@ -103,6 +111,8 @@ def unparse(tree: Phrase) -> str:  # noqa: PLR0911  one row of a table each
             return f"{_nested(part)}  inside  {_nested(whole)}"
         case Relation(kind, what, anchor):
             return f"{_nested(what)}  {kind}  {_nested(anchor)}"
+        case Counted(count, what):
+            return f"{count}  {_nested(what)}"
         case Superlative(kind, what, anchor):
             seen_from = "" if anchor is None else f"  from  {_nested(anchor)}"
             return f"{kind}  {_nested(what)}{seen_from}"
@@ -121,6 +131,8 @@ def children(tree: Phrase) -> tuple[Phrase, ...]:
             return (one, other)
         case Superlative(_, what, anchor):
             return (what,) if anchor is None else (what, anchor)
+        case Counted(_, what):
+            return (what,)
         case Atom():
             return ()
 
@@ -190,6 +202,25 @@ def forms(word: str) -> tuple[str, ...]:
     return (low, low.removesuffix("s"), low.removesuffix("es"))
 
 
+_PLURALS = {
+    "men": "man", "women": "woman", "people": "person", "children": "child", "feet": "foot", "teeth": "tooth",
+    "mice": "mouse", "geese": "goose", "leaves": "leaf", "loaves": "loaf", "knives": "knife",
+    "wolves": "wolf", "shelves": "shelf", "halves": "half", "scarves": "scarf", "shoes": "shoe",
+}  # fmt: skip
+_ALWAYS_PLURAL = _words("scissors glasses jeans trousers headphones shorts pants pliers tongs binoculars")
+
+
+def singular(word: str) -> str:
+    """The singular of an English noun; a word that is none already stays."""
+    low = word.lower()
+    if low in _PLURALS or low in _ALWAYS_PLURAL:
+        return _PLURALS.get(low, word)
+    for ending, one in (("ies", "y"), ("sses", "ss"), ("xes", "x"), ("ches", "ch"), ("shes", "sh")):
+        if low.endswith(ending) and len(low) > len(ending) + 1:
+            return word[: -len(ending)] + one
+    return word[:-1] if low.endswith("s") and not low.endswith(("ss", "us", "is")) else word
+
+
 def is_part(word: str) -> bool:
     """True of a noun, in either number, that is a part of things."""
     return any(form in PARTS for form in forms(word))
@@ -230,8 +261,9 @@ def check_names(words: Sequence[str]) -> None:
 #     exclusion   = ", not" | "but not" | "and not" | "not" | "without" | "except" | "other than"
 #     alternatives = all { ("or" | ",") all }
 #     all         = clause { ("and" | "&" | "as well as") clause }
-#     clause      = [ superlative ] related [ "on the left" | "on the right" ]
+#     clause      = [ superlative | number ] related [ "on the left" | "on the right" ]
 #     superlative = "biggest" | "smallest" | "nearest" | "farthest" | "highest" | "lowest" | "leftmost" | ...
+#     number      = "one" | "two" | ... | "twelve" | digits
 #     related     = thing { preposition related }      the first preposition relates all that follows it
 #     preposition = "of" | "on" | "in" | "near" | "left of" | "in front of" | "nearest to" | ...
 #     thing       = owner "'s" thing | words part-word | words
@@ -263,6 +295,7 @@ _SIDES: dict[str, Side] = {
     "above": "above", "over": "above", "below": "below", "under": "below", "underneath": "below",
     "beneath": "below", "behind": "behind", "in back of": "behind", "in front of": "in front of",
 }  # fmt: skip
+_NUMBERS = ["one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
 _PREPOSITIONS: dict[tuple[str, ...], Side | Literal["nearest", "farthest", "of"]] = {
     ("of",): "of",
     **{(word, to): kind for word, kind in _DISTANCES.items() for to in ("to", "from")},
@@ -392,10 +425,32 @@ def _clause(tokens: list[str]) -> Phrase:
         if kind in ("nearest", "farthest") and at and _names(tokens[1:at]) and _names(tokens[at + 1 :]):
             return Superlative(kind, _related(tokens[1:at]), _related(tokens[at + 1 :]))
         return Superlative(kind, what)
+    count = _NUMBERS.index(low[0]) + 1 if low[0] in _NUMBERS else _digits(low[0])
+    if count and _names(tokens[1:]):
+        what = _clause(tokens[1:])
+        return Counted(count, what if count == 1 else _one_of(what))
     for side, extreme in (("left", "leftmost"), ("right", "rightmost")):
         if low[-3:] == ["on", "the", side] and _names(tokens[:-3]):
             return Superlative(_SUPERLATIVES[extreme], _related(tokens[:-3]))
     return _related(tokens)
+
+
+def _digits(word: str) -> int:
+    """The number that a word writes in at most three digits; 0 for any other word."""
+    return int(word) if re.fullmatch("[0-9]{1,3}", word) else 0
+
+
+def _one_of(tree: Phrase) -> Phrase:
+    """The tree with what is asked for in the singular, since a mask shows one thing."""
+    match tree:
+        case Atom(text):
+            *before, last = text.split()
+            return Atom(" ".join([*before, singular(last)]))
+        case Inside(part, whole):
+            return Inside(_one_of(part), whole)
+        case Relation() | Superlative():
+            return replace(tree, what=_one_of(tree.what))
+    return tree
 
 
 def _related(tokens: list[str]) -> Phrase:

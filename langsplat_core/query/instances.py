@@ -154,7 +154,7 @@ def told_apart(surface: Surface, numbers: Array, wholes: Array | None, join: boo
     """Of the Gaussians `numbers` (K,) of a surface those of each single thing.
 
     wholes: (N,) voted wholes, see `Tree.voted`, which tell apart things that touch; join: what is of one
-    whole is one, half hidden or not.
+    whole is one, connected or not.
     """
     if wholes is None:
         return surface.parts(numbers).each()

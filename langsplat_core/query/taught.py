@@ -5,7 +5,7 @@ and what tells things apart is lost in what is no matter of words, such as light
 are compared in the *word space*: along the directions in which everyday phrases differ, and less the mean of
 the scene's regions. How alike different things are there depends on encoder and scene; it is measured as the
 scene's *rival*, the similarity that most pairs of its wholes stay below: the rest may show one thing twice. A
-region is what was shown if it is more like it than `FOUND` times the mean rival of both scenes.
+region is what was shown if it is more like it than `FOUND` says for the mean rival of both scenes.
 """
 
 from dataclasses import dataclass
@@ -22,10 +22,11 @@ from langsplat_core.scene import LEVELS, LanguageField, TaughtWord
 from langsplat_core.scene.surface import SMALLEST
 
 VARIANCE = 0.95  # share of the everyday phrases' variance that the word space holds
-OTHERS = 0.84  # share of pairs of wholes
-# Times the rival from which a region of each level is what was shown. Of what was shown in one of rooms 201
-# to 203 and is absent in another, 95 % stays below, with the bundled encoder and CLIP's geometry together.
-FOUND = (3.4, 3.4, 2.6)
+OTHERS = 0.9  # share of pairs of wholes
+# A region of each level is what was shown from a similarity of the first number plus the second times the
+# rival. Of what was shown in one of rooms 201 to 203 and is absent in another, 95 % stays below, with the
+# bundled encoder and with CLIP's geometry.
+FOUND = ((0.0, 2.8), (0.0, 2.8), (0.1, 1.9))
 LEAST = 0.08  # rival: a few regions say little about it
 HIGHEST = 0.95  # similarity from which anything is what was shown
 UNIT = 0.3  # of the similarity from which it is found: half of it below, 80 % of what is absent is less
@@ -43,8 +44,12 @@ class WordSpace:
     rival: float  # in [0, 1], see above; 0 where there is nothing to compare
 
 
-def build_word_space(field: LanguageField, regions: Regions) -> WordSpace:
-    """The word space of a scene; that of all images where the scene keeps no everyday phrases."""
+def build_word_space(field: LanguageField, regions: Regions, votes: Array) -> WordSpace:
+    """The word space of a scene; that of all images where the scene keeps no everyday phrases.
+
+    votes: (K,) of the tree's nodes. Where masks voted, mean and rival are of those regions that have a vote:
+    the others are mostly fragments of walls and floors, many of one thing.
+    """
     basis = np.eye(field.codec.vector_dim, dtype=np.float32)
     if field.everyday is not None and len(field.everyday) > 1:
         _, spreads, axes = np.linalg.svd(field.everyday - field.everyday.mean(0), full_matrices=False)
@@ -54,6 +59,8 @@ def build_word_space(field: LanguageField, regions: Regions) -> WordSpace:
     for level, (of, sizes) in enumerate(zip(regions.everywhere, regions.sizes, strict=True)):
         means, known = _means(field, basis, level, of, regions.weights, len(sizes))
         solid = known & (sizes >= SMALLEST)
+        told = solid & (votes[regions.nodes[level]] > 0)
+        solid = told if told.sum() > 1 else solid
         centres.append(means[solid].mean(0) if solid.any() else np.zeros(len(basis)))
         every.append(np.where(known[:, None], unit(means - centres[-1]), 0))
     alike = every[-1][solid] @ every[-1][solid].T
@@ -104,7 +111,9 @@ def compared(word: TaughtWord, space: WordSpace, vectors: Array, level: int) -> 
 def _examples(word: TaughtWord, space: WordSpace) -> tuple[Array, Array]:
     """(T, W) unit examples, and (3, T) similarity from which something is as each of them, at each level."""
     rivals = np.maximum((word.rivals + space.rival) / 2, LEAST)
-    return unit(word.vectors @ space.basis.T), np.minimum(np.outer(FOUND, rivals), HIGHEST)
+    base, times = np.array(FOUND).T
+    bars = np.minimum(base[:, None] + np.outer(times, rivals), HIGHEST)
+    return unit(word.vectors @ space.basis.T), bars
 
 
 def _fits(alike: Array, bar: Array) -> Array:

@@ -23,6 +23,7 @@ from langsplat_core.query.grammar import (
     MAX_CHARACTERS,
     Atom,
     Both,
+    Counted,
     Inside,
     Relation,
     Superlative,
@@ -32,6 +33,7 @@ from langsplat_core.query.grammar import (
     heads,
     named,
     parse,
+    singular,
     unparse,
 )
 from langsplat_core.scene import NO_NODE, look_at
@@ -73,6 +75,11 @@ READ = {
     "mug closest to the book": Superlative("nearest", MUG, BOOK),
     "the mug on the left": Superlative("leftmost", MUG),
     "handle of the smallest mug": Inside(HANDLE, Superlative("smallest", MUG)),
+    "three mugs": Counted(3, MUG),
+    "the 2 red mugs on the table": Counted(2, Relation("on", Atom("red mug"), DESK)),
+    "one mug": Counted(1, MUG),
+    "two boxes or a book": Union((Counted(2, Atom("box")), BOOK)),
+    "handles of two mugs": Inside(Atom("handles"), Counted(2, MUG)),
 }
 WHOLE = (
     *(
@@ -84,7 +91,17 @@ WHOLE = (
         "children's book",
         "t-shirt",
     ),
-    *("red and blue ball", "on the table", "mug on", "mug and", "mug without", "biggest", "handle", "orange"),
+    *(
+        "red and blue ball",
+        "on the table",
+        "mug on",
+        "mug and",
+        "mug without",
+        "biggest",
+        "handle",
+        "orange",
+        "three",
+    ),
     *("杯子", "красная кружка", "κούπα", "كوب أحمر", "☕"),
 )
 
@@ -117,6 +134,15 @@ def test_a_text_without_end_is_refused():
         parse("mug " * 2500)
     with pytest.raises(InputError, match=f"at most {MAX_ATOMS}"):
         parse(" and ".join(["mug"] * (MAX_ATOMS + 1)))
+
+
+@pytest.mark.parametrize(
+    ("plural", "one"),
+    [("books", "book"), ("boxes", "box"), ("glass", "glass"), ("shelves", "shelf"), ("cherries", "cherry")]
+    + [("Chairs", "Chair"), ("scissors", "scissors"), ("cactus", "cactus"), ("benches", "bench")],
+)
+def test_things_are_counted_in_the_singular(plural, one):
+    assert singular(plural) == one
 
 
 def test_readings_show_the_structure():
@@ -184,6 +210,7 @@ ANSWERS = {  # phrase -> blocks that answer it
     "mug, not red mug": ["blue mug", "blue handle", "far mug"],
     "mug without its handle": ["red mug", "blue mug", "far mug"],
     "the biggest mug": ["far mug"],
+    "three mugs": ["red mug", "red handle", "blue mug", "blue handle", "far mug"],
     "the lowest mug": ["far mug"],
     "the mug nearest to the book": ["red mug", "red handle"],
     "handle of the mug near the book": ["red handle"],
@@ -223,7 +250,14 @@ def test_what_a_viewer_says_needs_one(table, text):
 
 
 @pytest.mark.parametrize(
-    "text", ["handle of the book", "book on the red mug", "mug in the book", "biggest handle on the book"]
+    "text",
+    [
+        "handle of the book",
+        "book on the red mug",
+        "mug in the book",
+        "biggest handle on the book",
+        "nine mugs",
+    ],
 )
 def test_what_is_not_so_is_not_found(table, text):
     assert not run_phrase(table[0], text).answer.found
