@@ -36,24 +36,29 @@ def missing_packages() -> list[str]:
         missing.append(DRI_PACKAGE)
     if shutil.which("Xvfb") is None and not os.environ.get("DISPLAY"):
         missing.append(XVFB_PACKAGE)  # window tests; the headless path does not need it
-    if "--tests" in sys.argv[1:] and not any(map(shutil.which, BROWSERS)):
-        missing.append(BROWSER_PACKAGE)
     return missing
 
 
 def main() -> int:
-    """Install what is missing (with --tests also what only tests need), or print the line that does; 0
-    unless an install failed."""
+    """Install what is missing, or print the line that does; 0 unless an install failed. With --tests also a
+    browser; its tests are skipped where it cannot be had."""
     if not sys.platform.startswith("linux"):
         return 0
-    missing = missing_packages()
+    code = install(missing_packages())
+    if "--tests" in sys.argv[1:] and not any(map(shutil.which, BROWSERS)):
+        install([BROWSER_PACKAGE])
+    return code
+
+
+def install(missing: list[str]) -> int:
+    """Install Debian packages, or print the line that does; apt's exit code."""
     if not missing:
         return 0
     command = ["apt-get", "install", "-y", "--no-install-recommends", *missing]
     if os.geteuid() != 0 or shutil.which("apt-get") is None:
-        print("System libraries are missing. Please run:\n  sudo " + " ".join(command))
+        print("System packages are missing. Please run:\n  sudo " + " ".join(command))
         return 0
-    print("Installing system libraries: " + " ".join(missing))
+    print("Installing system packages: " + " ".join(missing))
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
     subprocess.run(["apt-get", "update", "-q"], env=environment, capture_output=True, check=False)
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
