@@ -81,6 +81,7 @@ EXTRAS: Mapping[str, str] = MappingProxyType(  # name as imported -> extra, as i
         "matplotlib": "plots",
         "gsplat": "cuda",
         "mcp": "agents",
+        "open3d": "geometry",
     }
 )
 

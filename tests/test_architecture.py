@@ -31,7 +31,7 @@ LAYERS = [
     ["langsplat_core.cli"],
     ["langsplat_core.bench"],
     ["langsplat_core.pipeline"],
-    ["langsplat_core.evaluation", "langsplat_core.compaction"],
+    ["langsplat_core.evaluation", "langsplat_core.compaction", "langsplat_core.geometry"],
     ["langsplat_core.training.radiance", "langsplat_core.training.language", "langsplat_core.query"],
     [
         "langsplat_core.raster",
