@@ -24,6 +24,7 @@ from langsplat_core.io.shapes import (
     POINT_SUFFIXES,
     base_colours,
     check_suffix,
+    gltf_axes,
     write_meshes,
     write_points,
 )
@@ -305,7 +306,7 @@ class Select:
     texts: tyro.conf.Positional[tuple[str, ...]]
     """Phrases, each in quotes if it has several words; what any of them names is taken."""
     out: OutFile
-    """File to write: .ply, .spz or .splat for a scene, .ply for points, .ply or .obj for hulls."""
+    """File to write: .ply, .spz or .splat for a scene, .ply for points, .ply, .obj or .glb for hulls."""
     remove: bool = False
     """Write everything else instead."""
     level: LevelChoice = "auto"
@@ -383,7 +384,7 @@ class Select:
                 hull(instance, scene.gaussians, colours, f"{name} {number}")
                 for number, instance in enumerate(engine.instances(answer), 1)
             ]
-            write_meshes(self.out, meshes)
+            write_meshes(self.out, meshes, gltf_axes(scene))
             return len(meshes)
         save_scene(self.out, replace(scene.take(rows), path=self.out))
         return len(rows)

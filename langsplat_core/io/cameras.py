@@ -118,11 +118,12 @@ def _pixels(entry: dict[str, Any], key: str, what: str) -> int:
 
 
 def numbers(entry: dict[str, Any], key: str, shape: tuple[int, ...], what: str) -> Array:
-    """Finite float64 numbers of the given shape under `key`: (), (3,) or (3, 3). FormatError, beginning with
-    `what`, where there are none."""
+    """Finite float64 numbers of the given shape under `key`: (), (3,), (3, 3) or (4, 4). FormatError, beginning
+    with `what`, where there are none."""
     if key not in entry:
         raise FormatError(f"{what}: {key!r} is missing")
-    kind = {(): "a number", (3,): "3 numbers", (3, 3): "3 rows of 3 numbers"}[shape]
+    kinds = {(): "a number", (3,): "3 numbers", (3, 3): "3 rows of 3 numbers", (4, 4): "4 rows of 4 numbers"}
+    kind = kinds[shape]
     try:
         found = np.array(entry[key])
     except ValueError:  # rows of unequal length

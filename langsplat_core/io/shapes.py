@@ -1,5 +1,7 @@
 """Coloured points and meshes, which other programs open without knowing Gaussians."""
 
+import json
+import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -10,15 +12,16 @@ from langsplat_core.arrays import Array
 from langsplat_core.errors import InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.ply import SH_C0
-from langsplat_core.scene import Gaussians
+from langsplat_core.scene import Gaussians, Scene
+from langsplat_core.scene.transform import AXES, scaling, turning
 
 POINT_SUFFIXES = (".ply",)
-MESH_SUFFIXES = (".ply", ".obj")
+MESH_SUFFIXES = (".ply", ".obj", ".glb")
 RGB = ("red", "green", "blue")
 
 
 class Mesh(Protocol):
-    """Triangles with a name and one colour."""
+    """Triangles with a name, and one colour or one a vertex."""
 
     @property
     def name(self) -> str: ...
@@ -32,7 +35,7 @@ class Mesh(Protocol):
 
     @property
     def colour(self) -> Array:
-        """(3,) display values in [0, 1]."""
+        """(3,) or (V, 3) display values in [0, 1]."""
 
 
 def base_colours(gaussians: Gaussians) -> Array:
@@ -62,14 +65,22 @@ def write_points(path: Path | str, gaussians: Gaussians, extras: Mapping[str, Ar
     return len(table)
 
 
-def write_meshes(path: Path | str, meshes: Sequence[Mesh]) -> None:
-    """All of them in one .ply, or in one .obj with an object each. Atomic; InputError for another suffix."""
+def write_meshes(path: Path | str, meshes: Sequence[Mesh], to_gltf: Array | None = None) -> None:
+    """All of them in one .ply, or in one .obj or .glb with an object each. Atomic; InputError for another
+    suffix. to_gltf: (4, 4) from world units to metres with y up, as glTF has them; nothing else is moved."""
     path = check_suffix(path, MESH_SUFFIXES)
     with atomic_path(path) as temporary:
         if path.suffix.lower() == ".obj":
             temporary.write_text(_obj(meshes), encoding="utf-8")
+        elif path.suffix.lower() == ".glb":
+            temporary.write_bytes(_glb(meshes, np.eye(4) if to_gltf is None else to_gltf))
         else:
             _write_mesh_ply(temporary, meshes)
+
+
+def gltf_axes(scene: Scene) -> Array:
+    """(4, 4) from world units to the axes of glTF: metres, where the scene's scale is known, with y up."""
+    return turning(scene.up(), AXES["y"]).then(scaling(scene.metres_per_unit or 1.0)).matrix
 
 
 def check_suffix(path: Path | str, suffixes: Sequence[str]) -> Path:
@@ -86,8 +97,8 @@ def _obj(meshes: Sequence[Mesh]) -> str:
     lines, first = [], 1
     for mesh in meshes:
         lines.append(f"o {'_'.join(mesh.name.split())}")
-        colour = " ".join(f"{value:.4f}" for value in mesh.colour)
-        lines += [f"v {x:.9g} {y:.9g} {z:.9g} {colour}" for x, y, z in mesh.vertices]
+        rows = np.column_stack([mesh.vertices, np.broadcast_to(mesh.colour, mesh.vertices.shape)])
+        lines += ["v %.9g %.9g %.9g %.4f %.4f %.4f" % tuple(row) for row in rows.tolist()]
         lines += [f"f {a} {b} {c}" for a, b, c in mesh.triangles + first]
         first += len(mesh.vertices)
     return "\n".join(lines) + "\n"
@@ -99,7 +110,7 @@ def _write_mesh_ply(path: Path, meshes: Sequence[Mesh]) -> None:
     firsts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     vertex = np.empty(firsts[-1], [(axis, "<f4") for axis in "xyz"] + [(name, "u1") for name in RGB])
     places = np.concatenate([mesh.vertices for mesh in meshes])
-    colours = np.concatenate([np.tile(_bytes(mesh.colour), (len(mesh.vertices), 1)) for mesh in meshes])
+    colours = np.concatenate([np.broadcast_to(_bytes(mesh.colour), mesh.vertices.shape) for mesh in meshes])
     for names, values in (("xyz", places), (RGB, colours)):
         for k, name in enumerate(names):
             vertex[name] = values[:, k]
@@ -108,6 +119,52 @@ def _write_mesh_ply(path: Path, meshes: Sequence[Mesh]) -> None:
     face["vertex_indices"] = np.concatenate(triangles)
     elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]
     PlyData(elements).write(str(path))
+
+
+def _glb(meshes: Sequence[Mesh], to_gltf: Array) -> bytes:
+    """Binary glTF 2.0. Colours are light as it was photographed, so the material is unlit, and linear."""
+    chunks: list[bytes] = []
+    views, accessors, shapes, nodes = [], [], [], []
+    for number, mesh in enumerate(meshes):
+        display = np.broadcast_to(mesh.colour, mesh.vertices.shape)
+        linear = np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+        places = mesh.vertices.astype("<f4")
+        corners = {"min": places.min(0).tolist(), "max": places.max(0).tolist()}
+        light = np.column_stack([linear, np.ones(len(linear))])
+        for values, kind, component, more in (
+            (places, "VEC3", 5126, corners),
+            (np.rint(65_535 * light).astype("<u2"), "VEC4", 5123, {"normalized": True}),
+            (mesh.triangles.reshape(-1, 1).astype("<u4"), "SCALAR", 5125, {}),
+        ):
+            start = sum(map(len, chunks))
+            views.append({"buffer": 0, "byteOffset": start, "byteLength": values.nbytes})
+            accessors.append(
+                {"bufferView": len(views) - 1, "componentType": component, "count": len(values)}
+                | {"type": kind, **more}
+            )
+            chunks.append(values.tobytes())
+        first = 3 * number
+        primitive = {"attributes": {"POSITION": first, "COLOR_0": first + 1}, "indices": first + 2}
+        shapes.append({"name": mesh.name, "primitives": [primitive | {"material": 0}]})
+        nodes.append({"name": mesh.name, "mesh": number, "matrix": to_gltf.T.reshape(-1).tolist()})
+    unlit = "KHR_materials_unlit"
+    document = {
+        "asset": {"version": "2.0", "generator": "langsplat"},
+        "extensionsUsed": [unlit],
+        "scene": 0,
+        "scenes": [{"nodes": list(range(len(nodes)))}],
+        "nodes": nodes,
+        "meshes": shapes,
+        "materials": [{"doubleSided": True, "extensions": {unlit: {}}}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": sum(map(len, chunks))}],
+    }
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    data = b"".join(chunks)  # of numbers of 4 and 8 bytes
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(data))
+    return head + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
 
 
 def _bytes(colours: Array) -> Array:

@@ -219,12 +219,15 @@ class ReferenceView(LiftingView):
         return mean_depth(total[..., 0], alpha)
 
     def median_depth(self) -> Array:
-        median = np.zeros((self.camera.height, self.camera.width))
+        return np.append(self.footprints.depths, 0)[self.median_rows()]
+
+    def median_rows(self) -> Array:
+        """(H, W) int64 the Gaussian at which the transmittance falls to 0.5 or below, -1 where it never does."""
+        rows = np.full((self.camera.height, self.camera.width), -1)
         for step in self.steps():
             passed = (step.weights > 0) & (step.after <= 0.5)
-            first = (median[step.window] == 0) & passed
-            median[step.window][first] = self.footprints.depths[step.index]
-        return median
+            rows[step.window][(rows[step.window] == -1) & passed] = step.index
+        return rows
 
 
 class ReferenceRasterizer:

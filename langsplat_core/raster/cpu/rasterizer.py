@@ -124,9 +124,19 @@ class CpuView(TileOperator):
         self.workers.run(kernel, len(self.tiles.starts) - 1, self.tiles, self._geometry, *arguments)
 
     def median_depth(self) -> Array:
-        median = np.empty((self.camera.height, self.camera.width, 1), np.float32)
-        self._over_tiles(blend.median_depth, self._depths, self._cutoffs, median)
-        return median[..., 0]
+        return self._at_half(self._depths)
+
+    def median_rows(self) -> Array:
+        """(H, W) int64 the Gaussian at which the transmittance falls to 0.5 or below (see `median_depth`), -1
+        where it never does; of more than 2^24 that are drawn perhaps the next in depth."""
+        place = self._at_half(np.arange(1, len(self.order) + 1, dtype=np.float32)).astype(np.int64)
+        return np.append(self.order, -1)[place - 1]
+
+    def _at_half(self, values: Array) -> Array:
+        """(H, W) the one of (M,) numbers above 0, in depth order, that belongs to that Gaussian, else 0."""
+        found = np.empty((self.camera.height, self.camera.width, 1), np.float32)
+        self._over_tiles(blend.median_depth, values, self._cutoffs, found)
+        return found[..., 0]
 
     def depth(self) -> Array:
         # Ones are blended along: alpha itself is 1 - T, which has no digits left where it is small.
