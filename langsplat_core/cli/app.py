@@ -24,6 +24,7 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
         "select": "query.Select",
         "teach": "teach.Teach",
         "serve": "serve.Serve",
+        "map": "robots.Map",
         "scale": "scenes.Scale",
         "export": "export.Export",
         "convert": "scenes.Convert",
