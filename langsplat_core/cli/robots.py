@@ -13,7 +13,7 @@ from langsplat_core.arrays import Array
 from langsplat_core.cli.run import OutFolder
 from langsplat_core.cli.teach import searchable
 from langsplat_core.config import Positive
-from langsplat_core.errors import InputError, optional_imports
+from langsplat_core.errors import EncoderError, InputError, optional_imports
 from langsplat_core.geometry.occupancy import (
     FloorMap,
     Occupancy,
@@ -103,6 +103,9 @@ class Map:
 
     def _write_goals(self, plan: FloorMap, occupancy: Occupancy, engine: QueryEngine | None) -> None:
         answers, missing = [], []
+        if self.goal:
+            (self.out / "goals.json").unlink(missing_ok=True)
+            where = reachable(plan, self.robot_radius, self.start)
         for phrase in self.goal:
             assert engine is not None
             result = run_phrase(engine, phrase, viewpoint=engine.scene.cameras[0]).answer
@@ -112,7 +115,6 @@ class Map:
             goal = None
             if result.found and len(points):
                 on_map = points @ occupancy.to_map[:3, :3].T + occupancy.to_map[:3, 3]
-                where = reachable(plan, self.robot_radius, self.start)
                 goal = find_goal(plan, where, on_map[:, :2], self.robot_radius + self.resolution)
             if goal is None:
                 missing.append(
@@ -157,7 +159,11 @@ def write_voxels(
     nodes, words = np.full(len(cells), NO_NODE), {}
     if engine is not None:
         nodes = _nodes(occupancy, scene, engine, cells)
-        outline = Describer(engine, None, progress).outline()
+        try:
+            outline = Describer(engine, None, progress).outline()
+        except EncoderError as error:  # a phrasebook answers goals, but names nothing
+            print(f"voxels have no words: {error}")
+            outline = ()
         words = {int(one.node): "" if one.word is None else one.word.phrase for one in outline}
     names = np.array([words.get(int(node), "") for node in nodes], str)
     with atomic_path(folder / "voxels.npz") as path:
@@ -186,7 +192,7 @@ COLOURS = ("red", "green", "blue")
 
 
 def _nodes(occupancy: Occupancy, scene: Scene, engine: QueryEngine, cells: Array) -> Array:
-    """(V,) the whole that most of the Gaussians nearest to each voxel belong to, NO_NODE far from any."""
+    """(V,) the whole of the Gaussian nearest to each voxel, NO_NODE far from any."""
     from scipy.spatial import cKDTree
 
     whole = engine.tree.at(LEVELS.index("whole"))

@@ -25,6 +25,7 @@ OUTSIDE = (
     0.02  # of the seen surface on each side of each axis that a grid leaves out: floaters, the view outside
 )
 MARGIN = 5  # voxels around what is seen
+MOST_LOOKS = 20_000  # places from which it is tried whether a thing is seen
 MOST_PAIRS = 4_000_000  # of a place and a cell of a thing, whose distance is measured
 STAGE = "measuring what is free"
 
@@ -168,8 +169,8 @@ def trace(eye: Array, ends: Array, hits: Array, passes: Array) -> None:
 
 def floor_map(occupancy: Occupancy, step: float, height: float) -> FloorMap:
     """The map for a robot of a height, metres, that drives over what is lower than `step`."""
-    heights = occupancy.origin[2] + (np.arange(occupancy.hits.shape[2]) + 0.5) * occupancy.resolution
-    band = (heights >= step) & (heights <= height)
+    floors = occupancy.origin[2] + np.arange(occupancy.hits.shape[2]) * occupancy.resolution
+    band = (floors + occupancy.resolution / 2 >= step) & (floors <= height)
     if not band.any():
         raise InputError(
             f"no voxel lies between a step of {step:g} m and a height of {height:g} m; "
@@ -199,8 +200,11 @@ def reachable(plan: FloorMap, radius: float, start: tuple[float, float] | None =
 
 
 def find_goal(plan: FloorMap, where: Array, points: Array, least: float = 0.0) -> Goal | None:
-    """The pose of `where` (X, Y) bool nearest to a thing, facing it; None where there is none. points: (P, 2)
-    metres, of the thing seen from above, P >= 1; least: metres to be kept from it, also where it hangs."""
+    """The pose of `where` (X, Y) bool nearest to a thing, facing it, with nothing between; None for none.
+
+    points: (P, 2) metres, of the thing seen from above, P >= 1; least: metres to be kept from it, also where
+    it hangs.
+    """
     cells = np.argwhere(where)
     if len(cells) == 0:
         return None
@@ -210,12 +214,27 @@ def find_goal(plan: FloorMap, where: Array, points: Array, least: float = 0.0) -
     spots = spots[:: max(len(spots) * len(cells) // MOST_PAIRS, 1)]
     gaps = np.sqrt(((centres[:, None] - spots[None]) ** 2).sum(2))
     nearest = gaps.min(1)
-    if not (nearest >= least).any():
+    own = np.zeros(plan.free.shape, bool)
+    inside = ((thing >= 0) & (thing < own.shape)).all(1)
+    own[tuple(thing[inside].T)] = True
+    blocked = plan.occupied & ~ndimage.binary_dilation(own, iterations=2)  # its own outline is no obstacle
+    for best in np.argsort(nearest, kind="stable")[:MOST_LOOKS]:
+        if nearest[best] >= least and not _between(plan, blocked, centres[best], spots[gaps[best].argmin()]):
+            break
+    else:
         return None
-    best = int(np.where(nearest >= least, nearest, np.inf).argmin())
     ahead = np.median(points, axis=0) - centres[best]
     x, y = centres[best]
     return Goal(float(x), float(y), float(np.arctan2(ahead[1], ahead[0])), float(nearest[best]))
+
+
+def _between(plan: FloorMap, blocked: Array, start: Array, end: Array) -> bool:
+    """Whether the straight line between two places (2,), metres, crosses a cell of `blocked` (X, Y) bool."""
+    count = 2 * int(np.linalg.norm(end - start) / plan.resolution) + 2
+    along = start + np.linspace(0, 1, count)[:, None] * (end - start)
+    cells = np.floor((along - plan.origin) / plan.resolution).astype(int)
+    cells = cells[((cells >= 0) & (cells < blocked.shape)).all(1)]
+    return bool(blocked[tuple(cells.T)].any())
 
 
 def collider(occupancy: Occupancy) -> tuple[Array, Array]:

@@ -28,6 +28,7 @@ from langsplat_core.geometry.planes import Room
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
 from tests.support.box_rooms import FLOOR, WALL, box_room
+from tests.support.fakes import named_scene
 
 ROOM = Room(np.array([0.0, 0.0, 1.0]), FLOOR, None, ())
 
@@ -89,11 +90,11 @@ def test_a_room_is_free_within_its_walls():
     standing = plan.centres(np.argwhere(plan.occupied))
     at_wall = np.abs(np.abs(standing).max(1) - WALL) < 0.35  # seen at a flat angle
     block = (np.abs(standing[:, 0] - 1.5) < 0.4) & (np.abs(standing[:, 1]) < 1.5)
-    assert (at_wall | block).mean() > 0.65
+    assert (at_wall | block).mean() > 0.5
     assert at_wall.sum() > 20
     assert block.sum() > 10
     with pytest.raises(InputError, match="finer --resolution"):
-        floor_map(occupancy, 0.31, 0.32)
+        floor_map(occupancy, 0.6, 0.5)
 
 
 def test_what_cannot_be_a_map_is_refused():
@@ -109,25 +110,48 @@ def plan_of(rows: list[str]) -> FloorMap:
     return FloorMap(np.zeros(2), 1.0, grid == "#", grid == ".")
 
 
-def test_goals_are_reachable_clear_of_things_and_face_them():
-    plan = plan_of(["#######", "#..#..#", "#..#..#", "#..#.##", "#..#..#", "#######"])
+PLAN = ["#######", "#..#..#", "#..#..#", "#..#.##", "#.....#", "#######"]
+
+
+def steps_to(plan: FloorMap, where: Array, start: Array, end: Array) -> int:
+    """Cells of the shortest way over neighbours in `where`, -1 without one: plain breadth first."""
+    ahead, seen = [(tuple(start), 0)], {tuple(start)}
+    for cell, length in ahead:
+        if cell == tuple(end):
+            return length
+        for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            other = cell[0] + dx, cell[1] + dy
+            if where[other] and other not in seen:
+                seen.add(other)
+                ahead.append((other, length + 1))
+    return -1
+
+
+def test_goals_are_reachable_and_face_a_thing_with_nothing_between():
+    plan = plan_of(PLAN)
     where = reachable(plan, 0.4, (1.5, 1.5))
-    assert np.argwhere(where)[:, 0].max() == 2  # never behind the wall
-    thing = np.array([[5.5, 2.5]])
-    goal = find_goal(plan, where, thing)
+    goal = find_goal(plan, where, np.array([[4.5, 4.5]]))
     assert goal is not None
-    assert (goal.x, goal.y) == (2.5, 2.5)
-    assert goal.yaw == pytest.approx(0.0)
-    assert goal.distance == pytest.approx(3.0)
-    farther = find_goal(plan, where, thing, 3.5)
-    assert farther is not None
-    assert farther.distance >= 3.5
-    assert find_goal(plan, where, thing, 30.0) is None
+    assert goal.x >= 4  # not through the wall, where it would be as near
+    cell = np.floor([goal.x, goal.y]).astype(int)
+    assert steps_to(plan, where, np.array([1, 1]), cell) > 3
+    far = find_goal(plan, where, np.array([[4.5, 4.5]]), 1.5)
+    assert far is not None
+    assert far.distance >= 1.5
+    assert np.hypot(4.5 - far.x, 4.5 - far.y) == pytest.approx(far.distance)
+    assert far.yaw == pytest.approx(np.arctan2(4.5 - far.y, 4.5 - far.x))
+    assert find_goal(plan, where, np.array([[4.5, 4.5]]), 30.0) is None
+    assert find_goal(plan, np.zeros(plan.free.shape, bool), np.array([[4.5, 4.5]])) is None
+
+
+def test_a_robot_stays_where_it_fits_and_where_it_is():
+    plan = plan_of([*PLAN[:4], "#..#..#", PLAN[5]])  # two rooms
+    assert np.argwhere(reachable(plan, 0.4, (1.5, 1.5)))[:, 0].max() == 2
+    assert np.argwhere(reachable(plan, 0.4))[:, 0].max() == 2  # the larger one
     with pytest.raises(InputError, match="does not fit there"):
         reachable(plan, 0.4, (3.5, 2.5))
     with pytest.raises(InputError, match="fits nowhere"):
         reachable(plan, 5.0)
-    assert find_goal(plan, np.zeros(plan.free.shape, bool), thing) is None
 
 
 def test_a_collider_is_closed_around_what_is_occupied():
@@ -178,7 +202,7 @@ def test_the_command_writes_what_nav2_reads(tmp_path, capsys):
     beyond = np.maximum(np.abs(columns)[None], np.abs(rows)[::-1, None]) > WALL + 0.15
     assert not free[beyond].any()
     labels, _ = ndimage.label(free)
-    assert np.bincount(labels[labels > 0]).max() > 0.9 * free.sum()
+    assert np.bincount(labels[labels > 0]).max() > 0.7 * free.sum()
     voxels = np.load(tmp_path / "map" / "voxels.npz", allow_pickle=False)
     assert len(voxels["cells"]) == len(voxels["words"]) == len(voxels["nodes"])
     assert (tmp_path / "map" / "collider.obj").read_text().startswith("v ")
@@ -190,3 +214,36 @@ def test_a_map_without_a_scale_is_refused(tmp_path, capsys):
     assert main("langsplat", lambda: parse(["map", str(tmp_path / "room.ply"), str(tmp_path / "map")])) == 2
     assert "nobody said how long a unit" in capsys.readouterr().err
     assert not (tmp_path / "map" / "map.pgm").exists()
+
+
+def test_goals_by_phrase_and_what_has_none(tmp_path, capsys):
+    pytest.importorskip("open3d")
+    scene, named = box_room(), named_scene()
+    rows = len(scene.gaussians)
+    near_block = (np.abs(scene.gaussians.means - [1.5, 0, FLOOR + 0.3]) < [0.4, 1.5, 0.4]).all(1)
+    assert named.language is not None
+    latents = np.zeros((3, rows, 4), np.float32)
+    latents[..., 3] = 1
+    latents[:, near_block] = [1, 0, 0, 0]
+    field = replace(
+        named.language,
+        latents=latents,
+        confidence=np.ones((3, rows), np.float32),
+        codec=named_scene(False).language.codec,
+    )
+    save_scene(tmp_path / "room.ply", replace(scene, language=field, metres_per_unit=1.0))
+    words = [
+        "map",
+        str(tmp_path / "room.ply"),
+        str(tmp_path / "map"),
+        "--resolution",
+        "0.1",
+        "--step",
+        "0.15",
+    ]
+    assert main("langsplat", lambda: parse([*words, "--goal", "mug", "wall"])) == 2
+    assert "no goal for 'wall': not here" in capsys.readouterr().err
+    (goal,) = json.loads((tmp_path / "map" / "goals.json").read_text())
+    assert goal["phrase"] == "mug"
+    assert 0.3 <= goal["distance"] < 1.0
+    assert np.cos(goal["yaw"]) > 0  # towards the block, which stands at the wall x = 2
