@@ -20,6 +20,7 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
     {
         "train": "train.Train",
         "query": "query.QueryScene",
+        "find": "find.Find",
         "describe": "describe.Describe",
         "select": "query.Select",
         "teach": "teach.Teach",

@@ -1,0 +1,149 @@
+"""The report `changed`: two captures of one room compared, unchanged and with things moved, removed, brought
+and painted, against what was done."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from assets.making.dataset import FIRST_ROOM, write_dataset
+from assets.making.kit import Kit, random_colour
+from assets.making.objects import BRIGHT, TABLE_TOP
+from assets.making.world import ENLARGED, Placed, Surface, assemble, footprint, furnished
+from langsplat_core.arrays import Array
+from langsplat_core.io.files import atomic_path
+from tests.benchmarks.room import Room
+
+HALF_TABLE = np.array([0.72, 0.545])  # metres
+EACH = 2  # things that are removed, moved, painted, brought, of each room
+FAR = 0.2  # metres: the least move
+ANOTHER = 5_000  # added to a room's seed: cameras and points of its second capture
+
+
+@dataclass(frozen=True)
+class Done:
+    """What was done to one thing."""
+
+    kind: str  # as of `changes.Kind`
+    word: str
+    centre: tuple[float, float, float]  # metres, of its box, where it is or was
+    moved: tuple[float, float, float] = (0, 0, 0)  # metres
+
+
+def middle(placed: Placed) -> Array:
+    """(3,) of the upright box around a placed thing, metres."""
+    points = np.concatenate([piece.mesh.vertices for piece in placed.thing.pieces])
+    points = (points * placed.scale) @ placed.turn.T + placed.offset
+    return np.asarray((points.min(0) + points.max(0)) / 2)
+
+
+def alter(seed: int, placed: list[Placed]) -> tuple[list[Placed], list[Done]]:
+    """A room with two things each removed, moved, painted another colour and brought, and the list of them."""
+    rng = np.random.default_rng((seed, 23))
+    room, done = list(placed), list[Done]()
+    on_table = [
+        item
+        for item in room
+        if item.thing.word in TABLE_TOP
+        and item.thing.word not in ("bowl", "plate")  # with fruit
+        and abs(item.offset[2]) < 0.05
+        and (np.abs(footprint(item).mean(0)) < HALF_TABLE).all()
+        and not any(other.thing.word in ("bowl", "plate") and _on(item, other) for other in room)
+    ]
+    order = [on_table[k] for k in rng.permutation(len(on_table))]
+
+    def note(kind: str, item: Placed, moved: Array | None = None) -> None:
+        shift = np.zeros(3) if moved is None else moved
+        x, y, z = middle(item).tolist()
+        done.append(Done(kind, item.thing.word, (x, y, z), tuple(shift.tolist())))
+
+    def stand(thing_of: Placed | None, thing: object) -> Placed | None:
+        others = [footprint(item) for item in room if item is not thing_of and item.offset[2] > -0.1]
+        table = Surface(np.zeros(3), HALF_TABLE, 0.012, ENLARGED, taken=others)
+        return table.stand(thing, rng)  # type: ignore[arg-type]
+
+    for item in order[:EACH]:
+        room = [other for other in room if other is not item]
+        note("gone", item)
+    painted = [item for item in order[EACH:] if _coloured(item)][:EACH]
+    for item in painted:
+        new = str(rng.choice([word for word in BRIGHT if word != item.thing.colour]))
+        room = [_painted(item, new, rng) if other is item else other for other in room]
+        note("recoloured", item)
+    moved = 0
+    for item in order[EACH:]:
+        if moved == EACH or item in painted:
+            continue
+        there = stand(item, item.thing)
+        if there is not None and np.linalg.norm(middle(there) - middle(item)) >= FAR:
+            room = [there if other is item else other for other in room]
+            note("moved", item, middle(there) - middle(item))
+            moved += 1
+    here, brought, kit = {item.thing.word for item in placed}, 0, Kit(rng)
+    for word in map(str, rng.permutation(list(TABLE_TOP))):
+        if brought == EACH or word in here:
+            continue
+        builder, colours = TABLE_TOP[word]
+        new_thing = stand(None, builder(kit, kit.pick(*colours)))
+        if new_thing is not None:
+            room.append(new_thing)
+            note("appeared", new_thing)
+            brought += 1
+    return room, done
+
+
+def _on(item: Placed, host: Placed) -> bool:
+    return item is not host and bool(np.linalg.norm((item.offset - host.offset)[:2]) < 0.12)
+
+
+def _coloured(item: Placed) -> bool:
+    """Whether most of a thing's surface has the colour that it is called by."""
+    sizes = [np.ptp(piece.mesh.vertices, 0).prod() ** (2 / 3) for piece in item.thing.pieces]
+    own = [piece.material.word == item.thing.colour != "" for piece in item.thing.pieces]
+    return float(np.dot(sizes, own)) > 0.6 * sum(sizes)
+
+
+def _painted(item: Placed, word: str, rng: np.random.Generator) -> Placed:
+    colour, old = random_colour(word, rng), item.thing.colour
+    pieces = tuple(
+        replace(piece, material=replace(piece.material, word=word, colour=colour, second=colour))
+        if piece.material.word == old
+        else piece
+        for piece in item.thing.pieces
+    )
+    return replace(item, thing=replace(item.thing, colour=word, pieces=pieces))
+
+
+class SecondCapture(Room):
+    """The room of a seed photographed again, from other places, and trained with another seed."""
+
+    def __init__(self, first: Room, change: Callable[[int, list[Placed]], tuple[list[Placed], list[Done]]] | None):
+        room = (first.config, first.tier, first.seed, first.folder.parent, (first.encoder, first.weights))
+        super().__init__(*room, first.progress)
+        self.change = change
+        name = "again" if change is None else "changed"
+        self.folder = first.folder.with_name(f"{first.folder.name}-{name}")
+        radiance = replace(self.settings.radiance, seed=1)
+        self.settings = replace(self.settings, radiance=radiance)
+
+    @cached_property
+    def photographs(self) -> Path:
+        folder, config = self.folder / "photographs", self.config
+        if not (folder / "transforms.json").exists():
+            world = assemble(self._altered[0])
+            seed = self.seed + ANOTHER * (1 if self.change is None else 2)
+            write_dataset(folder, seed, config.views, config.size, self.progress, self.tier, world=world)
+        return folder
+
+    @cached_property
+    def _altered(self) -> tuple[list[Placed], list[Done]]:
+        placed = furnished(FIRST_ROOM + self.seed, self.tier)
+        return (placed, []) if self.change is None else self.change(self.seed, placed)
+
+    @property
+    def done(self) -> list[Done]:
+        """What was done to the room since the first capture."""
+        return self._altered[1]
