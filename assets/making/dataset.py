@@ -56,12 +56,13 @@ def write_dataset(
     """Render the room of `seed` and difficulty `tier` into folder `out`.
 
     views: number of photographs, >= 4; size: (width, height) in pixels, at least 16 each; naming: of the
-    photographs; world: what the cameras and points of `seed` show, in place of its own room. Written are images/view_000.png ..., points.ply, truth/view_000.npz (`ids`: (3, H, W) int32
-    label ids at subpart, part and whole level, -1 where there is nothing; `depth`: (H, W) float32 metres
-    along the camera's z), truth/labels.json (id -> level, word, thing, colour, phrase, words) and, last,
-    transforms.json in nerfstudio's convention (OpenGL camera-to-world), marked as "drawn". A view counts as
-    done when its truth file is there, so an interrupted call goes on where it stopped. Raises InputError for
-    a size or number out of range.
+    photographs; world: what the cameras and points of `seed` show, in place of its own room. Written are
+    images/view_000.png ..., points.ply, truth/view_000.npz (`ids`: (3, H, W) int32 label ids at subpart, part
+    and whole level, -1 where there is nothing; `depth`: (H, W) float32 metres along the camera's z),
+    truth/labels.json (id -> level, word, thing, colour, phrase, words) and, last, transforms.json in
+    nerfstudio's convention (OpenGL camera-to-world), marked as "drawn". A view counts as done when its truth
+    file is there, so an interrupted call goes on where it stopped. Raises InputError for a size or number out
+    of range.
     """
     if views < 4 or min(size) < 16:
         raise InputError(

@@ -9,20 +9,29 @@ from io import BytesIO
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import tyro
 from PIL import Image, ImageDraw, ImageFont
 
-from langsplat_core.cli.query import Unit, print_json
+from langsplat_core.arrays import Array
+from langsplat_core.cli.query import Unit, print_json, unit_of
 from langsplat_core.cli.run import OutFile
-from langsplat_core.config import CountOrZero
-from langsplat_core.errors import InputError
+from langsplat_core.cli.teach import searchable
+from langsplat_core.config import CountOrZero, Positive
+from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.files import atomic_path
+from langsplat_core.io.hostile import read_json_file
 from langsplat_core.progress import TerminalProgress
+from langsplat_core.query.changes import Change, changes, check_similarity
+from langsplat_core.query.describe import Describer
+from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.library import PICTURE, Answered, Hit, Library, find, update_library
+from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import LEVELS
 from langsplat_core.scene.language import split_phrases
 from langsplat_core.semantics.encoders import load_text_encoder
 
+LIMIT = 100_000  # bytes of a transform
 COLUMNS, CAPTION, GAP = 4, 44, 8  # of a sheet: pictures in a row; pixels below one, and between them
 
 
@@ -190,3 +199,74 @@ def _image(listed: Sequence[tuple[Answered, list[Hit]]], library: Library) -> Im
             brush.text((corner[0], corner[1] + height), says, "black", font, spacing=1)
         top += -(-len(hits) // COLUMNS) * (height + CAPTION)
     return sheet
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Say what changed between two scenes of one place: what appeared, is gone, moved, or has another colour.
+    Places are in the first scene's frame."""
+
+    before: tyro.conf.Positional[Path]
+    """A trained scene, *.ply with its language field beside it."""
+    after: tyro.conf.Positional[Path]
+    """Another one of the same place."""
+    transform: Path | None = None
+    """JSON of 4 x 4 numbers, row by row, from the second scene's frame into the first one's; without it they
+    are taken to be in one frame."""
+    encoder: str = ""
+    """Text encoder folder or hub id, in place of the one the scenes name."""
+    scale: Positive | None = None
+    """Metres per world unit of the first scene, in place of what it says."""
+    json: bool = False
+    """Print JSON, lengths in world units."""
+
+    def run(self) -> None:
+        placed = None if self.transform is None else _read_transform(self.transform)
+        scenes = searchable(self.before), searchable(self.after)
+        unit = unit_of(scenes[0], self.scale)
+        first, second = (QueryEngine(scene, load_text_encoder, encoder_id=self.encoder) for scene in scenes)
+        with TerminalProgress() as progress:
+            describers = None
+            try:
+                describers = Describer(first, progress=progress), Describer(second, progress=progress)
+            except EncoderError as error:
+                print(f"langsplat: without names: {error}", file=sys.stderr)
+            found = changes(first, second, load_lifting_rasterizer("cpu"), placed, describers, progress)
+        if self.json:
+            print_json({"metres_per_unit": unit.metres, "changes": [_change_fields(c) for c in found]})
+            return
+        print("\n".join(_in_words(change, unit) for change in found) or "nothing changed")
+
+
+def _read_transform(path: Path) -> Array:
+    try:
+        return check_similarity(np.array(read_json_file(path, LIMIT), np.float64))
+    except (ValueError, TypeError, InputError) as error:
+        raise InputError(f"{path}: no transform ({error})") from None
+
+
+def _in_words(change: Change, unit: Unit) -> str:
+    name = change.name or "something"
+    at = f"{unit.format(change.centre)} {unit.name}"
+    if change.kind == "moved":
+        assert change.moved is not None
+        by = f"{unit.length * change.distance:.2f} {unit.name} ({unit.format(change.moved)})"
+        return f"moved: {name} by {by}, now at {at}"
+    if change.colours is not None:
+        before, now = change.colours
+        said = f"{before} to {now}" if before != now else f"another {now}"
+        return f"changed colour: {name} at {at}, {said}"
+    return f"{change.kind}: {name} at {at}"
+
+
+def _change_fields(change: Change) -> dict[str, Any]:
+    return {
+        "kind": change.kind,
+        "name": change.name,
+        "centre": change.centre.tolist(),
+        "box": change.box.tolist(),
+        "moved": None if change.moved is None else change.moved.tolist(),
+        "distance": change.distance,
+        "colours": None if change.colours is None else list(change.colours),
+        "share": change.share,
+    }

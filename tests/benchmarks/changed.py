@@ -1,7 +1,6 @@
 """The report `changed`: two captures of one room compared, unchanged and with things moved, removed, brought
 and painted, against what was done."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,7 +13,6 @@ from assets.making.kit import Kit, random_colour
 from assets.making.objects import BRIGHT, TABLE_TOP
 from assets.making.world import ENLARGED, Placed, Surface, assemble, footprint, furnished
 from langsplat_core.arrays import Array
-from langsplat_core.io.files import atomic_path
 from tests.benchmarks.room import Room
 
 HALF_TABLE = np.array([0.72, 0.545])  # metres
@@ -41,18 +39,10 @@ def middle(placed: Placed) -> Array:
 
 
 def alter(seed: int, placed: list[Placed]) -> tuple[list[Placed], list[Done]]:
-    """A room with two things each removed, moved, painted another colour and brought, and the list of them."""
+    """A room with two things each removed, painted another colour, moved and brought; and what was done."""
     rng = np.random.default_rng((seed, 23))
     room, done = list(placed), list[Done]()
-    on_table = [
-        item
-        for item in room
-        if item.thing.word in TABLE_TOP
-        and item.thing.word not in ("bowl", "plate")  # with fruit
-        and abs(item.offset[2]) < 0.05
-        and (np.abs(footprint(item).mean(0)) < HALF_TABLE).all()
-        and not any(other.thing.word in ("bowl", "plate") and _on(item, other) for other in room)
-    ]
+    on_table = [item for item in room if _is_alone(item, room)]
     order = [on_table[k] for k in rng.permutation(len(on_table))]
 
     def note(kind: str, item: Placed, moved: Array | None = None) -> None:
@@ -95,6 +85,14 @@ def alter(seed: int, placed: list[Placed]) -> tuple[list[Placed], list[Done]]:
     return room, done
 
 
+def _is_alone(item: Placed, room: list[Placed]) -> bool:
+    """Whether a thing stands on the table, and neither in a bowl nor with something in it."""
+    hosts = [other for other in room if other.thing.word in ("bowl", "plate")]
+    on_table = item.thing.word in TABLE_TOP and abs(item.offset[2]) < 0.05 and item not in hosts
+    inside = bool((np.abs(footprint(item).mean(0)) < HALF_TABLE).all())
+    return on_table and inside and not any(_on(item, host) for host in hosts)
+
+
 def _on(item: Placed, host: Placed) -> bool:
     return item is not host and bool(np.linalg.norm((item.offset - host.offset)[:2]) < 0.12)
 
@@ -120,7 +118,9 @@ def _painted(item: Placed, word: str, rng: np.random.Generator) -> Placed:
 class SecondCapture(Room):
     """The room of a seed photographed again, from other places, and trained with another seed."""
 
-    def __init__(self, first: Room, change: Callable[[int, list[Placed]], tuple[list[Placed], list[Done]]] | None):
+    def __init__(
+        self, first: Room, change: Callable[[int, list[Placed]], tuple[list[Placed], list[Done]]] | None
+    ):
         room = (first.config, first.tier, first.seed, first.folder.parent, (first.encoder, first.weights))
         super().__init__(*room, first.progress)
         self.change = change
