@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from assets.making.dataset import FIRST_ROOM, write_dataset
-from assets.making.kit import Kit, random_colour
+from assets.making.kit import Kit, Thing, random_colour
 from assets.making.objects import BRIGHT, TABLE_TOP
 from assets.making.world import ENLARGED, Placed, Surface, assemble, footprint, furnished
 from langsplat_core.arrays import Array
@@ -50,11 +50,6 @@ def alter(seed: int, placed: list[Placed]) -> tuple[list[Placed], list[Done]]:
         x, y, z = middle(item).tolist()
         done.append(Done(kind, item.thing.word, (x, y, z), tuple(shift.tolist())))
 
-    def stand(thing_of: Placed | None, thing: object) -> Placed | None:
-        others = [footprint(item) for item in room if item is not thing_of and item.offset[2] > -0.1]
-        table = Surface(np.zeros(3), HALF_TABLE, 0.012, ENLARGED, taken=others)
-        return table.stand(thing, rng)  # type: ignore[arg-type]
-
     for item in order[:EACH]:
         room = [other for other in room if other is not item]
         note("gone", item)
@@ -67,22 +62,32 @@ def alter(seed: int, placed: list[Placed]) -> tuple[list[Placed], list[Done]]:
     for item in order[EACH:]:
         if moved == EACH or item in painted:
             continue
-        there = stand(item, item.thing)
+        there = _stand(item.thing, [other for other in room if other is not item], rng)
         if there is not None and np.linalg.norm(middle(there) - middle(item)) >= FAR:
             room = [there if other is item else other for other in room]
             note("moved", item, middle(there) - middle(item))
             moved += 1
-    here, brought, kit = {item.thing.word for item in placed}, 0, Kit(rng)
-    for word in map(str, rng.permutation(list(TABLE_TOP))):
-        if brought == EACH or word in here:
-            continue
-        builder, colours = TABLE_TOP[word]
-        new_thing = stand(None, builder(kit, kit.pick(*colours)))
-        if new_thing is not None:
-            room.append(new_thing)
-            note("appeared", new_thing)
-            brought += 1
+    for item in _brought(room, {item.thing.word for item in placed}, rng):
+        room.append(item)
+        note("appeared", item)
     return room, done
+
+
+def _stand(thing: Thing, room: list[Placed], rng: np.random.Generator) -> Placed | None:
+    """A thing at a free place on the table; None where there is no room."""
+    others = [footprint(item) for item in room if item.offset[2] > -0.1]
+    return Surface(np.zeros(3), HALF_TABLE, 0.012, ENLARGED, taken=others).stand(thing, rng)
+
+
+def _brought(room: list[Placed], here: set[str], rng: np.random.Generator) -> list[Placed]:
+    """Things of kinds that are not `here`, on free places of the table."""
+    new, kit = list[Placed](), Kit(rng)
+    for word in map(str, rng.permutation(list(TABLE_TOP))):
+        if len(new) < EACH and word not in here:
+            builder, colours = TABLE_TOP[word]
+            item = _stand(builder(kit, kit.pick(*colours)), [*room, *new], rng)
+            new += [] if item is None else [item]
+    return new
 
 
 def _is_alone(item: Placed, room: list[Placed]) -> bool:
