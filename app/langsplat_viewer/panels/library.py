@@ -72,7 +72,6 @@ def _row(viewer: Viewer, view: LibraryView, row: int, hit: Hit) -> None:
     if imgui.selectable("##scene", hit.path == viewer.state.path, size=ImVec2(0, height))[0]:
         opening.open_hit(viewer, hit)
     tip(str(hit.path))
-    after = imgui.get_cursor_pos()
     imgui.set_cursor_pos(start)
     if texture is not None:
         ends = ImVec2(0, row / count), ImVec2(1, (row + 1) / count)
@@ -85,4 +84,3 @@ def _row(viewer: Viewer, view: LibraryView, row: int, hit: Hit) -> None:
         sure = "" if hit.probability is None else f" ({100 * hit.probability:.0f} %)"
         imgui.text_colored(good() if hit.verdict == "found" else muted(), hit.verdict + sure)
     imgui.end_group()
-    imgui.set_cursor_pos(after)
