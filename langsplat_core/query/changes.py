@@ -33,9 +33,10 @@ FARTHER = 0.03  # of the depth: a surface so much farther behind is another one
 PLAINLY = 3  # times as far, it is whatever its colour
 OTHER = 18.0  # distance of colours in CIE L*a*b* from which a kept pixel has another
 TINT = 5.0  # and from which what is barely farther is gone
-MOST = 0.6  # of what is seen of a node: from here on it changed
-ABSENT = 0.2  # of that: gone; below, what changed is its colour
+ABSENT = 0.2  # of what is seen of a node: if more of it is gone, all of it may be, else its colour changed
+MOST_GONE, MOST_COLOURED = 0.8, 0.6  # of that, changed: from here on a node changed
 LEAST_PIXELS = 50.0  # that a node covers, of an image in which it is seen
+EMPTY = 0.05  # alpha below which nothing is there
 SIDE = 400  # pixels: the longer side of these images
 ALIKE = 0.4  # cosine of meanings, from the scene's mean, of one thing in two places
 SHADE = 18.0  # distance of its mean colours at most
@@ -151,30 +152,33 @@ def _evidence(
 ) -> tuple[Array, Array]:
     """(N, `_CHANNELS`) float64 of the Gaussians of both scenes."""
     back = np.linalg.inv(into)
-    cameras = _some(first.cameras) + [_seen_from(camera, back) for camera in _some(second.cameras)]
-    if not cameras:
+    own, others = _some(first.cameras), [_seen_from(camera, back) for camera in _some(second.cameras)]
+    if not own + others:
         raise InputError("neither scene has cameras to look from; keep .cameras.json beside one of them")
     scale = float(np.cbrt(np.linalg.det(into[:3, :3])))
     sums = np.zeros((len(first.gaussians), _CHANNELS)), np.zeros((len(second.gaussians), _CHANNELS))
-    for done, camera in enumerate(cameras):
-        progress("comparing the scenes", done / len(cameras))
-        pair = ((first, camera, 1.0), (second, _seen_from(camera, into), scale))
-        views = [rasterizer.view(s.gaussians, c, s.raster_settings()) for s, c, _ in pair]
-        near, far = (factor * view.median_depth() for view, (_, _, factor) in zip(views, pair, strict=True))
-        looks = [
-            to_lab(np.clip(splat_colours(view, s.gaussians, c).colours, 0, 1))
-            for view, (s, c, _) in zip(views, pair, strict=True)
-        ]
+    for done, camera in enumerate(own + others):
+        progress("comparing the scenes", done / len(own + others))
+        pair = ((first, camera), (second, _seen_from(camera, into)))
+        views = [rasterizer.view(s.gaussians, c, s.raster_settings()) for s, c in pair]
+        drawn = [splat_colours(view, s.gaussians, c) for view, (s, c) in zip(views, pair, strict=True)]
+        looks = [to_lab(np.clip(image.colours, 0, 1)) for image in drawn]
+        near, far = views[0].median_depth(), scale * views[1].median_depth()
+        # Where a capture looked and has nothing, nothing is; where it did not look, nobody knows.
+        if done < len(own):
+            near = np.where(drawn[0].alpha < EMPTY, np.inf, near)
+        else:
+            far = np.where(drawn[1].alpha < EMPTY, np.inf, far)
         both, limit = (near > 0) & (far > 0), FARTHER * np.minimum(near, far)
         kept = both & (np.abs(near - far) <= limit)
         if kept.any():  # of another exposure
             looks[1] = looks[1] - np.median((looks[1] - looks[0])[kept], axis=0)
         apart = np.linalg.norm(looks[1] - looks[0], axis=-1)
-        for own, other, view, total, look, away in (
+        for depth, other, view, total, look, away in (
             (near, far, views[0], sums[0], looks[0], looks[1]),
             (far, near, views[1], sums[1], looks[1], looks[0]),
         ):
-            behind = other - own
+            behind = other - depth
             gone = both & ((behind > limit) & (apart > TINT) | (behind > PLAINLY * limit))
             stays = both & ~gone & (behind > -limit)
             marks = np.stack([gone, stays, stays & (apart > OTHER)], -1).astype(np.float32)
@@ -254,7 +258,8 @@ def _has_changed(evidence: Array) -> bool:
     gone, kept, coloured = evidence[:, :3].sum(0)
     images = evidence[:, 3].max(initial=0)
     enough = len(evidence) >= LEAST_COUNT and gone + kept >= LEAST_PIXELS * max(images, 1)
-    return bool(enough and gone + coloured >= MOST * (gone + kept))
+    least = MOST_GONE if gone >= ABSENT * (gone + kept) else MOST_COLOURED
+    return bool(enough and gone + coloured >= least * (gone + kept))
 
 
 def _meanings(engine: QueryEngine) -> tuple[Array, Array, Array]:

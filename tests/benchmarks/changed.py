@@ -1,7 +1,8 @@
 """The report `changed`: two captures of one room compared, unchanged and with things moved, removed, brought
 and painted, against what was done."""
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +14,13 @@ from assets.making.kit import Kit, Thing, random_colour
 from assets.making.objects import BRIGHT, TABLE_TOP
 from assets.making.world import ENLARGED, Placed, Surface, assemble, footprint, furnished
 from langsplat_core.arrays import Array
-from tests.benchmarks.room import Room
+from langsplat_core.bench.measure import markdown
+from langsplat_core.progress import TerminalProgress
+from langsplat_core.query.changes import Change, changes
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster import load_lifting_rasterizer
+from langsplat_core.scene import Scene
+from tests.benchmarks.room import InRooms, MaskOrigin, Room, Variant, publish
 
 HALF_TABLE = np.array([0.72, 0.545])  # metres
 EACH = 2  # things that are removed, moved, painted, brought, of each room
@@ -152,3 +159,81 @@ class SecondCapture(Room):
     def done(self) -> list[Done]:
         """What was done to the room since the first capture."""
         return self._altered[1]
+
+
+# The report.
+
+NEAR = 0.12  # metres between where a change was and where it is said
+
+
+@dataclass(frozen=True)
+class Changed(InRooms):
+    """Rooms captured twice, unchanged and with two things each removed, painted, moved and brought: which of
+    these are said, and what is said besides. A room takes three trainings."""
+
+    masks: MaskOrigin = "truth"  # where outlines come from
+
+    def run(self) -> None:
+        with TerminalProgress() as progress:
+            rows = [row for room in self.rooms(progress) for row in measure_changes(room, self.masks)]
+        publish(self, "changed", "What changed between two captures", change_table(rows), rows)
+
+
+@dataclass(frozen=True)
+class Said:
+    """Two captures of a room compared."""
+
+    seed: int
+    what: str  # "unchanged" or "changed"
+    done: int
+    found: tuple[str, ...]  # things whose change was said, as what it was
+    missed: tuple[str, ...]
+    false: tuple[str, ...]  # what was said and was not done
+    errors: tuple[float, ...]  # of the moves that were found, metres
+    seconds: float
+
+
+def measure_changes(room: Room, masks: MaskOrigin) -> Iterator[Said]:
+    """The first capture against an unchanged and a changed second one."""
+    variant = Variant("the method", masks)
+
+    def engine(own: Room) -> QueryEngine:
+        cameras = tuple(own.capture.cameras)
+        return QueryEngine(Scene(own.gaussians, own.field(variant)[0], cameras), lambda _: room.encoder)
+
+    first, rasterizer = engine(room), load_lifting_rasterizer("cpu")
+    for what, second in (("unchanged", SecondCapture(room, None)), ("changed", SecondCapture(room, alter))):
+        other, start = engine(second), time.perf_counter()
+        said = changes(first, other, rasterizer)
+        seconds = time.perf_counter() - start
+        yield judged(room.seed, what, second.done, said, seconds)
+
+
+def judged(seed: int, what: str, done: Sequence[Done], said: Sequence[Change], seconds: float) -> Said:
+    """Match what was said to what was done: of one kind, and near."""
+    left, found, missed, errors = list(said), list[str](), list[str](), list[float]()
+    for one in done:
+        place = np.add(one.centre, one.moved)
+        near = [c for c in left if c.kind == one.kind and np.linalg.norm(c.centre - place) < NEAR]
+        (found if near else missed).append(f"{one.kind} {one.word}")
+        if near:
+            best = min(near, key=lambda change: float(np.linalg.norm(change.centre - place)))
+            left = [change for change in left if change is not best]
+            if best.moved is not None:
+                errors.append(float(np.linalg.norm(best.moved - one.moved)))
+    false = tuple(f"{change.kind}, {change.pixels:.0f} pixels" for change in left)
+    return Said(seed, what, len(done), tuple(found), tuple(missed), false, tuple(errors), seconds)
+
+
+def change_table(rows: Sequence[Said]) -> str:
+    """A row for each comparison."""
+    names = ["room", "second capture", "done", "found", "missed", "false", "error of moves, cm", "seconds"]
+    lines = [
+        [
+            *(str(row.seed), row.what, str(row.done), str(len(row.found))),
+            *(", ".join(row.missed) or "0", "; ".join(row.false) or "0"),
+            *(", ".join(f"{100 * error:.1f}" for error in row.errors) or "-", f"{row.seconds:.0f}"),
+        ]
+        for row in rows
+    ]
+    return markdown(names, lines)

@@ -1,4 +1,4 @@
-"""Two scenes of one place: what appeared, is gone, moved, has another colour; and nothing where nothing did."""
+"""Two scenes of one place: what appeared, is gone, moved or has another colour, and nothing else."""
 
 from dataclasses import replace
 
@@ -84,6 +84,15 @@ def test_gone_and_appeared_are_each_other_backwards(scene, number):
         assert change.share > 0.8
 
 
+def test_before_nothing_what_is_gone_is_told_by_who_looked_there():
+    """The blobs alone: what the second capture did not see may still be there."""
+    scene = named_scene()
+    fewer = taken(scene, BOOK)
+    (change,) = compared(scene, fewer)
+    assert change.kind == "gone"
+    assert compared(scene, replace(fewer, cameras=())) == ()
+
+
 def test_a_move_is_one_change_and_has_its_length(scene):
     means = scene.gaussians.means.copy()
     means[PLANT] += (0.3, -0.2, -1.0)
@@ -106,9 +115,7 @@ def test_another_exposure_changes_nothing(scene):
 
 
 def test_names_are_the_words_of_the_encoder(scene):
-    one, other = (
-        QueryEngine(part, lambda _: FakeEncoder()) for part in (scene, noisy(taken(scene, BOOK)))
-    )
+    one, other = (QueryEngine(part, lambda _: FakeEncoder()) for part in (scene, noisy(taken(scene, BOOK))))
     describers = Describer(one, WORDS), Describer(other, WORDS)
     (change,) = changes(one, other, load_lifting_rasterizer("cpu"), None, describers)
     assert change.name == "book"

@@ -1,4 +1,4 @@
-"""An index of scenes answers like the engine, follows the files of its folder, and is refused when damaged."""
+"""The index of scenes: its answers are the engine's, it follows its folder, and is refused when damaged."""
 
 import json
 from dataclasses import replace
