@@ -74,6 +74,8 @@ class Find:
         with TerminalProgress() as progress:
             library = update_library(Path(self.words[-1]), self.index, load, progress, self.rebuild)
             answers = [each for phrase in phrases for each in find(library, phrase, load, self.top, progress)]
+        if all(each.problem for each in answers):
+            raise InputError("; ".join(dict.fromkeys(each.problem for each in answers)))
         listed = [(each, self._listed(each)) for each in answers]
         if self.sheet is not None:
             _write_sheet(self.sheet, listed, library)

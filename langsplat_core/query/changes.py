@@ -18,7 +18,7 @@ from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
 from langsplat_core.query.describe import LEAST_COUNT, LIKELY, NAMES, OR, Describer
-from langsplat_core.query.engine import SAME_ENCODER, QueryEngine
+from langsplat_core.query.engine import QueryEngine, same_vectors
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.raster.protocol import LiftingRasterizer
 from langsplat_core.raster.render import splat_colours
@@ -326,8 +326,7 @@ def _meet(one: Array, other: Array) -> bool:
 
 def _same_words(first: QueryEngine, second: QueryEngine) -> bool:
     """Whether meanings of both scenes are of one encoder."""
-    one, other = first.field.canonical, second.field.canonical
-    return one.shape == other.shape and bool(((one * other).sum(1) >= SAME_ENCODER).all())
+    return same_vectors(first.field.canonical, second.field.canonical)
 
 
 def _matched(lost: list[_Piece], new: list[_Piece], comparable: bool) -> list[tuple[_Piece, _Piece]]:

@@ -49,7 +49,7 @@ from langsplat_core.query.answers import (
     excess,
 )
 from langsplat_core.query.compose import run_phrase
-from langsplat_core.query.engine import LoadEncoder, QueryEngine
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, same_vectors
 from langsplat_core.query.grammar import Atom, Named, heads, named, parse
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.raster.render import splat_colours
@@ -298,21 +298,23 @@ def _digests(library: Library) -> Iterator[Digest]:
 
 def write_library(index: Path, digests: Sequence[Digest]) -> None:
     """Write an index, whole or not at all."""
-    groups: dict[tuple[str, bytes], list[Digest]] = {}
+    groups: list[list[Digest]] = []
     for each in digests:
         if each.canonical is not None:
-            groups.setdefault((each.encoder_id, each.canonical.tobytes()), []).append(each)
+            alike = [members for members in groups if _same_encoder(members[0], each)]
+            groups += [] if alike else [[]]
+            (alike or groups)[-1].append(each)
     header = {
         "groups": [
-            [encoder, *_canonical(members).shape, [_stated(each.listed) for each in members]]
-            for (encoder, _), members in groups.items()
+            [members[0].encoder_id, *_canonical(members).shape, [_stated(each.listed) for each in members]]
+            for members in groups
         ],
         "unread": [_stated(each.listed) for each in digests if each.canonical is None],
     }
     text = json.dumps(header).encode()
     with atomic_path(index) as temporary, temporary.open("wb") as file:
         file.write(MAGIC + len(text).to_bytes(8, "little") + text + bytes(-len(text) % 8))
-        for members in groups.values():
+        for members in groups:
             file.write(_canonical(members).astype("<f4").tobytes())
             for name, _, _ in COLUMNS:
                 for each in members:
@@ -321,6 +323,12 @@ def write_library(index: Path, digests: Sequence[Digest]) -> None:
                 assert each.thumbnail is not None
                 file.write(each.thumbnail.tobytes())
             file.write(bytes(-file.tell() % 8))
+
+
+def _same_encoder(one: Digest, other: Digest) -> bool:
+    assert one.canonical is not None
+    assert other.canonical is not None
+    return one.encoder_id == other.encoder_id and same_vectors(one.canonical, other.canonical)
 
 
 def _canonical(members: Sequence[Digest]) -> Array:
