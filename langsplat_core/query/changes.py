@@ -38,10 +38,10 @@ MOST_GONE, MOST_COLOURED = 0.8, 0.6  # of that, changed: from here on a node cha
 LEAST_PIXELS = 50.0  # that a node covers, of an image in which it is seen
 EMPTY = 0.05  # alpha below which nothing is there
 SIDE = 400  # pixels: the longer side of these images
-ALIKE = 0.4  # cosine of meanings, from the scene's mean, of one thing in two places
-SHADE = 18.0  # distance of its mean colours at most
+ALIKE = 0.8  # cosine of meanings, from the scene's mean, of one thing in two places
+SHADE = 25.0  # distance of its mean colours at most
 GROWN = 1.7  # ratio of its sizes at most
-TOUCHING = 0.04  # of the depth: pieces so near each other are of one thing
+TOUCHING = 0.25  # of the larger one's diagonal: pieces so near each other, and alike, are of one thing
 
 
 @dataclass(frozen=True, eq=False)
