@@ -17,7 +17,7 @@ import numpy as np
 from langsplat_core.arrays import Array, unit
 from langsplat_core.errors import InputError
 from langsplat_core.progress import Progress, silent
-from langsplat_core.query.describe import LEAST_COUNT, LIKELY, NAMES, OR, Describer
+from langsplat_core.query.describe import LIKELY, NAMES, OR, Describer
 from langsplat_core.query.engine import QueryEngine, same_vectors
 from langsplat_core.query.instances import axis_aligned_box
 from langsplat_core.raster.protocol import LiftingRasterizer
@@ -34,7 +34,8 @@ PLAINLY = 3  # times as far, it is whatever its colour
 OTHER = 18.0  # distance of colours in CIE L*a*b* from which a kept pixel has another
 TINT = 5.0  # and from which what is barely farther is gone
 ABSENT = 0.2  # of what is seen of a node: if more of it is gone, all of it may be, else its colour changed
-MOST_GONE, MOST_COLOURED = 0.8, 0.6  # of that, changed: from here on a node changed
+MOST_GONE, MOST_COLOURED = 0.9, 0.6  # of that, changed: from here on a node changed
+LEAST = 100  # Gaussians of a node: of fewer, at the fringe of what was photographed, the shape is a guess
 LEAST_PIXELS = 50.0  # that a node covers, of an image in which it is seen
 EMPTY = 0.05  # alpha below which nothing is there
 SIDE = 400  # pixels: the longer side of these images
@@ -257,7 +258,7 @@ def _pieces(engine: QueryEngine, evidence: Array, into: Array) -> list[_Piece]:
 def _has_changed(evidence: Array) -> bool:
     gone, kept, coloured = evidence[:, :3].sum(0)
     images = evidence[:, 3].max(initial=0)
-    enough = len(evidence) >= LEAST_COUNT and gone + kept >= LEAST_PIXELS * max(images, 1)
+    enough = len(evidence) >= LEAST and gone + kept >= LEAST_PIXELS * max(images, 1)
     least = MOST_GONE if gone >= ABSENT * (gone + kept) else MOST_COLOURED
     return bool(enough and gone + coloured >= least * (gone + kept))
 

@@ -151,4 +151,4 @@ def synthetic(seed: int) -> Digest:
     made = {name: columns[name].astype(kind) for name, kind, _ in COLUMNS}
     width, height = THUMBNAIL
     picture = np.zeros((height, width, 3), np.uint8)
-    return Digest(listed, "synthetic", np.zeros((4, DIM), np.float32), made, picture)
+    return Digest(listed, "synthetic", np.eye(4, DIM, dtype=np.float32), made, picture)
