@@ -24,9 +24,12 @@ $(STAMP): pyproject.toml packaging/constraints.txt
 	$(BIN)/pip install --quiet --constraint packaging/constraints.txt --editable '.[dev]'
 	touch $@
 
-.PHONY: system
+.PHONY: system browser
 system: $(STAMP)
 	@$(PYTHON) packaging/system_libraries.py
+
+browser: $(STAMP)
+	@$(PYTHON) packaging/system_libraries.py --tests
 
 demo: system  ## install everything and open the bundled scene (without a display: pictures in demo_out/)
 	if [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ] || [ "$$(uname)" != Linux ]; then $(BIN)/langsplat-viewer; \
@@ -36,7 +39,7 @@ demo: system  ## install everything and open the bundled scene (without a displa
 quick: check  ## lint, types, and the tests that take no time: the loop while working
 	$(PYTEST) -m "not long"
 
-test: system  ## install everything, then lint, type-check and run every test but the slow tier
+test: browser  ## install everything, then lint, type-check and run every test but the slow tier
 	$(MAKE) --no-print-directory check
 	$(PYTEST)
 
@@ -92,7 +95,7 @@ gpu:  ## on a machine with CUDA: run what never ran without, write docs/benchmar
 	  --requirement packaging/gpu/$(if $(SITE),beside_torch,requirements).txt
 	MAX_JOBS=$${MAX_JOBS:-$$(nproc)} $(GPU)/bin/python packaging/gpu/run.py $(if $(ONLY),--only $(ONLY))
 
-pictures: system  ## make the README's pictures again (on a display, or on Xvfb)
+pictures: browser  ## make the README's pictures again (on a display, or on Xvfb)
 	if [ -n "$$DISPLAY" ]; then $(BIN)/python packaging/pictures.py; \
 	else xvfb-run -a -s "-screen 0 1280x800x24" $(BIN)/python packaging/pictures.py; fi
 

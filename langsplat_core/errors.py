@@ -80,6 +80,8 @@ EXTRAS: Mapping[str, str] = MappingProxyType(  # name as imported -> extra, as i
         "ftfy": "encoders",
         "matplotlib": "plots",
         "gsplat": "cuda",
+        "mcp": "agents",
+        "open3d": "geometry",
     }
 )
 

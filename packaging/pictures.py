@@ -17,6 +17,9 @@ from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.state import TrainingForm
 from langsplat_viewer.window import Window, WindowRequest
 
+sys.path.insert(0, str(Path(__file__).parent.parent))  # the tests
+from tests.support.browser import open_browser, open_tab
+
 OUT = Path(__file__).parent.parent / "docs" / "pictures"
 CAMERA = "3"
 FRAMES = 20_000  # that something is waited for
@@ -33,6 +36,7 @@ STILLS = {
 }
 
 
+PAGE, PAGE_VIEW, PAGE_PHRASE = "page.jpg", 20, "blue gift"
 QUERIES = ("teddy bear", "blue gift", "hamburger")
 
 
@@ -206,9 +210,28 @@ def window_picture(path: Path, queries: tuple[str, ...], act: Act) -> None:
     whole.unlink()
 
 
+def page_picture(path: Path) -> None:
+    """A screenshot of the demo scene's page in a browser."""
+    with tempfile.TemporaryDirectory() as folder, open_browser() as browser:
+        page = Path(folder) / "room.html"
+        command = [sys.executable, "-m", "langsplat_core", "export", "--quiet", "--title", "A toy table"]
+        subprocess.run([*command, str(scene_path(None)), str(page)], check=True)
+        size = {"width": 1280, "height": 720}
+        with open_tab(browser, page, reduced_motion="reduce", viewport=size) as tab:
+            tab.run(f"async () => (await langsplat).page.view({PAGE_VIEW})")
+            tab.page.fill("#phrase", PAGE_PHRASE)
+            tab.page.press("#phrase", "Enter")
+            tab.page.wait_for_timeout(5_000)  # until the order is found and the view rests
+            tab.page.screenshot(path=path, type="jpeg", quality=85)
+
+
 def main() -> None:
     """Write every picture into `docs/pictures`."""
     OUT.mkdir(exist_ok=True)
+    if sys.argv[1:] in ([], [PAGE]):
+        page_picture(OUT / PAGE)
+    if sys.argv[1:] == [PAGE]:
+        return
     for name, options in STILLS.items() if not sys.argv[1:] else ():
         command = [sys.executable, "-m", "langsplat_viewer", "--headless", "--camera", CAMERA]
         subprocess.run([*command, "--out", str(OUT / name), *options], check=True)

@@ -20,6 +20,8 @@ NEEDED = {
 # Mesa's software driver has no library that find_library sees: look for the driver folder's file.
 DRI_PACKAGE = "libgl1-mesa-dri"
 XVFB_PACKAGE = "xvfb"
+# Exported pages are tested in a browser, by any of these names.
+BROWSERS, BROWSER_PACKAGE = ("chromium", "chromium-browser", "google-chrome"), "chromium"
 
 
 def missing_packages() -> list[str]:
@@ -38,17 +40,25 @@ def missing_packages() -> list[str]:
 
 
 def main() -> int:
-    """Install what is missing, or print the line that does; 0 unless an install failed."""
+    """Install what is missing, or print the line that does; 0 unless an install failed. With --tests also a
+    browser; its tests are skipped where it cannot be had."""
     if not sys.platform.startswith("linux"):
         return 0
-    missing = missing_packages()
+    code = install(missing_packages())
+    if "--tests" in sys.argv[1:] and not any(map(shutil.which, BROWSERS)):
+        install([BROWSER_PACKAGE])
+    return code
+
+
+def install(missing: list[str]) -> int:
+    """Install Debian packages, or print the line that does; apt's exit code."""
     if not missing:
         return 0
     command = ["apt-get", "install", "-y", "--no-install-recommends", *missing]
     if os.geteuid() != 0 or shutil.which("apt-get") is None:
-        print("System libraries are missing. Please run:\n  sudo " + " ".join(command))
+        print("System packages are missing. Please run:\n  sudo " + " ".join(command))
         return 0
-    print("Installing system libraries: " + " ".join(missing))
+    print("Installing system packages: " + " ".join(missing))
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
     subprocess.run(["apt-get", "update", "-q"], env=environment, capture_output=True, check=False)
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)

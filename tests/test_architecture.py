@@ -31,7 +31,7 @@ LAYERS = [
     ["langsplat_core.cli"],
     ["langsplat_core.bench"],
     ["langsplat_core.pipeline"],
-    ["langsplat_core.evaluation", "langsplat_core.compaction"],
+    ["langsplat_core.evaluation", "langsplat_core.compaction", "langsplat_core.geometry"],
     ["langsplat_core.training.radiance", "langsplat_core.training.language", "langsplat_core.query"],
     [
         "langsplat_core.raster",
@@ -43,7 +43,7 @@ LAYERS = [
     ["langsplat_core.scene"],
     ["langsplat_core.config", "langsplat_core.compiled"],
     ["langsplat_core.arrays", "langsplat_core.progress"],
-    ["langsplat_core.errors"],
+    ["langsplat_core.errors", "langsplat_core.web"],
 ]
 FACADE = "langsplat_core.__init__"  # the public names; it may reach anything below the command line
 HEAVY = ("torch", "open3d", "transformers", "pycolmap", "moderngl", "glfw", "imgui_bundle", "skimage")

@@ -1,6 +1,6 @@
 """`langsplat describe`: words for what is in a scene, everywhere, at a place, or as a tree."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -74,10 +74,7 @@ class Describe:
             print_json(answer | basis_fields(engine))
             return
         if self.outline:
-            named = [one for one in answer["outline"] if one["word"] is not None or one["parts"]]
-            _print_outline(named, unit_of(scene, None))
-            if len(named) < len(answer["outline"]):
-                print(f"and {len(answer['outline']) - len(named)} without a name, which --json lists")
+            print(*outline_lines(answer["outline"], unit_of(scene, None)), sep="\n")
         elif self._everything:
             _print_inventory(answer["inventory"])
         else:
@@ -127,7 +124,7 @@ class Describe:
         sure = engine.basis.calibration is not None
         asked = {"asked": len(describer.words[0].phrases), "left_out": len(describer.left_out)}
         if self.outline:
-            return asked | {"outline": [_plain(one, sure) for one in describer.outline()]}
+            return asked | {"outline": outline_of(describer)}
         found: Sequence[Words | Entry]
         place: dict[str, Any] = {}
         if self.pixel is not None:
@@ -199,7 +196,22 @@ def _print_inventory(entries: list[dict[str, Any]]) -> None:
         print("nothing of the vocabulary was found in the scene")
 
 
-def _print_outline(nodes: list[dict[str, Any]], unit: Unit, depth: int = 0) -> None:
+def outline_of(describer: Describer) -> list[dict[str, Any]]:
+    """The scene as a tree, ready for JSON."""
+    sure = describer.engine.basis.calibration is not None
+    return [_plain(one, sure) for one in describer.outline()]
+
+
+def outline_lines(nodes: list[dict[str, Any]], unit: Unit) -> list[str]:
+    """An outline as text, without what has neither a name nor parts."""
+    named = [one for one in nodes if one["word"] is not None or one["parts"]]
+    lines = list(_outline_lines(named, unit, 0))
+    if len(named) < len(nodes):
+        lines.append(f"and {len(nodes) - len(named)} without a name, which --json lists")
+    return lines
+
+
+def _outline_lines(nodes: list[dict[str, Any]], unit: Unit, depth: int) -> Iterator[str]:
     """Nodes with their parts indented under them; a line for those of one name that have none, too."""
     groups: dict[Any, list[dict[str, Any]]] = {}
     for node in nodes:
@@ -216,8 +228,8 @@ def _print_outline(nodes: list[dict[str, Any]], unit: Unit, depth: int = 0) -> N
         if any(node["votes"]):
             what.append(f"outlined in {node['votes'][0]} of {sum(node['votes'])} photographs")
         times = f"{len(group)} x " if len(group) > 1 else ""
-        print(f"{'  ' * depth}{times}{word}: {'the largest ' if times else ''}{', '.join(what)}")
-        _print_outline(node["parts"], unit, depth + 1)
+        yield f"{'  ' * depth}{times}{word}: {'the largest ' if times else ''}{', '.join(what)}"
+        yield from _outline_lines(node["parts"], unit, depth + 1)
 
 
 def _print_words(levels: list[dict[str, Any]]) -> None:

@@ -120,18 +120,25 @@ def _fits(alike: Array, bar: Array) -> Array:
     return np.asarray((HEAT * (alike - bar) / (1 - bar)).max(1, initial=-HEAT))
 
 
-def by_showing(
-    word: TaughtWord, space: WordSpace, regions: Regions, means: Array, level: LevelChoice
-) -> QueryResult:
-    """The answer to a taught word: the whole regions that are like one of its examples. At the level that was
-    shown unless another `level` is asked for. means: (N, 3) of the Gaussians."""
-    chosen = word.level if level == "auto" else LEVELS.index(level)
+def likeness(word: TaughtWord, space: WordSpace) -> tuple[list[Array], list[Array]]:
+    """Of each level the (R,) fits of the regions, and the (R,) `UNIT`s by which they are more like an example
+    than what is found has to be."""
     examples, bars = _examples(word, space)
     fits, above = [], []
     for row, bar in zip(space.regions, bars, strict=True):
         alike = row @ examples.T  # (R, T)
         fits.append(_fits(alike, bar))
         above.append(((alike / bar - 1) / UNIT).max(1, initial=-1 / UNIT))
+    return fits, above
+
+
+def by_showing(
+    word: TaughtWord, space: WordSpace, regions: Regions, means: Array, level: LevelChoice
+) -> QueryResult:
+    """The answer to a taught word: the whole regions that are like one of its examples. At the level that was
+    shown unless another `level` is asked for. means: (N, 3) of the Gaussians."""
+    chosen = word.level if level == "auto" else LEVELS.index(level)
+    fits, above = likeness(word, space)
     every = [sigmoid(row) for row in fits]
     solid = [sizes >= min(SMALLEST, sizes.max(initial=0)) for sizes in regions.sizes]
     peaks = triple(row[some].max(initial=0) for row, some in zip(every, solid, strict=True))

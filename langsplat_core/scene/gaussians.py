@@ -128,7 +128,7 @@ class _Part(NamedTuple):
 def merged(gaussians: Gaussians, progress: Progress = silent) -> Merged:
     """A quarter to all of the drawable rows, in another order; rows that are not valid are left out."""
     rows = np.flatnonzero(gaussians.valid())
-    rows = rows[np.argsort(_along_curve(gaussians.means[rows]))]
+    rows = rows[np.argsort(along_curve(gaussians.means[rows]))]
     grouped = rows[: len(rows) // GROUP * GROUP].reshape(-1, GROUP)
     parts = [_kept(gaussians, rows[grouped.size :])]
     for start in range(0, len(grouped), BLOCK):
@@ -146,7 +146,7 @@ def merged(gaussians: Gaussians, progress: Progress = silent) -> Merged:
     return Merged(Gaussians(*joined), matrix)
 
 
-def _along_curve(points: Array) -> Array:
+def along_curve(points: Array) -> Array:
     """(N, 3) -> (N,) place on a Morton curve: near numbers are mostly near points."""
     if len(points) == 0:
         return np.zeros(0, np.uint64)

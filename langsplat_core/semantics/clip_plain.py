@@ -89,21 +89,21 @@ class PlainClipText:
     def __init__(self, id: str, config: TextConfig, tensors: Tensors, tokenizer: "PairTokenizer") -> None:
         self.id = id
         self.temperature = TEMPERATURE
-        self._config, self._tensors, self._tokenizer = config, tensors, tokenizer
+        self.config, self.tensors, self.tokenizer = config, tensors, tokenizer
 
     @property
     def dim(self) -> int:
-        return self._config.projection_dim
+        return self.config.projection_dim
 
     def encode(self, texts: list[str]) -> Array:
-        begin, end = self._tokenizer.begin, self._tokenizer.end
-        rows = [[begin, *self._tokenizer.encode(text), end] for text in texts]
+        begin, end = self.tokenizer.begin, self.tokenizer.end
+        rows = [[begin, *self.tokenizer.encode(text), end] for text in texts]
         for text, row in zip(texts, rows, strict=True):
-            check_whole(text, row[1:-1], self._config.max_position_embeddings - 2, {end})
+            check_whole(text, row[1:-1], self.config.max_position_embeddings - 2, {end})
         longest = max(map(len, rows))
         # What follows the end token is not seen by it.
         ids = np.array([row + [end] * (longest - len(row)) for row in rows])
-        return text_vectors(self._tensors, self._config, ids, np.array([len(row) - 1 for row in rows]))
+        return text_vectors(self.tensors, self.config, ids, np.array([len(row) - 1 for row in rows]))
 
 
 def plain_text_tower(weights: Weights) -> PlainClipText | None:

@@ -189,35 +189,35 @@ class PhraseEncoder:
 
     def __init__(self, weights: Weights, tower: TextTower) -> None:
         self.id = weights.id  # hub id or folder as it was asked for; "demo" for the bundled encoder
-        self._tower = tower
-        self._words = _vocabulary(weights.folder)
+        self.tower = tower
+        self.words = _vocabulary(weights.folder)
         self.reading = _reading(weights, tower.temperature)  # how its cosines are read, as a scene stores it
 
     @property
     def dim(self) -> int:
         """Length D of the vectors."""
-        return self._tower.dim
+        return self.tower.dim
 
     @property
     def temperature(self) -> float:
         """Factor with which a margin of cosines, phrase minus nearest canonical phrase, becomes relevancy."""
-        return self._tower.temperature
+        return self.tower.temperature
 
     def unknown_words(self, text: str) -> tuple[str, ...]:
         """Words of `text` that the encoder was never taught; empty when it was taught open vocabulary."""
-        if self._words is None:
+        if self.words is None:
             return ()
         return tuple(word for word in WORD.findall(text.lower()) if self._taught(word) is None)
 
     def near_words(self, word: str) -> tuple[str, ...]:
         """Words it was taught that are written like an unknown one, the nearest first."""
-        return tuple(get_close_matches(word.lower(), sorted(self._words or ()), n=SUGGESTIONS))
+        return tuple(get_close_matches(word.lower(), sorted(self.words or ()), n=SUGGESTIONS))
 
     def _taught(self, word: str) -> str | None:
         """The word in which the encoder was taught `word`: itself, or of a possessive its owner."""
-        assert self._words is not None
+        assert self.words is not None
         owner = word.partition("'")[0]
-        return next((form for form in (word, owner) if form in self._words), None)
+        return next((form for form in (word, owner) if form in self.words), None)
 
     def encode_texts(self, texts: Sequence[str]) -> Array:
         """(M, D) float32 unit vectors of M phrases, raw: no prompt template, as in LangSplat.
@@ -231,7 +231,7 @@ class PhraseEncoder:
             self._check(text)
         said = [self._said(text) for text in texts]
         starts = range(0, len(texts), TEXT_BATCH)
-        parts = [unit(self._tower.encode(said[i : i + TEXT_BATCH])) for i in starts]
+        parts = [unit(self.tower.encode(said[i : i + TEXT_BATCH])) for i in starts]
         return np.concatenate(parts) if parts else np.zeros((0, self.dim), np.float32)
 
     def _check(self, text: str) -> None:
@@ -239,7 +239,7 @@ class PhraseEncoder:
             raise InputError(f"empty phrase {text!r}: type a word or a few, such as 'red mug'")
         unknown = self.unknown_words(text)
         if unknown:
-            words = sorted(self._words or ())
+            words = sorted(self.words or ())
             examples = ", ".join(words[:: len(words) // EXAMPLES + 1])
             raise UnknownWordError(
                 {word: self.near_words(word) for word in unknown},
@@ -248,7 +248,7 @@ class PhraseEncoder:
             )
 
     def _said(self, text: str) -> str:
-        if self._words is None:
+        if self.words is None:
             return text
         return " ".join(self._taught(word) or "" for word in WORD.findall(text.lower()))
 

@@ -36,8 +36,8 @@ from langsplat_core.raster.opengl.scene_textures import (
     drawing,
     is_software,
     set_uniforms,
-    shader,
 )
+from langsplat_core.raster.opengl.shaders import shader
 from langsplat_core.raster.render import splat_colours
 from langsplat_core.scene import Gaussians, Scene
 from langsplat_viewer.rendering.depth import VISIBLE_ALPHA, camera_depths, depth_range
@@ -395,8 +395,8 @@ class GlRenderer:
         else:
             self._source = ArraySource(ctx, load_rasterizer(backend))
         self._program = ctx.program(
-            vertex_shader=shader("fullscreen.vert", 330),
-            fragment_shader=shader("compose.frag", 330, "langsplat_core.display", **shader_defines()),
+            vertex_shader=shader("fullscreen.vert", "330 core"),
+            fragment_shader=shader("compose.frag", "330 core", "langsplat_core.display", **shader_defines()),
         )
         self._vao = ctx.vertex_array(self._program, [])
         tables = np.stack(list(COLOUR_MAPS.values()))

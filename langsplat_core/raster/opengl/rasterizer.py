@@ -26,8 +26,8 @@ from langsplat_core.raster.opengl.scene_textures import (
     draw_order,
     drawing,
     set_uniforms,
-    shader,
 )
+from langsplat_core.raster.opengl.shaders import shader, splat_shaders
 from langsplat_core.raster.protocol import View, farthest, mean_depth, tangent_limits
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
 
@@ -195,9 +195,7 @@ class GlRasterizer:
     def _splat_program(self, values: int, depth: bool) -> moderngl.Program:
         key = (values, depth)
         if key not in self._splats:
-            vertex, fragment = (
-                shader(name, VALUES=values, DEPTH=int(depth)) for name in ("splat.vert", "splat.frag")
-            )
+            vertex, fragment = splat_shaders(values, depth)
             self._splats[key] = self.ctx.program(vertex_shader=vertex, fragment_shader=fragment)
         return self._splats[key]
 

@@ -5,7 +5,6 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.resources import files
 from itertools import product
 from typing import Any, Literal, Protocol
 
@@ -16,6 +15,7 @@ from langsplat_core.arrays import Array, sigmoid, unit
 from langsplat_core.config import RasterSettings
 from langsplat_core.errors import BackendError
 from langsplat_core.progress import lap
+from langsplat_core.raster.opengl.shaders import shader
 from langsplat_core.raster.protocol import farthest
 from langsplat_core.scene import Camera, Gaussians
 
@@ -48,15 +48,7 @@ def create_egl_context() -> moderngl.Context:
     raise BackendError(f"no offscreen OpenGL 4.1 ({problem}); {advice}, or use --backend cpu")
 
 
-# Small tools for drawing with moderngl: sources, uniforms, a pass that leaves the state as it was.
-
-SHADERS = "langsplat_core.raster.opengl.shaders"
-
-
-def shader(name: str, version: int = 410, package: str = SHADERS, **defines: int | float | str) -> str:
-    """Source of `name`.glsl in `package` with its GLSL version and `defines` in front."""
-    head = [f"#version {version} core", *(f"#define {key} {value}" for key, value in defines.items())]
-    return "\n".join([*head, files(package).joinpath(f"{name}.glsl").read_text(encoding="utf-8")])
+# Small tools for drawing with moderngl: uniforms, a pass that leaves the state as it was.
 
 
 def set_uniforms(program: moderngl.Program | moderngl.ComputeShader, values: dict[str, object]) -> None:
@@ -168,7 +160,9 @@ class DepthSorter:
     def __init__(self, ctx: moderngl.Context) -> None:
         self._ctx = ctx
         self._programs: Mapping[str, moderngl.ComputeShader] = {
-            name: ctx.compute_shader(shader("depth_sort.comp", 430, STEP=number, GROUP=GROUP, ROUNDS=ROUNDS))
+            name: ctx.compute_shader(
+                shader("depth_sort.comp", "430 core", STEP=number, GROUP=GROUP, ROUNDS=ROUNDS)
+            )
             for number, name in enumerate(STEPS)
         }
 

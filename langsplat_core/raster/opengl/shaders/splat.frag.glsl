@@ -25,8 +25,8 @@ void main() {
     if (alpha < alpha_min)
         discard;
 #if VALUES > 0
-    for (int i = 0; i < VALUES; ++i)
-        image[i] = vec4(value[i] * alpha, alpha);
+#define BLEND(i) image[i] = vec4(value[i] * alpha, alpha);
+    EACH_VALUE(BLEND)
 #endif
 #if DEPTH
     depth_image = vec4(depth * alpha, alpha, 0.0, alpha);

@@ -1,0 +1,344 @@
+"""A scene as one HTML file that a browser draws and searches without a network: `write_page`.
+
+The file holds a compressed safetensors file (Gaussians of 8 and 16 bits, codes, codebook, words, regions)
+and the modules of `langsplat_core/web`. A phrase is answered there by the rule of `query.answers.by_regions`:
+what does not depend on the phrase is computed here, so that little more than a product with the codebook is
+left. Gaussians that can never be drawn are left out; the others lie along a curve, so that neighbours
+compress well.
+"""
+
+import base64
+import hashlib
+import html
+import json
+import re
+import zlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from langsplat_core.arrays import Array, sigmoid, unit
+from langsplat_core.config import PictureConfig
+from langsplat_core.display.displays import COLOUR_MAPS, NUMBERS, QUERY_COLOURS, STRENGTH, shader_defines
+from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.io.files import atomic_path
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query import answers, grammar, taught
+from langsplat_core.query.answers import place_of
+from langsplat_core.query.describe import suggest
+from langsplat_core.query.engine import QueryEngine, TextEncoder, no_field
+from langsplat_core.query.instances import BOXED, oriented_box
+from langsplat_core.raster.opengl.shaders import WEB, shader, splat_shaders
+from langsplat_core.scene import LEVELS, Camera, Gaussians, Scene
+from langsplat_core.scene.gaussians import along_curve
+from langsplat_core.scene.surface import SMALLEST
+from langsplat_core.semantics.clip_plain import PlainClipText
+from langsplat_core.semantics.encoder import PhraseEncoder
+from langsplat_core.semantics.relevancy import FLOOR, MIN_HEAT_SPAN, NARROWEST
+from langsplat_core.semantics.vocabulary import BUNDLED, bundled_vocabulary
+
+MODULES = ("data", "language", "camera", "draw", "page")  # in the order in which they import each other
+WIDE = 10  # columns of 16 bits: means, scales, quaternions
+CHUNK = 256  # Gaussians that share the range of a quantised column
+FLATTEST, OPAQUE = -46.0, 20.0  # bounds of the logarithm of a scale, whatever a file holds; of a logit
+MOST_VIEWS = 200  # bookmarks; of more cameras every so-manyth
+IMPORT = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL)
+EXPORT = re.compile(r"^export (?=async |class|const|function|let)", re.MULTILINE)
+NO_TABLES = "a page answers by everyday phrases, and neither the scene nor an encoder here has them"
+
+
+@dataclass(frozen=True)
+class PageReport:
+    """What a page holds."""
+
+    gaussians: int
+    phrases: int  # that can be completed
+    free_text: bool  # the encoder is in the page, so that any of its words may be combined
+    bytes: int
+    why_not: str = ""  # reason why nothing can be searched, "" where it can
+
+
+def write_page(
+    path: Path, scene: Scene, engine: QueryEngine | None, title: str, progress: Progress = silent
+) -> PageReport:
+    """Write `scene` as an HTML file. engine: of the same scene, None where it is only to be
+    looked at. title: plain text.
+
+    Raises InputError for a scene of which nothing can be drawn.
+    """
+    rows = drawable(scene.gaussians)
+    if len(rows) == 0:
+        raise InputError(f"{scene.path}: no Gaussian of this scene can be drawn; there is nothing to export")
+    centre, radius = scene.bounds()
+    progress("packing the Gaussians", 0.1)
+    tensors = pack_gaussians(scene.gaussians.take(rows), centre)
+    meta: dict[str, Any] = {
+        "title": title,
+        "origin": centre.tolist(),
+        "radius": radius,
+        "up": scene.up().tolist(),
+        "metres_per_unit": scene.metres_per_unit,
+        "raster": asdict(scene.raster_settings()),
+        "sh_count": scene.gaussians.sh.shape[1],
+        "views": views(scene),
+        "picture": {**asdict(PictureConfig()), "displays": dict(NUMBERS), "strength": dict(STRENGTH)},
+        "query_colours": QUERY_COLOURS.tolist(),
+        "shaders": page_shaders(),
+    }
+    tensors["colour_map"] = COLOUR_MAPS["turbo"]
+    why_not = no_field(scene) if engine is None else unsearchable(engine)
+    language: dict[str, Any] = {}
+    if engine is not None and not why_not:
+        language, own = language_tables(engine, rows, progress)
+        tensors |= own
+    meta |= {"language": language or None, "why_not": why_not}
+    progress("compressing", 0.8)
+    text = page_text(title, pack(tensors, meta))
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    free = "encoder" in language
+    return PageReport(len(rows), len(language.get("phrases", ())), free, len(text.encode()), why_not)
+
+
+def unsearchable(engine: QueryEngine) -> str:
+    """Why a page of a scene with a language field cannot answer; "" where it can."""
+    if engine.field.codec.blends:
+        return (
+            f"its language field is {engine.field.codec.kind!r}, not a codebook: train it with "
+            "--codec.kind codebook to search it in a page"
+        )
+    return "" if engine.rule == "regions" else NO_TABLES
+
+
+# The Gaussians: every column in 8 or 16 bits between the least and the largest value of its chunk.
+
+
+def drawable(gaussians: Gaussians) -> Array:
+    """(M,) rows that some camera could show, in the order of a Morton curve."""
+    opacities = sigmoid(gaussians.opacity_logits.astype(np.float64))
+    rows = np.flatnonzero(gaussians.valid() & (opacities >= 1 / 255))
+    found: Array = rows[np.argsort(along_curve(gaussians.means[rows]), kind="stable")]
+    return found
+
+
+def pack_gaussians(gaussians: Gaussians, centre: Array) -> dict[str, Array]:
+    """`low` and `high` (C, M) uint8 bytes of the columns, high ones of the first `WIDE` alone, and `ranges`
+    (C, M / CHUNK, 2) float32; columns as listed here, means relative to `centre`."""
+    count = len(gaussians)
+    columns = np.concatenate(
+        [
+            gaussians.means - centre,
+            gaussians.log_scales.clip(FLATTEST, -FLATTEST),
+            unit(gaussians.quats_wxyz.astype(np.float64), 1e-30),
+            gaussians.opacity_logits.clip(-OPAQUE, OPAQUE)[:, None],
+            gaussians.sh.reshape(count, -1),
+        ],
+        axis=1,
+    ).T
+    chunks = -(-count // CHUNK)
+    edge = np.pad(columns, ((0, 0), (0, chunks * CHUNK - count)), mode="edge").reshape(
+        len(columns), -1, CHUNK
+    )
+    ranges = np.stack([edge.min(2), edge.max(2)], -1).astype(np.float32)
+    steps = np.where(np.arange(len(columns)) < WIDE, 65_535, 255)[:, None, None]
+    low = ranges[..., :1].astype(np.float64)
+    span = np.maximum(ranges[..., 1:].astype(np.float64) - low, 1e-30)
+    numbers = np.rint(((edge - low) / span).clip(0, 1) * steps).astype(np.uint16)
+    numbers = numbers.reshape(len(columns), -1)[:, :count]
+    return {
+        "low": (numbers & 255).astype(np.uint8),
+        "high": (numbers[:WIDE] >> 8).astype(np.uint8),
+        "ranges": ranges,
+    }
+
+
+def views(scene: Scene) -> list[dict[str, Any]]:
+    """The scene's cameras as bookmarks, relative to the page's origin; one that frames it without any."""
+    centre, _ = scene.bounds()
+    cameras: Sequence[Camera] = scene.cameras or (scene.framing_camera((1280, 800)),)
+    step = -(-len(cameras) // MOST_VIEWS)
+    return [
+        {
+            "name": camera.name or f"view {number}",
+            **{key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
+            "rotation": camera.rotation.ravel().tolist(),
+            "position": (camera.position - centre).tolist(),
+        }
+        for number, camera in enumerate(cameras)
+        if number % step == 0 and not camera.orthographic
+    ] or views(Scene(scene.gaussians))
+
+
+def page_shaders() -> dict[str, list[str]]:
+    """Vertex and fragment shader of each pass, for WebGL 2."""
+    quad = shader("fullscreen.vert", WEB)
+    return {
+        "project": [quad, shader("project.frag", WEB)],
+        "splat": list(splat_shaders(2, False, WEB)),
+        "compose": [quad, shader("compose.frag", WEB, "langsplat_core.display", **shader_defines())],
+    }
+
+
+# The language field.
+
+
+def language_tables(
+    engine: QueryEngine, rows: Array, progress: Progress = silent
+) -> tuple[dict[str, Any], dict[str, Array]]:
+    """What answers need: numbers and words, and tensors. rows: (M,) Gaussians of the page."""
+    field, regions = engine.field, engine.regions
+    codebook = field.codec.decode(np.arange(field.codec.size)[:, None])
+    scale = engine.scale
+    zero, rate = scale.of(codebook @ scale.texts.T)
+    codes = np.where(field.known, field.latents[..., 0], len(codebook))[:, rows]
+    palette = field.codec.colours(np.arange(len(codebook), dtype=np.uint16)[:, None], np.ones(len(codebook)))
+    tensors: dict[str, Array] = {
+        "codebook": codebook.astype(np.float16),
+        "zero": zero,
+        "rate": rate,
+        "codes": codes.astype(np.uint16),
+        "regions": regions.everywhere[:, rows],
+        "palette": np.rint(255 * palette).astype(np.uint8),
+        **_region_tables(engine),
+    }
+    bars = [] if engine.chance is None else [asdict(bar) for bar in answers.bars(engine.chance)]
+    progress("choosing phrases", 0.3)
+    suggested = suggest(engine)
+    numbers: dict[str, Any] = {
+        "levels": LEVELS,
+        "counts": [len(nodes) for nodes in regions.nodes],
+        "basis": engine.basis.long,
+        "guess": engine.basis.short if engine.basis.guesses else "",
+        "bars": bars,
+        "calibration": None if engine.calibration is None else asdict(engine.calibration),
+        "rules": _rules(),
+        "examples": suggested.examples,
+        "phrases": suggested.phrases,
+    }
+    numbers["taught"] = [{"name": word.name, "level": word.level} for word in engine.taught.values()]
+    fits = [taught.likeness(word, engine.word_space) for word in engine.taught.values()]
+    for place, name in enumerate(("taught_fits", "taught_above")):
+        each = [np.concatenate(pair[place]) for pair in fits]
+        tensors[name] = np.array(each, np.float32).reshape(len(each), sum(numbers["counts"]))
+    progress("encoding words", 0.6)
+    words, own = _words(engine, suggested.phrases)
+    return numbers | words, tensors | own
+
+
+def _rules() -> dict[str, Any]:
+    """The constants of `query.answers`, `query.taught` and `query.grammar`."""
+    words = ("ARTICLES", "STOP_WORDS", "ADJECTIVES", "PARTS")
+    return {
+        **{name.lower(): sorted(getattr(grammar, name)) for name in words},
+        "found": {name: [None if np.isinf(x) else x for x in pair] for name, pair in answers.FOUND.items()},
+        "advantage": dict(answers.ADVANTAGE),
+        "parts_share": answers.PARTS,
+        "reach": [answers.REACH, answers.NEAREST, answers.FARTHEST],
+        "nothing": answers.NOTHING,
+        "smallest": SMALLEST,
+        "narrowest": NARROWEST,
+        "floor": FLOOR,
+        "heat_span": MIN_HEAT_SPAN,
+        "weak": answers.WEAK,
+        "nearly": answers.NEARLY,
+        "least_fit": -taught.HEAT,
+        "least_above": -1 / taught.UNIT,
+    }
+
+
+def _region_tables(engine: QueryEngine) -> dict[str, Array]:
+    """Tensors of all regions, those of subparts first: `share_of`, `share_code` and `share`, a sparse matrix
+    that takes relevancies of codewords to means of regions; sizes, parents, places, boxes, corners."""
+    field, regions = engine.field, engine.regions
+    means = engine.scene.gaussians.means
+    firsts = np.cumsum([0, *map(len, regions.nodes)])
+    shares, places, boxes, corners = [], [], [], []
+    for level, (first, total) in enumerate(zip(firsts, regions.totals, strict=False)):
+        counted = np.flatnonzero(regions.weights > 0)
+        order = counted[np.argsort(regions.everywhere[level, counted], kind="stable")]
+        each = np.split(order, np.cumsum(regions.sizes[level])[:-1]) if len(total) else []
+        found = [place_of(means[own]) for own in each]
+        places += [place for place, _ in found]
+        boxes += [box.ravel() for _, box in found]
+        corners += [oriented_box(means[own[:: -(-len(own) // BOXED)]]).corners.ravel() for own in each]
+        own = counted[field.known[level, counted]]
+        where = regions.everywhere[level, own], field.latents[level, own, 0]
+        shape = len(total), field.codec.size
+        matrix = csr_matrix((regions.weights[own].astype(np.float64), where), shape=shape).tocoo()
+        shares.append((matrix.row + first, matrix.col, matrix.data / total[matrix.row]))
+    of, code, share = (np.concatenate(parts) for parts in zip(*shares, strict=True))
+    above = [parents + first for parents, first in zip(regions.parents, firsts[1:], strict=False)]
+    count = int(firsts[-1])
+    return {
+        "share_of": of.astype(np.uint32),
+        "share_code": code.astype(np.uint16),
+        "share": share.astype(np.float32),
+        "sizes": np.concatenate(regions.sizes).astype(np.uint32),
+        "parents": np.concatenate([*above, np.full(len(regions.nodes[2]), count)]).astype(np.uint32),
+        "places": np.array(places, np.float64).reshape(count, 3),
+        "boxes": np.array(boxes, np.float64).reshape(count, 6),
+        "corners": np.array(corners, np.float32).reshape(count, 24),
+    }
+
+
+def _words(engine: QueryEngine, suggested: Sequence[str]) -> tuple[dict[str, Any], dict[str, Array]]:
+    """The phrases whose vectors are in the page; the encoder too where it is small and its words are few."""
+    book = tuple(engine.field.phrasebook)
+    try:
+        encoder: TextEncoder | None = engine.load_encoder()
+    except EncoderError:
+        encoder = None
+    plain = encoder.tower if isinstance(encoder, PhraseEncoder) else None
+    if isinstance(plain, PlainClipText) and isinstance(encoder, PhraseEncoder) and encoder.words:
+        config = asdict(plain.config)
+        ends = {"begin": plain.tokenizer.begin, "end": plain.tokenizer.end}
+        ids = {word: plain.tokenizer.encode(word) for word in sorted(encoder.words)}
+        tensors = {f"encoder.{name}": tensor.astype(np.float16) for name, tensor in plain.tensors.items()}
+        _, vectors = engine.known_vectors(book)
+        encoding = {"config": config, "words": ids, **ends}
+        return {"keys": book, "encoder": encoding}, tensors | {"vectors": vectors.astype(np.float16)}
+    phrases: Sequence[str] = book
+    if encoder is not None:
+        phrases = (*book, *suggested, *(phrase for name in BUNDLED for phrase in bundled_vocabulary(name)))
+    known, vectors = engine.known_vectors(phrases)
+    return {"keys": known, "phrases": known if encoder else book}, {"vectors": vectors.astype(np.float16)}
+
+
+# The file.
+
+
+def pack(tensors: dict[str, Array], meta: dict[str, Any]) -> bytes:
+    """Tensors and `meta` as a safetensors file, deflated."""
+    from safetensors.numpy import save
+
+    plain = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
+    return zlib.compress(save(plain, {"page": json.dumps(meta, allow_nan=False)}), 9)
+
+
+def page_text(title: str, data: bytes) -> str:
+    """The HTML file. Its policy lets nothing run but its own script, and nothing be fetched."""
+    folder = files("langsplat_core.web")
+    script = "\n".join(folder.joinpath(f"{name}.js").read_text(encoding="utf-8") for name in MODULES)
+    script = EXPORT.sub("", IMPORT.sub("", script))
+    style = folder.joinpath("page.css").read_text(encoding="utf-8")
+    script_hash, style_hash = (
+        base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (script, style)
+    )
+    policy = (
+        f"default-src 'none'; script-src 'sha256-{script_hash}'; style-src 'sha256-{style_hash}'; "
+        "worker-src blob:; img-src data:; base-uri 'none'; form-action 'none'"
+    )
+    filled = {
+        "POLICY": policy,
+        "TITLE": html.escape(title),
+        "STYLE": style,
+        "SCRIPT": script,
+        "DATA": base64.b64encode(data).decode(),
+    }
+    page = folder.joinpath("page.html").read_text(encoding="utf-8")
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: filled[found[1]], page)

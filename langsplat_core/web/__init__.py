@@ -1,0 +1,1 @@
+"""Browser code of an exported scene: plain JavaScript modules, inlined by `pipeline.webpage`."""

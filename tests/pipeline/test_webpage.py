@@ -1,0 +1,446 @@
+"""Exported pages in a real browser: images against the OpenGL backend's, answers against Python's, and what a
+hostile scene can do."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import moderngl
+import numpy as np
+import pytest
+
+from langsplat_core.arrays import Array, psnr, unit
+from langsplat_core.cli.app import parse
+from langsplat_core.cli.export import Export
+from langsplat_core.config import PictureConfig
+from langsplat_core.display.displays import Channels, compose, heat_ranges, latent_colours
+from langsplat_core.errors import EncoderError, InputError
+from langsplat_core.io.scenes import load_scene, save_scene
+from langsplat_core.pipeline.webpage import write_page
+from langsplat_core.query.engine import QueryEngine
+from langsplat_core.raster.opengl.rasterizer import GlRasterizer
+from langsplat_core.raster.render import splat_colours
+from langsplat_core.scene import CANONICAL_PHRASES, LEVELS, Camera, Gaussians, Scene
+from langsplat_core.semantics.encoders import load_text_encoder
+from tests.support.browser import Tab, open_browser, open_tab
+from tests.support.file_samples import random_field
+from tests.support.fixtures import Measure
+from tests.support.scenes import random_camera, random_gaussians
+
+pytestmark = pytest.mark.long
+
+DEMO = Path(str(files("langsplat_assets"))) / "demo" / "scene.ply"
+THINGS = """teddy bear,laptop,hamburger,candle,rocket,teapot,toy duck,penguin,ball,sofa,table,chair,present,
+fruit basket,aeroplane,snail,car,painting,rug,potted plant,stool,floor,wall,apple,orange,mug,lamp,guitar,
+umbrella,hat,train,robot,cactus,castle,drum,headphones,fish,flag,clock,camera,backpack,shoe,windmill,snowman,globe"""
+PARTS = "keyboard,handle,wheel,screen,leg,spout,lid,wing,propeller,ear,nose,flame,bow,bun,seat,cushion"
+NAMES = [name.strip() for name in f"{THINGS},{PARTS}".split(",")]
+MIXED = [f"{colour} {thing}" for colour in ("red", "blue", "yellow") for thing in NAMES[:10]]
+OWNED = ["duck beak", "teapot lid", "laptop screen", "the Red Mug!", "  blue, gift ", "penguin’s beak"]
+PHRASES = [*NAMES, *MIXED, *OWNED, "rocket fins", "wooden table", "green car"]
+MARKUP = '<img src=x onerror="window.escaped=1"></script><script>window.escaped=2</script>'
+FIELDS = ("level", "scores", "fits", "peak", "probability", "excess", "found", "verdict", "place", "box")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with open_browser() as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def demo() -> Scene:
+    return load_scene(DEMO)
+
+
+@pytest.fixture(scope="module")
+def engine(demo: Scene) -> QueryEngine:
+    return QueryEngine(demo, load_text_encoder)
+
+
+@pytest.fixture(scope="module")
+def page(demo: Scene, engine: QueryEngine, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("page") / "room.html"
+    write_page(path, demo, engine, "Demo")
+    return path
+
+
+@pytest.fixture(scope="module")
+def thin(demo: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of every eighth Gaussian, for what is not about the image: here the processor draws it."""
+    scene = demo.take(np.arange(0, len(demo.gaussians), 8))
+    path = tmp_path_factory.mktemp("page") / "thin.html"
+    write_page(path, scene, QueryEngine(scene, load_text_encoder), "Thin")
+    return path
+
+
+@pytest.fixture(scope="module")
+def tab(browser: Any, page: Path) -> Iterator[Tab]:
+    with open_tab(browser, page) as opened:
+        yield opened
+
+
+def exported(tmp_path: Path, scene: Scene, engine: QueryEngine | None = None) -> Path:
+    write_page(tmp_path / "a.html", scene, engine, "A")
+    return tmp_path / "a.html"
+
+
+def drawn(
+    gl: moderngl.Context, scene: Scene, camera: Camera, values: Array | None = None, **look: Any
+) -> Array:
+    """(H, W, 3) uint8 of the OpenGL backend."""
+    rasterizer = GlRasterizer(gl, "single")
+    view = rasterizer.view(scene.gaussians, camera, scene.raster_settings())
+    image = splat_colours(view, scene.gaussians, camera, values)
+    rasterizer.release()
+    channels = Channels(image.colours, image.alpha, None if values is None else image.values)
+    return compose(channels, PictureConfig(display=look.pop("display", "rgb")), **look)
+
+
+def compare(measured: Measure, what: str, ours: Array, theirs: Array) -> None:
+    """At least 50 dB, and no value further off than 4 of 255 but for one in a thousand."""
+    error = np.abs(ours.astype(int) - theirs)
+    measured(what, "least dB", -psnr(ours / 255, theirs / 255))
+    measured(what, "99.9 % of the differences, of 255", np.quantile(error, 0.999))
+    assert theirs.std() > 5  # there is something to be seen
+    assert psnr(ours / 255, theirs / 255) >= 50
+    assert np.quantile(error, 0.999) <= 4
+
+
+@pytest.mark.parametrize("view", [0, 11, 30])
+def test_the_bundled_scene_is_drawn_as_opengl_draws_it(
+    tab: Tab, demo: Scene, gl: moderngl.Context, measured: Measure, view: int
+) -> None:
+    camera = demo.cameras[view]
+    ours = tab.image(camera, demo.bounds()[0])
+    compare(measured, "demo, colours", ours, drawn(gl, demo, camera))
+
+
+def test_heat_and_latents_are_drawn_as_opengl_draws_them(
+    tab: Tab, demo: Scene, engine: QueryEngine, gl: moderngl.Context, measured: Measure
+) -> None:
+    camera, origin = demo.cameras[3], demo.bounds()[0]
+    assert demo.language is not None
+    answer = engine.run("teddy bear")
+    ours = tab.image(camera, origin, "relevancy", "teddy bear")
+    values, ranges = answer.relevancy[answer.level][:, None], heat_ranges([answer])
+    compare(measured, "demo, heat", ours, drawn(gl, demo, camera, values, display="relevancy", ranges=ranges))
+    ours = tab.image(camera, origin, "latent")
+    compare(
+        measured,
+        "demo, latent",
+        ours,
+        drawn(gl, demo, camera, latent_colours(demo.language)[2], display="latent"),
+    )
+
+
+def hard(kind: str) -> Gaussians:
+    rng = np.random.default_rng(5)
+    if kind.startswith("degree"):
+        gaussians = random_gaussians(600, 3, sh_degree=int(kind[-1]))
+        return replace(gaussians, sh=gaussians.sh * np.float32(0.6))
+    gaussians = random_gaussians(600, 4)
+    if kind == "one":
+        return replace(gaussians.take(np.arange(1)), opacity_logits=np.full(1, 9.0))
+    if kind == "flat and needles":
+        scales = gaussians.log_scales.copy()
+        scales[::2, 0], scales[1::4, 1] = -np.inf, -9
+        return replace(gaussians, log_scales=scales)
+    if kind == "right angles":
+        quats = np.eye(4)[rng.integers(4, size=600)] + np.eye(4)[rng.integers(4, size=600)]
+        return replace(gaussians, quats_wxyz=quats * rng.choice([-3, 1], (600, 1)))
+    if kind == "far away":
+        return replace(gaussians, means=gaussians.means + np.float32([4096, -2048, 512]))
+    broken = gaussians.means.copy()  # "broken rows"
+    broken[::5] = np.nan
+    logits = np.where(np.arange(600) % 3, np.inf, gaussians.opacity_logits)
+    return replace(gaussians, means=broken, opacity_logits=np.where(np.arange(600) % 7, logits, -np.inf))
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *(f"degree {degree}" for degree in range(4)),
+        *("one", "flat and needles", "right angles", "far away", "broken rows"),
+    ],
+)
+def test_hard_scenes_are_drawn_as_opengl_draws_them(
+    browser: Any, gl: moderngl.Context, measured: Measure, tmp_path: Path, kind: str
+) -> None:
+    scene = Scene(hard(kind), antialiased=kind == "degree 1")
+    camera = (
+        Scene(random_gaussians(600, 4)).framing_camera((320, 240))
+        if kind == "one"
+        else scene.framing_camera((320, 240))
+    )
+    with open_tab(browser, exported(tmp_path, scene)) as tab:
+        ours = tab.image(camera, scene.bounds()[0])
+        assert tab.run("async () => (await langsplat).page.language") is None
+    compare(measured, "hard scenes", ours, drawn(gl, scene, camera))
+
+
+def same(found: dict[str, Any], expected: Any, members: int) -> None:
+    for name in FIELDS:
+        value = getattr(expected, name)
+        if name in ("level", "found", "verdict"):
+            assert found[name] == value, name
+        elif value is None:
+            assert found[name] is None, name
+        else:
+            np.testing.assert_allclose(found[name], np.ravel(value), atol=1e-3, rtol=0, err_msg=name)
+    np.testing.assert_allclose(found["heat"], expected.heat_range, atol=1e-3)
+    assert abs(found["members"] - members) <= 1e-3 * members
+
+
+def test_a_hundred_phrases_are_answered_as_python_answers_them(
+    tab: Tab, engine: QueryEngine, measured: Measure
+) -> None:
+    assert len(set(PHRASES)) == 100
+    verdicts = set()
+    visible = engine.scene.gaussians.opacity_logits >= -np.log(254)
+    for number, phrase in enumerate(PHRASES):
+        level = ("auto", "auto", *LEVELS)[number % 5]
+        expected, found = engine.run(phrase, level), tab.ask(phrase, level)
+        same(found, expected, int(expected.members[visible].sum()))
+        assert abs(found["mean"] - expected.relevancy[expected.level][visible].mean()) < 1e-3
+        measured(
+            "answers", "difference of scores", np.abs(np.subtract(found["scores"], expected.scores)).max()
+        )
+        verdicts.add(expected.verdict)
+    assert verdicts == {"found", "weak match", "not here"}
+
+
+def test_a_phrase_is_shown_at_once(tab: Tab, measured: Measure) -> None:
+    """Times are measured and not judged."""
+    for phrase in ("teddy bear", "blue gift", "keyboard"):
+        spent = tab.run(
+            """async (phrase) => {
+              const { page } = await langsplat, begun = performance.now();
+              page.search(phrase);
+              return performance.now() - begun;
+            }""",
+            phrase,
+        )
+        measured("page", "ms from a phrase to its heat in the textures", spent)
+
+
+def no_encoder(name: str) -> Any:
+    raise EncoderError("none here")
+
+
+def without_encoder(demo: Scene, **field: Any) -> tuple[Scene, QueryEngine]:
+    """The bundled scene with an encoder that is not here, and no calibration."""
+    assert demo.language is not None
+    own = replace(demo.language, reading=demo.language.reading.elsewhere, encoder_id="elsewhere", **field)
+    scene = replace(demo, language=own)
+    return scene, QueryEngine(scene, no_encoder)
+
+
+def test_without_an_encoder_the_phrasebook_and_taught_words_answer(
+    browser: Any, demo: Scene, engine: QueryEngine, tmp_path: Path
+) -> None:
+    book = dict(zip(PHRASES[:60], engine.text_vectors(PHRASES[:60]), strict=True))
+    pointed = engine.run("teddy bear").members
+    word = QueryEngine(demo).teach("bruno", pointed)
+    scene, other = without_encoder(demo, phrasebook=book, taught=(word,))
+    assert other.calibration is None
+    visible = scene.gaussians.opacity_logits >= -np.log(254)
+    with open_tab(browser, exported(tmp_path, scene, other)) as tab:
+        for number, phrase in enumerate((*PHRASES[:60], "bruno", "Bruno")):
+            level = ("auto", *LEVELS)[number % 4] if number < 61 else "auto"
+            expected = other.run(phrase, level)
+            same(tab.ask(phrase, level), expected, int(expected.members[visible].sum()))
+        tab.page.fill("#phrase", "zebra")
+        tab.page.press("#phrase", "Enter")
+        assert "zebra" in tab.page.inner_text("#verdict")
+        assert tab.page.locator("#answer").is_hidden()
+
+
+class Fluent:
+    """Knows every word, each by numbers of its own; the canonical phrases as the bundled scene has them."""
+
+    def __init__(self, canonical: Array) -> None:
+        self.known = dict(zip(CANONICAL_PHRASES, canonical, strict=True))
+
+    def encode_texts(self, texts: list[str]) -> Array:
+        seeds = [list(text.encode()) for text in texts]
+        drawn = [np.random.default_rng(seed).normal(size=512) for seed in seeds]
+        return np.float32([self.known.get(text, unit(own)) for text, own in zip(texts, drawn, strict=True)])
+
+    def unknown_words(self, text: str) -> tuple[str, ...]:
+        return ()
+
+    near_words = unknown_words
+
+
+def test_with_an_encoder_that_stays_here_the_page_knows_thousands_of_phrases(
+    browser: Any, demo: Scene, tmp_path: Path
+) -> None:
+    scene = demo.take(np.arange(0, len(demo.gaussians), 8))
+    assert scene.language is not None
+    encoder = Fluent(scene.language.canonical)
+    engine = QueryEngine(scene, lambda name: encoder)
+    report = write_page(tmp_path / "a.html", scene, engine, "A")
+    assert (report.free_text, report.why_not) == (False, "")
+    assert report.phrases > 2000
+    visible = scene.gaussians.opacity_logits >= -np.log(254)
+    with open_tab(browser, tmp_path / "a.html") as tab:
+        phrases = tab.run("async () => [...(await langsplat).page.language.keys.keys()]")
+        assert len(phrases) == report.phrases
+        for phrase in phrases[:: len(phrases) // 20]:
+            expected = engine.run(phrase)
+            same(tab.ask(phrase), expected, int(expected.members[visible].sum()))
+
+
+def test_names_with_markup_are_text_and_nothing_else(
+    browser: Any, demo: Scene, engine: QueryEngine, tmp_path: Path
+) -> None:
+    name = MARKUP.replace(",", "")[:80]
+    word = replace(QueryEngine(demo).teach("bruno", engine.run("teddy bear").members), name=name)
+    vector = engine.text_vector("laptop")
+    scene, other = without_encoder(demo, phrasebook={MARKUP: vector, "laptop": vector}, taught=(word,))
+    scene = replace(scene, cameras=tuple(replace(camera, name=MARKUP) for camera in demo.cameras[:3]))
+    path = tmp_path / "a.html"
+    write_page(path, scene, other, MARKUP + "{{DATA}}{{SCRIPT}}")
+    with open_tab(browser, path) as tab:
+        assert tab.page.title() == MARKUP + "{{DATA}}{{SCRIPT}}"
+        assert MARKUP in tab.page.inner_text("h1")
+        for phrase in (MARKUP, name):
+            tab.page.fill("#phrase", phrase[:6])
+            assert tab.page.locator("#list li").count() > 0
+            tab.page.fill("#phrase", phrase)
+            tab.page.press("#phrase", "Enter")
+        assert tab.page.locator("img").count() == 0
+        assert tab.page.locator("script").count() == 1  # the data's is gone once it is read
+        # Should text ever become markup, the page's policy still runs none of it and fetches nothing.
+        tab.run("markup => document.body.insertAdjacentHTML('beforeend', markup)", MARKUP)
+        said = tab.run("() => fetch('https://example.org/').then(() => 'there', () => 'refused')")
+        assert said == "refused"
+        tab.page.wait_for_timeout(100)
+        assert tab.run("() => window.escaped") is None
+        assert {url.split(":")[0] for url in tab.requests} <= {"file", "blob"}
+        assert tab.faults == []
+
+
+def test_the_page_is_small_alone_and_asks_for_nothing(browser: Any, page: Path, tmp_path: Path) -> None:
+    assert page.stat().st_size < 8e6
+    assert re.findall(r"https?://[^\s\"'`]+", page.read_text(encoding="utf-8").split('id="data">')[0]) == []
+    alone = tmp_path / "alone.html"
+    alone.write_bytes(page.read_bytes())
+    with open_tab(browser, alone) as tab:
+        tab.page.fill("#phrase", "laptop")
+        tab.page.press("#phrase", "Enter")
+        assert tab.page.inner_text("#verdict").startswith("Found")
+        assert [url for url in tab.requests if not url.startswith("blob:")] == [alone.as_uri()]
+        assert tab.faults == []
+
+
+STATE = """async () => {
+  const { page } = await langsplat, { view } = page.controls;
+  return { display: page.display, current: page.current, rotation: view.rotation, position: view.position };
+}"""
+
+
+def test_keys_alone_find_a_thing_and_go_around_it(browser: Any, thin: Path) -> None:
+    with open_tab(browser, thin, reduced_motion="reduce", viewport={"width": 800, "height": 600}) as tab:
+        keys = tab.page.keyboard
+        reached = []
+        for _ in range(20):
+            keys.press("Tab")
+            reached.append(tab.run("() => document.activeElement.id || document.activeElement.name"))
+        wanted = ["scene", "phrase", "levels", "displays", "boxes", "before", "views", "after"]
+        assert [name for name in reached if name in wanted][: len(wanted)] == wanted
+        keys.press("/")
+        keys.type("teddy b")
+        box = tab.page.locator("#phrase")
+        assert box.get_attribute("aria-expanded") == "true"
+        keys.press("ArrowDown")
+        marked = tab.page.locator(f"#{box.get_attribute('aria-activedescendant')}")
+        assert (marked.get_attribute("aria-selected"), marked.inner_text()) == ("true", "teddy bear")
+        keys.press("Enter")
+        assert tab.page.inner_text("#verdict").startswith("Found")
+        assert tab.run(STATE)["display"] == "relevancy"
+        tab.page.focus("#scene")
+        before = tab.run(STATE)
+        keys.press("ArrowLeft")
+        assert tab.run(STATE)["rotation"] != before["rotation"]
+        keys.press("Shift+ArrowLeft")
+        keys.press("+")
+        turned = tab.run(STATE)
+        np.testing.assert_allclose(np.linalg.det(np.reshape(turned["rotation"], (3, 3))), 1, atol=1e-9)
+        for key, display in (("l", "latent"), ("s", "segmentation"), ("c", "rgb")):
+            keys.press(key)
+            assert tab.run(STATE)["display"] == display
+        keys.press("3")
+        assert tab.page.locator("#levels [value=whole]").is_checked()
+        keys.press("]")  # at once, since less motion is wanted
+        assert tab.run(STATE)["current"] == 1
+        assert tab.run(STATE)["position"] == tab.run(
+            "async () => (await langsplat).page.meta.views[1].position"
+        )
+        assert tab.faults == []
+
+
+def test_mouse_and_fingers_move_the_camera(browser: Any, thin: Path) -> None:
+    with open_tab(browser, thin, has_touch=True, viewport={"width": 390, "height": 800}) as tab:
+        tab.page.wait_for_timeout(50)
+        states = [tab.run(STATE)]
+        mouse = tab.page.mouse
+        for button in ("left", "right"):
+            mouse.move(150, 150)
+            mouse.down(button=button)
+            mouse.move(190, 160, steps=3)
+            mouse.up(button=button)
+            states.append(tab.run(STATE))
+        mouse.wheel(0, -200)
+        tab.page.wait_for_timeout(100)
+        states.append(tab.run(STATE))
+        tab.run(
+            """() => {
+              const scene = document.getElementById("scene");
+              const send = (type, pointerId, clientX) => scene.dispatchEvent(
+                new PointerEvent(type, { pointerId, clientX, clientY: 200, pointerType: "touch" }));
+              scene.setPointerCapture = () => {};
+              send("pointerdown", 11, 100); send("pointerdown", 12, 200); send("pointermove", 12, 300);
+              send("pointerup", 11, 100); send("pointerup", 12, 300);
+            }"""
+        )
+        states.append(tab.run(STATE))
+        orbited, panned, zoomed, pinched = states[1:]
+        assert orbited["rotation"] != states[0]["rotation"]
+        assert panned["rotation"] == orbited["rotation"] == zoomed["rotation"] == pinched["rotation"]
+        assert len({tuple(state["position"]) for state in states}) == 5
+        assert tab.run("() => document.documentElement.scrollWidth") <= 390
+        assert tab.faults == []
+
+
+def test_scenes_that_cannot_be_searched_can_be_looked_at(browser: Any, tmp_path: Path) -> None:
+    cameras = tuple(random_camera(seed) for seed in range(2))
+    scene = Scene(random_gaussians(40), random_field(40), cameras)
+    report = write_page(tmp_path / "a.html", scene, QueryEngine(scene, no_encoder), "A")
+    assert "autoencoder" in report.why_not
+    with open_tab(browser, tmp_path / "a.html") as tab:
+        assert tab.page.locator("#search").is_hidden()
+        assert "autoencoder" in (tab.page.text_content("#about") or "")
+        assert tab.faults == []
+
+
+def test_what_cannot_be_exported_is_said_in_one_line(tmp_path: Path) -> None:
+    save_scene(tmp_path / "s.ply", Scene(random_gaussians(4)))
+    with pytest.raises(InputError, match=r"written as \.html"):
+        Export(tmp_path / "s.ply", tmp_path / "room.png").run()
+    hidden = replace(random_gaussians(4), opacity_logits=np.full(4, -np.inf))
+    save_scene(tmp_path / "h.ply", Scene(hidden))
+    with pytest.raises(InputError, match="nothing to export"):
+        Export(tmp_path / "h.ply", tmp_path / "room.html").run()
+    assert not list(tmp_path.glob("*.html"))
+
+
+def test_the_command_writes_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_scene(tmp_path / "s.ply", Scene(random_gaussians(40)))
+    parse(["export", str(tmp_path / "s.ply"), str(tmp_path / "room.html"), "--title", "Über <b>"]).run()
+    assert "40 Gaussians" in capsys.readouterr().out
+    assert "<title>Über &lt;b&gt;</title>" in (tmp_path / "room.html").read_text(encoding="utf-8")
