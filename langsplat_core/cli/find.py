@@ -21,13 +21,13 @@ from langsplat_core.config import CountOrZero, Positive
 from langsplat_core.errors import EncoderError, InputError
 from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import read_json_file
-from langsplat_core.progress import TerminalProgress
+from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.changes import Change, changes, check_similarity
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.query.library import PICTURE, Answered, Hit, Library, find, update_library
 from langsplat_core.raster import load_lifting_rasterizer
-from langsplat_core.scene import LEVELS
+from langsplat_core.scene import LEVELS, Scene
 from langsplat_core.scene.language import split_phrases
 from langsplat_core.semantics.encoders import load_text_encoder
 
@@ -215,6 +215,8 @@ class Changes:
     transform: Path | None = None
     """JSON of 4 x 4 numbers, row by row, from the second scene's frame into the first one's; without it they
     are taken to be in one frame."""
+    register: bool = False
+    """Find the transform from the surfaces of both."""
     encoder: str = ""
     """Text encoder folder or hub id, in place of the one the scenes name."""
     scale: Positive | None = None
@@ -223,6 +225,8 @@ class Changes:
     """Print JSON, lengths in world units."""
 
     def run(self) -> None:
+        if self.register and self.transform is not None:
+            raise InputError("--register finds what --transform gives; leave one of them out")
         placed = None if self.transform is None else _read_transform(self.transform)
         scenes = searchable(self.before), searchable(self.after)
         unit = unit_of(scenes[0], self.scale)
@@ -233,11 +237,26 @@ class Changes:
                 describers = Describer(first, progress=progress), Describer(second, progress=progress)
             except EncoderError as error:
                 print(f"langsplat: without names: {error}", file=sys.stderr)
+            if self.register:
+                placed = _registered(scenes[1], scenes[0], progress)
             found = changes(first, second, load_lifting_rasterizer("cpu"), placed, describers, progress)
         if self.json:
             print_json({"metres_per_unit": unit.metres, "changes": [_change_fields(c) for c in found]})
             return
         print("\n".join(_in_words(change, unit) for change in found) or "nothing changed")
+
+
+def _registered(moving: Scene, fixed: Scene, progress: Progress) -> Array:
+    from langsplat_core.geometry.registration import register
+
+    units = moving.metres_per_unit, fixed.metres_per_unit
+    found = register(moving, fixed, scaled=None in units, progress=progress)
+    if not found.trusted:
+        raise InputError(
+            f"the two scenes do not lie on each other ({100 * found.agreement:.0f} % of the depths agree): "
+            "are they of one place? give --transform"
+        )
+    return found.transform
 
 
 def _read_transform(path: Path) -> Array:

@@ -104,3 +104,10 @@ def test_a_transform_that_is_none_is_refused(folder, capsys, text):
     (folder / "placed.json").write_text(text)
     assert run("changes", "scans/whole.ply", "scans/whole.ply", "--transform", "placed.json") == 2
     assert "placed.json" in capsys.readouterr().err
+
+
+def test_a_transform_is_given_or_found_not_both(folder, capsys):
+    (folder / "placed.json").write_text(json.dumps(np.eye(4).tolist()))
+    words = "scans/whole.ply", "scans/whole.ply", "--transform", "placed.json", "--register"
+    assert run("changes", *words) == 2
+    assert "leave one of them out" in capsys.readouterr().err
