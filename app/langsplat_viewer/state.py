@@ -15,8 +15,9 @@ from langsplat_core.config import LevelChoice, PictureConfig, TrainPreset
 from langsplat_core.display.displays import MAX_QUERIES
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.describe import Pointed, Suggestions
+from langsplat_core.query.finding import Hit
 from langsplat_core.query.instances import Instance
-from langsplat_core.query.library import Hit, Library
+from langsplat_core.query.library import Library
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe

@@ -25,7 +25,8 @@ from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.changes import Change, changes, check_similarity
 from langsplat_core.query.describe import Describer
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.library import PICTURE, Answered, Hit, Library, find, update_library
+from langsplat_core.query.finding import PICTURE, Answered, Hit, find
+from langsplat_core.query.library import Library, update_library
 from langsplat_core.raster import load_lifting_rasterizer
 from langsplat_core.scene import LEVELS, Scene
 from langsplat_core.scene.language import split_phrases

@@ -16,6 +16,7 @@ from langsplat_core.config import CountOrZero
 from langsplat_core.io.scenes import save_scene
 from langsplat_core.progress import TerminalProgress
 from langsplat_core.query.engine import QueryEngine
+from langsplat_core.query.finding import judged, rank
 from langsplat_core.query.grammar import named
 from langsplat_core.query.library import (
     COLUMNS,
@@ -25,8 +26,6 @@ from langsplat_core.query.library import (
     Listed,
     digest,
     fits_in,
-    judged,
-    rank,
     read_library,
     write_library,
 )

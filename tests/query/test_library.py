@@ -12,7 +12,8 @@ from langsplat_core.errors import EncoderError, FormatError, InputError
 from langsplat_core.io.scenes import load_scene, save_scene
 from langsplat_core.query import library as module
 from langsplat_core.query.engine import QueryEngine
-from langsplat_core.query.library import INDEX, MAGIC, find, fits_in, read_library, scenes_in, update_library
+from langsplat_core.query.finding import find, judged
+from langsplat_core.query.library import INDEX, MAGIC, fits_in, read_library, scenes_in, update_library
 from langsplat_core.scene import Scene
 from tests.support.fakes import NAMES, PER_BLOB, WORDS, FakeEncoder, axis, named_scene
 
@@ -60,7 +61,7 @@ def test_the_index_has_the_fits_of_the_engine(folder, phrase):
             assert np.isneginf(fits).all()
         else:
             np.testing.assert_allclose(fits, answer.fits, atol=0.05)  # spreads; 8 bits of a codeword
-            above, chance, verdict = module.judged(scene, fits, "thing")
+            above, chance, verdict = judged(scene, fits, "thing")
             assert (verdict, chance) == (answer.verdict, answer.probability)
             assert above == pytest.approx(answer.excess, abs=0.2)
 

@@ -17,7 +17,8 @@ from langsplat_core.pipeline.forecast import count_photographs
 from langsplat_core.pipeline.report import stated_warnings
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import no_field
-from langsplat_core.query.library import Answered, Hit, Library, find, update_library
+from langsplat_core.query.finding import Answered, Hit, find
+from langsplat_core.query.library import Library, update_library
 from langsplat_core.scene import Camera, Scene, surface
 from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions.filming import load_path

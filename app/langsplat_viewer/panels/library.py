@@ -3,7 +3,8 @@
 import moderngl
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_core.query.library import THUMBNAIL, Hit
+from langsplat_core.query.finding import Hit
+from langsplat_core.query.library import THUMBNAIL
 from langsplat_viewer.actions import opening
 from langsplat_viewer.panels.style import elided, good, muted, small_wrapped, tip, width_of
 from langsplat_viewer.state import LibraryView
