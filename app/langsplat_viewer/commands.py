@@ -114,6 +114,7 @@ MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
 COMMANDS: tuple[Command, ...] = (
     Command("open a scene", opening.ask_for_file, ("Ctrl+O",), "File"),
+    Command("search all scenes of a folder", opening.ask_for_library, menu="File"),
     Command("reload the scene", opening.reload, ("F5",), "File"),
     Command(
         "next scene of the list", lambda viewer: opening.step_scene(viewer, 1), ("Ctrl+PageDown",), "File"

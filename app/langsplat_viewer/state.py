@@ -15,7 +15,9 @@ from langsplat_core.config import LevelChoice, PictureConfig, TrainPreset
 from langsplat_core.display.displays import MAX_QUERIES
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.describe import Pointed, Suggestions
+from langsplat_core.query.finding import Hit
 from langsplat_core.query.instances import Instance
+from langsplat_core.query.library import Library
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
@@ -205,6 +207,17 @@ class EvidenceSheet:
     image: Array  # (H, W, 3) uint8, row 0 on top
 
 
+@dataclass(frozen=True, eq=False)
+class LibraryView:
+    """The scenes of a folder, as the panel "Library" lists them."""
+
+    library: Library
+    phrase: str = ""  # that they are ranked by; "": by name
+    hits: tuple[Hit, ...] = ()  # the first `MOST_HITS` of the ranked
+    said: str = ""  # how many scenes have it, in words
+    thumbnails: Array | None = None  # (H, W, 3) uint8 of the hits listed, one below the other
+
+
 @dataclass(frozen=True)
 class Message:
     """One line of the messages area."""
@@ -321,7 +334,9 @@ class ViewerState(SceneState):
     show_palette: bool = False
     palette_typed: str = ""
     browser: Listing | None = None  # the folder that the file browser shows, while it is open
-    picks_folder: bool = False  # it is there to choose the folder of the photographs
+    picks_folder: Literal["", "photographs", "library"] = ""  # what it is there to choose a folder for
+    library: LibraryView | None = None  # scenes of a folder, and what was looked for in them
+    library_typed: str = ""
     preferences: Preferences = field(default_factory=Preferences)
     letters_muted: bool = False  # letters are no keys: they were meant for a box that cannot be typed in
 

@@ -20,6 +20,8 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
     {
         "train": "train.Train",
         "query": "query.QueryScene",
+        "find": "find.Find",
+        "changes": "find.Changes",
         "describe": "describe.Describe",
         "select": "query.Select",
         "teach": "teach.Teach",

@@ -1,9 +1,11 @@
-"""`python -m tests.benchmarks rooms|verdicts|taught|phrases|votes|maps|lifting|scale`: one report each."""
+"""`python -m tests.benchmarks NAME`: one report each, of those in `parse`."""
 
 import sys
 from typing import Union
 
 from langsplat_core.cli.run import Command, main, parsed, with_codec
+from tests.benchmarks.changed import Changed
+from tests.benchmarks.library import Found
 from tests.benchmarks.lifting import Lifting
 from tests.benchmarks.maps import Maps
 from tests.benchmarks.phrases import Phrases
@@ -19,7 +21,7 @@ PROGRAM = "python -m tests.benchmarks"
 def parse(args: list[str]) -> Command:
     """The report that the words of a command line name; SystemExit as tyro raises it."""
     about = "Measure this project where the truth is known, and at large sizes."
-    known = (Rooms, Verdicts, Taught, Phrases, Votes, Maps, Lifting, Scale)
+    known = (Rooms, Verdicts, Taught, Phrases, Votes, Maps, Lifting, Scale, Found, Changed)
     reports = tuple(with_codec(report, args) for report in known)
     command: Command = parsed(PROGRAM, Union[(*reports,)], args, about)
     return command

@@ -63,6 +63,7 @@ def folder(tmp_path: Path) -> Path:
         "watch_a_training",
         "read_what_speaks_against",
         "switch_between_scenes",
+        "search_a_library",
         "time_and_compare",
         "fade_in_a_photograph",
         "see_the_evidence",

@@ -10,6 +10,7 @@ from langsplat_viewer.actions import filming, opening, selecting, settings, view
 from langsplat_viewer.commands import COMMANDS, HELD, MENUS, Command, in_menu, matching
 from langsplat_viewer.files.preferences import SCALES, THEMES
 from langsplat_viewer.panels import (
+    library,
     overlays,
     record,
     scene,
@@ -267,6 +268,7 @@ PANELS: tuple[Panel, ...] = (
     Panel("Display", MIDDLE, view.draw_display),
     Panel("Camera", MIDDLE, view.draw_camera),
     Panel("Select", MIDDLE, select.draw, is_open=False),
+    Panel("Library", LEFT, library.draw, is_open=False),
     Panel("Train", LEFT, scene.draw_training, is_open=False),
     Panel("Record", LEFT, record.draw, is_open=False),
     Panel("Bookmarks", LEFT, record.draw_bookmarks, is_open=False),

@@ -92,7 +92,7 @@ def _figures(viewer: Viewer) -> str:
 
 # The file browser.
 
-OPEN, PICK = "Open a scene", "Folder of the photographs"
+TITLES = {"": "Open a scene", "photographs": "Folder of the photographs", "library": "Folder of scenes"}
 WIDTH_EM, HEIGHT_EM = 40.0, 30.0
 UNITS = ("bytes", "kB", "MB", "GB", "TB")
 
@@ -100,7 +100,7 @@ UNITS = ("bytes", "kB", "MB", "GB", "TB")
 def draw_browser(viewer: Viewer) -> None:
     """A box for a path, the folders above, what is in this one, and what was open before."""
     listing = viewer.state.browser
-    title = PICK if viewer.state.picks_folder else OPEN
+    title = TITLES[viewer.state.picks_folder]
     if listing is not None and not imgui.is_popup_open(title):
         imgui.open_popup(title)
     centre = imgui.get_main_viewport().get_center()
@@ -124,7 +124,7 @@ def draw_browser(viewer: Viewer) -> None:
 def _foot(viewer: Viewer, listing: Listing) -> None:
     if viewer.state.picks_folder:
         if imgui.button("Take this folder"):
-            opening.choose_photograph_folder(viewer, listing.folder)
+            opening.choose_folder(viewer, listing.folder)
     elif has_several(listing) and imgui.button("Open all scenes here"):
         opening.open_all(viewer)
 
@@ -167,7 +167,7 @@ def _entries(viewer: Viewer, listing: Listing) -> None:
     recent = () if picks else viewer.state.preferences.recent
     lines = min(len(recent), 4) + 1 if recent else 0
     below = lines * imgui.get_text_line_height_with_spacing() + 8 * bool(recent)
-    below += imgui.get_frame_height_with_spacing() * (picks or has_several(listing))
+    below += imgui.get_frame_height_with_spacing() * (bool(picks) or has_several(listing))
     if imgui.begin_child("entries", ImVec2(0, -below), imgui.ChildFlags_.borders):
         if listing.problem:
             small_wrapped(listing.problem, bad())
