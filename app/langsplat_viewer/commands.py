@@ -107,7 +107,7 @@ SIDE_KEYS: tuple[tuple[Side, str], ...] = (
     ("bottom", "Ctrl+Keypad7"),
 )
 PANEL_TITLES = (
-    *("Search", "Scene", "Display", "Camera", "Select", "Train"),
+    *("Search", "Scene", "Display", "Camera", "Select", "Library", "Train"),
     *("Record", "Bookmarks", "Messages", "Overlays", "Timing"),
 )
 MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
