@@ -1,9 +1,10 @@
-"""`python -m tests.benchmarks rooms|verdicts|taught|phrases|votes|lifting|scale`: one report each."""
+"""`python -m tests.benchmarks rooms|verdicts|taught|phrases|votes|clean|lifting|scale`: one report each."""
 
 import sys
 from typing import Union
 
 from langsplat_core.cli.run import Command, main, parsed, with_codec
+from tests.benchmarks.clean import Clean
 from tests.benchmarks.lifting import Lifting
 from tests.benchmarks.phrases import Phrases
 from tests.benchmarks.rooms import Rooms
@@ -18,7 +19,7 @@ PROGRAM = "python -m tests.benchmarks"
 def parse(args: list[str]) -> Command:
     """The report that the words of a command line name; SystemExit as tyro raises it."""
     about = "Measure this project where the truth is known, and at large sizes."
-    known = (Rooms, Verdicts, Taught, Phrases, Votes, Lifting, Scale)
+    known = (Rooms, Verdicts, Taught, Phrases, Votes, Clean, Lifting, Scale)
     reports = tuple(with_codec(report, args) for report in known)
     command: Command = parsed(PROGRAM, Union[(*reports,)], args, about)
     return command
