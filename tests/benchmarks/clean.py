@@ -37,19 +37,19 @@ def with_floaters(gaussians: Gaussians, cameras: list[Camera], seed: int) -> tup
     seen = [cameras[i] for i in rng.integers(0, len(cameras), 40)]
     veil = np.array([c.position + size * rng.uniform(0.08, 0.2) * c.rotation[2] for c in seen])
     veil += rng.normal(scale=0.02 * size, size=veil.shape)
-    places = [single, clump, veil]
+    places: list[Array] = [single, clump, veil]
     scales = [
-        typical * rng.uniform(0.5, 3, single.shape),
-        typical * rng.uniform(0.5, 2, clump.shape),
-        size * rng.uniform(0.01, 0.05, veil.shape),
+        rng.uniform(0.5, 3, (len(single), 3)) * typical,
+        rng.uniform(0.5, 2, (len(clump), 3)) * typical,
+        rng.uniform(0.01, 0.05, (len(veil), 3)) * size,
     ]
     opacities = [rng.uniform(*limits, len(p)) for p, limits in zip(places, RANGES, strict=True)]
     means = np.concatenate(places)
     sh = np.zeros((len(means), *gaussians.sh.shape[1:]))
     sh[:, 0] = rng.uniform(-1.5, 1.5, (len(means), 3))
     quats = rng.normal(size=(len(means), 4))
-    made = Gaussians(means, np.log(np.concatenate(scales)), quats, logit(np.concatenate(opacities)), sh)
-    kinds = np.repeat([0, 1, 2, 3], [len(gaussians), *map(len, places)])
+    made = Gaussians(means, np.log(np.vstack(scales)), quats, logit(np.concatenate(opacities)), sh)
+    kinds = np.repeat([0, 1, 2, 3], [len(gaussians), *(len(part) for part in places)])
     return join_gaussians([gaussians, made]), kinds
 
 
