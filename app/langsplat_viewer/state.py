@@ -23,7 +23,7 @@ from langsplat_viewer.files.browsing import Listing
 from langsplat_viewer.files.flights import Bookmark
 from langsplat_viewer.files.photographs import Photograph
 from langsplat_viewer.files.preferences import Preferences
-from langsplat_viewer.marks import Selection
+from langsplat_viewer.marks import Move, Selection
 from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
 from langsplat_viewer.rendering.request import (
     EditedScene,
@@ -255,11 +255,27 @@ class TrainingForm:
     encoder: str = "demo"
 
 
+Gizmo = Literal["off", "move", "rotate", "scale"]
+
+
+@dataclass(frozen=True)
+class EditForm:
+    """Fields of the panel that transforms and crops."""
+
+    gizmo: Gizmo = "off"
+    move: Point = (0.0, 0.0, 0.0)
+    rotate: Point = (0.0, 0.0, 0.0)  # degrees about x, then y, then z
+    scale: float = 1.0
+    low: Point = (-1.0, -1.0, -1.0)  # two opposite corners of the box that is cropped to
+    high: Point = (1.0, 1.0, 1.0)
+
+
 @dataclass(eq=False)
 class SceneState:
     """The part of the state that begins anew with every scene."""
 
     scene: Scene | None = None
+    opened: Scene | None = None  # as its file has it, once something was transformed
     path: Path | None = None
     extent: Extent | None = None  # there whenever a scene is
     doubts: tuple[str, ...] = ()  # quality warnings of its training, with the remedies
@@ -285,6 +301,7 @@ class SceneState:
     suggestions: Suggestions = field(default_factory=Suggestions)
     suggestions_of: Scene | None = None  # the scene for which they were looked for
     _edited: EditedScene | None = None  # of the last request
+    _moved: tuple[Move, Scene] | None = None  # the scene that a held gizmo shows
 
 
 @dataclass(eq=False)
@@ -309,6 +326,7 @@ class ViewerState(SceneState):
     focus_input: bool = False  # the query box takes the keyboard at the next frame
 
     training_form: TrainingForm = field(default_factory=TrainingForm)
+    edit_form: EditForm = field(default_factory=EditForm)
     path_typed: str = ""
     messages: list[Message] = field(default_factory=list)
     timing: Timing = field(default_factory=Timing)
@@ -353,13 +371,24 @@ class ViewerState(SceneState):
         """Displays in the scene's area, from left to right."""
         return panes(self.picture, self.latent_level, self.shown_results(), self.settings.split)
 
+    def _seen(self) -> Scene:
+        """The scene, with the transform of a gizmo that is held."""
+        assert self.scene is not None
+        moving = self.selection.moving
+        if moving is None:
+            self._moved = None
+            return self.scene
+        if self._moved is None or self._moved[0] is not moving:
+            self._moved = moving, moving.applied(self.scene)
+        return self._moved[1]
+
     def request(self, size: tuple[int, int] | None = None, transparent: bool = False) -> RenderRequest:
         """The image that the scene's area shows, or the same of another size (width, height) in pixels."""
         assert self.scene is not None
         assert self.view is not None
         settings = self.settings
         size = size or self.size
-        self._edited = edited_scene(self.scene, self.selection.marks, self._edited)
+        self._edited = edited_scene(self._seen(), self.selection.marks, self._edited)
         return RenderRequest(
             self._edited,
             self.view.camera(*settings.split.pane_size(size)),
