@@ -151,7 +151,6 @@ class Selection:
     saved: Array | None = None  # (N,) what was deleted when the scene was last saved; None: not yet
     moves: tuple[Move, ...] = ()  # transforms so far, since the scene was opened
     saved_moves: tuple[Move, ...] = ()  # the same when it was last saved
-    moving: Move | None = None  # by a gizmo that is held: seen, but not done yet
     tool: Tool | None = None  # what a drag in the scene does; None: it turns the camera
     mode: Mode = "replace"
     brush: float = 0.03  # radius, of the image's height, within BRUSHES
@@ -180,7 +179,6 @@ def of_scene(selection: Selection, count: int) -> Selection:
         saved=None,
         moves=(),
         saved_moves=(),
-        moving=None,
         stroke=None,
         leaving=None,
     )

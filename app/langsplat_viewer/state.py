@@ -276,6 +276,7 @@ class SceneState:
 
     scene: Scene | None = None
     opened: Scene | None = None  # as its file has it, once something was transformed
+    moving: tuple[Move, Scene] | None = None  # what a gizmo that is held does, and what is seen of it
     path: Path | None = None
     extent: Extent | None = None  # there whenever a scene is
     doubts: tuple[str, ...] = ()  # quality warnings of its training, with the remedies
@@ -301,7 +302,6 @@ class SceneState:
     suggestions: Suggestions = field(default_factory=Suggestions)
     suggestions_of: Scene | None = None  # the scene for which they were looked for
     _edited: EditedScene | None = None  # of the last request
-    _moved: tuple[Move, Scene] | None = None  # the scene that a held gizmo shows
 
 
 @dataclass(eq=False)
@@ -371,24 +371,14 @@ class ViewerState(SceneState):
         """Displays in the scene's area, from left to right."""
         return panes(self.picture, self.latent_level, self.shown_results(), self.settings.split)
 
-    def _seen(self) -> Scene:
-        """The scene, with the transform of a gizmo that is held."""
-        assert self.scene is not None
-        moving = self.selection.moving
-        if moving is None:
-            self._moved = None
-            return self.scene
-        if self._moved is None or self._moved[0] is not moving:
-            self._moved = moving, moving.applied(self.scene)
-        return self._moved[1]
-
     def request(self, size: tuple[int, int] | None = None, transparent: bool = False) -> RenderRequest:
         """The image that the scene's area shows, or the same of another size (width, height) in pixels."""
         assert self.scene is not None
         assert self.view is not None
         settings = self.settings
         size = size or self.size
-        self._edited = edited_scene(self._seen(), self.selection.marks, self._edited)
+        seen = self.scene if self.moving is None else self.moving[1]
+        self._edited = edited_scene(seen, self.selection.marks, self._edited)
         return RenderRequest(
             self._edited,
             self.view.camera(*settings.split.pane_size(size)),

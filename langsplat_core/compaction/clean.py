@@ -197,35 +197,52 @@ def _within_budget(
 ) -> tuple[Array, Array]:
     """Rows that stay (N,) bool, and the loss in each view, where as many of `order` go as the budget allows.
 
-    Groups of the order are removed one after the other, in two passes. What a group adds to the mean loss,
-    and the standard error of that, is taken from the budget. A group that costs more than is left is halved,
-    and its halves are tried. Gains are not added to the budget, or true floaters would pay for the loss of
-    what is none.
+    Groups of the order are removed one after the other. What a group adds to the mean loss, and the standard
+    error of that, is taken from the budget. A group that costs more than is left is halved, and its halves
+    are tried. Gains are not added to the budget, or true floaters would pay for the loss of what is none.
+    What was removed while others still hid its worth is found last: every group is measured again without
+    all others, and the dearest come back until the rest is within the budget.
     """
     keep = np.ones(len(scene.gaussians), bool)
     losses, spent, done = np.zeros(len(measured)), 0.0, 0
     least = max(len(order) // RESOLUTION, 1)
     waiting = [group for group in np.array_split(order, GROUPS) if len(group)][::-1]
-    again: list[Array] = []  # too dear, as long as others hid what is behind them
+    gone: list[Array] = []
+
+    def measure() -> Array:
+        return psnr_losses(scene.take(keep), measured, config.assumed_psnr)
+
     while waiting:
         group = waiting.pop()
         keep[group] = False
-        tried = psnr_losses(scene.take(keep), measured, config.assumed_psnr)
-        added = tried - losses
-        cost = max(float(added.mean() + added.std() / np.sqrt(len(added))), 0.0)
-        fits = spent + cost <= config.max_psnr_loss
-        if fits:
+        tried = measure()
+        cost = _cost(tried - losses)
+        if spent + cost <= config.max_psnr_loss:
             losses, spent = tried, spent + cost
+            gone += np.array_split(group, -(-len(group) // least))
         else:
             keep[group] = True
-            halves = [group[len(group) // 2 :], group[: len(group) // 2]]
-            waiting += halves if len(group) > least else []
-            again += [] if len(group) > least else [group]
-        done += len(group) if fits or len(group) <= least else 0
-        progress("removing within the budget", min(done / len(order), 1.0))
-        if not waiting and done == len(order):
-            waiting = again[::-1]
-    return keep, losses
+            if len(group) > least:
+                waiting += [group[len(group) // 2 :], group[: len(group) // 2]]
+                continue
+        done += len(group)
+        progress("removing within the budget", done / len(order))
+    costs = []
+    for index, group in enumerate(gone):
+        keep[group] = True
+        costs.append(_cost(losses - measure()))
+        keep[group] = False
+        progress("measuring again", (index + 1) / len(gone))
+    rising = np.argsort(costs, kind="stable").astype(int)
+    dear = rising[np.cumsum(np.array(costs, np.float64)[rising]) > config.max_psnr_loss]
+    for index in dear:
+        keep[gone[index]] = True
+    return keep, measure() if len(dear) else losses
+
+
+def _cost(added: Array) -> float:
+    """What (V,) dB added to the loss of the views take from the budget."""
+    return max(float(added.mean() + added.std() / np.sqrt(len(added))), 0.0)
 
 
 def clean_scene(

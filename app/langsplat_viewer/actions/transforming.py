@@ -52,19 +52,16 @@ def _move_of(viewer: Viewer, to: Similarity) -> Move:
 
 
 def preview(viewer: Viewer, to: Similarity) -> None:
-    """Show the selection, or without one the scene, transformed, until `transform` or `stop_preview`."""
+    """Show the selection, or without one the scene, transformed, until `transform`. Raises InputError where
+    that leads too far."""
     if viewer.state.scene is not None:
-        viewer.state.selection = replace(viewer.state.selection, moving=_move_of(viewer, to))
-
-
-def stop_preview(viewer: Viewer) -> None:
-    """Show it as it is again."""
-    viewer.state.selection = replace(viewer.state.selection, moving=None)
+        move = _move_of(viewer, to)
+        viewer.state.moving = move, move.applied(viewer.state.scene)
 
 
 def transform(viewer: Viewer, to: Similarity) -> None:
     """Transform the selection; without one the whole scene with its cameras. Says why where that fails."""
-    stop_preview(viewer)
+    viewer.state.moving = None
     if not has_scene(viewer) or to.is_identity:
         return
     move, moves = _move_of(viewer, to), viewer.state.selection.moves
@@ -93,9 +90,9 @@ def place(viewer: Viewer, moves: tuple[Move, ...]) -> None:
     if field is not None and viewer.engine is not None:
         field = replace(field, taught=tuple(viewer.engine.taught.values()))
     scene = replace(scene, language=field)
-    state.opened, state.scene, state.extent = opened, scene, extent_of(scene)
+    state.opened, state.scene, state.extent, state.moving = opened, scene, extent_of(scene), None
     state.ruler = replace(state.ruler, points=())
-    state.selection = replace(state.selection, moves=moves, moving=None)
+    state.selection = replace(state.selection, moves=moves)
     viewer.engine, viewer.describer = viewer.services.engine(scene), None
     if state.canonical:
         set_canonical(viewer, ", ".join(state.canonical))  # which asks again

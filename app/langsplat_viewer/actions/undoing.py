@@ -41,7 +41,7 @@ def _restore(viewer: Viewer, moment: Moment) -> None:
         set_cut(viewer, query, cut, is_new=False)
     state.queries, state.selected = [query for query, *_ in moment.queries], moment.selected
     marks = unpack(moment.marks, pack(state.selection.marks, history.marks))
-    state.selection = replace(state.selection, marks=marks, stroke=None, moving=None)
+    state.selection = replace(state.selection, marks=marks, stroke=None)
     state.record.keyframes, state.record.chosen = moment.keyframes, None
     state.picture, state.latent_level = moment.picture, moment.latent_level
     state.settings = moment.settings

@@ -97,8 +97,8 @@ def draw_gizmo(viewer: Viewer, area: Area) -> None:
         return
     camera = state.view.camera(max(round(area.width), 1), max(round(area.height), 1))
     view, projection = gl_matrices(camera, state.view.distance)
-    start, held = moving(centre).matrix, state.selection.moving
-    edited = gizmo.Matrix16(_columns(start if held is None else held.to.matrix @ start))
+    start, held = moving(centre).matrix, state.moving
+    edited = gizmo.Matrix16(_columns(start if held is None else held[0].to.matrix @ start))
     gizmo.begin_frame()
     gizmo.set_drawlist(imgui.get_foreground_draw_list())
     gizmo.set_rect(area.left, area.top, area.width, area.height)
@@ -110,7 +110,7 @@ def draw_gizmo(viewer: Viewer, area: Area) -> None:
             with suppress(LangSplatError):  # turned inside out: what it was before stays
                 transforming.preview(viewer, dragged(start, np.array(edited.values).reshape(4, 4).T))
     elif held is not None:
-        transforming.transform(viewer, held.to)
+        transforming.transform(viewer, held[0].to)
 
 
 def dragged(start: Array, now: Array) -> Similarity:
