@@ -39,6 +39,7 @@ from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.progress import Progress, silent
 from langsplat_core.raster import load_rasterizer
 from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.scene.gaussians import along_curve
 from langsplat_core.scene.surface import Surface, build_surface
 
 # From the least suspicious to the most; chosen in rooms 201 to 203 of `python -m tests.benchmarks clean`.
@@ -200,14 +201,14 @@ def _within_budget(
     Groups of the order are removed one after the other. What a group adds to the mean loss, and the standard
     error of that, is taken from the budget. A group that costs more than is left is halved, and its halves
     are tried. Gains are not added to the budget, or true floaters would pay for the loss of what is none.
-    What was removed while others still hid its worth is found last: every group is measured again without
-    all others, and the dearest come back until the rest is within the budget.
+    What was removed while others still hid its worth is found last: what lies together is measured again
+    without all others, and the dearest come back until the rest is within the budget.
     """
     keep = np.ones(len(scene.gaussians), bool)
     losses, spent, done = np.zeros(len(measured)), 0.0, 0
     least = max(len(order) // RESOLUTION, 1)
     waiting = [group for group in np.array_split(order, GROUPS) if len(group)][::-1]
-    gone: list[Array] = []
+    removed = np.zeros(len(scene.gaussians), bool)
 
     def measure() -> Array:
         return psnr_losses(scene.take(keep), measured, config.assumed_psnr)
@@ -219,7 +220,7 @@ def _within_budget(
         cost = _cost(tried - losses)
         if spent + cost <= config.max_psnr_loss:
             losses, spent = tried, spent + cost
-            gone += np.array_split(group, -(-len(group) // least))
+            removed[group] = True
         else:
             keep[group] = True
             if len(group) > least:
@@ -227,7 +228,9 @@ def _within_budget(
                 continue
         done += len(group)
         progress("removing within the budget", done / len(order))
-    costs = []
+    costs, rows = [], np.flatnonzero(removed)
+    rows = rows[np.argsort(along_curve(scene.gaussians.means[rows]))]
+    gone = [group for group in np.array_split(rows, RESOLUTION) if len(group)]
     for index, group in enumerate(gone):
         keep[group] = True
         costs.append(_cost(losses - measure()))

@@ -46,11 +46,8 @@ def test_the_selection_moves_alone_and_is_found_where_it_went(opened):
 
 
 def test_the_whole_scene_takes_its_cameras_along(opened):
-    up, before, eyes = (
-        opened.state.extent.up,
-        means(opened),
-        [camera.position for camera in opened.state.scene.cameras],
-    )
+    up, before = opened.state.extent.up, means(opened)
+    eyes = [camera.position for camera in opened.state.scene.cameras]
     to = rotating(AXES["z"], 90).then(scaling(3)).then(moving(STEP))
     transforming.transform(opened, to)
     np.testing.assert_allclose(means(opened), to.points(before), atol=1e-4)
