@@ -11,8 +11,8 @@ five programs, 0.8 to 1.4 % of the Gaussians are in regions that 1.25 extents le
 its centre lies before the surface that is seen through it (the median depth). Veils are found
 first and are no part of regions, which they would bridge.
 
-**Visibility.** Of equally suspicious Gaussians, those that contribute the least to any view go first
-(`compact.contributions`), as many as the loss, measured on other views, allows.
+**Visibility.** What contributes the least to any view (`compact.contributions`) goes first, as many as the
+loss, measured on other views, allows.
 """
 
 from dataclasses import dataclass, replace
@@ -171,8 +171,12 @@ def clean(
     found = find_floaters(scene, views.ranking, config.region, progress)
     cost = contributions(scene, views.ranking, progress)
     suspects = np.flatnonzero(found.suspicion)
-    order = suspects[np.lexsort((cost[suspects], -found.suspicion[suspects]))]
-    keep, losses = _within_budget(scene, order, measured, config, progress)
+    trial = _Trial(scene, measured, config, progress)
+    if views.photographs[0] is None:
+        _by_change(trial, suspects[np.argsort(cost[suspects], kind="stable")])
+    else:
+        _by_photographs(trial, suspects[np.lexsort((cost[suspects], -found.suspicion[suspects]))])
+    losses, keep = trial.losses(), trial.keep
     keep &= valid
     gone = valid & ~keep
     report = CleanReport(
@@ -193,54 +197,77 @@ def clean(
     return keep, report
 
 
-def _within_budget(
-    scene: Scene, order: Array, measured: list[MeasuringView], config: CleanConfig, progress: Progress
-) -> tuple[Array, Array]:
-    """Rows that stay (N,) bool, and the loss in each view, where as many of `order` go as the budget allows.
+@dataclass(eq=False)
+class _Trial:
+    """A scene of N Gaussians without some of them, measured."""
 
-    Groups of the order are removed one after the other. What a group adds to the mean loss, and the standard
+    scene: Scene
+    measured: list[MeasuringView]
+    config: CleanConfig
+    progress: Progress
+
+    def __post_init__(self) -> None:
+        self.keep = np.ones(len(self.scene.gaussians), bool)
+
+    def losses(self) -> Array:
+        """(V,) dB, as it is now."""
+        return psnr_losses(self.scene.take(self.keep), self.measured, self.config.assumed_psnr)
+
+
+def _by_change(trial: _Trial, rising: Array) -> None:
+    """Remove as many of `rising`, by rising contribution, as the budget allows: by bisection."""
+    low, high = 0, len(rising) + 1
+    middle = len(rising)  # all of them, first
+    while middle > low:
+        trial.keep[rising] = np.arange(len(rising)) >= middle
+        if trial.losses().mean() <= trial.config.max_psnr_loss:
+            low = middle
+        else:
+            high = middle
+        middle = (low + high) // 2
+        trial.progress("removing within the budget", 1 - (high - low) / (len(rising) + 2))
+    trial.keep[rising] = np.arange(len(rising)) >= low
+
+
+def _by_photographs(trial: _Trial, order: Array) -> None:
+    """Remove what photographs do not miss, and as many more as the budget allows.
+
+    Groups of `order` are removed one after the other. What a group adds to the mean loss, and the standard
     error of that, is taken from the budget. A group that costs more than is left is halved, and its halves
     are tried. Gains are not added to the budget, or true floaters would pay for the loss of what is none.
     What was removed while others still hid its worth is found last: what lies together is measured again
     without all others, and the dearest come back until the rest is within the budget.
     """
-    keep = np.ones(len(scene.gaussians), bool)
-    losses, spent, done = np.zeros(len(measured)), 0.0, 0
+    keep, budget = trial.keep, trial.config.max_psnr_loss
+    losses, spent, done = np.zeros(len(trial.measured)), 0.0, 0
     least = max(len(order) // RESOLUTION, 1)
     waiting = [group for group in np.array_split(order, GROUPS) if len(group)][::-1]
-    removed = np.zeros(len(scene.gaussians), bool)
-
-    def measure() -> Array:
-        return psnr_losses(scene.take(keep), measured, config.assumed_psnr)
-
     while waiting:
         group = waiting.pop()
         keep[group] = False
-        tried = measure()
+        tried = trial.losses()
         cost = _cost(tried - losses)
-        if spent + cost <= config.max_psnr_loss:
+        if spent + cost <= budget:
             losses, spent = tried, spent + cost
-            removed[group] = True
         else:
             keep[group] = True
             if len(group) > least:
                 waiting += [group[len(group) // 2 :], group[: len(group) // 2]]
                 continue
         done += len(group)
-        progress("removing within the budget", done / len(order))
-    costs, rows = [], np.flatnonzero(removed)
-    rows = rows[np.argsort(along_curve(scene.gaussians.means[rows]))]
+        trial.progress("removing within the budget", done / len(order))
+    rows = np.flatnonzero(~keep)
+    rows = rows[np.argsort(along_curve(trial.scene.gaussians.means[rows]))]
     gone = [group for group in np.array_split(rows, RESOLUTION) if len(group)]
+    costs = np.zeros(len(gone))
     for index, group in enumerate(gone):
         keep[group] = True
-        costs.append(_cost(losses - measure()))
+        costs[index] = _cost(losses - trial.losses())
         keep[group] = False
-        progress("measuring again", (index + 1) / len(gone))
-    rising = np.argsort(costs, kind="stable").astype(int)
-    dear = rising[np.cumsum(np.array(costs, np.float64)[rising]) > config.max_psnr_loss]
-    for index in dear:
+        trial.progress("measuring again", (index + 1) / len(gone))
+    rising = np.argsort(costs, kind="stable")
+    for index in rising[np.cumsum(costs[rising]) > budget]:
         keep[gone[index]] = True
-    return keep, measure() if len(dear) else losses
 
 
 def _cost(added: Array) -> float:
