@@ -8,7 +8,16 @@ from pathlib import Path
 from langsplat_core.config import Display
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.actions import filming, opening, queries, selecting, settings, undoing, viewpoint
+from langsplat_viewer.actions import (
+    filming,
+    opening,
+    queries,
+    selecting,
+    settings,
+    transforming,
+    undoing,
+    viewpoint,
+)
 from langsplat_viewer.actions.selecting import Part
 from langsplat_viewer.camera.controls import Side, adopt_up, level
 from langsplat_viewer.marks import TOOLS, Tool
@@ -107,8 +116,8 @@ SIDE_KEYS: tuple[tuple[Side, str], ...] = (
     ("bottom", "Ctrl+Keypad7"),
 )
 PANEL_TITLES = (
-    *("Search", "Scene", "Display", "Camera", "Select", "Library", "Train"),
-    *("Record", "Bookmarks", "Messages", "Overlays", "Timing"),
+    *("Search", "Scene", "Display", "Camera", "Select", "Transform"),
+    *("Library", "Train", "Record", "Bookmarks", "Messages", "Overlays", "Timing"),
 )
 MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
@@ -144,6 +153,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("search", queries.focus_search, ("Ctrl+F", "/"), "Edit"),
     Command("undo", undoing.undo, ("Ctrl+Z",), "Edit", repeats=True, is_edit=True),
     Command("redo", undoing.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), "Edit", repeats=True, is_edit=True),
+    Command("gizmo: move, rotate, scale, off", transforming.next_gizmo, ("G",), "Edit"),
     Command("select everything", selecting.select_all, ("Ctrl+A",), "Select", is_edit=True),
     Command("select nothing", selecting.select_none, ("Ctrl+D", "Ctrl+Shift+A"), "Select", is_edit=True),
     Command("invert the selection", selecting.invert_selection, ("Ctrl+I",), "Select", is_edit=True),

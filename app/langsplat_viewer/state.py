@@ -25,7 +25,7 @@ from langsplat_viewer.files.browsing import Listing
 from langsplat_viewer.files.flights import Bookmark
 from langsplat_viewer.files.photographs import Photograph
 from langsplat_viewer.files.preferences import Preferences
-from langsplat_viewer.marks import Selection
+from langsplat_viewer.marks import Move, Selection
 from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
 from langsplat_viewer.rendering.request import (
     EditedScene,
@@ -268,11 +268,28 @@ class TrainingForm:
     encoder: str = "demo"
 
 
+Gizmo = Literal["off", "move", "rotate", "scale"]
+
+
+@dataclass(frozen=True)
+class EditForm:
+    """Fields of the panel that transforms and crops."""
+
+    gizmo: Gizmo = "off"
+    move: Point = (0.0, 0.0, 0.0)
+    rotate: Point = (0.0, 0.0, 0.0)  # degrees about x, then y, then z
+    scale: float = 1.0
+    low: Point = (-1.0, -1.0, -1.0)  # two opposite corners of the box that is cropped to
+    high: Point = (1.0, 1.0, 1.0)
+
+
 @dataclass(eq=False)
 class SceneState:
     """The part of the state that begins anew with every scene."""
 
     scene: Scene | None = None
+    opened: Scene | None = None  # as its file has it, once something was transformed
+    moving: tuple[Move, Scene] | None = None  # what a gizmo that is held does, and what is seen of it
     path: Path | None = None
     extent: Extent | None = None  # there whenever a scene is
     doubts: tuple[str, ...] = ()  # quality warnings of its training, with the remedies
@@ -322,6 +339,7 @@ class ViewerState(SceneState):
     focus_input: bool = False  # the query box takes the keyboard at the next frame
 
     training_form: TrainingForm = field(default_factory=TrainingForm)
+    edit_form: EditForm = field(default_factory=EditForm)
     path_typed: str = ""
     messages: list[Message] = field(default_factory=list)
     timing: Timing = field(default_factory=Timing)
@@ -374,7 +392,8 @@ class ViewerState(SceneState):
         assert self.view is not None
         settings = self.settings
         size = size or self.size
-        self._edited = edited_scene(self.scene, self.selection.marks, self._edited)
+        seen = self.scene if self.moving is None else self.moving[1]
+        self._edited = edited_scene(seen, self.selection.marks, self._edited)
         return RenderRequest(
             self._edited,
             self.view.camera(*settings.split.pane_size(size)),

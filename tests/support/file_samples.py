@@ -19,7 +19,6 @@ import zstandard
 from PIL import Image
 
 from langsplat_core.arrays import Array, sigmoid, unit
-from langsplat_core.raster.reference import basis
 from langsplat_core.scene import (
     CANONICAL_PHRASES,
     AutoencoderCodec,
@@ -29,6 +28,7 @@ from langsplat_core.scene import (
     LanguageField,
     LinearCodec,
 )
+from langsplat_core.scene.transform import sh_basis
 
 SHARED_DATA = Path(os.environ.get("LANGSPLAT_TEST_DATA", Path(__file__).parents[3] / "shared" / "data"))
 C0 = 0.28209479177387814
@@ -378,7 +378,7 @@ def turned_coefficients(sh: Array, turn: Array) -> Array:
     directions = np.random.default_rng(0).normal(size=(400, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     count = sh.shape[1]
-    matrix = np.linalg.lstsq(basis(directions @ turn.T, count), basis(directions, count), rcond=None)[0]
+    matrix = np.linalg.lstsq(sh_basis(directions @ turn.T, count), sh_basis(directions, count), rcond=None)[0]
     return np.einsum("kj,njc->nkc", matrix, sh.astype(float))
 
 

@@ -48,6 +48,7 @@ def folder(tmp_path: Path) -> Path:
         "outline_and_rest",
         "name_what_is_clicked",
         "ask_before_leaving",
+        "drag_the_gizmo",
         "type_while_opening",
         "look_at_nothing",
         "record_and_play",

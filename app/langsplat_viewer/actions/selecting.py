@@ -234,7 +234,7 @@ def export(
     if not (has_scene(viewer) if part == "edited" else has_selection(viewer)):
         return
     state, engine = viewer.state, viewer.engine
-    scene, marks = state.scene, state.selection.marks
+    scene, marks, moves = state.scene, state.selection.marks, state.selection.moves
     assert scene is not None
     field = scene.language
     if field is not None and engine is not None:
@@ -252,7 +252,7 @@ def export(
         kind = "points" if as_points else "Gaussians"
         state.say(f"saved {written.path}: {written.count:,} {kind}")
         if part == "edited" and not as_points and state.scene is scene:
-            state.selection = replace(state.selection, saved=marks.deleted)
+            state.selection = replace(state.selection, saved=marks.deleted, saved_moves=moves)
         then(viewer)
 
     def failed(reason: str) -> None:

@@ -16,6 +16,7 @@ from langsplat_viewer.panels import (
     scene,
     search,
     select,
+    transform,
     view,
 )
 from langsplat_viewer.panels.scene import in_words
@@ -268,6 +269,7 @@ PANELS: tuple[Panel, ...] = (
     Panel("Display", MIDDLE, view.draw_display),
     Panel("Camera", MIDDLE, view.draw_camera),
     Panel("Select", MIDDLE, select.draw, is_open=False),
+    Panel("Transform", MIDDLE, transform.draw, is_open=False),
     Panel("Library", LEFT, library.draw, is_open=False),
     Panel("Train", LEFT, scene.draw_training, is_open=False),
     Panel("Record", LEFT, record.draw, is_open=False),
@@ -376,6 +378,7 @@ def draw_over(viewer: Viewer) -> None:
         overlays.draw_legend(viewer, area)
         overlays.draw_pointing(viewer)
         select.draw_stroke(viewer, area)
+        transform.draw_gizmo(viewer, area)
     overlays.draw_grip(viewer, area)
     overlays.draw_cube(viewer, area)
     scene.draw_changed(viewer, area)

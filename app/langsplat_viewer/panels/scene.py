@@ -257,7 +257,8 @@ def draw_unsaved(viewer: Viewer) -> None:
         return
     if leaving is not None:
         count = int(viewer.state.selection.marks.deleted.sum())
-        imgui.text_unformatted(f"{count:,} Gaussians were deleted, and the scene is not saved without them.")
+        moved = " and some transformed" if viewer.state.selection.moves else ""
+        imgui.text_unformatted(f"{count:,} Gaussians were deleted{moved}, and the scene is not saved so.")
         imgui.text_unformatted(f"Save it as a new file before {leaving.to}?")
         if imgui.button("Save"):
             selecting.save_and_leave(viewer, Path.cwd())

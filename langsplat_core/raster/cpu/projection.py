@@ -20,9 +20,9 @@ from langsplat_core.arrays import Array, check_array
 from langsplat_core.compiled import helper, kernel, plain, shared_workers
 from langsplat_core.config import RasterSettings
 from langsplat_core.raster.protocol import farthest, tangent_limits
-from langsplat_core.raster.reference import C0, C1, C2, C3
 from langsplat_core.scene import Camera
 from langsplat_core.scene.gaussians import LARGEST_COEFFICIENT
+from langsplat_core.scene.transform import C0, C1, C2, C3
 
 COLUMNS = 8  # of the geometry: one cache line a row
 INVALID, UNDRAWN, DRAWN = 0, 1, 2  # what `project` says of a row

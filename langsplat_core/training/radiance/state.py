@@ -21,8 +21,8 @@ from langsplat_core.datasets.capture import Capture
 from langsplat_core.datasets.known_poses import TELLING_POINTS, inside, random_points
 from langsplat_core.errors import FormatError, InputError
 from langsplat_core.io.files import atomic_path
-from langsplat_core.raster.reference import C0
 from langsplat_core.scene import SH_COUNTS, Camera, Gaussians
+from langsplat_core.scene.transform import C0
 
 INITIAL_OPACITY = 0.1
 NEIGHBOURS = 3

@@ -19,8 +19,9 @@ from langsplat_core.config import INRIA, RadianceConfig, RasterSettings
 from langsplat_core.datasets.capture import Capture
 from langsplat_core.errors import BackendError, FormatError, InputError
 from langsplat_core.progress import Cancelled, Progress, Report
-from langsplat_core.raster.reference import C0, ReferenceRasterizer, colours
+from langsplat_core.raster.reference import ReferenceRasterizer, colours
 from langsplat_core.scene import Camera, Gaussians, look_at
+from langsplat_core.scene.transform import C0
 from langsplat_core.training.radiance.differentiable import CpuRenderer, renderer_for
 from langsplat_core.training.radiance.losses import blur, radiance_loss, raw_moments, ssim, ssim_terms
 from langsplat_core.training.radiance.state import (
