@@ -137,10 +137,11 @@ class Stroke:
 
 @dataclass(frozen=True, eq=False)
 class Leaving:
-    """An action that waits for the answer whether deletions are to be saved."""
+    """An action that waits for the answer whether deletions are to be saved, or for a film."""
 
     then: Callable[[Any], None]  # takes the `Viewer`
     to: str  # what it does, in words: "the window closes"
+    film: bool = False  # it is done as soon as the recorder is
 
 
 @dataclass(frozen=True, eq=False)

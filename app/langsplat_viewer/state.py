@@ -337,6 +337,7 @@ class ViewerState(SceneState):
     asked: list[str] = field(default_factory=list)  # what was searched for, the oldest first
     recalled: int = 0  # index into `asked` of the phrase last recalled; its length: none
     focus_input: bool = False  # the query box takes the keyboard at the next frame
+    awaits_keyboard: bool = False  # keys wait until a box has it
 
     training_form: TrainingForm = field(default_factory=TrainingForm)
     edit_form: EditForm = field(default_factory=EditForm)
@@ -350,6 +351,7 @@ class ViewerState(SceneState):
     show_panel: bool = True  # the panels, as many as are open
     show_help: bool = False
     show_palette: bool = False
+    resets_panels: bool = False  # at the next frame
     palette_typed: str = ""
     browser: Listing | None = None  # the folder that the file browser shows, while it is open
     picks_folder: Literal["", "photographs", "library"] = ""  # what it is there to choose a folder for

@@ -309,18 +309,18 @@ def record_and_play(s) -> None:
         s.ctx.key_press(imgui.Key.k)
         s.drag((600, 300), end)
         s.settle()
-    s.ctx.item_click("//**/Add keyframe")
+    s.ctx.item_click("//Record/Add keyframe")
     s.ctx.yield_(2)
     assert [key.seconds for key in record.keyframes] == [0, 2, 4]
     last = s.state.view
-    s.ctx.item_click("//**/Clear")
+    s.ctx.item_click("//Record/Clear")
     s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
     s.ctx.yield_(2)
     assert len(record.keyframes) == 3
 
     filming.set_path_seconds(s.window.viewer, 1.0)
     start = s.shot("start")
-    s.ctx.item_click("//**/Play##path")
+    s.ctx.item_click("//Record/Play##path")
     s.wait(lambda: 0.2 < record.at < 1.0)
     moving = s.state.view
     s.wait(lambda: record.began is None)
@@ -334,7 +334,7 @@ def record_and_play(s) -> None:
     assert record.began is None
     assert np.abs(s.shot("elsewhere") - start)[100:500, 400:].max() > 30
 
-    s.ctx.item_click("//**/Save path")
+    s.ctx.item_click("//Record/Save path")
     s.ctx.yield_(2)
     assert len(read_flight(s.folder / "blobs-001.path.json").keyframes) == 3
     filming.set_film_size(s.window.viewer, 32, 24)

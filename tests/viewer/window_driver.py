@@ -160,10 +160,13 @@ class Session:
         self.ctx.item_click(f"//$FOCUSED/{item}")
         self.ctx.yield_(3)
 
-    def search(self, phrase: str) -> None:
+    def search(self, phrase: str, stay: bool = False) -> None:
         self.ctx.item_click("//**/##phrase")
         self.ctx.key_chars_append_enter(phrase)
         self.settle()
+        if not stay:  # in the box
+            self.ctx.key_press(imgui.Key.escape)
+            self.ctx.yield_(2)
 
 
 def look_and_search(s: Session) -> None:
@@ -185,11 +188,19 @@ def look_and_search(s: Session) -> None:
 def find_the_plant(s: Session, rgb: np.ndarray) -> None:
     # Typing owns the keyboard: the p of "plant" saves no picture, its a and t move nothing.
     before = s.state.view
-    s.search("plant")
+    s.search("plant", stay=True)
     assert s.state.view is before
     assert list(s.folder.glob("blobs-*.png")) == []
     assert s.state.queries[0].result.found
-    # Enter has left the box: the next letter is a key again.
+    # The box keeps the keyboard, until Esc leaves it: then the next letter is a key again.
+    assert imgui.get_io().want_text_input
+    s.ctx.key_chars("ff")
+    s.ctx.yield_(2)
+    assert s.state.typed == "ff"
+    assert s.state.view is before
+    for _ in range(2):
+        s.ctx.key_press(imgui.Key.escape)
+        s.ctx.yield_(2)
     s.ctx.key_press(imgui.Key.f)
     s.settle()
     assert s.state.typed == ""
@@ -255,11 +266,11 @@ def use_keys(s: Session) -> None:
     s.settle()
     assert s.state.picture.display == "rgb"
     width = s.state.size[0]
-    s.ctx.key_press(imgui.Key.tab)
+    s.ctx.key_press(imgui.Key.f11)
     s.settle()
     assert s.state.size[0] == 860
     assert width < 600
-    s.ctx.key_press(imgui.Key.tab)
+    s.ctx.key_press(imgui.Key.f11)
     s.settle()
     s.ctx.key_press(imgui.Key.f)
     s.settle()
@@ -359,7 +370,7 @@ def use_shortcuts(s: Session) -> None:
     """Chords work everywhere, letters only by themselves and never while typing."""
     key, ctrl, shift = imgui.Key, imgui.Key.mod_ctrl, imgui.Key.mod_shift
     before = s.state.view
-    for chord in (ctrl | key.r, ctrl | key.p, ctrl | key.d, ctrl | digit_key(2), ctrl | key.q):
+    for chord in (ctrl | key.r, ctrl | key.p, ctrl | key.d, ctrl | digit_key(2), ctrl | key.e):
         s.ctx.key_press(chord)
         s.ctx.yield_(3)
     assert s.state.view is before
@@ -482,7 +493,7 @@ def leave_settings(s: Session) -> None:
     s.menu("Window", "Light theme")
     s.menu("Window", "Display")
     s.ctx.yield_(3)
-    s.ctx.key_press(imgui.Key.tab)  # hidden at the end, there again the next time
+    s.ctx.key_press(imgui.Key.f11)  # hidden at the end, there again the next time
     s.settle()
     assert s.state.size[0] == 860
 

@@ -255,7 +255,9 @@ def draw_unsaved(viewer: Viewer) -> None:
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_saved_settings
     if not imgui.begin_popup_modal(UNSAVED, None, flags)[0]:
         return
-    if leaving is not None:
+    if leaving is not None and leaving.film:
+        _wait_for_film(viewer)
+    elif leaving is not None:
         count = int(viewer.state.selection.marks.deleted.sum())
         moved = " and some transformed" if viewer.state.selection.moves else ""
         imgui.text_unformatted(f"{count:,} Gaussians were deleted{moved}, and the scene is not saved so.")
@@ -271,6 +273,20 @@ def draw_unsaved(viewer: Viewer) -> None:
     if viewer.state.selection.leaving is None:
         imgui.close_current_popup()
     imgui.end_popup()
+
+
+def _wait_for_film(viewer: Viewer) -> None:
+    work = viewer.recorder.current
+    if work is None:
+        selecting.discard_and_leave(viewer)
+        return
+    imgui.text_unformatted("The window closes once this is written.")
+    imgui.progress_bar(work[1], ImVec2(-1, 0), work[0])
+    if imgui.button("Stop it, and close"):
+        selecting.end_at_once(viewer)
+    imgui.same_line()
+    if imgui.button("Stay"):
+        selecting.stay(viewer)
 
 
 # The panel "Train".

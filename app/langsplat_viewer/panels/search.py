@@ -31,9 +31,14 @@ def _box(viewer: Viewer) -> None:
     if queries.take_search_focus(viewer):
         imgui.set_keyboard_focus_here()
     flags = imgui.InputTextFlags_.enter_returns_true | imgui.InputTextFlags_.callback_history
+    completion = queries.completion(viewer)
+    if completion:
+        flags |= imgui.InputTextFlags_.callback_completion  # else Tab goes on to the next widget
 
     def recalled(data: imgui.InputTextCallbackData) -> int:
-        text = queries.recall(viewer, -1 if data.event_key == imgui.Key.up_arrow else 1)
+        text = completion
+        if data.event_flag == imgui.InputTextFlags_.callback_history:
+            text = queries.recall(viewer, -1 if data.event_key == imgui.Key.up_arrow else 1)
         data.delete_chars(0, data.buf_text_len)
         data.insert_chars(0, text)
         return 0
