@@ -366,8 +366,8 @@ def with_preset(config: TrainConfig, preset: TrainPreset) -> TrainConfig:
 
 
 @dataclass(frozen=True)
-class CompactConfig:
-    """Settings of `langsplat compact`: the error allowed, and the views it is measured on."""
+class BudgetConfig:
+    """An error that is allowed, and the views it is measured on."""
 
     max_psnr_loss: Decibels = 0.1  # dB, mean over the measuring views; nothing that loses more is written
     views: SeveralCount = 96
@@ -375,7 +375,20 @@ class CompactConfig:
     max_side: Side = 800  # images are drawn with at most this many pixels on their longer side
     # dB that the scene is assumed to have where no photographs are given: higher is more cautious
     assumed_psnr: Annotated[float, Range(0.0, 200.0, above=True)] = 35.0
+
+
+@dataclass(frozen=True)
+class CompactConfig(BudgetConfig):
+    """Settings of `langsplat compact`: the error allowed, and the views it is measured on."""
+
     phrases: tuple[str, ...] = ()  # asked before and after, beside those in the scene's phrasebook
+
+
+@dataclass(frozen=True)
+class CleanConfig(BudgetConfig):
+    """Settings of `langsplat clean`: the error allowed, its views, and what may be a floater."""
+
+    region: Count = 100  # Gaussians: a larger connected region is no floater
 
 
 Display = Literal["rgb", "latent", "tree", "relevancy", "segmentation", "depth", "alpha"]

@@ -62,6 +62,7 @@ class Canvas:
         self._textures: dict[Key, moderngl.Texture] = {}
         self.phase: Phase = "still"
         self._view: OrbitCamera | None = None
+        self._moving: object = None  # what a gizmo does
         self._moved = -1e9  # when the view last changed, seconds
         self._tried: RenderRequest | None = None  # the last one that was drawn, if only in vain
         self._shown: RenderRequest | None = None  # what the textures show
@@ -80,9 +81,9 @@ class Canvas:
             self._background.drop()
             self.phase = "still"
             return False
-        if state.view is not self._view:
+        if state.view is not self._view or state.moving is not self._moving:
             self._moved = now if self._view is not None else self._moved
-            self._view = state.view
+            self._view, self._moving = state.view, state.moving
         request = state.request().without_line()
         self._pace.expect(len(state.scene.gaussians))
         moving = now - self._moved < REST_SECONDS

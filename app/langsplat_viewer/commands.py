@@ -1,16 +1,26 @@
 """Everything that can be done with one key or one click: one table, from which the menus, the keys, the list
 of keys and the list of commands are made."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from langsplat_core.config import Display
 from langsplat_core.display.displays import DISPLAYS, DisplayRow
 from langsplat_core.scene import LEVELS
-from langsplat_viewer.actions import filming, opening, queries, selecting, settings, undoing, viewpoint
+from langsplat_viewer.actions import (
+    filming,
+    opening,
+    queries,
+    selecting,
+    settings,
+    transforming,
+    undoing,
+    viewpoint,
+)
 from langsplat_viewer.actions.selecting import Part
 from langsplat_viewer.camera.controls import Side, adopt_up, level
+from langsplat_viewer.files.preferences import THEMES, Theme
 from langsplat_viewer.marks import TOOLS, Tool
 from langsplat_viewer.output import saving
 from langsplat_viewer.state import Overlay
@@ -51,6 +61,7 @@ class Command:
     menu: str = ""  # one of MENUS; without one it is found in the list of commands alone
     repeats: bool = False  # while held
     is_edit: bool = False  # belongs to the box while one types, as it does everywhere
+    is_on: Callable[[Viewer], bool] | None = None  # for a check mark in the menu
 
 
 def _show(button: Button) -> Callable[[Viewer], None]:
@@ -64,6 +75,37 @@ def _name(button: Button) -> str:
     )
 
 
+def _is_shown(button: Button) -> Callable[[Viewer], bool]:
+    def shown(viewer: Viewer) -> bool:
+        state, level = viewer.state, button.latent_level
+        return state.picture.display == button.display and level in (None, state.latent_level)
+
+    return shown
+
+
+def _theme(theme: Theme) -> Command:
+    return Command(
+        f"{theme} theme",
+        lambda viewer: settings.set_theme(viewer, theme),
+        menu="Window",
+        is_on=lambda viewer: viewer.state.preferences.theme == theme,
+    )
+
+
+def _letters(scale: float) -> Command:
+    return Command(
+        f"letters of {100 * scale:.0f} %",
+        lambda viewer: settings.set_ui_scale(viewer, scale),
+        menu=LETTERS_MENU,
+        is_on=lambda viewer: abs(viewer.state.preferences.ui_scale - scale) < 1e-6,
+    )
+
+
+def _recent(path: str) -> Command:
+    name = Path(path)
+    return Command(f"open {name.parent.name}/{name.name}", lambda viewer: opening.open_recent(viewer, path))
+
+
 def _panel(title: str) -> Command:
     return Command(f"panel: {title}", lambda viewer: settings.open_panel(viewer, title))
 
@@ -71,7 +113,11 @@ def _panel(title: str) -> Command:
 def _overlay(name: Overlay, title: str) -> Command:
     keys = ("B",) if name == "things" else ()
     return Command(
-        f"show or hide the {title}", lambda viewer: settings.toggle_overlay(viewer, name), keys, "View"
+        f"show or hide the {title}",
+        lambda viewer: settings.toggle_overlay(viewer, name),
+        keys,
+        "View",
+        is_on=lambda viewer: name in viewer.state.preferences.overlays,
     )
 
 
@@ -107,13 +153,16 @@ SIDE_KEYS: tuple[tuple[Side, str], ...] = (
     ("bottom", "Ctrl+Keypad7"),
 )
 PANEL_TITLES = (
-    *("Search", "Scene", "Display", "Camera", "Select", "Train"),
-    *("Record", "Bookmarks", "Messages", "Overlays", "Timing"),
+    *("Search", "Display", "Camera", "Scene", "Select", "Transform"),
+    *("Library", "Train", "Record", "Bookmarks", "Messages", "Overlays", "Timing"),
 )
+LETTERS_MENU = "Size of letters"  # in the menu Window
+UI_SCALES = (0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
 MENUS = ("File", "Edit", "Select", "View", "Camera", "Window", "Help")
 
 COMMANDS: tuple[Command, ...] = (
     Command("open a scene", opening.ask_for_file, ("Ctrl+O",), "File"),
+    Command("search all scenes of a folder", opening.ask_for_library, menu="File"),
     Command("reload the scene", opening.reload, ("F5",), "File"),
     Command(
         "next scene of the list", lambda viewer: opening.step_scene(viewer, 1), ("Ctrl+PageDown",), "File"
@@ -140,9 +189,11 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command("save a film of the path", lambda viewer: filming.save_film(viewer, Path.cwd()), menu="File"),
     Command("save the camera path", lambda viewer: filming.save_path(viewer, Path.cwd()), menu="File"),
+    Command("quit", selecting.quit_viewer, ("Ctrl+Q",), "File"),
     Command("search", queries.focus_search, ("Ctrl+F", "/"), "Edit"),
     Command("undo", undoing.undo, ("Ctrl+Z",), "Edit", repeats=True, is_edit=True),
     Command("redo", undoing.redo, ("Ctrl+Shift+Z", "Ctrl+Y"), "Edit", repeats=True, is_edit=True),
+    Command("gizmo: move, rotate, scale, off", transforming.next_gizmo, ("G",), "Edit"),
     Command("select everything", selecting.select_all, ("Ctrl+A",), "Select", is_edit=True),
     Command("select nothing", selecting.select_none, ("Ctrl+D", "Ctrl+Shift+A"), "Select", is_edit=True),
     Command("invert the selection", selecting.invert_selection, ("Ctrl+I",), "Select", is_edit=True),
@@ -160,7 +211,9 @@ COMMANDS: tuple[Command, ...] = (
     _export("save the rest", "rest"),
     _export("save the scene without what was deleted", "edited"),
     *(
-        Command(_name(button), _show(button), (str(key),) if key < 10 else (), "View")
+        Command(
+            _name(button), _show(button), (str(key),) if key < 10 else (), "View", is_on=_is_shown(button)
+        )
         for key, button in enumerate(BUTTONS, 1)
     ),
     Command("say what is under the cursor", viewpoint.toggle_pointing, ("I",), "View"),
@@ -186,7 +239,10 @@ COMMANDS: tuple[Command, ...] = (
     Command("bookmark this view", viewpoint.add_bookmark, ("Ctrl+B",), "Camera"),
     Command("add a keyframe here", filming.add_keyframe, ("K",), "Camera"),
     Command("play the camera path, or stop", viewpoint.toggle_playing, ("Shift+K",), "Camera"),
-    Command("hide or show the panels", settings.toggle_panel, ("Tab",), "Window"),
+    Command("hide or show the panels", settings.toggle_panel, ("F11",), "Window"),
+    Command("panels as at first", settings.reset_panels, menu="Window"),
+    *(_theme(theme) for theme in THEMES),
+    *(_letters(scale) for scale in UI_SCALES),
     *(_panel(title) for title in PANEL_TITLES),
     Command("find a command", lambda viewer: settings.show_palette(viewer, True), ("Ctrl+Shift+P",), "Help"),
     Command("list of keys", settings.toggle_help, ("F1", "?"), "Help"),
@@ -213,10 +269,10 @@ def with_key(text: str, act: Callable[[Viewer], object]) -> str:
     return f"{text} ({keys[0]})" if keys else text
 
 
-def matching(text: str) -> list[Command]:
-    """The commands whose words hold every word of `text`; all of them for none."""
-    words = text.lower().split()
-    return [command for command in COMMANDS if all(word in command.does.lower() for word in words)]
+def matching(text: str, recent: Sequence[str] = ()) -> list[Command]:
+    """The commands whose words hold every word of `text`; all of them for none. `recent` scenes are some."""
+    words, commands = text.lower().split(), (*COMMANDS, *map(_recent, recent))
+    return [command for command in commands if all(word in command.does.lower() for word in words)]
 
 
 def in_menu(menu: str) -> list[Command]:

@@ -1,11 +1,14 @@
 """The worker thread of the window, and the memory that its process gives back on Linux."""
 
 import ctypes
+import signal
+import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from queue import SimpleQueue
 from typing import Any, TypeVar
@@ -33,6 +36,32 @@ def _in_c_library(name: str, *arguments: object) -> None:
         function = getattr(ctypes.CDLL(None), name, None)  # not every C library has them
         if function is not None:
             function(*arguments)
+
+
+@contextmanager
+def on_signals(wake: Callable[[], None]) -> Iterator[list[int]]:
+    """Within, Ctrl + C and SIGTERM interrupt nothing: their numbers are added to the list, and `wake` is
+    called on another thread, since Python's handlers run only once a sleeping main thread is awake again."""
+    caught: list[int] = []
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+
+    def listen() -> None:
+        while reader.recv(1):
+            wake()
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number in before:
+        signal.signal(number, lambda number, frame: caught.append(number))
+    old = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    threading.Thread(target=listen, name="langsplat-signals", daemon=True).start()
+    try:
+        yield caught
+    finally:
+        signal.set_wakeup_fd(old)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        writer.close()
 
 
 T = TypeVar("T")

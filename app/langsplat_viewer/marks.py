@@ -19,7 +19,8 @@ from langsplat_core.query.selection import (
     on_surface,
     project,
 )
-from langsplat_core.scene import Camera
+from langsplat_core.scene import Camera, Scene
+from langsplat_core.scene.transform import Similarity, transform_scene
 
 # The scene itself is never changed: deleting marks, and what is marked is left out of images and of what is
 # saved. So everything can be undone, and an answer's numbers per Gaussian keep their places.
@@ -102,6 +103,30 @@ def deleting(marks: Marks) -> Marks:
     return Marks(np.zeros_like(marks.selected), marks.hidden, marks.deleted | marks.selected)
 
 
+@dataclass(frozen=True, eq=False)
+class Move:
+    """A transform of the whole scene, or of some of its `count` Gaussians."""
+
+    to: Similarity
+    packed: Array | None  # ceil(count / 8) bytes, a bit each; None: all of them, and the cameras
+    count: int
+
+    def applied(self, scene: Scene) -> Scene:
+        """The scene with it. Raises InputError where it leads too far."""
+        rows = None if self.packed is None else np.unpackbits(self.packed, count=self.count).astype(bool)
+        return transform_scene(scene, self.to, rows)
+
+    def moves_same(self, other: "Move") -> bool:
+        """Return whether both are of the same Gaussians."""
+        if self.packed is None or other.packed is None:
+            return self.packed is other.packed
+        return np.array_equal(self.packed, other.packed)
+
+    def then(self, other: "Move") -> "Move":
+        """Return both as one, where they are of the same."""
+        return replace(self, to=self.to.then(other.to))
+
+
 @dataclass(frozen=True)
 class Stroke:
     """A stroke of the mouse. Places are fractions of the image, (0, 0) its top left corner."""
@@ -112,10 +137,11 @@ class Stroke:
 
 @dataclass(frozen=True, eq=False)
 class Leaving:
-    """An action that waits for the answer whether deletions are to be saved."""
+    """An action that waits for the answer whether deletions are to be saved, or for a film."""
 
     then: Callable[[Any], None]  # takes the `Viewer`
     to: str  # what it does, in words: "the window closes"
+    film: bool = False  # it is done as soon as the recorder is
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +150,8 @@ class Selection:
 
     marks: Marks = field(default_factory=lambda: unmarked(0))
     saved: Array | None = None  # (N,) what was deleted when the scene was last saved; None: not yet
+    moves: tuple[Move, ...] = ()  # transforms so far, since the scene was opened
+    saved_moves: tuple[Move, ...] = ()  # the same when it was last saved
     tool: Tool | None = None  # what a drag in the scene does; None: it turns the camera
     mode: Mode = "replace"
     brush: float = 0.03  # radius, of the image's height, within BRUSHES
@@ -137,14 +165,24 @@ class Selection:
 
     @property
     def is_unsaved(self) -> bool:
-        """True where something was deleted since the scene was opened or saved."""
+        """True where something was deleted or transformed since the scene was opened or saved."""
         deleted = self.marks.deleted
+        if self.moves != self.saved_moves:
+            return True
         return bool(deleted.any()) and (self.saved is None or not np.array_equal(deleted, self.saved))
 
 
 def of_scene(selection: Selection, count: int) -> Selection:
     """For another scene, of `count` Gaussians: the tool and its settings stay."""
-    return replace(selection, marks=unmarked(count), saved=None, stroke=None, leaving=None)
+    return replace(
+        selection,
+        marks=unmarked(count),
+        saved=None,
+        moves=(),
+        saved_moves=(),
+        stroke=None,
+        leaving=None,
+    )
 
 
 # Marks as history keeps them: one bit each, and none for what is not marked at all.

@@ -15,7 +15,9 @@ from langsplat_core.config import LevelChoice, PictureConfig, TrainPreset
 from langsplat_core.display.displays import MAX_QUERIES
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.describe import Pointed, Suggestions
+from langsplat_core.query.finding import Hit
 from langsplat_core.query.instances import Instance
+from langsplat_core.query.library import Library
 from langsplat_core.scene import Camera, Scene
 from langsplat_viewer.camera.controls import Extent, OrbitCamera
 from langsplat_viewer.camera.flight import Flight, Keyframe
@@ -23,7 +25,7 @@ from langsplat_viewer.files.browsing import Listing
 from langsplat_viewer.files.flights import Bookmark
 from langsplat_viewer.files.photographs import Photograph
 from langsplat_viewer.files.preferences import Preferences
-from langsplat_viewer.marks import Selection
+from langsplat_viewer.marks import Move, Selection
 from langsplat_viewer.rendering.depth import UNCLIPPED, Clip
 from langsplat_viewer.rendering.request import (
     EditedScene,
@@ -205,6 +207,17 @@ class EvidenceSheet:
     image: Array  # (H, W, 3) uint8, row 0 on top
 
 
+@dataclass(frozen=True, eq=False)
+class LibraryView:
+    """The scenes of a folder, as the panel "Library" lists them."""
+
+    library: Library
+    phrase: str = ""  # that they are ranked by; "": by name
+    hits: tuple[Hit, ...] = ()  # the first `MOST_HITS` of the ranked
+    said: str = ""  # how many scenes have it, in words
+    thumbnails: Array | None = None  # (H, W, 3) uint8 of the hits listed, one below the other
+
+
 @dataclass(frozen=True)
 class Message:
     """One line of the messages area."""
@@ -255,11 +268,28 @@ class TrainingForm:
     encoder: str = "demo"
 
 
+Gizmo = Literal["off", "move", "rotate", "scale"]
+
+
+@dataclass(frozen=True)
+class EditForm:
+    """Fields of the panel that transforms and crops."""
+
+    gizmo: Gizmo = "off"
+    move: Point = (0.0, 0.0, 0.0)
+    rotate: Point = (0.0, 0.0, 0.0)  # degrees about x, then y, then z
+    scale: float = 1.0
+    low: Point = (-1.0, -1.0, -1.0)  # two opposite corners of the box that is cropped to
+    high: Point = (1.0, 1.0, 1.0)
+
+
 @dataclass(eq=False)
 class SceneState:
     """The part of the state that begins anew with every scene."""
 
     scene: Scene | None = None
+    opened: Scene | None = None  # as its file has it, once something was transformed
+    moving: tuple[Move, Scene] | None = None  # what a gizmo that is held does, and what is seen of it
     path: Path | None = None
     extent: Extent | None = None  # there whenever a scene is
     doubts: tuple[str, ...] = ()  # quality warnings of its training, with the remedies
@@ -307,8 +337,10 @@ class ViewerState(SceneState):
     asked: list[str] = field(default_factory=list)  # what was searched for, the oldest first
     recalled: int = 0  # index into `asked` of the phrase last recalled; its length: none
     focus_input: bool = False  # the query box takes the keyboard at the next frame
+    awaits_keyboard: bool = False  # keys wait until a box has it
 
     training_form: TrainingForm = field(default_factory=TrainingForm)
+    edit_form: EditForm = field(default_factory=EditForm)
     path_typed: str = ""
     messages: list[Message] = field(default_factory=list)
     timing: Timing = field(default_factory=Timing)
@@ -319,9 +351,12 @@ class ViewerState(SceneState):
     show_panel: bool = True  # the panels, as many as are open
     show_help: bool = False
     show_palette: bool = False
+    resets_panels: bool = False  # at the next frame
     palette_typed: str = ""
     browser: Listing | None = None  # the folder that the file browser shows, while it is open
-    picks_folder: bool = False  # it is there to choose the folder of the photographs
+    picks_folder: Literal["", "photographs", "library"] = ""  # what it is there to choose a folder for
+    library: LibraryView | None = None  # scenes of a folder, and what was looked for in them
+    library_typed: str = ""
     preferences: Preferences = field(default_factory=Preferences)
     letters_muted: bool = False  # letters are no keys: they were meant for a box that cannot be typed in
 
@@ -359,7 +394,8 @@ class ViewerState(SceneState):
         assert self.view is not None
         settings = self.settings
         size = size or self.size
-        self._edited = edited_scene(self.scene, self.selection.marks, self._edited)
+        seen = self.scene if self.moving is None else self.moving[1]
+        self._edited = edited_scene(seen, self.selection.marks, self._edited)
         return RenderRequest(
             self._edited,
             self.view.camera(*settings.split.pane_size(size)),

@@ -1,6 +1,7 @@
 """The window. This alone and the panels use hello_imgui and glfw; the rest is in actions."""
 
 import os
+import signal
 import sys
 import warnings
 
@@ -14,7 +15,13 @@ from pathlib import Path
 from imgui_bundle import hello_imgui
 
 from langsplat_core.errors import BackendError, InputError
-from langsplat_viewer.files.preferences import LAYOUT_NAME, Preferences, load_preferences, save_preferences
+from langsplat_viewer.files.preferences import (
+    LAYOUT_NAME,
+    Preferences,
+    fitting_scale,
+    load_preferences,
+    save_preferences,
+)
 from langsplat_viewer.jobs import one_line
 from langsplat_viewer.panels import style
 from langsplat_viewer.state import ViewerState
@@ -29,9 +36,10 @@ from langsplat_viewer import fonts
 from langsplat_viewer.actions import filming, opening, queries, selecting, settings, training, viewpoint
 from langsplat_viewer.canvas import Canvas
 from langsplat_viewer.files.flights import Shelf
-from langsplat_viewer.jobs import give_memory_back, share_one_heap
+from langsplat_viewer.jobs import give_memory_back, on_signals, share_one_heap
 from langsplat_viewer.options import chosen_camera, latent_level
 from langsplat_viewer.panels import layout, navigation, overlays
+from langsplat_viewer.panels.keyboard import Keyboard
 from langsplat_viewer.panels.style import scene_area
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.viewer import Services, Viewer
@@ -61,6 +69,13 @@ def probe_gl() -> tuple[int, int]:
     raise BackendError(f"the display offers no OpenGL 3.3; update the graphics driver, or {hint}")
 
 
+def _screen_height() -> float:
+    """Of the first screen, window units of the size that the system gives them; 0 where that is not known."""
+    monitor = glfw.get_primary_monitor()
+    mode = glfw.get_video_mode(monitor) if monitor else None
+    return mode.size.height / max(glfw.get_monitor_content_scale(monitor)[1], 1.0) if mode else 0.0
+
+
 def _gl_hints(major: int, minor: int) -> None:
     glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, major)
     glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, minor)
@@ -86,11 +101,12 @@ class Remembered:
         written or understood, the reason is said and nothing is kept."""
         params.ini_disable = True
         params.app_window_params.restore_previous_geometry = False
+        self._state.preferences = replace(self._state.preferences, ui_scale=fitting_scale(_screen_height()))
         if self._folder is None:
             return
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._state.preferences = load_preferences(self._folder)
+            self._state.preferences = load_preferences(self._folder, self._state.preferences)
         except (OSError, InputError) as error:
             self._state.say(f"settings are not remembered: {one_line(error)}", is_error=True)
             return
@@ -170,7 +186,8 @@ def open_window(request: WindowRequest, services: Services) -> None:
     """Run until the window is closed. Raises BackendError where there is no display or no OpenGL."""
     share_one_heap()
     window = Window(request, services, lambda ctx: GlRenderer(ctx, request.backend))
-    immapp.run(window.params())
+    with on_signals(glfw.post_empty_event) as window.signals:
+        immapp.run(window.params())
     if window.failure is not None:
         raise window.failure
     if window.is_running:  # they stop for nothing, and libraries wait for them
@@ -187,6 +204,7 @@ class Window:
         self.failure: LangSplatError | None = None  # why the window could not work
         self._request = request
         self._make_renderer = make_renderer
+        self.keyboard = Keyboard(self.viewer.state)
         self._hiding, self._column = layout.Hiding(), layout.Column()
         self._remembered = Remembered(request.settings, self.viewer.state)
         self._canvas: Canvas | None = None
@@ -194,6 +212,8 @@ class Window:
         self._evidence: overlays.EvidenceWindow | None = None
         self._screen: moderngl.Framebuffer | None = None
         self.unfinished = False  # a finer image is due
+        self.signals: list[int] = []  # that the process got
+        self._obeyed = 0  # of them
         self.idles = True  # False for scripts that drive the window and count on its next frame
         self._began = 0.0  # this frame, seconds
         self._frames = AWAKE_FRAMES  # to be drawn whatever happens
@@ -207,10 +227,12 @@ class Window:
         params = hello_imgui.RunnerParams()
         window = params.app_window_params
         window.window_title = TITLE
-        window.window_geometry.size = self._request.size or DEFAULT_SIZE
+        self._remembered.load(params, restore_size=self._request.size is None)
+        scale = self.viewer.state.preferences.ui_scale
+        width, height = DEFAULT_SIZE
+        window.window_geometry.size = self._request.size or (round(scale * width), round(scale * height))
         if self._request.size is not None:
             window.window_geometry.window_size_measure_mode = hello_imgui.WindowSizeMeasureMode.screen_coords
-        self._remembered.load(params, restore_size=self._request.size is None)
         panels = params.imgui_window_params
         panels.default_imgui_window_type = hello_imgui.DefaultImGuiWindowType.provide_full_screen_dock_space
         panels.show_menu_bar, panels.show_menu_app, panels.show_menu_view = True, False, False
@@ -228,6 +250,7 @@ class Window:
         params.callbacks.setup_imgui_style = self._remembered.style
         params.callbacks.show_menus = lambda: layout.draw_menus(self.viewer)
         params.callbacks.post_init = self._start
+        params.callbacks.pre_new_frame = self.keyboard.feed
         params.callbacks.show_gui = self._gui
         params.callbacks.before_imgui_render = self._picture
         params.callbacks.confirm_exit = self._may_close
@@ -255,7 +278,10 @@ class Window:
         self.viewer.watch.wake = glfw.post_empty_event
         self.viewer.watch.start()
         imgui.get_io().config_input_text_cursor_blink = False  # a blinking cursor would be drawn for ever
+        imgui.get_io().config_flags |= imgui.ConfigFlags_.nav_enable_keyboard
         glfw.set_drop_callback(glfw_window_hello_imgui(), self._dropped)  # type: ignore[arg-type]
+        self.keyboard.listen(glfw_window_hello_imgui())
+        settings.open_panel(self.viewer, "Search")  # before what was left over it the last time
         opening.open_scene(self.viewer, self._request.path, self._first_view)
 
     def _first_view(self, viewer: Viewer) -> None:
@@ -291,6 +317,8 @@ class Window:
         if self.failure is not None:  # leaving before a first frame would trip an assertion of hello_imgui
             hello_imgui.get_runner_params().app_shall_exit = True
             return
+        if len(self.signals) > self._obeyed:
+            self._obey()
         if viewer.state.selection.may_close:
             hello_imgui.get_runner_params().app_shall_exit = True
         self._began = time.perf_counter()
@@ -304,6 +332,18 @@ class Window:
         layout.show_wanted(viewer)
         self._title()
         self._remembered.update()
+
+    def _obey(self) -> None:
+        """A signal came: Ctrl + C asks what is to be saved, SIGTERM saves it; a second one ends at once."""
+        self._obeyed, number = len(self.signals), self.signals[-1]
+        if self._obeyed > 1:
+            selecting.end_at_once(self.viewer)
+        elif number == signal.SIGTERM:
+            selecting.end(self.viewer, Path.cwd())
+        else:
+            selecting.quit_viewer(self.viewer)
+            if not self.viewer.state.selection.may_close:
+                print("asked in the window; Ctrl + C again ends at once", file=sys.stderr)
 
     def _pace(self) -> None:
         """Say how soon the next frame is wanted: at once only while something moves or has just changed."""
@@ -322,6 +362,7 @@ class Window:
             (self.unfinished and not awaits)
             or state.glide is not None
             or state.record.began is not None
+            or self.keyboard.is_waiting
             or self._frames > 0
         )
         idling.enable_idling = self.idles and (self.is_minimised() or not busy)

@@ -22,7 +22,7 @@ from langsplat_core.progress import Progress
 from langsplat_core.scene import LEVELS, Camera, look_at
 
 POINTS = 20_000  # sparse points, as structure from motion would give
-_FIRST_ROOM = 2_000_000  # the demo encoder was trained in rooms of lower numbers only
+FIRST_ROOM = 2_000_000  # the demo encoder was trained in rooms of lower numbers only
 LIGHT_SAMPLES = 40  # rays per vertex towards the lamp, and again towards the sky
 LIGHT_CELL = 0.006  # metres between the places where light is gathered, where it varies
 _POINT_NOISE = 0.004  # metres, standard deviation
@@ -51,22 +51,24 @@ def write_dataset(
     progress: Progress,
     tier: Tier = "clutter",
     naming: Naming = PLAIN,
+    world: World | None = None,
 ) -> None:
     """Render the room of `seed` and difficulty `tier` into folder `out`.
 
     views: number of photographs, >= 4; size: (width, height) in pixels, at least 16 each; naming: of the
-    photographs. Written are images/view_000.png ..., points.ply, truth/view_000.npz (`ids`: (3, H, W) int32
-    label ids at subpart, part and whole level, -1 where there is nothing; `depth`: (H, W) float32 metres
-    along the camera's z), truth/labels.json (id -> level, word, thing, colour, phrase, words) and, last,
-    transforms.json in nerfstudio's convention (OpenGL camera-to-world), marked as "drawn". A view counts as
-    done when its truth file is there, so an interrupted call goes on where it stopped. Raises InputError for
-    a size or number out of range.
+    photographs; world: what the cameras and points of `seed` show, in place of its own room. Written are
+    images/view_000.png ..., points.ply, truth/view_000.npz (`ids`: (3, H, W) int32 label ids at subpart, part
+    and whole level, -1 where there is nothing; `depth`: (H, W) float32 metres along the camera's z),
+    truth/labels.json (id -> level, word, thing, colour, phrase, words) and, last, transforms.json in
+    nerfstudio's convention (OpenGL camera-to-world), marked as "drawn". A view counts as done when its truth
+    file is there, so an interrupted call goes on where it stopped. Raises InputError for a size or number out
+    of range.
     """
     if views < 4 or min(size) < 16:
         raise InputError(
             f"demo dataset: {views} views of {size[0]}x{size[1]}: it needs at least 4 views of 16x16"
         )
-    world = photographed_room(seed, tier)
+    world = photographed_room(seed, tier) if world is None else world
     cameras = [
         replace(camera, name=naming.stem.format(naming.first + k))
         for k, camera in enumerate(orbit_cameras(views, size, seed))
@@ -87,7 +89,7 @@ def write_dataset(
 
 def photographed_room(seed: int, tier: Tier = "clutter") -> World:
     """The room that `write_dataset` photographs; the demo encoder has never seen one of them."""
-    return build_room(_FIRST_ROOM + seed, tier)
+    return build_room(FIRST_ROOM + seed, tier)
 
 
 def truth_ids(world: World, picture: Picture) -> Array:

@@ -20,7 +20,7 @@ from typing import TypeVar
 import numpy as np
 
 from langsplat_core.arrays import Array, mean_squared_error, psnr
-from langsplat_core.config import CompactConfig, DatasetConfig, check_settings
+from langsplat_core.config import BudgetConfig, CompactConfig, DatasetConfig, check_settings
 from langsplat_core.datasets import load_capture
 from langsplat_core.errors import InputError
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
@@ -57,7 +57,7 @@ class Views:
     origin: str  # where they come from, for the report
 
 
-def choose_views(scene: Scene, photos: Path | None, config: CompactConfig, progress: Progress) -> Views:
+def choose_views(scene: Scene, photos: Path | None, config: BudgetConfig, progress: Progress) -> Views:
     """The cameras of the photographs, else of the scene, else a ring around it; at most ``config.views``.
 
     Photographs that the scene was not trained on, if there are any, all measure; otherwise every
@@ -99,7 +99,7 @@ def ring_cameras(scene: Scene, count: int) -> list[Camera]:
     return cameras
 
 
-def _photographed(scene: Scene, photos: Path, config: CompactConfig, progress: Progress) -> Views:
+def _photographed(scene: Scene, photos: Path, config: BudgetConfig, progress: Progress) -> Views:
     with tempfile.TemporaryDirectory() as work:  # for points that may have to be found, and that are not used
         settings = DatasetConfig(max_side=config.max_side, allow_few_cameras=True)  # only looked through
         capture = load_capture(photos, settings, Path(work), progress)

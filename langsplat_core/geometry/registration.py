@@ -12,11 +12,15 @@ from langsplat_core.progress import Progress, silent
 from langsplat_core.raster.cpu.rasterizer import CpuRasterizer
 from langsplat_core.scene import Camera, Scene
 
-SAMPLES = 60_000  # points of each surface
+SAMPLES = 40_000  # points of each surface
 ROUGH, FINE = 0.06, 0.03  # of the fixed scene's radius: spacing of points for features, and for ICP
 TRIES = 50_000  # of RANSAC
-# RANSAC is begun anew so often; where the scale is open, from these times the ratio of the scenes' radii.
-STARTS = (1.0, 1.0, 0.8, 1.25)
+AGAIN = 2  # times RANSAC is begun
+SIZES = (
+    1.0,
+    0.8,
+    1.25,
+)  # times the ratio of the scenes' radii, from which it is begun where the scale is open
 VIEWS, SIDE = 8, 120  # cameras of either scene that check it, and pixels of their longer side
 ALIKE = 0.05  # of the depth: surfaces that are no farther apart are the same
 TRUSTED = 0.7  # of the pixels that both scenes fill, from which two scenes are one place
@@ -57,13 +61,14 @@ def register(
         unit, scaled = moving.metres_per_unit / fixed.metres_per_unit, False
     elif scaled:
         unit = fixed.bounds()[1] / moving.bounds()[1]
+    turns = quarter_turns(fixed)
     radius = fixed.bounds()[1]
     mine, theirs = (sample_surface(scene.gaussians, SAMPLES, seed)[0] for scene in (moving, fixed))
     best: Registration | None = None
-    for start, factor in enumerate(STARTS):
-        progress(STAGE, start / len(STARTS))
-        size = unit * factor if scaled else unit
-        matrix, rmse = _aligned(size * mine, theirs, radius, scaled, seed + start)
+    sizes = [unit * factor for factor in SIZES] if scaled else [unit] * AGAIN
+    for start, size in enumerate(sizes):
+        progress(STAGE, start / len(sizes))
+        matrix, rmse = _aligned(size * mine, theirs, turns, radius, scaled, seed + start)
         found = Registration(matrix @ np.diag([size, size, size, 1.0]), rmse, 0.0)
         found = replace(found, agreement=agreement(moving, fixed, found.transform))
         if best is None or found.agreement > best.agreement:
@@ -75,8 +80,25 @@ def register(
     return best
 
 
-def _aligned(moving: Array, fixed: Array, radius: float, scaled: bool, seed: int) -> tuple[Array, float]:
-    """(4, 4) that lays points (P, 3) onto others, and the error of those that lie on each other."""
+def quarter_turns(scene: Scene) -> list[Array]:
+    """Four (4, 4) rotations about up through the middle of a scene: rooms are nearly alike from all sides."""
+    centre, up = scene.bounds()[0], scene.up()
+    cross = np.cross(np.eye(3), up).T  # cross @ x = up x x
+    made = []
+    for quarter in range(4):
+        sine, cosine = np.sin(np.pi / 2 * quarter), np.cos(np.pi / 2 * quarter)
+        turn = np.eye(4)
+        turn[:3, :3] += sine * cross + (1 - cosine) * cross @ cross
+        turn[:3, 3] = centre - turn[:3, :3] @ centre
+        made.append(turn)
+    return made
+
+
+def _aligned(
+    moving: Array, fixed: Array, turns: list[Array], radius: float, scaled: bool, seed: int
+) -> tuple[Array, float]:
+    """(4, 4) that lays points (P, 3) onto others, and the error of those that lie on each other. turns:
+    (4, 4) each, tried after RANSAC."""
     import open3d
 
     methods = open3d.pipelines.registration
@@ -94,7 +116,7 @@ def _aligned(moving: Array, fixed: Array, radius: float, scaled: bool, seed: int
         methods.CorrespondenceCheckerBasedOnDistance(1.5 * voxel),
     ]
     until = methods.RANSACConvergenceCriteria(TRIES, 0.999)
-    result = methods.registration_ransac_based_on_feature_matching(
+    rough = methods.registration_ransac_based_on_feature_matching(
         *clouds, *features, True, 1.5 * voxel, estimate, 3, checks, until
     )
     voxel = FINE * radius
@@ -103,9 +125,15 @@ def _aligned(moving: Array, fixed: Array, radius: float, scaled: bool, seed: int
     if not scaled:
         estimate = methods.TransformationEstimationPointToPlane()
         clouds[1].estimate_normals(near)
-    for reach in (3.0, 1.0):
-        result = methods.registration_icp(*clouds, reach * voxel, result.transformation, estimate)
-    return np.asarray(result.transformation, np.float64), float(result.inlier_rmse)
+    found = []
+    for turn in turns:
+        matrix = turn @ rough.transformation
+        for reach in (3.0, 1.0):
+            result = methods.registration_icp(*clouds, reach * voxel, matrix, estimate)
+            matrix = result.transformation
+        found.append((float(result.inlier_rmse) / max(float(result.fitness), 1e-9), result))
+    best = min(found, key=lambda one: one[0])[1]
+    return np.asarray(best.transformation, np.float64), float(best.inlier_rmse)
 
 
 def moved_camera(camera: Camera, transform: Array) -> tuple[Camera, float]:

@@ -2,9 +2,9 @@
 desktop entry and the tests of round trips and damaged files read; and a scene's companions.
 
 A scene is `scene.ply` with, beside it, `scene.langsplat.safetensors` and `scene.cameras.json`, either of
-which may be absent. The same companions are looked for beside a compressed PLY, a SOG folder or a .sog. Those
-of `scene.spz`, `.splat` and `.ksplat` keep its suffix, `scene.spz.langsplat.safetensors`: the sidecar knows
-the rounded positions of that file, so that it could not serve a `scene.ply` in the same folder.
+which may be absent. The same companions are looked for beside a compressed PLY or a SOG folder. Those of
+`scene.spz`, `.sog`, `.splat` and `.ksplat` keep its suffix, `scene.spz.langsplat.safetensors`: the sidecar
+knows the rounded positions of that file, so that it could not serve a `scene.ply` in the same folder.
 """
 
 import logging
@@ -24,7 +24,7 @@ from langsplat_core.io.files import atomic_path, check_output_file
 from langsplat_core.io.hostile import exists
 from langsplat_core.io.language import read_language, write_language
 from langsplat_core.io.ply import metres_comment, read_ply_scene, write_ply
-from langsplat_core.io.sog import META_NAME, read_sog_scene
+from langsplat_core.io.sog import META_NAME, read_sog_scene, write_sog
 from langsplat_core.io.splat import read_ksplat, read_splat, write_splat
 from langsplat_core.io.spz import read_spz_scene, write_spz
 from langsplat_core.scene import Gaussians, Scene
@@ -75,7 +75,14 @@ FORMATS = (
         own_companions=True,
     ),
     SceneFormat(".ksplat", lambda path: Scene(read_ksplat(path)), own_companions=True),
-    SceneFormat(".sog", read_sog_scene, folder_file=META_NAME),
+    SceneFormat(
+        ".sog",
+        read_sog_scene,
+        lambda path, scene: write_sog(path, scene.gaussians, scene.antialiased),
+        loses=("precision", "metres per unit", "extra properties"),
+        own_companions=True,
+        folder_file=META_NAME,
+    ),
 )
 WRITABLE = tuple(row.suffix for row in FORMATS if row.write is not None)
 SUPPORTED = ", ".join(
@@ -211,9 +218,9 @@ def save_scene(path: Path | str, scene: Scene) -> None:
 
 
 def companion_path(scene: Path | str, suffix: str) -> Path:
-    """Return where the companion of a scene that ends in `suffix` lies: `a/b.ply` or .sog -> `a/b<suffix>`; a
-    SOG folder `a/b` (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder; `a/b.spz`, .splat or .ksplat ->
-    `a/b.spz<suffix>` and so on."""
+    """Return where the companion of a scene that ends in `suffix` lies: `a/b.ply` -> `a/b<suffix>`; a SOG
+    folder `a/b` (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder; `a/b.spz`, .sog, .splat or .ksplat
+    -> `a/b.spz<suffix>` and so on."""
     scene = Path(scene)
     if any(row.folder_file and scene.name == row.folder_file for row in FORMATS):
         scene = scene.parent

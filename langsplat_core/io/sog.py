@@ -1,4 +1,4 @@
-"""Reading SOG version 2 (PlayCanvas "spatially ordered Gaussians"): images of quantised columns.
+"""SOG version 2 (PlayCanvas "spatially ordered Gaussians"): images of quantised columns.
 
 `meta.json` names the images; they lie beside it in a folder, or with it in one `.sog` (zip). Pixel i, row
 by row, belongs to Gaussian i:
@@ -17,14 +17,19 @@ Opacities of 0 and 1 become logits of -infinity and +infinity. `model: "antialia
 PlayCanvas' public specification.
 """
 
+import io
+import json
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
-from langsplat_core.arrays import Array, logit
+from langsplat_core.arrays import Array, logit, sigmoid, unit
 from langsplat_core.errors import FormatError, quoted
+from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import Archive, open_for_reading, opened, opened_archive, parse_json
 from langsplat_core.io.ply import smallest_three
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
@@ -202,3 +207,139 @@ class _Meta:
 def _is_finite_number(value: Any) -> bool:
     # Python's integers have no limit: one beyond float64 must not reach NumPy
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
+
+
+# Writing: one `.sog` file, rows in their order.
+
+CODES = 256  # entries of a codebook
+ROUNDS = 30  # of Lloyd's algorithm for one
+MOST_ENTRIES = 65536  # of the palette of higher coefficients
+
+
+def write_sog(path: Path | str, gaussians: Gaussians, antialiased: bool = False) -> None:
+    """Write a bundled .sog, atomically; rows keep their order.
+
+    Positions are rounded to 1/65535 of the scene's extent in sign(x) log(1 + |x|), quaternions and opacities
+    to 1/255; scales, colours and higher coefficients to the nearest of 256 values each, chosen for the
+    scene; with more than 65536 Gaussians the higher coefficients of several are one entry of a palette. A row
+    that cannot be drawn is written with opacity 0.
+    """
+    valid = gaussians.valid()
+    count = len(gaussians)
+    side = max(int(np.ceil(np.sqrt(count))), 1)
+    images: dict[str, Array] = {}
+
+    def plane(name: str, codes: Array) -> str:
+        pixels = np.zeros((-(-max(count, 1) // side) * side, 4), np.uint8)
+        pixels[:, 3] = 255
+        pixels[:count, : codes.shape[1]] = codes
+        images[name] = pixels.reshape(-1, side, 4)
+        return name
+
+    means = np.where(valid[:, None], gaussians.means, 0).astype(np.float64)
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    low, high = (reduced(logs[valid], axis=0) if valid.any() else np.zeros(3) for reduced in (np.min, np.max))
+    spans = np.where(high > low, high - low, 1)
+    whole = np.rint(((logs - low) / spans).clip(0, 1) * 65535).astype(np.uint32)
+    scales = np.where(valid[:, None], gaussians.log_scales, 0).astype(np.float64).clip(LEAST_SCALE)
+    scale_codes, scale_book = _coded(scales, valid)
+    colours = np.where(valid[:, None, None], gaussians.sh, 0).astype(np.float64)
+    base_codes, base_book = _coded(colours[:, 0], valid)
+    opacities = np.where(valid, sigmoid(gaussians.opacity_logits.astype(np.float64)), 0)
+    meta: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": "langsplat-viewer"},
+        "count": count,
+        "means": {
+            "mins": low.tolist(),
+            "maxs": high.tolist(),
+            "files": [plane("means_l.webp", whole & 255), plane("means_u.webp", whole >> 8)],
+        },
+        "scales": {"codebook": scale_book.tolist(), "files": [plane("scales.webp", scale_codes)]},
+        "quats": {"files": [plane("quats.webp", _quaternion_codes(gaussians.quats_wxyz, valid))]},
+        "sh0": {
+            "codebook": base_book.tolist(),
+            "files": [
+                plane("sh0.webp", np.concatenate([base_codes, np.rint(255 * opacities)[:, None]], axis=1))
+            ],
+        },
+    }
+    if antialiased:
+        meta["antialias"] = True
+    if gaussians.sh_degree and valid.any():
+        entry, palette = _palette(colours[:, 1:].reshape(count, -1), valid)
+        codes, book = _coded(palette, np.ones(len(palette), bool))
+        coefficients = colours.shape[1] - 1
+        rows = -(-len(palette) // PALETTE_ROW)
+        table = np.full((rows * PALETTE_ROW, coefficients, 4), 255, np.uint8)
+        table[: len(palette), :, :3] = codes.reshape(len(palette), coefficients, 3)
+        images["shN_centroids.webp"] = table.reshape(rows, PALETTE_ROW * coefficients, 4)
+        labels = np.stack([entry & 255, entry >> 8], axis=1)
+        meta["shN"] = {
+            "count": len(palette),
+            "bands": gaussians.sh_degree,
+            "codebook": book.tolist(),
+            "files": ["shN_centroids.webp", plane("shN_labels.webp", labels)],
+        }
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for name, pixels in images.items():
+            encoded = io.BytesIO()
+            Image.fromarray(pixels).save(encoded, "WEBP", lossless=True, exact=True, quality=100)
+            archive.writestr(zipfile.ZipInfo(name), encoded.getvalue())
+        archive.writestr(zipfile.ZipInfo(META_NAME), json.dumps(meta))
+
+
+LEAST_SCALE = -30.0  # logarithm: a flat axis
+
+
+def _quaternion_codes(quats: Array, valid: Array) -> Array:
+    """(N, 4) uint8: the three smaller components, and 252 plus the number of the largest."""
+    turns = unit(np.where(valid[:, None], quats, [1, 0, 0, 0]).astype(np.float64))
+    largest = np.abs(turns).argmax(1)
+    turns *= np.where(turns[np.arange(len(turns)), largest] < 0, -1, 1)[:, None]
+    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
+    three = np.take_along_axis(turns, others, axis=1)
+    codes = np.rint((three / np.sqrt(2) + 0.5) * 255).clip(0, 255)
+    return np.concatenate([codes, 252 + largest[:, None]], axis=1).astype(np.uint8)
+
+
+def _coded(values: Array, counts: Array) -> tuple[Array, Array]:
+    """(N, C) uint8 codes, and the (256,) rising values that they stand for: those with the least squared
+    error over the rows that count, by Lloyd's algorithm in one dimension."""
+    known = np.sort(values[counts].ravel())
+    if len(known) == 0:
+        return np.zeros(values.shape, np.uint8), np.zeros(CODES)
+    sums = np.concatenate([[0.0], np.cumsum(known)])
+    # Half of the first values by how many there are, half evenly over their range: tails count too.
+    even = np.linspace(known[0], known[-1], CODES // 2)
+    book = np.sort(np.concatenate([np.quantile(known, np.linspace(0, 1, CODES - len(even))), even]))
+    for _ in range(ROUNDS):
+        edges = np.concatenate([[0], np.searchsorted(known, (book[1:] + book[:-1]) / 2), [len(known)]])
+        sizes = np.diff(edges)
+        book = np.sort(np.where(sizes > 0, np.diff(sums[edges]) / np.maximum(sizes, 1), book))
+    codes = np.searchsorted((book[1:] + book[:-1]) / 2, values)
+    return codes.astype(np.uint8), book
+
+
+def _palette(values: Array, counts: Array) -> tuple[Array, Array]:
+    """(N,) number of a palette entry, and (P, D) entries: every row that counts its own while there is room,
+    else the means of groups that are halved where they vary most (median cut)."""
+    rows = np.flatnonzero(counts)
+    group = np.zeros(len(values), np.int64)
+    if len(rows) <= MOST_ENTRIES:
+        group[rows] = np.arange(len(rows))
+        return group, values[rows]
+    own = np.zeros(len(rows), np.int64)
+    for _ in range(int(np.log2(MOST_ENTRIES))):
+        sizes = np.bincount(own)
+        centres, squares = (
+            np.stack([np.bincount(own, column) for column in powers.T], 1) / sizes[:, None]
+            for powers in (values[rows], values[rows] ** 2)
+        )
+        axis = (squares - centres**2).argmax(1)[own]
+        above = values[rows, axis] > centres[own, axis]
+        own = np.unique(2 * own + above, return_inverse=True)[1]
+    sizes = np.bincount(own)
+    entries = np.stack([np.bincount(own, column) for column in values[rows].T], 1) / sizes[:, None]
+    group[rows] = own
+    return group, entries

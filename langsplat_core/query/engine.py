@@ -329,7 +329,7 @@ class QueryEngine:
         canonical = np.asarray(encoder.encode_texts(list(CANONICAL_PHRASES)), np.float64)
         assert self.scene.language is not None
         own = self.scene.language.canonical
-        if not _same(canonical, own):
+        if not same_vectors(canonical, own):
             raise EncoderError(
                 f"the scene was made with other weights of {self.field.encoder_id}; give those with "
                 "--encoder, or make the scene again"
@@ -458,14 +458,14 @@ class QueryEngine:
 
 def check_words(field: LanguageField, words: Words) -> None:
     """EncoderError unless taught words are of the encoder of a field, whatever its folder is called."""
-    if not _same(words.canonical, field.canonical):
+    if not same_vectors(words.canonical, field.canonical):
         raise EncoderError(
             f"these words were taught with {words.encoder_id}, the scene was made with {field.encoder_id}; "
             "teach them in a scene of that encoder"
         )
 
 
-def _same(canonical: Array, own: Array) -> bool:
+def same_vectors(canonical: Array, own: Array) -> bool:
     """Whether canonical vectors are of one encoder."""
     return canonical.shape == own.shape and bool(
         ((canonical.astype(np.float64) * own).sum(1) >= SAME_ENCODER).all()

@@ -40,6 +40,14 @@ def in_box(means: Array, low: Array, high: Array) -> Array:
     return inside
 
 
+def above_plane(means: Array, normal: Array, offset: float) -> Array:
+    """(N, 3) -> (N,) bool: on the side of a plane that its `normal` (3,) points to, itself included.
+    offset: of its points along the normal as it is given. A mean that is not finite is nowhere."""
+    with np.errstate(invalid="ignore"):
+        above: Array = np.asarray(means, np.float64) @ np.asarray(normal, np.float64) >= offset
+        return above & np.isfinite(means).all(1)
+
+
 def at_point(surface: Surface, regions: Regions, level: int, point: Array) -> Array:
     """(N,) bool: the whole region, at a level (index into LEVELS), of what lies nearest to `point` (3,),
     world units, with the faint ones beside it. Nothing where the scene has no surface."""

@@ -267,5 +267,6 @@ def rotated_harmonics(sh: Array, rotation: Array) -> Array:
         span = slice(order**2, (order + 1) ** 2)
         for first in range(0, len(sh), BLOCK):
             part = slice(first, first + BLOCK)
-            turned[part, span] = np.einsum("ij,njc->nic", matrix, sh[part, span].astype(np.float64))
+            by_channel = sh[part, span].swapaxes(1, 2).astype(np.float64)
+            turned[part, span] = (by_channel @ matrix.T).swapaxes(1, 2)
     return turned

@@ -1,10 +1,14 @@
-"""`python -m tests.benchmarks rooms|verdicts|taught|phrases|votes|lifting|scale`: one report each."""
+"""`python -m tests.benchmarks NAME`: one report each, of those in `parse`."""
 
 import sys
 from typing import Union
 
 from langsplat_core.cli.run import Command, main, parsed, with_codec
+from tests.benchmarks.changed import Changed
+from tests.benchmarks.clean import Clean
+from tests.benchmarks.library import Found
 from tests.benchmarks.lifting import Lifting
+from tests.benchmarks.maps import Maps
 from tests.benchmarks.phrases import Phrases
 from tests.benchmarks.rooms import Rooms
 from tests.benchmarks.scale import Scale
@@ -18,7 +22,7 @@ PROGRAM = "python -m tests.benchmarks"
 def parse(args: list[str]) -> Command:
     """The report that the words of a command line name; SystemExit as tyro raises it."""
     about = "Measure this project where the truth is known, and at large sizes."
-    known = (Rooms, Verdicts, Taught, Phrases, Votes, Lifting, Scale)
+    known = (Rooms, Verdicts, Taught, Phrases, Votes, Clean, Maps, Lifting, Scale, Found, Changed)
     reports = tuple(with_codec(report, args) for report in known)
     command: Command = parsed(PROGRAM, Union[(*reports,)], args, about)
     return command

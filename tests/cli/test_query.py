@@ -409,7 +409,7 @@ def test_words_for_a_gaussian_a_thing_and_a_pixel(described, capsys):
         ("select a.ply mug --as hull --remove", "--as hull"),
         ("select a.ply mug --as hull --out b.stl", ".ply or .obj"),
         ("select a.ply mug --as points --out b.spz", "written as .ply"),
-        ("select a.ply mug --out b.sog", "scenes are written as"),
+        ("select a.ply mug --out b.obj.gz", "scenes are written as"),
         ("select a.ply mug --out a.ply", "would replace the original"),
         ("select a.ply mug --out there/b.ply", "there: no such folder for b.ply"),
         ("select a.ply mug --scale 0", "--scale 0"),

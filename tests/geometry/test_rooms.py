@@ -9,7 +9,7 @@ from langsplat_core.errors import InputError
 from langsplat_core.geometry import registration
 from langsplat_core.geometry.planes import find_room
 from langsplat_core.geometry.points import FEWEST, sample_surface
-from langsplat_core.geometry.registration import agreement, moved_camera, register
+from langsplat_core.geometry.registration import agreement, moved_camera, quarter_turns, register
 from langsplat_core.scene import Scene
 from tests.support.box_rooms import FLOOR, WALL, box_room, moved
 from tests.support.scenes import random_gaussians
@@ -93,6 +93,18 @@ def test_a_capture_is_laid_onto_another(quick, scale, scaled):
     assert found.agreement > 0.9
     assert np.linalg.norm(off - np.eye(4)) < 0.03
     assert found.scale == pytest.approx(1 / scale, rel=0.01)
+
+
+def test_quarter_turns_are_rotations_about_the_middle():
+    scene = box_room()
+    centre, up = scene.bounds()[0], scene.up()
+    turns = quarter_turns(scene)
+    for quarter, turn in enumerate(turns):
+        np.testing.assert_allclose(turn[:3, :3] @ turn[:3, :3].T, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(turn[:3, :3] @ centre + turn[:3, 3], centre, atol=1e-12)
+        np.testing.assert_allclose(turn[:3, :3] @ up, up, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.matrix_power(turns[1], quarter), turn, atol=1e-12)
+    assert np.trace(turns[1][:3, :3]) == pytest.approx(1)
 
 
 def test_metres_decide_the_scale(quick):

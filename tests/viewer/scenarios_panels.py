@@ -18,7 +18,7 @@ from langsplat_viewer.actions import filming, opening, settings, viewpoint
 from langsplat_viewer.files.flights import read_flight
 from langsplat_viewer.panels.layout import PANELS
 from langsplat_viewer.panels.style import scene_area
-from tests.support.fakes import CENTRES, as_trained, blob_scene
+from tests.support.fakes import CENTRES, PER_BLOB, as_trained, blob_scene, cameras, named_scene
 
 
 def reload_what_changed(s: Any) -> None:
@@ -128,6 +128,37 @@ def switch_between_scenes(s: Any) -> None:
     assert s.state.path.name == "blobs.ply"
 
 
+def search_a_library(s: Any) -> None:
+    """The panel lists the scenes of a folder; a phrase ranks them, a click opens one and asks it there."""
+    viewer = s.window.viewer
+    save_scene(s.folder / "deep" / "named.ply", replace(named_scene(), path=None))
+    fewer = named_scene().take(np.arange(3 * PER_BLOB) < PER_BLOB)
+    save_scene(s.folder / "deep" / "mug.ply", replace(fewer, cameras=cameras()))
+    settings.open_panel(viewer, "Library")
+    s.ctx.yield_(3)
+    s.ctx.item_click("//Library/Folder ...")
+    s.ctx.yield_(4)
+    opening.type_path(viewer, "deep")
+    opening.open_typed(viewer)
+    s.ctx.yield_(3)
+    s.ctx.item_click("//**/Take this folder")
+    s.wait(lambda: s.state.library is not None)
+    s.settle()
+    assert len(s.state.library.hits) == 2
+    s.shot("library")
+    opening.ask_library(viewer, "plant")
+    s.wait(lambda: s.state.library.phrase == "plant")
+    s.settle()
+    assert [hit.path.name for hit in s.state.library.hits] == ["named.ply", "mug.ply"]
+    assert [hit.verdict for hit in s.state.library.hits] == ["found", "not here"]
+    s.shot("ranked")
+    s.ctx.item_click("//**/$$0/##scene")
+    s.wait(lambda: s.state.path.name == "named.ply")
+    s.settle()
+    assert s.state.queries[0].phrase == "plant"
+    assert s.state.queries[0].result.found
+
+
 TRAINS = """
 import json, sys, time
 for step in range(60):
@@ -211,6 +242,7 @@ FILES: dict[str, Scenario] = {
     "fade_in_a_photograph": (fade_in_a_photograph, "blobs.ply", {}),
     "see_the_evidence": (see_the_evidence, "blobs.ply", {}),
     "switch_between_scenes": (switch_between_scenes, "blobs.ply", {}),
+    "search_a_library": (search_a_library, "blobs.ply", {}),
     "watch_a_training": (watch_a_training, "blobs.ply", {}),
     "read_what_speaks_against": (read_what_speaks_against, "blobs.ply", {}),
 }
@@ -277,18 +309,18 @@ def record_and_play(s) -> None:
         s.ctx.key_press(imgui.Key.k)
         s.drag((600, 300), end)
         s.settle()
-    s.ctx.item_click("//**/Add keyframe")
+    s.ctx.item_click("//Record/Add keyframe")
     s.ctx.yield_(2)
     assert [key.seconds for key in record.keyframes] == [0, 2, 4]
     last = s.state.view
-    s.ctx.item_click("//**/Clear")
+    s.ctx.item_click("//Record/Clear")
     s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
     s.ctx.yield_(2)
     assert len(record.keyframes) == 3
 
     filming.set_path_seconds(s.window.viewer, 1.0)
     start = s.shot("start")
-    s.ctx.item_click("//**/Play##path")
+    s.ctx.item_click("//Record/Play##path")
     s.wait(lambda: 0.2 < record.at < 1.0)
     moving = s.state.view
     s.wait(lambda: record.began is None)
@@ -302,7 +334,7 @@ def record_and_play(s) -> None:
     assert record.began is None
     assert np.abs(s.shot("elsewhere") - start)[100:500, 400:].max() > 30
 
-    s.ctx.item_click("//**/Save path")
+    s.ctx.item_click("//Record/Save path")
     s.ctx.yield_(2)
     assert len(read_flight(s.folder / "blobs-001.path.json").keyframes) == 3
     filming.set_film_size(s.window.viewer, 32, 24)

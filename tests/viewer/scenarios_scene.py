@@ -1,6 +1,7 @@
 """Scenarios of `window_driver` over the scene: several panes, overlays, measuring, selecting."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import combinations
 from threading import Event, current_thread
 from typing import Any
@@ -13,13 +14,14 @@ from imgui_bundle.glfw_utils import glfw_window_hello_imgui  # isort: skip
 import glfw  # isort: skip
 from langsplat_core.io.scenes import load_scene
 from langsplat_viewer import canvas
-from langsplat_viewer.actions import queries, selecting, settings, viewpoint
+from langsplat_viewer.actions import queries, selecting, settings, transforming, viewpoint
 from langsplat_viewer.camera.overlays import Label, visible_faces
 from langsplat_viewer.panels import overlays
 from langsplat_viewer.panels.overlays import EDGE
 from langsplat_viewer.panels.style import Area, scene_area
 from langsplat_viewer.rendering.renderer import ArrayChannels
 from langsplat_viewer.rendering.request import TINT
+from langsplat_viewer.state import EditForm
 from tests.support.fakes import CENTRES
 from tests.support.marks_and_flights import marked
 
@@ -487,9 +489,62 @@ def name_what_is_clicked(s: Any) -> None:
     assert marked(s.window.viewer)[0] == "plant"
 
 
+def drag_the_gizmo(s: Any) -> None:
+    """What was found is moved by the gizmo's middle, and seen there; the camera stays. Numbers and the crop
+    box do the rest, and all is undone."""
+    viewer, before = s.window.viewer, s.state.scene.gaussians.means.copy()
+    rgb = s.shot("rgb")
+    s.search("mug")
+    selecting.select_query(viewer)
+    settings.set_display(viewer, "rgb")
+    settings.open_panel(viewer, "Transform")
+    s.ctx.key_press(imgui.Key.g)
+    s.settle()
+    view, chosen = s.state.view, s.state.selection.marks.selected
+    x, y = on_screen(s, transforming.pivot(viewer))
+    s.ctx.mouse_teleport_to_pos((x, y))
+    s.ctx.yield_(2)
+    s.ctx.mouse_down(0)
+    s.ctx.yield_(2)
+    for step in range(1, 7):
+        s.ctx.mouse_teleport_to_pos((x + 10 * step, y - 20 * step))
+        s.ctx.yield_(2)
+    assert s.state.moving is not None
+    s.capture(s.folder / "dragging.png")
+    s.ctx.mouse_up(0)
+    s.settle()
+    assert s.state.view is view
+    moved = s.state.scene.gaussians.means - before
+    assert (moved[~chosen] == 0).all()
+    assert np.ptp(moved[chosen], axis=0).max() < 1e-5
+    went = on_screen(s, transforming.pivot(viewer))
+    np.testing.assert_allclose(went, (x + 60, y - 120), atol=3)
+    selecting.select_none(viewer)
+    s.ctx.key_press(imgui.Key.g, 3)  # off again
+    shot = s.shot("moved")
+    assert s.at(shot, MUG + moved[chosen][0]).argmax() == s.at(rgb, MUG).argmax()
+    assert np.abs(s.at(shot, MUG) - s.at(rgb, MUG)).max() > 40
+
+    transforming.fill_form(viewer, EditForm(rotate=(0.0, 0.0, 90.0)))
+    s.ctx.item_click("//Transform/Apply")
+    s.ctx.item_click("//Transform/Fit")
+    s.settle()
+    form = s.state.edit_form
+    transforming.fill_form(viewer, replace(form, high=(*form.high[:2], (form.low[2] + form.high[2]) / 2)))
+    s.ctx.item_click("//Transform/Crop")
+    s.shot("cropped")
+    assert 0 < s.state.selection.marks.deleted.sum() < len(chosen)
+    for _ in range(5):
+        s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.z)
+        s.settle()
+    np.testing.assert_array_equal(s.state.scene.gaussians.means, before)
+    assert not s.state.selection.is_unsaved
+
+
 SELECTING: dict[str, tuple[Any, str, dict[str, Any]]] = {
     "select_with_the_mouse": (select_with_the_mouse, "blobs.ply", {}),
     "outline_and_rest": (outline_and_rest, "blobs.ply", {}),
     "name_what_is_clicked": (name_what_is_clicked, "blobs.ply", {}),
     "ask_before_leaving": (ask_before_leaving, "blobs.ply", {}),
+    "drag_the_gizmo": (drag_the_gizmo, "blobs.ply", {}),
 }

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from langsplat_core.config import LevelChoice, PictureConfig
 from langsplat_viewer.camera.flight import Keyframe
-from langsplat_viewer.marks import PackedMarks, pack
+from langsplat_viewer.marks import Move, PackedMarks, pack
 from langsplat_viewer.state import Query, ViewSettings
 from langsplat_viewer.viewer import Viewer
 
@@ -14,7 +14,7 @@ GESTURE = 1.0  # seconds: changes of one setting that follow each other sooner a
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """The queries and how they were looked at; what is selected, hidden and deleted."""
+    """The queries and how they were looked at; what is selected, hidden, deleted and moved."""
 
     queries: tuple[tuple[Query, int | None, int, float | None], ...]  # with slot, shown_since and cut
     selected: Query | None
@@ -24,6 +24,7 @@ class Moment:
     settings: ViewSettings
     overlays: tuple[str, ...]
     marks: PackedMarks
+    moves: tuple[Move, ...]
     keyframes: tuple[Keyframe, ...]
 
 
@@ -40,6 +41,7 @@ def now(viewer: Viewer) -> Moment:
         settings=state.settings,
         overlays=state.preferences.overlays,
         marks=viewer.history.marks.packed,
+        moves=state.selection.moves,
         keyframes=state.record.keyframes,
     )
 

@@ -17,11 +17,13 @@ from langsplat_core.pipeline.forecast import count_photographs
 from langsplat_core.pipeline.report import stated_warnings
 from langsplat_core.progress import Progress
 from langsplat_core.query.engine import no_field
+from langsplat_core.query.finding import Answered, Hit, find
+from langsplat_core.query.library import Library, update_library
 from langsplat_core.scene import Camera, Scene, surface
 from langsplat_core.semantics.encoders import DEMO
 from langsplat_viewer.actions.filming import load_path
 from langsplat_viewer.actions.history import forget, remember
-from langsplat_viewer.actions.queries import ask_again, load_queries, set_canonical
+from langsplat_viewer.actions.queries import ask, ask_again, load_queries, set_canonical
 from langsplat_viewer.actions.selecting import leave
 from langsplat_viewer.actions.settings import open_panel
 from langsplat_viewer.actions.viewpoint import opening_view, read_bookmarks
@@ -35,7 +37,7 @@ from langsplat_viewer.files.preferences import with_photographs, with_recent
 from langsplat_viewer.files.watching import Stamps, stamps
 from langsplat_viewer.marks import of_scene
 from langsplat_viewer.rendering.depth import UNCLIPPED, why_undrawable
-from langsplat_viewer.state import Recording, SceneState, ViewerState
+from langsplat_viewer.state import LibraryView, Recording, SceneState, ViewerState
 from langsplat_viewer.viewer import Viewer, Visit, unanswered, visit_of
 
 
@@ -344,7 +346,7 @@ def ask_for_photographs(viewer: Viewer) -> None:
     state = viewer.state
     if state.path is not None:
         start = Path(_folder(viewer) or state.path.parent)
-        state.path_typed, state.browser, state.picks_folder = "", list_folder(start.absolute()), True
+        state.path_typed, state.browser, state.picks_folder = "", list_folder(start.absolute()), "photographs"
 
 
 def choose_photograph_folder(viewer: Viewer, folder: Path) -> None:
@@ -353,6 +355,82 @@ def choose_photograph_folder(viewer: Viewer, folder: Path) -> None:
     state.browser = None
     if state.path is not None:
         state.preferences = with_photographs(state.preferences, state.path.absolute(), folder.absolute())
+
+
+# The library: all scenes of a folder, searched by their index.
+
+MOST_HITS = 200  # scenes that the panel lists
+
+
+def ask_for_library(viewer: Viewer) -> None:
+    """Open the browser to choose a folder of scenes."""
+    ask_for_file(viewer)
+    viewer.state.picks_folder = "library"
+
+
+def choose_folder(viewer: Viewer, folder: Path) -> None:
+    """Take the folder that the browser was opened for."""
+    if viewer.state.picks_folder == "library":
+        open_library(viewer, folder)
+    else:
+        choose_photograph_folder(viewer, folder)
+
+
+def open_library(viewer: Viewer, folder: Path) -> None:
+    """Read the index of a folder, and the scenes that are new there, in the background."""
+    state = viewer.state
+    state.browser = None
+
+    def done(library: Library) -> None:
+        hits = [Hit(folder / scene.path, "not here", 0.0, None) for scene in library.scenes]
+        _show_hits(viewer, LibraryView(library, said=f"{len(hits)} scenes"), hits)
+        for scene in library.unread:
+            viewer.say_error(f"{scene.path}: {scene.unread}")
+        open_panel(viewer, "Library")
+
+    def work(progress: Progress) -> Library:
+        return update_library(folder, load_encoder=viewer.services.load_encoder, progress=progress)
+
+    viewer.run(f"reading the scenes of {folder.name}", work, done)
+
+
+def ask_library(viewer: Viewer, phrase: str) -> None:
+    """Rank the scenes of the library by how certain it is that they have what a phrase names."""
+    view = viewer.state.library
+    if view is None or not phrase.strip():
+        return
+    library, phrase = view.library, phrase.strip()
+
+    def done(answers: list[Answered]) -> None:
+        hits = sorted((hit for each in answers for hit in each.hits), key=lambda hit: -hit.margin)
+        found = sum(hit.verdict == "found" for hit in hits)
+        problems = [each.problem for each in answers if each.problem]
+        said = "; ".join([f"'{phrase}': found in {found} of {len(hits)} scenes", *problems])
+        _show_hits(viewer, LibraryView(library, phrase, said=said), hits)
+
+    def work(progress: Progress) -> list[Answered]:
+        return find(library, phrase, viewer.services.load_encoder, 0, progress)
+
+    viewer.run(f"searching '{phrase}' in {len(library.scenes)} scenes", work, done)
+
+
+def _show_hits(viewer: Viewer, view: LibraryView, hits: Sequence[Hit]) -> None:
+    listed, pictures = tuple(hits[:MOST_HITS]), view.library.thumbnails or {}
+    names = [hit.path.relative_to(view.library.folder).as_posix() for hit in listed]
+    image = np.concatenate([pictures[name] for name in names]) if names else None
+    viewer.state.library = replace(view, hits=listed, thumbnails=image)
+
+
+def type_library(viewer: Viewer, text: str) -> None:
+    """Take the text of the library's box."""
+    viewer.state.library_typed = text
+
+
+def open_hit(viewer: Viewer, hit: Hit) -> None:
+    """Open a scene of the library, and search it for what was looked for in all of them."""
+    view = viewer.state.library
+    phrase = "" if view is None else view.phrase
+    open_scene(viewer, hit.path, lambda viewer: ask(viewer, phrase))
 
 
 # The file browser, typed paths, files dropped onto the window, and recent scenes.
@@ -365,7 +443,7 @@ def ask_for_file(viewer: Viewer) -> None:
     """Open the browser in the folder of the scene that is shown."""
     state = viewer.state
     folder = state.path.parent if state.path is not None else Path.cwd()
-    state.path_typed, state.browser, state.picks_folder = "", list_folder(folder.absolute()), False
+    state.path_typed, state.browser, state.picks_folder = "", list_folder(folder.absolute()), ""
 
 
 def close_browser(viewer: Viewer) -> None:

@@ -81,7 +81,8 @@ def type_phrase(viewer: Viewer, text: str) -> None:
 
 
 def ask_typed(viewer: Viewer) -> None:
-    """Search for what stands in the box and empty it; the keyboard is the scene's again."""
+    """Search for what stands in the box and empty it; the box keeps the keyboard for the next phrase."""
+    viewer.state.focus_input = viewer.state.awaits_keyboard = True
     if not viewer.state.typed.strip():
         return
     ask(viewer, viewer.state.typed)
@@ -121,7 +122,7 @@ def focus_search(viewer: Viewer) -> None:
         )
         mute_letters(viewer, True)
     else:
-        viewer.state.focus_input = True
+        viewer.state.focus_input = viewer.state.awaits_keyboard = True
 
 
 def take_search_focus(viewer: Viewer) -> bool:
@@ -394,6 +395,12 @@ def offers(viewer: Viewer) -> tuple[str, tuple[str, ...]]:
     if last is None:
         return "try", state.suggestions.examples
     return "did you mean", (last.meant,) if last.meant else ()
+
+
+def completion(viewer: Viewer) -> str:
+    """The phrase that goes on from what is typed, "" for none."""
+    phrases = offers(viewer)[1] if viewer.state.typed.strip() else ()
+    return phrases[0] if phrases else ""
 
 
 def ask_offered(viewer: Viewer, phrase: str) -> None:

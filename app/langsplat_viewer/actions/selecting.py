@@ -234,7 +234,7 @@ def export(
     if not (has_scene(viewer) if part == "edited" else has_selection(viewer)):
         return
     state, engine = viewer.state, viewer.engine
-    scene, marks = state.scene, state.selection.marks
+    scene, marks, moves = state.scene, state.selection.marks, state.selection.moves
     assert scene is not None
     field = scene.language
     if field is not None and engine is not None:
@@ -252,7 +252,7 @@ def export(
         kind = "points" if as_points else "Gaussians"
         state.say(f"saved {written.path}: {written.count:,} {kind}")
         if part == "edited" and not as_points and state.scene is scene:
-            state.selection = replace(state.selection, saved=marks.deleted)
+            state.selection = replace(state.selection, saved=marks.deleted, saved_moves=moves)
         then(viewer)
 
     def failed(reason: str) -> None:
@@ -301,8 +301,25 @@ def quit_viewer(viewer: Viewer) -> None:
     leave(viewer, _close, "the window closes")
 
 
+def end(viewer: Viewer, folder: Path) -> None:
+    """Close without a question: what is not saved is first written to a new file in `folder`."""
+    if viewer.state.selection.is_unsaved:
+        export(viewer, folder, "edited", then=end_at_once)
+    else:
+        end_at_once(viewer)
+
+
+def end_at_once(viewer: Viewer) -> None:
+    """Close, whatever is lost."""
+    viewer.state.selection = replace(viewer.state.selection, leaving=None, may_close=True)
+
+
 def _close(viewer: Viewer) -> None:
-    viewer.state.selection = replace(viewer.state.selection, may_close=True)
+    selection = viewer.state.selection
+    if viewer.recorder.current is not None:
+        viewer.state.selection = replace(selection, leaving=Leaving(_close, "the window closes", film=True))
+    else:
+        end_at_once(viewer)
 
 
 def _answered(viewer: Viewer) -> Callable[[Viewer], None] | None:

@@ -206,6 +206,18 @@ def open_panel(viewer: Viewer, title: str) -> None:
     viewer.state.wanted_panel = title
 
 
+def reset_panels(viewer: Viewer) -> None:
+    """Have the panels where they were at first."""
+    show_panel(viewer, True)
+    viewer.state.resets_panels = True
+
+
+def take_panel_reset(viewer: Viewer) -> bool:
+    """Whether the panels go back to their first places now; said once."""
+    reset, viewer.state.resets_panels = viewer.state.resets_panels, False
+    return reset
+
+
 def take_wanted_panel(viewer: Viewer) -> str:
     """The panel that is opened now, "" for none; said once."""
     title, viewer.state.wanted_panel = viewer.state.wanted_panel, ""
@@ -232,6 +244,7 @@ def toggle_help(viewer: Viewer) -> None:
 def show_palette(viewer: Viewer, shown: bool) -> None:
     """Set whether the list of everything that can be done is there, its box empty."""
     viewer.state.show_palette, viewer.state.palette_typed = shown, ""
+    viewer.state.awaits_keyboard |= shown
 
 
 def type_command(viewer: Viewer, text: str) -> None:

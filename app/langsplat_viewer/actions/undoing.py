@@ -5,13 +5,14 @@ from dataclasses import replace
 
 from langsplat_viewer.actions.history import Moment, let_go, now
 from langsplat_viewer.actions.queries import ask_unanswered, set_cut, set_level
+from langsplat_viewer.actions.transforming import place
 from langsplat_viewer.marks import pack, unpack
 from langsplat_viewer.viewer import Viewer
 
 
 def undo(viewer: Viewer) -> None:
-    """Go back to before the last query, removal, colour, level, keyframe, selection, hiding or deletion, or
-    the last change of display, colours, sliders, split, cuts or overlays."""
+    """Go back to before the last query, removal, colour, level, keyframe, selection, hiding, deletion or
+    transform, or the last change of display, colours, sliders, split, cuts or overlays."""
     _step(viewer, viewer.history.past, viewer.history.future, "nothing to undo")
 
 
@@ -50,4 +51,7 @@ def _restore(viewer: Viewer, moment: Moment) -> None:
     set_level(viewer, moment.level)
     history.past, history.future = past, future  # what that has remembered is no step of its own
     let_go(viewer)
-    ask_unanswered(viewer)
+    if moment.moves != state.selection.moves:
+        place(viewer, moment.moves)
+    else:
+        ask_unanswered(viewer)

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import numpy as np
 import platformdirs
 
 from langsplat_core.config import ColourMap
@@ -15,6 +16,7 @@ from langsplat_core.io.files import atomic_path
 Theme = Literal["dark", "light"]
 THEMES: tuple[Theme, ...] = get_args(Theme)
 SCALES = (0.75, 3.0)  # least and largest size of letters and widgets
+DESIGNED = 1080  # window units: the height of the screen that a scale of 1 is made for
 MOST_RECENT = 12
 MOST_FOLDERS = 100  # scenes whose folder of photographs is remembered
 FILE_NAME, LAYOUT_NAME = "preferences.json", "layout.ini"
@@ -59,15 +61,20 @@ def preferences_folder() -> Path:
     return Path(platformdirs.user_config_path("langsplat-viewer", appauthor=False))
 
 
-def load_preferences(folder: Path) -> Preferences:
-    """Read the preferences in `folder`, the defaults where there are none. InputError where the file makes no
-    sense."""
+def fitting_scale(height: float) -> float:
+    """The size of letters for a screen `height` units high: at 1080 that of the design."""
+    return float(np.clip(round(4 * height / DESIGNED) / 4, 1.0, SCALES[1]))
+
+
+def load_preferences(folder: Path, at_first: Preferences | None = None) -> Preferences:
+    """Read the preferences in `folder`, `at_first` or the defaults where there are none. InputError where the
+    file makes no sense."""
     path = folder / FILE_NAME
     try:
         text = path.read_bytes()[:LARGEST]
         return _from_json(json.loads(text))
     except FileNotFoundError:
-        return Preferences()
+        return at_first or Preferences()
     except (OSError, ValueError, RecursionError, InputError) as error:
         reason = printable_line(getattr(error, "strerror", None) or error, 120)
         raise InputError(f"{path}: {reason}; the defaults are used; mend or delete it") from None

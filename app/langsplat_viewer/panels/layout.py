@@ -6,15 +6,16 @@ from pathlib import Path
 
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
-from langsplat_viewer.actions import filming, opening, selecting, settings, viewpoint
-from langsplat_viewer.commands import COMMANDS, HELD, MENUS, Command, in_menu, matching
-from langsplat_viewer.files.preferences import SCALES, THEMES
+from langsplat_viewer.actions import filming, opening, settings, viewpoint
+from langsplat_viewer.commands import COMMANDS, HELD, LETTERS_MENU, MENUS, Command, in_menu, matching
 from langsplat_viewer.panels import (
+    library,
     overlays,
     record,
     scene,
     search,
     select,
+    transform,
     view,
 )
 from langsplat_viewer.panels.scene import in_words
@@ -22,23 +23,28 @@ from langsplat_viewer.panels.style import MAIN_DOCK, bad, muted, scene_area, sma
 from langsplat_viewer.state import Comparison, memory_bytes
 from langsplat_viewer.viewer import Viewer
 
-UI_SCALES = (0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0)
-
 
 def draw_menus(viewer: Viewer) -> None:
     """Inside the menu bar."""
     for menu in MENUS:
         if imgui.begin_menu(menu):
-            for command in in_menu(menu):
-                title = command.does[0].upper() + command.does[1:]
-                if imgui.menu_item(title, ", ".join(command.keys[:1]), False)[0]:
-                    command.act(viewer)
+            _items(viewer, menu)
             if menu == "File":
                 _recent(viewer)
             if menu == "Window":
                 _panels()
-                _looks(viewer)
+                if imgui.begin_menu(LETTERS_MENU):
+                    _items(viewer, LETTERS_MENU)
+                    imgui.end_menu()
             imgui.end_menu()
+
+
+def _items(viewer: Viewer, menu: str) -> None:
+    for command in in_menu(menu):
+        title = command.does[0].upper() + command.does[1:]
+        is_on = command.is_on is not None and command.is_on(viewer)
+        if imgui.menu_item(title, ", ".join(command.keys[:1]), is_on)[0]:
+            command.act(viewer)
 
 
 def _recent(viewer: Viewer) -> None:
@@ -51,9 +57,6 @@ def _recent(viewer: Viewer) -> None:
             if imgui.is_item_hovered():
                 imgui.set_tooltip(path)
         imgui.end_menu()
-    imgui.separator()
-    if imgui.menu_item("Quit", "", False)[0]:
-        selecting.quit_viewer(viewer)
 
 
 def _panels() -> None:
@@ -61,23 +64,7 @@ def _panels() -> None:
     docking = hello_imgui.get_runner_params().docking_params
     for window in docking.dockable_windows:
         _, window.is_visible = imgui.menu_item(window.label, "", window.is_visible)
-    if imgui.menu_item("Panels as at first", "", False)[0]:
-        docking.layout_reset = True
     imgui.separator()
-
-
-def _looks(viewer: Viewer) -> None:
-    preferences = viewer.state.preferences
-    for theme in THEMES:
-        if imgui.menu_item(f"{theme.capitalize()} theme", "", preferences.theme == theme)[0]:
-            settings.set_theme(viewer, theme)
-    if imgui.begin_menu("Size of letters"):
-        for scale in UI_SCALES:
-            if SCALES[0] <= scale <= SCALES[1]:
-                chosen = abs(preferences.ui_scale - scale) < 1e-6
-                if imgui.menu_item(f"{100 * scale:.0f} %", "", chosen)[0]:
-                    settings.set_ui_scale(viewer, scale)
-        imgui.end_menu()
 
 
 # The command palette.
@@ -91,7 +78,7 @@ def draw_palette(viewer: Viewer) -> None:
     if not viewer.state.show_palette:
         return
     top = imgui.get_main_viewport().get_center()
-    imgui.set_next_window_pos(ImVec2(top.x, 0.15 * top.y), imgui.Cond_.appearing, ImVec2(0.5, 0))
+    imgui.set_next_window_pos(ImVec2(top.x, 0.15 * top.y), imgui.Cond_.always, ImVec2(0.5, 0))
     imgui.set_next_window_size(hello_imgui.em_to_vec2(WIDTH_EM, HEIGHT_EM))
     imgui.set_next_window_bg_alpha(1.0)
     flags = imgui.WindowFlags_.no_title_bar | imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_collapse
@@ -103,7 +90,7 @@ def draw_palette(viewer: Viewer) -> None:
         "##command", "what to do", viewer.state.palette_typed, imgui.InputTextFlags_.enter_returns_true
     )
     settings.type_command(viewer, typed)
-    found = matching(typed)
+    found = matching(typed, viewer.state.preferences.recent)
     chosen = found[0] if entered and found else _clicked(found)
     left = not imgui.is_window_focused(imgui.FocusedFlags_.root_and_child_windows)
     escaped = imgui.is_key_pressed(imgui.Key.escape)
@@ -118,6 +105,8 @@ def _clicked(found: list[Command]) -> Command | None:
     """The list; the command that was clicked."""
     chosen = None
     if imgui.begin_child("found"):
+        if not found:
+            imgui.text_colored(muted(), "no command has these words")
         right = imgui.get_content_region_avail().x - hello_imgui.em_size(GAP_EM)
         for command in found:
             if imgui.selectable(command.does, False)[0]:
@@ -246,9 +235,9 @@ def in_numbers(comparison: Comparison) -> str:
 
 # Panels, docked around the scene, each where its user left it.
 
-LEFT, MIDDLE, FOOT = "Left", "Middle", "Foot"  # docks of the column beside the scene
+LEFT, MIDDLE, FOOT = "Left", "Middle", "Foot"  # docks of the column beside the scene; Search has its own
 COLUMN = 345.0  # its width at first, window units
-MOST_SHARE, MIDDLE_SHARE, FOOT_SHARE = 0.4, 0.36, 0.15
+MOST_SHARE, MIDDLE_SHARE, FOOT_SHARE = 0.4, 0.44, 0.15
 
 
 @dataclass(frozen=True)
@@ -263,16 +252,18 @@ class Panel:
 
 PANELS: tuple[Panel, ...] = (
     Panel("Search", LEFT, search.draw),
-    Panel("Scene", LEFT, scene.draw),
     Panel("Display", MIDDLE, view.draw_display),
     Panel("Camera", MIDDLE, view.draw_camera),
+    Panel("Scene", MIDDLE, scene.draw),
     Panel("Select", MIDDLE, select.draw, is_open=False),
-    Panel("Train", LEFT, scene.draw_training, is_open=False),
-    Panel("Record", LEFT, record.draw, is_open=False),
-    Panel("Bookmarks", LEFT, record.draw_bookmarks, is_open=False),
+    Panel("Transform", MIDDLE, transform.draw, is_open=False),
+    Panel("Library", MIDDLE, library.draw, is_open=False),
+    Panel("Train", MIDDLE, scene.draw_training, is_open=False),
+    Panel("Record", MIDDLE, record.draw, is_open=False),
+    Panel("Bookmarks", MIDDLE, record.draw_bookmarks, is_open=False),
     Panel("Messages", FOOT, draw_messages),
     Panel("Overlays", MIDDLE, view.draw_overlays, is_open=False),
-    Panel("Timing", LEFT, draw_timing, is_open=False),
+    Panel("Timing", MIDDLE, draw_timing, is_open=False),
 )
 
 
@@ -304,9 +295,9 @@ def _window(viewer: Viewer, panel: Panel) -> hello_imgui.DockableWindow:
 
 def show_wanted(viewer: Viewer) -> None:
     """Open the panel that an action wants seen, in front of those it shares its place with."""
-    title = settings.take_wanted_panel(viewer)
+    title, docking = settings.take_wanted_panel(viewer), hello_imgui.get_runner_params().docking_params
+    docking.layout_reset |= settings.take_panel_reset(viewer)
     if title:
-        docking = hello_imgui.get_runner_params().docking_params
         docking.dockable_window_of_name(title).is_visible = True
         docking.focus_dockable_window(title)
 
@@ -374,6 +365,7 @@ def draw_over(viewer: Viewer) -> None:
         overlays.draw_legend(viewer, area)
         overlays.draw_pointing(viewer)
         select.draw_stroke(viewer, area)
+        transform.draw_gizmo(viewer, area)
     overlays.draw_grip(viewer, area)
     overlays.draw_cube(viewer, area)
     scene.draw_changed(viewer, area)

@@ -9,7 +9,7 @@ from imgui_bundle import imgui
 from langsplat_viewer.actions import settings, viewpoint
 from langsplat_viewer.camera import controls
 from langsplat_viewer.commands import COMMANDS, Command
-from langsplat_viewer.panels import select
+from langsplat_viewer.panels import select, transform
 from langsplat_viewer.panels.style import Area
 from langsplat_viewer.viewer import Viewer
 
@@ -86,8 +86,10 @@ WHEEL_STEP = 0.88  # factor of the distance per notch
 def handle(viewer: Viewer, area: Area) -> None:
     """Once per frame, after the panels: they take what is theirs first."""
     io = imgui.get_io()
-    select.handle_stroke(viewer, area)
-    if viewer.state.view is not None and not io.want_capture_mouse:
+    held = transform.holds_mouse(viewer)
+    if not held:
+        select.handle_stroke(viewer, area)
+    if viewer.state.view is not None and not io.want_capture_mouse and not held:
         _mouse(viewer, area)
     viewpoint.hover(viewer, _pixel(area))
     handle_keys(viewer)

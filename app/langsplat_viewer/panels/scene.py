@@ -92,7 +92,7 @@ def _figures(viewer: Viewer) -> str:
 
 # The file browser.
 
-OPEN, PICK = "Open a scene", "Folder of the photographs"
+TITLES = {"": "Open a scene", "photographs": "Folder of the photographs", "library": "Folder of scenes"}
 WIDTH_EM, HEIGHT_EM = 40.0, 30.0
 UNITS = ("bytes", "kB", "MB", "GB", "TB")
 
@@ -100,7 +100,7 @@ UNITS = ("bytes", "kB", "MB", "GB", "TB")
 def draw_browser(viewer: Viewer) -> None:
     """A box for a path, the folders above, what is in this one, and what was open before."""
     listing = viewer.state.browser
-    title = PICK if viewer.state.picks_folder else OPEN
+    title = TITLES[viewer.state.picks_folder]
     if listing is not None and not imgui.is_popup_open(title):
         imgui.open_popup(title)
     centre = imgui.get_main_viewport().get_center()
@@ -124,7 +124,7 @@ def draw_browser(viewer: Viewer) -> None:
 def _foot(viewer: Viewer, listing: Listing) -> None:
     if viewer.state.picks_folder:
         if imgui.button("Take this folder"):
-            opening.choose_photograph_folder(viewer, listing.folder)
+            opening.choose_folder(viewer, listing.folder)
     elif has_several(listing) and imgui.button("Open all scenes here"):
         opening.open_all(viewer)
 
@@ -167,7 +167,7 @@ def _entries(viewer: Viewer, listing: Listing) -> None:
     recent = () if picks else viewer.state.preferences.recent
     lines = min(len(recent), 4) + 1 if recent else 0
     below = lines * imgui.get_text_line_height_with_spacing() + 8 * bool(recent)
-    below += imgui.get_frame_height_with_spacing() * (picks or has_several(listing))
+    below += imgui.get_frame_height_with_spacing() * (bool(picks) or has_several(listing))
     if imgui.begin_child("entries", ImVec2(0, -below), imgui.ChildFlags_.borders):
         if listing.problem:
             small_wrapped(listing.problem, bad())
@@ -255,9 +255,12 @@ def draw_unsaved(viewer: Viewer) -> None:
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_saved_settings
     if not imgui.begin_popup_modal(UNSAVED, None, flags)[0]:
         return
-    if leaving is not None:
+    if leaving is not None and leaving.film:
+        _wait_for_film(viewer)
+    elif leaving is not None:
         count = int(viewer.state.selection.marks.deleted.sum())
-        imgui.text_unformatted(f"{count:,} Gaussians were deleted, and the scene is not saved without them.")
+        moved = " and some transformed" if viewer.state.selection.moves else ""
+        imgui.text_unformatted(f"{count:,} Gaussians were deleted{moved}, and the scene is not saved so.")
         imgui.text_unformatted(f"Save it as a new file before {leaving.to}?")
         if imgui.button("Save"):
             selecting.save_and_leave(viewer, Path.cwd())
@@ -270,6 +273,20 @@ def draw_unsaved(viewer: Viewer) -> None:
     if viewer.state.selection.leaving is None:
         imgui.close_current_popup()
     imgui.end_popup()
+
+
+def _wait_for_film(viewer: Viewer) -> None:
+    work = viewer.recorder.current
+    if work is None:
+        selecting.discard_and_leave(viewer)
+        return
+    imgui.text_unformatted("The window closes once this is written.")
+    imgui.progress_bar(work[1], ImVec2(-1, 0), work[0])
+    if imgui.button("Stop it, and close"):
+        selecting.end_at_once(viewer)
+    imgui.same_line()
+    if imgui.button("Stay"):
+        selecting.stay(viewer)
 
 
 # The panel "Train".

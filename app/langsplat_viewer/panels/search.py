@@ -31,9 +31,14 @@ def _box(viewer: Viewer) -> None:
     if queries.take_search_focus(viewer):
         imgui.set_keyboard_focus_here()
     flags = imgui.InputTextFlags_.enter_returns_true | imgui.InputTextFlags_.callback_history
+    completion = queries.completion(viewer)
+    if completion:
+        flags |= imgui.InputTextFlags_.callback_completion  # else Tab goes on to the next widget
 
     def recalled(data: imgui.InputTextCallbackData) -> int:
-        text = queries.recall(viewer, -1 if data.event_key == imgui.Key.up_arrow else 1)
+        text = completion
+        if data.event_flag == imgui.InputTextFlags_.callback_history:
+            text = queries.recall(viewer, -1 if data.event_key == imgui.Key.up_arrow else 1)
         data.delete_chars(0, data.buf_text_len)
         data.insert_chars(0, text)
         return 0
@@ -94,7 +99,7 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
     if imgui.is_item_hovered():
         imgui.set_tooltip("Gaussians by relevancy, on a logarithmic scale; the line is where the answer ends")
     x = corner.x + size.x * (min(max(result.cut, low), high) - low) / (high - low)
-    colour = imgui.get_color_u32(imgui.Col_.slider_grab_active)
+    colour = imgui.get_color_u32(imgui.Col_.text)
     imgui.get_window_draw_list().add_line(ImVec2(x, corner.y), ImVec2(x, corner.y + size.y), colour, 2.0)
     own = result.own_cut is not None
     button = imgui.calc_text_size("Auto").x + 2 * imgui.get_style().frame_padding.x

@@ -1,0 +1,145 @@
+"""Transforms of the scene or of the selection, and cropping to a box; undone as every other edit is.
+
+The scene that is shown is made anew from the one that was opened, by all transforms so far, so that undoing
+them all gives exactly what was there.
+"""
+
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+
+from langsplat_core.arrays import Array
+from langsplat_core.errors import LangSplatError
+from langsplat_core.query.selection import in_box
+from langsplat_core.scene.transform import AXES, Similarity, moving, rotating, scaling
+from langsplat_viewer.actions.history import remember
+from langsplat_viewer.actions.queries import ask_again, set_canonical
+from langsplat_viewer.actions.selecting import has_scene, mark
+from langsplat_viewer.camera.controls import extent_of
+from langsplat_viewer.marks import Move
+from langsplat_viewer.state import EditForm, Gizmo
+from langsplat_viewer.viewer import Viewer
+
+
+def fill_form(viewer: Viewer, form: EditForm) -> None:
+    """Take what was typed or chosen in the panel."""
+    viewer.state.edit_form = form
+
+
+def next_gizmo(viewer: Viewer) -> None:
+    """Show the gizmo that moves, the one that rotates, the one that scales, none."""
+    kinds: tuple[Gizmo, ...] = get_args(Gizmo)
+    here = kinds.index(viewer.state.edit_form.gizmo)
+    fill_form(viewer, replace(viewer.state.edit_form, gizmo=kinds[(here + 1) % len(kinds)]))
+
+
+def pivot(viewer: Viewer) -> Array | None:
+    """(3,) middle of what is transformed, world units: the selection, else the whole scene. None without a
+    scene."""
+    state = viewer.state
+    if state.scene is None or state.extent is None:
+        return None
+    chosen = state.selection.marks.selected & state.scene.gaussians.valid()
+    if not chosen.any():
+        return state.extent.centre
+    return np.asarray(np.median(state.scene.gaussians.means[chosen].astype(np.float64), axis=0))
+
+
+def _move_of(viewer: Viewer, to: Similarity) -> Move:
+    selected = viewer.state.selection.marks.selected
+    return Move(to, np.packbits(selected) if selected.any() else None, len(selected))
+
+
+def preview(viewer: Viewer, to: Similarity) -> None:
+    """Show the selection, or without one the scene, transformed, until `transform`. Raises InputError where
+    that leads too far."""
+    if viewer.state.scene is not None:
+        move = _move_of(viewer, to)
+        viewer.state.moving = move, move.applied(viewer.state.scene)
+
+
+def transform(viewer: Viewer, to: Similarity) -> None:
+    """Transform the selection; without one the whole scene with its cameras. Says why where that fails."""
+    viewer.state.moving = None
+    if not has_scene(viewer) or to.is_identity:
+        return
+    move, moves = _move_of(viewer, to), viewer.state.selection.moves
+    joined = (*moves[:-1], moves[-1].then(move)) if moves and moves[-1].moves_same(move) else (*moves, move)
+    remember(viewer)
+    try:
+        place(viewer, joined)
+    except LangSplatError as error:
+        viewer.history.past.pop()
+        viewer.state.say(str(error), is_error=True)
+        return
+    what = "the scene" if move.packed is None else "the selection"
+    viewer.state.say(f"transformed {what}; save the scene to keep it")
+
+
+def place(viewer: Viewer, moves: tuple[Move, ...]) -> None:
+    """Show the scene that was opened with `moves`; what was asked is asked anew. Raises InputError where a
+    move leads too far, and leaves everything as it was."""
+    state = viewer.state
+    if state.scene is None:
+        return
+    opened = state.opened or state.scene
+    scene, field = opened, state.scene.language
+    for move in moves:
+        scene = move.applied(scene)
+    if field is not None and viewer.engine is not None:
+        field = replace(field, taught=tuple(viewer.engine.taught.values()))
+    scene = replace(scene, language=field)
+    state.opened, state.scene, state.extent, state.moving = opened, scene, extent_of(scene), None
+    state.ruler = replace(state.ruler, points=())
+    state.selection = replace(state.selection, moves=moves)
+    viewer.engine, viewer.describer = viewer.services.engine(scene), None
+    if state.canonical:
+        set_canonical(viewer, ", ".join(state.canonical))  # which asks again
+    else:
+        ask_again(viewer)
+
+
+def apply_form(viewer: Viewer) -> None:
+    """Transform by the numbers of the panel: scaled and rotated about the middle, then moved."""
+    form, centre = viewer.state.edit_form, pivot(viewer)
+    if centre is None:
+        has_scene(viewer)
+        return
+    try:
+        to = scaling(form.scale)
+        for axis, degrees in zip("xyz", form.rotate, strict=True):
+            to = to.then(rotating(AXES[axis], degrees))
+        to = (to if to.is_identity else to.about(centre)).then(moving(np.array(form.move)))
+    except LangSplatError as error:
+        viewer.state.say(str(error), is_error=True)
+        return
+    transform(viewer, to)
+    fill_form(viewer, replace(form, move=EditForm.move, rotate=EditForm.rotate, scale=EditForm.scale))
+
+
+def fill_box(viewer: Viewer) -> None:
+    """Set the box of the panel around the selection, or without one around everything that is shown."""
+    state = viewer.state
+    if state.scene is None:
+        return
+    marks = state.selection.marks
+    chosen = (marks.selected if marks.selected.any() else marks.shown) & state.scene.gaussians.valid()
+    if chosen.any():
+        means = state.scene.gaussians.means[chosen].astype(np.float64)
+        low, high = (tuple(corner.tolist()) for corner in (means.min(0), means.max(0)))
+        fill_form(viewer, replace(state.edit_form, low=low, high=high))
+
+
+def crop(viewer: Viewer) -> None:
+    """Delete what lies outside the box of the panel; refused where nothing lies inside."""
+    state, form = viewer.state, viewer.state.edit_form
+    if not has_scene(viewer) or state.scene is None:
+        return
+    corners = np.array([form.low, form.high])
+    inside = in_box(state.scene.gaussians.means, corners.min(0), corners.max(0))
+    marks = state.selection.marks
+    if not (inside & marks.kept).any():
+        state.say("the box holds nothing: set its corners around something, or press Fit", is_error=True)
+        return
+    mark(viewer, replace(marks, selected=marks.selected & inside, deleted=marks.deleted | ~inside))

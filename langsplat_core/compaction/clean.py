@@ -1,0 +1,290 @@
+"""Scenes without floaters: Gaussians that hang in free space, found by three measures and removed within an
+error budget.
+
+**Regions.** Two neighbours touch where the gap between their centres is no longer than `TOUCH` times the sum
+of their extents (one standard deviation) along it. What touches is one region; a region of few Gaussians
+beside the scene's surfaces is a floater, a single one is the smallest region. Extents make this a measure
+without a unit: large sparse Gaussians of a wall touch as small dense ones do. Over six scenes, trained by
+five programs, 0.8 to 1.4 % of the Gaussians are in regions that 1.25 extents leave alone.
+
+**Free space.** A faint veil touches what lies behind it. A Gaussian counts as in free space in a view where
+its centre lies before the surface that is seen through it (the median depth). Veils are found
+first and are no part of regions, which they would bridge.
+
+**Visibility.** What contributes the least to any view (`compact.contributions`) goes first, as many as the
+loss, measured on other views, allows.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from langsplat_core.arrays import Array, rotation_matrices
+from langsplat_core.compaction.compact import (
+    MeasuringView,
+    Views,
+    check_likeness,
+    choose_views,
+    contributions,
+    mean_psnr,
+    measuring_views,
+    psnr_losses,
+)
+from langsplat_core.config import CleanConfig, check_settings
+from langsplat_core.errors import InputError
+from langsplat_core.io.scenes import check_writable, load_scene, save_scene
+from langsplat_core.progress import Progress, silent
+from langsplat_core.raster import load_rasterizer
+from langsplat_core.scene import Camera, Gaussians, Scene
+from langsplat_core.scene.gaussians import along_curve
+from langsplat_core.scene.surface import Surface, build_surface
+
+# From the least suspicious to the most; chosen in rooms 201 to 203 of `python -m tests.benchmarks clean`.
+TOUCH = (1.1, 1.25, 1.5)  # a region that touches no other even if so many extents are bridged
+USUAL = 0.45  # median gap to the nearest in trained scenes, at most; sparser ones get as much larger a TOUCH
+AHEAD = (0.4, 0.55, 0.7)  # share of the views of a place in which it lies in free space
+FAINTEST = 0.02  # opacity of what belongs to a region; what is fainter is judged by free space alone
+BEFORE = 0.05  # of the surface's depth: what is nearer to it lies on it
+VIEWS = 2  # fewer views of free space tell nothing
+GROUPS = 12  # of the floaters, tried one after the other
+RESOLUTION = 96  # groups are halved down to this fraction of the floaters
+
+
+@dataclass(frozen=True, eq=False)
+class Floaters:
+    """What is suspected in a scene of N Gaussians."""
+
+    suspicion: Array  # (N,) int8 0: none, up to 3
+    region: Array  # (N,) bool: of a small region; the other suspects hang in free space
+
+
+def find_floaters(
+    scene: Scene, cameras: tuple[Camera, ...], largest: int, progress: Progress = silent
+) -> Floaters:
+    """Return the floaters of `scene`, seen from `cameras`; `largest`: Gaussians of a region that may be one.
+    The largest region of all is never one."""
+    gaussians = scene.gaussians
+    suspicion = np.zeros(len(gaussians), np.int8)
+    share = _free_space(scene, cameras, progress)
+    for level, least in enumerate(AHEAD, 1):
+        suspicion[share >= least] = level
+    rows = np.flatnonzero(suspicion == 0)  # a veil would bridge what lies before and behind it
+    solid = gaussians.take(rows)
+    surface = build_surface(solid, FAINTEST)
+    gaps = _gaps(solid, surface)
+    nearest = float(np.median(np.partition(gaps, 1, axis=1)[:, 1])) if gaps.shape[1] > 1 else USUAL
+    region = np.zeros(len(gaussians), bool)
+    for level, touch in enumerate(TOUCH, 1):
+        near = gaps <= touch * max(1.0, nearest / USUAL)
+        small = rows[_small_regions(surface, near, largest)]
+        suspicion[small], region[small] = level, True
+    return Floaters(suspicion, region)
+
+
+def _gaps(gaussians: Gaussians, surface: Surface) -> Array:
+    """(M, k) distance of each Gaussian of the surface to its neighbours, over both extents along it."""
+    count, width = surface.neighbours.shape
+    first, second = np.repeat(np.arange(count), width), surface.neighbours.ravel()
+    apart = surface.positions[second] - surface.positions[first]
+    distance = np.linalg.norm(apart, axis=1)
+    along = apart / np.maximum(distance, 1e-300)[:, None]
+    quats = gaussians.quats_wxyz[surface.rows].astype(np.float64)
+    scales = np.exp(gaussians.log_scales[surface.rows].astype(np.float64))
+    axes = rotation_matrices(quats) * scales[:, None, :]
+    ends = (np.linalg.norm(np.einsum("nij,ni->nj", axes[end], along), axis=1) for end in (first, second))
+    gaps: Array = distance / np.maximum(sum(ends), 1e-300)
+    return gaps.reshape(count, width)
+
+
+def _small_regions(surface: Surface, near: Array, largest: int) -> Array:
+    """Rows of the Gaussians in regions of at most `largest`, but for the largest of all; near: (M, k) bool
+    which neighbours touch."""
+    count, width = near.shape
+    if count == 0:
+        return surface.rows
+    first, second = np.repeat(np.arange(count), width)[near.ravel()], surface.neighbours[near]
+    links = csr_matrix((np.ones(len(first), bool), (first, second)), (count, count))
+    _, labels = connected_components(links, directed=False)
+    sizes = np.bincount(labels)
+    small = sizes <= largest
+    small[sizes.argmax()] = False
+    return surface.rows[small[labels]]
+
+
+def _free_space(scene: Scene, cameras: tuple[Camera, ...], progress: Progress) -> Array:
+    """(N,) share of the views of each centre, hidden ones not counted, that see through it to a surface; 0
+    where fewer than `VIEWS` do."""
+    gaussians, rasterizer = scene.gaussians, load_rasterizer("cpu")
+    ahead, on = np.zeros(len(gaussians), int), np.zeros(len(gaussians), int)
+    for index, camera in enumerate(cameras):
+        depths = rasterizer.view(gaussians, camera, scene.raster_settings()).median_depth()
+        pixels, z = camera.project(gaussians.means.astype(np.float64))
+        with np.errstate(invalid="ignore"):
+            inside = (z > 0) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(1)
+        rows = np.flatnonzero(inside)
+        column, row = pixels[rows].astype(int).T
+        there, z = depths[row, column], z[rows]
+        ahead[rows] += (there > 0) & (z < (1 - BEFORE) * there)
+        on[rows] += (there > 0) & (np.abs(z - there) <= BEFORE * there)
+        progress("finding floaters", (index + 1) / len(cameras))
+    share: Array = np.where(ahead >= VIEWS, ahead / np.maximum(ahead + on, 1), 0.0)
+    return share
+
+
+@dataclass(frozen=True)
+class CleanReport:
+    """What went, and what it cost; losses over the measuring views, dB, negative for a gain."""
+
+    gaussians: int  # before
+    invalid: int  # rows removed because nothing can draw them
+    regions: int  # floaters removed: of small regions
+    free_space: int  # floaters removed: in free space
+    kept: int  # suspected, but too dear for the budget
+    budget: float
+    loss: float  # mean
+    worst_loss: float
+    psnr_before: float | None  # mean over the photographs that measure; None without
+    psnr_after: float | None
+    assumed_psnr: float | None  # None: measured against photographs
+    measuring_views: int
+    views_from: str
+
+    @property
+    def removed(self) -> int:
+        """Gaussians that went."""
+        return self.invalid + self.regions + self.free_space
+
+
+def clean(
+    scene: Scene, views: Views, config: CleanConfig, progress: Progress = silent
+) -> tuple[Array, CleanReport]:
+    """Return the rows (N,) bool of `scene` that stay, and the report. Raises InputError where nothing can be
+    drawn or the photographs show something else."""
+    valid = scene.gaussians.valid()
+    if not valid.any():
+        raise InputError("the scene holds nothing that can be drawn: there is nothing to clean")
+    measured = measuring_views(scene, views.measuring, views.photographs)
+    check_likeness(measured)
+    found = find_floaters(scene, views.ranking, config.region, progress)
+    cost = contributions(scene, views.ranking, progress)
+    suspects = np.flatnonzero(found.suspicion)
+    trial = _Trial(scene, measured, config, progress)
+    if views.photographs[0] is None:
+        _by_change(trial, suspects[np.argsort(cost[suspects], kind="stable")])
+    else:
+        _by_photographs(trial, suspects[np.lexsort((cost[suspects], -found.suspicion[suspects]))])
+    losses, keep = trial.losses(), trial.keep
+    keep &= valid
+    gone = valid & ~keep
+    report = CleanReport(
+        gaussians=len(keep),
+        invalid=int((~valid).sum()),
+        regions=int((gone & found.region).sum()),
+        free_space=int((gone & ~found.region).sum()),
+        kept=int((found.suspicion[keep] > 0).sum()),
+        budget=config.max_psnr_loss,
+        loss=float(losses.mean()),
+        worst_loss=float(losses.max()),
+        psnr_before=mean_psnr(scene, measured),
+        psnr_after=mean_psnr(scene.take(keep), measured),
+        assumed_psnr=config.assumed_psnr if views.photographs[0] is None else None,
+        measuring_views=len(measured),
+        views_from=views.origin,
+    )
+    return keep, report
+
+
+@dataclass(eq=False)
+class _Trial:
+    """A scene of N Gaussians without some of them, measured."""
+
+    scene: Scene
+    measured: list[MeasuringView]
+    config: CleanConfig
+    progress: Progress
+
+    def __post_init__(self) -> None:
+        self.keep = np.ones(len(self.scene.gaussians), bool)
+
+    def losses(self) -> Array:
+        """(V,) dB, as it is now."""
+        return psnr_losses(self.scene.take(self.keep), self.measured, self.config.assumed_psnr)
+
+
+def _by_change(trial: _Trial, rising: Array) -> None:
+    """Remove as many of `rising`, by rising contribution, as the budget allows: by bisection."""
+    low, high = 0, len(rising) + 1
+    middle = len(rising)  # all of them, first
+    while middle > low:
+        trial.keep[rising] = np.arange(len(rising)) >= middle
+        if trial.losses().mean() <= trial.config.max_psnr_loss:
+            low = middle
+        else:
+            high = middle
+        middle = (low + high) // 2
+        trial.progress("removing within the budget", 1 - (high - low) / (len(rising) + 2))
+    trial.keep[rising] = np.arange(len(rising)) >= low
+
+
+def _by_photographs(trial: _Trial, order: Array) -> None:
+    """Remove what photographs do not miss, and as many more as the budget allows.
+
+    Groups of `order` are removed one after the other. What a group adds to the mean loss, and the standard
+    error of that, is taken from the budget. A group that costs more than is left is halved, and its halves
+    are tried. Gains are not added to the budget, or true floaters would pay for the loss of what is none.
+    What was removed while others still hid its worth is found last: what lies together is measured again
+    without all others, and the dearest come back until the rest is within the budget.
+    """
+    keep, budget = trial.keep, trial.config.max_psnr_loss
+    losses, spent, done = np.zeros(len(trial.measured)), 0.0, 0
+    least = max(len(order) // RESOLUTION, 1)
+    waiting = [group for group in np.array_split(order, GROUPS) if len(group)][::-1]
+    while waiting:
+        group = waiting.pop()
+        keep[group] = False
+        tried = trial.losses()
+        cost = _cost(tried - losses)
+        if spent + cost <= budget:
+            losses, spent = tried, spent + cost
+        else:
+            keep[group] = True
+            if len(group) > least:
+                waiting += [group[len(group) // 2 :], group[: len(group) // 2]]
+                continue
+        done += len(group)
+        trial.progress("removing within the budget", done / len(order))
+    rows = np.flatnonzero(~keep)
+    rows = rows[np.argsort(along_curve(trial.scene.gaussians.means[rows]))]
+    gone = [group for group in np.array_split(rows, RESOLUTION) if len(group)]
+    costs = np.zeros(len(gone))
+    for index, group in enumerate(gone):
+        keep[group] = True
+        costs[index] = _cost(losses - trial.losses())
+        keep[group] = False
+        trial.progress("measuring again", (index + 1) / len(gone))
+    rising = np.argsort(costs, kind="stable")
+    for index in rising[np.cumsum(costs[rising]) > budget]:
+        keep[gone[index]] = True
+
+
+def _cost(added: Array) -> float:
+    """What (V,) dB added to the loss of the views take from the budget."""
+    return max(float(added.mean() + added.std() / np.sqrt(len(added))), 0.0)
+
+
+def clean_scene(
+    source: Path, out: Path, config: CleanConfig, photos: Path | None = None, progress: Progress = silent
+) -> CleanReport:
+    """Write the scene `source` without its floaters to `out`, with all that belongs to it; see `clean`."""
+    check_writable(out)
+    if out.resolve() == source.resolve():
+        raise InputError(f"{out}: would replace the original scene; choose another name")
+    check_settings(config)
+    scene = load_scene(source)
+    views = choose_views(scene, photos, config, progress)
+    keep, report = clean(scene, views, config, progress)
+    save_scene(out, replace(scene.take(keep), path=out))
+    return report

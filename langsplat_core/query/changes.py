@@ -1,0 +1,364 @@
+"""What changed between two scenes of one place: nodes of their trees that appeared, are gone, moved, or have
+another colour.
+
+Both scenes are rendered from the training cameras of both. A pixel of one scene is *gone* where the other has
+its surface clearly farther behind, *hidden* where it has it nearer, and else *kept*; what is kept may have
+*another colour*. With the adjoint of the rasterizer these four are summed over the Gaussians that paint a
+pixel, and from them over the nodes. So a node changes where most of its own pixels say so, however the two
+trees are divided; what one capture did not see, or what stands behind something new, says nothing.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from langsplat_core.arrays import Array, unit
+from langsplat_core.errors import InputError
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.describe import LIKELY, NAMES, OR, Describer
+from langsplat_core.query.engine import QueryEngine, same_vectors
+from langsplat_core.query.instances import axis_aligned_box
+from langsplat_core.raster.protocol import LiftingRasterizer
+from langsplat_core.raster.render import splat_colours
+from langsplat_core.scene import LEVELS, Camera, Scene
+from langsplat_core.scene.surface import surface_areas
+
+Kind = Literal["gone", "appeared", "moved", "recoloured"]
+KINDS: tuple[Kind, ...] = ("gone", "appeared", "moved", "recoloured")
+VIEWS = 24  # cameras of each scene
+# Chosen on rooms 201 to 203.
+FARTHER = 0.03  # of the depth: a surface so much farther behind is another one
+PLAINLY = 3  # times as far, it is whatever its colour
+OTHER = 18.0  # distance of colours in CIE L*a*b* from which a kept pixel has another
+TINT = 5.0  # and from which what is barely farther is gone
+ABSENT = 0.2  # of what is seen of a node: if more of it is gone, all of it may be, else its colour changed
+MOST_GONE, MOST_COLOURED = 0.9, 0.6  # of that, changed: from here on a node changed
+LEAST = 100  # Gaussians of a node: of fewer, at the fringe of what was photographed, the shape is a guess
+LEAST_PIXELS = 50.0  # that a node covers, of an image in which it is seen
+EMPTY = 0.05  # alpha below which nothing is there
+SIDE = 400  # pixels: the longer side of these images
+ALIKE = 0.8  # cosine of meanings, from the scene's mean, of one thing in two places
+SHADE = 25.0  # distance of its mean colours at most
+GROWN = 1.7  # ratio of its sizes at most
+TOUCHING = 0.25  # of the larger one's diagonal: pieces so near each other, and alike, are of one thing
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """One thing that is not as it was. Places are in the first scene's frame."""
+
+    kind: Kind
+    name: str | None  # its best words, "mug or cup"; None where none is likely
+    centre: Array  # (3,) world units, where it is now, or was
+    box: Array  # (2, 3) corners, world units
+    moved: Array | None = None  # (3,) world units, of what moved
+    colours: tuple[str, str] | None = None  # before and now, of what has another
+    share: float = 0.0  # of its pixels that say so
+    pixels: float = 0.0  # in which it was looked at, over all images
+
+    @property
+    def distance(self) -> float:
+        """Length of the move, world units; 0 of what stayed."""
+        return 0.0 if self.moved is None else float(np.linalg.norm(self.moved))
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """Gaussians of one scene that changed together."""
+
+    rows: Array  # (M,) int64
+    gone: float  # pixels
+    coloured: float
+    kept: float
+    seen: int  # images
+    colour: Array  # (3,) mean L*a*b* as rendered
+    other: Array  # (3,) the other scene's at its kept pixels
+    meaning: Array  # (D,) unit, from the scene's mean
+    points: Array  # (M, 3) in the first scene's frame
+
+    @property
+    def share(self) -> float:
+        """Of its pixels, in [0, 1]: those that changed."""
+        return (self.gone + self.coloured) / max(self.gone + self.kept, 1e-9)
+
+    @property
+    def is_absent(self) -> bool:
+        """Whether it is gone, and not only of another colour."""
+        return self.gone >= ABSENT * (self.gone + self.kept)
+
+    @property
+    def size(self) -> float:
+        low, high = axis_aligned_box(self.points)
+        return float(np.linalg.norm(high - low))
+
+
+def changes(
+    first: QueryEngine,
+    second: QueryEngine,
+    rasterizer: LiftingRasterizer,
+    placed: Array | None = None,
+    describers: tuple[Describer, Describer] | None = None,
+    progress: Progress = silent,
+) -> tuple[Change, ...]:
+    """What changed from the first scene to the second, the largest first of each of `KINDS`.
+
+    placed: (4, 4) similarity from the second scene's frame into the first one's; None: they are one.
+    describers: of both, for names. Raises InputError for a scene without cameras or language field, and for a
+    matrix that is no similarity.
+    """
+    into = np.eye(4) if placed is None else check_similarity(placed)
+    before, after = _evidence(first.scene, second.scene, into, rasterizer, progress)
+    home = (first, before, np.eye(4)), (second, after, into)
+    gone, appeared = (_pieces(*each) for each in home)
+    lost = [piece for piece in gone if piece.is_absent]
+    new = [piece for piece in appeared if piece.is_absent]
+    found: list[Change] = []
+    for old, now in _matched(lost, new, _same_words(first, second)):
+        lost, new = [p for p in lost if p is not old], [p for p in new if p is not now]
+        moved = now.points.mean(0) - old.points.mean(0)
+        found.append(replace(_change("moved", now, 1, describers), moved=moved))
+    found += [_change("gone", piece, 0, describers) for piece in lost]
+    found += [_change("appeared", piece, 1, describers) for piece in new]
+    painted = [piece for piece in gone if not piece.is_absent]
+    found += [_change("recoloured", piece, 0, describers) for piece in painted]
+    for piece in appeared:  # what has a node of its own only in the second scene
+        box = axis_aligned_box(piece.points)
+        if not piece.is_absent and not any(_meet(box, axis_aligned_box(p.points)) for p in painted):
+            other = replace(piece, colour=piece.other, other=piece.colour)
+            found.append(_change("recoloured", other, 1, describers))
+    return tuple(sorted(found, key=lambda change: (KINDS.index(change.kind), -change.pixels)))
+
+
+def check_similarity(matrix: Array) -> Array:
+    """The matrix as float64; InputError unless it turns, moves and scales alone."""
+    matrix = np.asarray(matrix, np.float64)
+    if matrix.shape == (4, 4) and np.isfinite(matrix).all():
+        scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
+        turn = matrix[:3, :3] / scale if scale > 1e-9 else np.zeros((3, 3))
+        if np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) and np.allclose(matrix[3], (0, 0, 0, 1)):
+            return matrix
+    raise InputError("the transform is not 4 x 4 numbers that turn, move and scale; measure it again")
+
+
+# Evidence: what the pixels of both say about the Gaussians of each.
+
+# Of each Gaussian: pixels gone, kept, of another colour; images; own colour, and the other's where kept.
+_CHANNELS = 10
+
+
+def _evidence(
+    first: Scene, second: Scene, into: Array, rasterizer: LiftingRasterizer, progress: Progress
+) -> tuple[Array, Array]:
+    """(N, `_CHANNELS`) float64 of the Gaussians of both scenes."""
+    back = np.linalg.inv(into)
+    own, others = _some(first.cameras), [_seen_from(camera, back) for camera in _some(second.cameras)]
+    if not own + others:
+        raise InputError("neither scene has cameras to look from; keep .cameras.json beside one of them")
+    scale = float(np.cbrt(np.linalg.det(into[:3, :3])))
+    sums = np.zeros((len(first.gaussians), _CHANNELS)), np.zeros((len(second.gaussians), _CHANNELS))
+    for done, camera in enumerate(own + others):
+        progress("comparing the scenes", done / len(own + others))
+        pair = ((first, camera), (second, _seen_from(camera, into)))
+        views = [rasterizer.view(s.gaussians, c, s.raster_settings()) for s, c in pair]
+        drawn = [splat_colours(view, s.gaussians, c) for view, (s, c) in zip(views, pair, strict=True)]
+        looks = [to_lab(np.clip(image.colours, 0, 1)) for image in drawn]
+        near, far = views[0].median_depth(), scale * views[1].median_depth()
+        # Where a capture looked and has nothing, nothing is; where it did not look, nobody knows.
+        if done < len(own):
+            near = np.where(drawn[0].alpha < EMPTY, np.inf, near)
+        else:
+            far = np.where(drawn[1].alpha < EMPTY, np.inf, far)
+        both, limit = (near > 0) & (far > 0), FARTHER * np.minimum(near, far)
+        kept = both & (np.abs(near - far) <= limit)
+        if kept.any():  # of another exposure
+            looks[1] = looks[1] - np.median((looks[1] - looks[0])[kept], axis=0)
+        apart = np.linalg.norm(looks[1] - looks[0], axis=-1)
+        for depth, other, view, total, look, away in (
+            (near, far, views[0], sums[0], looks[0], looks[1]),
+            (far, near, views[1], sums[1], looks[1], looks[0]),
+        ):
+            behind = other - depth
+            gone = both & ((behind > limit) & (apart > TINT) | (behind > PLAINLY * limit))
+            stays = both & ~gone & (behind > -limit)
+            marks = np.stack([gone, stays, stays & (apart > OTHER)], -1).astype(np.float32)
+            colours = np.concatenate([look * (gone | stays)[..., None], away * stays[..., None]], -1)
+            lifted = view.gather(np.concatenate([marks, colours], -1).astype(np.float32))
+            total[:, :3] += lifted[:, :3]
+            total[:, 3] += lifted[:, :2].sum(1) > 0
+            total[:, 4:] += lifted[:, 3:]
+    return sums
+
+
+def _some(cameras: Sequence[Camera]) -> list[Camera]:
+    """At most `VIEWS` of them, evenly, small."""
+    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).astype(int))
+    small = []
+    for camera in (cameras[row] for row in chosen):
+        share = min(SIDE / max(camera.width, camera.height), 1.0)
+        small.append(
+            camera.resized(max(round(share * camera.width), 1), max(round(share * camera.height), 1))
+        )
+    return small
+
+
+def _seen_from(camera: Camera, into: Array) -> Camera:
+    """`camera`, of the frame that `into` leads to, in the frame that it comes from: what it sees is the same,
+    but for the scale of depths."""
+    scale = np.cbrt(np.linalg.det(into[:3, :3]))
+    matrix = camera.world_to_camera @ into
+    matrix[:3] /= scale
+    return replace(camera, world_to_camera=matrix)
+
+
+def to_lab(colours: Array) -> Array:
+    """(..., 3) sRGB in [0, 1] -> CIE L*a*b* of D65."""
+    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    mixed = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    x, y, z = np.moveaxis(linear @ mixed.T / (0.9505, 1.0, 1.089), -1, 0)
+    x, y, z = (np.where(v > 216 / 24389, np.cbrt(v), (24389 / 27 * v + 16) / 116) for v in (x, y, z))
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)
+
+
+# Basic colour terms at typical sRGB values.
+_TERMS = {
+    "red": (190, 35, 40), "orange": (235, 130, 40), "yellow": (240, 215, 60), "green": (60, 150, 60),
+    "turquoise": (50, 180, 180), "blue": (45, 85, 180), "purple": (120, 50, 140), "pink": (235, 150, 180),
+    "brown": (110, 70, 40), "beige": (215, 195, 160), "black": (20, 20, 20), "gray": (125, 125, 125),
+    "white": (240, 240, 240),
+}  # fmt: skip
+
+
+def colour_term(lab: Array) -> str:
+    """The basic colour term nearest to a colour (3,) in CIE L*a*b*; lightness counts half, for the shade."""
+    terms = to_lab(np.array(list(_TERMS.values())) / 255)
+    return list(_TERMS)[int((((terms - lab) * (0.5, 1, 1)) ** 2).sum(1).argmin())]
+
+
+# Pieces: the largest nodes that changed, those of one thing taken together.
+
+
+def _pieces(engine: QueryEngine, evidence: Array, into: Array) -> list[_Piece]:
+    tree, members = engine.tree, engine.tree.gaussians()
+    changed: list[int] = []
+    inside = np.zeros(tree.count, bool)
+    whole = _meanings(engine)
+    for node in range(tree.count - 1, -1, -1):  # parents first
+        parent = tree.parents[node]
+        if parent >= 0 and inside[parent]:
+            inside[node] = True
+        elif _has_changed(evidence[members[node]]):
+            inside[node] = True
+            changed.append(node)
+    made = [_piece(engine, evidence, into, members[node], whole) for node in changed]
+    return _together(engine, evidence, into, made, whole)
+
+
+def _has_changed(evidence: Array) -> bool:
+    gone, kept, coloured = evidence[:, :3].sum(0)
+    images = evidence[:, 3].max(initial=0)
+    enough = len(evidence) >= LEAST and gone + kept >= LEAST_PIXELS * max(images, 1)
+    least = MOST_GONE if gone >= ABSENT * (gone + kept) else MOST_COLOURED
+    return bool(enough and gone + coloured >= least * (gone + kept))
+
+
+def _meanings(engine: QueryEngine) -> tuple[Array, Array, Array]:
+    """(U, D) vectors of distinct codewords, from the mean of the scene; their (N,) number at level whole, -1
+    for none; and the (N,) areas of Gaussians."""
+    field, level = engine.field, len(LEVELS) - 1
+    number, areas = np.full(len(field), -1), surface_areas(engine.scene.gaussians)
+    known = field.known[level]
+    latents, number[known] = field.codec.unique(field.latents[level, known])
+    vectors = field.codec.decode(latents)
+    weights = np.bincount(number[known], areas[known], minlength=len(vectors))
+    return vectors - weights @ vectors / max(weights.sum(), 1e-12), number, areas
+
+
+def _piece(
+    engine: QueryEngine, evidence: Array, into: Array, rows: Array, meanings: tuple[Array, Array, Array]
+) -> _Piece:
+    vectors, number, areas = meanings
+    known = rows[number[rows] >= 0]
+    mean = np.bincount(number[known], areas[known], minlength=len(vectors)) @ vectors
+    gone, kept, coloured, _, *looks = evidence[rows].sum(0)
+    colour, other = np.array(looks[:3]) / max(gone + kept, 1e-9), np.array(looks[3:]) / max(kept, 1e-9)
+    means = engine.scene.gaussians.means[rows].astype(np.float64)
+    return _Piece(
+        rows=rows,
+        gone=float(gone),
+        coloured=float(coloured),
+        kept=float(kept),
+        seen=int(evidence[rows, 3].max(initial=0)),
+        colour=colour,
+        other=other,
+        meaning=unit(mean[None])[0] if len(known) else np.zeros(vectors.shape[1]),
+        points=means @ into[:3, :3].T + into[:3, 3],
+    )
+
+
+def _together(
+    engine: QueryEngine,
+    evidence: Array,
+    into: Array,
+    pieces: list[_Piece],
+    meanings: tuple[Array, Array, Array],
+) -> list[_Piece]:
+    """Pieces of one thing as one: they meet, mean the same, and have changed in the same way."""
+    pieces = sorted(pieces, key=lambda piece: -len(piece.rows))
+    kept: list[_Piece] = []
+    for piece in pieces:
+        for place, other in enumerate(kept):
+            alike = float(piece.meaning @ other.meaning) >= ALIKE and piece.is_absent == other.is_absent
+            if alike and _meet(axis_aligned_box(piece.points), axis_aligned_box(other.points)):
+                rows = np.union1d(piece.rows, other.rows)
+                kept[place] = _piece(engine, evidence, into, rows, meanings)
+                break
+        else:
+            kept.append(piece)
+    return kept
+
+
+def _meet(one: Array, other: Array) -> bool:
+    """Whether boxes (2, 3) overlap, or nearly."""
+    room = TOUCHING * max(np.linalg.norm(one[1] - one[0]), np.linalg.norm(other[1] - other[0]))
+    return bool(((one[0] - room <= other[1]) & (other[0] - room <= one[1])).all())
+
+
+def _same_words(first: QueryEngine, second: QueryEngine) -> bool:
+    """Whether meanings of both scenes are of one encoder."""
+    return same_vectors(first.field.canonical, second.field.canonical)
+
+
+def _matched(lost: list[_Piece], new: list[_Piece], comparable: bool) -> list[tuple[_Piece, _Piece]]:
+    """Pairs of what is gone and what appeared that are one thing, the likest first; each in one pair."""
+    pairs = []
+    for old in lost:
+        for now in new:
+            alike = float(old.meaning @ now.meaning) if comparable else 1.0
+            shade = float(np.linalg.norm((old.colour - now.colour) * (0.5, 1, 1)))
+            ratio = max(old.size, now.size) / max(min(old.size, now.size), 1e-9)
+            if alike >= ALIKE and shade <= SHADE and ratio <= GROWN:
+                pairs.append((alike - shade / SHADE, old, now))
+    found: list[tuple[_Piece, _Piece]] = []
+    for _, old, now in sorted(pairs, key=lambda pair: -pair[0]):
+        if not any(old is one or now is other for one, other in found):
+            found.append((old, now))
+    return found
+
+
+def _change(kind: Kind, piece: _Piece, scene: int, describers: tuple[Describer, Describer] | None) -> Change:
+    name = None if describers is None else _name(describers[scene], piece.rows)
+    centre, box = piece.points.mean(0), axis_aligned_box(piece.points)
+    colours = (colour_term(piece.colour), colour_term(piece.other)) if kind == "recoloured" else None
+    pixels = piece.gone + piece.kept
+    return Change(kind, name, centre, box, colours=colours, share=piece.share, pixels=pixels)
+
+
+def _name(describer: Describer, rows: Array) -> str | None:
+    """The best words for Gaussians as a whole, as many as are likely together."""
+    words = describer.at_gaussians(rows, top=NAMES)[-1].words
+    for count in range(1, len(words) + 1):
+        if sum(word.probability for word in words[:count]) >= LIKELY:
+            return OR.join(word.phrase for word in words[:count])
+    return None

@@ -1,0 +1,539 @@
+"""Search over all scenes of a folder, by an index of their codebooks.
+
+The answer to a phrase in a scene rests on the mean relevancies of its regions, which are mixtures of the
+relevancies of few codewords. So the index keeps, of every scene, its codewords in 8 bits, how each is read
+(zero and rate), the codewords of every region with their shares, and the fits of everyday phrases by chance.
+From these the fits and the verdict of `answers.by_regions` are computed without opening the scene, up to the
+rounding of codewords. The scenes that answer best are then opened and asked by `QueryEngine`.
+
+The index is one file, mapped into memory: `MAGIC`, the length of a JSON header as uint64, the header, zeros
+up to a multiple of 8, then for each group of scenes of one encoder its canonical vectors, the arrays of
+`COLUMNS` and the thumbnails. All lengths follow from the numbers of the header, so that a file of another
+length is refused.
+"""
+
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from scipy.sparse import csr_matrix
+
+from langsplat_core.arrays import Array
+from langsplat_core.compiled import helper, kernel, shared_workers
+from langsplat_core.config import PictureConfig
+from langsplat_core.display.displays import mapped
+from langsplat_core.errors import FormatError, InputError, LangSplatError
+from langsplat_core.io.files import atomic_path
+from langsplat_core.io.hostile import exists, open_for_reading, parse_json
+from langsplat_core.io.language import SUFFIX
+from langsplat_core.io.scenes import companion_path, format_of, load_scene, scene_files
+from langsplat_core.progress import Progress, silent
+from langsplat_core.query.answers import (
+    NOTHING,
+    PARTS,
+    Bar,
+    Bars,
+    QueryResult,
+    bars,
+)
+from langsplat_core.query.engine import LoadEncoder, QueryEngine, same_vectors
+from langsplat_core.query.grammar import Named
+from langsplat_core.raster import load_rasterizer
+from langsplat_core.raster.render import splat_colours
+from langsplat_core.scene import LEVELS, Camera, Odds, Scene
+from langsplat_core.scene.surface import SMALLEST
+from langsplat_core.semantics.relevancy import NARROWEST
+
+INDEX = ".langsplat-library"  # its name in the folder
+MAGIC = b"LSLIB\x00\x00\x01"
+LONGEST_HEADER = 2**30  # bytes
+THUMBNAIL = (96, 72)  # width and height, pixels, of the picture that the index keeps of a scene
+# Name, type, and what has a row: k, d codewords, m entries of mixtures, r regions, those of subparts first.
+COLUMNS: tuple[tuple[str, str, str], ...] = (
+    ("steps", "<f4", "k"),  # (K,) of the 8 bits: a codeword is step times codewords
+    ("zeros", "<f4", "k"),  # (K,) see `Scale.of`
+    ("rates", "<f4", "k"),  # (K,)
+    ("shares", "<f4", "m"),  # (M,) of a codeword in the mean of a region
+    ("words", "<u4", "m"),  # (M,) codeword, from 0 in each scene
+    ("regions", "<u4", "m"),  # (M,) region, from 0 in each scene
+    ("parents", "<i4", "r"),  # (R,) region of the level above, from 0 in each scene; -1 for none
+    ("solid", "<u4", "r"),  # (R,) whether it is no crumb
+    ("codewords", "<i1", "d"),  # (K, D)
+)
+FLOATS = 8 + 4 * len(LEVELS)  # of a scene: median and spread of four bars; odds, or NaN
+
+
+@dataclass(frozen=True, eq=False)
+class Listed:
+    """One scene of the folder, as the index knows it."""
+
+    path: str  # below the folder, "/" between names
+    stamp: tuple[int, ...]  # size and time of change, ns, of each of its files
+    counts: tuple[int, ...] = (0,) * 5  # codewords; regions of each level; entries of its mixtures
+    numbers: tuple[float, ...] = (math.nan,) * FLOATS
+    taught: tuple[str, ...] = ()  # keys of taught words
+    phrases: int = 0  # in its phrasebook
+    unread: str = ""  # why it has no answers; one line
+
+    @property
+    def is_indexed(self) -> bool:
+        """False for a scene that only the engine can answer: of another codec than a codebook."""
+        return self.counts[0] > 0
+
+    @property
+    def bars(self) -> Bars:
+        """The fits of everyday phrases."""
+        pairs = self.numbers[:8]
+        one, two, three, four = (Bar(*pairs[at : at + 2]) for at in range(0, 8, 2))
+        return one, two, three, four
+
+    def odds(self, kind: Named) -> Odds | None:
+        """The calibration for what is named; None where the encoder has none here."""
+        at = 8 if kind == "thing" else 12
+        return None if math.isnan(self.numbers[at]) else Odds(*self.numbers[at : at + 4])
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """The scenes of one encoder, and the arrays of `COLUMNS` of all of them, one after the other."""
+
+    encoder_id: str
+    canonical: Array  # (C, D) float32
+    scenes: tuple[Listed, ...]
+    columns: Mapping[str, Array]
+
+    @property
+    def starts(self) -> Array:
+        """(S + 1, 3) int64: where the codewords, mixtures and regions of each scene begin."""
+        sizes = [(c[0], c[4], sum(c[1:4])) for c in (scene.counts for scene in self.scenes)]
+        return np.cumsum([(0, 0, 0), *sizes], axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Library:
+    """A folder of scenes with its index."""
+
+    folder: Path
+    groups: tuple[Group, ...]
+    unread: tuple[Listed, ...] = ()  # scenes that cannot be opened
+    thumbnails: Mapping[str, Array] | None = None  # by path: (H, W, 3) uint8
+
+    @property
+    def scenes(self) -> tuple[Listed, ...]:
+        """All scenes that can be searched."""
+        return tuple(scene for group in self.groups for scene in group.scenes)
+
+
+# Scenes of a folder, and their digests.
+
+
+def scenes_in(folder: Path) -> list[Path]:
+    """Every scene below a folder with a language field beside it, by name; hidden folders are left out. Of
+    several scenes beside one field the first. InputError where there is no such folder."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; name one with scenes in it")
+    found: list[Path] = []
+    for root, folders, files in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        fields = {name.removesuffix(SUFFIX) for name in files if name.endswith(SUFFIX)}
+        if not fields:
+            continue
+        taken = set[str]()
+        for name in sorted([*files, *folders]):
+            stem = name if name in fields else Path(name).stem
+            path = Path(root, name)
+            own = stem in fields - taken and format_of(path) is not None
+            if own and companion_path(path, SUFFIX).name == stem + SUFFIX:
+                taken.add(stem)
+                found.append(path)
+    return found
+
+
+def stamp_of(scene: Path) -> tuple[int, ...]:
+    """Size and time of change, ns, of each file of a scene; zeros for one that is not there."""
+    numbers: list[int] = []
+    for file in scene_files(scene):
+        try:
+            status = file.stat()
+            numbers += [status.st_size, status.st_mtime_ns]
+        except OSError:
+            numbers += [0, 0]
+    return tuple(numbers)
+
+
+@dataclass(frozen=True, eq=False)
+class Digest:
+    """What the index keeps of one scene."""
+
+    listed: Listed
+    encoder_id: str = ""
+    canonical: Array | None = None
+    columns: Mapping[str, Array] | None = None
+    thumbnail: Array | None = None  # (H, W, 3) uint8
+
+
+def digest(path: Path, name: str, load_encoder: LoadEncoder | None) -> Digest:
+    """Read a scene; one that cannot be read, or has no field, says why."""
+    listed = Listed(name, stamp_of(path))
+    try:
+        scene = load_scene(path)
+        engine = QueryEngine(scene, load_encoder)
+        field, picture = engine.field, draw(scene, THUMBNAIL)
+    except LangSplatError as error:
+        return Digest(replace(listed, unread=str(error)))
+    taught = tuple(word.key for word in field.taught)
+    listed = replace(listed, taught=taught, phrases=len(field.phrasebook))
+    made = Digest(listed, field.encoder_id, field.canonical, None, picture)
+    if field.codec.blends or engine.chance is None or not field.known.any():
+        return made
+    calibration = engine.calibration
+    odds = () if calibration is None else (calibration.thing, calibration.part, calibration.inside)
+    numbers = [number for bar in bars(engine.chance) for number in (bar.median, bar.spread)]
+    numbers += [n for odd in odds for n in (odd.constant, odd.whole, odd.finer, odd.found)]
+    if not np.isfinite(numbers).all():
+        return made
+    numbers += [math.nan] * (FLOATS - len(numbers))
+    columns, counts = _columns(engine)
+    return replace(made, listed=replace(listed, counts=counts, numbers=tuple(numbers)), columns=columns)
+
+
+def _columns(engine: QueryEngine) -> tuple[dict[str, Array], tuple[int, ...]]:
+    """The arrays of a scene, and their `Listed.counts`."""
+    field, regions, scale = engine.field, engine.regions, engine.scale
+    latents, of = field.codec.unique(field.latents[field.known])
+    number = np.full(field.known.shape, -1, np.int64)
+    number[field.known] = of
+    zeros, rates = scale.of(field.codec.cosines(latents, scale.texts))
+    vectors = field.codec.decode(latents)
+    steps = np.maximum(np.abs(vectors).max(1), 1e-12) / 127
+    sizes = [len(totals) for totals in regions.totals]
+    firsts = [0, *accumulate(sizes)]
+    mixtures = []
+    for level, (totals, first) in enumerate(zip(regions.totals, firsts, strict=False)):
+        rows = np.flatnonzero((number[level] >= 0) & (regions.weights > 0))
+        where = regions.everywhere[level, rows], number[level, rows]
+        shares = csr_matrix((regions.weights[rows], where), shape=(len(totals), len(latents))).tocoo()
+        mixtures.append((shares.data / totals[shares.row], shares.col, shares.row + first))
+    above = [regions.parents[0] + firsts[1], regions.parents[1] + firsts[2], np.full(sizes[2], -1)]
+    columns = {
+        "steps": steps,
+        "zeros": zeros,
+        "rates": rates,
+        "shares": np.concatenate([part[0] for part in mixtures]),
+        "words": np.concatenate([part[1] for part in mixtures]),
+        "regions": np.concatenate([part[2] for part in mixtures]),
+        "parents": np.concatenate(above),
+        "solid": np.concatenate([each >= SMALLEST for each in regions.sizes]),
+        "codewords": np.rint(vectors / steps[:, None]),
+    }
+    made = {name: columns[name].astype(kind) for name, kind, _ in COLUMNS}
+    return made, (len(latents), *sizes, len(made["shares"]))
+
+
+# The index file.
+
+
+def update_library(
+    folder: Path,
+    index: Path | None = None,
+    load_encoder: LoadEncoder | None = None,
+    progress: Progress = silent,
+    rebuild: bool = False,
+) -> Library:
+    """The library of a folder, with scenes that are new or have changed read again, and the index written
+    where anything is different. An interrupted call keeps what it had read. rebuild: every scene is read,
+    whatever the index says. Raises InputError without scenes and FormatError for an index that is none."""
+    index = folder / INDEX if index is None else index
+    paths = {path.relative_to(folder).as_posix(): path for path in scenes_in(folder)}
+    if not paths:
+        raise InputError(f"{folder}: no scene with a language field in it; `langsplat train` makes them")
+    old = read_library(index, folder) if exists(index) and not rebuild else Library(folder, ())
+    stamps = {name: stamp_of(path) for name, path in paths.items()}
+    kept = {
+        each.listed.path: each for each in _digests(old) if stamps.get(each.listed.path) == each.listed.stamp
+    }
+    listed = len(old.scenes) + len(old.unread)
+    fresh = [name for name in paths if name not in kept]
+    try:
+        for done, name in enumerate(fresh):
+            progress("reading scenes", done / len(fresh), name)
+            kept[name] = digest(paths[name], name, load_encoder)
+    finally:
+        if fresh or len(kept) != listed:
+            write_library(index, [kept[name] for name in paths if name in kept])
+    progress("reading scenes", 1.0)
+    return read_library(index, folder)
+
+
+def _digests(library: Library) -> Iterator[Digest]:
+    """Every scene of a library, as views of its arrays."""
+    pictures = library.thumbnails or {}
+    for group in library.groups:
+        starts = group.starts
+        for row, scene in enumerate(group.scenes):
+            place = {"k": 0, "d": 0, "m": 1, "r": 2}
+            columns = {
+                name: group.columns[name][starts[row, place[of]] : starts[row + 1, place[of]]]
+                for name, _, of in COLUMNS
+            }
+            yield Digest(scene, group.encoder_id, group.canonical, columns, pictures[scene.path])
+    yield from map(Digest, library.unread)
+
+
+def write_library(index: Path, digests: Sequence[Digest]) -> None:
+    """Write an index, whole or not at all."""
+    groups: list[list[Digest]] = []
+    for each in digests:
+        if each.canonical is not None:
+            alike = [members for members in groups if _same_encoder(members[0], each)]
+            groups += [] if alike else [[]]
+            (alike or groups)[-1].append(each)
+    header = {
+        "groups": [
+            [members[0].encoder_id, *_canonical(members).shape, [_stated(each.listed) for each in members]]
+            for members in groups
+        ],
+        "unread": [_stated(each.listed) for each in digests if each.canonical is None],
+    }
+    text = json.dumps(header).encode()
+    with atomic_path(index) as temporary, temporary.open("wb") as file:
+        file.write(MAGIC + len(text).to_bytes(8, "little") + text + bytes(-len(text) % 8))
+        for members in groups:
+            file.write(_canonical(members).astype("<f4").tobytes())
+            for name, _, _ in COLUMNS:
+                for each in members:
+                    file.write(b"" if each.columns is None else each.columns[name].tobytes())
+            for each in members:
+                assert each.thumbnail is not None
+                file.write(each.thumbnail.tobytes())
+            file.write(bytes(-file.tell() % 8))
+
+
+def _same_encoder(one: Digest, other: Digest) -> bool:
+    assert one.canonical is not None
+    assert other.canonical is not None
+    return one.encoder_id == other.encoder_id and same_vectors(one.canonical, other.canonical)
+
+
+def _canonical(members: Sequence[Digest]) -> Array:
+    assert members[0].canonical is not None
+    return members[0].canonical
+
+
+def _stated(listed: Listed) -> list[Any]:
+    numbers = [None if math.isnan(number) else number for number in listed.numbers]
+    return [
+        *(listed.path, listed.stamp, listed.counts, numbers if listed.is_indexed else []),
+        *(listed.taught, listed.phrases, listed.unread),
+    ]
+
+
+def read_library(index: Path, folder: Path) -> Library:
+    """Map an index into memory. Raises InputError where it cannot be opened, and FormatError for what breaks
+    a rule of its layout; nothing is allocated on the word of its header."""
+    file, size = open_for_reading(index)
+    with file:
+        start = file.read(16)
+        length = int.from_bytes(start[8:], "little")
+        if start[:8] != MAGIC or not 0 < length <= min(size, LONGEST_HEADER):
+            raise _refused(index, "it begins otherwise")
+        header = parse_json(file.read(length), index)
+    try:
+        return _mapped(header, index, folder, 16 + length + (-length) % 8, size)
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
+        raise _refused(index, str(error)[:80]) from None
+
+
+def _refused(index: Path, why: str) -> FormatError:
+    return FormatError(f"{index}: no index of scenes ({why}); remove it, and it is made again")
+
+
+def _mapped(header: Any, index: Path, folder: Path, at: int, size: int) -> Library:
+    data = np.memmap(index, np.uint8, "r")
+    groups, pictures, width, height = [], dict[str, Array](), *THUMBNAIL
+
+    def taken(kind: str, count: int) -> Array:
+        nonlocal at
+        end = at + count * np.dtype(kind).itemsize
+        if end > size:
+            raise ValueError("shorter than its header says")
+        at, part = end, data[at:end]
+        return part.view(kind)
+
+    for encoder, phrases, dim, rows in header["groups"]:
+        scenes = tuple(map(_listed, rows))
+        if not (isinstance(encoder, str) and min(_whole(phrases), _whole(dim)) > 0):
+            raise ValueError("a group without an encoder")
+        k, m = sum(scene.counts[0] for scene in scenes), sum(scene.counts[4] for scene in scenes)
+        lengths = {"k": k, "d": k * dim, "m": m, "r": sum(sum(scene.counts[1:4]) for scene in scenes)}
+        canonical = taken("<f4", phrases * dim).reshape(phrases, dim)
+        columns = {name: taken(kind, lengths[of]) for name, kind, of in COLUMNS}
+        columns["codewords"] = columns["codewords"].reshape(k, dim)
+        shown = taken("|u1", len(scenes) * width * height * 3).reshape(len(scenes), height, width, 3)
+        at += -at % 8
+        pictures |= {scene.path: picture for scene, picture in zip(scenes, shown, strict=True)}
+        groups.append(Group(encoder, np.array(canonical), scenes, columns))
+    if at != size:
+        raise ValueError("longer than its header says")
+    return Library(folder, tuple(groups), tuple(map(_listed, header["unread"])), pictures)
+
+
+def _whole(value: Any) -> int:
+    if type(value) is not int or not 0 <= value < 2**62:
+        raise ValueError("a count that is none")
+    return value
+
+
+def _listed(row: Any) -> Listed:
+    path, stamp, counts, numbers, taught, phrases, unread = row
+    if not (isinstance(path, str) and isinstance(unread, str) and all(isinstance(t, str) for t in taught)):
+        raise ValueError("a scene without a name")
+    if Path(path).is_absolute() or ".." in Path(path).parts:
+        raise ValueError("a scene outside of the folder")
+    counts = tuple(map(_whole, counts))
+    floats = tuple(math.nan if n is None else float(n) for n in numbers) or (math.nan,) * FLOATS
+    if len(counts) != 5 or len(floats) != FLOATS or (counts[0] and not np.isfinite(floats[:8]).all()):
+        raise ValueError("a scene without its numbers")
+    found = Listed(path, tuple(map(_whole, stamp)), counts, floats, tuple(taught), _whole(phrases), unread)
+    for kind in ("thing", "part"):
+        found.odds(kind)  # which checks them
+    return found
+
+
+# The first pass: fits of a phrase in all scenes of a group.
+
+
+def fits_in(group: Group, vector: Array) -> Array:
+    """(S, 3) float64 fits of a phrase's (D,) unit vector in every scene, see `QueryResult.fits`; -inf in
+    those that are not indexed. FormatError for an index whose numbers do not fit each other."""
+    found, columns = np.full((len(group.scenes), len(LEVELS)), -np.inf), group.columns
+    levels = np.array([scene.counts[1:4] for scene in group.scenes], np.int64).reshape(-1, 3)
+    arrays = (columns[name] for name, _, _ in COLUMNS)
+    workers = shared_workers()
+    workers.run(_fits, len(found), np.require(vector, np.float32, "C"), *arrays, group.starts, levels, found)
+    if np.isnan(found).any():
+        raise FormatError("the index of scenes is damaged; remove it, and it is made again")
+    return found
+
+
+@partial(helper, fastmath={"reassoc", "contract", "nsz"})
+def _dot(row: Array, vector: Array) -> np.float32:
+    total = np.float32(0)
+    for i in range(len(vector)):
+        total += np.float32(row[i]) * vector[i]
+    return total
+
+
+@kernel
+def _fits(  # noqa: PLR0913  the columns
+    first: int,
+    last: int,
+    vector: Array,
+    steps: Array,
+    zeros: Array,
+    rates: Array,
+    shares: Array,
+    words: Array,
+    regions: Array,
+    parents: Array,
+    solid: Array,
+    codewords: Array,
+    starts: Array,
+    levels: Array,
+    found: Array,
+) -> None:
+    """Rows [first, last) of `found` (S, 3): as `answers.by_regions` says; NaN for numbers out of place."""
+    for scene in range(first, last):
+        k, m, r = starts[scene]
+        last_k, last_m, last_r = starts[scene + 1]
+        if last_k == k:
+            continue
+        relevancy = np.empty(last_k - k, np.float64)
+        for i in range(k, last_k):
+            cosine = _dot(codewords[i], vector) * steps[i]
+            relevancy[i - k] = 1 / (1 + np.exp(-rates[i] * (cosine - zeros[i])))
+        fits = np.zeros(last_r - r)
+        if _mix(fits, relevancy, shares[m:last_m], words[m:last_m], regions[m:last_m], parents[r:last_r]):
+            _best_fits(fits, parents[r:last_r], solid[r:last_r], levels[scene], found[scene])
+        else:
+            found[scene] = np.nan
+
+
+@helper
+def _mix(fits: Array, relevancy: Array, shares: Array, words: Array, regions: Array, parents: Array) -> bool:
+    """Set `fits` (R,) to those of the mean relevancy of regions; False where a number is out of place."""
+    for i in range(len(shares)):
+        if regions[i] >= len(fits) or words[i] >= len(relevancy):
+            return False
+        fits[regions[i]] += shares[i] * relevancy[words[i]]
+    for i in range(len(fits)):
+        if np.isnan(fits[i]) or parents[i] >= len(fits):
+            return False
+        value = min(max(fits[i], NARROWEST), 1 - NARROWEST)
+        fits[i] = np.log(value / (1 - value))
+    return True
+
+
+@helper
+def _best_fits(fits: Array, parents: Array, solid: Array, levels: Array, found: Array) -> None:
+    """Set `found` (3,) to the best fits with parts, see `answers.with_parts`; crumbs count where all are."""
+    best = np.full(len(fits), -np.inf)
+    for i in range(len(fits)):
+        if solid[i] and fits[i] > NOTHING and parents[i] >= 0:
+            best[parents[i]] = max(best[parents[i]], fits[i])
+    at = 0
+    for level in range(len(levels)):
+        top = crumbs = -np.inf
+        for i in range(at, at + levels[level]):
+            part = best[i]
+            if np.isinf(part) and solid[i] and fits[i] > NOTHING:
+                part = fits[i]
+            value = fits[i] if np.isinf(part) else (1 - PARTS) * fits[i] + PARTS * part
+            top, crumbs = max(top, value if solid[i] else -np.inf), max(crumbs, value)
+        at += levels[level]
+        top = crumbs if np.isinf(top) else top
+        found[level] = top if top > NOTHING else np.log(NARROWEST / (1 - NARROWEST))
+
+
+# Pictures.
+
+
+def draw(scene: Scene, size: tuple[int, int], answer: QueryResult | None = None) -> Array:
+    """(H, W, 3) uint8 picture of a scene, of `size` (width, height); with an answer from the training camera
+    nearest to its place that has it in its image, with the answer as a heat map."""
+    camera = _camera(scene, size, answer)
+    view = load_rasterizer("cpu").view(scene.gaussians, camera, scene.raster_settings())
+    values = None if answer is None else answer.even[:, None] * answer.members[:, None]
+    drawn = splat_colours(view, scene.gaussians, camera, values)
+    image = np.clip(drawn.colours, 0, 1)
+    if answer is not None:
+        low, high = answer.heat_range
+        heat = drawn.values[..., 0] / np.maximum(drawn.alpha, 1e-6)
+        share = np.clip((heat - low) / (high - low), 0, 1)[..., None]
+        solid = np.where(share > 0, PictureConfig().heat_opacity, 0) * (drawn.alpha[..., None] > 0.02)
+        grey = image.mean(2, keepdims=True) * 0.7 + 0.05
+        image = grey * (1 - solid) + solid * mapped(share[..., 0])
+    return np.asarray(Image.fromarray(np.rint(255 * image).astype(np.uint8)).convert("RGB"))
+
+
+def _camera(scene: Scene, size: tuple[int, int], answer: QueryResult | None) -> Camera:
+    if not scene.cameras:
+        return scene.framing_camera(size)
+    fitted = [camera.with_intrinsics(camera.intrinsics.fitted(*size)) for camera in scene.cameras]
+    if answer is None or answer.place is None:
+        return fitted[0]
+
+    def away(camera: Camera) -> float:
+        pixels, depth = camera.project(answer.place[None])  # type: ignore[index]
+        inside = (np.abs(pixels[0] / size - 0.5) < 0.4).all() and depth[0] > 0
+        return float(np.linalg.norm(camera.position - answer.place)) + (0 if inside else 1e9)
+
+    return min(fitted, key=away)

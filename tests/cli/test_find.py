@@ -1,0 +1,113 @@
+"""`langsplat find` and `langsplat changes`."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from langsplat_core.cli import find
+from langsplat_core.cli.app import parse
+from langsplat_core.cli.run import main
+from langsplat_core.io.scenes import save_scene
+from langsplat_core.query.library import INDEX
+from tests.support.fakes import PER_BLOB, FakeEncoder, named_scene
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder; in "scans" a scene with mug, book and plant, and one without the mug."""
+    scene = named_scene()
+    (tmp_path / "scans" / "<b>&").mkdir(parents=True)
+    save_scene(tmp_path / "scans" / "whole.ply", scene)
+    fewer = replace(scene.take(np.arange(len(scene.gaussians)) >= PER_BLOB), cameras=scene.cameras)
+    save_scene(tmp_path / "scans" / "<b>&" / "fewer.ply", fewer)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(find, "load_text_encoder", lambda name: FakeEncoder())
+    return tmp_path
+
+
+def run(*words: str) -> int:
+    return main("langsplat", lambda: parse(list(words)))
+
+
+def test_find_lists_the_scenes_that_have_it(folder, capsys):
+    assert run("find", "mug", "book", "scans", "--json") == 0
+    mug, book = json.loads(capsys.readouterr().out)
+    assert (mug["phrase"], mug["found"], mug["not_here"]) == ("mug", 1, 1)
+    assert [scene["scene"] for scene in mug["scenes"]] == ["whole.ply"]
+    np.testing.assert_allclose(mug["scenes"][0]["place"], (-1.2, 0, 0), atol=0.2)
+    assert book["found"] == 2
+    assert run("find", "mug", "scans", "--all") == 0
+    text = capsys.readouterr().out
+    assert "found in 1 of 2 scenes" in text
+    assert "fewer.ply: not here" in text
+
+
+def test_sheets_show_every_answer_and_escape_names(folder):
+    assert run("find", "book", "scans", "--sheet", "sheet.html") == 0
+    text = (folder / "sheet.html").read_text()
+    assert text.count("<img") == 2
+    assert "&lt;b&gt;&amp;/fewer.ply" in text
+    assert "<b>" not in text
+    assert run("find", "book", "scans", "--sheet", "sheet.png") == 0
+    picture = np.asarray(Image.open(folder / "sheet.png"))
+    assert picture.shape[1] > 4 * 320
+    assert np.ptp(picture[60:200, 20:600].astype(int)) > 100
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["mug"], "phrases and a folder"),
+        (["mug", "elsewhere"], "no such folder"),
+        (["mug", "scans", "--sheet", "sheet.txt"], ".html"),
+        (["the", "scans"], "the"),
+    ],
+)
+def test_find_says_what_is_wrong_in_a_line(folder, capsys, words, said):
+    assert run("find", *words) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert said in error
+    assert not (folder / "sheet.txt").exists()
+
+
+def test_a_damaged_index_is_refused_and_made_again(folder, capsys):
+    (folder / "scans" / INDEX).write_bytes(b"no index")
+    assert run("find", "mug", "scans") == 2
+    assert INDEX in capsys.readouterr().err
+    assert run("find", "mug", "scans", "--rebuild") == 0
+
+
+def test_changes_are_said_in_words_and_in_json(folder, capsys):
+    pair = "scans/whole.ply", "scans/<b>&/fewer.ply"
+    assert run("changes", *pair) == 0
+    assert capsys.readouterr().out.startswith("gone: ")
+    assert run("changes", pair[0], pair[0]) == 0
+    assert capsys.readouterr().out.strip() == "nothing changed"
+    scene = named_scene()
+    sh = scene.gaussians.sh.copy()
+    sh[:PER_BLOB] = sh[2 * PER_BLOB :]
+    save_scene(folder / "painted.ply", replace(scene, gaussians=replace(scene.gaussians, sh=sh)))
+    assert run("changes", pair[0], "painted.ply") == 0
+    assert "red to blue" in capsys.readouterr().out
+    (folder / "placed.json").write_text(json.dumps(np.eye(4).tolist()))
+    assert run("changes", pair[0], "painted.ply", "--transform", "placed.json", "--json") == 0
+    (change,) = json.loads(capsys.readouterr().out)["changes"]
+    assert (change["kind"], change["colours"]) == ("recoloured", ["red", "blue"])
+
+
+@pytest.mark.parametrize("text", ["[[1]]", "{}", "[[1, 2], [3]]", '"x"', "[" * 50, "[[0,0,0,0]]"])
+def test_a_transform_that_is_none_is_refused(folder, capsys, text):
+    (folder / "placed.json").write_text(text)
+    assert run("changes", "scans/whole.ply", "scans/whole.ply", "--transform", "placed.json") == 2
+    assert "placed.json" in capsys.readouterr().err
+
+
+def test_a_transform_is_given_or_found_not_both(folder, capsys):
+    (folder / "placed.json").write_text(json.dumps(np.eye(4).tolist()))
+    words = "scans/whole.ply", "scans/whole.ply", "--transform", "placed.json", "--register"
+    assert run("changes", *words) == 2
+    assert "leave one of them out" in capsys.readouterr().err

@@ -1,0 +1,223 @@
+"""The scene and the selection are transformed and cropped, as seen and as saved; and that is undone."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from langsplat_core.errors import InputError
+from langsplat_core.io.scenes import load_scene
+from langsplat_core.scene.transform import AXES, IDENTITY, moving, rotating, scaling
+from langsplat_viewer.actions import opening, queries, selecting, transforming, undoing
+from langsplat_viewer.panels.transform import dragged, gl_matrices
+from langsplat_viewer.state import EditForm
+from tests.support.fakes import CENTRES
+from tests.support.scenes import random_camera, without_perspective
+from tests.support.windowless import errors, settle
+
+MUG = CENTRES[0]
+STEP = np.array([0.0, 2.0, -1.0])
+
+
+def selected_mug(viewer) -> np.ndarray:
+    queries.ask(viewer, "mug")
+    settle(viewer)
+    selecting.select_query(viewer)
+    chosen: np.ndarray = viewer.state.selection.marks.selected
+    assert 0 < chosen.sum() < len(chosen)
+    return chosen
+
+
+def means(viewer) -> np.ndarray:
+    return viewer.state.scene.gaussians.means
+
+
+def test_the_selection_moves_alone_and_is_found_where_it_went(opened):
+    chosen, before = selected_mug(opened), means(opened)
+    place, cameras = opened.state.queries[0].result.place, opened.state.scene.cameras
+    transforming.transform(opened, moving(STEP))
+    settle(opened)
+    np.testing.assert_allclose(means(opened)[chosen], before[chosen] + STEP, atol=1e-5)
+    np.testing.assert_array_equal(means(opened)[~chosen], before[~chosen])
+    assert opened.state.scene.cameras is cameras
+    np.testing.assert_allclose(opened.state.queries[0].result.place, place + STEP, atol=1e-4)
+    np.testing.assert_array_equal(opened.state.selection.marks.selected, chosen)
+
+
+def test_the_whole_scene_takes_its_cameras_along(opened):
+    up, before = opened.state.extent.up, means(opened)
+    eyes = [camera.position for camera in opened.state.scene.cameras]
+    to = rotating(AXES["z"], 90).then(scaling(3)).then(moving(STEP))
+    transforming.transform(opened, to)
+    np.testing.assert_allclose(means(opened), to.points(before), atol=1e-4)
+    moved = [camera.position for camera in opened.state.scene.cameras]
+    np.testing.assert_allclose(moved, to.points(np.array(eyes)), atol=1e-9)
+    np.testing.assert_allclose(opened.state.extent.up, to.rotation @ up, atol=1e-6)
+
+
+def test_undone_exactly_and_done_again(opened):
+    chosen, first = selected_mug(opened), means(opened)
+    place = opened.state.queries[0].result.place
+    transforming.transform(opened, rotating(AXES["x"], 33).about(MUG))
+    transforming.transform(opened, moving(STEP))
+    selecting.select_none(opened)
+    transforming.transform(opened, scaling(0.5))
+    settle(opened)
+    last = means(opened)
+    for _ in range(4):
+        undoing.undo(opened)
+    settle(opened)
+    np.testing.assert_array_equal(means(opened), first)
+    np.testing.assert_array_equal(opened.state.selection.marks.selected, chosen)
+    np.testing.assert_allclose(opened.state.queries[0].result.place, place, atol=1e-6)
+    assert not opened.state.selection.is_unsaved
+    for _ in range(4):
+        undoing.redo(opened)
+    settle(opened)
+    np.testing.assert_array_equal(means(opened), last)
+    assert opened.state.selection.is_unsaved
+
+
+def test_transforms_of_the_same_are_one(opened):
+    """Thirty degrees twelve times: as if nothing had been done, to float32."""
+    before = means(opened)
+    for _ in range(12):
+        transforming.transform(opened, rotating(AXES["y"], 30))
+    assert len(opened.state.selection.moves) == 1
+    np.testing.assert_allclose(means(opened), before, atol=1e-5)
+
+
+def test_a_held_gizmo_shows_what_release_does(opened):
+    chosen = selected_mug(opened)
+    before, shown = means(opened), opened.state.request((32, 24))
+    transforming.preview(opened, moving(STEP))
+    seen = opened.state.request((32, 24))
+    assert seen != shown
+    np.testing.assert_allclose(seen.scene.scene.gaussians.means[chosen], before[chosen] + STEP, atol=1e-5)
+    assert means(opened) is before
+    assert opened.state.request((32, 24)) == seen  # nothing is drawn anew while it rests
+    with pytest.raises(InputError):
+        transforming.preview(opened, moving(np.array([1e39, 0, 0])))
+    assert opened.state.request((32, 24)) == seen
+    transforming.transform(opened, IDENTITY)
+    assert opened.state.request((32, 24)).scene.source is opened.state.scene
+
+
+def test_what_is_saved_is_what_is_seen(opened, tmp_path):
+    chosen = selected_mug(opened)
+    transforming.transform(opened, moving(STEP))
+    selecting.export(opened, tmp_path, "edited")
+    settle(opened)
+    made = load_scene(next(tmp_path.glob("*.ply")))
+    np.testing.assert_array_equal(made.gaussians.means, means(opened))
+    assert made.language is not None
+    assert not opened.state.selection.is_unsaved
+    transforming.transform(opened, moving(STEP))
+    opening.open_scene(opened, Path("plain.ply"))  # is asked about first
+    assert opened.state.selection.leaving is not None
+    assert chosen.any()
+
+
+def test_names_that_were_taught_go_along(opened):
+    selected_mug(opened)
+    queries.type_name(opened, "trophy")
+    queries.name_selection(opened)
+    settle(opened)
+    transforming.transform(opened, moving(STEP))
+    settle(opened)
+    assert opened.engine.is_taught("trophy")
+    assert [word.name for word in opened.state.scene.language.taught] == ["trophy"]
+
+
+def test_the_numbers_of_the_panel(opened):
+    """Scaled and rotated about the middle of the selection, then moved; then the fields are neutral again."""
+    chosen, before = selected_mug(opened), means(opened)
+    centre = transforming.pivot(opened)
+    form = EditForm(move=(1.0, 0.0, 0.0), rotate=(0.0, 0.0, 90.0), scale=2.0)
+    transforming.fill_form(opened, form)
+    transforming.apply_form(opened)
+    x, y, z = (before[chosen] - centre).T
+    expected = centre + np.stack([1 - 2 * y, 2 * x, 2 * z], 1)
+    np.testing.assert_allclose(means(opened)[chosen], expected, atol=1e-5)
+    assert opened.state.edit_form == EditForm()
+
+
+@pytest.mark.parametrize("form", [EditForm(scale=0), EditForm(scale=-1), EditForm(move=(1e39, 0.0, 0.0))])
+def test_numbers_that_cannot_be_are_refused(form, opened):
+    before = opened.state.scene
+    transforming.fill_form(opened, form)
+    transforming.apply_form(opened)
+    assert len(errors(opened)) == 1
+    assert opened.state.scene is before
+    undoing.undo(opened)
+    assert "nothing to undo" in opened.state.messages[-1].text
+
+
+def test_cropped_to_a_box_and_undone(opened):
+    chosen = selected_mug(opened)
+    transforming.fill_box(opened)
+    transforming.crop(opened)
+    marks = opened.state.selection.marks
+    assert (marks.kept[chosen]).all()
+    assert 0 < marks.kept.sum() < len(chosen)
+    undoing.undo(opened)
+    assert opened.state.selection.marks.kept.all()
+    transforming.fill_form(opened, EditForm(low=(50.0, 50, 50), high=(51.0, 51, 51)))
+    transforming.crop(opened)
+    assert "holds nothing" in errors(opened)[-1]
+    assert opened.state.selection.marks.kept.all()
+
+
+def test_without_a_scene_nothing_happens(viewer):
+    for act in (transforming.apply_form, transforming.crop, transforming.fill_box, transforming.next_gizmo):
+        act(viewer)
+    transforming.preview(viewer, moving(STEP))
+    assert viewer.state.moving is None
+
+
+def test_without_a_language_field(viewer):
+    opening.open_scene(viewer, Path("plain.ply"))
+    settle(viewer)
+    before = means(viewer)
+    transforming.transform(viewer, moving(STEP))
+    settle(viewer)
+    np.testing.assert_allclose(means(viewer), before + STEP, atol=1e-5)
+    assert viewer.state.scene.language is None
+
+
+@pytest.mark.parametrize("perspective", [True, False])
+def test_the_gizmo_lies_where_the_camera_sees_it(perspective):
+    camera = random_camera(3)
+    camera = camera if perspective else without_perspective(camera)
+    points = np.random.default_rng(0).normal(scale=0.3, size=(20, 3))
+    view, projection = gl_matrices(camera, 3.0)
+    clip = np.c_[points, np.ones(20)] @ (projection @ view).T
+    x, y, depth = (clip[:, :3] / clip[:, 3:]).T
+    pixels, _ = camera.project(points)
+    np.testing.assert_allclose((x + 1) / 2 * camera.width, pixels[:, 0], atol=1e-9)
+    np.testing.assert_allclose((1 - y) / 2 * camera.height, pixels[:, 1], atol=1e-9)
+    assert (np.abs(depth) < 1).all()
+
+
+def test_what_a_drag_means():
+    start = moving(np.array([1.0, 2.0, 3.0])).matrix
+    turned = rotating(AXES["y"], 20).about(start[:3, 3])
+    np.testing.assert_allclose(dragged(start, turned.matrix @ start).matrix, turned.matrix, atol=1e-9)
+    stretched = start.copy()
+    stretched[:3, :3] = np.diag([1.0, 1.4, 1.0])
+    grown = dragged(start, stretched)
+    assert grown.scale == pytest.approx(1.4)
+    np.testing.assert_allclose(grown.points(start[None, :3, 3])[0], start[:3, 3])
+    stretched[:3, :3] = 0
+    with pytest.raises(InputError):
+        dragged(start, stretched)
+
+
+def test_another_scene_begins_without_transforms(opened):
+    transforming.transform(opened, moving(STEP))
+    opened.state.selection = replace(opened.state.selection, saved_moves=opened.state.selection.moves)
+    opening.open_scene(opened, Path("book.ply"))
+    settle(opened)
+    assert opened.state.selection.moves == ()
+    assert opened.state.opened is None
