@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import tyro
 
 from langsplat_core.arrays import Array
@@ -20,7 +19,7 @@ from langsplat_core.io.files import atomic_path
 from langsplat_core.io.hostile import read_json_file
 from langsplat_core.io.scenes import check_writable, load_scene, save_scene
 from langsplat_core.io.shapes import MESH_SUFFIXES, check_suffix, gltf_axes, write_meshes
-from langsplat_core.progress import TerminalProgress
+from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.engine import QueryEngine
 from langsplat_core.scene import Scene
 from langsplat_core.scene.transform import similarity, transform_scene
@@ -35,7 +34,7 @@ TRANSFORM_LIMIT = 1 << 20  # bytes of a file with a matrix
 @dataclass(frozen=True)
 class Mesh:
     """Write the surface of a scene, or of what a phrase names, as triangles with colours. They are fused from
-    images rendered by the scene's cameras, or generated ones, so that what no camera sees has none."""
+    images rendered by the scene's cameras, or from around it, so that what no camera sees has none."""
 
     scene: tyro.conf.Positional[Path]
     """Any readable scene."""
@@ -151,7 +150,7 @@ class Merge:
         print(f"{self.out}: {len(scene.gaussians)} Gaussians, {len(scene.cameras)} cameras; {said}")
 
 
-def _registered(moving: Scene, fixed: Scene, scaled: bool, progress: TerminalProgress) -> "Registration":
+def _registered(moving: Scene, fixed: Scene, scaled: bool, progress: Progress) -> "Registration":
     """How a scene lies in the axes of another; InputError unless renderings confirm it."""
     from langsplat_core.geometry.registration import TRUSTED, register
 
@@ -160,7 +159,8 @@ def _registered(moving: Scene, fixed: Scene, scaled: bool, progress: TerminalPro
         hint = "" if scaled else ", and give --scaled where their units differ"
         raise InputError(
             f"the scenes do not show one place as far as can be told: {100 * found.agreement:.0f} % of the "
-            f"surfaces agree where both are seen, and {100 * TRUSTED:.0f} % should; see that they overlap{hint}"
+            f"surfaces agree where both are seen, of {100 * TRUSTED:.0f} % at least; see that they "
+            f"overlap{hint}"
         )
     return found
 

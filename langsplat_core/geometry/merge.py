@@ -54,8 +54,8 @@ def _language(first: Scene, second: Scene) -> LanguageField | None:
     b = other if other is not None else _meaningless(_chosen(one), len(second.gaussians))
     if a.encoder_id != b.encoder_id or a.codec.vector_dim != b.codec.vector_dim:
         raise InputError(
-            f"their language fields are of two text encoders, {a.encoder_id} and {b.encoder_id}, and no phrase "
-            "can be asked in both; train the field of one again with the other's encoder"
+            f"their language fields are of two text encoders, {a.encoder_id} and {b.encoder_id}, and no "
+            "phrase can be asked in both; train the field of one again with the other's encoder"
         )
     codec, latents = _one_codec(a, b)
     everyday = a.everyday if a.everyday is not None else b.everyday
@@ -104,8 +104,8 @@ def _one_codec(a: LanguageField, b: LanguageField) -> tuple[Codec, Array]:
     count = len(mine.vectors)
     if count + len(theirs.vectors) > LARGEST:
         raise InputError(
-            f"codebooks of {count} and {len(theirs.vectors)} words are more than {LARGEST} together; train one "
-            "of the scenes with a smaller --codec.size"
+            f"codebooks of {count} and {len(theirs.vectors)} words are more than {LARGEST} together; train "
+            "one of the scenes with a smaller --codec.size"
         )
     latents = both([a.latents, b.latents + np.uint16(count)], axis=1)
     vectors = both([mine.vectors, theirs.vectors])
@@ -121,6 +121,5 @@ def _one_tree(a: Tree, b: Tree) -> Tree:
     """The nodes of `a`, then those of `b`."""
     shifted = [np.where(row == NO_NODE, row, row + np.int32(a.count)) for row in (b.leaves, b.parents)]
     columns = {"leaves": shifted[0], "parents": shifted[1], "levels": b.levels, "votes": b.votes}
-    return Tree(**{
-        column.name: np.concatenate([getattr(a, column.name), columns[column.name]]) for column in fields(Tree)
-    })  # fmt: skip
+    names = [column.name for column in fields(Tree)]
+    return Tree(**{name: np.concatenate([getattr(a, name), columns[name]]) for name in names})

@@ -1,4 +1,4 @@
-"""Meshes of a scene's surface: rendered depth and colour, fused in a truncated signed distance field (Open3D).
+"""Meshes of a scene: rendered depth and colour, fused in a truncated signed distance field (Open3D).
 
 The depth of a pixel is that of the median Gaussian, the one at which the transmittance falls to 0.5, there
 where this Gaussian is densest along the ray. The depth of its centre, which `View.median_depth` gives, is off
@@ -26,8 +26,9 @@ OVERSAMPLED = 8  # voxels in a pixel, at most
 SPECK = 128  # triangles; a connected piece with fewer is noise
 FLATTEST = 1e-3  # of a Gaussian's longest axis: its shortest, for the place where it is densest
 DEVIATIONS = 3.0  # from its centre, beyond which no Gaussian has a surface
+ROOM = 1.5  # extents of the cube in which holes are closed; what bulges out of it stays open
 BLOCK = 8  # voxels a side that are kept together
-CLOSED, TURNS, EYES = 0.8, 48, 8  # of the directions from the middle of a scene: from which it is a room; views
+TURNS, RISES, AWAY = 48, (-0.6, 0.9), 2.6  # generated views: how many, sines of heights, distance in radii
 STAGE = "fusing depth images"
 
 Depth = tuple[Camera, Array, Array]  # (H, W) float32 along z, 0 where there is none, and (H, W, 3) uint8
@@ -63,7 +64,9 @@ def surface_depth(gaussians: Gaussians, camera: Camera, rows: Array) -> Array:
     found = np.flatnonzero(rows >= 0)
     chosen, place = np.unique(rows.reshape(-1)[found], return_inverse=True)
     y, x = np.divmod(found, camera.width)
-    rays = np.stack([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, np.ones(len(x))], 1)
+    rays = np.stack(
+        [(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, np.ones(len(x))], 1
+    )
     means = gaussians.means[chosen] @ camera.rotation.T + camera.world_to_camera[:3, 3]
     axes = camera.rotation @ rotation_matrices(gaussians.quats_wxyz[chosen].astype(np.float64))  # columns
     scales = np.exp(gaussians.log_scales[chosen].astype(np.float64))
@@ -88,9 +91,9 @@ def fuse(
 ) -> tuple[Mesh, float]:
     """The surface of a scene, and the side of its voxels, world units.
 
-    resolution: that side, by default a `FINEST` of the scene's radius, but no less than 1.5 pixels; views: how
-    many must show a surface, >= 1; more leave out more, and what is left is nearer to the truth; cameras: to
-    be rendered, by default the scene's own, or generated ones. Raises InputError where nothing is seen.
+    resolution: that side, by default a `FINEST` of the scene's radius, but no less than 1.5 pixels; views:
+    how many must show a surface, >= 1; more leave out more, and what is left is nearer to the truth; cameras:
+    to be rendered, by default the scene's own, or generated ones. Raises InputError where nothing is seen.
     """
     chosen = cameras or scene.cameras or generated_cameras(scene)
     images, pixels = [], []
@@ -182,40 +185,21 @@ def close_holes(mesh: Mesh, resolution: float) -> tuple[Mesh, float]:
     points = cloud(mesh.vertices, unit(normals, 1e-30))
     points.colors = open3d.utility.Vector3dVector(mesh.colour)
     extent = float(np.ptp(mesh.vertices, axis=0).max())
-    depth = int(np.clip(np.ceil(np.log2(1.1 * extent / resolution)), 5, 10))
-    closed = _taken(
-        open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(points, depth=depth, n_threads=1)[0]
-    )
+    depth = int(np.clip(np.ceil(np.log2(ROOM * extent / resolution)), 5, 10))
+    poisson = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson
+    closed = _taken(poisson(points, depth=depth, scale=ROOM, n_threads=1)[0])
     middles = closed.vertices[closed.triangles].mean(1)
     gaps = cKDTree(mesh.vertices).query(middles, workers=-1)[0]
     return closed, float(closed.areas()[gaps > 2 * resolution].sum())
 
 
 def generated_cameras(scene: Scene) -> tuple[Camera, ...]:
-    """Views of a scene without cameras: from outside around it; or, where its middle sees something in nearly
-    all directions, as in a room, from places within, each in six directions."""
+    """Views of a scene without cameras, from outside around it."""
     centre, radius = scene.bounds()
     up = scene.up()
     side = unit(np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))]), 1e-12)
-    ahead = np.cross(up, side)
-
-    def around(eye: Array) -> list[Camera]:
-        return [
-            look_at(eye, eye + to, ahead if abs(to @ up) > 0.5 else up, (SIDE // 2, SIDE // 2), 90)
-            for to in (side, -side, ahead, -ahead, up, -up)
-        ]
-
-    def seen(eye: Array) -> Array:
-        small = [camera.resized(48, 48) for camera in around(eye)]
-        views = [CpuRasterizer().view(scene.gaussians, one, scene.raster_settings()) for one in small]
-        return np.stack([view.median_depth() for view in views])
-
-    angles = np.arange(TURNS) * np.pi * (3 - np.sqrt(5))
-    flat = np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * ahead
-    if (seen(centre) > 0).mean() < CLOSED:
-        rise = np.linspace(-0.3, 0.9, TURNS)[:, None]
-        eyes = centre + 2.6 * radius * (np.sqrt(1 - rise**2) * flat + rise * up)
-        return tuple(look_at(eye, centre, up, (SIDE, SIDE * 3 // 4)) for eye in eyes)
-    eyes = centre + radius * (0.6 * flat[:EYES] + np.linspace(-0.1, 0.5, EYES)[:, None] * up)
-    free = [eye for eye in eyes if np.median(seen(eye)) > 0.1 * radius] or [centre]
-    return tuple(camera for eye in free for camera in around(eye))
+    angles = np.arange(TURNS)[:, None] * np.pi * (3 - np.sqrt(5))
+    flat = np.cos(angles) * side + np.sin(angles) * np.cross(up, side)
+    rise = np.linspace(*RISES, TURNS)[:, None]
+    eyes = centre + AWAY * radius * (np.sqrt(1 - rise**2) * flat + rise * up)
+    return tuple(look_at(eye, centre, up, (SIDE, SIDE * 3 // 4)) for eye in eyes)

@@ -118,8 +118,8 @@ def _pixels(entry: dict[str, Any], key: str, what: str) -> int:
 
 
 def numbers(entry: dict[str, Any], key: str, shape: tuple[int, ...], what: str) -> Array:
-    """Finite float64 numbers of the given shape under `key`: (), (3,), (3, 3) or (4, 4). FormatError, beginning
-    with `what`, where there are none."""
+    """Finite float64 numbers of the given shape under `key`: (), (3,), (3, 3) or (4, 4). FormatError,
+    beginning with `what`, where there are none."""
     if key not in entry:
         raise FormatError(f"{what}: {key!r} is missing")
     kinds = {(): "a number", (3,): "3 numbers", (3, 3): "3 rows of 3 numbers", (4, 4): "4 rows of 4 numbers"}

@@ -98,7 +98,7 @@ def _obj(meshes: Sequence[Mesh]) -> str:
     for mesh in meshes:
         lines.append(f"o {'_'.join(mesh.name.split())}")
         rows = np.column_stack([mesh.vertices, np.broadcast_to(mesh.colour, mesh.vertices.shape)])
-        lines += ["v %.9g %.9g %.9g %.4f %.4f %.4f" % tuple(row) for row in rows.tolist()]
+        lines += [f"v {x:.9g} {y:.9g} {z:.9g} {r:.4f} {g:.4f} {b:.4f}" for x, y, z, r, g, b in rows.tolist()]
         lines += [f"f {a} {b} {c}" for a, b, c in mesh.triangles + first]
         first += len(mesh.vertices)
     return "\n".join(lines) + "\n"
@@ -164,7 +164,13 @@ def _glb(meshes: Sequence[Mesh], to_gltf: Array) -> bytes:
     text += b" " * (-len(text) % 4)
     data = b"".join(chunks)  # of numbers of 4 and 8 bytes
     head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(data))
-    return head + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    return (
+        head
+        + struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(data), b"BIN\0")
+        + data
+    )
 
 
 def _bytes(colours: Array) -> Array:

@@ -222,7 +222,7 @@ class ReferenceView(LiftingView):
         return np.append(self.footprints.depths, 0)[self.median_rows()]
 
     def median_rows(self) -> Array:
-        """(H, W) int64 the Gaussian at which the transmittance falls to 0.5 or below, -1 where it never does."""
+        """(H, W) int64 the Gaussian at which the transmittance falls to 0.5 or below, -1 where never."""
         rows = np.full((self.camera.height, self.camera.width), -1)
         for step in self.steps():
             passed = (step.weights > 0) & (step.after <= 0.5)

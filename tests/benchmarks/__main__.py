@@ -9,6 +9,7 @@ from tests.benchmarks.clean import Clean
 from tests.benchmarks.library import Found
 from tests.benchmarks.lifting import Lifting
 from tests.benchmarks.maps import Maps
+from tests.benchmarks.meshes import Meshes
 from tests.benchmarks.phrases import Phrases
 from tests.benchmarks.rooms import Rooms
 from tests.benchmarks.scale import Scale
@@ -22,7 +23,7 @@ PROGRAM = "python -m tests.benchmarks"
 def parse(args: list[str]) -> Command:
     """The report that the words of a command line name; SystemExit as tyro raises it."""
     about = "Measure this project where the truth is known, and at large sizes."
-    known = (Rooms, Verdicts, Taught, Phrases, Votes, Clean, Maps, Lifting, Scale, Found, Changed)
+    known = (Rooms, Verdicts, Taught, Phrases, Votes, Clean, Maps, Meshes, Lifting, Scale, Found, Changed)
     reports = tuple(with_codec(report, args) for report in known)
     command: Command = parsed(PROGRAM, Union[(*reports,)], args, about)
     return command

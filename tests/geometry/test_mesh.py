@@ -85,13 +85,19 @@ def test_degenerate_gaussians_have_a_finite_depth():
         assert (depth >= 0).all()
 
 
+def sharp_room(seed: int = 1) -> Scene:
+    """With pixels of a centimetre."""
+    room = box_room(seed)
+    return replace(room, cameras=tuple(camera.resized(384, 288) for camera in room.cameras))
+
+
 def distances_to_room(points: Array) -> Array:
     """To the nearest of floor and walls; what stands on the table is left out by height."""
     return np.minimum(np.abs(points[:, 2] - FLOOR), np.abs(np.abs(points[:, :2]).max(1) - WALL))
 
 
 def test_the_surface_of_a_room_is_found():
-    mesh, side = fuse(box_room(1), views=1)
+    mesh, side = fuse(sharp_room())
     shell = (mesh.vertices[:, 2] < -0.1) & (np.abs(mesh.vertices[:, :2]).max(1) > 1.85)
     assert shell.sum() > 2000
     assert np.median(distances_to_room(mesh.vertices[shell])) < 0.005 < side
@@ -108,7 +114,9 @@ def test_more_views_leave_out_more():
 def test_a_ball_is_closed_and_coloured_without_cameras():
     mesh, side = fuse(ball(2.0))
     assert np.median(np.abs(np.linalg.norm(mesh.vertices, axis=1) - 2)) < 0.01
-    outside = np.cross(*(mesh.vertices[mesh.triangles[:, k]] - mesh.vertices[mesh.triangles[:, 0]] for k in (1, 2)))
+    outside = np.cross(
+        *(mesh.vertices[mesh.triangles[:, k]] - mesh.vertices[mesh.triangles[:, 0]] for k in (1, 2))
+    )
     assert ((outside * mesh.vertices[mesh.triangles[:, 0]]).sum(1) > 0).mean() > 0.98
     np.testing.assert_allclose(np.median(mesh.colour, axis=0), 0.5 + 0.2821 * np.array([1, -1, 0]), atol=0.02)
     half = mesh.triangles[mesh.vertices[mesh.triangles].mean(1)[:, 2] > -1.0]
@@ -122,11 +130,7 @@ def test_a_ball_is_closed_and_coloured_without_cameras():
     assert nothing < 0.02 * mesh.areas().sum()
 
 
-def test_generated_cameras_are_inside_of_a_room_and_outside_of_a_thing():
-    room = replace(box_room(), cameras=())
-    inside = np.stack([camera.position for camera in generated_cameras(room)])
-    # it has no ceiling: up is where nothing is, the other five directions are filled
-    assert (np.abs(inside - room.bounds()[0]).max(1) < WALL).all()
+def test_generated_cameras_are_outside():
     outside = np.stack([camera.position for camera in generated_cameras(ball())])
     assert (np.linalg.norm(outside, axis=1) > 1.5).all()
 
