@@ -20,7 +20,7 @@ FOUND = 0.02  # metres: a true point as near to the mesh is there
 
 @dataclass(frozen=True)
 class Meshes(InRooms):
-    """Error of `langsplat mesh` in rooms whose surfaces are known; meshes from images that many must agree on."""
+    """Error of `langsplat mesh` in rooms whose surfaces are known, by how many images must agree."""
 
     agreeing: tuple[int, ...] = (1, 2, 4)
 
