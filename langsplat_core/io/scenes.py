@@ -3,8 +3,8 @@ desktop entry and the tests of round trips and damaged files read; and a scene's
 
 A scene is `scene.ply` with, beside it, `scene.langsplat.safetensors` and `scene.cameras.json`, either of
 which may be absent. The same companions are looked for beside a compressed PLY or a SOG folder. Those of
-`scene.spz`, `.sog`, `.splat` and `.ksplat` keep its suffix, `scene.spz.langsplat.safetensors`: the sidecar
-knows the rounded positions of that file, so that it could not serve a `scene.ply` in the same folder.
+the other formats keep its suffix, `scene.spz.langsplat.safetensors`: the sidecar knows the rounded positions
+of that file, so that it could not serve a `scene.ply` in the same folder.
 """
 
 import logging
@@ -21,6 +21,7 @@ from langsplat_core.io import cameras as camera_files
 from langsplat_core.io import language, ply
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.files import atomic_path, check_output_file
+from langsplat_core.io.gltf import read_gltf_scene, write_gltf
 from langsplat_core.io.hostile import exists
 from langsplat_core.io.language import read_language, write_language
 from langsplat_core.io.ply import metres_comment, read_ply_scene, write_ply
@@ -82,6 +83,17 @@ FORMATS = (
         loses=("precision", "metres per unit", "extra properties"),
         own_companions=True,
         folder_file=META_NAME,
+    ),
+    *(
+        SceneFormat(
+            suffix,
+            read_gltf_scene,
+            lambda path, scene: write_gltf(path, scene.gaussians),
+            loses=("precision", "antialiasing", "metres per unit", "extra properties"),
+            own_companions=True,
+            mime=mime,
+        )
+        for suffix, mime in ((".glb", "model/gltf-binary"), (".gltf", "model/gltf+json"))
     ),
 )
 WRITABLE = tuple(row.suffix for row in FORMATS if row.write is not None)
