@@ -29,6 +29,7 @@ from langsplat_core.io.hostile import open_for_reading, parse_json
 from langsplat_core.io.splat import to_bytes
 from langsplat_core.io.spz import coefficient_signs, decode_spz, quaternion_signs
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
+from langsplat_core.scene.gaussians import joined
 from langsplat_core.scene.transform import C0, Similarity, similarity, transform_gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -61,16 +62,7 @@ def read_gltf_scene(path: Path | str) -> Scene:
         raise FormatError(f"{path}: not a sound glTF file ({str(error)[:80]}); export it again") from None
     if not parts and EXTENSION not in file.content.get("extensionsUsed", ()):
         raise FormatError(f"{path}: holds no Gaussians ({EXTENSION}); meshes are not read")
-    count = max((part.sh.shape[1] for part in parts), default=1)
-    padded = [np.pad(part.sh, ((0, 0), (0, count - part.sh.shape[1]), (0, 0))) for part in parts]
-    names = ("means", "log_scales", "quats_wxyz", "opacity_logits")
-    columns = [[getattr(part, name) for part in parts] for name in names]
-    shapes = [(0, 3), (0, 3), (0, 4), (0,), (0, 1, 3)]
-    joined = [
-        np.concatenate(column) if parts else np.zeros(shape, np.float32)
-        for column, shape in zip([*columns, padded], shapes, strict=True)
-    ]
-    return Scene(_turned(Gaussians(*joined)))
+    return Scene(_turned(joined(parts)))
 
 
 def _turned(gaussians: Gaussians) -> Gaussians:
