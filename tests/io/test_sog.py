@@ -110,10 +110,9 @@ def streamed(folder, parts: list[Gaussians], change=lambda content: None):
         with zipfile.ZipFile(folder / "packed.sog") as archive:
             archive.extractall(folder / name)
     (folder / "packed.sog").unlink()
-    places = [
-        {"file": 0, "offset": at, "count": len(part)} for at, part in zip(rows, parts[:-1], strict=False)
-    ]
-    places.append({"file": 2, "offset": 0, "count": len(parts[-1])})
+    places = [{"file": 0, "offset": 0, "count": len(parts[0])}]
+    places.append({"file": 0, "offset": len(parts[0]), "count": len(parts[1])})
+    places.append({"file": 2, "offset": 0, "count": len(parts[2])})
     leaves = [{"lods": {"0": place}} for place in places]
     leaves[0]["lods"]["1"] = {"file": 1, "offset": 0, "count": 1}
     tree = {"children": [leaves[0], {"children": leaves[1:]}]}
