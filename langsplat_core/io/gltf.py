@@ -98,7 +98,7 @@ def _parts(file: "_File") -> Iterator[Gaussians]:
         if left < 0:
             raise FormatError(f"{file.path}: shows more Gaussians than {file.size} bytes can hold")
         if views:
-            gaussians = _turned(decode_spz(data, file.path).gaussians)
+            gaussians = _turned(decode_spz(bytes(data), file.path).gaussians)
         else:
             gaussians = _gaussians(file, primitive["attributes"], count)
         try:
@@ -267,7 +267,7 @@ class _File:
             values = np.maximum(values / np.iinfo(dtype).max, -1)
         return values
 
-    def view(self, index: Any) -> tuple[bytes, int]:
+    def view(self, index: Any) -> tuple[memoryview, int]:
         """Bytes of a buffer view and its stride, 0 where rows follow each other."""
         views = self.content["bufferViews"]
         offset, size, stride = (
@@ -277,7 +277,7 @@ class _File:
         buffer = self._buffer(_index(views[index]["buffer"]))
         if offset + size > len(buffer):
             raise FormatError(f"{self.path}: truncated: buffer view {index} lies beyond its buffer")
-        return buffer[offset : offset + size], stride
+        return memoryview(buffer)[offset : offset + size], stride
 
     def _buffer(self, index: int) -> bytes:
         if index not in self._buffers:
