@@ -2,13 +2,13 @@
 
     python -m tests.viewer.process_driver [--scene SCENE.ply] [--count 500000] [--seconds 10]
                                           [--size 1280 800] [--at-once] [--slow]
-    python -m tests.viewer.process_driver --idle SCENE.ply | --leave SCENE.ply
+    python -m tests.viewer.process_driver --idle SCENE.ply | --leave SCENE.ply | --type SCENE.ply
 
 By default the camera orbits. Prints JSON: pictures per second while it moves, seconds from the last move to
 the full picture, the longest that a frame kept the window's thread in either, and the processor time of both,
 which other work on the machine changes little. --at-once: full pictures are rasterized in the window's own
 thread. --idle: prints frames and the share of a core while nothing happens. --leave: closes the window while
-a scene is being read for a minute. Needs a display (xvfb-run).
+a scene is being read for a minute. --type: types faster than frames are drawn. Needs a display (xvfb-run).
 """
 
 import argparse
@@ -16,11 +16,13 @@ import json
 import statistics
 import threading
 import time
+import traceback
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import psutil
-from imgui_bundle import immapp
+from imgui_bundle import imgui, immapp
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui
 
 import glfw  # isort: skip
@@ -30,6 +32,7 @@ from langsplat_core.scene import Scene
 from langsplat_viewer import canvas
 from langsplat_viewer.actions import viewpoint
 from langsplat_viewer.camera.controls import orbit
+from langsplat_viewer.panels.keyboard import Event
 from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.viewer import Services
 from langsplat_viewer.window import Window, WindowRequest, open_window
@@ -218,10 +221,85 @@ def leave(path: Path) -> None:
     open_window(WindowRequest(path, size=(860, 620)), Services(slow_load, lambda encoder_id: FakeEncoder()))
 
 
+def press(window: Window, *keys: str) -> Iterator[None]:
+    """Have keys arrive between two frames: "Ctrl+F" or "h"; goes on once all have had their effect."""
+    free, add = 4 * (False,), window.keyboard.add
+    for text in keys:
+        name = text.removeprefix("Ctrl+").lower()
+        ctrl = text.startswith("Ctrl+")
+        held, key = (ctrl, *free[1:]), imgui.Key[f"_{name}" if name.isdigit() else name]
+        if ctrl:
+            add(Event(imgui.Key.left_ctrl, True, held))
+        add(Event(key, True, held))
+        if len(name) == 1 and not ctrl:
+            add(Event(character=ord(name)))
+        add(Event(key, False, held))
+        if ctrl:
+            add(Event(imgui.Key.left_ctrl, False, free))
+    while window.keyboard.is_waiting:
+        yield
+    for _ in range(8):
+        yield
+
+
+def typing(window: Window) -> Iterator[None]:
+    """However slow the frames, each key does what it did in its own moment."""
+    state = window.viewer.state
+    while state.scene is None or window.viewer.worker.current is not None:
+        yield
+    while not state.suggestions.phrases:
+        yield
+    before = state.view
+    yield from press(window, "Ctrl+F", *"hamburger")
+    assert (state.typed, state.view is before) == ("hamburger", True)
+    yield from press(window, "escape", "Ctrl+A", "h")  # keys of the scene again
+    assert state.selection.marks.hidden.all()
+    yield from press(window, *"u231")
+    assert not state.selection.marks.hidden.any()
+    assert state.picture.display == "rgb"
+    yield from press(window, "Ctrl+F", *"mug", "enter", *"plant", "enter", *"bo")
+    assert ([query.phrase for query in state.queries], state.typed) == (["mug", "plant"], "bo")
+    yield from press(window, "tab")
+    assert (state.typed, state.show_panel) == ("book", True)
+    yield from press(window, "up_arrow")
+    assert state.typed == "plant"
+    handle = glfw_window_hello_imgui()
+    for action in (glfw.PRESS, glfw.RELEASE):
+        window.keyboard.pressed(handle, glfw.KEY_ESCAPE, 0, action, 0)
+    yield from press(window)
+    for action in (glfw.PRESS, glfw.RELEASE):
+        window.keyboard.pressed(handle, glfw.KEY_F1, 0, action, 0)
+    yield from press(window)
+    assert state.show_help
+    print("PASSED", flush=True)
+
+
+def drive(path: Path) -> None:
+    services = Services(load_scene, lambda encoder_id: FakeEncoder())
+    window = Window(WindowRequest(path, size=(860, 620)), services, lambda ctx: GlRenderer(ctx, "opengl"))
+    params = window.params()
+    gui, steps = params.callbacks.show_gui, typing(window)
+    window.idles = False
+
+    def stepped() -> None:
+        try:
+            next(steps)
+        except StopIteration:
+            close()
+        except AssertionError:
+            traceback.print_exc()
+            close()
+        gui()
+
+    params.callbacks.show_gui = stepped
+    immapp.run(params)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("--idle", type=Path, help="a scene; in place of orbiting")
     parser.add_argument("--leave", type=Path, help="a scene; in place of orbiting")
+    parser.add_argument("--type", type=Path, help="a scene; in place of orbiting")
     parser.add_argument("--scene", type=Path, default=DEMO)
     parser.add_argument("--count", type=int, default=500_000, help="Gaussians; 0: as the file has")
     parser.add_argument("--seconds", type=float, default=10.0, help="of moving, three times")
@@ -233,6 +311,8 @@ if __name__ == "__main__":
         canvas.MOVING_BUDGET = 0.0
     if asked.idle:
         idle(asked.idle)
+    elif asked.type:
+        drive(asked.type)
     elif asked.leave:
         leave(asked.leave)
     else:

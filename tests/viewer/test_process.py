@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -15,7 +16,7 @@ from langsplat_core.io.scenes import save_scene
 from langsplat_core.scene import Scene
 from tests.support.fakes import blob_scene
 from tests.support.fixtures import Measure
-from tests.support.on_display import play
+from tests.support.on_display import play, surroundings
 
 ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "assets" / "demo" / "scene.ply"
@@ -44,6 +45,36 @@ def test_closing_does_not_wait_for_what_is_being_read(display, tmp_path, blobs):
     began = time.monotonic()
     run(display, tmp_path, "--leave", blobs)
     assert time.monotonic() - began < 45  # the reading takes 60
+
+
+@pytest.mark.long
+def test_keys_that_come_faster_than_frames_keep_their_order(display, tmp_path):
+    save_scene(tmp_path / "many.ply", blob_scene(phrasebook=True))
+    assert "PASSED" in run(display, tmp_path, "--type", str(tmp_path / "many.ply"))
+
+
+def handles(status: str, number: int) -> bool:
+    """Whether a process handles a signal, by what Linux says of it."""
+    return bool(int(status.partition("SigCgt:")[2].split()[0], 16) >> (number - 1) & 1)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks /proc")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_window_at_rest_ends_by_a_signal(display, tmp_path, blobs, number):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "langsplat_viewer", blobs, "--fresh"],
+        env=surroundings(display),
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    status = Path(f"/proc/{process.pid}/status")
+    while not handles(status.read_text(), signal.SIGTERM):
+        time.sleep(0.2)
+    time.sleep(2)  # and it rests
+    process.send_signal(number)
+    assert process.wait(100) == 0, process.communicate()[1]
 
 
 @pytest.mark.long

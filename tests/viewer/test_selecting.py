@@ -491,6 +491,15 @@ def test_the_window_closes_at_once_or_asks(opened):
     assert selecting.may_close(opened)
 
 
+def test_a_process_that_has_to_end_saves_what_is_not(opened, tmp_path):
+    without_plant(opened)
+    selecting.end(opened, tmp_path)
+    assert not opened.state.selection.may_close
+    settle(opened)
+    assert opened.state.selection.may_close
+    assert len(load_scene(tmp_path / "blobs-edited-001.ply").gaussians) == 240
+
+
 def test_what_is_being_written_is_waited_for(opened, tmp_path):
     selecting.finish_writing(opened)  # nothing is
     take(opened, blob("mug"))

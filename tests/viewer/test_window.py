@@ -50,6 +50,8 @@ def folder(tmp_path: Path) -> Path:
         "ask_before_leaving",
         "drag_the_gizmo",
         "type_while_opening",
+        "travel_by_keys",
+        "end_by_signals",
         "look_at_nothing",
         "record_and_play",
         "mark_and_return",

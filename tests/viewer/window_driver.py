@@ -4,6 +4,7 @@ Its arguments: SCENARIO FOLDER. A scenario asserts as it goes and ends with "PAS
 and is the working folder.
 """
 
+import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +18,8 @@ from langsplat_core.display.displays import QUERY_COLOURS
 from langsplat_core.errors import BackendError
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.scene import Scene
-from langsplat_viewer.actions import settings
+from langsplat_viewer.actions import selecting, settings
+from langsplat_viewer.files.preferences import with_recent
 from langsplat_viewer.panels.style import scene_area
 from langsplat_viewer.rendering.renderer import Backend, GlRenderer
 from langsplat_viewer.viewer import Services
@@ -529,6 +531,70 @@ def type_while_opening(s: Session) -> None:
     s.wait(lambda: s.state.scene is not None)
 
 
+def travel_by_keys(s: Session) -> None:
+    """Esc closes a menu; Tab goes from field to field, and the panels stay; the palette knows everything."""
+    s.ctx.item_click("//**/##MenuBar/View")
+    assert imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
+    s.ctx.key_press(imgui.Key.escape)
+    s.ctx.yield_(2)
+    assert not imgui.is_popup_open("", imgui.PopupFlags_.any_popup)
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.f)
+    s.ctx.yield_(4)
+    seen = set()
+    for _ in range(12):
+        s.ctx.key_press(imgui.Key.tab)
+        s.ctx.yield_(2)
+        seen.add(imgui.internal.get_focus_id())
+    assert len(seen) > 5
+    assert s.state.show_panel
+    for words, done in (
+        ("light theme", lambda: s.state.preferences.theme == "light"),
+        ("letters of 125", lambda: s.state.preferences.ui_scale == 1.25),
+        ("open plain", lambda: s.state.path.name == "plain.ply"),
+    ):
+        if words == "open plain":
+            s.state.preferences = with_recent(s.state.preferences, s.folder / "plain.ply")
+        s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
+        s.ctx.yield_(3)
+        s.ctx.key_chars_append_enter(words)
+        s.wait(done)
+        s.settle()
+    s.ctx.key_press(imgui.Key.mod_ctrl | imgui.Key.mod_shift | imgui.Key.p)
+    s.ctx.yield_(3)
+    s.ctx.key_chars_append_enter("teleport")
+    s.ctx.yield_(3)
+    assert s.state.show_palette
+
+
+def end_by_signals(s: Session) -> None:
+    """What is not saved is asked about, and a film is waited for."""
+    viewer = s.window.viewer
+    viewer.recorder.submit("a film", slow_film, print, print)
+    selecting.quit_viewer(viewer)
+    s.wait(lambda: s.state.selection.leaving is not None)
+    s.shot("film")
+    s.ctx.item_click("//**/Stay")
+    s.ctx.yield_(2)
+    assert not s.state.selection.may_close
+    viewer.recorder.cancel()
+    s.search("mug")
+    s.menu("Select", "Select what the search found")
+    s.ctx.key_press(imgui.Key.delete)
+    s.settle()
+    s.window.signals.append(signal.SIGINT)
+    s.wait(lambda: s.state.selection.leaving is not None)
+    assert not s.state.selection.may_close
+    s.shot("asked")
+    s.ctx.item_click("//**/Cancel")
+    s.ctx.yield_(2)
+
+
+def slow_film(progress) -> None:
+    for step in range(2000):
+        progress("a film", step / 2000)
+        time.sleep(0.05)
+
+
 def look_at_nothing(s: Session) -> None:
     """A scene of which nothing can be drawn says so over the picture."""
     assert "none of the 360 Gaussians can be drawn" in s.state.nothing
@@ -562,6 +628,8 @@ SCENARIOS = {
     "find_settings": (find_settings, "blobs.ply", {"settings": Path("settings")}),
     "many_queries": (many_queries, "blobs.ply", {}),
     "type_while_opening": (type_while_opening, "blobs.ply", {"load": slow_load}),
+    "travel_by_keys": (travel_by_keys, "blobs.ply", {}),
+    "end_by_signals": (end_by_signals, "blobs.ply", {}),
     "look_at_nothing": (look_at_nothing, "nothing.ply", {}),
     **scenarios_scene.SELECTING,
     **scenarios_panels.RECORD,

@@ -67,8 +67,8 @@ def fitting_scale(height: float) -> float:
 
 
 def load_preferences(folder: Path, at_first: Preferences | None = None) -> Preferences:
-    """Read the preferences in `folder`, `at_first` or the defaults where there are none. InputError where the file makes no
-    sense."""
+    """Read the preferences in `folder`, `at_first` or the defaults where there are none. InputError where the
+    file makes no sense."""
     path = folder / FILE_NAME
     try:
         text = path.read_bytes()[:LARGEST]

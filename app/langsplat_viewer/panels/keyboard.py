@@ -26,7 +26,7 @@ HELD = (  # imgui's modifiers, and the keys that are one of them
     (imgui.Key.mod_alt, (glfw.KEY_LEFT_ALT, glfw.KEY_RIGHT_ALT)),
     (imgui.Key.mod_super, (glfw.KEY_LEFT_SUPER, glfw.KEY_RIGHT_SUPER)),
 )
-FOCUS_FRAMES = 8  # that a box has to take the keyboard
+FOCUS_FRAMES = 3, 8  # least and most that a box has to take the keyboard; the one before may still have it
 
 
 def _keys() -> dict[int, imgui.Key]:
@@ -91,20 +91,25 @@ class Keyboard:
     def feed(self) -> None:
         """Before a frame begins: give imgui what belongs to it."""
         io = imgui.get_io()
-        if self._state.awaits_keyboard and not io.want_text_input and self._waited < FOCUS_FRAMES:
+        least, most = FOCUS_FRAMES
+        if self._state.awaits_keyboard and self._waited < (least if io.want_text_input else most):
             self._waited += 1
             return
         self._state.awaits_keyboard, self._waited = False, 0
-        is_pressed = False
+        if len(imgui.get_current_context().input_events_queue) > 0:
+            return  # what imgui itself has put off comes first
+        typing, has_text, is_pressed = io.want_text_input, False, False
         while self._events:
             event = self._events[0]
-            starts = event.down and event.key is not None
-            # while one types, imgui itself keeps letters and other keys in order
-            if starts and is_pressed and not (io.want_text_input and _is_letter(event)):
+            is_text = bool(event.character) or (typing and event.down and _is_letter(event))
+            starts = event.down and not is_text
+            # a frame takes a run of text, or one key
+            if (starts and (is_pressed or (typing and has_text))) or (typing and is_text and is_pressed):
                 return
             self._events.popleft()
-            is_pressed |= starts
-            _give(io, event)
+            is_pressed, has_text = is_pressed or starts, has_text or is_text
+            if event.character or not is_text:  # the box reads characters: their keys would take a frame each
+                _give(io, event)
 
 
 def _as_printed(key: int, scancode: int) -> imgui.Key | None:
@@ -118,9 +123,10 @@ def _as_printed(key: int, scancode: int) -> imgui.Key | None:
 
 def _is_letter(event: Event) -> bool:
     """Return whether a key makes a character: it is none that imgui would have to keep apart from them."""
-    assert event.key is not None
-    return not any(event.held[index] for index in (0, 2, 3)) and (
-        imgui.Key["_0"] <= event.key <= imgui.Key.z or event.key == imgui.Key.space
+    return (
+        event.key is not None
+        and not any(event.held[index] for index in (0, 2, 3))
+        and (imgui.Key["_0"] <= event.key <= imgui.Key.z or event.key == imgui.Key.space)
     )
 
 

@@ -237,7 +237,7 @@ def in_numbers(comparison: Comparison) -> str:
 
 LEFT, MIDDLE, FOOT = "Left", "Middle", "Foot"  # docks of the column beside the scene; Search has its own
 COLUMN = 345.0  # its width at first, window units
-MOST_SHARE, MIDDLE_SHARE, FOOT_SHARE = 0.4, 0.44, 0.13
+MOST_SHARE, MIDDLE_SHARE, FOOT_SHARE = 0.4, 0.44, 0.15
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,7 @@ def _cut(viewer: Viewer, query: Query, result: QueryResult) -> None:
     if imgui.is_item_hovered():
         imgui.set_tooltip("Gaussians by relevancy, on a logarithmic scale; the line is where the answer ends")
     x = corner.x + size.x * (min(max(result.cut, low), high) - low) / (high - low)
-    colour = imgui.get_color_u32(imgui.Col_.slider_grab_active)
+    colour = imgui.get_color_u32(imgui.Col_.text)
     imgui.get_window_draw_list().add_line(ImVec2(x, corner.y), ImVec2(x, corner.y + size.y), colour, 2.0)
     own = result.own_cut is not None
     button = imgui.calc_text_size("Auto").x + 2 * imgui.get_style().frame_padding.x

@@ -60,6 +60,8 @@ def apply(preferences: Preferences) -> None:
         setattr(style, name, size * scale)
     style.window_border_size = 0
     style.font_scale_main = scale
+    for colour in (imgui.Col_.slider_grab, imgui.Col_.slider_grab_active):  # numbers are read over it
+        style.set_color_(colour, ImVec4(0.18, 0.36, 0.66, 1) if dark else ImVec4(0.62, 0.76, 0.96, 1))
     popup = style.color_(imgui.Col_.popup_bg)
     style.set_color_(imgui.Col_.popup_bg, ImVec4(popup.x, popup.y, popup.z, 1))
 

@@ -9,13 +9,14 @@ compositing. All panes of a request share one pass of the rasterizer.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import moderngl
 import numpy as np
 
 from langsplat_core.arrays import Array
+from langsplat_core.display.composing import composed
 from langsplat_core.display.displays import (
     COLOUR_MAPS,
     MAX_QUERIES,
@@ -44,8 +45,9 @@ from langsplat_viewer.rendering.depth import VISIBLE_ALPHA, camera_depths, depth
 from langsplat_viewer.rendering.request import Channel, Inputs, Pane, RenderKey, RenderRequest
 
 Backend = Literal["auto", "opengl", "cpu", "cuda"]
-Textures = tuple[moderngl.Texture, ...]  # colours with alpha, then one for each channel that was wanted
-Ahead = Callable[[Progress], Callable[[], Textures]]  # for any thread; what it returns: for the context's
+Layer = moderngl.Texture | Channels  # what a pane is composed of, by the shader or by `composed`
+Layers = tuple[Layer, ...]  # colours with alpha, then one for each channel that was wanted
+Ahead = Callable[[Progress], Callable[[], Layers]]  # for any thread; what it returns: for the context's
 PICK_ALPHA = 0.1  # a pixel with less alpha shows nothing that could be picked
 
 
@@ -183,14 +185,14 @@ class ArrayRenderer:
         return self._shows_nothing
 
 
-# Channel textures: what the compositing shader reads, from either rasterizer.
+# Channel layers: what is composed, from either rasterizer.
 
 
 class ChannelSource(Protocol):
-    """Source of channel textures."""
+    """Source of channel layers."""
 
-    def render(self, key: RenderKey, wanted: Sequence[Channel]) -> Textures:
-        """Colours, then the texture of each channel (the colours' for an absent one), valid until the next
+    def render(self, key: RenderKey, wanted: Sequence[Channel]) -> Layers:
+        """Colours, then the layer of each channel (the colours' for an absent one), valid until the next
         call. At most three with values, none of them twice."""
 
     def ahead(self, key: RenderKey, wanted: Sequence[Channel]) -> Ahead | None:
@@ -200,7 +202,7 @@ class ChannelSource(Protocol):
         """Surface depth (world units, 0: nothing) and alpha of one pixel."""
 
     def depth_map(self, key: RenderKey) -> Array:
-        """(H, W) surface depth, 0 where less than half the light is stopped. It ends `render`'s textures."""
+        """(H, W) surface depth, 0 where less than half the light is stopped. It ends `render`'s layers."""
 
     def forget(self) -> None:
         """Do every step anew the next time."""
@@ -223,7 +225,7 @@ class GlSource:
         assert isinstance(view, GlView)
         return view
 
-    def render(self, key: RenderKey, wanted: Sequence[Channel]) -> Textures:
+    def render(self, key: RenderKey, wanted: Sequence[Channel]) -> Layers:
         self._keep(wanted if key.scene is self._of else [])
         self._of, view = key.scene, self._view(key)
         uploads = [self._upload(view.gaussians, c.values) for c in wanted if c.values is not None]
@@ -268,37 +270,40 @@ class GlSource:
 
 
 class ArraySource:
-    """Channels by a rasterizer that returns arrays, uploaded."""
+    """Channels by a rasterizer that returns arrays: uploaded, but on a software driver left to `composed`,
+    since such a driver takes longer to upload and compose than the rasterizer to draw."""
 
     def __init__(self, ctx: moderngl.Context, rasterizer: Rasterizer) -> None:
-        self._ctx = ctx
+        self._ctx, self._uploads = ctx, not is_software(ctx)
         self._channels = ArrayChannels(rasterizer)
         self._textures: dict[tuple[int, int], moderngl.Texture] = {}  # by place and number of components
 
-    def render(self, key: RenderKey, wanted: Sequence[Channel]) -> Textures:
-        return self._uploaded(self._channels.render(key, wanted), wanted)
+    def render(self, key: RenderKey, wanted: Sequence[Channel]) -> Layers:
+        return self._layers(self._channels.render(key, wanted), wanted)
 
     def ahead(self, key: RenderKey, wanted: Sequence[Channel]) -> Ahead | None:
         channels = self._channels.apart()
 
-        def work(report: Progress) -> Callable[[], Textures]:
+        def work(report: Progress) -> Callable[[], Layers]:
             channels.views.of(key)
             report("", 0.5)  # ends here where nobody wants it any more
             drawn = channels.render(key, wanted)
 
-            def finish() -> Textures:
+            def finish() -> Layers:
                 self._channels = channels
-                return self._uploaded(drawn, wanted)
+                return self._layers(drawn, wanted)
 
             return finish
 
         return work
 
-    def _uploaded(self, drawn: Sequence[Channels], wanted: Sequence[Channel]) -> Textures:
+    def _layers(self, drawn: Sequence[Channels], wanted: Sequence[Channel]) -> Layers:
+        if not self._uploads:
+            return (replace(drawn[0], extra=None), *drawn[: len(wanted)])
         with lap("upload", self._ctx.finish):
             return self._upload_all(drawn, wanted)
 
-    def _upload_all(self, drawn: Sequence[Channels], wanted: Sequence[Channel]) -> Textures:
+    def _upload_all(self, drawn: Sequence[Channels], wanted: Sequence[Channel]) -> Layers:
         colours = self._upload(0, 4, drawn[0].rgb, drawn[0].alpha)
         textures = [colours]
         for place, (channels, channel) in enumerate(zip(drawn, wanted, strict=False), 1):
@@ -365,7 +370,7 @@ class Rasterized:
     """Result of a `Rasterizing`."""
 
     of: Rasterizing
-    finish: Callable[[], Textures]  # what its work returned
+    finish: Callable[[], Layers]  # what its work returned
     milliseconds: float
     laps: Mapping[str, float]  # see `langsplat_core.progress`
 
@@ -403,8 +408,8 @@ class GlRenderer:
         self._maps = ctx.texture((tables.shape[1], len(tables)), 3, tables.tobytes(), alignment=1)
         self._inputs = Inputs()
         self._held: RenderKey | None = None  # of the channels
-        self._channels: Sequence[Channel] = ()  # those of `_textures` after the colours
-        self._textures: Textures = ()
+        self._channels: Sequence[Channel] = ()  # those of `_layers` after the colours
+        self._layers: Layers = ()
         self._own: moderngl.Framebuffer | None = None
 
     def forget(self) -> None:
@@ -417,8 +422,7 @@ class GlRenderer:
         self._held, self._channels = None, ()
 
     def draw(self, request: RenderRequest, targets: Sequence[moderngl.Framebuffer]) -> None:
-        """Fill the viewport of each pane's target with its image, and leave the last target bound. Images are
-        rasterized at the size of the request's camera and stretched to a viewport of another."""
+        """Fill each pane's target, of the size of the request's camera, and leave the last one bound."""
         key, wanted = self._rasterized(request)
         for pane, channel, target in zip(request.panes, wanted, targets, strict=True):
             self._compose(pane, key, channel, target)
@@ -452,7 +456,7 @@ class GlRenderer:
     def take(self, made: Rasterized) -> None:
         """Have the result, as if it had been rasterized here."""
         self._drop()
-        self._textures = made.finish()
+        self._layers = made.finish()
         self._held, self._channels = made.of.key, made.of.channels
 
     def _rasterized(self, request: RenderRequest) -> tuple[RenderKey, list[Channel]]:
@@ -461,7 +465,7 @@ class GlRenderer:
         missing = self._missing(key, wanted)
         if missing is not None:
             self._drop()
-            self._textures = self._source.render(key, missing)
+            self._layers = self._source.render(key, missing)
             self._held, self._channels = key, tuple(missing)
         return key, wanted
 
@@ -471,14 +475,23 @@ class GlRenderer:
         needed = {channel.key: channel for channel in wanted if not channel.is_absent}
         return None if self._held == key and needed.keys() <= held else list(needed.values())
 
-    def _texture_of(self, channel: Channel) -> moderngl.Texture:
+    def _layer_of(self, channel: Channel) -> Layer:
         """The one that holds a channel; the colours where it is absent."""
         places = (place for place, held in enumerate(self._channels, 1) if held.key == channel.key)
-        return self._textures[next(places, 0)]
+        return self._layers[next(places, 0)]
 
     def _compose(self, pane: Pane, key: RenderKey, channel: Channel, target: moderngl.Framebuffer) -> None:
-        set_uniforms(self._program, _uniforms(pane, _ranges(pane, key, channel), channel.is_absent))
-        for unit, texture in enumerate((self._textures[0], self._texture_of(channel), self._maps)):
+        layer, ranges = self._layer_of(channel), _ranges(pane, key, channel)
+        if isinstance(layer, Channels):
+            (image,) = target.color_attachments
+            assert isinstance(image, moderngl.Texture)
+            with lap("compose", self._ctx.finish):
+                image.write(composed(layer, pane.picture, ranges))
+            target.use()
+            return
+        set_uniforms(self._program, _uniforms(pane, ranges, channel.is_absent))
+        for unit, texture in enumerate((self._layers[0], layer, self._maps)):
+            assert isinstance(texture, moderngl.Texture)
             texture.use(unit)
         with lap("compose", self._ctx.finish), drawing(self._ctx, target, moderngl.NOTHING):
             self._vao.render(moderngl.TRIANGLES, vertices=3)
@@ -488,7 +501,9 @@ class GlRenderer:
         """True where the last image, if there was one, holds nothing of the scene."""
         if self._held is None:
             return False
-        colours = self._textures[0]
+        colours = self._layers[0]
+        if isinstance(colours, Channels):
+            return bool(colours.alpha.max(initial=0) < VISIBLE_ALPHA)
         alpha = np.frombuffer(colours.read(), colours.dtype).reshape(-1, colours.components)[:, -1]
         return bool(alpha.max(initial=0) < VISIBLE_ALPHA)
 
@@ -508,7 +523,7 @@ class GlRenderer:
     def depth_map(self, request: RenderRequest) -> Array:
         """(H, W) camera z of the surface in every pixel of a pane, world units, 0 where nothing stops half
         the light."""
-        self._held = None  # the rasterizer draws, and its textures hold until then
+        self._held = None  # the rasterizer draws, and its layers hold until then
         return self._source.depth_map(self._inputs.key(request))
 
     def _release_own(self) -> None:
