@@ -43,7 +43,7 @@ MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
 JSON_LIMIT = 16 << 20  # bytes; ours has 10 kB
 LEAST_ROW = 12  # bytes of a Gaussian: its position
 MOST_NODES = 1 << 16
-SIGNS = np.array([-1, -1, 1])  # left up front to right down front, and back
+SIGNS = np.array([-1, -1, 1], np.float32)  # left up front to right down front, and back
 SRGB = "srgb_rec709_display"
 
 
@@ -67,7 +67,7 @@ def read_gltf_scene(path: Path | str) -> Scene:
 
 def _turned(gaussians: Gaussians) -> Gaussians:
     """Return the Gaussians half a turn about z further: from glTF's axes to the PLY's, or back."""
-    harmonics = np.concatenate([[1], coefficient_signs(SIGNS, gaussians.sh.shape[1] - 1)])
+    harmonics = np.append(np.float32(1), coefficient_signs(SIGNS, gaussians.sh.shape[1] - 1))
     with np.errstate(invalid="ignore"):
         return replace(
             gaussians,
@@ -172,13 +172,10 @@ def _gaussians(file: "_File", attributes: Any, count: int) -> Gaussians:
     scales = column(f"{EXTENSION}:SCALE", 3)
     log_scales = scales if (scales < 0).any() else np.log(scales)
     logits = logit(column(f"{EXTENSION}:OPACITY", 1)[:, 0].astype(np.float64))
-    return Gaussians(
-        column("POSITION", 3),
-        log_scales,
-        quats[:, [3, 0, 1, 2]],
-        logits,
-        np.stack([column(name, 3) for name in names[:have]], axis=1),
-    )
+    sh = np.empty((count, have, 3), np.float32)
+    for number, name in enumerate(names[:have]):
+        sh[:, number] = column(name, 3)
+    return Gaussians(column("POSITION", 3), log_scales, quats[:, [3, 0, 1, 2]], logits, sh)
 
 
 def _index(value: Any) -> int:
@@ -197,11 +194,11 @@ class _File:
         with file:
             start = file.read(12)
             if start[:4] == MAGIC:
-                text, self._binary = self._chunks(start, file.read())
+                text, self._binary = self._chunks(start, memoryview(file.read()))
             else:
                 if self.size > 2**31:
                     raise FormatError(f"{path}: {self.size} bytes of JSON; write it as .glb")
-                text, self._binary = start + file.read(), b""
+                text, self._binary = start + file.read(), memoryview(b"")
         self.content = parse_json(text, path)
         if not isinstance(self.content, dict) or not isinstance(self.content.get("asset"), dict):
             raise FormatError(f"{path}: not a glTF file: it has no 'asset'")
@@ -215,16 +212,16 @@ class _File:
         )
         if unknown:
             raise FormatError(f"{path}: needs {quoted(unknown[0])}, which is not read; export it without")
-        self._buffers: dict[int, bytes] = {}
+        self._buffers: dict[int, bytes | memoryview] = {}
 
-    def _chunks(self, start: bytes, rest: bytes) -> tuple[bytes, bytes]:
+    def _chunks(self, start: bytes, rest: memoryview) -> tuple[bytes, memoryview]:
         """The JSON and the binary chunk of a .glb."""
         version, length = struct.unpack("<II", start[4:]) if len(start) == 12 else (0, 0)
         if version != 2 or length > self.size:
             raise FormatError(
                 f"{self.path}: a .glb of version {version} and {length} bytes, found {self.size}"
             )
-        found: list[tuple[bytes, bytes]] = []
+        found: list[tuple[bytes, memoryview]] = []
         at = 0
         while at + 8 <= length - 12 and len(found) < 2:
             size, kind = struct.unpack_from("<I4s", rest, at)
@@ -236,7 +233,8 @@ class _File:
             raise FormatError(
                 f"{self.path}: does not begin with a chunk of JSON of at most {JSON_LIMIT} bytes"
             )
-        return found[0][1], found[1][1] if len(found) == 2 and found[1][0] == BINARY_CHUNK else b""
+        binary = found[1][1] if len(found) == 2 and found[1][0] == BINARY_CHUNK else rest[:0]
+        return bytes(found[0][1]), binary
 
     def whole_number(self, entries: Any, index: Any, key: str, default: int | None = None) -> int:
         """Return entry `key` of `entries[index]`, a whole number from 0."""
@@ -279,7 +277,7 @@ class _File:
             raise FormatError(f"{self.path}: truncated: buffer view {index} lies beyond its buffer")
         return memoryview(buffer)[offset : offset + size], stride
 
-    def _buffer(self, index: int) -> bytes:
+    def _buffer(self, index: int) -> bytes | memoryview:
         if index not in self._buffers:
             uri = self.content["buffers"][index].get("uri")
             if uri is None and index == 0:
