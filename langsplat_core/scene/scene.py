@@ -12,6 +12,10 @@ from langsplat_core.scene.camera import Camera, look_at
 from langsplat_core.scene.gaussians import Gaussians
 from langsplat_core.scene.language import LanguageField
 
+# The opening view of a scene without cameras is from where it covers the most of a grid; lengths in radii.
+SAMPLES, TURNS, REACH, CELL = 20_000, 12, 3.0, 0.06
+MORE = 1.25  # how many times as much another side has to cover, to be better
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -69,11 +73,26 @@ class Scene:
         # far from the origin float32 positions are coarse, and a camera needs a distance that it can tell
         return centre, max(radius, 1e-3, 1e-6 * float(np.abs(centre).max()))
 
+    def _across(self, centre: Array, radius: float, up: Array) -> Array:
+        """(3,) the level direction along which the scene covers the most of an image."""
+        side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+        side /= np.linalg.norm(side)
+        ahead = np.cross(up, side)
+        means = self.gaussians.means[self.gaussians.valid()]
+        offsets = (means[:: len(means) // SAMPLES + 1] - centre) / radius
+        heights, covered, directions = offsets @ up, [], []
+        for angle in np.arange(TURNS) * np.pi / TURNS:
+            directions.append(np.cos(angle) * side + np.sin(angle) * ahead)
+            places = np.stack([offsets @ np.cross(up, directions[-1]), heights], 1)
+            cells = np.floor(places[(np.abs(places) < REACH).all(1)] / CELL)
+            covered.append(len(np.unique(cells, axis=0)))
+        broadest = int(np.argmax(covered))
+        return np.asarray(directions[broadest if covered[broadest] > MORE * covered[0] else 0])
+
     def framing_camera(self, size: tuple[int, int]) -> Camera:
-        """A camera of `size` (width, height) that frames the bounds, a little from above."""
+        """A camera of `size` (width, height) that frames the bounds, a little from above, and from where they
+        are broadest."""
         centre, radius = self.bounds()
         up = self.up()
-        side = np.eye(3)[int(np.argmin(np.abs(up)))]
-        side = np.cross(up, side)
-        direction = side / np.linalg.norm(side) + 0.35 * up
+        direction = self._across(centre, radius, up) + 0.35 * up
         return look_at(centre + 2.6 * radius * direction / np.linalg.norm(direction), centre, up, size)

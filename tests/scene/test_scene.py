@@ -28,6 +28,19 @@ def test_a_camera_frames_any_scene(offset: float) -> None:
     np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-6)
 
 
+@pytest.mark.parametrize("angle", [0.0, 0.5, 1.3, 2.2])
+def test_a_thin_scene_is_seen_from_its_broad_side(angle: float) -> None:
+    """Up is -y without cameras; a sheet that stands upright, turned about it."""
+    gaussians = random_gaussians(2000)
+    across, high, thin = np.random.default_rng(0).uniform(-1, 1, (3, 2000)) * [[1.0], [1.0], [0.05]]
+    normal = np.array([np.cos(angle), 0, np.sin(angle)])
+    along = np.cross([0, 1, 0], normal)
+    means = across[:, None] * along + high[:, None] * [0, 1, 0] + thin[:, None] * normal
+    camera = Scene(replace(gaussians, means=means)).framing_camera((64, 48))
+    ahead = camera.rotation[2] * [1, 0, 1]
+    assert abs(ahead @ normal) / np.linalg.norm(ahead) > 0.75  # a quarter more would be better
+
+
 # Fewer Gaussians that look much the same.
 
 
