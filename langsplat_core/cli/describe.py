@@ -23,6 +23,8 @@ from langsplat_core.cli.run import OutputConsole
 from langsplat_core.cli.teach import Level, pixel_in, searchable
 from langsplat_core.config import Count, CountOrZero
 from langsplat_core.errors import InputError
+from langsplat_core.io.scenes import check_writable
+from langsplat_core.pipeline.exporting import export_labels
 from langsplat_core.progress import Progress, TerminalProgress
 from langsplat_core.query.describe import Describer, Entry, Words, look_at_pixel
 from langsplat_core.query.engine import QueryEngine
@@ -53,6 +55,9 @@ class Describe:
     """This semantic level alone."""
     outline: bool = False
     """The scene as a tree: wholes, with their parts under them."""
+    labels: Annotated[Path | None, tyro.conf.arg(metavar="OUT.ply")] = None
+    """Write the scene with instance, part and class of each Gaussian as properties, and OUT.labels.json with
+    the tree's nodes: words, boxes, counts."""
     top: Count = 5
     """Words per level."""
     vocabulary: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -69,6 +74,9 @@ class Describe:
         with TerminalProgress() as progress:
             engine = QueryEngine(scene, load_text_encoder, encoder_id=self.encoder)
             describer = Describer(engine, phrases, progress)
+            if self.labels is not None:
+                print(f"{self.labels} and {export_labels(describer, self.labels)}")
+                return
             answer = self._described(describer, progress)
         if self.json:
             print_json(answer | basis_fields(engine))
@@ -103,6 +111,8 @@ class Describe:
             raise InputError(
                 "--outline is of the whole scene, at all levels; leave out what else is asked for"
             )
+        if self.labels is not None:
+            self._check_labels(self.labels)
         if len(self._asked_of) > 1:
             raise InputError(f"{' and '.join(self._asked_of)} are several questions; ask one of them")
         if self.phrase is None and self.instance != 1:
@@ -117,6 +127,13 @@ class Describe:
         if not scene.cameras:
             raise InputError(f"{self.scene}: has no cameras, so --pixel means nothing; ask by --gaussian")
         pixel_in(scene, self.camera, self.pixel, "--pixel {} {}".format(*self.pixel))
+
+    def _check_labels(self, out: Path) -> None:
+        if self.outline or self.json or self._asked_of or self.level is not None:
+            raise InputError("--labels writes files of the whole scene; leave out what else is asked for")
+        if out.suffix.lower() != ".ply":
+            raise InputError(f"{out}: labels are properties of a .ply; choose such a name")
+        check_writable(out)
 
     def _described(self, describer: Describer, progress: Progress) -> dict[str, Any]:
         """The inventory, or the words of the place that is asked for, ready for JSON."""

@@ -3,8 +3,8 @@ desktop entry and the tests of round trips and damaged files read; and a scene's
 
 A scene is `scene.ply` with, beside it, `scene.langsplat.safetensors` and `scene.cameras.json`, either of
 which may be absent. The same companions are looked for beside a compressed PLY or a SOG folder. Those of
-`scene.spz`, `.sog`, `.splat` and `.ksplat` keep its suffix, `scene.spz.langsplat.safetensors`: the sidecar
-knows the rounded positions of that file, so that it could not serve a `scene.ply` in the same folder.
+the other formats keep its suffix, `scene.spz.langsplat.safetensors`: the sidecar knows the rounded positions
+of that file, so that it could not serve a `scene.ply` in the same folder.
 """
 
 import logging
@@ -21,10 +21,11 @@ from langsplat_core.io import cameras as camera_files
 from langsplat_core.io import language, ply
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.files import atomic_path, check_output_file
+from langsplat_core.io.gltf import read_gltf_scene, write_gltf
 from langsplat_core.io.hostile import exists
 from langsplat_core.io.language import read_language, write_language
 from langsplat_core.io.ply import metres_comment, read_ply_scene, write_ply
-from langsplat_core.io.sog import META_NAME, read_sog_scene, write_sog
+from langsplat_core.io.sog import LOD_NAME, META_NAME, read_sog_scene, write_sog
 from langsplat_core.io.splat import read_ksplat, read_splat, write_splat
 from langsplat_core.io.spz import read_spz_scene, write_spz
 from langsplat_core.scene import Gaussians, Scene
@@ -43,7 +44,7 @@ class SceneFormat:
     write: Callable[[Path, Scene], None] | None = None  # None: read only
     loses: tuple[str, ...] = ()  # what a written file cannot hold, in words of `LOSSES`
     own_companions: bool = False  # companions keep the suffix: `a.spz.langsplat.safetensors`
-    folder_file: str = ""  # a folder with this file in it is a scene too, and so is the file
+    folder_files: tuple[str, ...] = ()  # a folder with one of these in it is a scene too, and so is the file
     mime: str = "model/x-gaussian-splat"
 
 
@@ -81,13 +82,24 @@ FORMATS = (
         lambda path, scene: write_sog(path, scene.gaussians, scene.antialiased),
         loses=("precision", "metres per unit", "extra properties"),
         own_companions=True,
-        folder_file=META_NAME,
+        folder_files=(META_NAME, LOD_NAME),
+    ),
+    *(
+        SceneFormat(
+            suffix,
+            read_gltf_scene,
+            lambda path, scene: write_gltf(path, scene.gaussians),
+            loses=("precision", "antialiasing", "metres per unit", "extra properties"),
+            own_companions=True,
+            mime=mime,
+        )
+        for suffix, mime in ((".glb", "model/gltf-binary"), (".gltf", "model/gltf+json"))
     ),
 )
 WRITABLE = tuple(row.suffix for row in FORMATS if row.write is not None)
 SUPPORTED = ", ".join(
     [row.suffix for row in FORMATS]
-    + [f"a folder with {row.folder_file} or that file" for row in FORMATS if row.folder_file]
+    + [f"a folder with {name} or that file" for row in FORMATS for name in row.folder_files]
 )
 
 
@@ -97,7 +109,7 @@ def format_of(path: Path) -> SceneFormat | None:
     for row in FORMATS:
         if not folder and path.suffix.lower() == row.suffix:
             return row
-        if row.folder_file and (path.name == row.folder_file or exists(path / row.folder_file)):
+        if any(path.name == name or exists(path / name) for name in row.folder_files):
             return row
     return None
 
@@ -222,7 +234,7 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
     folder `a/b` (or `a/b/meta.json`) -> `a/b<suffix>`, beside the folder; `a/b.spz`, .sog, .splat or .ksplat
     -> `a/b.spz<suffix>` and so on."""
     scene = Path(scene)
-    if any(row.folder_file and scene.name == row.folder_file for row in FORMATS):
+    if any(scene.name in row.folder_files for row in FORMATS):
         scene = scene.parent
     row = None if os.path.isdir(scene) else format_of(scene)  # which a name too long is not
     if row is not None:
@@ -232,13 +244,16 @@ def companion_path(scene: Path | str, suffix: str) -> Path:
 
 
 def scene_files(path: Path | str) -> tuple[Path, ...]:
-    """Return the files that `load_scene` reads, the scene's own first (of a SOG folder its meta.json, then
-    images), then language field and cameras, whether these are there or not."""
+    """Return the files that `load_scene` reads, the scene's own first (of a SOG folder its meta.json or
+    lod-meta.json, then images), then language field and cameras, whether these are there or not."""
     path = Path(path)
     own: tuple[Path, ...] = (path,)
-    if os.path.isdir(path) or path.name == META_NAME:  # which a name too long is not
-        folder = path if os.path.isdir(path) else path.parent
-        own = (folder / META_NAME, *sorted(folder.glob("*.webp")))
+    folder = path if os.path.isdir(path) else path.parent  # which a name too long is not
+    if os.path.isdir(path) or path.name in (META_NAME, LOD_NAME):
+        streamed = path.name == LOD_NAME or (path.name != META_NAME and not exists(folder / META_NAME))
+        streamed = streamed and exists(folder / LOD_NAME)
+        own = (folder / (LOD_NAME if streamed else META_NAME), *sorted(folder.glob("*.webp")))
+        own += tuple(sorted(folder.glob("*/*"))) if streamed else ()
     return (*own, companion_path(path, language.SUFFIX), _cameras_path(path))
 
 

@@ -12,6 +12,10 @@ by row, belongs to Gaussian i:
     shN, optional        files[1]: 16-bit number of a palette entry; files[0]: the palette, 64 entries a
                          row, one pixel per coefficient, rgb: indices into `codebook`
 
+A streamed scene is a folder of such folders with `lod-meta.json`: `filenames` of their meta files, and a
+`tree` of boxes whose leaves name, for each level of detail ("0" is the finest), a `file` and the rows from
+`offset`, `count` of them, in it. `environment` may name one more, of what lies around.
+
 Opacities of 0 and 1 become logits of -infinity and +infinity. `model: "antialiased"`, in older files
 `antialias: true`, says that the Gaussians were trained with Mip-Splatting's compensation. Source:
 PlayCanvas' public specification.
@@ -30,11 +34,21 @@ from PIL import Image
 from langsplat_core.arrays import Array, logit, sigmoid, unit
 from langsplat_core.errors import FormatError, quoted
 from langsplat_core.io.files import atomic_path
-from langsplat_core.io.hostile import Archive, open_for_reading, opened, opened_archive, parse_json
+from langsplat_core.io.hostile import (
+    Archive,
+    exists,
+    open_for_reading,
+    opened,
+    opened_archive,
+    parse_json,
+    read_json_file,
+)
 from langsplat_core.io.ply import smallest_three
 from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
+from langsplat_core.scene.gaussians import joined
 
-META_NAME = "meta.json"
+META_NAME, LOD_NAME = "meta.json", "lod-meta.json"
+LOD_LIMIT = 16 << 20  # bytes of lod-meta.json; a leaf, of some thousand Gaussians, has 300
 META_LIMIT = 1024 * 1024  # bytes; a real one has three codebooks, 15 kB
 PALETTE_ROW, PALETTE_ROWS = 64, 1024  # entries a row, most rows
 IMAGE_LIMIT = 1 << 30  # bytes of one image file
@@ -48,17 +62,69 @@ Fetch = Callable[[str, int], bytes]  # (file name, most bytes) -> content
 
 def read_sog_scene(path: Path | str) -> Scene:
     """Return the Gaussians of a SOG folder, its `meta.json` or a `.sog` file, and whether they are to be
-    drawn antialiased.
+    drawn antialiased; of a streamed scene (`lod-meta.json`) all of its finest level.
 
     Raises InputError when a file cannot be opened and FormatError when it breaks a rule of the format.
     """
     path = Path(path)
+    if path.name == LOD_NAME or (path.is_dir() and exists(path / LOD_NAME) and not exists(path / META_NAME)):
+        return _read_streamed(path / LOD_NAME if path.is_dir() else path)
     if path.is_dir():
         return _decode(_folder_reader(path), path / META_NAME)
     if path.suffix.lower() == ".json":
         return _decode(_folder_reader(path.parent), path)
     with opened_archive(path, "SOG archive") as archive:
         return _decode(_archive_reader(archive), path / META_NAME)
+
+
+def _read_streamed(path: Path) -> Scene:
+    content = read_json_file(path, LOD_LIMIT)
+    try:
+        names, tree = content["filenames"], content["tree"]
+        ranges = _finest_ranges(tree)
+        environment = content.get("environment")
+        files = {number: _inside(path, names[number]) for number in ranges}
+        around = [] if environment is None else [_inside(path, environment)]
+        if len({*files.values(), *around}) < len(files) + len(around):
+            raise ValueError("a file is named twice")
+    except (LookupError, TypeError, AttributeError, ValueError) as error:
+        raise FormatError(f"{path}: not a sound {LOD_NAME} ({str(error)[:80]}); export it again") from None
+    parts, antialiased = [], False
+    for number, file in files.items():
+        scene = read_sog_scene(file)
+        count, rows = len(scene.gaussians), ranges[number]
+        if sum(length for _, length in rows) > count or any(at + length > count for at, length in rows):
+            raise FormatError(f"{path}: asks for more than the {count} Gaussians of {file}")
+        parts += [scene.gaussians.take(np.arange(at, at + length)) for at, length in rows]
+        antialiased |= scene.antialiased
+    return Scene(joined(parts + [read_sog_scene(file).gaussians for file in around]), antialiased=antialiased)
+
+
+def _finest_ranges(tree: Any) -> dict[int, list[tuple[int, int]]]:
+    """File -> (offset, count) of the rows of the finest level, in the order of the tree."""
+    waiting, leaves = [tree], []
+    while waiting:
+        node = waiting.pop()
+        waiting += reversed(node.get("children", []))
+        leaves.append({int(level): place for level, place in node.get("lods", {}).items()})
+    finest = min((level for leaf in leaves for level in leaf), default=0)
+    ranges: dict[int, list[tuple[int, int]]] = {}
+    for place in (leaf[finest] for leaf in leaves if finest in leaf):
+        numbers = [place[key] for key in ("file", "offset", "count")]
+        if any(type(number) is not int or number < 0 for number in numbers):
+            raise ValueError(f"{quoted(place)} is no place")
+        ranges.setdefault(numbers[0], []).append((numbers[1], numbers[2]))
+    return ranges
+
+
+def _inside(path: Path, name: Any) -> Path:
+    """A file beside `path` or in a folder there: a path could lead out of it."""
+    parts = name.split("/") if isinstance(name, str) else []
+    if not 1 <= len(parts) <= 2 or set(name) & set("\\:\0") or set(parts) & {"", ".", ".."}:
+        raise ValueError(f"{quoted(name)} is no file in the scene's folder")
+    if parts[-1] != META_NAME and not parts[-1].endswith(".sog"):
+        raise ValueError(f"{quoted(name)} is no SOG")
+    return path.parent.joinpath(*parts)
 
 
 def _folder_reader(folder: Path) -> Fetch:

@@ -12,6 +12,7 @@ Source of the layout: README, extensions and loader of nianticlabs/spz; the code
 """
 
 import gzip
+import io
 import struct
 import zlib
 from dataclasses import dataclass
@@ -68,19 +69,23 @@ def read_packed(path: Path) -> Packed:
     """Raises InputError when the file cannot be opened and FormatError when it breaks a rule."""
     file, size = open_for_reading(path)
     with file:
-        start = file.read(8)
-        file.seek(0)
-        if start.startswith(GZIP_MAGIC):
-            try:
-                with gzip.GzipFile(fileobj=file) as unzipped:
-                    return _read_one_stream(unzipped, BYTES_PER_BYTE * size + SLACK, path)  # type: ignore[arg-type]
-            except (OSError, EOFError, zlib.error) as error:
-                raise FormatError(
-                    f"{path}: not a whole gzip stream ({str(error)[:80]}); fetch it again"
-                ) from None
-        if start == MAGIC + b"\x04\0\0\0":
-            return _read_streams(file, size, path)
-        return _read_one_stream(file, size, path)
+        return _read_opened(file, size, path)
+
+
+def _read_opened(file: BinaryIO, size: int, path: Path) -> Packed:
+    start = file.read(8)
+    file.seek(0)
+    if start.startswith(GZIP_MAGIC):
+        try:
+            with gzip.GzipFile(fileobj=file) as unzipped:
+                return _read_one_stream(unzipped, BYTES_PER_BYTE * size + SLACK, path)  # type: ignore[arg-type]
+        except (OSError, EOFError, zlib.error) as error:
+            raise FormatError(
+                f"{path}: not a whole gzip stream ({str(error)[:80]}); fetch it again"
+            ) from None
+    if start == MAGIC + b"\x04\0\0\0":
+        return _read_streams(file, size, path)
+    return _read_one_stream(file, size, path)
 
 
 @dataclass(frozen=True)
@@ -233,18 +238,26 @@ def read_spz_scene(path: Path | str) -> Scene:
 
     Raises InputError when the file cannot be opened and FormatError when it breaks a rule of the format.
     """
-    packed = read_packed(Path(path))
+    return _scene(read_packed(Path(path)))
+
+
+def decode_spz(data: bytes, path: Path) -> Scene:
+    """The scene of an .spz file in memory, along the axes of the PLY; `path` is for messages. FormatError."""
+    return _scene(_read_opened(io.BytesIO(data), len(data), path))
+
+
+def _scene(packed: Packed) -> Scene:
     blocks, signs = packed.blocks, _signs_to_rdf(packed.axes)
     count, degree = len(blocks["alphas"]), min(packed.sh_degree, 3)
     rest = blocks["sh"].reshape(count, blocks["sh"].shape[1] // 3, 3)[:, : SH_COUNTS[degree] - 1]
-    rest = (rest.astype(np.float32) - 128) / 128 * _coefficient_signs(signs, rest.shape[1])[:, None]
+    rest = (rest.astype(np.float32) - 128) / 128 * coefficient_signs(signs, rest.shape[1])[:, None]
     base = (blocks["colours"] / 255 - 0.5) / COLOUR_SCALE
     with np.errstate(invalid="ignore"):  # signalling NaN in half floats become ordinary ones
         means = _positions(packed) * signs
     gaussians = Gaussians(
         means=means,
         log_scales=blocks["scales"].astype(np.float32) / 16 - 10,
-        quats_wxyz=_rotations(packed) * _quaternion_signs(signs),
+        quats_wxyz=_rotations(packed) * quaternion_signs(signs),
         opacity_logits=logit(blocks["alphas"][:, 0] / 255),
         sh=np.concatenate([base[:, None], rest], axis=1),
     )
@@ -265,13 +278,13 @@ def write_spz(path: Path | str, gaussians: Gaussians, antialiased: bool = False)
     bits = _fractional_bits(drawn, Path(path))
     signs = _signs_to_rdf(AXES_RUB)  # half a turn, its own inverse
     codes = np.rint(drawn.means.astype(np.float64) * signs * 2.0**bits).astype("<i4")
-    rest = drawn.sh[:, 1:] * _coefficient_signs(signs, drawn.sh.shape[1] - 1)[:, None]
+    rest = drawn.sh[:, 1:] * coefficient_signs(signs, drawn.sh.shape[1] - 1)[:, None]
     coded = {
         "positions": codes[..., None].view(np.uint8)[..., :3].reshape(-1, 9),
         "alphas": to_bytes(sigmoid(drawn.opacity_logits) * 255)[:, None],
         "colours": to_bytes((drawn.sh[:, 0] * COLOUR_SCALE + 0.5) * 255),
         "scales": to_bytes((drawn.log_scales + 10) * 16),
-        "rotations": _rotation_codes(drawn.quats_wxyz * _quaternion_signs(signs)),
+        "rotations": _rotation_codes(drawn.quats_wxyz * quaternion_signs(signs)),
         "sh": to_bytes(rest.reshape(len(rest), 3 * rest.shape[1]) * 128 + 128),
     }
     numbers = (3, len(valid), gaussians.sh_degree, bits, ANTIALIASED if antialiased else 0, 0)
@@ -353,11 +366,11 @@ def _signs_to_rdf(axes: int) -> Array:
     return np.array([1 if right else -1, -1 if up else 1, 1 if front else -1])
 
 
-def _quaternion_signs(signs: Array) -> Array:
+def quaternion_signs(signs: Array) -> Array:
     """(4,) signs of w x y z: mirroring an axis turns the two rotations about the others round."""
     return np.array([1, signs[1] * signs[2], signs[0] * signs[2], signs[0] * signs[1]])
 
 
-def _coefficient_signs(signs: Array, count: int) -> Array:
+def coefficient_signs(signs: Array, count: int) -> Array:
     """(count,) of the coefficients from degree 1 on."""
     return np.where(_ODD, signs, 1).prod(axis=1)[:count]

@@ -89,6 +89,18 @@ class Gaussians:
         )
 
 
+def joined(parts: Sequence[Gaussians]) -> Gaussians:
+    """Return the Gaussians of all `parts`, in order; harmonics of lower degrees are filled up with zeros."""
+    if not parts:
+        return Gaussians(*(np.zeros(shape) for shape in ((0, 3), (0, 3), (0, 4), 0, (0, 1, 3))))
+    if len(parts) == 1:
+        return parts[0]
+    count = max(part.sh.shape[1] for part in parts)
+    columns = {field.name: [getattr(part, field.name) for part in parts] for field in fields(Gaussians)}
+    columns["sh"] = [np.pad(sh, ((0, 0), (0, count - sh.shape[1]), (0, 0))) for sh in columns["sh"]]
+    return Gaussians(**{name: np.concatenate(column) for name, column in columns.items()})
+
+
 # A scene with fewer and larger Gaussians that looks much the same: for images that have to be fast.
 #
 # Neighbours are merged four at a time where together they are about one blob: mean and covariance become

@@ -80,15 +80,14 @@ class Scene:
         ahead = np.cross(up, side)
         means = self.gaussians.means[self.gaussians.valid()]
         offsets = (means[:: len(means) // SAMPLES + 1] - centre) / radius
-        heights, best, most = offsets @ up, side, 0.0
+        heights, covered, directions = offsets @ up, [], []
         for angle in np.arange(TURNS) * np.pi / TURNS:
-            direction = np.cos(angle) * side + np.sin(angle) * ahead
-            places = np.stack([offsets @ np.cross(up, direction), heights], 1)
+            directions.append(np.cos(angle) * side + np.sin(angle) * ahead)
+            places = np.stack([offsets @ np.cross(up, directions[-1]), heights], 1)
             cells = np.floor(places[(np.abs(places) < REACH).all(1)] / CELL)
-            covered = len(np.unique(cells, axis=0))
-            if covered > MORE * most:
-                best, most = direction, covered
-        return np.asarray(best)
+            covered.append(len(np.unique(cells, axis=0)))
+        broadest = int(np.argmax(covered))
+        return np.asarray(directions[broadest if covered[broadest] > MORE * covered[0] else 0])
 
     def framing_camera(self, size: tuple[int, int]) -> Camera:
         """A camera of `size` (width, height) that frames the bounds, a little from above, and from where they

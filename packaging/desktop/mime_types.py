@@ -3,7 +3,12 @@
 from langsplat_core.io.scenes import FORMATS
 
 HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n<mime-info xmlns="http://www.freedesktop.org/standards/shared-mime-info">'
-NAMES = {"model/x-gaussian-splat": "3D Gaussian scene", "model/x-ply": "3D points, mesh or Gaussians (PLY)"}
+NAMES = {
+    "model/x-gaussian-splat": "3D Gaussian scene",
+    "model/x-ply": "3D points, mesh or Gaussians (PLY)",
+    "model/gltf-binary": "3D scene (glTF, binary)",
+    "model/gltf+json": "3D scene (glTF)",
+}
 FURTHER = {
     "model/x-gaussian-splat": ['<glob pattern="*.compressed.ply" weight="60"/>'],
     "model/x-ply": [
@@ -20,7 +25,7 @@ def mime_info() -> str:
     lines = [HEAD]
     for mime, name in NAMES.items():
         globs = [f'<glob pattern="*{row.suffix}"/>' for row in FORMATS if row.mime == mime]
-        inside = [f"<comment>{name}</comment>", *FURTHER[mime], *globs]
+        inside = [f"<comment>{name}</comment>", *FURTHER.get(mime, []), *globs]
         lines += [f'  <mime-type type="{mime}">', *(f"    {line}" for line in inside), "  </mime-type>"]
     return "\n".join([*lines, "</mime-info>"])
 

@@ -6,6 +6,7 @@ from typing import Union
 from langsplat_core.cli.run import Command, main, parsed, with_codec
 from tests.benchmarks.changed import Changed
 from tests.benchmarks.clean import Clean
+from tests.benchmarks.formats import Formats
 from tests.benchmarks.library import Found
 from tests.benchmarks.lifting import Lifting
 from tests.benchmarks.maps import Maps
@@ -23,7 +24,10 @@ PROGRAM = "python -m tests.benchmarks"
 def parse(args: list[str]) -> Command:
     """The report that the words of a command line name; SystemExit as tyro raises it."""
     about = "Measure this project where the truth is known, and at large sizes."
-    known = (Rooms, Verdicts, Taught, Phrases, Votes, Clean, Maps, Meshes, Lifting, Scale, Found, Changed)
+    known = (
+        *(Rooms, Verdicts, Taught, Phrases, Votes, Clean, Maps, Meshes),
+        *(Lifting, Scale, Found, Changed, Formats),
+    )
     reports = tuple(with_codec(report, args) for report in known)
     command: Command = parsed(PROGRAM, Union[(*reports,)], args, about)
     return command

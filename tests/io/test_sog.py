@@ -8,12 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from langsplat_core.arrays import sigmoid, unit
+from langsplat_core.errors import InputError
 from langsplat_core.io import sog
-from langsplat_core.io.scenes import load_gaussians
+from langsplat_core.io.ply import write_ply
+from langsplat_core.io.scenes import load_gaussians, scene_files
 from langsplat_core.io.sog import write_sog
 from langsplat_core.scene import Gaussians
+from langsplat_core.scene.gaussians import joined
 from tests.support.scenes import random_gaussians
 
 
@@ -97,3 +101,81 @@ def test_splat_transform_reads_it_alike(tmp_path):
         np.testing.assert_allclose(getattr(theirs, name), getattr(mine, name), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(sigmoid(theirs.opacity_logits), sigmoid(mine.opacity_logits), atol=1e-6)
     assert angles(mine, theirs).max() < 0.05
+
+
+def streamed(folder, parts: list[Gaussians], change=lambda content: None):
+    """A streamed scene: each of `parts` a leaf of the finest level, in two files; a coarse row."""
+    for name, some in {"0_0": parts[:-1], "0_1": parts[-1:], "1_0": [parts[0].take(np.arange(1))]}.items():
+        write_sog(folder / "packed.sog", joined(some))
+        with zipfile.ZipFile(folder / "packed.sog") as archive:
+            archive.extractall(folder / name)
+    (folder / "packed.sog").unlink()
+    places = [{"file": 0, "offset": 0, "count": len(parts[0])}]
+    places.append({"file": 0, "offset": len(parts[0]), "count": len(parts[1])})
+    places.append({"file": 2, "offset": 0, "count": len(parts[2])})
+    leaves = [{"lods": {"0": place}} for place in places]
+    leaves[0]["lods"]["1"] = {"file": 1, "offset": 0, "count": 1}
+    tree = {"children": [leaves[0], {"children": leaves[1:]}]}
+    names = ["0_0/meta.json", "1_0/meta.json", "0_1/meta.json"]
+    content = {"version": 1, "lodLevels": 2, "filenames": names, "tree": tree}
+    change(content)
+    (folder / "lod-meta.json").write_text(json.dumps(content))
+    return folder
+
+
+def three_parts() -> list[Gaussians]:
+    return [random_gaussians(count, seed=count, sh_degree=1) for count in (30, 40, 50)]
+
+
+def test_a_streamed_scene_is_read_at_its_finest_level(tmp_path):
+    parts = three_parts()
+    folder = streamed(tmp_path, parts)
+    for path in (folder, folder / "lod-meta.json"):
+        got = load_gaussians(path)
+        assert len(got) == 120
+        assert np.abs(got.means - joined(parts).means).max() < 1e-3  # in the order of the tree
+    files = scene_files(folder)
+    assert files[0] == folder / "lod-meta.json"
+    assert {path.parent.name for path in files if path.suffix == ".webp"} == {"0_0", "0_1", "1_0"}
+
+    def surroundings(content: dict) -> None:
+        content["filenames"].pop(1)  # of the coarse level, which is not asked for
+        content["filenames"].insert(1, "none/meta.json")
+        content["environment"] = "1_0/meta.json"
+
+    assert len(load_gaussians(streamed(tmp_path, parts, surroundings))) == 121
+
+
+LIES = {
+    "a path": lambda c: c["filenames"].__setitem__(0, "../x/meta.json"),
+    "a missing file": lambda c: c["filenames"].__setitem__(0, "3_0/meta.json"),
+    "itself": lambda c: c["filenames"].__setitem__(0, "lod-meta.json"),
+    "a file twice": lambda c: c["filenames"].__setitem__(2, "0_0/meta.json"),
+    "rows beyond the end": lambda c: c["tree"]["children"][0]["lods"]["0"].update(count=71),
+    "rows again and again": lambda c: c["tree"]["children"].extend([c["tree"]["children"][0]] * 99),
+    "negative rows": lambda c: c["tree"]["children"][0]["lods"]["0"].update(offset=-1),
+    "no tree": lambda c: c.pop("tree"),
+    "a tree of numbers": lambda c: c["tree"].update(children=[1]),
+}
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_a_streamed_scene_that_lies_is_refused(tmp_path, name):
+    with pytest.raises(InputError):
+        load_gaussians(streamed(tmp_path, three_parts(), LIES[name]))
+
+
+@pytest.mark.slow
+def test_what_splat_transform_streams_is_read(tmp_path):
+    program = shutil.which("splat-transform")
+    if program is None:
+        pytest.skip("splat-transform of @playcanvas is not installed")
+    scene = random_gaussians(30_000, sh_degree=1)
+    write_ply(tmp_path / "a.ply", scene)
+    command = [program, "-w", "-q", "-g", "cpu", "-C", "8", tmp_path / "a.ply", "-l", "0"]
+    command += [tmp_path / "a.ply", "-F", "20%", "-l", "1", tmp_path / "lod" / "lod-meta.json"]
+    subprocess.run(command, check=True, timeout=300)
+    got = load_gaussians(tmp_path / "lod")
+    assert len(got) == len(scene)
+    near, _ = cKDTree(got.means).query(scene.means)
+    assert near.max() < 1e-3

@@ -5,6 +5,7 @@ import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from PIL import Image
@@ -15,10 +16,12 @@ from langsplat_core.datasets.colmap import load_colmap
 from langsplat_core.datasets.nerfstudio import load_nerfstudio
 from langsplat_core.io.cameras import read_cameras, write_cameras
 from langsplat_core.io.foreign import read_foreign
+from langsplat_core.io.gltf import write_gltf
 from langsplat_core.io.hostile import picture_size
 from langsplat_core.io.language import read_language, write_language
 from langsplat_core.io.scenes import load_scene
 from langsplat_core.progress import silent
+from langsplat_core.scene import Gaussians
 from langsplat_core.semantics.store import FeatureStore, ImageFeatures
 from tests.support.file_samples import (
     ascii_ply,
@@ -48,6 +51,13 @@ class FileKind:
     samples: Callable[[Path], list[bytes]]  # also writes what has to lie beside them into the folder
     read: Callable[[Path], float]  # the share of sound content
     damage: Mutation = mutant
+
+
+def gltf_bytes(gaussians: Gaussians, suffix: str = ".glb") -> bytes:
+    """A scene as our writer makes it: the format's own writer is not in Python."""
+    with TemporaryDirectory() as folder:
+        write_gltf(Path(folder) / f"a{suffix}", gaussians)
+        return (Path(folder) / f"a{suffix}").read_bytes()
 
 
 def scene_share(path: Path) -> float:
@@ -277,6 +287,8 @@ KINDS = {
         f"SPZ {v}": _scenes("a.spz", spz_bytes(SCENE, v), spz_bytes(PLAIN, v), damage=in_gzip)
         for v in (1, 2, 3, 4)
     },
+    ".glb": _scenes("a.glb", gltf_bytes(SCENE), gltf_bytes(PLAIN)),
+    ".gltf": _scenes("a.gltf", gltf_bytes(random_gaussians(3), ".gltf")),
     ".splat": _scenes("a.splat", splat_bytes(SCENE), splat_bytes(PLAIN)),
     ".ksplat": _scenes(
         "a.ksplat", *(ksplat_bytes([SCENE, PLAIN][: 1 + level % 2], level) for level in range(3))

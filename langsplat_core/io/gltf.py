@@ -1,0 +1,385 @@
+"""glTF 2.0 with KHR_gaussian_splatting: .glb (one binary file) and .gltf (JSON; buffers inside or beside).
+
+Gaussians are a primitive of points with the attributes POSITION and, under the extension's prefix, ROTATION
+(unit quaternion xyzw), SCALE (world units, not logarithms), OPACITY (0 to 1) and SH_DEGREE_l_COEF_n. glTF is
+left, up, front where the PLY is right, down, front: half a turn about z, which changes signs alone. Nodes
+place primitives; all Gaussians of the default scene are read, in the order of its nodes. A primitive may hold
+an .spz file instead (KHR_gaussian_splatting_compression_spz and _spz_2).
+
+Drafts of the extension stored SCALE as logarithms: a file with a negative scale is taken for such a one.
+Source: Khronos' public specification of the extension, release candidate of 2026.
+"""
+
+import base64
+import binascii
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from langsplat_core.arrays import Array, logit, sigmoid, unit
+from langsplat_core.errors import FormatError, InputError, quoted
+from langsplat_core.io.files import atomic_path
+from langsplat_core.io.hostile import open_for_reading, parse_json
+from langsplat_core.io.splat import to_bytes
+from langsplat_core.io.spz import coefficient_signs, decode_spz, quaternion_signs
+from langsplat_core.scene import SH_COUNTS, Gaussians, Scene
+from langsplat_core.scene.gaussians import joined
+from langsplat_core.scene.transform import C0, Similarity, similarity, transform_gaussians
+
+EXTENSION = "KHR_gaussian_splatting"
+PACKED = (f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz")
+KNOWN = {EXTENSION, *PACKED, "KHR_mesh_quantization"}  # others that a file requires are refused
+POINTS = 0  # mode of a primitive
+FLOAT, UNSIGNED_BYTE = 5126, 5121
+COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", FLOAT: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
+JSON_LIMIT = 16 << 20  # bytes; ours has 10 kB
+LEAST_ROW = 12  # bytes of a Gaussian: its position
+MOST_NODES = 1 << 16
+SIGNS = np.array([-1, -1, 1], np.float32)  # left up front to right down front, and back
+SRGB = "srgb_rec709_display"
+
+
+@np.errstate(all="ignore")  # whatever numbers a file holds: rows that come out unsound are not drawn
+def read_gltf_scene(path: Path | str) -> Scene:
+    """Return all Gaussians of the default scene of a .glb or .gltf file.
+
+    Raises InputError when a file cannot be opened and FormatError when it breaks a rule of the format, needs
+    an extension that is not known here, or holds no Gaussians.
+    """
+    path = Path(path)
+    file = _File(path)
+    try:
+        parts = list(_parts(file))
+    except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        raise FormatError(f"{path}: not a sound glTF file ({str(error)[:80]}); export it again") from None
+    if not parts and EXTENSION not in file.content.get("extensionsUsed", ()):
+        raise FormatError(f"{path}: holds no Gaussians ({EXTENSION}); meshes are not read")
+    return Scene(_turned(joined(parts)))
+
+
+def _turned(gaussians: Gaussians) -> Gaussians:
+    """Return the Gaussians half a turn about z further: from glTF's axes to the PLY's, or back."""
+    harmonics = np.append(np.float32(1), coefficient_signs(SIGNS, gaussians.sh.shape[1] - 1))
+    with np.errstate(invalid="ignore"):
+        return replace(
+            gaussians,
+            means=gaussians.means * SIGNS,
+            quats_wxyz=gaussians.quats_wxyz * quaternion_signs(SIGNS),
+            sh=gaussians.sh * harmonics[:, None],
+        )
+
+
+def _parts(file: "_File") -> Iterator[Gaussians]:
+    """Yield the Gaussians of every primitive that has some, placed by their nodes, along glTF's axes."""
+    left = file.size  # bytes that are not shown yet: an honest file has no need to show one again and again
+    for place, primitive in _placed(file):
+        extension = primitive["extensions"][EXTENSION]
+        if primitive.get("mode") != POINTS:
+            raise FormatError(f"{file.path}: Gaussians in a primitive that is not of points")
+        views = [one["bufferView"] for name, one in extension.get("extensions", {}).items() if name in PACKED]
+        if views:
+            data = file.view(views[0])[0]
+            left -= len(data)
+        else:
+            if extension.get("colorSpace", SRGB) != SRGB:
+                raise FormatError(
+                    f"{file.path}: colours are not {SRGB} but {quoted(extension['colorSpace'])}"
+                )
+            count = file.whole_number(file.content["accessors"], primitive["attributes"]["POSITION"], "count")
+            left -= LEAST_ROW * count
+        if left < 0:
+            raise FormatError(f"{file.path}: shows more Gaussians than {file.size} bytes can hold")
+        if views:
+            gaussians = _turned(decode_spz(bytes(data), file.path).gaussians)
+        else:
+            gaussians = _gaussians(file, primitive["attributes"], count)
+        try:
+            yield gaussians if place.is_identity else transform_gaussians(gaussians, place)
+        except InputError as error:
+            raise FormatError(f"{file.path}: {error}") from None
+
+
+def _placed(file: "_File") -> Iterator[tuple[Similarity, Any]]:
+    """Yield the primitives with Gaussians and where they are. Every node has one parent at most."""
+    content = file.content
+    nodes, meshes = content.get("nodes", []), content.get("meshes", [])
+    if len(nodes) > MOST_NODES:
+        raise FormatError(f"{file.path}: {len(nodes)} nodes; at most {MOST_NODES} are read")
+    scenes = content.get("scenes", [])
+    roots = scenes[content.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
+    waiting = [(_index(root), np.eye(4)) for root in reversed(roots)]
+    seen: set[int] = set()
+    while waiting:
+        number, above = waiting.pop()
+        if number in seen:
+            raise FormatError(f"{file.path}: node {number} is in two places or within itself")
+        seen.add(number)
+        node = nodes[number]
+        matrix = above @ _matrix(node)
+        mesh = meshes[_index(node["mesh"])] if "mesh" in node else {"primitives": []}
+        for primitive in mesh["primitives"]:
+            if EXTENSION in primitive.get("extensions", {}):
+                try:
+                    yield similarity(matrix), primitive
+                except InputError as error:
+                    raise FormatError(f"{file.path}: node {number}: {error}") from None
+        waiting += [(_index(child), matrix) for child in reversed(node.get("children", []))]
+        if len(waiting) > MOST_NODES:
+            raise FormatError(f"{file.path}: more than {MOST_NODES} nodes in its tree")
+
+
+def _matrix(node: Any) -> Array:
+    """(4, 4) place of a node in its parent."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T  # stored by columns
+    x, y, z, w = unit(np.array(node.get("rotation", [0, 0, 0, 1]), np.float64), 1e-300)
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn * np.array(node.get("scale", [1, 1, 1]), np.float64).reshape(3)
+    matrix[:3, 3] = np.array(node.get("translation", [0, 0, 0]), np.float64).reshape(3)
+    return matrix
+
+
+def _gaussians(file: "_File", attributes: Any, count: int) -> Gaussians:
+    """`count` Gaussians along glTF's axes."""
+
+    def column(name: str, width: int) -> Array:
+        return file.accessor(attributes[name], width, count, name)
+
+    names = [
+        f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{number}"
+        for degree in range(4)
+        for number in range(2 * degree + 1)
+    ]
+    have = sum(name in attributes for name in names)
+    if have not in SH_COUNTS.values() or names[have - 1] not in attributes:
+        raise FormatError(f"{file.path}: {have} of the coefficients of its colours; expected 1, 4, 9 or 16")
+    quats = column(f"{EXTENSION}:ROTATION", 4)
+    scales = column(f"{EXTENSION}:SCALE", 3)
+    log_scales = scales if (scales < 0).any() else np.log(scales)
+    logits = logit(column(f"{EXTENSION}:OPACITY", 1)[:, 0].astype(np.float64))
+    sh = np.empty((count, have, 3), np.float32)
+    for number, name in enumerate(names[:have]):
+        sh[:, number] = column(name, 3)
+    return Gaussians(column("POSITION", 3), log_scales, quats[:, [3, 0, 1, 2]], logits, sh)
+
+
+def _index(value: Any) -> int:
+    """`value`, where it is a place in a list; negative numbers would count from the end."""
+    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+        raise ValueError(f"{quoted(value)} is no index")
+    return value
+
+
+class _File:
+    """The JSON of a glTF file and its buffers, whose every entry is checked when it is asked for."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        file, self.size = open_for_reading(path)
+        with file:
+            start = file.read(12)
+            if start[:4] == MAGIC:
+                text, self._binary = self._chunks(start, memoryview(file.read()))
+            else:
+                if self.size > 2**31:
+                    raise FormatError(f"{path}: {self.size} bytes of JSON; write it as .glb")
+                text, self._binary = start + file.read(), memoryview(b"")
+        self.content = parse_json(text, path)
+        if not isinstance(self.content, dict) or not isinstance(self.content.get("asset"), dict):
+            raise FormatError(f"{path}: not a glTF file: it has no 'asset'")
+        if str(self.content["asset"].get("version"))[:2] != "2.":
+            raise FormatError(
+                f"{path}: glTF version {quoted(self.content['asset'].get('version'))}; only 2 is read"
+            )
+        required = self.content.get("extensionsRequired", [])
+        unknown = (
+            [name for name in required if name not in KNOWN] if isinstance(required, list) else [required]
+        )
+        if unknown:
+            raise FormatError(f"{path}: needs {quoted(unknown[0])}, which is not read; export it without")
+        self._buffers: dict[int, bytes | memoryview] = {}
+
+    def _chunks(self, start: bytes, rest: memoryview) -> tuple[bytes, memoryview]:
+        """The JSON and the binary chunk of a .glb."""
+        version, length = struct.unpack("<II", start[4:]) if len(start) == 12 else (0, 0)
+        if version != 2 or length > self.size:
+            raise FormatError(
+                f"{self.path}: a .glb of version {version} and {length} bytes, found {self.size}"
+            )
+        found: list[tuple[bytes, memoryview]] = []
+        at = 0
+        while at + 8 <= length - 12 and len(found) < 2:
+            size, kind = struct.unpack_from("<I4s", rest, at)
+            if at + 8 + size > len(rest):
+                raise FormatError(f"{self.path}: truncated: a chunk of {size} bytes does not fit")
+            found.append((kind, rest[at + 8 : at + 8 + size]))
+            at += 8 + size
+        if not found or found[0][0] != JSON_CHUNK or len(found[0][1]) > JSON_LIMIT:
+            raise FormatError(
+                f"{self.path}: does not begin with a chunk of JSON of at most {JSON_LIMIT} bytes"
+            )
+        binary = found[1][1] if len(found) == 2 and found[1][0] == BINARY_CHUNK else rest[:0]
+        return bytes(found[0][1]), binary
+
+    def whole_number(self, entries: Any, index: Any, key: str, default: int | None = None) -> int:
+        """Return entry `key` of `entries[index]`, a whole number from 0."""
+        value = entries[_index(index)].get(key, default)
+        if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**40:
+            raise FormatError(f"{self.path}: {key} of entry {index} is not a whole number from 0")
+        return value
+
+    def accessor(self, index: Any, width: int, count: int, name: str) -> Array:
+        """(count, width) float32 values of an accessor."""
+        about = self.content["accessors"][_index(index)]
+        dtype, offset = np.dtype(COMPONENTS[about["componentType"]]), about.get("byteOffset", 0)
+        fits = WIDTHS.get(about["type"]) == width and about["count"] == count and "sparse" not in about
+        if not fits or "bufferView" not in about or _index(offset) > self.size:
+            raise FormatError(f"{self.path}: {name} is not {count} times {width} numbers in a buffer")
+        data, stride = self.view(about["bufferView"])
+        row = dtype.itemsize * width
+        stride = stride or row
+        if (
+            stride < row
+            or (stride > 252 and stride != row)
+            or offset + stride * (count - 1) + row > len(data)
+        ):
+            raise FormatError(f"{self.path}: truncated: {name} of {count} Gaussians does not fit its buffer")
+        shape, strides = (count, width), (stride, dtype.itemsize)
+        values: Array = np.ndarray(shape, dtype, data, offset, strides).astype(np.float32)
+        if about.get("normalized") and dtype.kind in "iu":
+            values = np.maximum(values / np.iinfo(dtype).max, -1)
+        return values
+
+    def view(self, index: Any) -> tuple[memoryview, int]:
+        """Bytes of a buffer view and its stride, 0 where rows follow each other."""
+        views = self.content["bufferViews"]
+        offset, size, stride = (
+            self.whole_number(views, index, key, default)
+            for key, default in (("byteOffset", 0), ("byteLength", None), ("byteStride", 0))
+        )
+        buffer = self._buffer(_index(views[index]["buffer"]))
+        if offset + size > len(buffer):
+            raise FormatError(f"{self.path}: truncated: buffer view {index} lies beyond its buffer")
+        return memoryview(buffer)[offset : offset + size], stride
+
+    def _buffer(self, index: int) -> bytes | memoryview:
+        if index not in self._buffers:
+            uri = self.content["buffers"][index].get("uri")
+            if uri is None and index == 0:
+                self._buffers[index] = self._binary
+            elif isinstance(uri, str) and uri.startswith("data:"):
+                try:
+                    self._buffers[index] = base64.b64decode(uri.partition(";base64,")[2], validate=True)
+                except (binascii.Error, ValueError):
+                    raise FormatError(f"{self.path}: buffer {index} is not base64") from None
+            else:
+                self._buffers[index] = self._beside(uri)
+        return self._buffers[index]
+
+    def _beside(self, uri: Any) -> bytes:
+        """A file in the same folder: a path could lead out of it."""
+        name = unquote(uri) if isinstance(uri, str) else ""
+        if not name or set(name) & set("/\\:\0") or name in (".", ".."):
+            raise FormatError(f"{self.path}: buffer {quoted(uri)} is no plain file name")
+        file, size = open_for_reading(self.path.parent / name)
+        with file:
+            self.size += size
+            return file.read()
+
+
+def write_gltf(path: Path | str, gaussians: Gaussians) -> None:
+    """Write a .glb, or a .gltf with its buffer inside, atomically; rows keep their order.
+
+    Positions and colours are exact, scales, quaternions (normalised) and opacities to float32. COLOR_0 shows
+    points of the base colour in programs that do not know the extension. A row that cannot be drawn is
+    written with opacity 0. Raises InputError for more than a .glb can hold, 4 GiB.
+    """
+    path = Path(path)
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    attributes, blocks, size = {}, [], 0
+    for name, values in _columns(gaussians).items() if len(gaussians) else ():
+        block = np.ascontiguousarray(values)
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[block[0].size]
+        attributes[name] = len(accessors)
+        views.append({"buffer": 0, "byteOffset": size, "byteLength": block.nbytes, "target": 34962})
+        about = {"bufferView": len(accessors), "count": len(block), "type": kind}
+        byte = block.dtype == np.uint8
+        about |= {"componentType": UNSIGNED_BYTE, "normalized": True} if byte else {"componentType": FLOAT}
+        if name == "POSITION":
+            about |= {"min": block.min(0).tolist(), "max": block.max(0).tolist()}
+        accessors.append(about)
+        blocks.append(block)
+        size += block.nbytes  # always a multiple of four
+    content: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "langsplat-viewer"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{}],
+    }
+    if blocks:
+        says = {"kernel": "ellipse", "colorSpace": SRGB}
+        says |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
+        primitive = {"attributes": attributes, "mode": POINTS, "extensions": {EXTENSION: says}}
+        content |= {
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0}],
+            "meshes": [{"primitives": [primitive]}],
+            "accessors": accessors,
+            "bufferViews": views,
+            "buffers": [{"byteLength": size}],
+        }
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        if path.suffix.lower() == ".gltf":
+            if blocks:
+                data = base64.b64encode(b"".join(block.tobytes() for block in blocks)).decode()
+                content["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{data}"
+            file.write(json.dumps(content).encode())
+            return
+        text = json.dumps(content).encode()
+        text += b" " * (-len(text) % 4)
+        whole = 12 + 8 + len(text) + (8 + size if blocks else 0)
+        if whole >= 2**32:
+            raise InputError(f"{path}: {whole} bytes are more than a .glb can hold; write .spz or .sog")
+        file.write(MAGIC + struct.pack("<III", 2, whole, len(text)) + JSON_CHUNK + text)
+        if blocks:
+            file.write(struct.pack("<I", size) + BINARY_CHUNK)
+        for block in blocks:
+            file.write(block.data)
+
+
+def _columns(gaussians: Gaussians) -> dict[str, Array]:
+    """Attribute -> (N, ...) values along glTF's axes; rows that cannot be drawn are harmless."""
+    valid = gaussians.valid()
+    keep = valid[:, None]
+    turned = _turned(gaussians)
+    quats = unit(np.where(keep, turned.quats_wxyz, [1, 0, 0, 0]).astype(np.float64), 1e-30)
+    opacity = np.where(valid, sigmoid(gaussians.opacity_logits.astype(np.float64)), 0)
+    sh = np.where(keep[..., None], turned.sh, 0)
+    base = np.concatenate([0.5 + C0 * sh[:, 0], opacity[:, None]], axis=1)
+    columns = {
+        "POSITION": np.where(keep, turned.means, 0).astype("<f4"),
+        "COLOR_0": to_bytes(255 * base),
+        f"{EXTENSION}:ROTATION": quats[:, [1, 2, 3, 0]].astype("<f4"),
+        f"{EXTENSION}:SCALE": np.exp(np.where(keep, turned.log_scales, 0).astype(np.float64)).astype("<f4"),
+        f"{EXTENSION}:OPACITY": opacity.astype("<f4"),
+    }
+    for degree in range(gaussians.sh_degree + 1):
+        for number in range(2 * degree + 1):
+            columns[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{number}"] = sh[:, degree**2 + number].astype("<f4")
+    return columns
