@@ -39,7 +39,7 @@ from langsplat_core.scene import (
     Tree,
     codec_from_tensors,
 )
-from langsplat_core.scene.codec import KINDS
+from langsplat_core.scene.codec import KINDS, CodebookCodec
 from langsplat_core.scene.language import phrase_key
 from langsplat_core.scene.surface import build_surface, build_tree
 from langsplat_core.semantics.encoder import Encoder, PhraseEncoder
@@ -50,6 +50,7 @@ from langsplat_core.training.language.codec_fit import (
     codec_report,
     everyday_vocabulary,
     fit_codec,
+    rounded,
 )
 from langsplat_core.training.language.lift import (
     Lifted,
@@ -65,6 +66,7 @@ from langsplat_core.training.language.mask_weights import (
     group_masks,
     view_pairs,
 )
+from langsplat_core.training.language.palette import contrasting_colours
 from langsplat_core.training.language.tree import count_votes
 
 Views = Sequence[tuple[Camera, ImageFeatures]]  # read when needed: they may be more than memory holds
@@ -103,7 +105,16 @@ def language_field(
         reading=encoder.reading,
         everyday=everyday_vectors(encoder),
     )
-    return replace(field, tree=stages.tree(field)), report
+    tree = stages.tree(field)
+    return replace(field, tree=tree, codec=_coloured(field, tree, gaussians)), report
+
+
+def _coloured(field: LanguageField, tree: Tree, gaussians: Gaussians) -> Codec:
+    """The codec; a codebook with colours that tell neighbours apart."""
+    if not isinstance(field.codec, CodebookCodec):
+        return field.codec
+    colours = contrasting_colours(field, tree, build_surface(gaussians))
+    return field.codec if colours is None else replace(field.codec, palette=rounded(colours))
 
 
 def check_lift(config: TrainConfig) -> None:

@@ -15,7 +15,6 @@ from langsplat_core.cli.run import main
 from langsplat_core.errors import InputError
 from langsplat_core.pipeline.stages import LOCK, ProcessGroup, join_processes, sole_use
 from langsplat_core.pipeline.train import StoredViews
-from langsplat_core.training.language import codec_fit
 from tests.support.scenes import make_views
 from tests.support.tiny_room import tiny_room
 from tests.support.tiny_sam import tiny_sam
@@ -92,7 +91,6 @@ def test_views_are_read_when_they_are_looked_at():
 def train(room: Path, out: Path, said: Path, surroundings: dict[str, str], *more: str) -> None:
     """The command, in an environment; its exit code becomes this process's, unless it is 0."""
     os.environ.update(surroundings)
-    codec_fit.COLOUR_STEPS = 20  # as in this folder's tests
     words = ["train", str(room), "--out", str(out), "--phrases", "red mug", *OPTIONS, *more]
     with said.open("w") as file, redirect_stdout(file), redirect_stderr(file):
         code = main("langsplat", lambda: parse([*words, "--clip.model", str(room / "encoder")]))

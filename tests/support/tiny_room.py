@@ -1,11 +1,9 @@
 """Photographs of a few large Gaussians, and settings with which they train in seconds."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
 
 from langsplat_core.config import (
@@ -18,7 +16,6 @@ from langsplat_core.config import (
 )
 from langsplat_core.raster.render import render
 from langsplat_core.scene import Scene, look_at
-from langsplat_core.training.language import codec_fit
 from tests.support.scenes import random_gaussians
 from tests.support.tiny_clip import tiny_clip
 
@@ -61,11 +58,3 @@ def tiny_settings(room: Path) -> TrainConfig:
         codec=CodebookConfig(),
         phrases=("red mug",),
     )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def rough_colours() -> Iterator[None]:
-    """A third of a tiny training's time is else the colours of its codewords."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(codec_fit, "COLOUR_STEPS", 20)
-        yield

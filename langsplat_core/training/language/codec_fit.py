@@ -20,7 +20,7 @@ from langsplat_core.config import (
 )
 from langsplat_core.progress import Progress, silent
 from langsplat_core.scene import CANONICAL_PHRASES, AutoencoderCodec, CodebookCodec, Codec, LinearCodec
-from langsplat_core.scene.codec import KINDS, principal_colours, stretched
+from langsplat_core.scene.codec import KINDS, principal_colours
 from langsplat_core.semantics.encoder import PhraseEncoder
 from langsplat_core.semantics.relevancy import Scale, relevancy_of
 from langsplat_core.semantics.vocabulary import everyday_phrases, everyday_vectors
@@ -184,8 +184,6 @@ LARGEST_SHARE = 4  # vectors per codeword, at least: with fewer, a codebook is a
 JUDGED = 5  # every so many vectors, one is kept from the fit and judges it
 FIRST_ROUNDS, FURTHER_ROUNDS = 8, 4
 REFINEMENTS = 2  # halvings of the interval that holds the smallest codebook, by ratio
-COLOUR_STEPS, COLOUR_BATCH = 300, 64  # of the autoencoder of 3 numbers whose latents are the colours
-FEWEST_FOR_COLOURS = 16  # codewords; fewer have their principal axes for colours
 
 
 def fit_codebook(
@@ -211,13 +209,13 @@ def fit_codebook(
     progress("colours of the codewords", 0.8)
     nearest, _ = nearest_centres(fitted, codewords)
     usage = np.bincount(nearest, minlength=len(codewords)).astype(np.float64)
-    return codebook_of(codewords, usage, config)
+    return codebook_of(codewords, usage)
 
 
-def codebook_of(vectors: Array, usage: Array, config: CodebookConfig) -> CodebookCodec:
+def codebook_of(vectors: Array, usage: Array) -> CodebookCodec:
     """The codebook of (K, D) float32 unit vectors that occur (K,) `usage` times, rounded to float16."""
     codewords = rounded(vectors)
-    return CodebookCodec(codewords, rounded(codeword_colours(codewords, usage, config.seed)))
+    return CodebookCodec(codewords, rounded(principal_colours(codewords, usage)))
 
 
 def _smallest(
@@ -255,15 +253,6 @@ def codebook_error(codewords: Array, vectors: Array, vocabulary: Vocabulary) -> 
     """Mean error of relevancy with every vector's nearest codeword in its place."""
     nearest, _ = nearest_centres(vectors, codewords)
     return relevancy_error(codewords[nearest], vectors, vocabulary)[0]
-
-
-def codeword_colours(codewords: Array, usage: Array, seed: int = 0) -> Array:
-    """(K, 3) float32 in [0, 1]: latents of the paper's autoencoder of 3 numbers, fitted to the (K, D)
-    codewords, each axis stretched over what (K,) usage says occurs."""
-    if len(codewords) < FEWEST_FOR_COLOURS:
-        return principal_colours(codewords, usage)
-    codec = train_autoencoder(codewords, AutoencoderConfig(steps=COLOUR_STEPS, batch=COLOUR_BATCH, seed=seed))
-    return stretched(codec.encode(codewords), usage)
 
 
 def rounded(numbers: Array) -> Array:
@@ -304,7 +293,7 @@ def fit_linear(vectors: Array, config: LinearConfig) -> LinearCodec:
 def exact_codec(vectors: Array, usage: Array, config: CodecConfig) -> Codec | None:
     """The codec whose latents stand for just the (K, D) float32 unit vectors, which occur (K,) `usage` times;
     None for a kind that only comes near to them."""
-    return EXACT[config.kind](vectors, usage, config) if config.kind in EXACT else None
+    return EXACT[config.kind](vectors, usage) if config.kind in EXACT else None
 
 
 # By the kind: the fit, and the codec of given vectors.
@@ -317,4 +306,4 @@ FITTERS: Mapping[str, Callable[[Array, Any, Vocabulary, Progress], Codec]] = Map
         "linear": lambda vectors, config, vocabulary, progress: fit_linear(vectors, config),
     }
 )
-EXACT: Mapping[str, Callable[[Array, Array, Any], Codec]] = MappingProxyType({"codebook": codebook_of})
+EXACT: Mapping[str, Callable[[Array, Array], Codec]] = MappingProxyType({"codebook": codebook_of})

@@ -11,7 +11,6 @@ from langsplat_core.config import CODEC_CONFIGS, AutoencoderConfig, CodebookConf
 from langsplat_core.scene import AutoencoderCodec, Codec, LinearCodec, codec_from_tensors
 from langsplat_core.scene.codec import KINDS
 from langsplat_core.semantics.relevancy import Scale
-from langsplat_core.training.language import codec_fit
 from langsplat_core.training.language.codec_fit import (
     FITTERS,
     Vocabulary,
@@ -43,13 +42,6 @@ QUICK = {
     "autoencoder": AutoencoderConfig(latent_dim=4, steps=20),
     "linear": LinearConfig(latent_dim=4),
 }
-
-
-@pytest.fixture(autouse=True)
-def quick_colours(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    """Tests that are not about colours do not wait for them."""
-    if "colours" not in request.node.name:
-        monkeypatch.setattr(codec_fit, "COLOUR_STEPS", 20)
 
 
 def clusters(count: int, each: int, noise: float = 0.02, seed: int = 0) -> tuple[Array, Array]:
