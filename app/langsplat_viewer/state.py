@@ -15,6 +15,7 @@ from langsplat_core.config import LevelChoice, PictureConfig, TrainPreset
 from langsplat_core.display.displays import MAX_QUERIES
 from langsplat_core.query.answers import QueryResult
 from langsplat_core.query.describe import Pointed, Suggestions
+from langsplat_core.query.engine import LoadEncoder
 from langsplat_core.query.finding import Hit
 from langsplat_core.query.instances import Instance
 from langsplat_core.query.library import Library
@@ -212,6 +213,7 @@ class LibraryView:
     """The scenes of a folder, as the panel "Library" lists them."""
 
     library: Library
+    load_encoder: LoadEncoder  # keeps the last one
     phrase: str = ""  # that they are ranked by; "": by name
     hits: tuple[Hit, ...] = ()  # the first `MOST_HITS` of the ranked
     said: str = ""  # how many scenes have it, in words

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -378,18 +379,17 @@ def choose_folder(viewer: Viewer, folder: Path) -> None:
 
 def open_library(viewer: Viewer, folder: Path) -> None:
     """Read the index of a folder, and the scenes that are new there, in the background."""
-    state = viewer.state
-    state.browser = None
+    viewer.state.browser, load = None, lru_cache(maxsize=1)(viewer.services.load_encoder)
 
     def done(library: Library) -> None:
         hits = [Hit(folder / scene.path, "not here", 0.0, None) for scene in library.scenes]
-        _show_hits(viewer, LibraryView(library, said=f"{len(hits)} scenes"), hits)
+        _show_hits(viewer, LibraryView(library, load, said=f"{len(hits)} scenes"), hits)
         for scene in library.unread:
             viewer.say_error(f"{scene.path}: {scene.unread}")
         open_panel(viewer, "Library")
 
     def work(progress: Progress) -> Library:
-        return update_library(folder, load_encoder=viewer.services.load_encoder, progress=progress)
+        return update_library(folder, load_encoder=load, progress=progress)
 
     viewer.run(f"reading the scenes of {folder.name}", work, done)
 
@@ -406,10 +406,10 @@ def ask_library(viewer: Viewer, phrase: str) -> None:
         found = sum(hit.verdict == "found" for hit in hits)
         problems = [each.problem for each in answers if each.problem]
         said = "; ".join([f"'{phrase}': found in {found} of {len(hits)} scenes", *problems])
-        _show_hits(viewer, LibraryView(library, phrase, said=said), hits)
+        _show_hits(viewer, replace(view, phrase=phrase, said=said), hits)
 
     def work(progress: Progress) -> list[Answered]:
-        return find(library, phrase, viewer.services.load_encoder, 0, progress)
+        return find(library, phrase, view.load_encoder, 0, progress)
 
     viewer.run(f"searching '{phrase}' in {len(library.scenes)} scenes", work, done)
 
