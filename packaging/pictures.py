@@ -11,7 +11,7 @@ from imgui_bundle import hello_imgui, imgui  # isort: skip  (before glfw)
 from imgui_bundle.immapp import testing  # isort: skip
 
 from langsplat_core.io.hostile import opened
-from langsplat_viewer.actions import filming, selecting, settings, training, viewpoint
+from langsplat_viewer.actions import filming, selecting, settings, training, transforming, viewpoint
 from langsplat_viewer.options import scene_path, services
 from langsplat_viewer.rendering.renderer import GlRenderer
 from langsplat_viewer.state import TrainingForm
@@ -59,6 +59,12 @@ def _selected(ctx: Any, window: Window) -> None:
     settings.open_panel(viewer, "Select")
     selecting.select_query(viewer)
     settings.set_display(viewer, "rgb")
+
+
+def _transformed(ctx: Any, window: Window) -> None:
+    _selected(ctx, window)
+    settings.open_panel(window.viewer, "Transform")
+    transforming.next_gizmo(window.viewer)
 
 
 def _side_by_side(ctx: Any, window: Window) -> None:
@@ -167,6 +173,7 @@ WINDOWS: dict[str, tuple[tuple[str, ...], Act]] = {
     "window.png": (QUERIES, _found),
     "cursor.jpg": (("teddy bear",), _under_the_cursor),
     "select.jpg": (("teddy bear",), _selected),
+    "transform.jpg": (("teddy bear",), _transformed),
     "side_by_side.jpg": (("teddy bear",), _side_by_side),
     "palette.jpg": (QUERIES, _palette),
     "structure.jpg": (("toy, not teddy bear", "keyboard of the laptop"), _with_structure),
