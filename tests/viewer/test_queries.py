@@ -170,6 +170,16 @@ def test_the_box_is_emptied_by_a_search_and_by_nothing_else(opened):
     assert not queries.take_search_focus(opened)  # said once
 
 
+def test_all_queries_go_at_once_and_come_back(opened):
+    for phrase in ("mug", "plant"):
+        queries.ask(opened, phrase)
+        settle(opened)
+    queries.remove_all(opened)
+    assert (opened.state.queries, opened.state.selected) == ([], None)
+    undoing.undo(opened)
+    assert [query.phrase for query in opened.state.queries] == ["mug", "plant"]
+
+
 @pytest.mark.parametrize(("logit", "verdict"), [(9.0, "found"), (1.0, "weak match"), (-3.0, "not here")])
 def test_a_calibrated_scene_gives_verdicts_with_probability(viewer, monkeypatch, logit, verdict):
     reading = Reading(calibration=calibrated_for("mug", logit))

@@ -243,6 +243,16 @@ def remove(viewer: Viewer, query: Query) -> None:
         let_go(viewer)
 
 
+def remove_all(viewer: Viewer) -> None:
+    """Take all queries off the list; one undo brings them back."""
+    state = viewer.state
+    if state.queries:
+        remember(viewer)
+        state.queries = []
+        select(viewer, None)
+        let_go(viewer)
+
+
 def set_level(viewer: Viewer, level: LevelChoice) -> None:
     """Choose the semantic level of all queries, or leave it to the score ("auto")."""
     if level == viewer.state.level:

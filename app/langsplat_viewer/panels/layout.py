@@ -6,6 +6,7 @@ from pathlib import Path
 
 from imgui_bundle import ImVec2, hello_imgui, imgui
 
+from langsplat_core import __version__
 from langsplat_viewer.actions import filming, opening, settings, viewpoint
 from langsplat_viewer.commands import COMMANDS, HELD, LETTERS_MENU, MENUS, Command, in_menu, matching
 from langsplat_viewer.panels import (
@@ -142,6 +143,7 @@ def draw_help(viewer: Viewer) -> None:
     imgui.set_next_window_bg_alpha(1.0)
     _, still_open = imgui.begin("Keys", True, flags)
     settings.show_help(viewer, bool(still_open))
+    imgui.text_disabled(f"LangSplat viewer {__version__}; documentation: docs/README.md of its source")
     _table()
     imgui.end()
 

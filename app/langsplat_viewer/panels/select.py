@@ -45,6 +45,18 @@ FATES: tuple[Verb, ...] = (
         "Out of the scene; its file stays as it is",
     ),
 )
+OF_SELECTED = {
+    "None",
+    "Grow",
+    "Shrink",
+    "More like it",
+    "Hide",
+    "Isolate",
+    "Delete",
+    "Selection",
+    "Rest",
+    "Points",
+}
 FILES: tuple[Verb, ...] = (
     ("Selection", lambda viewer: selecting.export(viewer, Path.cwd(), "selection"), "A PLY with its field"),
     ("Rest", lambda viewer: selecting.export(viewer, Path.cwd(), "rest"), "Everything else as a PLY"),
@@ -142,11 +154,14 @@ def _name(viewer: Viewer) -> None:
 
 
 def _buttons(viewer: Viewer, verbs: Sequence[Verb]) -> None:
+    nothing = not viewer.state.selection.marks.selected.any()
     for place, (name, act, what) in enumerate(verbs):
         if place:
             beside(name)
+        imgui.begin_disabled(nothing and name in OF_SELECTED)
         if imgui.button(f"{name}##verb"):
             act(viewer)
+        imgui.end_disabled()
         tip(with_key(what, act))
 
 
